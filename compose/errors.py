@@ -58,6 +58,15 @@ class BadKill(UserError):
     """A `--kill` or a `[[kill]]` table is invalid; the text shows the expected form or names the field."""
 
 
+# --- planners ---------------------------------------------------------------------------------------
+
+
+class PlannerFailed(UserError):
+    """A planner of the user raised an error or gave an invalid answer; the text names the method and tick."""
+
+    exit_status: ClassVar[int] = FAILED
+
+
 # --- sweeps -----------------------------------------------------------------------------------------
 
 
@@ -67,6 +76,13 @@ class BadSpec(UserError):
 
 class NoSuchField(UserError):
     """A field path of a sweep does not exist in the scenario; the text names the part that is missing."""
+
+
+# --- range recordings -------------------------------------------------------------------------------
+
+
+class BadRecording(UserError):
+    """A range recording is invalid; the text names the file, the line and what is wrong."""
 
 
 # --- keys -------------------------------------------------------------------------------------------

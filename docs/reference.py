@@ -7,14 +7,11 @@ A page has a line `<!-- generated: NAME -->` for each of TABLES, and the hook wr
 from __future__ import annotations
 
 import argparse
-import ast
 import inspect
 import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from functools import cache, partial
-from itertools import pairwise
-from types import ModuleType
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -22,18 +19,29 @@ from msgspec import NODEFAULT
 from msgspec import inspect as types
 
 from compose.cli.main import COMMANDS, command_parser
+from compose.recording.estimating.estimate_rows import (
+    EstimateSummary,
+    PoseEstimate,
+    PoseEstimateRow,
+    RobotEstimate,
+)
+from compose.recording.estimating.learned_errors import LearnedErrors
+from compose.recording.ranging import recording_rows
 from compose.recording.ticks_csv import TickRow
 from compose.scenario.fault_syntax import FaultTable
+from compose.scenario.json_schema import described
 from compose.scenario.kills import KillTable
-from compose.scenario.scenario_file import PlannerTable, RobotTable, ScenarioFile
+from compose.scenario.scenario_file import PlannerTable, RobotTable, ScenarioFile, WorldTable
 from compose.sweep.draws import DrawTable, StartsTable
-from compose.sweep.spec import AxisTable, SpecFile
+from compose.sweep.spec import AxisTable, RowTable, SpecFile
 from compose.sweep.trial import RobotRow, TrialRow
 from protocol import messages, wire
 from protocol.attack import Attack
 from protocol.mission import Mission
 from protocol.network import keys
 from protocol.noise import Noise, VelocityNoise
+from tandem import rows
+from world.world_noise import WorldActuationNoise, WorldNoise, WorldOdometryNoise
 
 MARKER = re.compile(r"^<!-- generated: (?P<name>[\w-]+) -->$", re.MULTILINE)
 NO_VALUE = "none"
@@ -54,45 +62,17 @@ NAMES = {
     "AxisTable": "`[[axis]]`",
     "DrawTable": "`[[draw]]`",
     "StartsTable": "table `[starts]`",
+    "WorldTable": "table `[world]`",
+    "ModelSpec": "table with `model` and `options`",
     "Attack": "table",
     "Noise": "table",
     "VelocityNoise": "table",
+    "WorldNoise": "table",
+    "WorldActuationNoise": "table",
+    "WorldOdometryNoise": "table",
+    "RowTable": "table",
 }
 """the types of tables of files, as a user writes them"""
-
-
-@cache
-def _docstrings(module: ModuleType) -> dict[str, dict[str, str]]:
-    """Return the docstring under each field of each class in `module`, by class and field."""
-    found: dict[str, dict[str, str]] = {}
-    try:
-        source = inspect.getsource(module)
-    except (OSError, TypeError):  # a module in C
-        return {}
-    for node in ast.parse(source).body:
-        if isinstance(node, ast.ClassDef):
-            found[node.name] = dict(_pairs(node.body))
-    return found
-
-
-def _pairs(body: Sequence[ast.stmt]) -> Iterable[tuple[str, str]]:
-    """Yield the names of annotated fields that have a string below them, and that string."""
-    for field, below in pairwise(body):
-        match field, below:
-            case (
-                ast.AnnAssign(target=ast.Name(id=name)),
-                ast.Expr(value=ast.Constant(value=str(text))),
-            ):
-                yield name, " ".join(text.split())
-
-
-def _described(struct: type[msgspec.Struct], field: str) -> str:
-    """Return the docstring of a field, of the class that declares it; empty if it has none."""
-    for cls in struct.__mro__:
-        module = inspect.getmodule(cls)
-        if module is not None and field in (found := _docstrings(module).get(cls.__name__, {})):
-            return found[field]
-    return ""
 
 
 def _bounds(kind: Any) -> str:
@@ -175,7 +155,7 @@ def fields_of(struct: type[msgspec.Struct], *, defaults: bool = True) -> str:
             f"`{field.encode_name}`",
             _typed(field.type),
             *([_default(field)] if defaults else []),
-            _described(struct, field.name),
+            described(struct, field.name),
         ]
         for field in info.fields
     ]
@@ -188,7 +168,7 @@ def columns_of(struct: type[msgspec.Struct]) -> str:
     assert isinstance(info, types.StructType)
     return _table(
         ["column", "type", "meaning"],
-        [[f"`{field.name}`", _typed(field.type), _described(struct, field.name)] for field in info.fields],
+        [[f"`{field.name}`", _typed(field.type), described(struct, field.name)] for field in info.fields],
     )
 
 
@@ -288,15 +268,36 @@ TABLES: dict[str, Callable[[], str]] = {
     "attack": partial(fields_of, Attack),
     "noise": partial(fields_of, Noise),
     "velocity-noise": partial(fields_of, VelocityNoise),
+    "world": partial(fields_of, WorldTable),
+    "world-noise": partial(fields_of, WorldNoise),
+    "world-actuation-noise": partial(fields_of, WorldActuationNoise),
+    "world-odometry-noise": partial(fields_of, WorldOdometryNoise),
     "fault": partial(fields_of, FaultTable),
     "kill": partial(fields_of, KillTable),
     "sweep": partial(fields_of, SpecFile),
     "axis": partial(fields_of, AxisTable),
+    "row": partial(fields_of, RowTable),
     "draw": partial(fields_of, DrawTable),
     "starts": partial(fields_of, StartsTable),
     "trial-columns": partial(columns_of, TrialRow),
     "robot-columns": partial(columns_of, RobotRow),
     "tick-columns": partial(columns_of, TickRow),
+    "truth-table": partial(columns_of, rows.TruthRow),
+    "observation-table": partial(columns_of, rows.ObservationRow),
+    "command-table": partial(columns_of, rows.CommandRow),
+    "estimate-table": partial(columns_of, rows.EstimateRow),
+    "message-table": partial(columns_of, rows.MessageRow),
+    "claim-table": partial(columns_of, rows.ClaimRow),
+    "odometry-columns": partial(fields_of, recording_rows.OdometryRow),
+    "range-columns": partial(fields_of, recording_rows.RangeRow),
+    "anchor-columns": partial(fields_of, recording_rows.AnchorRow),
+    "antenna-columns": partial(fields_of, recording_rows.AntennaRow),
+    "truth-columns": partial(fields_of, recording_rows.TruePoseRow),
+    "estimate-columns": partial(columns_of, PoseEstimateRow),
+    "estimate-fields": partial(fields_of, EstimateSummary, defaults=False),
+    "robot-estimate-fields": partial(fields_of, RobotEstimate, defaults=False),
+    "estimate-pose-fields": partial(fields_of, PoseEstimate, defaults=False),
+    "learned-fields": partial(fields_of, LearnedErrors, defaults=False),
     "final-report": partial(columns_of, messages.FinalReport),
     "wire-version": wire_version,
     "wire-keys": wire_keys,

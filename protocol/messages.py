@@ -14,9 +14,11 @@ Decoding checks the type and the bounds of every field, which are part of the ty
 ============== ====================================== ==========================================
 Message        Direction                              When
 ============== ====================================== ==========================================
-RobotConfig    world -> robot                         once, in answer to the robot's query
+RobotConfig    world -> robot                         once, in answer to the robot's query; with
+                                                      options of the planner, its own kind
 Observation    world -> robot                         every tick
 Report         robot -> its peer                      every tick in which the two are in contact
+PlannerReport  robot -> its peer                      in place of Report, by planners with own reports
 Command        robot -> world                         every tick
 Estimate       robot -> viewers                       every tick
 GroundTruth    world -> viewers                       every tick with a subscriber
@@ -36,6 +38,7 @@ from __future__ import annotations
 
 import math
 import re
+from functools import cached_property
 from typing import Annotated, Literal
 
 import msgspec
@@ -43,9 +46,9 @@ from msgspec import Meta
 from msgspec.structs import force_setattr
 
 from protocol.attack import Attack
-from protocol.mission import Anchor, Mission, PlannerName, Role
+from protocol.mission import Anchor, Mission, Options, PlannerName, Role
 from protocol.motion import Controls, Covariance, Pose, Segment
-from protocol.orbits import Rendezvous
+from protocol.orbits import Orbit, Rendezvous
 from protocol.units import (
     Angle,
     AngularVelocity,
@@ -91,6 +94,9 @@ MAX_REPORT_RUNS = 70
 """The maximum number of segments in a Report, so that its frame fits in `wire.MAX_REPORT_BYTES`."""
 MAX_REPORT_RANGES = 70
 """The maximum number of ranges in a Report, for the same reason."""
+
+MAX_BODY_BYTES = 3890
+"""The maximum size of the body of a PlannerReport, so that its frame fits in `wire.MAX_REPORT_BYTES`."""
 
 
 def _cut(struct: msgspec.Struct, field: str) -> None:
@@ -213,7 +219,7 @@ class DeadlineMissed(Message, frozen=True):
 # --- from the world to a robot ---
 
 
-class RobotConfig(Message, frozen=True):
+class RobotConfig(Message, frozen=True, dict=True):
     """The configuration of a robot: everything that its agent needs to start."""
 
     robot: RobotId
@@ -238,9 +244,30 @@ class RobotConfig(Message, frozen=True):
     """The duration of a tick in s of wall time; None in lockstep, where a tick has no deadline."""
 
     @property
+    def planner_options(self) -> Options:
+        """The options of the planner; here, none."""
+        return {}
+
+    @cached_property
     def anchor_distance(self) -> float:
         """The distance D between the two anchors, in m."""
         return math.hypot(self.anchor.x - self.peer_anchor.x, self.anchor.y - self.peer_anchor.y)
+
+    @cached_property
+    def orbit(self) -> Orbit:
+        """The orbit of this robot in phase 2."""
+        return self.rendezvous.of(self.role)
+
+
+class RobotConfigWithOptions(RobotConfig, frozen=True, dict=True):
+    """The configuration of a robot whose planner has options."""
+
+    planner_options: Options = {}
+    """The options of the planner, by name."""
+
+
+AnyRobotConfig = RobotConfig | RobotConfigWithOptions
+"""The two kinds of configurations."""
 
 
 class Observation(Message, frozen=True):
@@ -308,6 +335,25 @@ class Report(Message, frozen=True):
     """The acknowledgement of ranges: the sender has this many of the receiver's anchor ranges."""
     verdict: Verdict | None = None
     """The sender's final result; None until it has one."""
+
+
+class PlannerReport(Message, frozen=True):
+    """A report whose content only the planners of the two robots understand."""
+
+    tick: Tick
+    """The tick k in which this is sent."""
+    robot: RobotId
+    """The sender."""
+    heard: Tick | None
+    """The tick of the receiver's latest report that the sender has received; None if there is none."""
+    verdict: Verdict | None
+    """The sender's final result until the tick before, with a short reason; None until it has one."""
+    body: Annotated[bytes, Meta(max_length=MAX_BODY_BYTES)]
+    """The content, in msgpack: the value that `Planner.report` returns."""
+
+
+PeerReport = Report | PlannerReport
+"""The messages from a robot to its peer."""
 
 
 class Command(Message, frozen=True):
@@ -428,8 +474,10 @@ class TickStart(Message, frozen=True):
 OfRobot = (
     Environment
     | RobotConfig
+    | RobotConfigWithOptions
     | Observation
     | Report
+    | PlannerReport
     | Command
     | Estimate
     | DeadlineMissed

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from typing import Annotated, Literal
 
 import msgspec
@@ -11,10 +12,22 @@ from msgspec import Meta
 from protocol.motion import TAU
 from protocol.noise import Noise
 from protocol.rounding import EPSILON, SAME, SURE, required_anchor_error, rounding
-from protocol.units import Clearance, Coordinate, Duration, Length, Speed, TurnRate
+from protocol.units import Clearance, Coordinate, Duration, Finite, Integer, Length, Speed, TurnRate
 
-PlannerName = Literal["assured", "paper"]
-"""The name of a planner: `paper` is the algorithm as published, `assured` also handles its failure cases."""
+PlannerName = Annotated[
+    str, Meta(pattern=r"\A[A-Za-z_][A-Za-z0-9_.-]*(:[A-Za-z_][A-Za-z0-9_]*)?\Z", max_length=64)
+]
+"""The name of a planner: of one that is shipped or installed, or MODULE:CLASS.
+
+`paper` is the algorithm as published, `assured` also handles its failure cases.
+"""
+
+Option = Annotated[str, Meta(pattern=r"\A[A-Za-z_][A-Za-z0-9_]*\Z", max_length=64)]
+"""The name of an option of a planner or of a model."""
+OptionValue = bool | Integer | Finite | Annotated[str, Meta(max_length=300)]
+"""The value of an option."""
+Options = Annotated[dict[Option, OptionValue], Meta(max_length=32)]
+"""The options of a planner or of a model: the keyword arguments of its class."""
 
 Role = Literal["a", "b"]
 """The role of a robot in its pair: when the two meet, a moves first, and b stops (Section III.C)."""
@@ -55,7 +68,7 @@ class Anchor(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields
     """The y coordinate, in m."""
 
 
-class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
     """The limits, sensors and required accuracy of the robots; the same for all of them (Section II)."""
 
     sensing_range: Length
@@ -76,7 +89,7 @@ class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     noise: Noise = Noise()
     """The noise of sensors and motion."""
 
-    @property
+    @cached_property
     def first_straight(self) -> float:
         """The length A_0 in m of the first manoeuvre: one tick at v_max, at most FIRST_STRAIGHT_LIMIT R."""
         return min(self.max_speed * self.period, FIRST_STRAIGHT_LIMIT * self.sensing_range)

@@ -91,25 +91,28 @@ def chord(v: float, omega: float, period: float) -> float:
 def step(pose: Pose, v: float, omega: float, period: float) -> Pose:
     """Return the pose after driving `v` m/s and `omega` rad/s for `period` s: eq. (1a), exact."""
     half = 0.5 * period * omega
-    length = chord(v, omega, period)
+    length = v * period if half == 0.0 else v * period * (math.sin(half) / half)  # as `chord`
     course = pose.heading + half
     return Pose(
         pose.x + length * math.cos(course), pose.y + length * math.sin(course), pose.heading + period * omega
     )
 
 
-def arc(start: Pose, run: Segment, period: float) -> list[Pose]:
-    """Return the poses after each tick of `run`: those that `step` gives from `start` after k `period` s."""
+def arc(start: Pose, run: Segment, period: float, done: int = 0) -> list[Pose]:
+    """Return the poses after each tick of `run` but the first `done`.
+
+    They are those that `step` gives from `start` after k `period` s.
+    """
     v, omega = run.v, run.omega
     x, y, heading = start.x, start.y, start.heading
     sin, cos = math.sin, math.cos
     if omega == 0.0:
         ahead = heading + omega
         c, s = cos(ahead), sin(ahead)
-        lengths = [v * (k * period) for k in range(1, run.ticks + 1)]
+        lengths = [v * (k * period) for k in range(done + 1, run.ticks + 1)]
         return [Pose(x + length * c, y + length * s, ahead) for length in lengths]
     poses: list[Pose] = []
-    for k in range(1, run.ticks + 1):
+    for k in range(done + 1, run.ticks + 1):
         lasting = k * period
         half = 0.5 * lasting * omega
         length = v * lasting if half == 0.0 else v * lasting * (sin(half) / half)

@@ -14,7 +14,7 @@ from functools import cache, cached_property
 
 import msgspec
 
-from protocol.mission import RANGE_MARGIN, Mission, PlannerName, Role
+from protocol.mission import RANGE_MARGIN, Mission, Role
 from protocol.motion import TAU, Controls
 from protocol.units import AngularVelocity, Range, Time, Velocity
 
@@ -161,16 +161,16 @@ def half_passage(apart: float, radius: float, reach: float) -> float:
     return math.acos(min(1.0, max(-1.0, cosine)))
 
 
-# --- the orbits of each planner -----------------------------------------------------------------------
+# --- the orbits of each shipped planner ---------------------------------------------------------------
 
-RENDEZVOUS: dict[PlannerName, Callable[[Mission, float], Rendezvous]] = {
+RENDEZVOUS: dict[str, Callable[[Mission, float], Rendezvous]] = {
     "paper": orbiting,
     "assured": searching,
 }
-"""The orbits of each planner, for a mission and the distance D in m between the anchors."""
+"""The orbits of each shipped planner, for a mission and the distance D in m between the anchors."""
 
 
 @cache
-def rendezvous(mission: Mission, distance: float, planner_name: PlannerName) -> Rendezvous:
-    """Return the orbits of the planner for anchors `distance` m (D) apart."""
+def rendezvous(mission: Mission, distance: float, planner_name: str) -> Rendezvous:
+    """Return the orbits of a shipped planner for anchors `distance` m (D) apart."""
     return RENDEZVOUS[planner_name](mission, distance)

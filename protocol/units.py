@@ -36,6 +36,8 @@ Moment = Annotated[float, Meta(ge=-1e15, le=1e15)]
 """An element of a covariance matrix, in m^2, m rad or rad^2."""
 Finite = Annotated[float, Meta(ge=-1e18, le=1e18)]
 """A number defined by the user, such as an encoder count or a time."""
+Integer = Annotated[int, Meta(ge=-(2**53), le=2**53)]
+"""An integer defined by the user."""
 Probability = Annotated[float, Meta(ge=0.0, le=0.5)]
 """The probability of an outlier or drop-out."""
 Fraction = Annotated[float, Meta(ge=0.0, le=0.5)]

@@ -74,10 +74,10 @@ def decode(frame: bytes, kind: Any, limit: int = MAX_SENT_BYTES) -> Any:
     """
     if not _HEAD.size < len(frame) <= limit:
         raise MalformedFrame(f"{len(frame)} bytes, outside {_HEAD.size + 1} to {limit}")
+    payload = frame[_HEAD.size :]
     version, crc = _HEAD.unpack_from(frame)
     if version != VERSION:
         raise MalformedFrame(f"protocol version {version}, this is version {VERSION}")
-    payload = body(frame)
     if zlib.crc32(payload) != crc:
         raise MalformedFrame("damaged: the CRC does not match")
     try:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from msgspec.structs import asdict
+
 from compose.scenario.scenario_file import load
 from protocol.messages import (
     Command,
@@ -16,18 +18,21 @@ from protocol.messages import (
     Message,
     MissionEnd,
     Observation,
+    PlannerReport,
     Ranged,
     Report,
+    RobotConfigWithOptions,
     TickStart,
     Undecided,
 )
 from protocol.motion import Controls, Covariance, Pose, Segment
 from world.hardware.driver_journal import Mark, ProcessStart
 
+CONFIG = load("paper-1").config("a", tick_s=0.25)
 POSE = Pose(1.5, -2.5, 0.75)
 
 EXAMPLES: tuple[Message, ...] = (
-    load("paper-1").config("a", tick_s=0.25),
+    CONFIG,
     Observation(7, "a", Controls(1.0, -0.5), 2.5, (Contact("b", 1.25, (5, 7)), Contact("c", None, ()))),
     Observation(0, "a", None, None),
     Report(
@@ -67,4 +72,9 @@ EXAMPLES: tuple[Message, ...] = (
     Command(
         4, "b", 0.0, 0.0, 3, "inconsistent", Inconsistent("a start that it told otherwise before", 0.5, 0.25)
     ),
+    RobotConfigWithOptions(
+        **asdict(CONFIG), planner_options={"step": 2, "gain": 0.5, "way": "left", "on": True}
+    ),
+    PlannerReport(9, "a", 8, Undecided("no pose"), b"\x93\x01\x02\x03"),
+    PlannerReport(0, "a", None, None, b""),
 )

@@ -24,7 +24,7 @@ class Step(NamedTuple):
     commands: dict[str, Command]
 
 
-def planner_of(state: RobotState) -> Planner:
+def planner_of(state: RobotState) -> Planner[RobotState, Report]:
     """Return the planner of the robot with this state."""
     return planner(state.config.planner_name, state.config.mission)
 

@@ -23,8 +23,8 @@ from matplotlib.patches import Circle
 from matplotlib.text import Annotation
 from msgspec.structs import replace
 
-from agent.planning import assured
 from agent.planning.active_sensing import stride
+from agent.planning.assured import AssuredExact
 from agent.planning.phase3_last_manoeuvre import compared
 from compose.cli.figures import draw as draw_all
 from compose.figures import PICTURES, catalogue, decisions, manoeuvre, over_time, phase_one, steps, trajectory
@@ -43,6 +43,7 @@ from protocol.motion import step, wrap
 from protocol.wire import MalformedFrame, decode, encode
 from tests.commands import PAPER_1, SECTION_IV, on_a_terminal, several_pairs, tandem
 from tests.reference import REFERENCE
+from tests.series import series
 from world.scenario import Scenario
 
 NOISE = "[mission.noise]\nanchor_sigma = 0.01\nmutual_sigma = 0.01\n"
@@ -171,7 +172,7 @@ def test_a_plan_shows_each_candidate_and_the_axis_of_each_two_and_the_choice(
 def test_what_is_compared_is_what_was_chosen_from(recordings: Path) -> None:
     told = pair(recorded("assured", recordings))
     (one,) = [one for role in ("b", "a") for one in manoeuvre.planned(told, role)][:1]
-    ways = compared(one.plan.question, told.mission, assured.MANOEUVRES)
+    ways = compared(one.plan.question, told.mission, AssuredExact.MANOEUVRES)
     row, column = np.unravel_index(np.argmax(ways.value), ways.value.shape)
     assert (ways.reach.v[row, 0], ways.reach.omega[column]) == (one.plan.command.v, one.plan.command.omega)
     command = told.command(one.plan.question.mover, one.tick)
@@ -361,7 +362,7 @@ def test_a_noisy_plan_of_the_paper_planner_is_drawn_in_bs_frame(recordings: Path
 ABSENT = {"undecided": {"phase-1-a", "plan-a-b", "encounter-a-b"}}
 
 
-@pytest.mark.parametrize("name", ["assured", "faulty", "noisy", "letter", "undecided"])
+@pytest.mark.parametrize("name", series(["noisy", "undecided", "assured", "faulty", "letter"], 2))
 def test_each_kind_of_figure_is_drawn_or_the_reason_is_printed(
     name: str, recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -63,11 +63,11 @@ def test_a_file_that_is_not_toml_is_refused(text: bytes, says: str, tmp_path: Pa
 @pytest.mark.parametrize(
     ("was", "typo", "field"),
     [
-        ("seed = 1", "sede = 1", "unknown field 'sede'"),
+        ("seed = 1", "sede = 1", "unknown field 'sede'; did you mean 'seed'?"),
         ("[planner]", "[planer]", "unknown field 'planer'"),
-        ("period =", "peroid =", "mission: unknown field 'peroid'"),
+        ("period =", "peroid =", "mission: unknown field 'peroid'; did you mean 'period'?"),
         ('name = "paper"', 'nmae = "paper"', "planner: unknown field 'nmae'"),
-        ("start = [11", "statr = [11", "robot[1]: unknown field 'statr'"),
+        ("start = [11", "statr = [11", "robot[1]: unknown field 'statr'; did you mean 'start'?"),
         ("seed = 1", '"two\\nlines" = 1', "unknown field 'two"),
     ],
 )
@@ -78,7 +78,11 @@ def test_an_unknown_field_is_named(was: str, typo: str, field: str, tmp_path: Pa
 @pytest.mark.parametrize(
     ("was", "new", "says"),
     [
-        ('"paper"', '"papers"', "planner.name: there is no 'papers'; there are assured, paper"),
+        (
+            '"paper"',
+            '"papers"',
+            "planner.name: there is no 'papers'; there are assured, paper; did you mean 'paper'?",
+        ),
         (
             'id = "a"',
             'id = "a"\nattack = {kind = "scal", size = 2}',
@@ -92,12 +96,12 @@ def test_an_unknown_field_is_named(was: str, typo: str, field: str, tmp_path: Pa
         (
             'id = "a"',
             'id = "a"\nattack = {kind = "scale", size = 2, part = "orbits"}',
-            "robot[0].attack.part: there is no 'orbits'; there are phase-1, orbit, encounter, all",
+            "robot[0].attack.part: there is no 'orbits'; there are all, encounter, orbit, phase-1; did",
         ),
         (
             "[planner]",
             '[[kill]]\npoint = "sens"\n[planner]',
-            "kill[0].point: there is no 'sens'; there are observation, report, journal, command, ?",
+            "kill[0].point: there is no 'sens'; there are ?, command, journal, observation, report",
         ),
     ],
 )
@@ -186,7 +190,7 @@ AMOUNTS = {
     "noise.odometry.v_floor": ("-0.01", "1.1e4", "inf", '"1 %"', "true"),
     "noise.odometry.omega_floor": ("-0.01", "1.1e4", "inf", '"1 %"', "true"),
     "noise.actuation": ("0.01", "[0.01]", '"1 %"'),
-    "noise": ("0.01", "[]", '"little"', "true"),
+    "noise": ("0.01", "[]", "true"),
 }
 """Invalid values for the fields of `noise`."""
 
@@ -209,6 +213,12 @@ def refused_text(text: str, field: str) -> None:
 )
 def test_noise_out_of_bounds_is_named(field: str, value: str) -> None:
     refused_text(with_noise(field, value), f"mission.{field}: ")
+
+
+def test_a_profile_that_does_not_exist_is_named_with_those_that_do() -> None:
+    refused_text(
+        with_noise("noise", '"little"'), "mission.noise.profile: there is no 'little'; there are uwb, "
+    )
 
 
 @pytest.mark.parametrize(
@@ -360,7 +370,6 @@ def test_an_unknown_scenario_is_refused(
         (["agent", "a"], "--connect"),
         (["agent", *CONNECT], "ID"),
         (["run", "paper-1", "--fast"], "--fast"),
-        (["run", "paper-1", "paper-2"], "paper-2"),
         (["run", "paper-1", "--out"], "--out"),
         (["run", "paper-1", "--in-process", "--rate", "2"], "--rate"),
         (["run", "paper-1", "--in-process", "--foxglove", "8765"], "--foxglove: "),

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.stats import chi2  # type: ignore[import-untyped]
 
 from compose.launch.in_process import run_mission
-from compose.recording.claim import matrix, nees
-from compose.recording.run import Run
+from compose.recording.claim import matrix, nees, truth_held
+from compose.recording.run import Run, read
 from compose.recording.summary_json import leave, summary
 from compose.scenario.scenario_file import load, parse
 from compose.sweep import execution, report, spec, trial
@@ -25,9 +25,10 @@ from compose.sweep.cells import cells
 from compose.sweep.statistics import CellSummary, counted
 from compose.sweep.table import of_rows, schema_of
 from compose.terminal.progress import result
-from protocol.messages import Command, FinalReport, Localised, MissionEnd
+from protocol.messages import Command, Estimate, FinalReport, Localised, MissionEnd
 from protocol.motion import Covariance, Pose
 from tests.commands import SECTION_IV, tandem
+from tests.surveys import scenario_of
 from world.referee import MissionOutcome
 from world.tick import World, advance, release
 from world.world_journal import Tick, WorldHistory
@@ -208,6 +209,62 @@ def test_a_row_counts_the_claims_within_three_times_the_accuracy() -> None:
     assert row_of(claimed(NOISY, SURE, by=0.301)).claims_within == 0
     generous = NOISY.replace("noise.anchor", "accuracy = 0.2\nnoise.anchor")
     assert row_of(claimed(generous, SURE, by=0.5)).claims_within == 1
+
+
+# --- the truth among the hypotheses -------------------------------------------------------------------
+
+
+def estimate_of(*poses: Pose, covariance: Covariance | None = SURE) -> Estimate:
+    equal = tuple([1.0 / len(poses)] * len(poses))
+    return Estimate(0, "a", (), poses, localised=True, probabilities=equal, covariance=covariance)
+
+
+def test_the_truth_is_held_if_any_hypothesis_is_near_it_in_position_and_in_heading() -> None:
+    truth, far = Pose(1.0, 2.0, 0.5), Pose(3.0, 2.0, 0.5)
+    for pose, held in (
+        (off(truth, 0.299), True),
+        (off(truth, 0.301), False),
+        (Pose(1.0, 2.0, 0.5 + 0.59), True),
+        (Pose(1.0, 2.0, 0.5 + 0.61), False),
+        (Pose(1.0, 2.0, 0.5 - math.tau), True),
+    ):
+        assert truth_held(estimate_of(far, pose), truth, 0.1) is held, pose
+
+
+def test_the_truth_is_held_within_six_sigmas_of_the_claimed_pose() -> None:
+    truth, wide = Pose(1.0, 2.0, 0.5), Covariance(0.01, 0.0, 0.0, 0.01, 0.0, 0.01)
+    assert truth_held(estimate_of(off(truth, 0.599), covariance=wide), truth, 0.01) is True
+    assert truth_held(estimate_of(off(truth, 0.601), covariance=wide), truth, 0.01) is False
+    far = Pose(9.0, 9.0, 0.0)
+    assert truth_held(estimate_of(far, off(truth, 0.1), covariance=wide), truth, 0.01) is False, "the first"
+
+
+def test_exact_sensors_have_no_truth_held() -> None:
+    pose = Pose(1.0, 2.0, 0.5)
+    assert truth_held(Estimate(0, "a", (), (pose,), localised=True), pose, 0.1) is None
+    assert row_of(claimed(EXACT, None, by=0.0)).truth_held is None
+
+
+def test_a_mission_in_this_process_and_its_recording_agree_on_whether_the_truth_was_held(
+    tmp_path: Path,
+) -> None:
+    scenario = scenario_of("anchor_sigma = 0.05\nmutual_sigma = 0.05", 4)
+    run = run_mission(scenario, tmp_path)
+    recorded = read(tmp_path)
+    assert run.final_reports["a"].probability is not None
+    for robot in run.robots:
+        assert run.truth_held(robot) is True
+        assert recorded.truth_held(robot) is True
+    elsewhere = {robot: estimate_of(Pose(99.0, 0.0, 0.0)) for robot in run.robots}
+    assert replace(run, claim_estimates=elsewhere).truth_held("a") is False
+
+
+def test_a_summary_has_the_fraction_of_trials_in_which_the_truth_was_held(tmp_path: Path) -> None:
+    row = row_of(claimed(NOISY, SURE))
+    assert row.truth_held is None, "neither this process nor a journal has the Estimate"
+    rows = [replace(row, trial=i, truth_held=held) for i, held in enumerate((True, False, True, None))]
+    assert figures_of(rows, tmp_path).truth_held == pytest.approx(2 / 3)
+    assert figures_of([row], tmp_path).truth_held is None
 
 
 def results_of(rows: list[trial.TrialRow], folder: Path) -> execution.Results:

@@ -14,6 +14,7 @@ from msgspec.structs import replace
 
 from agent.process.recovery import remember
 from compose.launch import in_process
+from compose.launch.planner_loader import planner_of
 from compose.scenario.scenario_file import load
 from protocol.journal import environment, journal_file
 from protocol.journal.journal_file import CorruptJournal
@@ -172,11 +173,11 @@ def test_a_robot_resumes_on_another_machine_unless_its_decisions_differ(recordin
     elsewhere(path)
     before = path.read_bytes()
     with closing(Retrace(path)) as retrace:
-        memory = remember(retrace)
+        memory = remember(retrace, planner_of)
         assert memory is not None
         assert memory.end is not None
     assert path.read_bytes() == before
     changed(path, Command, lambda one: replace(one, omega=one.omega + 1e-15), first=20)
     again = f"at tick 20: recorded with tandem {OLDER}; here is tandem"
     with closing(Retrace(path)) as retrace, pytest.raises(CorruptJournal, match=again):
-        remember(retrace)
+        remember(retrace, planner_of)

@@ -123,7 +123,7 @@ def test_a_field_that_cannot_be_is_named_with_its_place(field: str, value: str) 
 
 
 BAD_TABLES = [
-    ("los = 0.1", "fault[0]: unknown field 'los'"),
+    ("los = 0.1", "fault[0]: unknown field 'los'; did you mean 'loss'?"),
     ("delay = [0, 51]", "fault[0].delay[1]: "),
     ("delay = [1.5, 2]", "fault[0].delay[0]: "),
     ("ticks = [-1, 5]", "fault[0].ticks[0]: "),
@@ -177,6 +177,7 @@ INVALID_FAULTS = [
     ("loss=0.1, loss=0.2", "loss: given twice"),
     ("a->b: link=1", "link: given twice"),
     ("los=0.1", "there is no 'los'; there are loss, burst_start, burst_end"),
+    ("los=0.1", "; did you mean 'loss'?"),
     ("two\nlines=0.1", "there is no 'two"),
     ("delay=1..2..3", "delay: '1..2..3' is neither a number nor a range"),
     ("delay=5..2", "delay: the lower bound 5 is above the upper bound 2"),

@@ -23,10 +23,10 @@ def test_help_lists_every_command_once_under_its_group() -> None:
         elif line.startswith("  ") and "-" not in line[:4]:
             group.append(line.split()[0])
     assert {name: listed[name] for name in ("Run", "Deploy", "Analyse", "Check")} == {
-        "Run": ["run", "replay", "scenarios", "sweep"],
+        "Run": ["run", "replay", "scenarios", "init", "sweep"],
         "Deploy": ["world", "agent", "robot", "keys"],
-        "Analyse": ["audit", "figures", "export", "watch"],
-        "Check": ["doctor", "ps", "check-driver", "bench"],
+        "Analyse": ["audit", "figures", "export", "estimate", "calibrate", "watch"],
+        "Check": ["doctor", "ps", "check-driver", "check-planner", "bench", "completion"],
     }
 
 

@@ -25,6 +25,7 @@ BELOW = {
     "agent": {"agent", "protocol"},
     "world": {"world", "protocol"},
     "compose": {"compose", "agent", "world", "protocol"},
+    "tandem": {"tandem", "compose", "agent", "world", "protocol"},
 }
 """The packages of the project that each package may import."""
 
@@ -52,6 +53,11 @@ PURE = {
     "world.channel",
     "world.referee",
     "world.scenario",
+    "world.sensor_model",
+    "world.world_noise",
+    "world.world_models",
+    "world.range_models",
+    "world.radio_models",
     "protocol.messages",
     "protocol.mission",
     "protocol.motion",
@@ -265,7 +271,7 @@ def test_robot_states_and_worlds_are_immutable() -> None:
 # --- contracts instead of questions -------------------------------------------------------------------
 
 ASKED_IN = {
-    "planner_name": {"agent.process.robot"},
+    "planner_name": set(),
     "exact": {"agent.planning.registry", "agent.planning.state"},
 }
 """The modules of the agent that read these fields: they select a planner and an estimator."""
@@ -295,6 +301,10 @@ def loaded_by(module: str) -> set[str]:
 @pytest.mark.parametrize(
     ("module", "absent"),
     [
+        ("tandem", {"compose", "protocol", "msgspec", "numpy", "zenoh", "scipy", "rich"}),
+        ("tandem.missions", {"zenoh", "scipy", "rich", "matplotlib", "pyarrow", "pandas", "polars"}),
+        ("tandem.results", {"agent", "zenoh", "scipy", "rich", "matplotlib", "pyarrow", "pandas", "polars"}),
+        ("tandem.sweeps", {"zenoh", "rich", "distributed", "matplotlib", "pyarrow", "pandas", "polars"}),
         ("compose.cli.main", {"zenoh", "numpy", "scipy", "rich"}),
         ("agent.process.node", {"world", "compose", "scipy", "rich"}),
         ("world.hardware.bridge", {"numpy", "scipy", "rich", "agent", "compose", "rosbags"}),

@@ -8,21 +8,31 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agent.estimation import closed_forms
 from agent.estimation.closed_forms import Placement, same_placement
+from agent.estimation.gaussian import hypotheses
 from agent.estimation.gaussian.hypotheses import (
     ScoredHypothesis,
+    _alone,
+    anchor_evidence,
+    follow,
     missing,
     no_detection_log_likelihood,
     of_anchor,
     search,
 )
-from agent.estimation.gaussian.least_squares import fit, poses
-from agent.estimation.gaussian.odometry_noise import Array, track
-from agent.estimation.gaussian.range_model import PairRanges, Ranges
+from agent.estimation.gaussian.initial_guesses import Residuals, _encounter, _likeliest
+from agent.estimation.gaussian.least_squares import fit, fits, poses
+from agent.estimation.gaussian.odometry_noise import Array, constant_errors, track
+from agent.estimation.gaussian.range_model import (
+    MOST_RANGES,
+    MOST_RANGES_BY_EXACT_ODOMETRY,
+    PairRanges,
+    Ranges,
+)
 from protocol.motion import Pose, step, wrap
 from protocol.noise import Noise, VelocityNoise
 
@@ -198,6 +208,197 @@ def test_the_truth_is_a_hypothesis_and_the_probabilities_sum_to_one(noise: Noise
 ENOUGH = 4
 """The number of ranges of each kind."""
 
+GYRO = Noise(0.05, 0.05, odometry=VelocityNoise(omega_floor=0.03))
+
+
+def after_a_long_way(seed: int, noise: Noise = GYRO) -> tuple[PairRanges, Array]:
+    """Return a pair whose a has driven 9 m since its last range to its anchor, and the truth as a guess."""
+    draws, ticks = np.random.default_rng(seed), 8
+    ell = [(0.5, 0.0), (0.5, 0.0), (0.0, math.pi / 2), (0.5, 0.0), (0.0, -math.pi / 2)]
+    survey = np.column_stack((np.full(ticks, 0.7), draws.uniform(-1.5, 1.5, ticks)))
+    wait = np.column_stack((np.full(ticks, 0.4), draws.uniform(-1.5, 1.5, ticks)))
+    a = Driven(Pose(-1.0, -0.6, 0.0), np.array([*ell, *([(0.75, 0.0)] * 12), *survey]), noise.odometry, draws)
+    b = Driven(Pose(9.2, 0.3, 1.0), np.array([*ell, *([(0.0, 0.0)] * 12), *wait]), noise.odometry, draws)
+    m2 = (10.0, 0.0)
+    ranges = Ranges.of_lists(
+        told([distance(pose, 0.0, 0.0) for pose in a.poses[:6]], noise.anchor_sigma, draws),
+        told([distance(pose, *m2) for pose in b.poses], noise.anchor_sigma, draws),
+        [
+            (tick + 17, rho)
+            for tick, rho in told(
+                [
+                    distance(*one)
+                    for one in [(p, q.x, q.y) for p, q in zip(a.poses[17:], b.poses[17:], strict=True)]
+                ],
+                noise.mutual_sigma,
+                draws,
+            )
+        ],
+        noise,
+    )
+    pair = PairRanges((a.track, b.track), ranges, (NONE, NONE, NONE), m2, REACH, noise)
+    return pair, np.array([*a.guess((0.0, 0.0)), *b.guess(m2)])
+
+
+def test_odometry_noise_before_the_encounter_does_not_hide_the_truth() -> None:
+    """It moves all mutual ranges at once by up to a metre, and each is accurate to 0.05 m."""
+    tried = 0
+    for seed in range(24):
+        pair, truth = after_a_long_way(seed)
+        if pair.ranges.counts[2] < ENOUGH:
+            continue
+        tried += 1
+        best = fit(truth, pair.paths, pair.ranges, pair.noise, pair.apart, steps=20)
+        found = search(pair)
+        assert min([sigmas(one, best.guess) for one in found]) < 1.0, seed
+    assert tried > 12
+
+
+def test_a_search_begins_from_what_is_held_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    pair, _ = after_a_long_way(0)
+    held = search(pair)
+    monkeypatch.setattr(hypotheses, "placements", lambda *_: [])
+    again = search.__wrapped__(pair, tuple([one.hypothesis for one in held]))
+    assert len(again) == len(held)
+    assert again[0].fit.guess == pytest.approx(held[0].fit.guess, abs=1e-3)
+    assert search.__wrapped__(pair) == ()
+
+
+def test_a_hypothesis_is_followed_on_the_path_that_it_believes_in() -> None:
+    pair, _ = after_a_long_way(0)
+    held = search(pair)[0]
+    start = held.hypothesis.start
+    assert [error.omega.tolist() for error in start.errors] == [
+        error.omega.tolist() for error in held.fit.errors
+    ]
+    (followed,) = follow((held.hypothesis,), pair)
+    assert followed.fit.last_step < 1e-2
+    assert followed.fit.guess == pytest.approx(held.fit.guess, abs=1e-3)
+
+
+def test_the_branches_of_a_robot_that_has_left_its_anchor_are_those_of_its_whole_path() -> None:
+    """They are fitted up to the last range to the anchor, and continued from there."""
+    pair, _ = after_a_long_way(0)
+    path, ranges = pair.paths[0], pair.ranges.only(0)
+    assert ranges.tick[-1] < len(path.v) - 10
+    for branch in _alone(pair, 0):
+        (whole,) = fits([branch.hypothesis.start], [path], ranges, pair.noise)
+        sigmas = np.sqrt(np.diagonal(whole.covariance))
+        assert np.max(np.abs(branch.fit.guess - whole.guess)[:2] / sigmas) < 0.01
+        assert len(branch.fit.paths[0].v) == len(branch.fit.errors[0].v) == len(path.v)
+        assert branch.fit.paths[0].x[-1] == pytest.approx(whole.paths[0].x[-1], abs=1e-3)
+        assert branch.fit.log_likelihood == pytest.approx(whole.log_likelihood, abs=1e-2)
+
+
+def test_a_search_is_repeated_only_if_a_measurement_differs_in_a_bit() -> None:
+    """Both robots of one process have the same measurements in most ticks."""
+    pair, _ = after_a_long_way(0)
+    again, _ = after_a_long_way(0)
+    assert search(again) is search(pair)
+    rho = pair.ranges.rho.copy()
+    rho[-1] = np.nextafter(rho[-1], 0.0)
+    assert search(pair._replace(ranges=pair.ranges._replace(rho=rho))) is not search(pair)
+    assert pair != pair._replace(sensing_range=2.0)
+
+
+@pytest.mark.parametrize(("sigma", "left"), [(1e-9, 2), (1e-3, 1)])
+def test_two_placements_between_which_the_likelihood_falls_are_not_merged(sigma: float, left: int) -> None:
+    """In the limit of exact ranges, two placements may be a hundredth of a rad apart."""
+    pair, _ = after_a_long_way(0)
+    z = np.zeros((2, 8))
+    z[:, 0] = -0.005, 0.005
+
+    def residuals_at(z: Array, *, derivatives: bool = True) -> Residuals:
+        assert not derivatives
+        return Residuals(z[:, :1] ** 2 - 0.005**2, np.empty(0), np.zeros((len(z), 2)))
+
+    found, _ = _likeliest(z, np.array([sigma]), residuals_at, np.ones(2), pair)
+    assert len(found) == left
+
+
+@given(st.integers(0, 40), st.lists(st.floats(-0.3, 0.3), min_size=3, max_size=3))
+@settings(max_examples=30, deadline=None)
+def test_a_fit_begins_on_a_path_that_is_off_by_what_its_placement_assumes(seed: int, z: list[float]) -> None:
+    """The offset at the encounter is due to the anchor, and to the odometry since the last range to it."""
+    pair, truth = after_a_long_way(seed)
+    ranges, base = pair.ranges.only(0), 20
+    own = fit(np.array([*truth[:2], 0.0]), [pair.paths[0]], ranges, pair.noise)
+    robot = _encounter(own, base, np.array([base]))
+    anchor, (errors,) = robot.begun(own, np.array(z))
+    driven = pair.paths[0]
+    patterns = constant_errors(driven.v, driven.omega, pair.noise)
+    v, omega = np.stack((errors.v, errors.omega)) + np.tensordot(errors.constant, patterns, 1)
+    path = track(driven.v + v, driven.omega + omega, driven.period)
+    before = own.paths[0]
+    off = np.array(
+        (
+            path.x[base] - anchor[0] - robot.x[0],
+            path.y[base] - anchor[1] - robot.y[0],
+            path.heading[base] - before.heading[base],
+        )
+    )
+    assert off == pytest.approx(robot.root @ np.array(z), abs=0.02), "to first order"
+    last = int(np.max(own.ticks))
+    assert path.x[: last + 1] == pytest.approx(before.x[: last + 1]), "as it was up to the last range"
+    assert float(np.linalg.norm(robot.root[:2])) > 0.1
+
+
+@pytest.mark.parametrize("sigma", [1e-9, 1e-3, 0.1])
+def test_ranges_that_have_nothing_to_do_with_each_other_are_no_evidence(sigma: float) -> None:
+    draws = np.random.default_rng(1)
+    noise = Noise(sigma, sigma)
+    path = track(np.full(5, 0.6), draws.uniform(-1.5, 1.5, 5), 1.0)
+    found = []
+    for _ in range(20):
+        ranges = Ranges.of_lists(list(enumerate(draws.uniform(0.0, REACH, 6).tolist())), (), (), noise)
+        scored = of_anchor((), path, ranges, NONE, REACH, noise)
+        found += [anchor_evidence(scored[0].fit, path, ranges, REACH)] if scored else []
+    assert max(found) < 1.0, "not worth a mention (Jeffreys)"
+
+
+def test_the_evidence_of_three_ranges_grows_as_they_get_more_accurate() -> None:
+    path = track(np.full(2, 0.8), np.array([0.3, 1.2]), 1.0)
+    true = np.hypot(path.x - 1.1, path.y - 0.7)
+    found = []
+    for sigma in (0.3, 0.03, 1e-3, 1e-5):
+        noise = Noise(sigma, sigma)
+        ranges = Ranges.of_lists(list(enumerate(true.tolist())), (), (), noise)
+        scored = of_anchor((), path, ranges, NONE, REACH, noise)
+        found.append(anchor_evidence(scored[0].fit, path, ranges, REACH))
+    assert found == sorted(found)
+    assert found[0] < 0.0
+    assert found[-1] > 7.0
+
+
+def test_the_ranges_of_a_fit_are_bounded_and_the_recent_ones_are_all_among_them() -> None:
+    many = [(tick, 1.0 + 1e-3 * tick) for tick in range(2 * MOST_RANGES_BY_EXACT_ODOMETRY)]
+    for noise, most in ((GYRO, MOST_RANGES), (RANGES, MOST_RANGES_BY_EXACT_ODOMETRY)):
+        for count in (10, most, most + 1, 500, 1000):
+            ranges = Ranges.of_lists(many[:count], many[:7], many[:count], noise)
+            left = ranges.thinned(noise)
+            assert max(left.counts) <= most
+            assert left.counts[1] == 7
+            recent = min(count, most // 2)
+            for kind in (0, 2):
+                assert left.tick[left.rows(kind)][-recent:].tolist() == list(range(count - recent, count))
+                assert left.tick[left.rows(kind)][0] == 0
+            assert np.array_equal(left.rho, 1.0 + 1e-3 * left.tick)
+
+
+def test_what_is_left_of_old_ranges_seldom_changes() -> None:
+    many = [(tick, 1.0) for tick in range(1000)]
+    old = [
+        {
+            tick
+            for tick in Ranges.of_lists(many[:count], (), (), GYRO).thinned(GYRO).tick.tolist()
+            if tick < count - MOST_RANGES
+        }
+        for count in range(MOST_RANGES, 1000)
+    ]
+    assert sum(not before <= after for before, after in pairwise(old)) <= 5, (
+        "as often as their number doubles"
+    )
+
 
 def test_where_ranges_are_fine_the_truth_is_as_near_as_the_covariance_says() -> None:
     off = [
@@ -213,12 +414,14 @@ def test_a_range_that_is_too_long_is_ignored() -> None:
     few, many = [(0, 1.0), (1, 1.5)], [(2, 2.0)]
     without = Ranges.of_lists(few, many, many, RANGES)
     beyond = (3, rho + 1e-9)
-    within = Ranges.of_lists([*few, beyond], [*many, beyond], [*many, beyond], RANGES).within(REACH)
+    within = Ranges.of_lists([*few, beyond], [*many, beyond], [*many, beyond], RANGES).within(
+        REACH, RANGES.as_told.priors
+    )
     assert within.counts == without.counts == (2, 1, 1)
     for one, other in zip(within[:3], without[:3], strict=True):
         assert np.array_equal(one, other)
     kept = Ranges.of_lists([*few, (3, rho - 1e-9)], many, many, RANGES)
-    assert kept.within(REACH) is kept
+    assert kept.within(REACH, RANGES.as_told.priors) is kept
 
 
 # --- the limit of exact sensors -----------------------------------------------------------------------
@@ -240,7 +443,7 @@ def met(corner: bool, start: Pose, standing: Pose) -> tuple[PairRanges, list[Pla
     ticks = (13, 14, 16)
     looks = [distance(a.poses[tick], b.poses[tick].x, b.poses[tick].y) for tick in ticks]
     assert max(looks) < REACH
-    noise = Noise(EXACT, EXACT)
+    noise = Noise(EXACT, EXACT).as_told
     ranges = Ranges.of_lists(
         told([distance(pose, 0.0, 0.0) for pose in a.poses], 0.0, draws),
         told([distance(pose, 10.0, 0.0) for pose in b.poses], 0.0, draws),

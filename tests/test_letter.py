@@ -8,7 +8,8 @@ from compose.launch.in_process import run_mission
 from compose.recording.summary_json import summary
 from tests.surveys import SIGMA, scenario_of, states, survey
 
-FINE = "anchor_sigma = 0.001\nmutual_sigma = 0.001"
+FINE = "anchor_sigma = 0.001\nmutual_sigma = 0.001\nstrays = 0.0"
+"""Fine ranges, none of which may be a stray: one range often has to tell two hypotheses apart."""
 SEEDS = range(1, 17)
 ITS_OWN = {
     "asleep", "straight", "turning", "circling", "third-point", "aligning", "radial", "tangent", "orbiting",

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from protocol.mission import RANGE_MARGIN, Mission
 from protocol.motion import TAU
 from protocol.orbits import WAITING_PLACE, Orbit, half_passage, rendezvous
+from tests.series import series
 
 Setting = tuple[float, float, float, float, float]
 """A setting: D, R, T_s, v_max, omega_max."""
@@ -88,7 +89,9 @@ def meeting(setting: Setting, a: Orbit, b: Orbit, phases: tuple[int, int]) -> Ar
 # --- time to meet -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("setting", SETTINGS)
+@pytest.mark.parametrize(
+    "setting", series(SETTINGS[::3] + SETTINGS[1::3] + SETTINGS[2::3], len(SETTINGS[::3]))
+)
 def test_they_meet_within_the_bound_from_all_phases_and_no_sooner_from_some(setting: Setting) -> None:
     distance, _, period, _, _ = setting
     plan = rendezvous(mission_of(setting), distance, "assured")

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from agent.estimation.closed_forms import Placement
-from agent.planning import assured, paper
+from agent.planning.assured import AssuredExact
+from agent.planning.paper import Paper
 from agent.planning.phase1_anchor import third_point
 from agent.planning.phase3_last_manoeuvre import SPEEDS, TURN_RATES, last_manoeuvre
-from agent.planning.registry import planner
 from compose.launch.in_process import run_mission
 from compose.recording.run import Run
 from compose.scenario.scenario_file import load, parse
@@ -30,6 +30,7 @@ from world.world_journal import Tick
 
 SECTION_IV = Mission(3.0, 1.0, 1.0, math.pi)
 D = 10.0
+MANOEUVRES = {"paper": Paper.MANOEUVRES, "assured": AssuredExact.MANOEUVRES}
 VARIANTS: tuple[PlannerName, ...] = ("paper", "assured")
 
 missions = st.builds(
@@ -110,7 +111,7 @@ def test_eq_5_keeps_the_nearer_branch_in_range(
     case: tuple[Mission, list[Pose]], planner_name: PlannerName
 ) -> None:
     mission, places = case
-    controls = third_point(places, mission, planner(planner_name, mission).MANOEUVRES)
+    controls = third_point(places, mission, MANOEUVRES[planner_name])
     if controls is None:
         assert planner_name == "paper"
         return
@@ -127,7 +128,7 @@ def test_where_there_is_room_the_third_point_is_the_best_of_eq_4(
 ) -> None:
     mission = Mission(20.0, period, 2.0, turn_rate)
     places = [step(Pose(rho0, 0.0, side * alpha), 2.0, 0.0, period) for side in (1.0, -1.0)]
-    controls = third_point(places, mission, paper.MANOEUVRES)
+    controls = third_point(places, mission, Paper.MANOEUVRES)
     assert controls is not None
     assert controls.v == mission.max_speed
     assert controls.omega == third_point_turn_rate(mission)
@@ -142,7 +143,7 @@ def test_a_branch_on_the_circle_of_range_is_put_inside_it_by_the_margin() -> Non
     """Eq. (5) puts it exactly on R, where rounding would decide if a range is measured."""
     place = step(Pose(1.8337195113037719, 0.0, 0.31233737057044775), 1.0, 0.0, 1.0)
     mirrored = Pose(place.x, -place.y, -place.heading)
-    controls = third_point([place, mirrored], SECTION_IV, paper.MANOEUVRES)
+    controls = third_point([place, mirrored], SECTION_IV, Paper.MANOEUVRES)
     assert controls is not None
     assert controls.v < 1.0
     nearer = min(after(one, controls.v, controls.omega, SECTION_IV) for one in (place, mirrored))
@@ -152,7 +153,7 @@ def test_a_branch_on_the_circle_of_range_is_put_inside_it_by_the_margin() -> Non
 def test_branches_that_mirror_across_the_heading_are_told_apart_straight_ahead() -> None:
     """After a circle, one branch can be in front of the anchor and one behind; no turn distinguishes them."""
     places = [Pose(0.5, 1.0, math.pi / 2), Pose(0.5, -1.0, math.pi / 2)]
-    controls = third_point(places, SECTION_IV, paper.MANOEUVRES)
+    controls = third_point(places, SECTION_IV, Paper.MANOEUVRES)
     assert controls is not None
     assert (controls.v, controls.omega) == (1.0, 0.0)
 
@@ -298,7 +299,7 @@ def test_the_last_manoeuvre_of_the_paper_planner_maximises_eq_8_at_full_speed(
     case: tuple[Pose, Pose, list[Placement]],
 ) -> None:
     b, a, found = case
-    plan = last_manoeuvre("b", a, b, found, SECTION_IV, paper.MANOEUVRES)
+    plan = last_manoeuvre("b", a, b, found, SECTION_IV, Paper.MANOEUVRES)
     assert plan is not None
     best = max(least(predicted(b, a, found, 1.0, omega)) for omega in grid())
     assert plan.command.v == 1.0
@@ -315,7 +316,7 @@ def test_the_assured_last_manoeuvre_keeps_as_many_candidates_in_range_as_it_can(
     """Among manoeuvres with as many candidates in range, it is the optimum of eq. (8)."""
     b, a, found = case
     rim = SECTION_IV.sensing_range - 1e-6
-    plan = last_manoeuvre("b", a, b, found, SECTION_IV, assured.MANOEUVRES)
+    plan = last_manoeuvre("b", a, b, found, SECTION_IV, AssuredExact.MANOEUVRES)
     assert plan is not None
 
     def value(v: float, omega: float) -> tuple[int, float]:
@@ -332,7 +333,7 @@ def test_the_assured_last_manoeuvre_keeps_as_many_candidates_in_range_as_it_can(
 def test_a_single_candidate_is_checked_from_where_its_range_changes_most() -> None:
     b, a = Pose(0.0, 0.0, 0.0), Pose(6.5, 0.0, 0.0)
     ahead = Placement(0.0, -4.5, 0.0)
-    plan = last_manoeuvre("b", a, b, [ahead], SECTION_IV, assured.MANOEUVRES)
+    plan = last_manoeuvre("b", a, b, [ahead], SECTION_IV, AssuredExact.MANOEUVRES)
     assert plan is not None
     assert plan.command.v == 1.0
     assert plan.command.omega == pytest.approx(0.0, abs=1e-9)

@@ -27,7 +27,7 @@ from protocol.noise import Noise, VelocityNoise
 from protocol.wire import decode, encode
 from tests.commands import SECTION_IV, journals, tandem
 from tests.series import series
-from world import sensors
+from world import random_streams
 from world.random_streams import gaussian, uniform
 from world.referee import MissionOutcome
 from world.scenario import Scenario
@@ -139,8 +139,7 @@ def test_without_noise_nothing_is_drawn_and_every_tick_is_the_same_to_the_bit(
     for folder in (without, zero):
         folder.mkdir()
     table = ticks_csv(in_process.run_mission(exact, without))
-    for name in ("gaussian", "uniform"):
-        monkeypatch.setattr(sensors, name, drawn)
+    monkeypatch.setattr(random_streams, "_uniforms", drawn)
     zeros = Noise(outlier_bias=(0.1, 0.2), actuation=VelocityNoise(0.0, 0.0, 0.0, 0.0))
     assert zeros.exact
     scenario = replace(exact, mission=replace(exact.mission, noise=zeros))

@@ -79,7 +79,7 @@ def test_an_sdist_has_the_sources_and_nothing_else(tree: Path, tmp_path: Path) -
     with tarfile.open(built(tree, "sdist", tmp_path)) as packed:
         names = {name.partition("/")[2] for name in packed.getnames()}
     assert not names & set(FOREIGN)
-    wanted = tracked(tree, "agent", "world", "protocol", "compose", "docs", "tests")
+    wanted = tracked(tree, "tandem", "agent", "world", "protocol", "compose", "docs", "tests")
     assert names == wanted | PROJECT_FILES | {"PKG-INFO"}
 
 
@@ -88,5 +88,5 @@ def test_a_wheel_has_the_packages_with_their_data_and_types_and_nothing_else(
 ) -> None:
     with zipfile.ZipFile(built(tree, "wheel", tmp_path)) as packed:
         names = {name for name in packed.namelist() if ".dist-info/" not in name}
-    assert names == tracked(tree, "agent", "world", "protocol", "compose")
-    assert {f"{package}/py.typed" for package in ("agent", "world", "protocol", "compose")} <= names
+    assert names == tracked(tree, "tandem", "agent", "world", "protocol", "compose")
+    assert {f"{package}/py.typed" for package in ("tandem", "agent", "world", "protocol", "compose")} <= names

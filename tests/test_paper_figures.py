@@ -20,6 +20,7 @@ from compose.launch.in_process import run_mission
 from compose.scenario.scenario_file import load
 from compose.view.colours import COLOURS
 from tests.commands import tandem
+from tests.series import series
 from tests.test_album import pair as pair_of
 
 WIDTHS = {3.5: (252.0, 1050), 7.16: (515.52, 2148)}
@@ -27,7 +28,7 @@ WIDTHS = {3.5: (252.0, 1050), 7.16: (515.52, 2148)}
 STYLE = Path(__file__).parent.parent / "compose/view/web/page/style.css"
 
 
-@pytest.fixture(scope="module", params=["paper-1", "paper-2", "noisy"])
+@pytest.fixture(scope="module", params=series(["noisy", "paper-1", "paper-2"]))
 def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp(request.param)
     run_mission(load(request.param), folder)

@@ -22,6 +22,7 @@ from agent.process.recovery import remember
 from agent.process.robot import Robot
 from compose.errors import BadKill
 from compose.launch.in_process import run_mission
+from compose.launch.planner_loader import planner_of
 from compose.launch.processes import free_endpoint
 from compose.scenario.kills import parse
 from compose.scenario.scenario_file import load
@@ -243,12 +244,12 @@ def test_an_agents_journal_torn_anywhere_is_finished_with_the_same_bytes(
     for cut in cuts(data):
         torn.write_bytes(data[:cut])
         old = Retrace(torn)
-        memory = remember(old)
+        memory = remember(old, planner_of)
         assert torn.stat().st_size == cut
         book, lost = old.open_for_append()
         assert torn.stat().st_size >= cut - lost
         with book:
-            body = Robot(whole.config, book) if memory is None else memory.robot
+            body = Robot(whole.config, planner_of(whole.config), book) if memory is None else memory.robot
             body.append_to(book)
             known = memory.observation.tick if memory is not None and memory.observation is not None else -1
             for step in whole.steps[max(known, 0) :]:
@@ -515,7 +516,7 @@ def test_a_journal_that_is_damaged_anywhere_is_not_mistaken_for_a_torn_one(
 
 def _remembered(path: Path) -> None:
     with closing(Retrace(path)) as old:
-        remember(old)
+        remember(old, planner_of)
 
 
 def test_a_worlds_journal_of_another_scenario_is_refused(recording: Path) -> None:
@@ -604,7 +605,7 @@ def test_a_mission_under_noise_is_folded_to_the_bit(tmp_path: Path) -> None:
     run_mission(scenario, tmp_path)
     for robot in ("a", "b"):
         with closing(Retrace(tmp_path / f"agent-{robot}.journal")) as old:
-            memory = remember(old)
+            memory = remember(old, planner_of)
             assert memory is not None
             assert memory.final_report is not None
     with closing(Retrace(tmp_path / "world.journal")) as old:

@@ -94,9 +94,20 @@ def test_summary_has_every_documented_value_of_a_run(played: tuple[str, Path]) -
             **dict.fromkeys(("anchor_sigma", "mutual_sigma", "outliers", "drop_outs"), 0.0),
             "outlier_bias": [0.3, 2.0],
             **dict.fromkeys(("actuation", "odometry"), EXACT_WHEELS),
+            **dict.fromkeys(
+                ("profile", "range_bias", "pair_bias", "range_scale", "wheel_scale", "gyro_bias")
+            ),
+            "slow_sigma": 0.0,
+            "slow_time": 2.0,
+            "sigma_degrees": 4.0,
+            "strays": 0.001,
         },
         "planner": "paper",
+        "planner_options": {},
         "max_ticks": told["parameters"]["max_ticks"],
+        "world_noise": None,
+        "world_range": None,
+        "world_radio": None,
     }
     assert told["parameters"]["max_ticks"] > 2 * 226
     assert {"python", "tandem-ranging", "eclipse-zenoh", "numpy"} <= told["versions"].keys()

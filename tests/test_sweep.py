@@ -29,13 +29,14 @@ from compose.cli.sweep import status_of
 from compose.errors import UserError
 from compose.scenario.scenario_file import load
 from compose.sweep import axis_figures, cluster, execution, report, spec
-from compose.sweep.cells import RefusedCell, cells, setting_of, trial_seed
+from compose.sweep.cells import RefusedCell, cells, label, setting_of, trial_seed
 from compose.sweep.statistics import wilson
 from compose.sweep.table import schema_of
 from compose.sweep.worker import PLAY
 from protocol.network.inbox import Inbox
 from protocol.noise import Noise, VelocityNoise
 from tests.commands import PAPER_1, Ended, TandemProcess, tandem, temporary_in, until
+from world.world_noise import WorldNoise
 
 HOUSE = Path(__file__).parents[1]
 RANDOM = PAPER_1.replace("start", "# start")
@@ -631,24 +632,124 @@ def test_the_sweep_of_noise_has_the_same_starts_in_every_cell() -> None:
     sweep = spec.load("noise")
     settings = [setting_of(sweep, cell) for cell in cells(sweep)]
     assert {cell.key for cell in cells(sweep)} == {"{}"}
-    assert len(settings) == 15 * 2 * 2
+    assert len(settings) == (15 * 2 + 4) * 2
     missions = set()
+    hard = set()
     starts = set()
     for setting in settings:
         assert not isinstance(setting, RefusedCell)
         scenario = setting.seeded(7)
         starts.add(tuple(robot.start for robot in scenario.robots))
         mission, noise = scenario.mission, scenario.mission.noise
+        if noise.drop_outs or noise.odometry.v_floor or noise.odometry.omega_floor:
+            hard.add((noise.drop_outs, noise.odometry.v_floor, noise.odometry.omega_floor))
+            continue
         fractions = {noise.odometry.v, noise.odometry.omega, noise.actuation.v, noise.actuation.omega}
         (fraction,) = fractions
         assert noise.anchor_sigma == noise.mutual_sigma
         fine = 0.03 if noise.anchor_sigma <= 0.01 else 0.1
-        assert mission.accuracy == (0.3 if fraction == 0.01 else fine)
+        assert mission.accuracy == (0.3 if fraction >= 0.01 else fine)
         missions.add((noise.anchor_sigma, fraction, noise.outliers, scenario.planner_name))
     assert len(starts) == 1
-    assert missions == set(
-        product((0, 0.001, 0.01, 0.05, 0.1), (0, 0.001, 0.01), (0, 0.05), ("paper", "assured"))
-    )
+    planners = ("paper", "assured")
+    known = product((0, 0.001, 0.01, 0.05, 0.1), (0, 0.001, 0.01), (0, 0.05), planners)
+    assert missions == {*known, *product((0.05,), (0.05,), (0,), planners)}
+    assert hard == {(0.3, 0.0, 0.0), (0.0, 0.02, 0.0), (0.0, 0.0, 0.02)}
+
+
+@pytest.mark.parametrize(("name", "told"), [("mismatch", 1), ("mismatch-uwb", 2)])
+def test_the_sensors_of_each_row_of_mismatch_differ_whatever_robots_are_told(name: str, told: int) -> None:
+    sweep = spec.load(name)
+    settings = [setting_of(sweep, cell) for cell in cells(sweep)]
+    scenarios = [one.scenario for one in settings if not isinstance(one, RefusedCell)]
+    assert len(scenarios) == len(settings)
+    assert {cell.key for cell in cells(sweep)} == {"{}"}
+    assert scenarios[0].sensors.noise == scenarios[0].mission.noise
+    of_noise: dict[Noise, list[WorldNoise]] = {}
+    for one in scenarios:
+        of_noise.setdefault(one.mission.noise, []).append(one.world_noise)
+    assert len(of_noise) == told
+    first = next(iter(of_noise.values()))
+    for sensors in of_noise.values():
+        assert sensors == first
+        assert all(one not in sensors[:i] for i, one in enumerate(sensors))
+
+
+ROWS = """
+name = "rows"
+scenario = "base.toml"
+trials = 2
+seed = 5
+[set]
+"mission.noise.anchor_sigma" = 0.01
+"mission.noise.mutual_sigma" = 0.01
+"mission.accuracy" = 0.2
+[[axis]]
+name = "sensors"
+paired = true
+rows = [
+    {label = "as told", set = {}},
+    {label = "10 % outliers", set = {"world.noise.outliers" = 0.1}},
+    {label = "a is biased", set = {"world.noise.anchor_bias" = {a = 0.1}, "mission.accuracy" = 0.3}},
+]
+"""
+
+
+def test_rows_differ_from_the_base_in_the_fields_that_they_set(folder: Path) -> None:
+    (folder / "rows.toml").write_text(ROWS)
+    results = played(folder, "rows.toml", "out")
+    settings = [setting_of(results.sweep, cell) for cell in cells(results.sweep)]
+    found = []
+    for setting in settings:
+        assert not isinstance(setting, RefusedCell)
+        assert setting.scenario.mission.noise == Noise(anchor_sigma=0.01, mutual_sigma=0.01)
+        noise = setting.scenario.world_noise
+        found.append((setting.scenario.mission.accuracy, noise.outliers, noise.anchor_bias))
+    assert found == [(0.2, None, 0.0), (0.2, 0.1, 0.0), (0.3, None, {"a": 0.1})]
+    fields = ("sensors", "world.noise.outliers", "world.noise.anchor_bias", "mission.accuracy")
+    assert [tuple(row[name] for name in fields) for row in rows(folder / "out")[::2]] == [
+        ("as told", None, None, None),
+        ("10 % outliers", 0.1, None, None),
+        ("a is biased", None, '{"a":0.1}', 0.3),
+    ]
+    assert len({row["seed"] for row in rows(folder / "out")}) == 2, "the same starts in all rows"
+    assert [tuple(row[name] for name in fields) for row in summary_rows(folder / "out")] == [
+        ("as told", "", "", ""),
+        ("10 % outliers", "0.1", "", ""),
+        ("a is biased", "", '{"a":0.1}', "0.3"),
+    ]
+    assert label(results.sweep, list(cells(results.sweep))[1]) == "sensors = 10 % outliers"
+
+
+@pytest.mark.parametrize(
+    ("was", "new", "says"),
+    [
+        ("rows = [", "values = [1]\nrows = [", "axis[0]: needs either 'values' or 'rows'"),
+        ('name = "sensors"', "", "axis[0].name: missing: an axis with 'rows' needs a name"),
+        ("paired = true", 'labels = ["x"]', "axis[0].labels: an axis with 'rows' has none"),
+        ('"as told"', '"a is biased"', "axis[0].rows[2].label: equal to that of rows[0]"),
+        ('label = "as told", ', "", "axis[0].rows[0]: missing field 'label'"),
+        ("noise.outliers", "noise.outlier", "axis[0].rows[1].set: 'world.noise.outlier': world.noise has no"),
+        (
+            'outliers" = 0.1',
+            'outliers" = nan',
+            "axis[0].rows[1].set: 'world.noise.outliers': must be a number",
+        ),
+        (
+            '"mission.accuracy" = 0.3',
+            '"world.noise" = {}',
+            "axis[0].rows[2].set: 'world.noise' is already set by",
+        ),
+        ('"mission.accuracy" = 0.2', '"mission.acuracy" = 1', "set: 'mission.acuracy': mission has no field"),
+        ('outliers" = 0.1', 'outliers" = 1.0', "cell 1 (sensors = 10 % outliers): world.noise.outliers: "),
+    ],
+)
+def test_a_mistake_in_a_row_is_one_line_that_names_it(was: str, new: str, says: str, folder: Path) -> None:
+    assert was in ROWS
+    (folder / "bad.toml").write_text(ROWS.replace(was, new, 1))
+    with pytest.raises(UserError) as refused:
+        played(folder, "bad.toml", "out")
+    assert str(refused.value).startswith(f"{folder / 'bad.toml'}: {says}")
 
 
 # --- invalid sweep files ----------------------------------------------------------------------------

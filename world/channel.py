@@ -7,11 +7,11 @@ robots are in contact both when it is sent and when it is due.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 
-from world.faults import Fault
+from world.faults import LATEST, Fault
 from world.random_streams import uniform
 
 
@@ -45,6 +45,8 @@ class LinkState(msgspec.Struct, frozen=True):
     """A flag for each fault of the link: True during a burst."""
     room: tuple[float, ...] = ()
     """The number of Reports, for each fault of the link, for which its bandwidth still has room."""
+    radio: Any = None
+    """The state of the link in the radio model."""
 
 
 class LinkFaults(NamedTuple):
@@ -70,12 +72,19 @@ def link_faults(plan: Sequence[Fault], sender: str, receiver: str) -> LinkFaults
 
 
 def next_link_state(
-    air: LinkState, links: LinkFaults, seed: int, tick: int, *, in_contact: bool
+    air: LinkState,
+    links: LinkFaults,
+    seed: int,
+    tick: int,
+    *,
+    in_contact: bool,
+    delivered: tuple[Any, int | None] = (None, 0),
 ) -> LinkState:
     """Return the state of the link at `tick`, given its state `air` at the tick before.
 
     The sender sends a Report at `tick` if the robots are in contact. Reports that are due while they are not
-    in contact are lost.
+    in contact are lost. `delivered` is the answer of the radio model to this Report: the state of the link,
+    and the delay in ticks, None if it is lost. The faults apply to what the model delivers.
     """
     flying = air.flying
     bursts = air.bursts or (False,) * len(links.faults)
@@ -87,7 +96,9 @@ def next_link_state(
                 for (i, fault), burst in zip(links.faults, bursts, strict=True)
             ]
         )
-        flying += tuple(_sent(links, bursts, active, seed, tick))
+        if delivered[1] is not None:
+            sent = _sent(links, bursts, active, seed, tick, max(0, delivered[1]))
+            flying += tuple([one for one in sent if one.due - tick <= LATEST])
     due = sorted([one for one in flying if one.due <= tick], key=lambda one: one.overtaken)
     coming, room = _limited(due if in_contact else [], links, air, tick)
     return LinkState(
@@ -97,6 +108,7 @@ def next_link_state(
         contacts=air.contacts + in_contact,
         bursts=bursts,
         room=room,
+        radio=delivered[0] if in_contact else air.radio,
     )
 
 
@@ -115,10 +127,13 @@ def _draw(seed: int, fault: int, what: str, links: LinkFaults, tick: int) -> flo
 
 
 def _sent(
-    links: LinkFaults, bursts: Sequence[bool], active: Sequence[bool], seed: int, tick: int
+    links: LinkFaults, bursts: Sequence[bool], active: Sequence[bool], seed: int, tick: int, delay: int = 0
 ) -> list[InFlight]:
-    """Return the copies of the Report of `tick` that are not lost, after all active faults."""
-    copies = [InFlight(tick, tick, overtaken=False, damaged=False, copy=0)]
+    """Return the copies of the Report of `tick` that are not lost, after all active faults.
+
+    Without them, it would be received after `delay` ticks.
+    """
+    copies = [InFlight(tick + delay, tick, overtaken=False, damaged=False, copy=0)]
     for (i, fault), burst, is_active in zip(links.faults, bursts, active, strict=True):
         if is_active:
             copies = [copy for one in copies for copy in _faulty(one, i, fault, burst, links, seed)]

@@ -2,15 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any
+
 import msgspec
+from msgspec.structs import asdict
 
 from protocol.attack import Attack
-from protocol.messages import RobotConfig
-from protocol.mission import Anchor, Mission, PlannerName, Role
+from protocol.messages import RobotConfig, RobotConfigWithOptions
+from protocol.mission import Anchor, Mission, Options, PlannerName, Role
 from protocol.motion import Pose
 from protocol.orbits import Rendezvous
 from protocol.units import RobotId, Tick
 from world.faults import Fault
+from world.radio_models import RADIO_MODELS
+from world.range_models import RANGE_MODELS
+from world.sensor_model import SensorModel, sensor_model
+from world.world_models import OWN, ModelSpec, RadioModel, RangeModel
+from world.world_noise import WorldNoise
+
+
+def model_class(name: str, shipped: Mapping[str, Any]) -> Any:
+    """Return the class of a model that is shipped, or that the user has named. Raises LookupError."""
+    found = shipped.get(name) or OWN.get(name)
+    if found is None:
+        raise LookupError(f"the world uses the model {name}; to run its code, add --model {name}")
+    return found
 
 
 class RobotSpec(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
@@ -32,7 +50,9 @@ class RobotSpec(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fie
     """The false data that the robot injects into its Reports; None for an honest robot."""
 
 
-class Scenario(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="scenario"):
+class Scenario(
+    msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="scenario", dict=True
+):
     """A validated mission. All its random and derived values have been computed."""
 
     name: str
@@ -49,6 +69,44 @@ class Scenario(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fiel
     """The robots, in pairs of peers."""
     faults: tuple[Fault, ...] = ()
     """The fault plan of the radio."""
+
+    @property
+    def world_noise(self) -> WorldNoise:
+        """The noise of the simulated sensors; here, what the robots are told."""
+        return WorldNoise()
+
+    @property
+    def planner_options(self) -> Options:
+        """The options of the planner; here, none."""
+        return {}
+
+    @property
+    def range_model(self) -> ModelSpec | None:
+        """The model of detection and ranges; here, the disc of R."""
+        return None
+
+    @property
+    def radio_model(self) -> ModelSpec | None:
+        """The model of the delivery of reports; here, all are delivered."""
+        return None
+
+    @cached_property
+    def ranging(self) -> RangeModel | None:
+        """The range model; None for the disc of R. Raises LookupError if this process does not know it."""
+        spec = self.range_model
+        return None if spec is None else model_class(spec.model, RANGE_MODELS)(**spec.options)
+
+    @cached_property
+    def radio(self) -> RadioModel[Any] | None:
+        """The radio model; None if all reports are delivered. Raises LookupError like `ranging`."""
+        spec = self.radio_model
+        return None if spec is None else model_class(spec.model, RADIO_MODELS)(**spec.options)
+
+    @cached_property
+    def sensors(self) -> SensorModel:
+        """The sensors of all robots, with everything that is drawn once for the mission."""
+        robots = [(robot.id, robot.anchor) for robot in self.robots]
+        return sensor_model(self.mission, self.world_noise, robots, self.pairs(), self.seed)
 
     def pairs(self) -> tuple[tuple[int, int], ...]:
         """Return the pairs of peers as indices into `robots`, with robot a first."""
@@ -73,7 +131,7 @@ class Scenario(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fiel
         Raises KeyError if there is no such robot.
         """
         own = self.robot(robot)
-        return RobotConfig(
+        config = RobotConfig(
             robot=own.id,
             peer=own.peer,
             role=own.role,
@@ -85,3 +143,36 @@ class Scenario(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fiel
             attack=own.attack,
             tick_s=tick_s,
         )
+        if not self.planner_options:
+            return config
+        return RobotConfigWithOptions(**asdict(config), planner_options=self.planner_options)
+
+
+class ScenarioWithWorldNoise(
+    Scenario, frozen=True, array_like=True, forbid_unknown_fields=True, tag="scenario-with-world-noise"
+):
+    """A mission in which the robots are told another noise than the simulated sensors have."""
+
+    world_noise: WorldNoise = WorldNoise()
+    """The noise of the simulated sensors."""
+
+
+class ScenarioWithOptions(
+    ScenarioWithWorldNoise,
+    frozen=True,
+    array_like=True,
+    forbid_unknown_fields=True,
+    tag="scenario-with-options",
+):
+    """A mission whose planner has options, or whose world has other models than the disc."""
+
+    planner_options: Options = {}
+    """The options of the planner, by name."""
+    range_model: ModelSpec | None = None
+    """The model of detection and ranges; None for the disc of R."""
+    radio_model: ModelSpec | None = None
+    """The model of the delivery of reports; None if all are delivered."""
+
+
+RecordedScenario = Scenario | ScenarioWithWorldNoise | ScenarioWithOptions
+"""The kinds of scenario in a world's journal."""

@@ -9,26 +9,36 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from protocol.motion import Controls
+from protocol.motion import REST, Controls
 from protocol.noise import VelocityNoise
-from world.random_streams import gaussian, uniform
+from world.random_streams import gaussian
 from world.scenario import Scenario
+from world.sensor_model import LONGEST
 from world.truth import Truth
+from world.world_models import Radios, RangeModel
 
 
 def anchor_ranges(truth: Truth, scenario: Scenario) -> list[float | None]:
     """Return the measured range of each robot to its own anchor (eq. (1b)), in m; None if there is none."""
-    noise, reach = scenario.mission.noise, scenario.mission.sensing_range
+    sensors, lobed = scenario.sensors, scenario.sensors.world.lobe_depth
+    model, radios = scenario.ranging, None
     ranges: list[float | None] = []
-    for pose, origin, robot in zip(truth.local, truth.origins, scenario.robots, strict=True):
-        anchor = robot.anchor
-        rho = math.hypot(pose.x - (anchor.x - origin.x), pose.y - (anchor.y - origin.y))
-        if rho > reach:
+    for i, (pose, origin, robot) in enumerate(zip(truth.local, truth.origins, scenario.robots, strict=True)):
+        anchor, (off_x, off_y) = robot.anchor, sensors.survey[i]
+        x, y = pose.x - (anchor.x - origin.x) - off_x, pose.y - (anchor.y - origin.y) - off_y
+        rho = math.hypot(x, y)
+        pattern = sensors.anchor_lobes[i].reach(math.atan2(y, x)) if lobed else 1.0
+        if model is not None:
+            surveyed = (anchor.x + off_x, anchor.y + off_y)
+            radios = Radios(
+                f"anchor/{robot.id}", (x + surveyed[0], y + surveyed[1]), surveyed, truth.tick, scenario.seed
+            )
+        if not sensors.detects("anchor", robot.id, truth.tick, rho, pattern, model, radios):
             ranges.append(None)
-        elif noise.exact:
+        elif sensors.exact:
             ranges.append(rho)
         else:
-            ranges.append(measured(rho, noise.anchor_sigma, scenario, "anchor", robot.id, truth.tick))
+            ranges.append(_modelled(sensors.measured(sensors.anchors[i], rho, truth.tick), model, radios))
     return ranges
 
 
@@ -41,46 +51,61 @@ class Mutual(NamedTuple):
 
 def mutual_ranges(truth: Truth, scenario: Scenario, pairs: Sequence[tuple[int, int]]) -> list[Mutual | None]:
     """Return the measurement of each pair; None if its robots are out of range of each other."""
-    reach, sigma = scenario.mission.sensing_range, scenario.mission.noise.mutual_sigma
+    sensors, lobed = scenario.sensors, scenario.sensors.world.lobe_depth
+    model, radios = scenario.ranging, None
     ranges: list[Mutual | None] = []
     for i, j in pairs:
-        one, other = truth.local[i], truth.local[j]
-        rho = math.hypot(one.x - other.x, one.y - other.y)
-        if rho <= reach:
-            robot = scenario.robots[i].id
-            ranges.append(Mutual(measured(rho, sigma, scenario, "mutual", robot, truth.tick)))
-        else:
+        one, other, robot = truth.local[i], truth.local[j], scenario.robots[i].id
+        x, y = one.x - other.x, one.y - other.y
+        rho, pattern = math.hypot(x, y), 1.0
+        if lobed:
+            to_one, to_other = math.atan2(y, x), math.atan2(-y, -x)
+            of_one = sensors.robot_lobes[i].reach(to_other - one.heading)
+            of_other = sensors.robot_lobes[j].reach(to_one - other.heading)
+            pattern = 0.5 * (of_one + of_other)
+        if model is not None:
+            places = truth.poses
+            radios = Radios(
+                f"mutual/{robot}",
+                (places[i].x, places[i].y),
+                (places[j].x, places[j].y),
+                truth.tick,
+                scenario.seed,
+            )
+        if not sensors.detects("mutual", robot, truth.tick, rho, pattern, model, radios):
             ranges.append(None)
+        elif sensors.exact:
+            ranges.append(Mutual(rho))
+        else:
+            measured = sensors.measured(sensors.mutual[i], rho, truth.tick)
+            ranges.append(Mutual(_modelled(measured, model, radios)))
     return ranges
 
 
-def measured(
-    rho: float, sigma: float, scenario: Scenario, sensor: str, robot: str, tick: int
-) -> float | None:
-    """Return the range in m that is measured at the true distance `rho` m; None for a drop-out."""
-    noise, seed = scenario.mission.noise, scenario.seed
-    if not (sigma or noise.outliers or noise.drop_outs):
+def _modelled(rho: float | None, model: RangeModel | None, radios: Radios | None) -> float | None:
+    """Return the range that is measured under `model`, within the bounds of a range."""
+    if rho is None or model is None or radios is None:
         return rho
-    if noise.drop_outs and uniform(seed, f"{sensor}-drop-out", robot, tick) < noise.drop_outs:
-        return None
-    if noise.outliers and uniform(seed, f"{sensor}-outlier", robot, tick) < noise.outliers:
-        least, most = noise.outlier_bias
-        rho += least + (most - least) * uniform(seed, f"{sensor}-bias", robot, tick)
-    if sigma:
-        rho = max(0.0, rho + sigma * gaussian(seed, sensor, robot, tick))
-    return rho
+    found = model.measured(radios, rho)
+    return None if found is None else min(max(0.0, float(found)), LONGEST)
 
 
 def executed(limited_controls: Controls, scenario: Scenario, robot: str, tick: int) -> Controls:
     """Return the controls that the robot executes over [tick, tick + 1], given the commanded ones."""
-    return _disturbed(
-        limited_controls, scenario.mission.noise.actuation, scenario.seed, "actuation", robot, tick
-    )
+    actuation = scenario.sensors.noise.actuation
+    return _disturbed(limited_controls, actuation, scenario.seed, "actuation", robot, tick)
 
 
-def odometry(driven: Controls, scenario: Scenario, robot: str, tick: int) -> Controls:
-    """Return the odometry at `tick`, given the controls that were executed over [tick - 1, tick]."""
-    return _disturbed(driven, scenario.mission.noise.odometry, scenario.seed, "odometry", robot, tick)
+def odometry(
+    driven: Controls, scenario: Scenario, robot: str, tick: int, before: Controls = REST
+) -> Controls:
+    """Return the odometry at `tick`, given the controls that were executed over [tick - 1, tick].
+
+    `before` are those that were executed over the tick before.
+    """
+    sensors = scenario.sensors
+    turned = driven if sensors.shared else sensors.turned(driven, before, robot, tick)
+    return _disturbed(turned, sensors.noise.odometry, scenario.seed, "odometry", robot, tick)
 
 
 def _disturbed(

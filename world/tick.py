@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import msgspec
 
 from protocol.messages import Command, Contact, Localised, Observation, Verdict
-from protocol.motion import Controls, Pose
+from protocol.motion import REST, Controls, Pose
 from world.channel import LinkState, link_faults, next_link_state
 from world.referee import MissionOutcome, decide_outcome
 from world.scenario import Scenario
 from world.sensors import anchor_ranges, executed, mutual_ranges, odometry
 from world.truth import Truth, limited_controls
+from world.world_models import Radios, Transmission
 
 
 class World(msgspec.Struct, frozen=True):
@@ -35,6 +37,8 @@ class World(msgspec.Struct, frozen=True):
 
     Empty without faults.
     """
+    executed_before: tuple[Controls, ...] | None = None
+    """The executed controls over the tick before the previous one; None until tick 2."""
 
 
 def release(scenario: Scenario) -> World:
@@ -46,7 +50,9 @@ def release(scenario: Scenario) -> World:
         for i, robot in enumerate(scenario.robots)
     )
     truth = Truth(0, local, tuple(origins[i] for i in range(len(local))))
-    still = (LinkState(),) * (2 * len(pairs)) if scenario.faults else ()
+    radio = scenario.radio
+    fresh = LinkState() if radio is None else LinkState(radio=radio.start())
+    still = (fresh,) * (2 * len(pairs)) if scenario.faults or radio is not None else ()
     return World(scenario, truth, None, {}, {}, pairs, _carried(still, scenario, truth, pairs))
 
 
@@ -55,8 +61,11 @@ def observations(world: World) -> list[Observation]:
     scenario, truth, driven = world.scenario, world.truth, world.executed
     tick, robots = truth.tick, scenario.robots
     measured: Sequence[Controls | None] = driven or [None] * len(robots)
-    if driven is not None and not scenario.mission.noise.exact:
-        measured = [odometry(driven[i], scenario, robot.id, tick) for i, robot in enumerate(robots)]
+    if driven is not None and not scenario.sensors.exact:
+        before = world.executed_before or (REST,) * len(robots)
+        measured = [
+            odometry(driven[i], scenario, robot.id, tick, before[i]) for i, robot in enumerate(robots)
+        ]
     contacts: list[tuple[Contact, ...]] = [()] * len(robots)
     mutuals = mutual_ranges(truth, scenario, world.pairs)
     for i, ((one, other), mutual) in enumerate(zip(world.pairs, mutuals, strict=True)):
@@ -77,7 +86,7 @@ def advance(world: World, commands: Mapping[str, Command]) -> World | MissionOut
     scenario, truth = world.scenario, world.truth
     verdicts, claimed = world.verdicts, world.claimed
     driven = []
-    exact = scenario.mission.noise.exact
+    exact = scenario.sensors.exact
     for place, robot in enumerate(scenario.robots):
         command = commands.get(robot.id)
         controls = limited_controls(command, scenario.mission)
@@ -92,7 +101,9 @@ def advance(world: World, commands: Mapping[str, Command]) -> World | MissionOut
             return mission_outcome
     moved = truth.moved(driven, scenario.mission.period)
     links = _carried(world.links, scenario, moved, world.pairs)
-    return World(scenario, moved, tuple(driven), verdicts, claimed, world.pairs, links)
+    return World(
+        scenario, moved, tuple(driven), verdicts, claimed, world.pairs, links, executed_before=world.executed
+    )
 
 
 def _carried(
@@ -104,6 +115,8 @@ def _carried(
     mutuals = mutual_ranges(truth, scenario, pairs)
     ids = [robot.id for robot in scenario.robots]
     links = [(way, mutual) for pair, mutual in zip(pairs, mutuals, strict=True) for way in (pair, pair[::-1])]
+    senders = [sender for (sender, _), mutual in links if mutual is not None]
+    delivered = _delivered(before, scenario, truth, links, senders) if scenario.radio is not None else {}
     return tuple(
         [
             next_link_state(
@@ -112,7 +125,30 @@ def _carried(
                 scenario.seed,
                 truth.tick,
                 in_contact=mutual is not None,
+                delivered=delivered.get(sender, (link.radio, 0)),
             )
             for link, ((sender, receiver), mutual) in zip(before, links, strict=True)
         ]
     )
+
+
+def _delivered(
+    before: Sequence[LinkState],
+    scenario: Scenario,
+    truth: Truth,
+    links: Sequence[tuple[tuple[int, ...], object]],
+    senders: Sequence[int],
+) -> dict[int, tuple[Any, int | None]]:
+    """Return the state of the link and the delay of the report of each of `senders`, by the radio model."""
+    assert scenario.radio is not None
+    places = [(pose.x, pose.y) for pose in truth.poses]
+    ids, reach = [robot.id for robot in scenario.robots], scenario.sensors.reach
+    sending = tuple([(ids[sender], places[sender]) for sender in senders])
+    found: dict[int, tuple[Any, int | None]] = {}
+    for link, ((sender, receiver), mutual) in zip(before, links, strict=True):
+        if mutual is not None:
+            name = f"report/{ids[sender]}->{ids[receiver]}"
+            radios = Radios(name, places[sender], places[receiver], truth.tick, scenario.seed)
+            transmission = Transmission(radios, reach, scenario.mission.period, sending, ids[sender])
+            found[sender] = scenario.radio.sent(link.radio, transmission)
+    return found

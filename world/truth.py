@@ -51,13 +51,12 @@ class Truth(msgspec.Struct, frozen=True):
 
     def moved(self, controls: Sequence[Controls], period: float) -> Truth:
         """Return the truth one tick later, after all robots have driven `controls` for `period` s."""
-        legs: list[Leg] = []
-        local: list[Pose] = []
         before = self.legs or [Leg(pose, 0, c) for pose, c in zip(self.local, controls, strict=True)]
-        for leg, pose, c in zip(before, self.local, controls, strict=True):
-            begin, ticks = (leg.begin, leg.ticks + 1) if leg.controls == c else (pose, 1)
-            legs.append(Leg(begin, ticks, c))
-            local.append(step(begin, c.v, c.omega, ticks * period))
+        legs = [
+            Leg(leg.begin, leg.ticks + 1, c) if leg.controls == c else Leg(pose, 1, c)
+            for leg, pose, c in zip(before, self.local, controls, strict=True)
+        ]
+        local = [step(leg.begin, leg.controls.v, leg.controls.omega, leg.ticks * period) for leg in legs]
         return Truth(self.tick + 1, tuple(local), self.origins, tuple(legs))
 
 

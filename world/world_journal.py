@@ -8,11 +8,11 @@ from typing import Any
 import msgspec
 
 from protocol.journal.environment import named_in
-from protocol.journal.journal_file import CorruptJournal, UnexpectedFrame
+from protocol.journal.journal_file import CorruptJournal, UnexpectedFrame, take_all
 from protocol.messages import Command, DeadlineMissed, Environment, FinalReport, MissionEnd
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 from world.referee import MissionOutcome
-from world.scenario import Scenario
+from world.scenario import RecordedScenario, Scenario
 from world.tick import World, advance, release
 from world.truth import Truth
 
@@ -66,12 +66,9 @@ def world_history(frames: Iterable[bytes], source: object) -> WorldHistory:
     Raises CorruptJournal, with `source` as the journal's name.
     """
     reading = WorldJournalReading()
-    try:
-        for frame in frames:
-            if not reading.take(frame):
-                break
-    except MalformedFrame as error:
-        raise CorruptJournal(f"{source}: {error}") from None
+    problem = take_all(reading, frames, source)
+    if problem is not None:
+        raise problem
     content = reading.content()
     if content is None:
         raise CorruptJournal(f"{source}: it contains no scenario")
@@ -81,7 +78,9 @@ def world_history(frames: Iterable[bytes], source: object) -> WorldHistory:
 class WorldJournalReading:
     """A reader of a world's journal, frame by frame. The journal may still be growing."""
 
-    def __init__(self) -> None:
+    def __init__(self, shared: dict[bytes, Any] | None = None) -> None:
+        """`shared` are messages that readers of the same recording have decoded, by frame."""
+        self._shared = {} if shared is None else shared
         self.environment: Environment | None = None
         self.world: World | None = None
         """The state at the tick after the last complete one, or at the last tick of the run.
@@ -112,7 +111,11 @@ class WorldJournalReading:
         if self.world is None:
             self._begin(frame)
             return True
-        message = decode(frame, _AFTER_THE_SCENARIO)
+        message = self._shared.get(frame)
+        if not isinstance(message, Command):
+            message = decode(frame, _AFTER_THE_SCENARIO)
+            if isinstance(message, Command):
+                self._shared[frame] = message
         is_running = self.end is None and self.mission_outcome is None
         tick = self.world.truth.tick
         match message:
@@ -141,10 +144,14 @@ class WorldJournalReading:
             self.environment = named
             self.messages.append(named)
             return
-        scenario = decode(frame, Scenario, MAX_FRAME_BYTES)
+        scenario: Scenario = decode(frame, RecordedScenario, MAX_FRAME_BYTES)
         problem = _unpaired(scenario)
         if problem is not None:
             raise MalformedFrame(problem)
+        try:
+            _ = scenario.ranging, scenario.radio
+        except (LookupError, TypeError, ValueError) as error:
+            raise MalformedFrame(error.args[0] if error.args else type(error).__name__) from None
         self._ids = [robot.id for robot in scenario.robots]
         self.world = release(scenario)
         self.messages.append(scenario)

@@ -83,9 +83,13 @@ def weigh_branches(
     Two branches with the anchor at the same position are merged. This happens very close to the anchor, or if
     the motion is almost radial.
     """
-    seen = tuple(seen)
-    ranged = [(pose, rho) for pose, rho in seen if rho is not None]
-    silent = [pose for pose, rho in seen if rho is None]
+    ranged: list[tuple[Pose, float]] = []
+    silent: list[Pose] = []
+    for pose, rho in seen:
+        if rho is None:
+            silent.append(pose)
+        else:
+            ranged.append((pose, rho))
     left: list[Branch] = []
     for candidate in candidates:
         branch = polished(candidate, ranged)
@@ -148,13 +152,14 @@ def polished(branch: Branch, ranged: Sequence[tuple[Pose, float]]) -> Branch:
     if len(ranged) < FITTED:
         return branch
     rho0, heading = branch.start.x, branch.start.heading
+    measured = [(pose.x, pose.y, rho * rho) for pose, rho in ranged]
     best, fitted = math.inf, heading
     for _ in range(POLISHING_STEPS):
         c, s = math.cos(heading), math.sin(heading)
         cost = gradient = curvature = 0.0
-        for pose, rho in ranged:
-            x, y = rho0 + c * pose.x - s * pose.y, s * pose.x + c * pose.y
-            error = x * x + y * y - rho * rho
+        for pose_x, pose_y, squared in measured:
+            x, y = rho0 + c * pose_x - s * pose_y, s * pose_x + c * pose_y
+            error = x * x + y * y - squared
             slope = -2.0 * rho0 * y
             cost += error * error
             gradient += slope * error
@@ -175,8 +180,8 @@ class PairObservation(msgspec.Struct, frozen=True, gc=False):
     range: float | None
 
 
-RangedPair = tuple[Pose, Pose, float]
-"""The poses of a and b, each in the frame of its own anchor, and the range (m) between them."""
+Positions = tuple[float, float, float, float]
+"""The positions of a and of b, each in the frame of its own anchor: x and y in m."""
 
 
 def weigh_placements(
@@ -190,8 +195,14 @@ def weigh_placements(
     `floor` is the largest error (m) of a predicted range from rounding, that of phase 1 included.
     """
     left: list[Placement] = []
-    ranged = [(seen.a, seen.b, seen.range) for seen in pair_observations if seen.range is not None]
-    silent = [(seen.a, seen.b) for seen in pair_observations if seen.range is None]
+    ranged: list[tuple[Positions, float]] = []
+    silent: list[Positions] = []
+    for seen in pair_observations:
+        a, b, rho = seen.a, seen.b, seen.range
+        if rho is None:
+            silent.append((a.x, a.y, b.x, b.y))
+        else:
+            ranged.append(((a.x, a.y, b.x, b.y), rho))
     for candidate in candidates:
         placement = _polished_placement(candidate, ranged) if len(ranged) > 2 else candidate
         same = same_turn(math.hypot(placement.x, placement.y) + sensing_range)
@@ -204,22 +215,22 @@ def weigh_placements(
     return tuple(left)
 
 
-def _explains_ranges(placement: Placement, ranged: Iterable[RangedPair], floor: float) -> bool:
+def _explains_ranges(placement: Placement, ranged: Iterable[tuple[Positions, float]], floor: float) -> bool:
     x, y = placement.x, placement.y
     c, s = math.cos(placement.phi), math.sin(placement.phi)
-    for a, b, rho in ranged:
-        if abs(math.hypot(x + c * a.x - s * a.y - b.x, y + s * a.x + c * a.y - b.y) - rho) > floor:
+    for (ax, ay, bx, by), rho in ranged:
+        if abs(math.hypot(x + c * ax - s * ay - bx, y + s * ax + c * ay - by) - rho) > floor:
             return False
     return True
 
 
-def _explains_silence(placement: Placement, silent: Iterable[tuple[Pose, Pose]], reach: float) -> bool:
+def _explains_silence(placement: Placement, silent: Iterable[Positions], reach: float) -> bool:
     x, y = placement.x, placement.y
     c, s = math.cos(placement.phi), math.sin(placement.phi)
     hypot = math.hypot
-    for a, b in silent:
-        ax, ay = a.x, a.y
-        if hypot(x + c * ax - s * ay - b.x, y + s * ax + c * ay - b.y) <= reach:
+    for ax, ay, bx, by in silent:
+        along = x + c * ax - s * ay - bx  # a distance is at least as long as its part along an axis
+        if -reach <= along <= reach and hypot(along, y + s * ax + c * ay - by) <= reach:
             return False
     return True
 
@@ -284,7 +295,7 @@ def _slopes(
             yield uy * (there.x - tx) - ux * (there.y - ty), uy * tx - ux * ty, ux, uy
 
 
-def _polished_placement(placement: Placement, measured: Sequence[RangedPair]) -> Placement:
+def _polished_placement(placement: Placement, measured: Sequence[tuple[Positions, float]]) -> Placement:
     """Return the placement near `placement` that fits all ranges best, with M1 at D from M2 (Gauss-Newton).
 
     The fit uses squared ranges, weighted so that a residual is an error of the range itself. Otherwise a
@@ -295,19 +306,23 @@ def _polished_placement(placement: Placement, measured: Sequence[RangedPair]) ->
     """
     distance = math.hypot(placement.x, placement.y)
     closest = CLOSEST * distance
-    ranged = [(a, b, rho, 0.5 / max(rho, closest)) for a, b, rho in measured]
+    ranged = [
+        (ax, ay, bx, by, rho * rho, weight, weight * 2.0)
+        for (ax, ay, bx, by), rho in measured
+        for weight in (0.5 / max(rho, closest),)
+    ]
     phi, psi = placement.phi, math.atan2(placement.y, placement.x)
     best, fitted = math.inf, placement
     for _ in range(POLISHING_STEPS):
         c, s = math.cos(phi), math.sin(phi)
         tx, ty = distance * math.cos(psi), distance * math.sin(psi)
         cost = pp = pq = qq = gp = gq = 0.0
-        for a, b, rho, weight in ranged:
-            ax, ay = c * a.x - s * a.y, s * a.x + c * a.y
-            x, y = tx + ax - b.x, ty + ay - b.y
-            error = weight * (x * x + y * y - rho * rho)
-            by_phi = weight * 2.0 * (y * ax - x * ay)
-            by_psi = weight * 2.0 * (y * tx - x * ty)
+        for own_x, own_y, bx, by, squared, weight, double in ranged:
+            ax, ay = c * own_x - s * own_y, s * own_x + c * own_y
+            x, y = tx + ax - bx, ty + ay - by
+            error = weight * (x * x + y * y - squared)
+            by_phi = double * (y * ax - x * ay)
+            by_psi = double * (y * tx - x * ty)
             cost += error * error
             pp += by_phi * by_phi
             pq += by_phi * by_psi

@@ -80,7 +80,7 @@ class ExactEstimator(msgspec.Struct, frozen=True):
         result is None until a has moved between two ranges while b stood still.
         """
         del required_ranges, second_range
-        observations = tuple(knowledge.pair_observations(first_tick))
+        observations = knowledge.pair_observations(first_tick)
         ranged = [at for at in observations if at.range is not None]
         away_from_m2 = [at for at in ranged if off_anchor(at.b, knowledge.config.rendezvous.b)]
         through = min(knowledge.tick, knowledge.peer_state.peer.through)
@@ -137,7 +137,7 @@ def _with_placements(
         possible = weigh_placements(solutions, undetected, reach, floor)
         candidates = (len(solutions), len(possible))
     remaining = weigh_placements(solutions, observations, reach, floor)
-    return replace(belief, placements=remaining, candidates=candidates)
+    return replace(belief, placements=remaining, candidates=candidates, observations=tuple(observations))
 
 
 EXACT: Estimator = ExactEstimator()

@@ -45,6 +45,8 @@ class Belief(msgspec.Struct, frozen=True):
     """Exact sensors: the bound in m on the error of the own anchor's position, from the ranges of phase 1."""
     peer_anchor: float | None = None
     """Exact sensors: the same bound in m for the peer and its anchor."""
+    observations: tuple[PairObservation, ...] = ()
+    """Exact sensors: the ticks from which the placements follow."""
     own: tuple[Hypothesis, ...] = ()
     """Noisy sensors: the hypotheses about the position of the own anchor, the most probable first."""
     branches: tuple[Branch, ...] = ()
@@ -62,9 +64,11 @@ class Belief(msgspec.Struct, frozen=True):
     inconsistency: Inconsistency | None = None
     """Noisy sensors: the result of the consistency test of the most probable hypothesis."""
     p_value: float | None = None
-    """Noisy sensors: the smallest p-value of all searches of the whole plane."""
+    """Noisy sensors: the smallest p-value of all searches of the whole plane, and of the claim."""
     inconsistent_searches: int = 0
     """Noisy sensors: the number of consecutive searches whose consistency test failed."""
+    doubtful_claims: int = 0
+    """Noisy sensors: the number of consecutive claims withheld because a profile contradicts them."""
     returns: int = 0
     """Noisy sensors: the number of times that the robot drove back to its anchor."""
 
@@ -111,18 +115,27 @@ class Knowledge(msgspec.Struct, frozen=True):
         track = self.log.track(ORIGIN, 0, self.tick, self.config.mission.period)
         return [(pose, ranges.get(tick)) for tick, pose in enumerate(track)]
 
-    def pair_observations(self, first: int) -> list[PairObservation]:
-        """Return both poses and the mutual range of each tick from `first` on that both logs cover."""
+    def pair_observations(self, first: int) -> tuple[PairObservation, ...]:
+        """Return both poses and the mutual range of each tick from `first` on that both logs cover.
+
+        Those in `belief.observations` are not computed again: logs are only extended.
+        """
         last = min(self.tick, self.peer_state.peer.through)
         if self.peer_state.start is None or last < first:
-            return []
-        period = self.config.mission.period
-        own = self.log.track(self.start, first, last, period)
-        peer = self.peer_state.peer.track(self.peer_state.start, first, last, period)
-        a, b = (own, peer) if self.config.role == "a" else (peer, own)
+            return ()
+        known = self.belief.observations
+        if known and known[0].tick != first:
+            known = ()
+        a_known, b_known = [at.a for at in known], [at.b for at in known]
+        a_start, a_log, b_start, b_log = self.start, self.log, self.peer_state.start, self.peer_state.peer
+        if self.config.role == "b":
+            a_start, a_log, b_start, b_log = b_start, b_log, a_start, a_log
+        period, new = self.config.mission.period, len(known)
+        a = a_log.track(a_start, first, last, period, a_known)
+        b = b_log.track(b_start, first, last, period, b_known)
         ranges = {ranged.tick: ranged.range for ranged in self.mutual}
-        ticks = range(first, last + 1)
-        return list(map(PairObservation, ticks, a, b, map(ranges.get, ticks)))
+        ticks = range(first + new, last + 1)
+        return (*known, *map(PairObservation, ticks, a[new:], b[new:], map(ranges.get, ticks)))
 
     @property
     def off_anchor(self) -> bool:

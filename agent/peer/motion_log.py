@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 
 import msgspec
@@ -40,8 +40,8 @@ class MotionLog(msgspec.Struct, frozen=True):
         if runs:
             last = runs[-1]
             if last.v == v and last.omega == omega:
-                runs, ticks_in_all = runs[:-1], last.ticks + ticks
-                return MotionLog(self.through + ticks, (*runs, Segment(ticks_in_all, v, omega)), self.ranges)
+                longer = Segment(last.ticks + ticks, v, omega)
+                return MotionLog(self.through + ticks, runs[:-1] + (longer,), self.ranges)
         return MotionLog(self.through + ticks, (*runs, Segment(ticks, v, omega)), self.ranges)
 
     def ranged(self, distance: float) -> MotionLog:
@@ -80,11 +80,20 @@ class MotionLog(msgspec.Struct, frozen=True):
         """Return the pose at `tick` for the pose `start` at tick 0."""
         return follow(start, self.until(tick), period)
 
-    def track(self, start: Pose, first: int, last: int, period: float) -> list[Pose]:
-        """Return the poses at each tick in [first, last] for the pose `start` at tick 0."""
-        track = [self.pose(start, first, period) if first else start]
+    def track(
+        self, start: Pose, first: int, last: int, period: float, known: Sequence[Pose] = ()
+    ) -> list[Pose]:
+        """Return the poses at each tick in [first, last] for the pose `start` at tick 0.
+
+        `known` are the first of them, from an earlier call. They are not computed again.
+        """
+        track = list(known) or [self.pose(start, first, period) if first else start]
+        begin = 0
         for run in _between(self.runs, first, last) if first else self.until(last):
-            track += arc(track[-1], run, period)
+            done = len(track) - 1 - begin
+            if done < run.ticks:
+                track += arc(track[begin], run, period, done)
+            begin += run.ticks
         return track
 
 

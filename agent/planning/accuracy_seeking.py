@@ -8,7 +8,8 @@ most (see `active_sensing`).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 from msgspec.structs import replace
 
@@ -16,15 +17,17 @@ from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.consistency import (
     CLAIM_P_VALUE,
     EARLY_CLAIM_P_VALUE,
+    FINISHED,
     INCONSISTENT_P_VALUE,
     INCONSISTENT_SEARCHES,
 )
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis, follow, search
-from agent.estimation.knowledge import Belief
+from agent.estimation.gaussian.inference import PlanningHypothesis
+from agent.estimation.gaussian.range_model import PairRanges
+from agent.estimation.knowledge import Belief, Knowledge
 from agent.planning import active_sensing, exchange, phase2_orbit, range_seeking, transitions
 from agent.planning.active_sensing import Listening, Retreating, Surveying
-from agent.planning.assured import MANOEUVRES, command, start
-from agent.planning.exchange import estimate, report
+from agent.planning.assured import AssuredExact
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent
 from agent.planning.range_seeking import Backing, Circling, Homing, Straight, Turning
 from agent.planning.state import Asleep, Done, RobotState
@@ -32,20 +35,8 @@ from protocol.messages import BranchKind, Localised, Observation, Report
 from protocol.mission import Mission
 from protocol.motion import ORIGIN, REST, Controls
 
-__all__ = (
-    "ACTIVE_SENSING",
-    "MANOEUVRES",
-    "command",
-    "decide",
-    "estimate",
-    "observe",
-    "report",
-    "required_mutual_ranges",
-    "start",
-)
-
-ACTIVE_SENSING = True
-"""Each hypothesis has a covariance, from which the value of further ranges follows."""
+MANOEUVRES = AssuredExact.MANOEUVRES
+"""The manoeuvres of the searches for ranges."""
 
 LOST_AFTER = 3
 """The number of strides without an expected anchor detection after which the robot returns to its anchor."""
@@ -59,11 +50,25 @@ MISLEADING = -8.0
 If it is smaller even for the most probable hypothesis, the ranges are misleading and not just unlucky.
 """
 
-CHECKED, CHECKED_WITH_OUTLIERS = 8, 12
-"""The minimum number of mutual ranges before a claim, without and with outliers."""
+CONVINCING_RANGES = 14
+"""The number of anchor ranges from which on detections do not make them misleading.
+
+It is twice the number that ends phase 1 with outliers. Without this bound, a robot whose ranges are 0.35 m
+too long drove to and fro for ever, because it had ranges longer than R.
+"""
 
 FEWEST_MUTUAL_RANGES = 3
-"""The minimum number of mutual ranges for hypotheses. With fewer, there are too many hypotheses."""
+"""The minimum number of mutual ranges for hypotheses, and before a claim.
+
+With fewer, there are too many hypotheses, and no range checks them. How many more a claim needs depends on
+their evidence (`inference.with_evidence_check`).
+"""
+
+EARLY_RANGES = 16
+"""The number of mutual ranges below which EARLY_CLAIM_P_VALUE applies.
+
+Few ranges leave room for a wrong hypothesis that fits by chance. With more, only the p-value of the search
+counts. The bound delays one of a hundred right claims by a few ticks."""
 
 OFF_RADIUS = 0.5
 """The heading error in rad relative to the radius from which on the robot aligns again in phase 2."""
@@ -71,22 +76,73 @@ OFF_RADIUS = 0.5
 DROP_OUT_SIGMAS = 3.0
 """The margin for the number of drop-outs, in standard deviations."""
 
-SEARCH_AT = frozenset((FEWEST_MUTUAL_RANGES, *(CHECKED * 2**n for n in range(12))))
-"""The numbers of mutual ranges at which the whole plane is searched again for hypotheses."""
+SEARCH_AT = frozenset((FEWEST_MUTUAL_RANGES, *(8 * 2**n for n in range(12))))
+"""The numbers of mutual ranges at which the whole plane is searched again for hypotheses.
+
+They only bound how long a missed hypothesis stays missed: the plane is also searched before each claim, and
+whenever the best fit still moves. More searches cost time; with fewer, robots plan with too few hypotheses.
+"""
 
 MANY_MUTUAL_RANGES = 60
-"""The number of mutual ranges after which a lack of accuracy is due to too few ranges to the anchor."""
+"""The number of mutual ranges after which a lack of accuracy is due to too few ranges to the anchor.
+
+Set on the sweep `noise`, whose missions need 10 to 40. With fewer, robots that would have claimed a few ticks
+later drive back; with more, robots whose anchor is known too badly range in vain for longer. Missions with
+little noise never come near it.
+"""
 
 
-def required_mutual_ranges(mission: Mission) -> int:
+JointManoeuvres = Callable[
+    [Sequence[PlanningHypothesis], tuple[float, float], float, Mission], tuple[Controls, Controls]
+]
+"""The type of `AccuracySeeking.joint_manoeuvres`."""
+
+
+class AccuracySeeking(AssuredExact):
+    """The planner `assured` with noisy sensors."""
+
+    ACTIVE_SENSING = True
+    """Each hypothesis has a covariance, from which the value of further ranges follows."""
+
+    def observe(self, state: RobotState, observation: Observation) -> RobotState:
+        """Return `state` with the sensor data of one tick, and with the mode that follows from them."""
+        return _observe(state, observation)
+
+    def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
+        """Return `state` with the peer's `reports` and with the mode that follows from them."""
+        return _decide(state, reports, self.joint_manoeuvres)
+
+    def joint_manoeuvres(
+        self,
+        hypotheses: Sequence[PlanningHypothesis],
+        m2: tuple[float, float],
+        rho: float,
+        mission: Mission,
+    ) -> tuple[Controls, Controls]:
+        """Return the manoeuvres of a and b in phase 3, for `active_sensing.stride` ticks.
+
+        `hypotheses` are about the poses of both robots relative to M1, the most probable first. M2 is at
+        `m2` in m, and `rho` is the latest range between the robots in m. A subclass may plan others; both
+        robots compute both from the same measurements.
+        """
+        return active_sensing.plan_together(hypotheses, m2, rho, mission)
+
+    def required_mutual_ranges(self, mission: Mission) -> int:
+        """Return the minimum number of mutual ranges before a claim."""
+        return _required_mutual_ranges(mission)
+
+
+def _required_mutual_ranges(mission: Mission) -> int:
     """Return the minimum number of mutual ranges before a claim."""
-    return CHECKED_WITH_OUTLIERS if mission.noise.outliers else CHECKED
+    return inference.MUTUAL_RANGES_WITH_OUTLIERS if mission.noise.outliers else FEWEST_MUTUAL_RANGES
 
 
-def observe(state: RobotState, observation: Observation) -> RobotState:
+def _observe(state: RobotState, observation: Observation) -> RobotState:
     """Return `state` with the sensor data of one tick, and with the mode that follows from them."""
     state, anchor_range = exchange.observed(state, observation), observation.anchor_range
     match state.mode:
+        case Asleep() if anchor_range is None and state.tick >= _first_range_timeout(state.config.mission):
+            return replace(state, mode=Straight("anchor", state.odometry, state.config.mission.sensing_range))
         case Asleep():
             return transitions.start_phase1(state, anchor_range)
         case Straight("anchor") | Backing("anchor") | Turning("anchor") | Circling("anchor"):
@@ -107,6 +163,19 @@ def observe(state: RobotState, observation: Observation) -> RobotState:
             return state
 
 
+def _first_range_timeout(mission: Mission) -> int:
+    """Return the tick from which on a robot without any anchor range searches for one.
+
+    A robot whose first ranges are drop-outs waits. If drop-outs hardly explain it, R is smaller than told.
+    """
+    p = mission.noise.drop_outs
+    return math.ceil(math.log(UNLIKELY_DROP_OUTS) / math.log(p)) if 0.0 < p < 1.0 else 0
+
+
+UNLIKELY_DROP_OUTS = 1e-3
+"""The probability of so many drop-outs in a row from which on a robot searches for its first range."""
+
+
 def is_planning_tick(state: RobotState) -> bool:
     """Return whether the robot plans a manoeuvre in this tick. Both robots plan in the same ticks."""
     return state.tick % active_sensing.stride(state.config.mission) == 0
@@ -124,12 +193,12 @@ def _continue_phase1(state: RobotState) -> RobotState:
         state = replace(state, belief=inference.with_own(state, scored))
     if _ticks_without_range(state) >= LOST_AFTER * active_sensing.stride(state.config.mission):
         return _return_to_anchor(state)
-    if not scored or scored[0].detection_log_likelihood < MISLEADING + _drop_out_log_likelihood(state):
+    if not scored or _are_misleading(state, scored[0]):
         if not ranged:
             return _return_to_anchor(state)
         return replace(state, mode=Straight("anchor", state.odometry, state.log.ranges[-1].range))
     mission = state.config.mission
-    if inference.is_anchor_known(scored, mission):
+    if inference.is_anchor_known(state, scored):
         kind: BranchKind = "circle" if len(state.log.ranges) == 2 else "three-ranges"
         phase1_done_tick = (
             state.tick if state.belief.phase1_done_tick is None else state.belief.phase1_done_tick
@@ -140,6 +209,16 @@ def _continue_phase1(state: RobotState) -> RobotState:
         return _start_phase2(state)
     command = active_sensing.plan_alone(inference.anchor_planning_hypotheses(scored), mission)
     return replace(state, mode=Surveying("anchor", command))
+
+
+def _are_misleading(state: RobotState, best: ScoredHypothesis) -> bool:
+    """Return whether the detections and the ticks without one contradict the most probable hypothesis.
+
+    With CONVINCING_RANGES, ranges count more: R may not be as it was told.
+    """
+    if len(state.log.ranges) >= CONVINCING_RANGES:
+        return False
+    return best.detection_log_likelihood < MISLEADING + _drop_out_log_likelihood(state)
 
 
 def _drop_out_log_likelihood(state: RobotState) -> float:
@@ -222,7 +301,7 @@ def _continue_phase3(state: RobotState) -> RobotState:
             return state
 
 
-def decide(state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
+def _decide(state: RobotState, reports: Sequence[Report], planned: JointManoeuvres) -> RobotState:
     """Return `state` with the peer's `reports` and with the mode that follows from them."""
     if reports:
         state = exchange.with_reports(state, reports)
@@ -242,10 +321,10 @@ def decide(state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
         case _ if not inference.peer_log_suffices(state):
             return replace(state, mode=Listening())
         case _:
-            return _decide_phase3(state)
+            return _decide_phase3(state, planned)
 
 
-def _decide_phase3(state: RobotState) -> RobotState:
+def _decide_phase3(state: RobotState, planned: JointManoeuvres) -> RobotState:
     """Evaluate both logs in phase 3: update the hypotheses, then claim a pose or plan the manoeuvres.
 
     Both robots compute the same pair of manoeuvres from the same logs, and each executes its own.
@@ -257,34 +336,81 @@ def _decide_phase3(state: RobotState) -> RobotState:
     mutual = pair.ranges.counts[2]
     if mutual < FEWEST_MUTUAL_RANGES:
         return _drive_without_hypotheses(state)
-    known = state.belief.pair
-    searched = not known or any(state.belief.ranges_at_last_search < count <= mutual for count in SEARCH_AT)
-    scored = search(pair) if searched else follow(known, pair)
+    scored, hypotheses, belief, searched = inferred(state, pair)
     if searched:
-        state = replace(state, belief=replace(state.belief, ranges_at_last_search=mutual))
-    required_ranges = required_mutual_ranges(mission)
-    hypotheses = inference.pair_planning_hypotheses(scored, pair)
-    belief = inference.with_pair(state, scored, hypotheses, pair, required_ranges)
-    if (belief.blocking_reason is None or _p_value_below(belief, CLAIM_P_VALUE)) and not searched:
-        scored, searched = search(pair), True
-        hypotheses = inference.pair_planning_hypotheses(scored, pair)
-        belief = inference.with_pair(state, scored, hypotheses, pair, required_ranges)
+        belief = replace(belief, ranges_at_last_search=mutual)
     tested = replace(state, belief=inference.with_convergence_check(belief, scored))
-    if searched:
+    if searched and len(pair.places) >= inference.sufficient_mutual_ranges(mission):
         tested = _with_consistency_test(tested)
     if tested.verdict is not None:
         return tested
-    few_ranges = len(pair.places) < 2 * required_ranges
-    if tested.belief.blocking_reason is None and not (
-        few_ranges and _p_value_below(tested.belief, EARLY_CLAIM_P_VALUE)
-    ):
-        return replace(tested, mode=Done(3, Localised(tested.belief.poses[0], tested.belief.covariance)))
+    if may_claim(tested.belief, pair):
+        tested = _with_claim(tested, scored, pair)
+    if tested.verdict is not None:
+        return tested
     if role == "a" and len(pair.places) >= MANY_MUTUAL_RANGES * (1 + state.belief.returns):
         return _return_to_anchor(tested)
     if not scored:
         return _drive_without_hypotheses(tested)
-    a, b = active_sensing.plan_together(hypotheses, pair.apart, state.mutual[-1].range, mission)
+    a, b = planned(hypotheses, pair.apart, state.mutual[-1].range, mission)
     return replace(tested, mode=Surveying("peer", a if role == "a" else b))
+
+
+def may_claim(belief: Belief, pair: PairRanges) -> bool:
+    """Return whether a search has left no reason against a claim."""
+    few_ranges = len(pair.places) < EARLY_RANGES
+    return belief.blocking_reason is None and not (few_ranges and _p_value_below(belief, EARLY_CLAIM_P_VALUE))
+
+
+def _with_claim(state: RobotState, scored: Sequence[ScoredHypothesis], pair: PairRanges) -> RobotState:
+    """Return `state` with the claim if nothing blocks it, or Undecided if profiles contradict all claims."""
+    state = replace(state, belief=inference.with_doubt_check(state.belief, scored, pair))
+    reason = state.belief.blocking_reason
+    if reason is None:
+        belief = replace(state.belief, p_value=_least_p_value(state.belief))
+        return replace(state, mode=Done(3, Localised(belief.poses[0], belief.covariance)), belief=belief)
+    return state.undecided(reason) if inference.ends_in_doubt(state.belief) else state
+
+
+class PairInference(NamedTuple):
+    """The hypotheses about both robots in one tick."""
+
+    scored: tuple[ScoredHypothesis, ...]
+    hypotheses: list[PlanningHypothesis]
+    belief: Belief
+    searched: bool
+    """True if the hypotheses are from a search of the whole plane."""
+
+
+def inferred(state: Knowledge, pair: PairRanges) -> PairInference:
+    """Return the hypotheses about both robots, from those of the last tick or from a search.
+
+    The whole plane is searched if nothing is known, at the counts SEARCH_AT, if the best fit still moves,
+    because it may be on its way to another mode, and before a claim or a suspicion.
+    """
+    known, mutual = state.belief.pair, pair.ranges.counts[2]
+    if known and not any(state.belief.ranges_at_last_search < count <= mutual for count in SEARCH_AT):
+        scored = follow(known, pair)
+        if scored and scored[0].fit.last_step <= FINISHED:
+            followed = weighed(state, pair, scored, searched=False)
+            if followed.belief.blocking_reason is not None and not _p_value_below(
+                followed.belief, CLAIM_P_VALUE
+            ):
+                return followed
+        known = tuple([one.hypothesis for one in scored])
+    return weighed(state, pair, search(pair, known), searched=True)
+
+
+def weighed(
+    state: Knowledge, pair: PairRanges, scored: tuple[ScoredHypothesis, ...], *, searched: bool
+) -> PairInference:
+    """Return the hypotheses `scored` with the belief that follows from them."""
+    mission = state.config.mission
+    hypotheses = inference.pair_planning_hypotheses(scored, pair)
+    belief = inference.with_pair(state, scored, hypotheses, pair, _required_mutual_ranges(mission))
+    return PairInference(
+        scored, hypotheses, inference.with_evidence_check(belief, scored, pair, mission), searched
+    )
 
 
 def _p_value_below(belief: Belief, bound: float) -> bool:
@@ -296,21 +422,28 @@ def _p_value_below(belief: Belief, bound: float) -> bool:
 def _with_consistency_test(state: RobotState) -> RobotState:
     """Return `state` with the consistency test of a search, and with the verdict if too many tests failed.
 
-    A test fails if its p-value is below INCONSISTENT_P_VALUE. The verdict is Inconsistent after
-    INCONSISTENT_SEARCHES consecutive failures.
+    A test fails if its p-value is below INCONSISTENT_P_VALUE. After INCONSISTENT_SEARCHES consecutive
+    failures, the verdict is Inconsistent, or Undecided if the robot's own sensors are not as it was told.
     """
     belief = state.belief
-    inconsistency = belief.inconsistency
+    inconsistency, least = belief.inconsistency, _least_p_value(belief)
     if inconsistency is None:
         return state
-    least = min(inconsistency.p_value, belief.p_value if belief.p_value is not None else 1.0)
     inconsistent_searches = (
         belief.inconsistent_searches + 1 if inconsistency.p_value < INCONSISTENT_P_VALUE else 0
     )
     state = replace(state, belief=replace(belief, inconsistent_searches=inconsistent_searches, p_value=least))
-    return (
-        state.inconsistent(inconsistency.verdict) if inconsistent_searches >= INCONSISTENT_SEARCHES else state
-    )
+    if inconsistent_searches < INCONSISTENT_SEARCHES:
+        return state
+    doubt = inference.sensor_doubt(state)
+    return state.inconsistent(inconsistency.verdict) if doubt is None else state.undecided(doubt.reason)
+
+
+def _least_p_value(belief: Belief) -> float | None:
+    """Return the smallest p-value of all tests that count, and of the latest one; None if there is none."""
+    if belief.inconsistency is None:
+        return belief.p_value
+    return min(belief.inconsistency.p_value, belief.p_value if belief.p_value is not None else 1.0)
 
 
 def _drive_without_hypotheses(state: RobotState) -> RobotState:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from agent.planning import exchange, phase3_last_manoeuvre, transitions
-from agent.planning.exchange import estimate, report, start
+from agent.planning.log_exchange import LogPlanner
 from agent.planning.manoeuvres import Manoeuvres
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent
 from agent.planning.phase3_last_manoeuvre import SPEEDS, Standing, Waiting
@@ -20,26 +20,6 @@ from protocol.messages import Command, Localised, Observation, Report
 from protocol.mission import Mission
 from protocol.motion import REST
 
-__all__ = (
-    "ACTIVE_SENSING",
-    "MANOEUVRES",
-    "command",
-    "decide",
-    "estimate",
-    "observe",
-    "report",
-    "required_mutual_ranges",
-    "start",
-)
-
-MANOEUVRES = Manoeuvres(
-    directions=(1.0, -1.0), sides=(1.0, -1.0), last_speeds=SPEEDS, fewest_out_of_range=True
-)
-"""Both ways, to both sides in phase 1, and at several speeds."""
-
-ACTIVE_SENSING = False
-"""The manoeuvres distinguish hypotheses. What remains is certain up to rounding."""
-
 PEER_RESTS = (MODE_NAMES[Standing], MODE_NAMES[Waiting])
 """The modes of the peer in which this robot may plan a manoeuvre.
 
@@ -47,91 +27,96 @@ If both moved at once, they might do so in mirror image, and the new range would
 """
 
 
-def observe(state: RobotState, observation: Observation) -> RobotState:
-    """Return `state` with the sensor data of one tick, and with the mode that follows from them."""
-    state = exchange.observed(state, observation)
-    return transitions.after_observation(state, observation.anchor_range, MANOEUVRES, _after_range)
+class AssuredExact(LogPlanner):
+    """The planner `assured` with exact sensors. Subclasses may plan another last manoeuvre."""
 
-
-def decide(state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
-    """Return `state` with the peer's `reports` and with the mode that follows from them.
-
-    Phase 3 begins as soon as the peer's phase 1 has ended and b is far enough from its anchor.
-    """
-    if reports:
-        state = exchange.with_reports(state, reports)
-    if not state.in_contact or isinstance(state.mode, Done):
-        return state
-    match state.mode:
-        case Aligning() | Radial() | Tangent() | Orbiting():
-            peer = state.peer_state
-            met = peer.phase == 3 or (peer.start is not None and state.off_anchor)
-            return transitions.begin_phase3(state) if met else state
-        case Standing() | Waiting():
-            return _decide_phase3(state)
-        case _:
-            return state
-
-
-def command(state: RobotState) -> Command:
-    """Return the command for the next tick, with the phase, the mode and the verdict."""
-    return exchange.command(state, REST if _must_wait(state) else transitions.controls(state))
-
-
-def required_mutual_ranges(mission: Mission) -> int:
-    """Return 0: not the number of exact ranges counts, but a redundant one."""
-    del mission
-    return 0
-
-
-def _must_wait(state: RobotState) -> bool:
-    """Return whether the robot stands still, to stay in range of a peer with which phase 3 cannot begin yet.
-
-    The peer is then in phase 1, or none of its reports has been received, or it is b and too near its anchor.
-    """
-    return (
-        state.in_contact
-        and (state.peer_state.start is None or state.config.role == "a")
-        and isinstance(state.mode, Aligning | Radial | Tangent | Orbiting)
+    MANOEUVRES = Manoeuvres(
+        directions=(1.0, -1.0), sides=(1.0, -1.0), last_speeds=SPEEDS, fewest_out_of_range=True
     )
+    """Both ways, to both sides in phase 1, and at several speeds."""
 
+    def observe(self, state: RobotState, observation: Observation) -> RobotState:
+        """Return `state` with the sensor data of one tick, and with the mode that follows from them."""
+        state = exchange.observed(state, observation)
+        return transitions.after_observation(
+            state, observation.anchor_range, self.MANOEUVRES, self._after_range
+        )
 
-def _after_range(state: RobotState) -> RobotState:
-    """Continue phase 1 with the branches +alpha and -alpha that the ranges allow (eq. (2)).
+    def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
+        """Return `state` with the peer's `reports` and with the mode that follows from them.
 
-    Phase 1 ends when one branch is left, and the ranges determine the anchor's position as accurately as a
-    claim needs.
-    """
-    kind = transitions.branch_kind(state)
-    found = transitions.anchor_estimate(state)
-    state = replace(state, belief=found.belief)
-    if kind is not None and len(found.branches) == 1:
-        known = state.estimator.fitted(state, found.branches[0])
-        if known.enough:
-            return transitions.end_phase1(state, known, kind)
-    return transitions.to_third_point(state, found, MANOEUVRES, pinning=len(found.branches) == 1)
-
-
-def _decide_phase3(state: RobotState) -> RobotState:
-    """Return `state` after the evaluation of both logs: with a verdict, a last manoeuvre, or the same mode.
-
-    All ticks count, including those before the encounter. The robots take turns until a redundant range has
-    confirmed the placement, and then until the ranges determine it.
-    """
-    evaluated = transitions.with_new_ticks(state)
-    if evaluated is None:
-        return state
-    state, found = transitions.pair_estimate(
-        evaluated, 0, required_mutual_ranges(state.config.mission), second_range=True
-    )
-    if found is None:  # There are too few ranges, or b was still driving while a drove straight on.
-        b_is_standing = isinstance(state.mode, Waiting) and state.peer_state.state == MODE_NAMES[Standing]
-        return transitions.begin_phase3(state) if b_is_standing else state
-    if state.verdict is not None:
-        return state
-    # A peer that has localised itself does not move again.
-    if not isinstance(state.peer_state.verdict, Localised):
-        turn = phase3_last_manoeuvre.turn(found.observations) if found.checked else "b"
-        if state.config.role != turn or state.peer_state.state not in PEER_RESTS:
+        Phase 3 begins as soon as the peer's phase 1 has ended and b is far enough from its anchor.
+        """
+        if reports:
+            state = exchange.with_reports(state, reports)
+        if not state.in_contact or isinstance(state.mode, Done):
             return state
-    return transitions.last_manoeuvre(state, found, MANOEUVRES) or state
+        match state.mode:
+            case Aligning() | Radial() | Tangent() | Orbiting():
+                peer = state.peer_state
+                met = peer.phase == 3 or (peer.start is not None and state.off_anchor)
+                return transitions.begin_phase3(state) if met else state
+            case Standing() | Waiting():
+                return self._decide_phase3(state)
+            case _:
+                return state
+
+    def command(self, state: RobotState) -> Command:
+        """Return the command for the next tick, with the phase, the mode and the verdict."""
+        return exchange.command(state, REST if self._must_wait(state) else transitions.controls(state))
+
+    def required_mutual_ranges(self, mission: Mission) -> int:
+        """Return 0: not the number of exact ranges counts, but a redundant one."""
+        del mission
+        return 0
+
+    def _must_wait(self, state: RobotState) -> bool:
+        """Return whether the robot stands still, in range of a peer with which phase 3 cannot begin yet.
+
+        The peer is then in phase 1, or none of its reports has been received, or it is b and too near its
+        anchor.
+        """
+        return (
+            state.in_contact
+            and (state.peer_state.start is None or state.config.role == "a")
+            and isinstance(state.mode, Aligning | Radial | Tangent | Orbiting)
+        )
+
+    def _after_range(self, state: RobotState) -> RobotState:
+        """Continue phase 1 with the branches +alpha and -alpha that the ranges allow (eq. (2)).
+
+        Phase 1 ends when one branch is left, and the ranges determine the anchor's position as accurately as
+        a claim needs.
+        """
+        kind = transitions.branch_kind(state)
+        found = transitions.anchor_estimate(state)
+        state = replace(state, belief=found.belief)
+        if kind is not None and len(found.branches) == 1:
+            known = state.estimator.fitted(state, found.branches[0])
+            if known.enough:
+                return transitions.end_phase1(state, known, kind)
+        return transitions.to_third_point(state, found, self.MANOEUVRES, pinning=len(found.branches) == 1)
+
+    def _decide_phase3(self, state: RobotState) -> RobotState:
+        """Return `state` after the evaluation of both logs: with a verdict, a last manoeuvre, or as it was.
+
+        All ticks count, including those before the encounter. The robots take turns until a redundant range
+        has confirmed the placement, and then until the ranges determine it.
+        """
+        evaluated = transitions.with_new_ticks(state)
+        if evaluated is None:
+            return state
+        state, found = transitions.pair_estimate(
+            evaluated, 0, self.required_mutual_ranges(state.config.mission), second_range=True
+        )
+        if found is None:  # There are too few ranges, or b was still driving while a drove straight on.
+            b_is_standing = isinstance(state.mode, Waiting) and state.peer_state.state == MODE_NAMES[Standing]
+            return transitions.begin_phase3(state) if b_is_standing else state
+        if state.verdict is not None:
+            return state
+        # A peer that has localised itself does not move again.
+        if not isinstance(state.peer_state.verdict, Localised):
+            turn = phase3_last_manoeuvre.turn(found.observations) if found.checked else "b"
+            if state.config.role != turn or state.peer_state.state not in PEER_RESTS:
+                return state
+        return transitions.last_manoeuvre(state, found, self.last_manoeuvre) or state

@@ -33,8 +33,9 @@ def start(config: RobotConfig) -> RobotState:
 def observed(state: RobotState, observation: Observation) -> RobotState:
     """Return `state` with the sensor data of one tick: odometry, anchor range, contact and mutual range."""
     log, odometry, leg = state.log, state.odometry, state.leg
-    if observation.executed is not None:
-        v, omega = observation.executed.v, observation.executed.omega
+    executed = observation.executed
+    if executed is not None:
+        v, omega = executed.v, executed.omega
         log = log.drove(v, omega)
         ticks = log.runs[-1].ticks
         if ticks == 1:
@@ -118,11 +119,12 @@ def with_reports(state: RobotState, reports: Sequence[Report]) -> RobotState:
 
 def command(state: RobotState, controls: Controls) -> Command:
     """Return the command with `controls`, limited by the safety distance, the mode and the verdict."""
-    if state.in_contact and state.config.mission.safety_distance:
+    config = state.config
+    if state.in_contact and config.mission.safety_distance:
         controls = _safe(state, controls)
     return Command(
         state.tick,
-        state.config.robot,
+        config.robot,
         controls.v,
         controls.omega,
         state.phase,
@@ -149,23 +151,24 @@ def _safe(state: RobotState, controls: Controls) -> Controls:
 
 def estimate(state: RobotState) -> Estimate:
     """Return all poses that the robot considers possible in its anchor's frame and in <W>."""
-    branches_left = state.belief.branches
-    if not branches_left and state.belief.branch is not None:
-        branches_left = (state.belief.branch,)
+    belief, verdict = state.belief, state.verdict
+    branches_left = belief.branches
+    if not branches_left and belief.branch is not None:
+        branches_left = (belief.branch,)
     elif not branches_left and isinstance(state.mode, ThirdPoint):
         branches_left = state.mode.branches
-    if state.belief.poses:
-        world: tuple[Pose, ...] = state.belief.poses
-    elif isinstance(state.verdict, Localised):
-        world = (state.verdict.pose,)
+    if belief.poses:
+        world: tuple[Pose, ...] = belief.poses
+    elif isinstance(verdict, Localised):
+        world = (verdict.pose,)
     else:
-        world = tuple(state.world_pose(placement) for placement in state.belief.placements)
+        world = tuple([state.world_pose(placement) for placement in belief.placements])
     return Estimate(
         tick=state.tick,
         robot=state.config.robot,
         local=tuple(phase1_anchor.local(branches_left, state.odometry)),
         world=world,
-        localised=isinstance(state.verdict, Localised),
-        probabilities=tuple(one.probability for one in state.belief.pair or state.belief.own),
-        covariance=state.belief.covariance,
+        localised=isinstance(verdict, Localised),
+        probabilities=tuple([one.probability for one in belief.pair or belief.own]),
+        covariance=belief.covariance,
     )

@@ -12,8 +12,7 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from agent.planning import exchange, transitions
-from agent.planning.accuracy_seeking import CHECKED_WITH_OUTLIERS
-from agent.planning.exchange import estimate, report, start
+from agent.planning.log_exchange import LogPlanner
 from agent.planning.manoeuvres import Manoeuvres
 from agent.planning.phase1_anchor import ThirdPoint
 from agent.planning.phase2_orbit import Orbiting
@@ -21,103 +20,93 @@ from agent.planning.phase3_last_manoeuvre import Standing, Waiting
 from agent.planning.state import MODE_NAMES, RobotState
 from protocol.messages import Command, Observation, Report
 from protocol.mission import Mission
+from protocol.orbits import Rendezvous, rendezvous
 
-__all__ = (
-    "ACTIVE_SENSING",
-    "MANOEUVRES",
-    "command",
-    "decide",
-    "estimate",
-    "observe",
-    "report",
-    "required_mutual_ranges",
-    "start",
-)
+CHECKED, CHECKED_WITH_OUTLIERS = 3, 12
+"""The minimum number of mutual ranges before a claim with noisy sensors, without and with outliers.
 
-MANOEUVRES = Manoeuvres(directions=(1.0,), sides=(1.0,), last_speeds=None, fewest_out_of_range=False)
-"""Forward, to the left in phase 1, and at v_max."""
-
-ACTIVE_SENSING = False
-"""The paper's manoeuvres distinguish hypotheses, and do not improve them."""
-
-CHECKED = 3
-"""The minimum number of mutual ranges before a claim with noisy sensors, without outliers."""
+The paper's manoeuvres give three. With outliers, three do not say which of them is one, so `paper` does not
+claim."""
 
 
-def observe(state: RobotState, observation: Observation) -> RobotState:
-    """Return `state` with the sensor data of one tick, and with the mode that follows from them."""
-    state = exchange.observed(state, observation)
-    return transitions.after_observation(state, observation.anchor_range, MANOEUVRES, _after_range)
+class Paper(LogPlanner):
+    """The algorithm as published. Subclasses may plan another last manoeuvre."""
 
+    MANOEUVRES = Manoeuvres(directions=(1.0,), sides=(1.0,), last_speeds=None, fewest_out_of_range=False)
+    """Forward, to the left in phase 1, and at v_max."""
 
-def decide(state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
-    """Return `state` with the peer's `reports` and with the mode that follows from them.
+    def observe(self, state: RobotState, observation: Observation) -> RobotState:
+        """Return `state` with the sensor data of one tick, and with the mode that follows from them."""
+        state = exchange.observed(state, observation)
+        return transitions.after_observation(
+            state, observation.anchor_range, self.MANOEUVRES, self._after_range
+        )
 
-    Phase 3 begins when both robots are on their orbits.
-    """
-    if reports:
-        state = exchange.with_reports(state, reports)
-    if not state.in_contact:
-        return state
-    match state.mode:
-        case Orbiting() if state.peer_state.phase == 3 or state.peer_state.state == state.mode_name:
-            return transitions.begin_phase3(state)
-        case Standing() | Waiting():
-            return _decide_phase3(state)
-        case _:
+    def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
+        """Return `state` with the peer's `reports` and with the mode that follows from them.
+
+        Phase 3 begins when both robots are on their orbits.
+        """
+        if reports:
+            state = exchange.with_reports(state, reports)
+        if not state.in_contact:
             return state
+        match state.mode:
+            case Orbiting() if state.peer_state.phase == 3 or state.peer_state.state == state.mode_name:
+                return transitions.begin_phase3(state)
+            case Standing() | Waiting():
+                return self._decide_phase3(state)
+            case _:
+                return state
 
+    def rendezvous(self, mission: Mission, distance: float) -> Rendezvous:
+        """Return the orbits of eq. (6)."""
+        return rendezvous(mission, distance, "paper")
 
-def command(state: RobotState) -> Command:
-    """Return the command for the next tick, with the phase, the mode and the verdict."""
-    return exchange.command(state, transitions.controls(state))
+    def command(self, state: RobotState) -> Command:
+        """Return the command for the next tick, with the phase, the mode and the verdict."""
+        return exchange.command(state, transitions.controls(state))
 
+    def required_mutual_ranges(self, mission: Mission) -> int:
+        """Return the minimum number of noisy mutual ranges before a claim."""
+        return CHECKED_WITH_OUTLIERS if mission.noise.outliers else CHECKED
 
-def required_mutual_ranges(mission: Mission) -> int:
-    """Return the minimum number of noisy mutual ranges before a claim.
+    def _after_range(self, state: RobotState) -> RobotState:
+        """Continue phase 1 with the branches +alpha and -alpha that the ranges allow (eq. (2)).
 
-    With outliers, it is that of the `assured` planner, which the paper's manoeuvres do not reach.
-    """
-    return CHECKED_WITH_OUTLIERS if mission.noise.outliers else CHECKED
+        The third range is the last one. It selects the most probable branch, if there is one.
+        """
+        kind, third = transitions.branch_kind(state), isinstance(state.mode, ThirdPoint)
+        found = transitions.anchor_estimate(state)
+        state = replace(state, belief=found.belief)
+        branch = found.best if third or len(found.branches) == 1 else None
+        if kind is not None and branch is not None:
+            return transitions.end_phase1(state, state.estimator.fitted(state, branch), kind)
+        if found.branches and third:
+            return state.undecided("the third range does not distinguish +alpha from -alpha")
+        return transitions.to_third_point(state, found, self.MANOEUVRES)
 
+    def _decide_phase3(self, state: RobotState) -> RobotState:
+        """Evaluate phase 3 after a's second mutual range, and again after b's last manoeuvre.
 
-def _after_range(state: RobotState) -> RobotState:
-    """Continue phase 1 with the branches +alpha and -alpha that the ranges allow (eq. (2)).
-
-    The third range is the last one. It selects the most probable branch, if there is one.
-    """
-    kind, third = transitions.branch_kind(state), isinstance(state.mode, ThirdPoint)
-    found = transitions.anchor_estimate(state)
-    state = replace(state, belief=found.belief)
-    branch = found.best if third or len(found.branches) == 1 else None
-    if kind is not None and branch is not None:
-        return transitions.end_phase1(state, state.estimator.fitted(state, branch), kind)
-    if found.branches and third:
-        return state.undecided("the third range does not distinguish +alpha from -alpha")
-    return transitions.to_third_point(state, found, MANOEUVRES)
-
-
-def _decide_phase3(state: RobotState) -> RobotState:
-    """Evaluate phase 3 after a's second mutual range, and again after b's last manoeuvre.
-
-    The mutual ranges count from the encounter on. Return `state` with a verdict, with b's last manoeuvre, or
-    with the same mode.
-    """
-    evaluated = transitions.with_new_ticks(state)
-    if evaluated is None:
-        return state
-    first_tick, planned = state.belief.encounter_tick, state.plan is not None
-    assert first_tick is not None
-    a_waits = not isinstance(state.mode, Standing) or state.peer_state.state == MODE_NAMES[Waiting]
-    state, found = transitions.pair_estimate(
-        evaluated,
-        first_tick,
-        required_mutual_ranges(state.config.mission),
-        second_range=a_waits or planned,
-    )
-    if found is None or state.verdict is not None or state.config.role == "a":
-        return state
-    if planned:
-        return state.undecided(found.failure)
-    moving = transitions.last_manoeuvre(state, found, MANOEUVRES)
-    return moving if moving is not None else state.undecided("no manoeuvre keeps the safety distance")
+        The mutual ranges count from the encounter on. Return `state` with a verdict, with b's last
+        manoeuvre, or with the same mode.
+        """
+        evaluated = transitions.with_new_ticks(state)
+        if evaluated is None:
+            return state
+        first_tick, planned = state.belief.encounter_tick, state.plan is not None
+        assert first_tick is not None
+        a_waits = not isinstance(state.mode, Standing) or state.peer_state.state == MODE_NAMES[Waiting]
+        state, found = transitions.pair_estimate(
+            evaluated,
+            first_tick,
+            self.required_mutual_ranges(state.config.mission),
+            second_range=a_waits or planned,
+        )
+        if found is None or state.verdict is not None or state.config.role == "a":
+            return state
+        if planned:
+            return state.undecided(found.failure)
+        moving = transitions.last_manoeuvre(state, found, self.last_manoeuvre)
+        return moving if moving is not None else state.undecided("no manoeuvre keeps the safety distance")

@@ -174,24 +174,31 @@ def compared(question: Question, mission: Mission, manoeuvres: Manoeuvres) -> Co
     squared: list[Array] = []
     for candidate in candidates:
         (ax, ay), (bx, by) = _positions_in_b(mover, a, b, candidate, reach.x, reach.y)
-        squared.append(np.square(ax - bx) + np.square(ay - by))
+        dx, dy = np.subtract(ax, bx), np.subtract(ay, by)
+        dx *= dx
+        dy *= dy
+        dx += dy
+        squared.append(dx)
     if len(squared) == 1:
         gap = travelled(b, candidates[0].place(a)) ** 2 - squared[0]
     else:
-        gaps = [np.abs(one - other) for i, one in enumerate(squared) for other in squared[:i]]
-        gap = reduce(np.minimum, gaps)
+        gap = reduce(np.minimum, [_gap(one, other) for i, one in enumerate(squared) for other in squared[:i]])
     value, apart = gap, None
     if mission.safety_distance:
         apart = _keeps_apart(question, reach, mission)
         value = np.where(apart, gap, -np.inf)
     if manoeuvres.fewest_out_of_range:
         rim = (mission.sensing_range - RANGE_MARGIN) ** 2
-        outside = np.zeros(gap.shape, np.int8)
-        for distance in squared:
-            outside += distance > rim
-        fewest = np.min(outside if apart is None else outside[apart], initial=len(squared))
+        outside = reduce(np.add, [(distance > rim).view(np.int8) for distance in squared])
+        fewest = (outside if apart is None else outside[apart]).min(initial=len(squared))
         value = np.where(outside == fewest, value, -np.inf)
     return Compared(reach, gap, value)
+
+
+def _gap(one: Array, other: Array) -> Array:
+    """Return the absolute difference of two squared distances in m^2."""
+    difference = one - other
+    return np.abs(difference, out=difference)
 
 
 def most_informative_manoeuvre(
@@ -261,7 +268,10 @@ def reachable(pose: Pose, mission: Mission, speeds: tuple[float, ...] | None) ->
     """Return the manoeuvres that are compared, from `pose`, at `speeds` in A_0 / T_s (None: at v_max)."""
     speed, omega, half, chords = _arcs(mission, speeds)
     course = pose.heading + half
-    return Reach(speed, omega, pose.x + chords * np.cos(course), pose.y + chords * np.sin(course))
+    x, y = chords * np.cos(course), chords * np.sin(course)
+    x += pose.x
+    y += pose.y
+    return Reach(speed, omega, x, y)
 
 
 @cache

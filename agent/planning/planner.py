@@ -2,55 +2,162 @@
 
 A tick has two halves, because two robots in contact exchange their new measurements before either decides:
 
-    observe(state, observation) -> state    adds the sensor data; `report(state)` is the message to the peer
+    observe(state, observation) -> state    adds the sensor data; `report(state)` is what the peer receives
     decide(state, reports)      -> state    adds the peer's reports; `command(state)` is the motion command
 
 There is no I/O, no clock and no randomness, so simulation, network, replay and recovery make decisions that
-are identical to the bit. A module with these functions is a planner; `registry` selects it, once per robot.
+are identical to the bit. A planner is a subclass of `Planner`. Its instances hold options, and never change.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Generic, TypeVar
+
+import msgspec
 
 from agent.planning.manoeuvres import Manoeuvres
-from agent.planning.state import RobotState
-from protocol.messages import Command, Estimate, Observation, Report, RobotConfig
+from protocol.messages import (
+    BranchKind,
+    Command,
+    Estimate,
+    Observation,
+    Probability,
+    RobotConfig,
+)
 from protocol.mission import Mission
+from protocol.orbits import Rendezvous, rendezvous
+
+S = TypeVar("S")
+"""The type of the state of a planner: a frozen value."""
+B = TypeVar("B")
+"""The type of the body of its reports."""
 
 
-class Planner(Protocol):
-    """The decisions of a robot. The current activity of the robot is one frozen value, `state.mode`."""
+class Summary(msgspec.Struct, frozen=True):
+    """The planner's part of a robot's FinalReport. A field that does not apply is None."""
 
-    @property
-    def MANOEUVRES(self) -> Manoeuvres:  # noqa: N802  # a constant of the module that is the planner
-        """The manoeuvres that the planner compares."""
+    anchor_ranges: int | None = None
+    """The number of anchor ranges that the planner has used; None for all that were measured."""
+    mutual_ranges: int | None = None
+    """The number of mutual ranges that the planner has used; None for all that were measured."""
+    reports_heard: int | None = None
+    """The number of reports that the planner has used; None for all that were received."""
+    branch: BranchKind | None = None
+    """The observation that decided the branch in phase 1."""
+    alpha: float | None = None
+    """The signed angle alpha of eq. (2), in rad."""
+    candidates: tuple[int, int] | None = None
+    """The number of solutions of eq. (7), or of hypotheses: at first and at last."""
+    last_turn_rate: float | None = None
+    """The latest planned omega_2 of eq. (8), in rad/s."""
+    separation_m2: float | None = None
+    """The cost J of eq. (8) for it, in m^2."""
+    hypotheses: int | None = None
+    """The number of remaining hypotheses about the poses of both robots."""
+    probability: Probability | None = None
+    """The probability of the most probable hypothesis."""
+    blocking_reason: str | None = None
+    """The condition that still prevents a claim, for a user."""
+    p_value: Probability | None = None
+    """The smallest p-value of all consistency tests."""
 
-    @property
-    def ACTIVE_SENSING(self) -> bool:  # noqa: N802
-        """True if robots choose each manoeuvre by the information of its next ranges."""
 
-    def start(self, config: RobotConfig) -> RobotState:
+class Planner(Generic[S, B]):
+    """The decisions of a robot. Subclasses define `start`, `observe`, `decide`, `command` and `estimate`.
+
+    All methods are pure: they do not change their arguments or the planner, and return equal values for equal
+    arguments. The keyword arguments of the class are the options of a scenario's `[planner]` table.
+    """
+
+    BODY: Any = type(None)
+    """The type of the body of a report, from which its decoder is made: `messages.Report` (the log that the
+    shipped planners exchange), a msgspec Struct, or another type that msgspec decodes. Default: no body."""
+
+    MANOEUVRES: Manoeuvres | None = None
+    """The manoeuvres that the planner compares, for figures. None: its states are not a `RobotState`, and
+    figures show nothing of them."""
+
+    ACTIVE_SENSING: bool = False
+    """True if robots choose each manoeuvre by the information of its next ranges, for figures."""
+
+    REQUIRED_PLACES: int = 0
+    """The number of different relative placements with a mutual range that a claim from exact ranges needs.
+
+    The audit checks it."""
+
+    # --- decisions ---
+
+    def start(self, config: RobotConfig) -> S:
         """Return the state of a robot that has measured nothing yet."""
+        raise NotImplementedError
 
-    def observe(self, state: RobotState, observation: Observation) -> RobotState:
+    def observe(self, state: S, observation: Observation) -> S:
         """Return `state` with the sensor data of one tick: odometry, anchor range, contact and mutual range.
 
-        The mode is also advanced, as far as it depends on the robot's own sensors.
+        Whatever depends only on the robot's own sensors is also decided.
         """
+        raise NotImplementedError
 
-    def report(self, state: RobotState) -> Report:
-        """Return the report of this tick to the peer."""
+    def report(self, state: S) -> B:
+        """Return the body of the report of this tick to the peer, a BODY. It is sent only in contact.
 
-    def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
-        """Return `state` with the peer's `reports` and with the mode that follows from them."""
+        Its encoding has at most `messages.MAX_BODY_BYTES` bytes.
+        """
+        del state
+        return None  # type: ignore[return-value]  # the default BODY
 
-    def command(self, state: RobotState) -> Command:
+    def decide(self, state: S, reports: Sequence[B] = ()) -> S:
+        """Return `state` with the peer's `reports` of this tick, and with the decisions that follow.
+
+        There may be none, several, and late or repeated ones: the bodies are in the order of their arrival.
+        """
+        raise NotImplementedError
+
+    def command(self, state: S) -> Command:
         """Return the command for the next tick, with the phase, the mode and the verdict."""
+        raise NotImplementedError
 
-    def estimate(self, state: RobotState) -> Estimate:
+    def estimate(self, state: S) -> Estimate:
         """Return all poses that the robot considers possible in its anchor's frame and in <W>."""
+        raise NotImplementedError
+
+    # --- optional ---
+
+    def suited(self, mission: Mission) -> Planner[Any, Any]:
+        """Return the planner that is used with the noise of `mission`: by default, this one."""
+        del mission
+        return self
+
+    def rendezvous(self, mission: Mission, distance: float) -> Rendezvous:
+        """Return the orbits of a pair whose anchors are `distance` m apart, and the bound of their duration.
+
+        They are part of each RobotConfig, and `max_ticks` follows from them. Default: those of `assured`.
+        """
+        return rendezvous(mission, distance, "assured")
+
+    def malformed(self, body: B) -> str | None:
+        """Return why a received `body` is refused, like a damaged one; None if it is not.
+
+        The decoder calls it once it has checked the types of all fields. It depends on the body alone.
+        """
+        del body
+        return None
+
+    def summary(self, state: S) -> Summary:
+        """Return the planner's part of the FinalReport."""
+        del state
+        return Summary()
+
+    def misreport(self, body: B, observations: Sequence[Observation]) -> str | None:
+        """Return how `body` contradicts the robot's own `observations` until then; None if it does not.
+
+        The audit checks reports of honest robots with it.
+        """
+        del body, observations
+        return None
 
     def required_mutual_ranges(self, mission: Mission) -> int:
-        """Return the minimum number of noisy mutual ranges before a claim."""
+        """Return the minimum number of noisy mutual ranges before a claim. The audit checks it."""
+        del mission
+        return 0

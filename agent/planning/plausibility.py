@@ -63,22 +63,30 @@ def _changed_start(before: PeerState, report: Report) -> Inconsistent | None:
 def _exceeded_limit(report: Report, mission: Mission) -> Inconsistent | None:
     """Return a contradiction if a speed exceeds v_max or a turn rate exceeds omega_max."""
     noise = mission.noise
+    scale = noise.priors.wheel_scale
     speed = _largest_measurement(
-        mission.max_speed, noise.actuation.v, noise.odometry.v, noise.standstill_bound[0]
+        mission.max_speed, (noise.actuation.v, noise.odometry.v, scale), noise.standstill_bound[0]
     )
     rate = _largest_measurement(
-        mission.max_turn_rate, noise.actuation.omega, noise.odometry.omega, noise.standstill_bound[1]
+        mission.max_turn_rate,
+        (noise.actuation.omega, noise.odometry.omega, scale),
+        math.hypot(noise.standstill_bound[1], NOISY * noise.priors.gyro_bias),
     )
     for run in report.runs:
-        for name, value, largest in (("v", abs(run.v), speed), ("omega", abs(run.omega), rate)):
-            if value > largest:
-                return Inconsistent(f"{name} = {value:.6g}, limit {largest:.6g}", value - largest)
+        v, omega = abs(run.v), abs(run.omega)
+        if v > speed:
+            return Inconsistent(f"v = {v:.6g}, limit {speed:.6g}", v - speed)
+        if omega > rate:
+            return Inconsistent(f"omega = {omega:.6g}, limit {rate:.6g}", omega - rate)
     return None
 
 
-def _largest_measurement(limit: float, actuation: float, odometry: float, floor: float) -> float:
-    """Return the largest plausible measurement of a speed of at most `limit`, with both kinds of noise."""
-    return limit * (1.0 + SLACK + NOISY * math.hypot(actuation, odometry)) + floor
+def _largest_measurement(limit: float, relative: tuple[float, ...], floor: float) -> float:
+    """Return the largest plausible measurement of a speed of at most `limit`.
+
+    `relative` are the sigmas of the actuation, of the odometry and of its scale, as fractions of the speed.
+    """
+    return limit * (1.0 + SLACK + NOISY * math.hypot(*relative)) + floor
 
 
 def _ranges_off_path(

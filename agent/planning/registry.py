@@ -1,16 +1,28 @@
-"""The planners by name and, for `assured`, by the noise of the mission."""
+"""The planners that are shipped with Tandem, by name. They are classes like those of anybody else."""
 
 from __future__ import annotations
 
-from agent.planning import accuracy_seeking, assured, paper
+from typing import Any
+
+from agent.planning.accuracy_seeking import AccuracySeeking
+from agent.planning.assured import AssuredExact
+from agent.planning.paper import Paper
 from agent.planning.planner import Planner
-from protocol.mission import Mission, PlannerName
+from protocol.mission import Mission
 
 
-def planner(name: PlannerName, mission: Mission) -> Planner:
-    """Return the planner `name` for the noise of `mission`."""
-    match name:
-        case "paper":
-            return paper
-        case "assured":
-            return assured if mission.noise.exact else accuracy_seeking
+class Assured(AssuredExact):
+    """The planner `assured`, of which there are two: for exact and for noisy sensors."""
+
+    def suited(self, mission: Mission) -> Planner[Any, Any]:
+        """Return the planner for the noise of `mission`."""
+        return AssuredExact() if mission.noise.exact else AccuracySeeking()
+
+
+SHIPPED: dict[str, type[Planner[Any, Any]]] = {"assured": Assured, "paper": Paper}
+"""The classes of the shipped planners."""
+
+
+def planner(name: str, mission: Mission) -> Planner[Any, Any]:
+    """Return the shipped planner `name` for the noise of `mission`. Raises KeyError if there is none."""
+    return SHIPPED[name]().suited(mission)

@@ -84,7 +84,7 @@ class RobotState(Knowledge, frozen=True):
     @property
     def orbit(self) -> Orbit:
         """Return the orbit of this robot in phase 2."""
-        return self.config.rendezvous.of(self.config.role)
+        return self.config.orbit
 
     @property
     def phase(self) -> int:
@@ -106,9 +106,10 @@ class RobotState(Knowledge, frozen=True):
     @property
     def mode_name(self) -> str:
         """Return the name of the mode that reports, commands and recordings use."""
-        if not isinstance(self.mode, Done):
-            return MODE_NAMES[type(self.mode)]
-        match self.mode.verdict:
+        mode = self.mode
+        if not isinstance(mode, Done):
+            return MODE_NAMES[type(mode)]
+        match mode.verdict:
             case Localised():
                 return "localised"
             case Inconsistent():
@@ -119,7 +120,8 @@ class RobotState(Knowledge, frozen=True):
     @property
     def verdict(self) -> messages.Verdict | None:
         """Return the verdict, or None if the robot has not reached one."""
-        return self.mode.verdict if isinstance(self.mode, Done) else None
+        mode = self.mode
+        return mode.verdict if isinstance(mode, Done) else None
 
     def undecided(self, reason: str) -> RobotState:
         """Return this state, ended with the verdict Undecided: the robot cannot continue."""

@@ -12,7 +12,14 @@ from agent.planning.active_sensing import Retreating, Surveying
 from agent.planning.manoeuvres import Manoeuvres
 from agent.planning.phase1_anchor import ThirdPoint
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent
-from agent.planning.phase3_last_manoeuvre import LastManoeuvre, Returning, Standing, Waiting
+from agent.planning.phase3_last_manoeuvre import (
+    LastManoeuvre,
+    Plan,
+    Question,
+    Returning,
+    Standing,
+    Waiting,
+)
 from agent.planning.range_seeking import (
     Backing,
     Circling,
@@ -25,7 +32,7 @@ from agent.planning.range_seeking import (
 )
 from agent.planning.state import Asleep, Done, RobotState
 from protocol.messages import BranchKind
-from protocol.mission import SHORTEST_STEP
+from protocol.mission import SHORTEST_STEP, Mission
 from protocol.motion import REST, Controls
 
 # --- the robot's own sensors --------------------------------------------------------------------------
@@ -67,8 +74,8 @@ def after_observation(
 
 def start_phase1(state: RobotState, rho0: float | None) -> RobotState:
     """Start phase 1 with the first anchor range `rho0` in m; None if the anchor was not detected."""
-    if rho0 is None and state.config.mission.noise.drop_outs:
-        return state  # the robot waits for its first range
+    if rho0 is None and state.estimator.corrects_poses:
+        return state  # a range may be missing by chance: the robot waits for its first one
     if rho0 is None:
         return state.undecided("the anchor is out of range at the start")
     known = state.estimator.on_anchor(state, rho0)
@@ -206,8 +213,13 @@ def pair_estimate(
     return replace(state, belief=found.belief, mode=mode), found
 
 
-def last_manoeuvre(state: RobotState, found: PairEstimate, manoeuvres: Manoeuvres) -> RobotState | None:
-    """Return `state` on its last manoeuvre; None if every manoeuvre violates the safety distance."""
+def last_manoeuvre(
+    state: RobotState, found: PairEstimate, planned: Callable[[Question, Mission], Plan | None]
+) -> RobotState | None:
+    """Return `state` on its last manoeuvre; None if every manoeuvre violates the safety distance.
+
+    `planned` returns the manoeuvre that tells several placements apart, or tests one for the first time.
+    """
     mover, mission = state.config.role, state.config.mission
     a, b, placements = found.a, found.b, found.placements
     if found.checked and len(placements) == 1:
@@ -215,7 +227,7 @@ def last_manoeuvre(state: RobotState, found: PairEstimate, manoeuvres: Manoeuvre
             mover, a, b, placements[0], found.observations, mission
         )
     else:
-        plan = phase3_last_manoeuvre.last_manoeuvre(mover, a, b, placements, mission, manoeuvres)
+        plan = planned(Question(mover, a, b, tuple(placements)), mission)
     if plan is None:
         return None
     return replace(state, mode=LastManoeuvre(plan.command, state.odometry), plan=plan)
@@ -235,7 +247,7 @@ def controls(state: RobotState) -> Controls:
     """Return the controls of the current mode."""
     match state.mode:
         case Orbiting(command):
-            return command or state.orbit.controls
+            return command or state.config.orbit.controls
         case Aligning() | Radial() | Tangent():
             return phase2_orbit.controls(
                 state.mode, state.odometry, state.start, state.orbit, state.config.mission

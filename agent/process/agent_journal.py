@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 
 from protocol import motion
-from protocol.journal.journal_file import CorruptJournal, UnexpectedFrame
+from protocol.journal.journal_file import CorruptJournal, UnexpectedFrame, take_all
 from protocol.messages import (
     Command,
     DeadlineMissed,
@@ -19,6 +19,8 @@ from protocol.messages import (
     MissionEnd,
     Observation,
     OfRobot,
+    PeerReport,
+    PlannerReport,
     Report,
     RobotConfig,
 )
@@ -29,7 +31,7 @@ from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 class FramedReport(msgspec.Struct, frozen=True):
     """A report together with the frame in which it was received or is sent."""
 
-    report: Report
+    report: PeerReport
     frame: bytes
 
 
@@ -101,7 +103,9 @@ class AgentHistory(msgspec.Struct, frozen=True):
 class AgentJournalReading:
     """A reader of an agent's journal, frame by frame."""
 
-    def __init__(self) -> None:
+    def __init__(self, shared: dict[bytes, Any] | None = None) -> None:
+        """`shared` are the Reports and Commands that readers of the same recording have decoded, by frame."""
+        self._shared = {} if shared is None else shared
         self.environment: Environment | None = None
         self.config: RobotConfig | None = None
         """The configuration; None until it has been read."""
@@ -120,7 +124,11 @@ class AgentJournalReading:
 
         Raises MalformedFrame, also if the first frame besides the environment is no RobotConfig.
         """
-        message = decode(frame, OfRobot, MAX_FRAME_BYTES)
+        message = self._shared.get(frame)
+        if message is None:
+            message = decode(frame, OfRobot, MAX_FRAME_BYTES)
+            if isinstance(message, PeerReport | Command):
+                self._shared[frame] = message
         if not self._fits(message, frame):
             tick: int | None = getattr(message, "tick", None)
             at = f" of tick {tick}" if tick is not None else ""
@@ -140,7 +148,7 @@ class AgentJournalReading:
                 if not isinstance(message, FinalReport) or self._final_report is not None:
                     return False
                 self._final_report = message
-            case Command() | Estimate() | Report() | DeadlineMissed():
+            case Command() | Estimate() | Report() | PlannerReport() | DeadlineMissed():
                 return bool(self._step) and self._answers(message, frame, self._step)
             case Observation(tick) if tick == len(self._steps) + bool(self._step):
                 if self._step:
@@ -155,12 +163,12 @@ class AgentJournalReading:
         return True
 
     def _answers(
-        self, message: Command | Estimate | Report | DeadlineMissed, frame: bytes, step: dict[str, Any]
+        self, message: Command | Estimate | PeerReport | DeadlineMissed, frame: bytes, step: dict[str, Any]
     ) -> bool:
         """Add `message` to `step`, and return True if it may be next."""
         assert self.config is not None
         is_open = "command" not in step
-        if isinstance(message, Report) and message.robot != self.config.robot:
+        if isinstance(message, PeerReport) and message.robot != self.config.robot:
             if is_open:
                 step["received"] = (*step.get("received", ()), FramedReport(message, frame))
             return is_open
@@ -171,7 +179,7 @@ class AgentJournalReading:
                 step["command"], step["command_frame"] = message, frame
             case Estimate() if not is_open and "estimate" not in step:
                 step["estimate"], step["estimate_frame"] = message, frame
-            case Report() if "report" not in step:
+            case Report() | PlannerReport() if "report" not in step:
                 step["report"] = FramedReport(message, frame)
             case DeadlineMissed() if is_open:
                 step["missed"] = (*step.get("missed", ()), message.robot)
@@ -206,12 +214,9 @@ def agent_history(frames: Iterable[bytes], source: object) -> AgentHistory:
     Raises CorruptJournal, with a text that begins with `source`.
     """
     reading = AgentJournalReading()
-    try:
-        for frame in frames:
-            if not reading.take(frame):
-                break
-    except MalformedFrame as error:
-        raise CorruptJournal(f"{source}: {error}") from None
+    problem = take_all(reading, frames, source)
+    if problem is not None:
+        raise problem
     if reading.unexpected is not None:
         raise CorruptJournal(f"{source}: {reading.unexpected.what}")
     content = reading.content()

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import zenoh
 
-from protocol.messages import RobotConfig
+from protocol.messages import AnyRobotConfig, RobotConfig
 from protocol.network import diagnosis, keys, session
 from protocol.network.diagnosis import FIRST_WORD_S
 from protocol.network.endpoints import Endpoints
@@ -153,7 +153,7 @@ def _offers(link: zenoh.Session, worlds: Sequence[str], robot: str) -> _Offers:
 def _decoded_config(answer: bytes, robot: str) -> RobotConfig | str:
     """Return the RobotConfig of `robot` in the answer of a world, or the reason why there is none."""
     try:
-        config = decode(answer, RobotConfig)
+        config: RobotConfig = decode(answer, AnyRobotConfig)
     except MalformedFrame as error:
         return f"the world's RobotConfig cannot be decoded: {error}"
     if config.robot != robot:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 
 import zenoh
 
@@ -20,6 +21,7 @@ from agent.process.discovery import ASK_AGAIN_S, NoWorld, Search, join
 from agent.process.link import AgentLink, WorldLinkLost
 from agent.process.out_of_step import OutOfStep
 from agent.process.recovery import OWN_REPORTS_KEPT, REPORTS_KEPT, Memory
+from agent.process.report_bodies import malformed
 from agent.process.report_buffer import ReportBuffer
 from protocol.messages import MissionEnd, Observation, RobotConfig
 from protocol.network import session
@@ -81,7 +83,12 @@ class AgentProcess:
         real_time = self._tick_s is not None
         self._link = AgentLink(config, run, inbox)
         self._out_of_step = OutOfStep(self._id, inbox, self._link.appear, real_time=real_time)
-        self._report_buffer = ReportBuffer(inbox, memory.received, real_time=real_time)
+        self._report_buffer = ReportBuffer(
+            inbox,
+            memory.received,
+            partial(malformed, planner=self._robot.planner),
+            real_time=real_time,
+        )
         self._loss_reported = False
         """True once the loss of the world has been reported to the user."""
         self._repeated_at = 0.0

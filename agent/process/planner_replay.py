@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
+from agent.planning.planner import Planner
 from agent.process.agent_journal import AgentHistory, Step
 from agent.process.robot import Robot
 from protocol.journal.journal_file import Sink
@@ -16,9 +18,14 @@ class PlannerReplay:
     of the planner is raised as it is, and `tick` is then the tick in which it occurred.
     """
 
-    def __init__(self, history: AgentHistory, journal: Sink | None = None) -> None:
-        """Prepare the replay of `history`. Everything that the robot recomputes is written to `journal`."""
-        self.robot = Robot(history.config)
+    def __init__(
+        self, history: AgentHistory, planner: Planner[Any, Any], journal: Sink | None = None
+    ) -> None:
+        """Prepare the replay of `history` with `planner`, which its configuration names.
+
+        Everything that the robot recomputes is written to `journal`.
+        """
+        self.robot = Robot(history.config, planner)
         self.robot.append_to(journal)
         self.tick: int | None = None
         """The tick of the current step; None before the first."""

@@ -6,9 +6,12 @@ The planner computes every decision again, and each must equal the recorded one.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
+from typing import Any
 
 import msgspec
 
+from agent.planning.planner import Planner
 from agent.process.agent_journal import FramedReport, agent_history
 from agent.process.planner_replay import PlannerReplay
 from agent.process.robot import Robot
@@ -43,8 +46,10 @@ class Memory(msgspec.Struct, frozen=True):
     """The answer to the MissionEnd."""
 
 
-def remember(recording: Retrace) -> Memory | None:
+def remember(recording: Retrace, planner_of: Callable[[RobotConfig], Planner[Any, Any]]) -> Memory | None:
     """Return the state that follows from `recording`, or None if the journal contains no RobotConfig.
+
+    `planner_of` returns the planner of a configuration.
 
     Raises CorruptJournal if the journal is not that of an agent, or if the recorded decisions differ.
     """
@@ -53,7 +58,7 @@ def remember(recording: Retrace) -> Memory | None:
     journal = agent_history(recording.frames, recording.path)
     head = (journal.environment, journal.config)
     recording.write(*[encode(one) for one in head if one is not None])
-    replay = PlannerReplay(journal, recording)
+    replay = PlannerReplay(journal, planner_of(journal.config), recording)
     robot = replay.robot
     own_reports: deque[FramedReport] = deque(maxlen=OWN_REPORTS_KEPT)
     try:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 
-from agent.peer import peer_state
 from agent.process.agent_journal import FramedReport
 from agent.process.recovery import REPORTS_KEPT
-from protocol.messages import Report
+from protocol.messages import PeerReport
 from protocol.network.inbox import Arrival, Inbox
 from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode
 
@@ -15,8 +14,19 @@ from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode
 class ReportBuffer:
     """The received reports, by tick."""
 
-    def __init__(self, inbox: Inbox, received: Sequence[FramedReport], *, real_time: bool) -> None:
-        """Start with `received`, the reports in the journal of a restarted process."""
+    def __init__(
+        self,
+        inbox: Inbox,
+        received: Sequence[FramedReport],
+        malformed: Callable[[PeerReport], str | None],
+        *,
+        real_time: bool,
+    ) -> None:
+        """Start with `received`, the reports in the journal of a restarted process.
+
+        `malformed` returns why the planner's decoder refuses a report, None if it does not.
+        """
+        self._malformed = malformed
         self._inbox = inbox
         self._real_time = real_time
         self._reports = {framed.report.tick: framed for framed in received}
@@ -28,11 +38,11 @@ class ReportBuffer:
     def take(self, arrival: Arrival, known: int) -> None:
         """Store the report in `arrival`, or refuse it. `known` is the tick of the latest Observation."""
         try:
-            report = decode(arrival.frame, Report, MAX_REPORT_BYTES)
+            report: PeerReport = decode(arrival.frame, PeerReport, MAX_REPORT_BYTES)
         except MalformedFrame as error:
             self._inbox.refuse(arrival, error)
             return
-        wrong = peer_state.contradiction(report)
+        wrong = self._malformed(report)
         if report.robot != arrival.source.robot:
             wrong = f"its sender is given as '{report.robot}'"
         if wrong is not None:

@@ -6,9 +6,11 @@ The agent process over Zenoh and the run in one process use the same `Robot`, so
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
-from agent.planning.registry import planner
+from agent.planning.planner import Planner
 from agent.process.agent_journal import FramedReport
+from agent.process.report_bodies import body_of, report_of
 from protocol.journal import environment
 from protocol.journal.journal_file import Sink
 from protocol.messages import (
@@ -17,7 +19,9 @@ from protocol.messages import (
     FinalReport,
     MissionEnd,
     Observation,
+    Report,
     RobotConfig,
+    Verdict,
 )
 from protocol.wire import encode
 
@@ -25,13 +29,25 @@ from protocol.wire import encode
 class Robot:
     """The state of one robot, and the journal of its inputs and outputs."""
 
-    def __init__(self, config: RobotConfig, journal: Sink | None = None) -> None:
-        self.planner = planner(config.planner_name, config.mission)
-        self.state = self.planner.start(config)
+    def __init__(self, config: RobotConfig, planner: Planner[Any, Any], journal: Sink | None = None) -> None:
+        """`planner` is the one that `config` names, with its options, for the noise of the mission."""
+        self.config = config
+        self.planner = planner
+        self._logs = planner.BODY is Report
+        self.state: Any = planner.start(config)
         self.report: FramedReport | None = None
         """The report of this tick; None if no peer is in contact."""
         self.command: Command | None = None
         """The Command of this tick; None until it is decided."""
+        self.tick = 0
+        """The tick of the latest Observation."""
+        self.anchor_ranges = self.mutual_ranges = 0
+        """The numbers of ranges that were measured."""
+        self.reports_received = 0
+        self._heard: int | None = None
+        """The tick of the peer's latest report; None if none was received."""
+        self._verdict: Verdict | None = None
+        """The verdict in the latest Command."""
         self.reports_sent = 0
         self.damaged = 0
         """The number of reports that were received damaged."""
@@ -67,14 +83,19 @@ class Robot:
 
         `frame` is the encoded Observation, if it was received as one.
         """
+        self.tick = observation.tick
         self.state = self.planner.observe(self.state, observation)
+        self.anchor_ranges += observation.anchor_range is not None
         self.report = self.command = self._command_frame = None
         for contact in observation.contacts:
             self.unheard.add(observation.tick)
             self.unheard.difference_update(contact.heard or (), contact.damaged)
             self.damaged += len(contact.damaged)
+            self.mutual_ranges += contact.range is not None
         if observation.contacts:
-            report = self.planner.report(self.state)
+            report = report_of(
+                self.planner.report(self.state), self.tick, self.config.robot, self._heard, self._verdict
+            )
             self.report = FramedReport(report, encode(report))
             self.reports_sent += 1
             self.bytes_sent += len(self.report.frame)
@@ -89,13 +110,21 @@ class Robot:
 
         `missed` names the peers whose reports did not arrive in time.
         """
-        self.state = self.planner.decide(self.state, [framed.report for framed in received])
+        bodies: Sequence[Any] = ()
         if received:
+            bodies = [framed.report for framed in received]
+            if not self._logs:
+                bodies = [body_of(report, self.planner) for report in bodies]
+        self.state = self.planner.decide(self.state, bodies)
+        if received:
+            self.reports_received += len(received)
+            self._heard = max(self._heard or 0, *[framed.report.tick for framed in received])
             self.unheard.difference_update([framed.report.tick for framed in received])
         self.command = self.planner.command(self.state)
+        self._verdict = self.command.verdict
         if self._journal is not None:
             frames = [framed.frame for framed in received]
-            frames += [encode(DeadlineMissed(self.state.tick, peer)) for peer in missed]
+            frames += [encode(DeadlineMissed(self.tick, peer)) for peer in missed]
             if self._unwritten is not None:
                 frames.insert(0, self._unwritten)
                 self._unwritten = None
@@ -119,23 +148,22 @@ class Robot:
 
         The arguments count the frames that the transport refused and the reports that no Observation listed.
         """
-        state, belief = self.state, self.state.belief
-        plan = state.plan
+        found = self.planner.summary(self.state)
         final_report = FinalReport(
-            robot=state.config.robot,
-            anchor_ranges=len(state.log.ranges),
-            mutual_ranges=len(state.mutual),
-            branch=belief.branch_kind,
-            alpha=belief.branch.alpha if belief.branch is not None else None,
-            candidates=belief.candidates,
-            last_turn_rate=plan.command.omega if plan is not None else None,
-            separation_m2=plan.separation_m2 if plan is not None else None,
-            hypotheses=(len(belief.pair or belief.placements) if belief.candidates is not None else None),
-            probability=belief.pair[0].probability if belief.pair else None,
-            blocking_reason=belief.blocking_reason,
-            p_value=belief.p_value,
+            robot=self.config.robot,
+            anchor_ranges=_first(found.anchor_ranges, self.anchor_ranges),
+            mutual_ranges=_first(found.mutual_ranges, self.mutual_ranges),
+            branch=found.branch,
+            alpha=found.alpha,
+            candidates=found.candidates,
+            last_turn_rate=found.last_turn_rate,
+            separation_m2=found.separation_m2,
+            hypotheses=found.hypotheses,
+            probability=found.probability,
+            blocking_reason=found.blocking_reason,
+            p_value=found.p_value,
             reports_sent=self.reports_sent,
-            reports_heard=state.peer_state.heard,
+            reports_heard=_first(found.reports_heard, self.reports_received),
             reports_refused=reports_refused + self.damaged,
             reports_unheard=reports_unheard,
             reports_lost=len(self.unheard),
@@ -145,3 +173,8 @@ class Robot:
         if self._journal is not None:
             self._journal.write(encode(end), encode(final_report))
         return final_report
+
+
+def _first(stated: int | None, counted: int) -> int:
+    """Return the number that the planner states; if it states none, the one that was counted."""
+    return counted if stated is None else stated

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
-from agent.peer import peer_state
+from agent.planning.planner import Planner
 from agent.process.agent_journal import Step
 from agent.process.planner_replay import PlannerReplay
+from agent.process.report_bodies import body_of
 from agent.process.robot import Robot
-from compose.audit.findings import Checks, Violation, between, difference, quoted
+from compose.audit.findings import Checks, Violation, between, difference
+from compose.launch.planner_loader import planner_of
 from compose.recording.run import Run
-from protocol.messages import FinalReport, Message, MissionEnd, Report
+from protocol.messages import FinalReport, Message, MissionEnd, Observation, PeerReport
 from protocol.mission import Mission
 from protocol.motion import Controls
-from protocol.wire import decode, encode
+from protocol.wire import MalformedFrame, decode, encode
 
 ROUNDING = 1e-12
 """The part of a limit by which rounding may move a quotient of a length and a period beyond it."""
@@ -25,7 +28,7 @@ def decision(run: Run) -> Checks:
     The frames are compared to the bit.
     """
     for robot, agent in run.agents.items():
-        replay = PlannerReplay(agent)
+        replay = PlannerReplay(agent, planner_of(agent.config))
         try:
             for step in replay:
                 yield from _answers(
@@ -107,39 +110,27 @@ def _within(tick: int, robot: str, how: str, controls: Controls, mission: Missio
 
 
 def log(run: Run) -> Checks:
-    """Check that the manoeuvres and ranges in each robot's Reports are those of its own Observations.
+    """Check that each robot's Reports agree with its own Observations, as far as its planner defines it.
 
-    Attackers are skipped. `decision` checks their Reports, because the attack is part of the configuration.
+    In a `Report`, manoeuvres and ranges must be those of the Observations. Attackers are skipped. `decision`
+    checks their Reports, because the attack is part of the configuration.
     """
     for robot, agent in run.agents.items():
         if agent.config.attack is not None:
             continue
-        driven = [step.observation.executed for step in agent.steps]
-        ranged = [step.observation.anchor_range for step in agent.steps]
+        planner = planner_of(agent.config)
+        observations = [step.observation for step in agent.steps]
         for step in agent.steps:
             if step.report is not None:
-                yield _log_violation(step.observation.tick, robot, step.report.report, driven, ranged)
+                tick = step.observation.tick
+                what = _misreport(planner, step.report.report, observations)
+                yield Violation("log", tick, robot, what) if what is not None else None
 
 
-def _log_violation(
-    tick: int,
-    robot: str,
-    report: Report,
-    driven: Sequence[Controls | None],
-    ranged: Sequence[float | None],
-) -> Violation | None:
-    contradiction = peer_state.contradiction(report)
-    if contradiction is not None:
-        return Violation("log", tick, robot, f"it reported {contradiction}")
-    k = report.since
-    for run in report.runs:
-        for _ in range(run.ticks):
-            k += 1
-            if driven[k] != Controls(run.v, run.omega):
-                what = f"it reported ({run.v:g}, {run.omega:g}) until tick {k}, expected {quoted(driven[k])}"
-                return Violation("log", tick, robot, what)
-    for one in report.ranges:
-        if ranged[one.tick] != one.range:
-            what = f"it reported {one.range!r} m at tick {one.tick}, expected {quoted(ranged[one.tick])}"
-            return Violation("log", tick, robot, what)
-    return None
+def _misreport(
+    planner: Planner[Any, Any], report: PeerReport, observations: Sequence[Observation]
+) -> str | None:
+    try:
+        return planner.misreport(body_of(report, planner), observations)
+    except MalformedFrame as error:
+        return f"it reported {error}"

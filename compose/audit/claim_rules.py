@@ -7,17 +7,14 @@ from collections.abc import Sequence
 from msgspec.structs import astuple
 
 from agent.estimation.mutual_ranges import ELSEWHERE
-from agent.planning.registry import planner
 from agent.process.agent_journal import AgentHistory
 from compose.audit.findings import Checks, Violation, between
+from compose.launch.planner_loader import planner_of
 from compose.recording.run import Run
-from protocol.messages import Localised, MissionEnd
+from protocol.messages import Localised, MissionEnd, PeerReport, Report
 from protocol.motion import Pose, travelled
 from world.referee import inaccuracy, mistake
 from world.scenario import RobotSpec
-
-PLACES = 3
-"""The number of relative placements that a claim from exact ranges needs; two leave several solutions."""
 
 
 def claim(run: Run) -> Checks:
@@ -52,18 +49,26 @@ def _first_claim(run: Run, robot: str) -> tuple[int, Localised | None]:
 def _redundant(run: Run, placed: RobotSpec, agent: AgentHistory, tick: int) -> Violation | None:
     """Return a violation if the claim at `tick` is based on too few mutual ranges.
 
-    Ranges count up to the latest tick for which the robot had received the peer's log.
+    How many it needs depends on the planner. Ranges count up to the latest tick for which the robot had
+    received the peer's log, if there are logs.
     """
-    scenario = run.scenario
-    noise = scenario.mission.noise
-    ends = [framed.report.through for step in agent.steps[: tick + 1] for framed in step.received]
-    through = min(max(ends, default=-1), tick)
+    planner, mission = planner_of(agent.config), run.scenario.mission
+    through = tick
+    if planner.BODY is Report:
+        ends = [_through(framed.report) for step in agent.steps[: tick + 1] for framed in step.received]
+        through = min(max(ends, default=-1), tick)
     mutual = _ranged(agent, through)
-    if noise.exact:
-        places = _places(run, placed, mutual)
-        return _too_few(tick, placed, "relative placements with a mutual range", places, PLACES)
-    least = planner(scenario.planner_name, scenario.mission).required_mutual_ranges(scenario.mission)
+    if mission.noise.exact:
+        least = planner.REQUIRED_PLACES
+        places = _places(run, placed, mutual) if least else 0
+        return _too_few(tick, placed, "relative placements with a mutual range", places, least)
+    least = planner.required_mutual_ranges(mission)
     return _too_few(tick, placed, "mutual ranges", len(mutual), least)
+
+
+def _through(report: PeerReport) -> int:
+    """Return the tick up to which a report contains the sender's manoeuvres."""
+    return report.through if isinstance(report, Report) else report.tick
 
 
 def _too_few(tick: int, placed: RobotSpec, what: str, found: int, expected: int) -> Violation | None:

@@ -91,7 +91,7 @@ def _same_command(run: Run, robot: str, agent: AgentHistory, step: Step) -> Viol
         return None
     if sent is None:
         return Violation("order", tick, robot, "the world has a Command from it, expected none: it sent none")
-    if encode(received) == step.command_frame or encode(received) == encode(sent):
+    if received is sent or encode(received) == step.command_frame or encode(received) == encode(sent):
         return None
     what = f"the world's Command from it: {difference(received, sent)}"
     return Violation("order", tick, robot, what, between(received, sent))

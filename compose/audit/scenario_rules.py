@@ -5,19 +5,21 @@ from __future__ import annotations
 import math
 
 from compose.audit.findings import Checks, Violation, difference
+from compose.launch import planner_loader
 from compose.recording.run import Run
 from compose.scenario.scenario_file import NEAREST_ANCHORS
 from protocol.attack import OF_THE_START
+from protocol.messages import RobotConfig
 from protocol.mission import (
     Anchor,
     Mission,
-    PlannerName,
     infeasibility,
     noise_infeasibility,
     safety_infeasibility,
 )
-from protocol.orbits import Rendezvous, rendezvous
-from world.scenario import RobotSpec
+from protocol.orbits import Rendezvous
+from world.scenario import RobotSpec, Scenario
+from world.world_noise import world_noise_infeasibility, world_noise_mistake
 
 
 def scenario(run: Run) -> Checks:
@@ -25,6 +27,7 @@ def scenario(run: Run) -> Checks:
     found = run.scenario
     for why in (noise_infeasibility(found.mission), safety_infeasibility(found.mission)):
         yield _violation(None, why and f"mission.{why}")
+    yield _violation(None, _off_world_noise(found))
     place = {robot.id: place for place, robot in enumerate(found.robots)}
     for robot in found.robots:
         peer = found.robots[place[robot.peer]]
@@ -32,7 +35,7 @@ def scenario(run: Run) -> Checks:
             _off_role(robot, first=place[robot.id] < place[robot.peer]),
             _off_range(robot, found.mission),
             _off_attack(robot),
-            _off_plan(robot.rendezvous, found.mission, found.planner_name, robot.anchor, peer.anchor),
+            _off_plan(robot.rendezvous, found, robot.anchor, peer.anchor),
         ):
             yield _violation(robot.id, why)
 
@@ -44,8 +47,18 @@ def config(run: Run) -> Checks:
     """
     for robot, agent in run.agents.items():
         found = agent.config
-        why = _off_plan(found.rendezvous, found.mission, found.planner_name, found.anchor, found.peer_anchor)
+        why = _off_plan(found.rendezvous, found, found.anchor, found.peer_anchor)
         yield Violation("config", None, robot, why) if why is not None else None
+
+
+def _off_world_noise(found: Scenario) -> str | None:
+    told = found.mission.noise
+    pairs = [(found.robots[i].id, found.robots[j].id) for i, j in found.pairs()]
+    mistake = world_noise_mistake(found.world_noise, told, pairs)
+    if mistake is not None:
+        return f"world.noise.{mistake[0]}: {mistake[1]}"
+    why = world_noise_infeasibility(found.world_noise, told)
+    return why and f"world.noise: {why}"
 
 
 def _off_role(robot: RobotSpec, *, first: bool) -> str | None:
@@ -64,16 +77,15 @@ def _off_attack(robot: RobotSpec) -> str | None:
     return "its attack changes the start, and its part is not all" if early else None
 
 
-def _off_plan(
-    found: Rendezvous, mission: Mission, planner_name: PlannerName, anchor: Anchor, peer: Anchor
-) -> str | None:
-    """Return why `found` are not the orbits for these anchors; None if they are."""
+def _off_plan(found: Rendezvous, given: Scenario | RobotConfig, anchor: Anchor, peer: Anchor) -> str | None:
+    """Return why `found` are not the orbits of the planner for these anchors; None if they are."""
+    mission = given.mission
     distance = math.dist((anchor.x, anchor.y), (peer.x, peer.y))
     if distance < NEAREST_ANCHORS:
         return f"its anchor is {distance:.3g} m from its peer's, expected at least {NEAREST_ANCHORS:g} m"
     if (why := infeasibility(mission, distance)) is not None:
         return f"mission: {why}"
-    expected = rendezvous(mission, distance, planner_name)
+    expected = planner_loader.orbits(given.planner_name, given.planner_options, mission, distance)
     return None if found == expected else f"rendezvous.{difference(found, expected)}"
 
 

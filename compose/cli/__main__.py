@@ -7,5 +7,7 @@ for _number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
 
 from compose.cli.main import main  # noqa: E402  # after the lines above, because it takes time
 
+__all__ = ["main"]
+
 if __name__ == "__main__":
     main()

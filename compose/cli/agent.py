@@ -8,7 +8,7 @@ from agent.process.discovery import NoWorld, Search, Unwelcome
 from agent.process.node import AgentProcess, run_agent
 from agent.process.recovery import Memory, remember
 from agent.process.robot import Robot
-from compose.cli.arguments import add_closing, add_connect_timeout, name
+from compose.cli.arguments import add_closing, add_connect_timeout, add_trusted_planner, name
 from compose.cli.participant import (
     add_launched,
     add_participation,
@@ -18,6 +18,7 @@ from compose.cli.participant import (
     warn_beyond,
 )
 from compose.errors import ENDED, UserError, status_of
+from compose.launch import planner_loader
 from compose.recording.recording_files import agent_journal
 from compose.recording.run import ended
 from compose.scenario import kills
@@ -41,6 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("id", type=name, metavar="ID", help="id of the robot in the scenario")
     add_participation(parser, "the only one that is running")
     add_connect_timeout(parser, "a world")
+    add_trusted_planner(parser)
     add_launched(parser)
     add_closing(parser, "tandem agent a --connect tcp/127.0.0.1:7447 --out recording-a", "docs/network.md")
 
@@ -65,13 +67,21 @@ def _run(options: argparse.Namespace, inbox: Inbox) -> MissionEnd:
     """Run the agent, resumed from its journal if there is one, and return the MissionEnd."""
     endpoints = endpoints_of(options, f"agent-{options.id}", MISSING)
     old = old_journal(options, agent_journal(options.id))
-    memory = remember(old) if old is not None else None
+    for planner in options.planner:
+        planner_loader.trust(planner)
+    memory = remember(old, planner_loader.planner_of) if old is not None else None
     end = memory.end if memory is not None else None
     which = f"world of run '{options.run}'" if options.run else "world"
     wait = options.connect_timeout if end is None else min(options.connect_timeout, ENDED_SEARCH_S)
     timeout = options.timeout if end is None else min(options.timeout, ENDED_TIMEOUT_S)
 
     def start(run: str, config: RobotConfig) -> AgentProcess:
+        name = config.planner_name
+        if not planner_loader.is_shipped(name) and name not in options.planner:
+            raise Unwelcome(
+                f"run '{run}' uses the planner '{name}', which this command does not name; if you trust "
+                f"its code on this machine, add --planner {name}"
+            )
         if memory is not None and old is not None and memory.config != config:
             raise CorruptJournal(
                 f"{old.path}: belongs to another run: its configuration does not match the world's"
@@ -118,6 +128,6 @@ def _ready(
     elif options.out is not None:
         journal = Journal(options.out / agent_journal(options.id), fsync=options.fsync)
     if memory is None:
-        return Memory(config, Robot(config, journal))
+        return Memory(config, Robot(config, planner_loader.planner_of(config), journal))
     memory.robot.append_to(journal)
     return memory

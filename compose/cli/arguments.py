@@ -8,11 +8,15 @@ import re
 from argparse import ArgumentParser, ArgumentTypeError
 from pathlib import Path
 
-from compose.errors import BadKill
+from compose.errors import BadKill, UserError
 from compose.scenario.kills import Kill, parse
 from protocol.units import NAME
 
 ENDPOINT_EXAMPLE = "tcp/127.0.0.1:7447"
+SCENARIO_HELP = "name of a scenario that ships with Tandem, or path of a TOML file"
+SEED_HELP = "seed of all random draws, 0 to 2^63 - 1"
+MOST_SEEDS = 1000
+"""The largest number of seeds of one command; `tandem sweep` runs more."""
 
 # --- shared arguments -------------------------------------------------------------------------------
 
@@ -23,24 +27,46 @@ def add_closing(parser: ArgumentParser, example: str, page: str) -> None:
 
 
 def add_scenario(parser: ArgumentParser) -> None:
-    """Add the scenario, and the flags that change it."""
-    parser.add_argument(
-        "scenario",
-        metavar="SCENARIO",
-        help="name of a scenario that ships with Tandem, or path of a TOML file",
-    )
+    """Add one scenario and its seed, and the flags that change it."""
+    parser.add_argument("scenario", metavar="SCENARIO", help=SCENARIO_HELP)
+    parser.add_argument("--seed", type=natural, metavar="N", help=f"{SEED_HELP} [default: the scenario's]")
+    add_scenario_flags(parser)
+
+
+def add_scenarios(parser: ArgumentParser) -> None:
+    """Add one or several scenarios and seeds, and the flags that change them."""
+    parser.add_argument("scenario", metavar="SCENARIO", nargs="+", help=f"{SCENARIO_HELP}; or several")
     parser.add_argument(
         "--seed",
-        type=natural,
+        type=seeds,
+        default=(None,),
         metavar="N",
-        help="seed of all random draws, 0 to 2^63 - 1 [default: the scenario's]",
+        help=f"{SEED_HELP}; or several, such as 1,5 or 1..20 [default: the scenario's]",
     )
+    add_scenario_flags(parser)
+
+
+def add_scenario_flags(parser: ArgumentParser) -> None:
+    """Add the flags that change a scenario."""
     parser.add_argument(
         "--fault",
         action="append",
         default=[],
         metavar="FAULT",
         help="fault of the radio, such as 'a->b: loss=0.3, delay=0..3' (delay in ticks); may be repeated",
+    )
+    parser.add_argument(
+        "--planner",
+        metavar="NAME",
+        help="planner to use instead of the scenario's: assured, paper, an installed one, or MODULE:CLASS",
+    )
+    parser.add_argument(
+        "--planner-option",
+        type=planner_option,
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="option of a planner of your own; may be repeated",
     )
     parser.add_argument(
         "--rate",
@@ -54,6 +80,20 @@ def add_recording(parser: ArgumentParser) -> None:
     """Add the folder of a finished recording."""
     parser.add_argument(
         "recording", type=folder, metavar="DIR", help="folder of a recording, written with --out DIR"
+    )
+    add_models(parser)
+
+
+def add_models(parser: ArgumentParser) -> None:
+    """Add `--model` of commands that read recordings."""
+    parser.add_argument(
+        "--model",
+        type=model,
+        action="append",
+        default=[],
+        metavar="MODULE:CLASS",
+        help="range or radio model of your own that the recording uses, whose code this command may run; "
+        "may be repeated",
     )
 
 
@@ -93,6 +133,18 @@ def add_connection(parser: ArgumentParser) -> None:
     )
     secured.add_argument(
         "--config", type=folder, metavar="FILE", help="Zenoh configuration file to use instead"
+    )
+
+
+def add_trusted_planner(parser: ArgumentParser) -> None:
+    """Add `--planner` of commands whose planner is named by a world or a recording."""
+    parser.add_argument(
+        "--planner",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="planner of your own whose code this command may run, MODULE:CLASS or an installed one; "
+        "may be repeated [default: only shipped planners]",
     )
 
 
@@ -181,6 +233,32 @@ def folder(text: str) -> Path:
     return Path(text).expanduser()
 
 
+def planner_option(text: str) -> tuple[str, bool | int | float | str]:
+    """Return the name and the value of an option, a number, true, false or text. Raises ArgumentTypeError."""
+    name, equals, value = text.partition("=")
+    if not equals or not name.isidentifier():
+        raise ArgumentTypeError(f"'{text}' is not an option; expected NAME=VALUE")
+    if value in ("true", "false"):
+        return name, value == "true"
+    for number in (int, float):
+        try:
+            return name, number(value)
+        except ValueError:
+            continue
+    return name, value
+
+
+def model(text: str) -> str:
+    """Return the name of a model of the user, once it is loaded. Raises ArgumentTypeError."""
+    from compose.launch import model_loader  # noqa: PLC0415  # rarely needed
+
+    try:
+        model_loader.trust(text)
+    except UserError as error:
+        raise ArgumentTypeError(str(error)) from None
+    return text
+
+
 def positive(text: str) -> float:
     """Return a number above 0 and below 1e9. Raises ArgumentTypeError."""
     try:
@@ -197,6 +275,21 @@ def natural(text: str) -> int:
     if not re.fullmatch(r"[0-9]{1,19}", text) or int(text) >= 2**63:
         raise ArgumentTypeError(f"'{text}' is not a whole number from 0 to 2^63 - 1")
     return int(text)
+
+
+def seeds(text: str) -> tuple[int, ...]:
+    """Return the seeds of a text such as 7, 1,5 or 1..20. Raises ArgumentTypeError."""
+    found: list[int] = []
+    for part in text.split(","):
+        first, dots, last = part.partition("..")
+        low = natural(first)
+        high = natural(last) if dots else low
+        if not 0 <= high - low < MOST_SEEDS:
+            raise ArgumentTypeError(f"'{part}' is not a range of 1 to {MOST_SEEDS} seeds")
+        found += range(low, high + 1)
+    if len({*found}) < len(found) or len(found) > MOST_SEEDS:
+        raise ArgumentTypeError(f"'{text}' has a seed twice, or more than {MOST_SEEDS} seeds")
+    return tuple(found)
 
 
 def cell_and_trial(text: str) -> tuple[int, int]:
@@ -264,6 +357,42 @@ def names(text: str) -> tuple[str, ...]:
     if any(len(one) > 32 for one in found):
         raise ArgumentTypeError(f"'{text}' has a name of more than 32 characters")
     return found
+
+
+def add_part_of_recording(parser: ArgumentParser) -> None:
+    """Add the options for the anchors and the seconds of a range recording."""
+    parser.add_argument(
+        "--anchors",
+        type=folder,
+        metavar="FILE",
+        help="CSV file of anchors to add to the recording, or to move [default: none]",
+    )
+    parser.add_argument(
+        "--window",
+        type=window,
+        metavar="S..S",
+        help="use only these seconds, such as 10..40, from the first odometry on [default: all]",
+    )
+
+
+def window(text: str) -> tuple[float, float]:
+    """Return the first and the last second of a text such as 10..40. Raises ArgumentTypeError."""
+    first, dots, last = text.partition("..")
+    try:
+        begin, end = float(first), float(last)
+    except ValueError:
+        begin, end = 0.0, 0.0
+    if not dots or not 0.0 <= begin < end < 1e9:
+        raise ArgumentTypeError(f"'{text}' is not a window in seconds such as 10..40")
+    return begin, end
+
+
+def confidence(text: str) -> float:
+    """Return a probability from 0.5 to below 1. Raises ArgumentTypeError."""
+    value = positive(text)
+    if not 0.5 <= value < 1.0:
+        raise ArgumentTypeError(f"'{text}' is not a probability from 0.5 to below 1")
+    return value
 
 
 def days(text: str) -> int:

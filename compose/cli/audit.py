@@ -8,8 +8,9 @@ from msgspec.structs import astuple
 
 from compose.audit.findings import Findings, LinkStatistics
 from compose.audit.rules import audit
-from compose.cli.arguments import add_closing, add_recording
+from compose.cli.arguments import add_closing, add_recording, add_trusted_planner
 from compose.errors import CLEAN, VIOLATED
+from compose.launch.planner_loader import trust
 from compose.recording.recording_files import user_errors
 from compose.terminal import text_width
 from protocol.output import say
@@ -21,11 +22,14 @@ SHOWN = 20
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `tandem audit`."""
     add_recording(parser)
+    add_trusted_planner(parser)
     add_closing(parser, "tandem audit recording", "docs/recordings.md")
 
 
 def main(options: argparse.Namespace) -> int:
     """Audit the recording, print the findings, and return VIOLATED if a rule is violated."""
+    for name in options.planner:
+        trust(name)
     with user_errors(options.recording):
         findings = audit(options.recording)
     _show(findings)

@@ -27,6 +27,7 @@ from compose.cli.arguments import add_closing, count
 from compose.errors import LOCALISED
 from compose.extras import need
 from compose.launch import in_process, processes, zenoh_baseline
+from compose.launch.planner_loader import planner_of
 from compose.launch.supervisor import COMMAND, STOP_S, Supervisor
 from compose.launch.viewers import page, viewing
 from compose.network import KEYED
@@ -36,6 +37,7 @@ from compose.scenario import scenario_file
 from compose.sweep.trial_mission import run_in_process
 from compose.terminal.outcome import counting
 from protocol.journal.journal_file import Journal
+from protocol.messages import RobotConfig
 from protocol.network import access_control, session
 from protocol.network.endpoints import Endpoints, configured, listening
 from protocol.network.inbox import Inbox
@@ -70,6 +72,8 @@ max_speed = 1.0
 max_turn_rate = 3.141592653589793
 """
 """The mission of section IV of the paper, as TOML."""
+COMMAND_S = 300.0
+"""The maximum wall time of a whole command (s). The longest takes some seconds on a quiet machine."""
 BARE_IMPORTS = "import zenoh, numpy, scipy.optimize, msgspec"
 """The program whose run time is the baseline of `tandem run`: the imports of Tandem's dependencies."""
 
@@ -296,7 +300,7 @@ def _parts(scenarios: Sequence[Scenario]) -> tuple[float, float, float]:
     sensing = deciding = world = 0.0
     for one in scenarios:
         simulation = Simulation(one)
-        robots = {robot.id: Robot(one.config(robot.id)) for robot in one.robots}
+        robots = {robot.id: _robot(one.config(robot.id)) for robot in one.robots}
         end = None
         while end is None:
             began = time.perf_counter()
@@ -323,6 +327,10 @@ def _parts(scenarios: Sequence[Scenario]) -> tuple[float, float, float]:
     return sensing, deciding, world
 
 
+def _robot(config: RobotConfig) -> Robot:
+    return Robot(config, planner_of(config))
+
+
 # --- starting ---------------------------------------------------------------------------------------
 
 
@@ -344,10 +352,24 @@ def _start(rounds: int, done: Callable[[], None]) -> Table:
 
 
 def _wall(command: Sequence[str]) -> float:
-    """Return the wall time (s) of a command. Raises CalledProcessError if it fails."""
+    """Return the wall time (s) of a command.
+
+    Raises CalledProcessError if it fails, and TimeoutError after COMMAND_S.
+    """
     began = time.perf_counter()
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    _run(command, check=True)
     return time.perf_counter() - began
+
+
+def _run(command: Sequence[str], *, check: bool) -> None:
+    """Run a command without its output, for at most COMMAND_S.
+
+    Raises TimeoutError after that, and with `check` CalledProcessError if the command fails.
+    """
+    try:
+        subprocess.run(command, check=check, stdout=subprocess.DEVNULL, timeout=COMMAND_S)
+    except subprocess.TimeoutExpired:
+        raise TimeoutError(f"{' '.join(command)} has not ended after {COMMAND_S:g} s") from None
 
 
 # --- many robots ------------------------------------------------------------------------------------
@@ -387,10 +409,13 @@ def _pairs(robots: int) -> str:
 
 
 def _used(arguments: Sequence[str]) -> tuple[float, float]:
-    """Return the wall time and the CPU time (s) of a `tandem` command with all its processes."""
+    """Return the wall time and the CPU time (s) of a `tandem` command with all its processes.
+
+    Raises TimeoutError after COMMAND_S.
+    """
     began, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
     command = [sys.executable, "-P", "-m", "compose.cli", *arguments]
-    subprocess.run(command, check=False, stdout=subprocess.DEVNULL)
+    _run(command, check=False)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     return time.perf_counter() - began, cpu

@@ -7,9 +7,12 @@ from pathlib import Path
 
 from compose.cli.arguments import add_closing, add_recording, folder
 from compose.cli.export_bar import MODULES, exported
-from compose.errors import ENDED, FAILED, STOPPED
+from compose.errors import ENDED, FAILED, STOPPED, UserError
 from compose.extras import need
 from compose.launch.signals import stop_by_signal
+from compose.recording.recording_files import cannot_write, make_folder, user_errors
+from compose.recording.run import read
+from protocol import files
 from protocol.network.inbox import Inbox, Interrupted
 from protocol.output import say
 
@@ -23,6 +26,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder for run.mcap, frames.csv and ticks.parquet [default: the recording's]",
     )
+    parser.add_argument(
+        "--pyfg",
+        action="store_true",
+        help="write only run.pyfg: odometry, ranges and true poses as a factor graph for other estimators",
+    )
     add_closing(parser, "tandem export recording --out exported", "docs/recordings.md")
 
 
@@ -31,8 +39,10 @@ def main(options: argparse.Namespace) -> int:
 
     The export then contains only what the other journals hold about that robot.
     """
-    need(*MODULES)
     out: Path = options.out or options.recording
+    if options.pyfg:
+        return _pyfg(options.recording, out)
+    need(*MODULES)
     inbox = Inbox("tandem export")
     stop_by_signal(inbox)
     try:
@@ -47,3 +57,20 @@ def main(options: argparse.Namespace) -> int:
     for name in done.missing:
         say(f"{name} is missing", error=True)
     return FAILED if done.missing else ENDED
+
+
+def _pyfg(recording: Path, out: Path) -> int:
+    """Write run.pyfg to `out`, and print its path and the names that it has for the radios."""
+    from compose.recording.ranging.pyfg import written_pyfg  # noqa: PLC0415  # it needs numpy
+    from compose.recording.ranging.run_ranges import ranges_of_run  # noqa: PLC0415
+
+    with user_errors(recording):
+        graph = written_pyfg(ranges_of_run(read(recording)))
+    make_folder(out)
+    path = out / "run.pyfg"
+    try:
+        files.write(path, graph.text)
+    except OSError as error:
+        raise UserError(cannot_write(out, error)) from None
+    say(str(path), ", ".join([f"{name} is {letter}" for name, letter in graph.names.items()]))
+    return ENDED

@@ -7,10 +7,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from compose.cli.arguments import add_closing, add_recording
+from compose.cli.arguments import add_closing, add_recording, add_trusted_planner
 from compose.errors import ENDED, FAILED, UserError
 from compose.extras import need
 from compose.figures import FORMATS, PICTURES
+from compose.launch.planner_loader import trust
 from compose.recording.recording_files import agent_journal, user_errors
 from compose.recording.run import Run, read
 from compose.terminal.outcome import counting
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `tandem figures`."""
     add_recording(parser)
+    add_trusted_planner(parser)
     parser.add_argument(
         "--only",
         action="append",
@@ -54,6 +56,8 @@ def main(options: argparse.Namespace) -> int:
     need("matplotlib")
     from compose.figures.pair import pair_of  # noqa: PLC0415
 
+    for name in options.planner:
+        trust(name)
     with user_errors(options.recording):
         run = read(options.recording)
     folder, status = options.recording / "figures", ENDED

@@ -48,6 +48,7 @@ COMMANDS = (
     CommandEntry("run", "Run", "Run a mission on this machine."),
     CommandEntry("replay", "Run", "Run a recording again and compare it with the original bit by bit."),
     CommandEntry("scenarios", "Run", "List the scenarios and sweeps that ship with Tandem."),
+    CommandEntry("init", "Run", "Write a scenario, a sweep, a script and a driver to start from."),
     CommandEntry("sweep", "Run", "Run many trials of a scenario, over ranges of its fields."),
     CommandEntry("world", "Deploy", "Run the simulator of a mission; agents connect to it."),
     CommandEntry("agent", "Deploy", "Run the agent of one robot; it connects to a world."),
@@ -55,12 +56,16 @@ COMMANDS = (
     CommandEntry("keys", "Deploy", "Create certificates and access rules for networks without trust."),
     CommandEntry("audit", "Analyse", "Check a recording against the rules of the system."),
     CommandEntry("figures", "Analyse", "Draw the figures of a recording."),
-    CommandEntry("export", "Analyse", "Convert a recording to MCAP, CSV and Parquet."),
+    CommandEntry("export", "Analyse", "Convert a recording to MCAP, CSV, Parquet or a factor graph."),
+    CommandEntry("estimate", "Analyse", "Estimate the poses of robots from recorded odometry and ranges."),
+    CommandEntry("calibrate", "Analyse", "Measure the errors of radios in a recording, as a noise profile."),
     CommandEntry("watch", "Analyse", "Serve a web page that shows recordings or live missions."),
     CommandEntry("doctor", "Check", "Check this machine, its keys and its network before a mission."),
     CommandEntry("ps", "Check", "List the missions on a network and the robots in them."),
     CommandEntry("check-driver", "Check", "Check a driver against its contract; the robot moves."),
+    CommandEntry("check-planner", "Check", "Check a planner of your own against its contract."),
     CommandEntry("bench", "Check", "Measure speed against baselines in the same run."),
+    CommandEntry("completion", "Check", "Print a script with which bash or zsh completes `tandem`."),
 )
 """All commands, in the order of `tandem --help`."""
 

@@ -6,8 +6,9 @@ import argparse
 
 from compose.audit.findings import Violation
 from compose.audit.replay import replay
-from compose.cli.arguments import add_closing, add_recording
+from compose.cli.arguments import add_closing, add_recording, add_trusted_planner
 from compose.errors import CLEAN, VIOLATED
+from compose.launch.planner_loader import trust
 from compose.recording.recording_files import user_errors
 from protocol.output import say
 
@@ -15,11 +16,14 @@ from protocol.output import say
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `tandem replay`."""
     add_recording(parser)
+    add_trusted_planner(parser)
     add_closing(parser, "tandem replay recording", "docs/recordings.md")
 
 
 def main(options: argparse.Namespace) -> int:
     """Replay the recording, print the first difference, and return VIOLATED if there is one."""
+    for name in options.planner:
+        trust(name)
     with user_errors(options.recording):
         replayed, torn = replay(options.recording)
     if replayed.differences:

@@ -13,6 +13,7 @@ from compose.cli.participant import RELISTEN_S, add_participation, participate, 
 from compose.errors import ENDED, status_of
 from compose.hardware.driver_recording import recorded
 from compose.launch.driver_loader import config_of, driver_class, made, mission, options_of
+from compose.launch.planner_loader import is_shipped
 from compose.launch.processes import free_endpoint
 from compose.launch.supervisor import STOP_S, ChildFailed, Supervisor
 from compose.network import reach
@@ -81,7 +82,7 @@ def main(options: argparse.Namespace) -> int:
                 journal=recording.journal,
             )
             recording.take_up(driver, options.driver, field)
-            end = _run(options, field, reached, folder, inbox)
+            end = _run(options, field, config.planner_name, reached, folder, inbox)
         if not options.quiet and isinstance(field.verdict, Localised):
             pose = field.verdict.pose
             say(f"{options.id}: claims {pose.x:.9f} {pose.y:.9f} {wrap(pose.heading):+.9f} (m, m, rad)")
@@ -96,7 +97,12 @@ def main(options: argparse.Namespace) -> int:
 
 
 def _run(
-    options: argparse.Namespace, field: Field, reached: Endpoints, folder: Path, inbox: Inbox
+    options: argparse.Namespace,
+    field: Field,
+    planner_name: str,
+    reached: Endpoints,
+    folder: Path,
+    inbox: Inbox,
 ) -> MissionEnd:
     """Run the mission with an agent process of its own, and return its end."""
     keys = (
@@ -113,6 +119,7 @@ def _run(
             *("agent", options.id, "--connect", own, "--launched", "--run", field.run, *keys),
             *("--out", str(folder.resolve()), "--timeout", str(options.timeout)),
             *(["--fsync"] if options.fsync else []),
+            *([] if is_shipped(planner_name) else ["--planner", planner_name]),
         ]
         children.start(agent, *arguments)
         try:

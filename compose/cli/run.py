@@ -18,18 +18,17 @@ from compose.launch.signals import stop_by_signal
 from compose.launch.viewers import Viewer, foxglove_server, page, stay, viewing
 from compose.recording.recording_files import folder_for
 from compose.recording.run import Run, read
-from compose.scenario.kills import WORLD, Kill
-from compose.scenario.scenario_file import ScenarioTemplate, check_rate, run_name, setting
+from compose.scenario.kills import Kill
+from compose.scenario.scenario_file import check_rate, run_name, setting
 from compose.terminal.outcome import break_off, conclude, shown_live
 from protocol.journal.journal_file import CannotRecord
 from protocol.network.inbox import Inbox, Interrupted
-from protocol.spelling import did_you_mean
 from world.scenario import Scenario
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `tandem run`."""
-    arguments.add_scenario(parser)
+    arguments.add_scenarios(parser)
     arguments.add_running(parser)
     parser.add_argument(
         "--in-process",
@@ -76,10 +75,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(options: argparse.Namespace) -> int:
-    """Run the mission, as processes or in this one, and return the exit status of its outcome."""
+    """Run the mission or missions, as processes or in this one, and return the exit status of the outcome."""
     if not options.in_process:
         supervisor.fork_server()  # it imports modules while this process does
-    found = setting(options.scenario, options.fault)
+    missions = [(source, seed) for source in options.scenario for seed in options.seed]
+    if len(missions) > 1:
+        from compose.cli import several_runs  # noqa: PLC0415  # rarely needed
+
+        return several_runs.run_all(options, missions, run_one)
+    options.scenario, options.seed = missions[0]
+    return run_one(options)
+
+
+def run_one(options: argparse.Namespace) -> int:
+    """Run one mission, whose `scenario` and `seed` are single values, and return its exit status."""
+    found = setting(options.scenario, options.fault, options.planner, options.planner_option)
     scenario = found.seeded(options.seed)
     if options.out is not None and any(options.out.glob("*.journal")):
         raise UserError(f"--out: {options.out} already contains a recording; choose another folder")
@@ -88,7 +98,7 @@ def main(options: argparse.Namespace) -> int:
         need(*export_bar.MODULES)
         if options.out is None:
             raise UserError("--export: it needs --out DIR")
-    kills = _kills(options, found, scenario)
+    kills = found.kills(scenario.seed, options.kill)
     if options.secure:
         need("cryptography", extra="deploy")
     if options.in_process:
@@ -104,18 +114,6 @@ def _check_viewers(options: argparse.Namespace) -> None:
         need("foxglove")
     elif options.foxglove_origin:
         raise UserError("--foxglove-origin: it needs --foxglove")
-
-
-def _kills(options: argparse.Namespace, found: ScenarioTemplate, scenario: Scenario) -> tuple[Kill, ...]:
-    """Return the kills of the file, then those of the command line. Raises UserError."""
-    ids = [robot.id for robot in scenario.robots]
-    for kill in options.kill:
-        if kill.who not in (*ids, WORLD):
-            near = did_you_mean(kill.who, [*ids, WORLD])
-            raise UserError(
-                f"--kill: {kill.text}: there is no '{kill.who}'; there are {', '.join(ids)}, {WORLD}{near}"
-            )
-    return (*found.kills(scenario.seed), *options.kill)
 
 
 def _in_process(options: argparse.Namespace, scenario: Scenario, kills: tuple[Kill, ...]) -> int:

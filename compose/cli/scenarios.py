@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import re
 from collections.abc import Mapping
 from itertools import takewhile
@@ -10,18 +11,32 @@ from pathlib import Path
 
 from compose.cli.arguments import add_closing
 from compose.errors import ENDED
-from compose.scenario.scenario_file import shipped
+from compose.scenario.scenario_file import ScenarioFile, shipped
 from compose.terminal import text_width
 from protocol.output import say
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `tandem scenarios`, which takes none."""
+    """Add the arguments of `tandem scenarios`."""
+    parser.add_argument(
+        "--schema",
+        nargs="?",
+        const="scenario",
+        choices=("scenario", "sweep"),
+        help="print the JSON Schema of scenario or sweep files instead, for editors [default: scenario]",
+    )
     add_closing(parser, "tandem scenarios", "docs/scenarios.md")
 
 
-def main(_options: argparse.Namespace) -> int:
-    """List the scenarios and the sweeps that ship, with the first sentence of each."""
+def main(options: argparse.Namespace) -> int:
+    """List the scenarios and the sweeps that ship, with the first sentence of each; or print a schema."""
+    if options.schema is not None:
+        from compose.scenario.json_schema import json_schema  # noqa: PLC0415  # rarely needed
+        from compose.sweep.spec import SpecFile  # noqa: PLC0415
+
+        schema = json_schema(ScenarioFile if options.schema == "scenario" else SpecFile)
+        say(*json.dumps(schema, indent=2).splitlines())
+        return ENDED
     _list(shipped())
     say("sweeps, for `tandem sweep`:")
     _list(shipped("sweep"))

@@ -7,13 +7,27 @@ from compose.launch import in_process
 from compose.scenario.scenario_file import load
 from protocol import wire
 from protocol.journal import environment
-from protocol.messages import Command, FinalReport, MissionEnd, Observation, Report, RobotConfig
-from world.scenario import Scenario
+from protocol.messages import (
+    AnyRobotConfig,
+    Command,
+    FinalReport,
+    MissionEnd,
+    Observation,
+    PeerReport,
+)
+from world.scenario import RecordedScenario
 
 MISSION = "paper-1"
 FORKED = ("world", "agent")
 """The commands that forked processes run."""
-RECEIVED = (RobotConfig, Scenario, Observation | MissionEnd, Report, Command, Command | FinalReport)
+RECEIVED = (
+    AnyRobotConfig,
+    RecordedScenario,
+    Observation | MissionEnd,
+    PeerReport,
+    Command,
+    Command | FinalReport,
+)
 """The types that worlds and agents decode."""
 
 

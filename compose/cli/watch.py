@@ -10,7 +10,15 @@ import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from compose.cli.arguments import add_closing, add_connection, add_launched, add_port, address, folder
+from compose.cli.arguments import (
+    add_closing,
+    add_connection,
+    add_launched,
+    add_models,
+    add_port,
+    address,
+    folder,
+)
 from compose.errors import ENDED, UserError
 from compose.extras import need
 from compose.launch.viewers import OVER
@@ -32,6 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder of a recording, of several recordings, or of a sweep [default: live missions]",
     )
+    add_models(parser)
     add_connection(parser)
     parser.add_argument(
         "--address",

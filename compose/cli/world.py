@@ -71,7 +71,7 @@ def _scenario(options: argparse.Namespace) -> Scenario:
     """Return the scenario of the launcher or of the command line. Raises UserError."""
     if options.launched:
         return scenario_from_launcher()
-    found = setting(options.scenario, options.fault)
+    found = setting(options.scenario, options.fault, options.planner, options.planner_option)
     if found.file.kill:
         raise UserError(
             f"{options.scenario}: kill: `tandem world` does not restart processes; use `tandem run`"

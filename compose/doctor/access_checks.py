@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import zenoh
 
 from compose.doctor.finding import Finding, fix, ok, untried
-from protocol.messages import Observation, RobotConfig
+from protocol.messages import AnyRobotConfig, Observation, RobotConfig
 from protocol.network import access_control, keys, session
 from protocol.network.endpoints import Endpoints
 from protocol.wire import MalformedFrame, decode
@@ -185,10 +185,13 @@ def _reading(pair: SessionPair, run: str, robot: str, wait: float) -> Iterator[F
 def _peer(link: zenoh.Session, run: str, robot: str) -> str | None:
     """Return the peer of `robot`, from its configuration; None if the world does not answer with one."""
     answer = session.ask(link, keys.config(run, robot), ASK_S)
+    if not isinstance(answer, bytes):
+        return None
     try:
-        return decode(answer, RobotConfig).peer if isinstance(answer, bytes) else None
+        config: RobotConfig = decode(answer, AnyRobotConfig)
     except MalformedFrame:
         return None
+    return config.peer
 
 
 def _under(key: str, subscriber: Any) -> zenoh.Sample | None:

@@ -14,7 +14,15 @@ from typing import Any
 import msgspec
 import zenoh
 
-from protocol.messages import Command, FinalReport, MissionEnd, Observation, Outcome, Phase, RobotConfig
+from protocol.messages import (
+    AnyRobotConfig,
+    Command,
+    FinalReport,
+    MissionEnd,
+    Observation,
+    Outcome,
+    Phase,
+)
 from protocol.network import keys, session
 from protocol.network.keys import Key
 from protocol.wire import MalformedFrame, decode, version_of
@@ -154,7 +162,7 @@ def _mission(link: zenoh.Session, latest: _LatestFrames, run: str, alive: frozen
     ]
     answers = _configs(link, run, latest.named(run, keys.observation) | alive - {""}) if "" in alive else {}
     frames += answers.values()
-    configs = [one for frame in answers.values() if (one := _decoded(frame, RobotConfig)) is not None]
+    configs = [one for frame in answers.values() if (one := _decoded(frame, AnyRobotConfig)) is not None]
     named = alive - {""} | latest.named(run, keys.observation) | latest.named(run, keys.command)
     named |= {one.peer for one in configs}
     messages = [
@@ -192,11 +200,14 @@ def _configs(link: zenoh.Session, run: str, robots: set[str]) -> dict[str, bytes
     for robot in sorted(robots):
         if robot not in paired and time.monotonic() < until:
             answer = session.ask(
-                link, keys.config(run, robot), ASK_S, lambda frame: _decoded(frame, RobotConfig) is not None
+                link,
+                keys.config(run, robot),
+                ASK_S,
+                lambda frame: _decoded(frame, AnyRobotConfig) is not None,
             )
             if isinstance(answer, bytes):
                 found[robot] = answer
-                config = _decoded(answer, RobotConfig)
+                config = _decoded(answer, AnyRobotConfig)
                 paired |= {config.peer} if config is not None else set()
     return found
 

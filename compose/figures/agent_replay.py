@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import msgspec
 
+from agent.planning.planner import Planner
 from agent.planning.state import RobotState
 from agent.process.agent_journal import AgentHistory
 from agent.process.planner_replay import PlannerReplay
+from compose.errors import UserError
+from compose.launch.planner_loader import planner_of
 from compose.recording.run import Run
 from protocol.messages import Estimate
 
@@ -20,6 +25,8 @@ class AgentReplay(msgspec.Struct, frozen=True):
     """The state after each tick in which the robot decided, starting at tick 0."""
     broken: str | None = None
     """The reason why `states` ends before the recording does; None if it does not."""
+    planner: Planner[Any, Any] | None = None
+    """The planner; None if its states cannot be drawn or its code has not been loaded."""
 
     @property
     def estimates(self) -> tuple[Estimate, ...]:
@@ -34,12 +41,18 @@ def agent_replay(run: Run, robot: str) -> AgentReplay:
     another robot or run.
     """
     history = run.agent(robot)
-    return _recomputed(history) if history is not None else AgentReplay(None)
+    if history is None:
+        return AgentReplay(None)
+    try:
+        planner = planner_of(history.config)
+    except UserError:
+        return AgentReplay(history)
+    return _recomputed(history, planner) if planner.MANOEUVRES is not None else AgentReplay(history)
 
 
-def _recomputed(history: AgentHistory) -> AgentReplay:
+def _recomputed(history: AgentHistory, planner: Planner[Any, Any]) -> AgentReplay:
     """Return the replay of `history`, which ends at the first decision that differs from the recording."""
-    again = PlannerReplay(history)
+    again = PlannerReplay(history, planner)
     states: list[RobotState] = []
     try:
         for step in again:
@@ -47,9 +60,9 @@ def _recomputed(history: AgentHistory) -> AgentReplay:
                 break
             if again.robot.command_frame != step.command_frame:
                 why = f"the recorded decision at tick {again.tick} differs: another version wrote the journal"
-                return AgentReplay(history, tuple(states), why)
+                return AgentReplay(history, tuple(states), why, planner)
             states.append(again.robot.state)
     except Exception as error:  # noqa: BLE001  # recorded inputs may raise any error in the planner
         why = f"the planner fails on its inputs of tick {again.tick}: {type(error).__name__}: {error}"
-        return AgentReplay(history, tuple(states), why)
-    return AgentReplay(history, tuple(states))
+        return AgentReplay(history, tuple(states), why, planner)
+    return AgentReplay(history, tuple(states), planner=planner)

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 
 from matplotlib.figure import Figure
 
-from agent.planning.registry import planner
 from compose.figures import decisions, manoeuvre, one_robot, over_time, phase_one, steps, trajectory
 from compose.figures.pair import PairRecord
 from compose.figures.sheet import Absent
@@ -29,16 +28,23 @@ def _trajectory(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
 
 def _phase_one(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
     for role in pair.readable:
-        yield f"phase-1-{pair.robot(role).id}", phase_one.draw(pair, role, medium)
+        name = f"phase-1-{pair.robot(role).id}"
+        yield name, phase_one.draw(pair, role, medium) if pair.planner is not None else _foreign(pair)
 
 
 def _plan(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
     """Yield the planned manoeuvres; with active sensing, the hypotheses at its decisions."""
-    if pair.readable and planner(pair.planner_name, pair.mission).ACTIVE_SENSING:
+    if pair.readable and pair.planner is None:
+        yield f"plan-{pair.name}", _foreign(pair)
+    elif pair.planner is not None and pair.planner.ACTIVE_SENSING:
         yield f"plan-{pair.name}", decisions.draw(pair, medium)
     elif pair.readable:
         for name, figure in manoeuvre.draw(pair, medium).items():
             yield f"plan-{name}", figure
+
+
+def _foreign(pair: PairRecord) -> Absent:
+    return Absent(f"the states of the planner {pair.planner_name} cannot be drawn")
 
 
 def _encounter(pair: PairRecord, medium: Medium) -> Iterator[Picture]:

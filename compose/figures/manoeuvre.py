@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 
 from agent.estimation.closed_forms import Placement
 from agent.planning.phase3_last_manoeuvre import Array, Compared, LastManoeuvre, Plan, compared
-from agent.planning.registry import planner
 from compose.figures.pair import ROLES, PairRecord
 from compose.figures.sheet import (
     ANCHORS,
@@ -110,7 +109,9 @@ def _inverse(placement: Placement) -> Pose:
 
 def _figure(pair: PairRecord, one: Planned, medium: Medium) -> Figure:
     seen, plan, mission = scene(one.plan), one.plan, pair.mission
-    ways = compared(plan.question, mission, planner(pair.planner_name, mission).MANOEUVRES)
+    assert pair.planner is not None
+    assert pair.planner.MANOEUVRES is not None
+    ways = compared(plan.question, mission, pair.planner.MANOEUVRES)
     sheet = Sheet(medium, False, [pair.title, _title(pair, one)])
     axes, value = sheet.panel(), sheet.panel()
     half = AROUND * max(

@@ -6,10 +6,12 @@ import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from itertools import groupby
+from typing import Any
 
 import msgspec
 from msgspec.structs import replace
 
+from agent.planning.planner import Planner
 from agent.planning.state import RobotState
 from compose.figures.agent_replay import AgentReplay
 from compose.recording.claim import Claim
@@ -139,6 +141,12 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
         if not robots:
             return None
         return f"the journal of {' and '.join(robots)} is missing or cannot be replayed to its end"
+
+    @property
+    def planner(self) -> Planner[Any, Any] | None:
+        """The planner of a robot whose states are known; None if no figure can show them."""
+        replays = [side.replay for side in (self.a, self.b) if side.replay is not None]
+        return next((replay.planner for replay in replays if replay.planner is not None), None)
 
     @property
     def readable(self) -> list[Role]:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Callable, Mapping
-from importlib import import_module
 
 from compose.errors import UserError
+from compose.launch.class_loader import named
 from compose.scenario.scenario_file import setting
 from protocol.messages import RobotConfig
 from protocol.spelling import did_you_mean
@@ -24,19 +22,7 @@ Maker = Callable[..., Driver]
 
 def driver_class(name: str) -> Maker:
     """Return the class named `name`; modules are searched in the working directory too. Raises UserError."""
-    module, _, cls = name.partition(":")
-    if not module or not cls.isidentifier():
-        raise UserError(f"'{name}' is not a driver; expected MODULE:CLASS")
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # last, because it may contain a folder named world
-    try:
-        found = getattr(import_module(module), cls)
-    except ModuleNotFoundError as error:
-        raise UserError(f"{name}: there is no module '{error.name}'") from None
-    except AttributeError:
-        raise UserError(f"{name}: there is no '{cls}' in {module}") from None
-    except Exception as error:  # noqa: BLE001  # the user's code may raise anything
-        raise UserError(f"{name}: {module} cannot be imported: {type(error).__name__}: {error}") from None
+    found = named(name, "a driver")
     missing = [method for method in METHODS if not callable(getattr(found, method, None))]
     if not callable(found) or missing:
         raise UserError(f"{name}: is not a driver: it has no {', '.join(missing) or 'constructor'}")

@@ -1,9 +1,9 @@
-"""The process that a launcher's processes are forked from: `python -P -m compose.launch.fork_server WARM_UP`.
+"""The process that a launcher's processes are forked from.
 
-It calls WARM_UP (module:function), which imports what the processes need. It opens no session and starts no
-thread. Its standard input is a socket to the launcher (`compose/launch/forked.py`). The launcher sends
-requests for processes and signals on it, and receives the exit status of each process. The server ends when
-the launcher does, and no process outlasts the server.
+Its first argument is WARM_UP, a module:function. It calls WARM_UP, which imports what the processes need. It
+opens no session and starts no thread. Its standard input is a socket to the launcher
+(`compose/launch/forked.py`). The launcher sends requests for processes and signals on it, and receives the
+exit status of each process. The server ends when the launcher does, and no process outlasts the server.
 """
 
 from __future__ import annotations
@@ -146,7 +146,3 @@ def main() -> None:
         server.linger()
         os._exit(0)
     _call(start.main)
-
-
-if __name__ == "__main__":
-    main()

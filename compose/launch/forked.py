@@ -75,9 +75,11 @@ class ForkServer:
         """Start the server; it first calls `warm_up`, a module:function."""
         self._socket, its = socket.socketpair(type=socket.SOCK_SEQPACKET)
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the server
-        # -P: the working directory may contain a folder named world or agent
+        # like `multiprocessing`, so that its modules are the launcher's: another folder may have a `world`
+        path = [folder or os.getcwd() for folder in sys.path]
+        code = f"import sys; sys.path[:] = {path!a}; from compose.launch.fork_server import main; main()"
         self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "compose.launch.fork_server", warm_up],
+            [sys.executable, "-P", "-c", code, warm_up],
             stdin=its.fileno(),
             stdout=subprocess.DEVNULL,
             stderr=self._errors.fileno(),

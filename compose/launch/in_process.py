@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
+from agent.planning.planner import Planner
 from agent.process.agent_journal import FramedReport
 from agent.process.robot import Robot
+from compose.launch.planner_loader import planner_of
 from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
 from compose.recording.run import Run
 from protocol.journal import environment
 from protocol.journal.journal_file import Journal, Sink
-from protocol.messages import Command, FinalReport, MissionEnd
+from protocol.messages import (
+    Command,
+    Estimate,
+    FinalReport,
+    Localised,
+    MissionEnd,
+    RobotConfig,
+)
 from world.faults import LATEST
 from world.referee import MissionOutcome
 from world.scenario import Scenario
@@ -38,13 +48,25 @@ def journals(scenario: Scenario) -> list[str]:
     return [*[agent_journal(robot.id) for robot in scenario.robots], WORLD_JOURNAL]
 
 
-def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Run:
-    """Run `scenario`, and write its journals to `sinks`, by file name; without sinks, write none."""
+def played(
+    scenario: Scenario,
+    sinks: Mapping[str, Sink],
+    planner_of: Callable[[RobotConfig], Planner[Any, Any]] = planner_of,
+) -> Run:
+    """Run `scenario`, and write its journals to `sinks`, by file name; without sinks, write none.
+
+    `planner_of` returns the planner of a robot.
+    """
     ids = [robot.id for robot in scenario.robots]
     simulation = Simulation(scenario, sinks.get(WORLD_JOURNAL))
-    robots = {robot: Robot(scenario.config(robot), sinks.get(agent_journal(robot))) for robot in ids}
+    configs = {robot: scenario.config(robot) for robot in ids}
+    robots = {
+        robot: Robot(config, planner_of(config), sinks.get(agent_journal(robot)))
+        for robot, config in configs.items()
+    }
     ticks: list[Tick] = []
     end: MissionEnd | None = None
+    claims: dict[str, Estimate] = {}
     sent: dict[tuple[str, int], FramedReport] = {}
     while end is None:
         observations = simulation.observations()
@@ -54,13 +76,19 @@ def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Run:
                 sent[observation.robot, observation.tick] = report
         commands: dict[str, Command] = {}
         for observation in observations:
-            received = [
-                sent[contact.peer, tick] for contact in observation.contacts for tick in contact.heard or ()
-            ]
-            agent = robots[observation.robot]
+            agent, received = robots[observation.robot], []
+            for contact in observation.contacts:
+                received += [sent[contact.peer, tick] for tick in contact.heard or ()]
             commands[observation.robot] = agent.decide(received)
-            if agent.journaled:
+            if sinks:
                 agent.estimate()
+            verdict = commands[observation.robot].verdict
+            if (
+                isinstance(verdict, Localised)
+                and verdict.covariance is not None
+                and observation.robot not in claims
+            ):
+                claims[observation.robot] = agent.planner.estimate(agent.state)
         if sent:
             for robot in ids:  # it can no longer be received
                 sent.pop((robot, simulation.tick - LATEST), None)
@@ -72,4 +100,4 @@ def played(scenario: Scenario, sinks: Mapping[str, Sink]) -> Run:
     history = WorldHistory(
         scenario, tuple(ticks), None, mission_outcome, end, final_reports, environment=environment.of_world()
     )
-    return Run(history)
+    return Run(history, claim_estimates=claims)

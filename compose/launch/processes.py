@@ -11,12 +11,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from compose.errors import ENDED
+from compose.launch.model_loader import trust_all
+from compose.launch.planner_loader import is_shipped
 from compose.launch.supervisor import ChildFailed, Supervisor
 from compose.scenario.kills import WORLD, Kill, taken
 from protocol import limits
 from protocol.network.inbox import Inbox
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
-from world.scenario import Scenario
+from world.scenario import RecordedScenario, Scenario
 
 FOLLOW_S = 2.0
 """Time in s that the agents have to end after the world has ended."""
@@ -62,7 +64,9 @@ def free_endpoint(protocol: str = "tcp") -> str:
 def scenario_from_launcher() -> Scenario:
     """Return the scenario that the launcher sent to the standard input of this child process."""
     size = int.from_bytes(sys.stdin.buffer.read(4), "big")
-    return decode(sys.stdin.buffer.read(size), Scenario, MAX_FRAME_BYTES)
+    scenario: Scenario = decode(sys.stdin.buffer.read(size), RecordedScenario, MAX_FRAME_BYTES)
+    trust_all(scenario)
+    return scenario
 
 
 def run_mission(
@@ -127,6 +131,7 @@ def _arguments(
             *keyed(f"agent-{robot.id}"),
             *shared,
             *(journal if agents_journal else []),
+            *([] if is_shipped(scenario.planner_name) else ["--planner", scenario.planner_name]),
             *wait,
         ]
         for robot in scenario.robots

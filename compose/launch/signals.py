@@ -5,8 +5,13 @@ from __future__ import annotations
 import os
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 
 from protocol.network.inbox import Inbox
+
+STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""The signals that stop a command."""
 
 
 def stop_with_launcher(inbox: Inbox) -> None:
@@ -20,15 +25,43 @@ def stop_with_launcher(inbox: Inbox) -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
+def end_by_signal() -> None:
+    """Let SIGINT, SIGTERM and SIGHUP end the process at once and without output, until `stop_by_signal`."""
+    for number in STOPPING:
+        signal.signal(number, signal.SIG_DFL)
+
+
 def stop_by_signal(inbox: Inbox) -> None:
     """Put "stop" into `inbox` on SIGINT, SIGTERM and SIGHUP, from now until the process ends.
 
-    Before this call, such a signal ends the process at once and without output. The handlers are never
-    removed, so that a signal cannot interrupt the output and the files at the end of a run.
+    Before this call, such a signal ends the process at once and without output. The handlers are not
+    removed after a run, so that a signal cannot interrupt the output and the files at the end of a run.
     """
 
     def hand_over(number: int, _frame: object) -> None:
         inbox.put("stop", signal.Signals(number).name)
 
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    for number in STOPPING:
         signal.signal(number, hand_over)
+
+
+@contextmanager
+def until_signal() -> Iterator[list[str]]:
+    """Let the first of SIGINT, SIGTERM and SIGHUP end the block; its name is then in the list.
+
+    The signals after it are ignored, so that they cannot interrupt the output at the end.
+    """
+    names: list[str] = []
+
+    def interrupt(number: int, _frame: object) -> None:
+        for one in STOPPING:
+            signal.signal(one, signal.SIG_IGN)
+        names.append(signal.Signals(number).name)
+        raise KeyboardInterrupt
+
+    for number in STOPPING:
+        signal.signal(number, interrupt)
+    with suppress(KeyboardInterrupt):
+        yield names
+    for number in STOPPING:
+        signal.signal(number, signal.SIG_IGN)

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import msgspec
 
-from protocol.messages import Localised
+from protocol.messages import Estimate, Localised
+from protocol.mission import HEADING_ACCURACY
 from protocol.motion import Covariance, Pose, wrap
 from protocol.rounding import TOLERANCE
 from world.referee import errors
 
 DEGREES_OF_FREEDOM = 3
 """The degrees of freedom of a pose, which is the mean NEES if the covariances are true."""
+HELD_WITHIN = 3.0
+"""The factor of the required accuracies of position and heading within which a hypothesis is the true one."""
+HELD_SIGMAS = 6.0
+"""The Mahalanobis distance within which the claimed hypothesis is the true one."""
 
 
 class Claim(msgspec.Struct, frozen=True):
@@ -35,6 +40,25 @@ def claim(tick: int, verdict: Localised, truth: Pose) -> Claim:
     position, heading = errors(verdict.pose, truth)
     squared = nees(verdict.pose, truth, verdict.covariance) if verdict.covariance is not None else None
     return Claim(tick, verdict.pose, verdict.covariance, position, heading, squared)
+
+
+def truth_held(estimate: Estimate, truth: Pose, accuracy: float) -> bool | None:
+    """Return whether the true pose `truth` is among the hypotheses of `estimate`; None with exact sensors.
+
+    It is, if a pose differs by at most 3 x `accuracy` in m and 3 x HEADING_ACCURACY in rad. The first pose,
+    whose covariance is known, may also differ by up to 6 sigmas.
+    """
+    if not estimate.probabilities or not estimate.world:
+        return None
+    if estimate.covariance is not None and (
+        nees(estimate.world[0], truth, estimate.covariance) <= HELD_SIGMAS**2
+    ):
+        return True
+    for pose in estimate.world:
+        position, heading = errors(pose, truth)
+        if position <= HELD_WITHIN * accuracy and heading <= HELD_WITHIN * HEADING_ACCURACY:
+            return True
+    return False
 
 
 def matrix(covariance: Covariance) -> list[list[float]]:

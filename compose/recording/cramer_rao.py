@@ -22,11 +22,17 @@ from world.sensors import anchor_ranges, mutual_ranges
 def position_bounds(run: Run, pair: tuple[int, int], tick: int) -> tuple[float, float] | None:
     """Return the square root in m of the trace of the bound on each robot's position at `tick`.
 
-    The result is None if sensors are exact, or if ranges can be outliers, whose noise is not Gaussian.
+    The result is None if sensors are exact, or if their noise is not white and Gaussian: with outliers, and
+    with anything of `[world.noise]` that robots cannot assume.
     """
     scenario = run.scenario
-    noise = scenario.mission.noise
-    if noise.exact or noise.outliers or noise.anchor_sigma == noise.mutual_sigma == 0.0:
+    noise = scenario.sensors.noise
+    if (
+        not scenario.sensors.shared
+        or noise.exact
+        or noise.outliers
+        or noise.anchor_sigma == noise.mutual_sigma == 0.0
+    ):
         return None
     ticks = run.ticks[: tick + 1]
     anchors = [scenario.robots[place].anchor for place in pair]
@@ -49,7 +55,8 @@ def position_bounds(run: Run, pair: tuple[int, int], tick: int) -> tuple[float, 
         dx, dy = anchor.x - start.x, anchor.y - start.y
         guess += [c * dx + s * dy, c * dy - s * dx, start.heading]
     apart = (anchors[1].x - anchors[0].x, anchors[1].y - anchors[0].y)
-    at_truth = fit(np.array(guess), tracks, Ranges.of_lists(own[0], own[1], mutual, noise), noise, apart, 0)
+    exact = Ranges.of_lists(own[0], own[1], mutual, noise)
+    at_truth = fit(np.array(guess), tracks, exact, noise.as_told, apart, 0)
     covariance = poses(at_truth, apart)[1]
     a, b = (deviation(covariance[i, i] + covariance[i + 1, i + 1]) for i in (0, 3))
     return a, b

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 import msgspec
+from msgspec.structs import astuple
 
 from compose.recording.run import Run
 from protocol.journal.journal_file import CorruptJournal
@@ -15,17 +16,18 @@ from protocol.messages import (
     Environment,
     Estimate,
     FinalReport,
+    Localised,
     Message,
     MissionEnd,
     Observation,
     OfRobot,
 )
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, body, decode
-from world.scenario import Scenario
+from world.scenario import RecordedScenario
 
-OfWorld = Environment | Scenario | Command | DeadlineMissed | MissionEnd | FinalReport
+OfWorld = Environment | RecordedScenario | Command | DeadlineMissed | MissionEnd | FinalReport
 """The kinds of messages in the world's journal."""
-KINDS = Scenario | OfRobot
+KINDS = RecordedScenario | OfRobot
 """The kinds of messages in any journal."""
 
 
@@ -52,6 +54,28 @@ class Journaled(msgspec.Struct, frozen=True):
     def body(self) -> bytes:
         """The frame without its head, as msgpack. The head is the version and the CRC of the body."""
         return body(self.frame)
+
+    @property
+    def json(self) -> str:
+        """The message as JSON, with the names of its fields."""
+        return msgspec.json.encode(_named(self.message)).decode()
+
+
+def _named(value: Any) -> Any:
+    """Return a message, or a value in one, with the names of its fields."""
+    if isinstance(value, tuple):
+        return [_named(one) for one in value]
+    if not isinstance(value, msgspec.Struct):
+        return value
+    named = {
+        name: one if type(one) in _PLAIN else _named(one)
+        for name, one in zip(value.__struct_fields__, astuple(value), strict=True)
+    }
+    return {"verdict": "localised", **named} if isinstance(value, Localised) else named
+
+
+_PLAIN = frozenset((int, float, str, bool, type(None)))
+"""The types of values without parts."""
 
 
 def kind_of(kind: type[msgspec.Struct]) -> str:

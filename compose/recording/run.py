@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 from msgspec.structs import replace
 
-from compose.recording.claim import Claim, claim
+from compose.recording.claim import Claim, claim, truth_held
 from compose.recording.recording_files import (
     WORLD_JOURNAL,
     JournalFile,
@@ -20,7 +20,7 @@ from compose.recording.recording_files import (
     robot_of,
 )
 from compose.recording.run_setup import RunSetup, of_configs, of_scenario
-from protocol.journal.journal_file import CorruptJournal
+from protocol.journal.journal_file import CorruptJournal, take_all
 from protocol.messages import (
     Command,
     Contact,
@@ -34,14 +34,12 @@ from protocol.messages import (
 )
 from protocol.motion import Controls, Pose
 from protocol.output import one_line
-from protocol.wire import MalformedFrame
 from world import world_journal
 from world.scenario import Scenario
 from world.tick import observations
 from world.world_journal import Tick, WorldHistory
 
 if TYPE_CHECKING:
-    from agent.process import agent_journal as of_agent
     from agent.process.agent_journal import AgentHistory
 
 
@@ -63,6 +61,8 @@ class Run(msgspec.Struct, frozen=True, dict=True):
     """The journals, by file name, the world's first; empty for a run without journals."""
     source: object = "the recording"
     """The folder of the journals, for errors."""
+    claim_estimates: dict[str, Estimate] = {}
+    """The Estimate of each robot at its first claim, if the run took place in this process."""
 
     # --- static data ---
 
@@ -226,6 +226,21 @@ class Run(msgspec.Struct, frozen=True, dict=True):
                 return claim(tick.truth.tick, command.verdict, tick.truth.poses[self._place[robot]])
         return None
 
+    def truth_held(self, robot: str) -> bool | None:
+        """Return whether `robot` held the true hypothesis at its first claim (see `claim.truth_held`).
+
+        None without a claim, with exact sensors, and if neither this process nor a journal has its Estimate.
+        """
+        one = self.claim(robot)
+        if one is None or one.covariance is None:
+            return None
+        estimate = self.claim_estimates.get(robot)
+        if estimate is None and robot in self.agents:
+            estimate = next((e for e in self.agents[robot].estimates if e.tick == one.tick), None)
+        if estimate is None:
+            return None
+        return truth_held(estimate, self.truth(robot)[one.tick], self.scenario.mission.accuracy)
+
     # --- the end ---
 
     @property
@@ -310,11 +325,12 @@ def of_journals(journals: Mapping[str, JournalFile], source: object) -> Run:
     decoded: dict[str, JournalFile] = {}
     world: WorldHistory | None = None
     agents: dict[str, AgentHistory] = {}
+    shared: dict[bytes, Any] = {}  # the Reports and Commands: each is in two journals, and decoded once
     for name, one in journals.items():
         if name == WORLD_JOURNAL:
-            decoded[name], world = _world(one, f"{source}/{name}")
+            decoded[name], world = _world(one, f"{source}/{name}", shared)
         else:
-            decoded[name], agent = _agent(one, robot_of(name), f"{source}/{name}")
+            decoded[name], agent = _agent(one, robot_of(name), f"{source}/{name}", shared)
             if agent is not None:
                 agents[robot_of(name)] = agent
     if world is None:
@@ -324,9 +340,9 @@ def of_journals(journals: Mapping[str, JournalFile], source: object) -> Run:
     return Run(world, {robot: agents[robot] for robot in ids if robot in agents}, decoded, source)
 
 
-def _world(journal: JournalFile, source: str) -> tuple[JournalFile, WorldHistory]:
-    reading = world_journal.WorldJournalReading()
-    problem = _take(reading, journal.frames, source)
+def _world(journal: JournalFile, source: str, shared: dict[bytes, Any]) -> tuple[JournalFile, WorldHistory]:
+    reading = world_journal.WorldJournalReading(shared)
+    problem = take_all(reading, journal.frames, source)
     content = reading.content()
     if problem is not None:
         raise problem
@@ -335,30 +351,17 @@ def _world(journal: JournalFile, source: str) -> tuple[JournalFile, WorldHistory
     return replace(journal, messages=reading.messages), content
 
 
-def _agent(journal: JournalFile, robot: str, source: str) -> tuple[JournalFile, AgentHistory | None]:
+def _agent(
+    journal: JournalFile, robot: str, source: str, shared: dict[bytes, Any]
+) -> tuple[JournalFile, AgentHistory | None]:
     from agent.process import agent_journal as of_agent  # noqa: PLC0415  # a launcher has no such journal
 
-    reading = of_agent.AgentJournalReading()
-    problem = journal.problem or _take(reading, journal.frames, source)
+    reading = of_agent.AgentJournalReading(shared)
+    problem = journal.problem or take_all(reading, journal.frames, source)
     agent = reading.content()
     if agent is not None and agent.config.robot != robot:
         problem, agent = CorruptJournal(f"{source} is the journal of {agent.config.robot}"), None
     return replace(journal, messages=reading.messages, problem=problem), agent
-
-
-def _take(
-    reading: of_agent.AgentJournalReading | world_journal.WorldJournalReading,
-    frames: Iterable[bytes],
-    source: str,
-) -> CorruptJournal | None:
-    """Give `frames` to `reading`, up to the first out of order; return the error of one that is damaged."""
-    try:
-        for frame in frames:
-            if not reading.take(frame):
-                break
-    except MalformedFrame as error:
-        return CorruptJournal(f"{source}: {error}")
-    return None
 
 
 def _agree(configs: Mapping[str, RobotConfig], source: object) -> None:

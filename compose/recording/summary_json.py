@@ -19,14 +19,15 @@ from compose.recording.ticks_csv import ticks_csv
 from protocol import files
 from protocol.messages import FinalReport
 from protocol.motion import Pose, wrap
+from world.scenario import Scenario
 from world.sensors import mutual_ranges
 
 Mode = Literal["processes", "in-process"]
 SUMMARY = "summary.json"
 
 
-def summary(run: Run, mode: Mode, wall_s: float | None) -> dict[str, Any]:
-    """Return the content of `summary.json`; values that do not apply are None.
+def summary(run: Run, mode: Mode | None, wall_s: float | None) -> dict[str, Any]:
+    """Return the content of `summary.json`; values that do not apply or are unknown are None.
 
     `wall_s` is the wall time of the run in s.
     """
@@ -52,11 +53,22 @@ def summary(run: Run, mode: Mode, wall_s: float | None) -> dict[str, Any]:
         "parameters": {
             **msgspec.to_builtins(scenario.mission),
             "planner": scenario.planner_name,
+            "planner_options": scenario.planner_options,
             "max_ticks": scenario.max_ticks,
+            "world_noise": _world_noise(scenario),
+            "world_range": msgspec.to_builtins(scenario.range_model),
+            "world_radio": msgspec.to_builtins(scenario.radio_model),
         },
         "versions": versions(),
         "robots": {robot: _robot_summary(run, robot) for robot in run.robots},
     }
+
+
+def _world_noise(scenario: Scenario) -> Any:
+    """Return the noise of the sensors; None if it is the one that the robots are told."""
+    if scenario.world_noise.changes_nothing(scenario.mission.noise):
+        return None
+    return msgspec.to_builtins(scenario.world_noise)
 
 
 def first_contact(run: Run) -> int | None:

@@ -11,6 +11,7 @@ from msgspec import Meta
 from msgspec.structs import asdict
 
 from compose.errors import BadFault
+from protocol.spelling import did_you_mean
 from world.faults import MAX_DELAY, MAX_FAULTS, Delay, Fault, LinkSelector
 
 _LINK = re.compile(r"\s*(?P<one>[A-Za-z0-9_-]+)\s*(?P<way><->|->)\s*(?P<other>[A-Za-z0-9_-]+)\s*")
@@ -101,8 +102,9 @@ def _named(error: str) -> str:
     what, _, where = error.partition(" - at `$")
     unknown = re.fullmatch(r"Object contains unknown field `(.*)`", what, re.DOTALL)
     if unknown is not None:
-        known = ", ".join([name for name in Fault.__struct_fields__ if name != "link"])
-        return f"there is no '{unknown[1]}'; there are {known}"
+        known = [name for name in Fault.__struct_fields__ if name != "link"]
+        near = did_you_mean(unknown[1], known)
+        return f"there is no '{unknown[1]}'; there are {', '.join(known)}{near}"
     return f"{where.strip('.`')}: {what[0].lower()}{what[1:]}".replace("`", "'")
 
 

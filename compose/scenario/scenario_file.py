@@ -12,20 +12,23 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta
+from msgspec.structs import asdict
 
 from compose.errors import BadFault, BadKill, BadScenario, Unworkable, UserError
+from compose.launch import model_loader, planner_loader
 from compose.scenario.fault_syntax import FaultTable, added, table_of
-from compose.scenario.kills import DRAWN, POINTS, Kill, KillTable, drawn
+from compose.scenario.kills import WORLD, Kill, KillTable, drawn
 from compose.scenario.toml_file import field_first, read_text, table_in
-from protocol.attack import OF_THE_START, Attack, Kind, Part
-from protocol.messages import RobotConfig
+from protocol.attack import OF_THE_START, Attack
+from protocol.messages import AnyRobotConfig
 from protocol.mission import (
     Anchor,
     Mission,
+    Options,
     PlannerName,
     Role,
     infeasibility,
@@ -33,13 +36,22 @@ from protocol.mission import (
     safety_infeasibility,
 )
 from protocol.motion import TAU, Pose, wrap
-from protocol.orbits import Rendezvous, rendezvous, tick_budget
+from protocol.noise import with_profile
+from protocol.orbits import Rendezvous, tick_budget
 from protocol.rounding import TOLERANCE
 from protocol.spelling import did_you_mean
 from protocol.units import NAME, RobotId
 from protocol.wire import MalformedFrame, decode, encode
 from world.faults import Fault, delivery_time_bound
-from world.scenario import RobotSpec, Scenario
+from world.scenario import (
+    RecordedScenario,
+    RobotSpec,
+    Scenario,
+    ScenarioWithOptions,
+    ScenarioWithWorldNoise,
+)
+from world.world_models import ModelSpec
+from world.world_noise import WorldNoise, world_noise_infeasibility, world_noise_mistake
 
 MAX_TICKS = 10**9
 MAX_ROBOTS = 200
@@ -56,15 +68,6 @@ WITHIN = 1.0 - 1e-9
 """The part of R within which starts are drawn, so that rounding cannot move one outside."""
 
 
-CHOICES: dict[str, tuple[str, ...]] = {
-    "name": get_args(PlannerName),
-    "kind": get_args(Kind),
-    "part": get_args(Part),
-    "point": (*POINTS, DRAWN),
-}
-"""The permitted values of each field that takes one of a few words."""
-
-
 class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A table of the file. Unknown fields are errors, because they are typing mistakes."""
 
@@ -73,7 +76,20 @@ class PlannerTable(_Table, frozen=True):
     """The `[planner]` table."""
 
     name: PlannerName = "assured"
-    """The planner of all robots."""
+    """The planner of all robots: `assured`, `paper`, an installed one, or MODULE:CLASS."""
+    options: Options = {}
+    """The options of a planner of your own: the keyword arguments of its class."""
+
+
+class WorldTable(_Table, frozen=True):
+    """The `[world]` table: what the simulator does and the robots are not told."""
+
+    noise: WorldNoise = WorldNoise()
+    """The `[world.noise]` table: the noise that the sensors have."""
+    range: ModelSpec | None = None
+    """The `[world.range]` table: the model of detection and ranges."""
+    radio: ModelSpec | None = None
+    """The `[world.radio]` table: the model of the delivery of reports."""
 
 
 class RobotTable(_Table, frozen=True):
@@ -106,6 +122,8 @@ class ScenarioFile(_Table, frozen=True):
     """The last tick of an undecided run; computed from the mission by default."""
     planner: PlannerTable = PlannerTable()
     """The `[planner]` table."""
+    world: WorldTable = WorldTable()
+    """The `[world]` table."""
     fault: list[FaultTable] = []
     """Faults of the radio, applied to each report one after the other."""
     kill: list[KillTable] = []
@@ -116,7 +134,7 @@ class ScenarioTemplate(msgspec.Struct, frozen=True):
     """A validated scenario file with its scenario, from which scenarios of other seeds are drawn cheaply."""
 
     file: ScenarioFile
-    scenario: Scenario
+    scenario: RecordedScenario
     """Scenario with the seed of the file."""
 
     def seeded(self, seed: int | None) -> Scenario:
@@ -135,9 +153,18 @@ class ScenarioTemplate(msgspec.Struct, frozen=True):
             ),
         )
 
-    def kills(self, seed: int) -> tuple[Kill, ...]:
-        """Return the kills of the file, with open fields drawn from `seed`. Raises BadKill."""
-        return drawn(self.file.kill, seed, [robot.id for robot in self.file.robot])
+    def kills(self, seed: int, options: Sequence[Kill] = ()) -> tuple[Kill, ...]:
+        """Return the kills of the file, with open fields drawn from `seed`, then those of `--kill` options.
+
+        Raises BadKill.
+        """
+        ids = [robot.id for robot in self.file.robot]
+        for kill in options:
+            if kill.who not in (*ids, WORLD):
+                anyone = [*ids, WORLD]
+                near = f"{', '.join(anyone)}{did_you_mean(kill.who, anyone)}"
+                raise BadKill(f"--kill: {kill.text}: there is no '{kill.who}'; there are {near}")
+        return (*drawn(self.file.kill, seed, ids), *options)
 
 
 def shipped(package: str = "scenario") -> dict[str, Path]:
@@ -209,8 +236,35 @@ def load(source: str, *, seed: int | None = None, faults: Sequence[str] = ()) ->
     return setting(source, faults).seeded(seed)
 
 
-def setting(source: str, faults: Sequence[str] = ()) -> ScenarioTemplate:
+def setting(
+    source: str,
+    faults: Sequence[str] = (),
+    planner: str | None = None,
+    planner_options: Sequence[tuple[str, Any]] = (),
+) -> ScenarioTemplate:
     """Return the template of the shipped scenario named `source`, or of the file at that path, with `faults`.
+
+    `planner` replaces the planner, and `planner_options` are added to the options. Raises NotToml and
+    BadScenario.
+    """
+    table = scenario_table(source)
+    if planner is not None or planner_options:
+        table["planner"] = with_planner(table.get("planner"), planner, dict(planner_options))
+    return validate(table, source, faults)
+
+
+def with_planner(given: Any, name: str | None, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the `[planner]` table `given` with another planner, or with more options."""
+    before: dict[str, Any] = dict(given) if isinstance(given, Mapping) and name is None else {}
+    if name is not None:
+        before["name"] = name
+    if options:
+        before["options"] = {**before.get("options", {}), **options}
+    return before
+
+
+def scenario_table(source: str) -> dict[str, Any]:
+    """Return the content of the shipped scenario named `source`, or of the file at that path, not validated.
 
     Raises NotToml and BadScenario.
     """
@@ -224,7 +278,7 @@ def setting(source: str, faults: Sequence[str] = ()) -> ScenarioTemplate:
     table = table_in(text, source)
     if (why := misplaced(source, table, "scenario")) is not None:
         raise BadScenario(why)
-    return validate(table, source, faults)
+    return table
 
 
 def parse(text: str, source: str, *, seed: int | None = None, faults: Sequence[str] = ()) -> Scenario:
@@ -241,9 +295,9 @@ def validate(table: Mapping[str, Any], source: str, faults: Sequence[str] = ()) 
     Raises BadScenario and Unworkable, whose texts begin with `source`.
     """
     try:
-        file = msgspec.convert(table, ScenarioFile)
+        file = msgspec.convert(_with_profile(table), ScenarioFile)
     except msgspec.ValidationError as error:
-        raise BadScenario(f"{source}: {field_first(str(error), CHOICES)}") from None
+        raise BadScenario(f"{source}: {field_first(str(error), ScenarioFile)}") from None
     found = ScenarioTemplate(file, _validated(file, source, faults))
     try:
         found.kills(file.seed)
@@ -252,10 +306,21 @@ def validate(table: Mapping[str, Any], source: str, faults: Sequence[str] = ()) 
     return found
 
 
+def _with_profile(table: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the content of a scenario file with the values of the noise profile that it names."""
+    mission = table.get("mission")
+    if not isinstance(mission, Mapping) or "noise" not in mission:
+        return table
+    return {**table, "mission": {**mission, "noise": with_profile(mission["noise"])}}
+
+
 def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scenario:
     """Return the scenario of `file`, with the faults of the `--fault` options added to its own."""
     _check_noise(file.mission, source)
+    _check_planner(file.planner, source)
     peers = _peers(file.robot, source)
+    _check_world_noise(file, list(peers.items()), source)
+    _check_models(file, source)
     place = {robot.id: i for i, robot in enumerate(file.robot)}
     placed: list[RobotSpec] = []
     plans: dict[str, Rendezvous] = {}
@@ -294,9 +359,19 @@ def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scena
         robots=tuple(placed),
         faults=faults,
     )
+    if file.planner.options or file.world.range is not None or file.world.radio is not None:
+        scenario = ScenarioWithOptions(
+            **asdict(scenario),
+            world_noise=file.world.noise,
+            planner_options=file.planner.options,
+            range_model=file.world.range,
+            radio_model=file.world.radio,
+        )
+    elif not file.world.noise.changes_nothing(file.mission.noise):
+        scenario = ScenarioWithWorldNoise(**asdict(scenario), world_noise=file.world.noise)
     try:
         for one in scenario.robots:
-            decode(encode(scenario.config(one.id)), RobotConfig)
+            decode(encode(scenario.config(one.id)), AnyRobotConfig)
     except MalformedFrame as error:
         raise Unworkable(f"{source}: mission: a robot's configuration cannot be encoded: {error}") from None
     return scenario
@@ -336,6 +411,43 @@ def _check_noise(mission: Mission, source: str) -> None:
         raise Unworkable(f"{source}: mission.{why}")
 
 
+def _check_planner(table: PlannerTable, source: str) -> None:
+    """Load the planner. Raises BadScenario if it cannot be loaded or created."""
+    try:
+        planner_loader.check(table.name, table.options)
+    except UserError as error:
+        field = "planner." if str(error).startswith("options: ") else "planner.name: "
+        raise BadScenario(f"{source}: {field}{error}") from None
+
+
+def _check_world_noise(file: ScenarioFile, pairs: Sequence[tuple[str, str]], source: str) -> None:
+    """Raise BadScenario if the noise of the sensors is invalid, Unworkable if robots cannot localise.
+
+    `pairs` holds each pair of robots in both orders.
+    """
+    mistake = world_noise_mistake(file.world.noise, file.mission.noise, pairs)
+    if mistake is not None:
+        raise BadScenario(f"{source}: world.noise.{mistake[0]}: {mistake[1]}")
+    why = world_noise_infeasibility(file.world.noise, file.mission.noise)
+    if why is not None:
+        raise Unworkable(f"{source}: world.noise: {why}")
+
+
+def _check_models(file: ScenarioFile, source: str) -> None:
+    """Load the models. Raises BadScenario if one cannot be created, Unworkable if robots cannot localise."""
+    for name, spec in (("range", file.world.range), ("radio", file.world.radio)):
+        if spec is not None:
+            try:
+                model_loader.check(name, spec)
+            except UserError as error:
+                raise BadScenario(f"{source}: world.{name}.{error}") from None
+    if file.world.range is not None and file.mission.noise.exact:
+        raise Unworkable(
+            f"{source}: world.range: the robots are told that all sensors are exact, and cannot localise "
+            "themselves with others: set mission.noise"
+        )
+
+
 def _plan(file: ScenarioFile, first: int, second: int, source: str) -> Rendezvous:
     """Return the rendezvous orbits of the pair of robots at the places `first` and `second` in the file."""
     distance = math.dist(file.robot[first].anchor, file.robot[second].anchor)
@@ -347,7 +459,14 @@ def _plan(file: ScenarioFile, first: int, second: int, source: str) -> Rendezvou
     why = infeasibility(file.mission, distance)
     if why is not None:
         raise Unworkable(f"{source}: mission: {why}")
-    return rendezvous(file.mission, distance, file.planner.name)
+    if not file.mission.noise.exact:
+        # imports numpy, which scenarios with exact sensors do not need
+        from agent.estimation.gaussian.reachable_accuracy import forbidding_prior  # noqa: PLC0415
+
+        why = forbidding_prior(file.mission, distance)
+        if why is not None:
+            raise Unworkable(f"{source}: mission.{why}")
+    return planner_loader.orbits(file.planner.name, file.planner.options, file.mission, distance)
 
 
 def _peers(robots: list[RobotTable], source: str) -> dict[str, str]:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import msgspec
+from msgspec import inspect
 
 from compose.errors import NotToml
 from protocol import files
+from protocol.spelling import did_you_mean
 
 
 def read_text(path: Path) -> str:
@@ -39,21 +41,50 @@ def table_in(text: str, source: str) -> dict[str, Any]:
         raise NotToml(f"{source}: not TOML: {error}") from None
 
 
-def field_first(error: str, choices: Mapping[str, Sequence[str]]) -> str:
+def field_first(error: str, schema: type[msgspec.Struct]) -> str:
     """Return msgspec's `error` with the field in front: "mission.period: expected 'float', got 'str'".
 
-    `choices` are the permitted values of each field that takes one of a few words.
+    `schema` is the type of the whole file. From it follow the permitted words of a field, and suggestions.
     """
     match = re.fullmatch(r"(?P<what>.*?)(?: - at `\$\.?(?P<where>.*)`)?", error, re.DOTALL)
     assert match is not None
-    what = match["what"].replace("`", "'")
+    what, where = match["what"].replace("`", "'"), match["where"] or ""
     what = what.replace("Object contains ", "").replace("Object missing required field", "missing field")
     what = what[0].lower() + what[1:]
-    field = (match["where"] or "").rpartition(".")[2]
-    if what.startswith("invalid enum value") and field in choices:
-        what = (
-            f"there is no {what.removeprefix('invalid enum value ')}; there are {', '.join(choices[field])}"
-        )
+    quoted = re.search(r"'(.*)'", what, re.DOTALL)
+    word = quoted[1] if quoted is not None else ""
+    if what.startswith("invalid enum value") and (words := known_words(schema, where)):
+        what = f"there is no '{word}'; there are {', '.join(words)}{did_you_mean(word, words)}"
+    elif what.startswith("unknown field"):
+        what += did_you_mean(word, known_words(schema, where))
     if "matching regex" in what:
         what = "invalid name: use letters, digits, - and _, and begin with a letter or digit"
-    return f"{match['where']}: {what}" if match["where"] else what
+    return f"{where}: {what}" if where else what
+
+
+def known_words(schema: type[msgspec.Struct], where: str) -> list[str]:
+    """Return the fields of the table, or the words that the field may be, at the path `where` in `schema`."""
+    kinds = list(_bare(inspect.type_info(schema)))
+    for step in re.findall(r"[A-Za-z_][\w-]*", where):
+        inner = [one for kind in kinds if isinstance(kind, inspect.StructType) for one in kind.fields]
+        kinds = [bare for field in inner if field.encode_name == step for bare in _bare(field.type)]
+    fields = [
+        one.encode_name for kind in kinds if isinstance(kind, inspect.StructType) for one in kind.fields
+    ]
+    return fields or [
+        str(one) for kind in kinds if isinstance(kind, inspect.LiteralType) for one in kind.values
+    ]
+
+
+def _bare(kind: inspect.Type) -> Iterator[inspect.Type]:
+    """Yield the types that a value of type `kind` may have, or its elements if it is a list."""
+    match kind:
+        case inspect.Metadata(type=inner):
+            yield from _bare(inner)
+        case inspect.UnionType(types=several):
+            for one in several:
+                yield from _bare(one)
+        case inspect.ListType(item_type=item) | inspect.VarTupleType(item_type=item):
+            yield from _bare(item)
+        case _:
+            yield kind

@@ -23,7 +23,7 @@ class Cell(msgspec.Struct, frozen=True):
     place: tuple[int, ...]
     """index of its value on each axis"""
     fields: dict[str, Any]
-    """values of the varied fields, by their paths"""
+    """values of the varied fields, by their paths; None if a field is as in the base scenario"""
     key: str
     """canonical JSON text of the fields of unpaired axes, on which the seeds of its trials depend"""
     table: dict[str, Any]
@@ -49,8 +49,10 @@ def cells(sweep: Sweep) -> Iterator[Cell]:
         unpaired: dict[str, Any] = {}
         for axis, i in zip(sweep.axes, place, strict=True):
             for field, way, value in zip(axis.fields, axis.ways, axis.values[i], strict=True):
-                table = with_value(table, way, value)
                 fields[field] = value
+                if value is None:
+                    continue
+                table = with_value(table, way, value)
                 if not axis.paired:
                     unpaired[field] = value
         yield Cell(index, place, fields, canonical(unpaired), table)

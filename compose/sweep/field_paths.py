@@ -13,6 +13,7 @@ from msgspec import inspect
 
 from compose.errors import NoSuchField
 from compose.scenario.scenario_file import ScenarioFile
+from protocol.spelling import did_you_mean
 
 Steps = tuple[str | int, ...]
 """A parsed path: table keys and list indices, from the top of the file."""
@@ -22,6 +23,17 @@ DRAWN = "seed"
 
 
 def steps(path: str, base: Mapping[str, Any]) -> Steps:
+    """Return the parsed `path` of a field that a sweep can vary, checked like `field_steps`.
+
+    Raises NoSuchField, also for the seed.
+    """
+    found = field_steps(path, base)
+    if found == (DRAWN,):
+        raise NoSuchField("every trial has its own seed")
+    return found
+
+
+def field_steps(path: str, base: Mapping[str, Any]) -> Steps:
     """Return the parsed `path`, checked against the scenario schema and the table `base`.
 
     The field may be missing in `base` if the schema has it. Raises NoSuchField.
@@ -37,7 +49,8 @@ def steps(path: str, base: Mapping[str, Any]) -> Steps:
                 if value is not None and not isinstance(value, Mapping):
                     raise NoSuchField(f"{so_far} of the base scenario is not a table")
                 if step not in kinds:
-                    raise NoSuchField(f"{so_far or 'a scenario'} has no field '{step}'")
+                    near = did_you_mean(str(step), kinds)
+                    raise NoSuchField(f"{so_far or 'a scenario'} has no field '{step}'{near}")
                 kind = kinds[str(step)]
                 value = value.get(step) if value is not None else None
             case inspect.DictType(value_type=kind):
@@ -53,8 +66,6 @@ def steps(path: str, base: Mapping[str, Any]) -> Steps:
             case _:
                 raise NoSuchField(f"{so_far} is a single value")
         walked.append(step)
-    if walked == [DRAWN]:
-        raise NoSuchField("every trial has its own seed")
     return tuple(walked)
 
 
@@ -132,7 +143,8 @@ def _place(step: str | int, listed: Sequence[Any], so_far: str, *, spare: bool) 
         return step
     ids = [one.get("id") if isinstance(one, Mapping) else None for one in listed]
     if step not in ids:
-        raise NoSuchField(f"the base scenario has no {so_far} with the id '{step}'")
+        near = did_you_mean(step, [one for one in ids if isinstance(one, str)])
+        raise NoSuchField(f"the base scenario has no {so_far} with the id '{step}'{near}")
     return ids.index(step)
 
 

@@ -19,6 +19,7 @@ from compose.scenario import scenario_file
 from compose.scenario.toml_file import field_first, read_text, table_in
 from compose.sweep.draws import Draw, Draws, DrawTable, StartsTable
 from compose.sweep.field_paths import Steps, canonical, jsonable, steps, value_at, with_value
+from protocol.spelling import did_you_mean
 from protocol.units import NAME
 
 MAX_TRIALS = 10**7
@@ -27,14 +28,30 @@ MAX_CELLS = 10_000
 """The largest number of cells of a sweep."""
 TRIAL_TIMEOUT_S = 60.0
 """The default wall time in s after which a trial counts as hung."""
+NOT_JSONABLE = "must be a number, a string, true or false, or a list or table of these"
+"""The error of a value that a scenario cannot have."""
 Label = Annotated[str, Meta(min_length=1, max_length=60)]
 
 
-class AxisTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [[axis]]: one `field` and its values, or a `name` and several `fields` that vary together."""
+class RowTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A row of an axis: the fields in which its cells differ from the base scenario."""
 
-    values: Annotated[list[Any], Meta(min_length=1)]
+    label: Label
+    """the name of the row in tables and figures"""
+    set: dict[str, Any]
+    """the values of fields, by their paths in quotes; all other fields are as in the base scenario"""
+
+
+class AxisTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [[axis]]: one `field` and its values, or a `name` and several `fields` that vary together.
+
+    An axis whose values differ in different fields has a `name` and `rows` instead.
+    """
+
+    values: Annotated[list[Any], Meta(min_length=1)] | None = None
     """the values; with `fields`, a list of values for each"""
+    rows: Annotated[list[RowTable], Meta(min_length=1)] | None = None
+    """the rows, `{label = "...", set = {"PATH" = VALUE, ...}}`, instead of `values`"""
     field: str | None = None
     """the path of the field that varies"""
     fields: Annotated[list[str], Meta(min_length=1)] | None = None
@@ -58,6 +75,8 @@ class SpecFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """number of trials per cell"""
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
     """the seed from which the seeds of all trials follow"""
+    set: dict[str, Any] = {}
+    """fields in which the base scenario differs from `scenario`, by their paths in quotes"""
     trial_timeout: Annotated[float, Meta(gt=0.0, le=1e6)] = TRIAL_TIMEOUT_S
     """wall time in s after which a trial counts as hung"""
     axis: list[AxisTable] = []
@@ -78,11 +97,16 @@ class Axis(msgspec.Struct, frozen=True):
     ways: tuple[Steps, ...]
     """parsed paths of the fields"""
     values: tuple[tuple[Any, ...], ...]
-    """values of the axis, each a tuple with one element per field"""
+    """values of the axis, each a tuple with one element per field; None leaves the field as in the base"""
     labels: tuple[str, ...] | None
     """names of the values; None to derive them from the values"""
     paired: bool
     """true if the seeds of trials do not depend on this axis"""
+
+    @property
+    def of_rows(self) -> bool:
+        """True if some of its values leave a field as in the base scenario."""
+        return any(None in value for value in self.values)
 
     def label(self, place: int) -> str:
         """Return the name of the value at index `place`."""
@@ -127,16 +151,34 @@ def load(source: str, *, trials: int | None = None, seed: int | None = None) -> 
     path = shipped().get(source, Path(source))
     try:
         table = table_in(read_text(path), source)
-        if (why := scenario_file.misplaced(source, table, "sweep")) is not None:
-            raise BadSpec(why)
-        spec = msgspec.convert(table, SpecFile)
     except FileNotFoundError:
         raise BadSpec(scenario_file.unknown(source, "sweep")) from None
-    except msgspec.ValidationError as error:
-        raise BadSpec(f"{source}: {field_first(str(error), {})}") from None
     except ValueError as error:
         raise BadSpec(f"{source}: {error}") from None
-    base = _base(spec, path, source)
+    if (why := scenario_file.misplaced(source, table, "sweep")) is not None:
+        raise BadSpec(why)
+    return validated(table, source, path.parent, trials=trials, seed=seed)
+
+
+def validated(
+    table: Mapping[str, Any],
+    source: str,
+    folder: Path,
+    *,
+    base: dict[str, Any] | None = None,
+    trials: int | None = None,
+    seed: int | None = None,
+) -> Sweep:
+    """Return the sweep whose file has the content `table`.
+
+    `source` begins errors, and `folder` is that of the sweep file. `base` is the table of the scenario if it
+    is not in a file; `trials` and `seed` override the values of the sweep file. Raises BadSpec.
+    """
+    try:
+        spec = msgspec.convert(table, SpecFile)
+    except msgspec.ValidationError as error:
+        raise BadSpec(f"{source}: {field_first(str(error), SpecFile)}") from None
+    base = base if base is not None else _base(spec, folder, source)
     axes = tuple(_axis(axis, f"{source}: axis[{i}]", base) for i, axis in enumerate(spec.axis))
     draws = Draws(_draws(spec, axes, base, source), spec.starts)
     _check_together(axes, draws, source)
@@ -152,23 +194,38 @@ def load(source: str, *, trials: int | None = None, seed: int | None = None) -> 
     )
 
 
-def _base(spec: SpecFile, path: Path, source: str) -> dict[str, Any]:
+def _base(spec: SpecFile, folder: Path, source: str) -> dict[str, Any]:
     """Return the table of the base scenario of `spec`. Raises BadSpec if it cannot be read."""
-    file = scenario_file.shipped().get(spec.scenario, path.parent / spec.scenario)
+    file = scenario_file.shipped().get(spec.scenario, folder / spec.scenario)
     try:
-        return table_in(read_text(file), spec.scenario)
+        return _with_fields(table_in(read_text(file), spec.scenario), spec.set, f"{source}: set")
     except FileNotFoundError:
-        names = ", ".join(scenario_file.shipped())
+        names = scenario_file.shipped()
         raise BadSpec(
             f"{source}: scenario: '{spec.scenario}' is neither a file in the folder of the sweep file nor a "
-            f"shipped scenario ({names})"
+            f"shipped scenario ({', '.join(names)}){did_you_mean(spec.scenario, names)}"
         ) from None
     except (ValueError, NotToml) as error:
         raise BadSpec(f"{source}: scenario: {error}") from None
 
 
+def _with_fields(base: dict[str, Any], fields: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Return `base` with the values in `fields`, by their paths. Raises BadSpec."""
+    for field, value in fields.items():
+        (way,) = _ways([field], base, where)
+        if not jsonable(value):
+            raise BadSpec(f"{where}: '{field}': {NOT_JSONABLE}")
+        base = with_value(base, way, value)
+    return base
+
+
 def _axis(table: AxisTable, where: str, base: dict[str, Any]) -> Axis:
     """Return the validated axis; `where` is its prefix in error messages. Raises BadSpec."""
+    if (table.values is None) == (table.rows is None):
+        raise BadSpec(f"{where}: needs either 'values' or 'rows'")
+    if table.rows is not None:
+        return _axis_of_rows(table, table.rows, where, base)
+    assert table.values is not None
     fields = _fields(table, where)
     ways = []
     for i, field in enumerate(fields):
@@ -195,6 +252,45 @@ def _axis(table: AxisTable, where: str, base: dict[str, Any]) -> Axis:
     )
 
 
+def _axis_of_rows(table: AxisTable, rows: Sequence[RowTable], where: str, base: dict[str, Any]) -> Axis:
+    """Return the validated axis of these rows. Raises BadSpec."""
+    for name in ("field", "fields", "labels"):
+        if getattr(table, name) is not None:
+            raise BadSpec(f"{where}.{name}: an axis with 'rows' has none")
+    if table.name is None:
+        raise BadSpec(f"{where}.name: missing: an axis with 'rows' needs a name")
+    ways: dict[str, Steps] = {}
+    labels: dict[str, int] = {}
+    for i, row in enumerate(rows):
+        named = f"{where}.rows[{i}]"
+        if (first := labels.setdefault(row.label, i)) != i:
+            raise BadSpec(f"{named}.label: equal to that of rows[{first}]")
+        _with_fields(base, row.set, f"{named}.set")
+        found = dict(zip(row.set, _ways(list(row.set), base, f"{named}.set"), strict=True))
+        for (field, way), (another, further) in combinations(found.items(), 2):
+            if _overlap(way, further):
+                raise BadSpec(f"{named}.set: '{another}' is already set by '{field}'")
+        ways |= found
+    if not ways:
+        raise BadSpec(f"{where}.rows: no row sets a field")
+    if table.name in ways:
+        raise BadSpec(f"{where}.name: '{table.name}' is also one of the fields of this axis")
+    return Axis(
+        name=table.name,
+        fields=tuple(ways),
+        ways=tuple(ways.values()),
+        values=tuple(tuple(row.set.get(field) for field in ways) for row in rows),
+        labels=tuple(labels),
+        paired=table.paired,
+    )
+
+
+def _overlap(one: Steps, other: Steps) -> bool:
+    """Return whether one of the two paths leads to the other."""
+    shorter = min(len(one), len(other))
+    return one[:shorter] == other[:shorter]
+
+
 def _fields(table: AxisTable, where: str) -> list[str]:
     """Return the field paths of the axis. Raises BadSpec if fields or name are missing or ambiguous."""
     if (table.field is None) == (table.fields is None):
@@ -212,7 +308,7 @@ def _fields(table: AxisTable, where: str) -> list[str]:
 def _value(value: Any, where: str, fields: Sequence[str] | None) -> tuple[Any, ...]:
     """Return one value of an axis as a tuple with one element per field. Raises BadSpec."""
     if not jsonable(value):
-        raise BadSpec(f"{where}: must be a number, a string, true or false, or a list or table of these")
+        raise BadSpec(f"{where}: {NOT_JSONABLE}")
     if fields is None:
         return (value,)
     if not isinstance(value, list) or len(value) != len(fields):
@@ -223,7 +319,9 @@ def _value(value: Any, where: str, fields: Sequence[str] | None) -> tuple[Any, .
 def _draws(spec: SpecFile, axes: Sequence[Axis], base: dict[str, Any], source: str) -> tuple[Draw, ...]:
     """Return the validated draws of `spec`, in order. Raises BadSpec."""
     known: dict[Steps, tuple[Any, ...]] = {
-        way: tuple(value[i] for value in axis.values) for axis in axes for i, way in enumerate(axis.ways)
+        way: tuple(value[i] for value in axis.values if value[i] is not None)
+        for axis in axes
+        for i, way in enumerate(axis.ways)
     }
     draws: list[Draw] = []
     for i, table in enumerate(spec.draw):
@@ -238,7 +336,7 @@ def _draws(spec: SpecFile, axes: Sequence[Axis], base: dict[str, Any], source: s
             raise BadSpec(f"{where}: {low:g} to {high:g} is not an interval{above}")
         if table.log_uniform is not None and not math.isfinite(high / low):
             raise BadSpec(f"{where}: the interval {low:g} to {high:g} is too wide")
-        (way,) = _numbers([table.field], f"{where}.field", base)
+        (way,) = _ways([table.field], base, f"{where}.field")
         _check_takes_float(table.field, way, low, base, f"{where}.field")
         draws.append(
             Draw(
@@ -263,7 +361,7 @@ def _check_takes_float(field: str, way: Steps, value: float, base: dict[str, Any
             raise BadSpec(f"{where}: '{field}' is not a floating-point field and cannot be drawn") from None
 
 
-def _numbers(fields: Sequence[str], where: str, base: dict[str, Any]) -> tuple[Steps, ...]:
+def _ways(fields: Sequence[str], base: dict[str, Any], where: str) -> tuple[Steps, ...]:
     """Return the parsed paths of `fields`. Raises BadSpec if a field does not exist."""
     found = []
     for field in fields:
@@ -288,7 +386,7 @@ def _known(
     that axes set, and an empty tuple for each field that is drawn earlier. A value may be 0 only if `zero` is
     true.
     """
-    ways = _numbers(fields, where, base)
+    ways = _ways(fields, base, where)
     for field, way in zip(fields, ways, strict=True):
         try:
             values = varied[way] if way in varied else (value_at(base, way),)
@@ -309,14 +407,13 @@ def _check_together(axes: Sequence[Axis], draws: Draws, source: str) -> None:
             raise BadSpec(f"{source}: axis[{i}]: another axis has the name '{axis.name}'")
         names.add(axis.name)
     placed = [
-        (f"axis[{i}]", field, way)
+        (f"axis[{i}]", axis.of_rows, field, way)
         for i, axis in enumerate(axes)
         for field, way in zip(axis.fields, axis.ways, strict=True)
     ]
-    placed += [(f"draw[{i}]", draw.field, draw.way) for i, draw in enumerate(draws.fields)]
-    for (one, field, way), (other, another, further) in combinations(placed, 2):
-        shorter = min(len(way), len(further))
-        if way[:shorter] == further[:shorter]:
+    placed += [(f"draw[{i}]", False, draw.field, draw.way) for i, draw in enumerate(draws.fields)]
+    for (one, of_rows, field, way), (other, _, another, further) in combinations(placed, 2):
+        if _overlap(way, further) and not (of_rows and one == other):
             raise BadSpec(f"{source}: {other}: '{another}' is already set by {one} ('{field}')")
     count = math.prod(len(axis.values) for axis in axes)
     if count > MAX_CELLS:

@@ -71,6 +71,8 @@ class CellSummary(msgspec.Struct, frozen=True):
     """number of claims by all robots"""
     within_3_accuracy: float | None
     """fraction of the claims with a position error of at most 3 times mission.accuracy"""
+    truth_held: float | None
+    """fraction of the trials with claims under noise in which every such robot held the true hypothesis"""
     nees_mean: float | None
     """mean over trials that were not wrong of the mean NEES of their robots' claims; 3 is expected if
     the claimed covariances are consistent"""
@@ -146,6 +148,7 @@ def counted(table: pa.Table, refused: str | None = None) -> CellSummary:
         error_max_rad=_percentile(_known(column(table, "heading_error_rad")), 100),
         claims=claims,
         within_3_accuracy=float(_known(column(table, "claims_within")).sum()) / claims if claims else None,
+        truth_held=_fraction(table["truth_held"].to_pylist()),
         nees_mean=float(nees.mean()) if len(nees) else None,
         nees_low=nees_low,
         nees_high=nees_high,
@@ -228,9 +231,16 @@ def summary_csv(sweep: Sweep, cells: Sequence[Cell], figures: Mapping[int, CellS
         axes: list[Any] = []
         for axis, place in zip(sweep.axes, cell.place, strict=True):
             axes += [axis.label(place)] if axis.labels is not None else []
-            axes += [value if isinstance(value, str) else canonical(value) for value in axis.values[place]]
+            axes += [_text(value) for value in axis.values[place]]
         rows.writerow([cell.index, *axes, *msgspec.structs.astuple(figures[cell.index])])
     return out.getvalue()
+
+
+def _text(value: Any) -> str:
+    """Return the value of a field as the text of a column; empty if the field is as in the base scenario."""
+    if value is None:
+        return ""
+    return value if isinstance(value, str) else canonical(value)
 
 
 def header(sweep: Sweep) -> list[str]:
@@ -291,6 +301,12 @@ def noted(table: pa.Table) -> NotableTrial | None:
 
 def _known(values: Floats) -> Floats:
     return values[~np.isnan(values)]
+
+
+def _fraction(values: list[bool | None]) -> float | None:
+    """Return the fraction of the known values that are true; None if there are none."""
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None
 
 
 def _percentile(values: Floats, percent: float) -> float | None:

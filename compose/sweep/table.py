@@ -27,7 +27,7 @@ _KINDS: dict[str, pa.DataType] = {
     **dict.fromkeys(("hypotheses", "claims", "claims_within", "violations"), pa.int64()),
     **dict.fromkeys(("reports_sent", "reports_heard", "reports_refused"), pa.int64()),
     **dict.fromkeys(("reports_lost", "bytes_sent", "kills"), pa.int64()),
-    "same_record": pa.bool_(),
+    **dict.fromkeys(("same_record", "truth_held"), pa.bool_()),
     **dict.fromkeys(("period_s", "t_max_s", "wall_s", "position_error_m", "nearest_m"), pa.float64()),
     **dict.fromkeys(
         ("heading_error_rad", "alpha", "probability", "p_value", "position_sigma_m", "nees", "bound_m"),
@@ -45,7 +45,7 @@ def schema_of(sweep: Sweep, cells: Sequence[Cell]) -> pa.Schema:
         if axis.labels is not None:
             fields.append(pa.field(axis.name, pa.string()))
         for i, field in enumerate(axis.fields):
-            fields.append(pa.field(field, _kind([values[i] for values in axis.values])))
+            fields.append(pa.field(field, _kind([one[i] for one in axis.values if one[i] is not None])))
     fields += [pa.field(draw.field, pa.float64()) for draw in sweep.draws.fields]
     fields.append(pa.field("trial", _KINDS["trial"]))
     fields += [pa.field(name, _KINDS[name]) for name in _OF_ALL]
@@ -79,7 +79,9 @@ def _kind(values: Sequence[Any]) -> pa.DataType:
 
 
 def _cast(value: Any, kind: pa.DataType) -> Any:
-    """Return `value` as an element of a column of type `kind`."""
+    """Return `value` as an element of a column of type `kind`; None if it is None."""
+    if value is None:
+        return None
     if kind == pa.string() and not isinstance(value, str):
         return canonical(value)
     return float(value) if kind == pa.float64() else value

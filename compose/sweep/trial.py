@@ -9,6 +9,8 @@ import msgspec
 from msgspec.structs import replace
 
 from compose.audit.findings import Findings
+from compose.launch.model_loader import trust_all
+from compose.launch.planner_loader import trust
 from compose.recording.claim import Claim
 from compose.recording.closest_approach import nearest
 from compose.recording.run import Run
@@ -68,6 +70,8 @@ class RobotRow(msgspec.Struct, frozen=True, array_like=True):
     """square root of the trace of the claimed position covariance"""
     nees: float | None = None
     """normalised estimation error squared of the claim"""
+    truth_held: bool | None = None
+    """true if the true pose was among the robot's hypotheses at its first claim, with noisy sensors"""
     bound_m: float | None = None
     """Cramér-Rao bound on the position (square root of the trace), for the trajectories up to the last claim
     of the pair"""
@@ -133,6 +137,8 @@ class TrialRow(msgspec.Struct, frozen=True, array_like=True):
     """number of claims with a position error of at most 3 times mission.accuracy"""
     nees: float | None = None
     """mean NEES of the robots that claimed a covariance"""
+    truth_held: bool | None = None
+    """true if every robot that claimed with noisy sensors held the true hypothesis"""
     reports_sent: int | None = None
     """number of reports that all robots sent"""
     reports_heard: int | None = None
@@ -176,6 +182,8 @@ def run_trial(trial: Trial) -> TrialRow:
 
     The outcome is `failed` if kills changed the recording. The caller turns exceptions into lost trials.
     """
+    trust(trial.scenario.planner_name)  # the user has named it in the scenario or in the sweep
+    trust_all(trial.scenario)
     if trial.processes or trial.kills is not None:
         played = as_processes(trial.scenario, audit=trial.audit, kills=trial.kills)
     else:
@@ -206,6 +214,7 @@ def row(trial: Trial, run: Run, wall_s: float, findings: Findings | None = None)
     final_reports = run.final_reports.values()
     errors = [robot.position_error_m for robot in robots.values() if robot.position_error_m is not None]
     nees = [robot.nees for robot in robots.values() if robot.nees is not None]
+    held = [robot.truth_held for robot in robots.values() if robot.truth_held is not None]
     return TrialRow(
         cell=trial.cell,
         trial=trial.number,
@@ -228,6 +237,7 @@ def row(trial: Trial, run: Run, wall_s: float, findings: Findings | None = None)
         claims=len(errors),
         claims_within=sum([error <= WITHIN * scenario.mission.accuracy for error in errors]),
         nees=sum(nees) / len(nees) if nees else None,
+        truth_held=all(held) if held else None,
         reports_sent=sum([final_report.reports_sent for final_report in final_reports]),
         reports_heard=sum([final_report.reports_heard for final_report in final_reports]),
         reports_refused=sum([final_report.reports_refused for final_report in final_reports]),
@@ -241,7 +251,8 @@ def row(trial: Trial, run: Run, wall_s: float, findings: Findings | None = None)
 
 
 def _robot_row(run: Run, robot: str) -> RobotRow:
-    return _claimed(_reported(run.final_reports.get(robot)), run.claim(robot))
+    row = _claimed(_reported(run.final_reports.get(robot)), run.claim(robot))
+    return replace(row, truth_held=run.truth_held(robot))
 
 
 def _reported(final_report: FinalReport | None) -> RobotRow:

@@ -62,11 +62,14 @@ def conclude(
 ) -> int:
     """Print the outcome, write `summary.json` and `ticks.csv` if `--out` is given, return the exit status.
 
+    If the options have a list of `results`, the content of `summary.json` is appended to it and not printed.
     `began` is the value of time.perf_counter at the start, in s. Raises UserError if the files cannot be
     written.
     """
     result = summary(recording, mode, round(time.perf_counter() - began, 6))
-    if options.quiet:
+    if (results := getattr(options, "results", None)) is not None:
+        results.append(result)
+    elif options.quiet:
         say(outcome_line(result))
     else:
         from compose.terminal import progress  # noqa: PLC0415  # as above

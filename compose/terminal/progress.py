@@ -17,7 +17,7 @@ from protocol.journal.journal_file import Tail
 from protocol.messages import Command, DeadlineMissed, FinalReport, MissionEnd
 from protocol.output import one_line, say
 from protocol.wire import MAX_FRAME_BYTES, decode
-from world.scenario import Scenario
+from world.scenario import RecordedScenario, Scenario
 
 TRUTH, ESTIMATE, ERROR, SIGMA = "true x, y, heading", "estimate", "error m", "sigma m"
 RANGES, REPORTS, LATE = "ranges", "reports", "late"
@@ -52,7 +52,9 @@ def live(scenario: Scenario, folder: Path) -> Iterator[None]:
         with suppress(OSError, ValueError):
             for frame in journal.news():
                 message = decode(
-                    frame, Scenario | Command | DeadlineMissed | MissionEnd | FinalReport, MAX_FRAME_BYTES
+                    frame,
+                    RecordedScenario | Command | DeadlineMissed | MissionEnd | FinalReport,
+                    MAX_FRAME_BYTES,
                 )
                 if isinstance(message, Command):
                     commands[message.robot] = message

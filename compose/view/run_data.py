@@ -15,6 +15,8 @@ from protocol.messages import (
     Message,
     MissionEnd,
     Observation,
+    PeerReport,
+    PlannerReport,
     Report,
     RobotConfig,
 )
@@ -29,7 +31,7 @@ Link = tuple[str, str]
 class SizedReport(msgspec.Struct, frozen=True):
     """A report and the size of its frame."""
 
-    report: Report
+    report: PeerReport
     bytes: int
     """The size of the frame in bytes."""
 
@@ -153,7 +155,7 @@ class RunData:
                 self.at(tick).commands.setdefault(robot, message)
             case Estimate(tick, robot):
                 self.at(tick).estimates.setdefault(robot, message)
-            case Report(tick, robot):
+            case Report(tick, robot) | PlannerReport(tick, robot):
                 self.at(tick).reports.setdefault(robot, SizedReport(message, size))
             case GroundTruth(tick, poses):
                 self.at(tick).truth.update(poses)

@@ -9,7 +9,16 @@ from compose.view.deliveries import Passage, passages
 from compose.view.events import Event, events
 from compose.view.run_data import TickData
 from compose.view.words import doing
-from protocol.messages import Contact, MissionEnd, Phase, Probability, Verdict, Word
+from protocol.messages import (
+    Contact,
+    MissionEnd,
+    PeerReport,
+    Phase,
+    Probability,
+    Report,
+    Verdict,
+    Word,
+)
 from protocol.motion import Controls, Covariance, Pose, wrap
 
 
@@ -18,11 +27,12 @@ class Sent(msgspec.Struct, frozen=True):
 
     bytes: int
     """The size of the frame in bytes."""
-    phase: Phase
-    state: Word
-    through: int
+    phase: Phase | None = None
+    """The phase; None, like the following fields, for a planner with reports of its own."""
+    state: Word | None = None
+    through: int | None = None
     """The last tick of the manoeuvres in the report's log."""
-    heard: int
+    heard: int | None = None
     """The last tick of the peer's manoeuvres that the report acknowledges."""
 
 
@@ -98,6 +108,14 @@ def scene(setup: RunSetup, before: TickData | None, now: TickData, end: MissionE
     return Scene(now.tick, players, deliveries, tuple(events(setup, before, now, deliveries, end)))
 
 
+def _sent(report: PeerReport, size: int) -> Sent:
+    match report:
+        case Report(phase=phase, state=state, through=through, heard=heard):
+            return Sent(size, phase, state, through, heard)
+        case _:
+            return Sent(size)
+
+
 def _player(robot_setup: RobotSetup, now: TickData) -> Player:
     robot = robot_setup.id
     pose, observation, sent = now.truth.get(robot), now.observations.get(robot), now.reports.get(robot)
@@ -119,11 +137,7 @@ def _player(robot_setup: RobotSetup, now: TickData) -> Player:
         executed=observation.executed if observation is not None else None,
         anchor_range=observation.anchor_range if observation is not None else None,
         contacts=observation.contacts if observation is not None else (),
-        sent=(
-            Sent(sent.bytes, sent.report.phase, sent.report.state, sent.report.through, sent.report.heard)
-            if sent is not None
-            else None
-        ),
+        sent=_sent(sent.report, sent.bytes) if sent is not None else None,
         command=(
             Decision(command.v, command.omega, command.phase, command.state, command.verdict)
             if command is not None

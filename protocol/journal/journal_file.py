@@ -20,7 +20,7 @@ import msgpack
 import msgspec
 
 from protocol.files import open_file
-from protocol.wire import MAX_FRAME_BYTES, RELEASES, VERSION, is_sound, other_version
+from protocol.wire import MAX_FRAME_BYTES, RELEASES, VERSION, MalformedFrame, is_sound, other_version
 
 _packer = msgpack.Packer()
 _LONGEST = b"\xc6" + MAX_FRAME_BYTES.to_bytes(4, "big")
@@ -68,6 +68,27 @@ class Sink(Protocol):
 
     def write(self, *frames: bytes) -> None:
         """Append all of `frames` in one operation."""
+
+
+class FrameReader(Protocol):
+    """The contract of a reader of a journal's frames."""
+
+    def take(self, frame: bytes) -> bool:
+        """Add the next frame, and return whether it is in order. Raises MalformedFrame."""
+
+
+def take_all(reading: FrameReader, frames: Iterable[bytes], source: object) -> CorruptJournal | None:
+    """Give `frames` to `reading`, up to the first out of order; return the error of one that is damaged.
+
+    The text of the error begins with `source`.
+    """
+    try:
+        for frame in frames:
+            if not reading.take(frame):
+                break
+    except MalformedFrame as error:
+        return CorruptJournal(f"{source}: {error}")
+    return None
 
 
 class MemoryJournal:

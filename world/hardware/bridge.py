@@ -15,7 +15,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any
 
 import msgspec
 import zenoh
@@ -27,7 +27,7 @@ from protocol.messages import (
     FinalReport,
     MissionEnd,
     Observation,
-    Report,
+    PeerReport,
     RobotConfig,
     TickStart,
     Verdict,
@@ -56,8 +56,6 @@ UNKNOWN = -math.inf
 
 UNHEARD = 4.0
 """The number of ticks within which a running robot sends a TickStart."""
-
-M = TypeVar("M", Command, TickStart, Report)
 
 
 class NoStart(TimeoutError):
@@ -305,10 +303,10 @@ class Field:
                 pass
         return None
 
-    def _accepted(self, arrival: Arrival, kind: type[M]) -> M | None:
+    def _accepted(self, arrival: Arrival, kind: Any) -> Any:
         """Return the message that arrived, if it is a `kind` from the robot of its key; None if refused."""
         try:
-            message: M = decode(arrival.frame, kind, MAX_REPORT_BYTES)
+            message: Any = decode(arrival.frame, kind, MAX_REPORT_BYTES)
         except MalformedFrame as error:
             self._inbox.refuse(arrival, error)
             return None
@@ -318,7 +316,7 @@ class Field:
         return message
 
     def _on_command(self, arrival: Arrival) -> Command | None:
-        command = self._accepted(arrival, Command)
+        command: Command | None = self._accepted(arrival, Command)
         if command is None or command.tick > self._tick:
             if command is not None:
                 self._inbox.refuse(arrival, "its tick is in the future")
@@ -334,7 +332,7 @@ class Field:
         b's next tick begins as many ticks later as its number is higher, and at once if it is lower. A
         restarted a sets its clock from b in the same way, as long as it is behind.
         """
-        tick_start = self._accepted(arrival, TickStart)
+        tick_start: TickStart | None = self._accepted(arrival, TickStart)
         if tick_start is None:
             return
         left = self._tick + 1 - tick_start.tick
@@ -347,7 +345,7 @@ class Field:
             self._inbox.refuse(arrival, f"it is of tick {tick_start.tick}, this is tick {max(self._tick, 0)}")
 
     def _on_report(self, arrival: Arrival) -> None:
-        report = self._accepted(arrival, Report)
+        report: PeerReport | None = self._accepted(arrival, PeerReport)
         if report is not None and self._ending.receive(report):
             self._write(arrival.frame)
 

@@ -15,7 +15,17 @@ from typing import Annotated
 import msgspec
 
 from protocol.journal.journal_file import CorruptJournal
-from protocol.messages import Command, Message, MissionEnd, Observation, Report, RobotConfig
+from protocol.messages import (
+    AnyRobotConfig,
+    Command,
+    Message,
+    MissionEnd,
+    Observation,
+    PeerReport,
+    PlannerReport,
+    Report,
+    RobotConfig,
+)
 from protocol.units import Finite, RobotId, Tick
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 
@@ -64,7 +74,7 @@ class DrivenTick(msgspec.Struct, frozen=True):
     """The frame of the Observation."""
     command: Command | None = None
     """The Command of the agent; None if it missed the deadline."""
-    reports: tuple[Report, ...] = ()
+    reports: tuple[PeerReport, ...] = ()
     """The peer's Reports that affect when the mission ends."""
 
 
@@ -88,6 +98,10 @@ class DriverHistory(msgspec.Struct, frozen=True):
         """True if frames may be missing: writes were not synced, and the computer has been rebooted since."""
         start = self.start
         return self.end is None and start is not None and not start.synced and start.boot != boot()
+
+
+OfDriver = AnyRobotConfig | ProcessStart | Mark | Observation | Command | PeerReport | MissionEnd
+"""The kinds of messages in the journal of a driver."""
 
 
 def driver_history(frames: Sequence[bytes], config: RobotConfig, path: Path) -> DriverHistory:
@@ -117,7 +131,7 @@ def driver_history(frames: Sequence[bytes], config: RobotConfig, path: Path) -> 
                 ticks and message.tick == ticks[-1].observation.tick and ticks[-1].command is None
             ):
                 ticks[-1] = msgspec.structs.replace(ticks[-1], command=message)
-            case Report() if ticks:
+            case Report() | PlannerReport() if ticks:
                 ticks[-1] = msgspec.structs.replace(ticks[-1], reports=(*ticks[-1].reports, message))
             case MissionEnd() if end is None:
                 end = message
@@ -126,14 +140,9 @@ def driver_history(frames: Sequence[bytes], config: RobotConfig, path: Path) -> 
     return DriverHistory(tuple(ticks), mark, end, start)
 
 
-def _message(
-    frame: bytes, path: Path
-) -> RobotConfig | ProcessStart | Mark | Observation | Command | Report | MissionEnd:
+def _message(frame: bytes, path: Path) -> Message:
     try:
-        return decode(
-            frame,
-            RobotConfig | ProcessStart | Mark | Observation | Command | Report | MissionEnd,
-            MAX_FRAME_BYTES,
-        )
+        message: Message = decode(frame, OfDriver, MAX_FRAME_BYTES)
     except MalformedFrame as error:
         raise CorruptJournal(f"{path}: {error}") from None
+    return message

@@ -13,6 +13,7 @@ from protocol.messages import (
     Inconsistent,
     Localised,
     MissionEnd,
+    PeerReport,
     Report,
     RobotConfig,
     Undecided,
@@ -46,10 +47,14 @@ class Ending:
         self._known: int | None = None
         """The tick in which both results were known and acknowledged."""
 
-    def receive(self, report: Report) -> bool:
+    def receive(self, report: PeerReport) -> bool:
         """Add the peer's `report`, and return whether it changes what is known."""
         before = self._peers, self._is_acknowledged
-        self._acknowledged = max(self._acknowledged, report.heard)
+        if isinstance(report, Report):
+            heard = report.heard
+        else:  # of a PlannerReport, the one after the result contains it
+            heard = -1 if report.heard is None else report.heard - 1
+        self._acknowledged = max(self._acknowledged, heard)
         self._peers = self._peers or report.verdict
         return (self._peers, self._is_acknowledged) != before
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.gaussian.least_squares import Fit
+from agent.estimation.gaussian.least_squares import INLIER, Fit, fit
 from agent.estimation.gaussian.range_model import PairRanges
 from protocol.messages import Inconsistent
+from protocol.noise import Noise
 
 CLAIM_P_VALUE = 1e-3
 """The p-value below which a robot does not claim a pose, but measures more ranges."""
@@ -34,6 +36,23 @@ hypothesis.
 FINISHED = 0.1
 """The length in sigmas of the last step above which a fit has not reached its minimum."""
 
+HIGHEST_LEVEL = 9.0
+"""The largest noise level that the own ranges may show, in variances: sigmas three times as large as told.
+
+Residuals that are larger still are a sign of something else. With no bound, no residual would be.
+"""
+
+STRAYS_BEFORE, RANGES_BEFORE = 0.05, 5.0
+"""The strays and the ranges that a robot has seen, as it were, before its first range (a beta distribution).
+
+With more strays, two of twelve mutual ranges may be strays though no range to the own anchor is one, and such
+strays make robots believe false reports. With fewer, honest peers are suspected if 10 % of all ranges are
+outliers that nobody told.
+"""
+
+TOLD_BEFORE = 200.0
+"""The number of ranges that the rate of outliers that was told is worth."""
+
 
 class Inconsistency(NamedTuple):
     """The least favourable test of a fit: a description, its sigmas and its p-value."""
@@ -48,24 +67,170 @@ class Inconsistency(NamedTuple):
         return Inconsistent(self.what, self.sigmas, self.p_value)
 
 
-def consistency_test(fit: Fit, pair: PairRanges) -> Inconsistency:
-    """Return the less probable of two tests: all residuals, and the distance between the anchors.
+def consistency_test(fitted: Fit, pair: PairRanges, robot: int) -> Inconsistency:
+    """Return the least probable of three tests: all residuals, the strays, and the distance of the anchors.
+
+    Its p-value is that of the three together if that is smaller: false data may be a little improbable in
+    each.
 
     The motion of a robot between its anchor and the encounter affects no single range. It is tested only by
-    the distance between the anchors that the fit implies, because this distance is known.
+    the distance between the anchors that the fit implies, because this distance is known. The tests of the
+    residuals and of the strays know those of the own ranges of `robot` (0 or 1), without the peer's reports.
     """
-    free = max(len(fit.residuals) - 6, 1)
-    sigmas = _normal(fit.chi2, free)
-    p_residuals = 0.5 * math.erfc(sigmas / math.sqrt(2.0))
-    score = abs(_distance_score(fit, pair)) if fit.last_step <= FINISHED else 0.0
-    p_distance = math.erfc(score / math.sqrt(2.0))
-    if p_distance < p_residuals:
-        return Inconsistency("motion that implies another distance between the anchors", score, p_distance)
+    count, free = len(fitted.residuals), max(fitted.inliers - 6, 1)
+    misfit = _normal(fitted.chi2, free)
+    p_value = 0.5 * math.erfc(misfit / math.sqrt(2.0))
+    learned = pair.noise.sigma_degrees > 0.0 and p_value < LEARNED_P_VALUE
+    own = _own_fit(fitted, pair, robot) if learned or fitted.inliers < count else None
+    if learned and own is not None:
+        p_value, misfit = _against_own(fitted, own, pair.noise)
     what = (
         "measurements and reports that contradict each other: "
-        f"chi-square {fit.chi2:.3g} for {free} degrees of freedom"
+        f"chi-square {fitted.chi2:.3g} for {free} degrees of freedom"
     )
-    return Inconsistency(what, max(sigmas, 0.0), p_residuals)
+    tests = [Inconsistency(what, max(misfit, 0.0), p_value)]
+    if own is not None and fitted.inliers < count:
+        tests.append(_strays_test(fitted, own, pair, robot))
+    if fitted.last_step <= FINISHED:
+        score = abs(_distance_score(fitted, pair))
+        what = "motion that implies another distance between the anchors"
+        tests.append(Inconsistency(what, score, math.erfc(score / math.sqrt(2.0))))
+    least = min(tests, key=lambda one: one.p_value)
+    return least._replace(p_value=min(least.p_value, fisher([one.p_value for one in tests])))
+
+
+def fisher(p_values: Sequence[float]) -> float:
+    """Return the p-value of several independent tests together (Fisher 1932)."""
+    log_product = sum([math.log(max(one, LEAST_P_VALUE)) for one in p_values])
+    term = total = 1.0
+    for k in range(1, len(p_values)):
+        term *= -log_product / k
+        total += term
+    return math.exp(log_product) * total
+
+
+def _own_fit(fitted: Fit, pair: PairRanges, robot: int) -> Fit:
+    """Return the fit of the ranges of `robot` to its anchor, without the peer's reports."""
+    guess = np.array([*fitted.guess[3 * robot : 3 * robot + 2], 0.0])
+    begun = fitted.errors[robot : robot + 1]
+    return fit(guess, [pair.paths[robot]], pair.ranges.only(robot), pair.noise, begun=begun)
+
+
+def _against_own(fitted: Fit, own: Fit, noise: Noise) -> tuple[float, float]:
+    """Return the p-value and the sigmas of all residuals, by the noise of the own ranges.
+
+    It is the test of nested models (F test): the ranges that depend on the peer against those of the robot to
+    its own anchor.
+    """
+    own_free = max(own.inliers - 2, 0)
+    more, more_free = max(fitted.chi2 - own.chi2, 0.0), max(fitted.inliers - 6 - own_free, 1)
+    degrees = noise.sigma_degrees + own_free
+    level = min((noise.sigma_degrees + own.chi2) / degrees, HIGHEST_LEVEL)
+    p_value = f_tail(more / more_free / level, more_free, degrees)
+    bound = 0.5 * math.erfc(_normal(more / HIGHEST_LEVEL, more_free) / math.sqrt(2.0))
+    return min(p_value, bound), _normal(more / level, more_free)
+
+
+LEARNED_P_VALUE = 1e-2
+"""The p-value under the told noise below which a robot asks how noisy its own ranges are."""
+
+
+def _strays_test(fitted: Fit, own: Fit, pair: PairRanges, robot: int) -> Inconsistency:
+    """Return the test of the number of strays among the ranges that depend on the peer.
+
+    The rate of strays follows from the ranges to the own anchor and from the outliers that were told. Mutual
+    ranges are tested apart from the others: there are fewer of them, and a false hypothesis that drops two of
+    them may fit the rest.
+    """
+    seen, rate = len(own.residuals) - own.inliers, pair.noise.outliers
+    worth = TOLD_BEFORE if rate else 0.0
+    strays = STRAYS_BEFORE + worth * rate + seen
+    ranges = RANGES_BEFORE + worth * (1.0 - rate) + own.inliers
+    stray = fitted.weights <= INLIER
+    mutual = pair.ranges.rows(2)
+    of_mutual, of_all = int(np.count_nonzero(stray[mutual])), int(np.count_nonzero(stray)) - seen
+    tested = [(of_mutual, pair.ranges.counts[2])]
+    if of_all > of_mutual:
+        tested.append((of_all, len(stray) - pair.ranges.counts[robot]))
+    p_value, count, total = min((beta_binomial_tail(k, n, strays, ranges), k, n) for k, n in tested)
+    what = f"measurements and reports of which {count} of {total} fit no other"
+    return Inconsistency(what, sigmas(p_value), p_value)
+
+
+def sigmas(p_value: float) -> float:
+    """Return the standard normal variable, at least 0, that is exceeded with the probability `p_value`."""
+    low, high = 0.0, MOST_SIGMAS
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if math.erfc(middle / math.sqrt(2.0)) > 2.0 * p_value else (low, middle)
+    return low
+
+
+MOST_SIGMAS = 37.0
+"""The standard normal variable that is exceeded with LEAST_P_VALUE."""
+
+HALVINGS = 50
+"""The number of halvings of an interval that lead to the precision of a float."""
+
+LEAST_P_VALUE = 1e-300
+"""The smallest p-value that is told from 0."""
+
+
+def beta_binomial_tail(least: int, count: int, alpha: float, beta: float) -> float:
+    """Return the probability of at least `least` of `count` events, whose rate has a beta distribution.
+
+    `alpha` and `beta` are the parameters of this distribution.
+    """
+    if least <= 0:
+        return 1.0
+    log_norm = math.lgamma(alpha + beta) - math.lgamma(alpha) - math.lgamma(beta)
+    log_norm += math.lgamma(count + 1.0) - math.lgamma(alpha + beta + count)
+    total = 0.0
+    for k in range(least, count + 1):
+        log_term = math.lgamma(k + alpha) + math.lgamma(count - k + beta)
+        total += math.exp(log_norm + log_term - math.lgamma(k + 1.0) - math.lgamma(count - k + 1.0))
+    return min(total, 1.0)
+
+
+def f_tail(ratio: float, over: float, under: float) -> float:
+    """Return the probability of an F ratio above `ratio`, with the degrees of freedom `over` and `under`.
+
+    It is the regularised incomplete beta function, by its continued fraction (Lentz).
+    """
+    if ratio <= 0.0:
+        return 1.0
+    x, a, b = under / (under + over * ratio), 0.5 * under, 0.5 * over
+    front = math.exp(
+        math.lgamma(a + b) - math.lgamma(a) - math.lgamma(b) + a * math.log(x) + b * math.log1p(-x)
+    )
+    if x < (a + 1.0) / (a + b + 2.0):
+        return front * _beta_fraction(x, a, b) / a
+    return 1.0 - front * _beta_fraction(1.0 - x, b, a) / b
+
+
+def _beta_fraction(x: float, a: float, b: float) -> float:
+    """Return the continued fraction of the incomplete beta function at `x`, which is small."""
+    tiny = 1e-300
+    c, d = 1.0, 1.0 - (a + b) * x / (a + 1.0)
+    d = 1.0 / (d if abs(d) > tiny else tiny)
+    value = d
+    for m in range(1, FRACTION_TERMS):
+        for term in (
+            m * (b - m) * x / ((a + 2 * m - 1.0) * (a + 2 * m)),
+            -(a + m) * (a + b + m) * x / ((a + 2 * m) * (a + 2 * m + 1.0)),
+        ):
+            d = 1.0 + term * d
+            d = 1.0 / (d if abs(d) > tiny else tiny)
+            c = 1.0 + term / c
+            c = c if abs(c) > tiny else tiny
+            value *= c * d
+        if abs(c * d - 1.0) < 1e-12:
+            break
+    return value
+
+
+FRACTION_TERMS = 500
+"""The maximum number of terms of the fraction; it needs about the root of the degrees of freedom."""
 
 
 def _normal(chi2: float, free: int) -> float:
@@ -78,23 +243,21 @@ def _normal(chi2: float, free: int) -> float:
     return float(((max(chi2, 0.0) / free) ** (1.0 / 3.0) - (1.0 - spread)) / math.sqrt(spread))
 
 
-def _distance_score(fit: Fit, pair: PairRanges) -> float:
+def _distance_score(fitted: Fit, pair: PairRanges) -> float:
     """Return by how many sigmas the ranges favour another distance of the anchors (score test, Rao 1948)."""
     mutual = pair.ranges.rows(2)
     length = math.hypot(*pair.apart)
-    c, s = math.cos(fit.guess[2]), math.sin(fit.guess[2])
-    ux, uy = fit.directions[0][:, mutual]  # from b to a, in the frame of a's odometry
-    by_distance = np.zeros(len(fit.residuals))
+    c, s = math.cos(fitted.guess[2]), math.sin(fitted.guess[2])
+    ux, uy = fitted.directions[0][:, mutual]  # from b to a, in the frame of a's odometry
+    by_distance = np.zeros(len(fitted.residuals))
     by_distance[mutual] = -((c * ux - s * uy) * pair.apart[0] + (s * ux + c * uy) * pair.apart[1]) / length
-    system = fit.system
-    if system.covariance.ndim == 2:
-        weighted = np.linalg.solve(system.covariance, by_distance)
-    else:
-        weighted = by_distance / system.covariance
+    system = fitted.system
+    weighted = system.covariance.solve(by_distance[:, None])[:, 0]
     explained = system.jacobian.T @ weighted
     information = float(by_distance @ weighted - explained @ system.of_guess @ explained)
     score = float(by_distance @ system.multipliers)
-    return score / math.sqrt(information) if information > LEAST else 0.0
+    level = min(fitted.level, HIGHEST_LEVEL)
+    return score / math.sqrt(information * max(level, 1.0)) if information > LEAST else 0.0
 
 
 LEAST = 1e-3

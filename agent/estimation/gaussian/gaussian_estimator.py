@@ -82,6 +82,7 @@ class GaussianEstimator(msgspec.Struct, frozen=True):
         hypotheses = inference.pair_planning_hypotheses(scored, pair)
         belief = inference.with_pair(knowledge, scored, hypotheses, pair, required_ranges)
         belief = inference.with_convergence_check(belief, scored)
+        belief = inference.with_doubt_check(belief, scored, pair)
         failure = f"the paper's manoeuvres give no further ranges: {belief.blocking_reason}"
         verdict: Verdict | None = None
         if belief.blocking_reason is None:

@@ -9,13 +9,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.gaussian.initial_guesses import MOST, SEED_RANGES, anchors, placements, without_drift
-from agent.estimation.gaussian.least_squares import STEPS, Fit, deviation, fit
-from agent.estimation.gaussian.odometry_noise import Array, Places, Track
+from agent.estimation.gaussian.initial_guesses import (
+    MOST,
+    SEED_RANGES,
+    STARTS,
+    UNLIKELY,
+    anchors,
+    placements,
+)
+from agent.estimation.gaussian.least_squares import STEPS, Fit, deviation, fit, fits
+from agent.estimation.gaussian.linear_model import Start
+from agent.estimation.gaussian.odometry_noise import Array, Errors, Places, Track
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Ranges, placed
 from protocol.noise import Noise
 
@@ -25,11 +34,17 @@ NEGLIGIBLE_PROBABILITY = 1e-7
 SAME_SIGMAS = 1.0
 """The distance in sigmas below which two fits are the same hypothesis."""
 
-ROUGH_STEPS = 2
-"""The Gauss-Newton steps from an initial guess before the likely fits are selected."""
+FOLLOWED_RANGES = 6
+"""The number of ranges to an anchor from which on its hypotheses are followed only, without outliers.
 
-WARM_STEPS = 1
-"""The Gauss-Newton steps from the guess of the previous tick; before a claim, the fit must converge."""
+Two circles have two intersections, so a few ranges from different places leave nothing that a search would
+find. With outliers it takes SEED_RANGES."""
+
+WARM_STEPS = 2
+"""The Gauss-Newton steps from the fit of the previous tick.
+
+Where the best fit has not converged by then, it may be on its way to another mode, and the plane is searched.
+With one step, that is every third tick; with more, each tick takes longer."""
 
 
 class Hypothesis(NamedTuple):
@@ -43,6 +58,23 @@ class Hypothesis(NamedTuple):
     """
     probability: float
     """The probability that this hypothesis is true; the probabilities of all remaining ones sum to 1."""
+    errors: tuple[tuple[tuple[float, ...], ...], ...] = ()
+    """The odometry errors of each robot by its fit, in the order of `Errors`, where the next one begins.
+
+    A fit that began on the measured path again could end in another mode. Empty if odometry is exact.
+    """
+
+    @property
+    def start(self) -> Start:
+        """Return where the next fit begins."""
+        errors = [Errors(*map(np.array, error)) for error in self.errors]
+        return Start(np.array(self.guess), tuple(errors))
+
+    @staticmethod
+    def of_fit(one: Fit, probability: float) -> Hypothesis:
+        """Return the hypothesis of a fit."""
+        errors = [tuple([tuple(part.tolist()) for part in error]) for error in one.errors]
+        return Hypothesis(tuple(one.guess.tolist()), probability, tuple(errors))
 
 
 class ScoredHypothesis(NamedTuple):
@@ -54,12 +86,12 @@ class ScoredHypothesis(NamedTuple):
     """The log-likelihood of the detections and of the ticks without one, given this fit."""
 
 
-def with_probability(fits: Sequence[tuple[Fit, float]]) -> tuple[ScoredHypothesis, ...]:
-    """Return the hypotheses for `fits`, likeliest first, without duplicates and without improbable ones.
+def with_probability(found: Sequence[tuple[Fit, float]]) -> tuple[ScoredHypothesis, ...]:
+    """Return the hypotheses for `found`, likeliest first, without duplicates and without improbable ones.
 
     Each fit is paired with the log-likelihood of its detections and of its ticks without one.
     """
-    scored = [(one.log_likelihood + 0.5 * _log_volume(one) + silent, one, silent) for one, silent in fits]
+    scored = [(one.log_likelihood + 0.5 * _log_volume(one) + silent, one, silent) for one, silent in found]
     scored.sort(key=lambda one: -one[0])
     left: list[tuple[float, Fit, float]] = []
     for weight, one, silent in scored:
@@ -69,7 +101,7 @@ def with_probability(fits: Sequence[tuple[Fit, float]]) -> tuple[ScoredHypothesi
             left.append((math.exp(weight - scored[0][0]), one, silent))
     total = sum([probability for probability, _, _ in left])
     return tuple(
-        ScoredHypothesis(Hypothesis(tuple(one.guess.tolist()), probability / total), one, silent)
+        ScoredHypothesis(Hypothesis.of_fit(one, probability / total), one, silent)
         for probability, one, silent in left
     )
 
@@ -77,8 +109,7 @@ def with_probability(fits: Sequence[tuple[Fit, float]]) -> tuple[ScoredHypothesi
 def _same(one: Fit, other: Fit) -> bool:
     change = one.guess - other.guess
     change[2::3] = np.remainder(change[2::3] + math.pi, 2.0 * math.pi) - math.pi
-    if len(change) == 3:
-        change = change[:2]
+    change = change[: len(one.information)]
     return float(change @ one.information @ change) < SAME_SIGMAS**2
 
 
@@ -130,16 +161,18 @@ def of_anchor(
     """
     known = tuple(before)
     lost = bool(len(silent)) and silent[-1] == len(path.x) - 1
-    if known and len(ranges.rho) > SEED_RANGES and not lost:
-        starts = [np.array(one.guess) for one in known]
+    enough = SEED_RANGES if noise.outliers else FOLLOWED_RANGES
+    if known and len(ranges.rho) > enough and not lost:
+        starts = [one.start for one in known]
         steps = WARM_STEPS
     else:
         places = [one.guess[:2] for one in known]
-        starts = [np.array([*point, 0.0]) for point in anchors(path, ranges, sensing_range, noise, places)]
+        points = anchors(path, ranges, sensing_range, noise, places)
+        starts = [Start(np.array([*point, 0.0])) for point in points]
         steps = STEPS
-    fits = [fit(guess, [path], ranges, noise, steps=steps) for guess in starts]
+    found = fits(starts, [path], ranges, noise, steps=steps)
     return with_probability(
-        [(one, _anchor_log_likelihood(one, 0, silent, ranges.tick, sensing_range, noise)) for one in fits]
+        [(one, _anchor_log_likelihood(one, 0, silent, ranges.tick, sensing_range, noise)) for one in found]
     )
 
 
@@ -193,34 +226,75 @@ def _log_volume(one: Fit) -> float:
 # --- the pair -----------------------------------------------------------------------------------------
 
 
-def search(pair: PairRanges) -> tuple[ScoredHypothesis, ...]:
-    """Return the hypotheses about both robots in <W>, from a search of the whole plane.
+@lru_cache(maxsize=2)
+def search(pair: PairRanges, known: tuple[Hypothesis, ...] = ()) -> tuple[ScoredHypothesis, ...]:
+    """Return the hypotheses about both robots in <W>: of a search of the whole plane, and those `known`.
 
-    The search combines the branches of a, the branches of b and their placements. The first fits treat
-    odometry noise as noise of the ranges. The likely ones are then fitted with the full model.
+    The search combines the branches of a, the branches of b and their placements. Where both robots run in
+    one process, they mostly search with the same measurements in the same tick.
     """
-    of_a, of_b = (
-        anchors(path, pair.ranges.only(robot), pair.sensing_range, pair.noise)
-        for robot, path in enumerate(pair.paths)
-    )
-    seeds = [
-        np.array([*a, theta_a, *b, theta_b])
+    of_a, of_b = (_alone(pair, robot) for robot in (0, 1))
+    found = [
+        (placed.log_likelihood + math.log(a.hypothesis.probability * b.hypothesis.probability), placed.start)
         for a in of_a
         for b in of_b
-        for theta_a, theta_b in placements(a, b, pair)
+        for placed in placements((a.fit, b.fit), pair)
     ]
-    rough = _fitted(seeds, without_drift(pair), ROUGH_STEPS)
-    return _fitted([one.fit.guess for one in rough], pair, STEPS)
+    found.sort(key=lambda one: -one[0])
+    starts = [start for weight, start in found[:STARTS] if weight > found[0][0] - UNLIKELY]
+    return _fitted([*[one.start for one in known], *starts], pair, STEPS)
 
 
-def follow(before: Sequence[Hypothesis], pair: PairRanges) -> tuple[ScoredHypothesis, ...]:
+def _alone(pair: PairRanges, robot: int) -> tuple[ScoredHypothesis, ...]:
+    """Return the hypotheses about one robot's anchor in the frame of its odometry, by its own ranges."""
+    path, ranges = pair.paths[robot], pair.ranges.only(robot)
+    last = int(ranges.tick[-1]) if len(ranges.tick) else 0
+    found = _up_to_last_range(_OwnRanges(path.until(last), ranges, pair.sensing_range, pair.noise))
+    return tuple([one._replace(fit=one.fit.continued(path)) for one in found])
+
+
+class _OwnRanges(NamedTuple):
+    """The ranges of one robot to its anchor, and its path up to the last of them."""
+
+    path: Track
+    ranges: Ranges
+    sensing_range: float
+    noise: Noise
+
+    @property
+    def content(self) -> tuple[object, ...]:
+        """Return all measurements as values that can be compared."""
+        return self.path.content, self.ranges.content, self.sensing_range, self.noise
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether `other` has the same measurements, to the bit."""
+        return isinstance(other, _OwnRanges) and self.content == other.content
+
+    def __hash__(self) -> int:
+        """Return the hash of all measurements."""
+        return hash(self.content)
+
+
+@lru_cache(maxsize=8)
+def _up_to_last_range(own: _OwnRanges) -> tuple[ScoredHypothesis, ...]:
+    """Return the hypotheses about one robot's anchor up to the last range to it.
+
+    A robot that has left its anchor has the same in each tick.
+    """
+    points = anchors(own.path, own.ranges, own.sensing_range, own.noise)
+    found = fits([Start(np.array([*point, 0.0])) for point in points], [own.path], own.ranges, own.noise)
+    return with_probability([(one, 0.0) for one in found])
+
+
+@lru_cache(maxsize=2)
+def follow(before: tuple[Hypothesis, ...], pair: PairRanges) -> tuple[ScoredHypothesis, ...]:
     """Return the hypotheses that follow from those of the previous tick, `before`."""
-    return _fitted([np.array(one.guess) for one in before], pair, WARM_STEPS)
+    return _fitted([one.start for one in before], pair, WARM_STEPS)
 
 
-def _fitted(guesses: Sequence[Array], pair: PairRanges, steps: int) -> tuple[ScoredHypothesis, ...]:
-    fits = [fit(guess, pair.paths, pair.ranges, pair.noise, pair.apart, steps) for guess in guesses]
-    return with_probability([(one, _detection_log_likelihood(one, pair)) for one in fits])
+def _fitted(starts: Sequence[Start], pair: PairRanges, steps: int) -> tuple[ScoredHypothesis, ...]:
+    found = fits(starts, pair.paths, pair.ranges, pair.noise, pair.apart, steps)
+    return with_probability([(one, _detection_log_likelihood(one, pair)) for one in found])
 
 
 def _detection_log_likelihood(one: Fit, pair: PairRanges) -> float:
@@ -258,3 +332,55 @@ def _mutual_log_likelihood(one: Fit, pair: PairRanges) -> float:
         )
     sigma = math.hypot(deviation(float(gradient @ one.covariance @ gradient)), EDGE * pair.sensing_range)
     return no_detection_log_likelihood(beyond, sigma, pair.noise.drop_outs)
+
+
+# --- evidence against chance ---------------------------------------------------------------------------
+
+
+def anchor_evidence(one: Fit, path: Track, ranges: Ranges, sensing_range: float) -> float:
+    """Return the logarithm of the Bayes factor for the fit of one robot, against ranges by chance.
+
+    It compares marginal likelihoods: that of the ranges if the anchor is anywhere within R of the start, with
+    the other unknowns integrated out (Laplace), and that of ranges that have nothing to do with each other
+    (see `_log_widths`).
+    """
+    prior = math.log(math.pi * sensing_range**2)
+    volume = math.log(2.0 * math.pi) + 0.5 * _log_volume(one)
+    return one.log_likelihood + volume - prior + _log_widths((path,), ranges, sensing_range)
+
+
+def mutual_evidence(one: Fit, pair: PairRanges) -> float:
+    """Return the logarithm of the Bayes factor for the mutual ranges under a fit of both robots.
+
+    It is that of `anchor_evidence`, given the ranges to the anchors. All headings are equally probable.
+    """
+    weight = one.log_likelihood + 0.5 * _log_volume(one) - math.log(2.0 * math.pi)
+    for robot in (0, 1):
+        guess = np.array([*one.guess[3 * robot : 3 * robot + 2], 0.0])
+        begun = one.errors[robot : robot + 1]
+        own = fit(guess, [pair.paths[robot]], pair.ranges.only(robot), pair.noise, begun=begun)
+        weight -= own.log_likelihood + 0.5 * _log_volume(own)
+    return weight + _log_widths(pair.paths, pair.ranges.only(2), pair.sensing_range)
+
+
+def _log_widths(paths: Sequence[Track], ranges: Ranges, sensing_range: float) -> float:
+    """Return the logarithm of the volume (m^n) over which n ranges spread that fit each other by chance.
+
+    The first is anywhere within R. Each of the others differs from the last by as much as the robots have
+    moved since at the most, and by the noise.
+    """
+    moved = np.zeros(max(len(ranges.tick) - 1, 0))
+    for path in paths:
+        ticks = np.minimum(ranges.tick, len(path.v))
+        moved += np.hypot(np.diff(path.x[ticks]), np.diff(path.y[ticks]))
+    width = np.full(len(ranges.tick), sensing_range)
+    width[1:] = np.minimum(np.hypot(2.0 * moved, CHANCE_SIGMAS * ranges.sigma[1:]), sensing_range)
+    return float(np.sum(np.log(width)))
+
+
+CHANCE_SIGMAS = 6.0
+"""The least width, in sigmas of a range, over which ranges by chance spread.
+
+It contains all of a normal distribution. With less, ranges from a robot at rest would speak for any fit; with
+more, they would be worth more than their noise allows.
+"""

@@ -11,9 +11,16 @@ from msgspec.structs import replace
 
 from agent.estimation.exact import Branch
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, Inconsistency, consistency_test
-from agent.estimation.gaussian.hypotheses import ScoredHypothesis, missing, of_anchor
-from agent.estimation.gaussian.least_squares import deviation, poses
+from agent.estimation.gaussian.hypotheses import (
+    ScoredHypothesis,
+    anchor_evidence,
+    missing,
+    mutual_evidence,
+    of_anchor,
+)
+from agent.estimation.gaussian.least_squares import Fit, deviation, poses
 from agent.estimation.gaussian.odometry_noise import Array, Track, track
+from agent.estimation.gaussian.own_sensors import DOUBTFUL_CLAIMS, Doubt, claim_doubt, doubt
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Ranges
 from agent.estimation.knowledge import Belief, Knowledge
 from agent.peer.motion_log import MotionLog
@@ -45,7 +52,7 @@ def own_anchor(knowledge: Knowledge) -> tuple[ScoredHypothesis, ...]:
     mission = knowledge.config.mission
     path = path_of(knowledge.log, knowledge.tick, mission.period)
     ranges = Ranges.of_lists(_ranges_until(knowledge.log, knowledge.tick), (), (), mission.noise)
-    possible = ranges.within(mission.sensing_range)
+    possible = ranges.within(mission.sensing_range, mission.noise.priors).thinned(mission.noise)
     if not len(possible.rho):
         return ()
     silent = missing(ranges.tick, knowledge.tick + 1)
@@ -55,6 +62,25 @@ def own_anchor(knowledge: Knowledge) -> tuple[ScoredHypothesis, ...]:
 def _ranges_until(log: MotionLog, through: int) -> list[tuple[int, float]]:
     """Return tick and range in m of each anchor range of `log` up to tick `through`."""
     return [(ranged.tick, ranged.range) for ranged in log.ranges if ranged.tick <= through]
+
+
+def sensor_doubt(knowledge: Knowledge) -> Doubt | None:
+    """Return the profile that explains the contradiction for which the robot would blame its peer.
+
+    It explains the own measurements better than the noise that the robot was told, or all without a
+    contradiction.
+    """
+    mission = knowledge.config.mission
+    path = path_of(knowledge.log, knowledge.tick, mission.period)
+    ranges = Ranges.of_lists(_ranges_until(knowledge.log, knowledge.tick), (), (), mission.noise)
+    return doubt(
+        path,
+        ranges.thinned(mission.noise),
+        mission.sensing_range,
+        mission.noise,
+        pair_of(knowledge),
+        0 if knowledge.config.role == "a" else 1,
+    )
 
 
 def with_own(knowledge: Knowledge, scored: Sequence[ScoredHypothesis]) -> Belief:
@@ -87,24 +113,64 @@ def anchor_planning_hypotheses(scored: Sequence[ScoredHypothesis]) -> list[Plann
     return hypotheses
 
 
-def is_anchor_known(scored: Sequence[ScoredHypothesis], mission: Mission) -> bool:
+def is_anchor_known(knowledge: Knowledge, scored: Sequence[ScoredHypothesis]) -> bool:
     """Return whether the anchor's position is known well enough to end phase 1."""
-    best = scored[0]
-    required_ranges = ANCHOR_RANGES_WITH_OUTLIERS if mission.noise.outliers else ANCHOR_RANGES
-    return (
-        int(np.count_nonzero(best.fit.weights > 0.5)) >= required_ranges
-        and best.hypothesis.probability >= SURE_OF_BRANCH
-        and deviation(float(np.trace(best.fit.covariance))) <= mission.required_anchor_sigma
-    )
+    mission, best = knowledge.config.mission, scored[0]
+    good = int(np.count_nonzero(best.fit.weights > 0.5))
+    if good < LEAST_RANGES or best.hypothesis.probability < SURE_OF_BRANCH:
+        return False
+    if _anchor_sigma(best.fit) > mission.required_anchor_sigma:
+        return False
+    if mission.noise.outliers or good >= ANCHOR_RANGES:
+        return good >= (ANCHOR_RANGES_WITH_OUTLIERS if mission.noise.outliers else ANCHOR_RANGES)
+    path = path_of(knowledge.log, knowledge.tick, mission.period)
+    ranges = Ranges.of_lists(_ranges_until(knowledge.log, knowledge.tick), (), (), mission.noise)
+    possible = ranges.within(mission.sensing_range, mission.noise.priors)
+    evidence = anchor_evidence(best.fit, path, possible, mission.sensing_range)
+    return evidence >= ANCHOR_EVIDENCE
+
+
+def _anchor_sigma(fit: Fit) -> float:
+    """Return the sigma (m) of the anchor's position relative to the start, or to the robot now if it is less.
+
+    With noisy odometry, ranges tell less and less of where a robot started.
+    """
+    of_start = np.trace(fit.covariance)
+    return deviation(float(min(of_start, np.trace(poses(fit, (0.0, 0.0))[1][:2, :2]))))
 
 
 SURE_OF_BRANCH = 0.999
-"""The probability from which on a robot accepts a branch and ends phase 1."""
+"""The probability from which on a robot accepts a branch and ends phase 1.
+
+A wrong branch does not lead to a wrong claim: all branches take part in the search of phase 3.
+"""
+
+ANCHOR_EVIDENCE = 20.0
+"""The evidence against chance that ends phase 1 with fewer than ANCHOR_RANGES, without outliers.
+
+Set on sigmas of 1e-9 to 0.1 m. With 7, three ranges of sigma 0.001 m ended phase 1, and 1 of 12 missions took
+an honest peer for inconsistent: few ranges make every later test depend on the error of one. With more,
+exact ranges take as many as noisy ones.
+"""
+
+LEAST_RANGES = 3
+"""The least number of ranges to an anchor, or between the robots, that may be enough.
+
+Two have no redundancy. The third checks them, if it is accurate: by its evidence against chance.
+"""
 
 ANCHOR_RANGES, ANCHOR_RANGES_WITH_OUTLIERS = 5, 7
-"""The minimum number of anchor ranges before phase 1 ends, without and with outliers.
+"""The numbers of anchor ranges that end phase 1 without such evidence, without and with outliers.
 
-Two unknowns need two ranges. The others check them.
+Set on the sweep `noise`. With sigmas of R / 30 and more, ranges give little evidence: it would take twice as
+many of them. With fewer, wrong branches reach phase 3, which takes longer; with more, phase 1 takes longer.
+"""
+
+MUTUAL_RANGES, MUTUAL_RANGES_WITH_OUTLIERS = 8, 12
+"""The numbers of mutual ranges from different places with which a claim needs no evidence against chance.
+
+Set on the sweep `noise`, in which 1 of 30 000 missions was wrong. With sigmas of R / 30 and more, evidence
+would need 11. With fewer ranges, claims are too often wrong; with more, each mission takes longer.
 """
 
 
@@ -132,7 +198,7 @@ def pair_of(knowledge: Knowledge) -> PairRanges:
     lists = [_ranges_until(log, end) for log, end in zip(logs, ends, strict=False)]
     ranges = Ranges.of_lists(lists[0], lists[1], mutual, mission.noise)
     silent = [missing(ranges.tick[ranges.rows(kind)], ends[kind] + 1) for kind in range(3)]
-    ranges = ranges.within(mission.sensing_range)
+    ranges = ranges.within(mission.sensing_range, mission.noise.priors).thinned(mission.noise)
     own, other = config.anchor, config.peer_anchor
     sign = 1.0 if config.role == "a" else -1.0
     return PairRanges(
@@ -181,6 +247,37 @@ def blocking_reason_for(
     return None
 
 
+def sufficient_mutual_ranges(mission: Mission) -> int:
+    """Return the number of mutual ranges from different places from which on evidence is not required.
+
+    With fewer, no suspicion of the peer counts either: the tests of a few ranges repeat each other.
+    """
+    return MUTUAL_RANGES_WITH_OUTLIERS if mission.noise.outliers else MUTUAL_RANGES
+
+
+def with_evidence_check(
+    belief: Belief, scored: Sequence[ScoredHypothesis], pair: PairRanges, mission: Mission
+) -> Belief:
+    """Return `belief` with a blocking reason if the mutual ranges may agree by chance.
+
+    A few noisy ranges do; three exact ones do not. The probability that they do must be at most
+    1 - confidence, if both are equally probable before. MUTUAL_RANGES suffice in any case. With outliers, a
+    claim needs that number: agreement of a few ranges among which one is an outlier is not chance.
+    """
+    if belief.blocking_reason is not None or len(pair.places) >= sufficient_mutual_ranges(mission):
+        return belief
+    evidence, required = mutual_evidence(scored[0].fit, pair), -math.log1p(-mission.confidence)
+    if evidence >= required:
+        return belief
+    return replace(
+        belief,
+        blocking_reason=(
+            f"the mutual ranges may agree by chance: the log evidence against it is {evidence:.3g}, "
+            f"required {required:.3g}"
+        ),
+    )
+
+
 def with_convergence_check(belief: Belief, scored: Sequence[ScoredHypothesis]) -> Belief:
     """Return `belief` with a blocking reason if the fit of the most probable hypothesis has not converged."""
     if belief.blocking_reason is not None or scored[0].fit.last_step <= FINISHED:
@@ -190,6 +287,25 @@ def with_convergence_check(belief: Belief, scored: Sequence[ScoredHypothesis]) -
         f"{scored[0].fit.last_step:.3g} sigmas"
     )
     return replace(belief, blocking_reason=blocking_reason)
+
+
+def with_doubt_check(belief: Belief, scored: Sequence[ScoredHypothesis], pair: PairRanges) -> Belief:
+    """Return `belief` with a blocking reason if a profile contradicts the claim that would follow.
+
+    The profile explains the ranges of both robots much better. After DOUBTFUL_CLAIMS of them, more ranges
+    have not helped, and `belief.doubtful_claims` says so.
+    """
+    if belief.blocking_reason is not None:
+        return belief
+    found = claim_doubt(scored[0].fit, pair)
+    if found is None:
+        return replace(belief, doubtful_claims=0)
+    return replace(belief, blocking_reason=found.reason, doubtful_claims=belief.doubtful_claims + 1)
+
+
+def ends_in_doubt(belief: Belief) -> bool:
+    """Return whether a robot gives up because a profile contradicts all of its latest claims."""
+    return belief.doubtful_claims >= DOUBTFUL_CLAIMS
 
 
 def with_pair(
@@ -207,7 +323,7 @@ def with_pair(
     config = knowledge.config
     robot, m1 = (0, config.anchor) if config.role == "a" else (1, config.peer_anchor)
     enough = len(pair.places) >= mutual
-    inconsistency = consistency_test(scored[0].fit, pair) if enough and scored else None
+    inconsistency = consistency_test(scored[0].fit, pair, robot) if enough and scored else None
     blocking_reason = blocking_reason_for(scored, hypotheses, inconsistency, pair, config.mission)
     claims = [claim(one, robot, pair) for one in hypotheses]
     first, _ = knowledge.belief.candidates or (len(scored), 0)

@@ -9,13 +9,31 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
-from msgspec.structs import replace
 
-from agent.estimation.gaussian.odometry_noise import Array, Places, Track, wander
-from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Ranges, mixture, placed
-from protocol.noise import Noise, VelocityNoise
+from agent.estimation.gaussian.least_squares import Fit
+from agent.estimation.gaussian.linear_model import Start
+from agent.estimation.gaussian.odometry_noise import (
+    Array,
+    Errors,
+    OdometryNoiseModel,
+    Places,
+    Projection,
+    Track,
+    attributed,
+    constant_effects,
+    constant_errors,
+    is_noisy,
+    spread,
+    symmetric,
+    variances,
+    wander,
+)
+from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Ranges, mixture
+from protocol.noise import Noise
 
 SEED_RANGES = 10
 """The largest number of ranges that initial guesses are made from.
@@ -27,7 +45,9 @@ NEAR = 0.02
 """The expected error of an initial guess, as a fraction of R; guesses closer than this are merged."""
 
 SCAN = 72
-"""The number of headings that are tried for the robot nearer to its anchor."""
+"""The number of headings that are tried for the robot nearer to its anchor.
+
+With several radii of the other robot's circle, half as many."""
 
 BENT = 0.1
 """The distance, as a fraction of R, below which placements are merged.
@@ -35,8 +55,33 @@ BENT = 0.1
 A fit moves by itself along directions that the ranges leave undetermined.
 """
 
+OFFSETS = (0.0, 1.0, -1.0, 2.0, -2.0)
+"""The offsets of the far robot from its anchor's circle that are scanned, in sigmas of its radius."""
+
+WIDE = 0.25
+"""The sigma of that radius, in steps of the scan, from which on other offsets than 0 are scanned.
+
+Gauss-Newton bridges smaller ones."""
+
+RIDGE_BETWEEN = 2.0
+"""The log-likelihood by which two candidates must exceed that between them to be two, however near they are.
+
+Without it, two exact placements 0.01 rad apart are one; with much less, rounding makes one candidate two."""
+
+DAMPING = 1e-3
+"""The damping of headings in the first refinement, as a fraction of their information."""
+
+CROWD = 60
+"""The number of candidates that are kept between refinements."""
+
+STARTS = 12
+"""The number of placements from which fits begin."""
+
+LEAST_OFFSET = 1e-9
+"""The sigma (m, rad) of an offset below which it is not attributed to anything."""
+
 POLISHINGS = 4
-"""The number of Gauss-Newton steps on an initial guess."""
+"""The least number of Gauss-Newton steps on an initial guess."""
 
 FINER, FINER_TURN = 0.1, 0.2
 """The factors by which the expected errors of a position and of a heading decrease at each of these steps."""
@@ -69,17 +114,26 @@ def anchors(
     if not len(points):
         return points
     variance = np.square(ranges.sigma) + _odometry_variance(path, ranges, noise)
+    variance += ranges.loosened(noise.priors)
     return _polished(points, path, ranges, np.sqrt(variance), noise, sensing_range)
 
 
 def _odometry_variance(path: Track, ranges: Ranges, noise: Noise) -> Array:
     """Return the approximate variance (m^2) that odometry noise adds to each range, without correlations."""
-    if noise.odometry == VelocityNoise():
+    if not is_noisy(noise):
         return np.zeros_like(ranges.rho)
-    model = wander(path, noise.odometry, path)
-    turn, bx, by, xx, _, yy = model.sums
-    lever = path.period
-    position = xx + yy + 2.0 * lever * (path.y * bx - path.x * by) + lever**2 * (path.x**2 + path.y**2) * turn
+    v, omega = path.v, path.omega
+    white = variances(v, omega, noise.odometry)
+    if path.extra is not None:
+        white += path.extra
+    model = wander(path, np.zeros(path.shift.shape), constant_errors(v, omega, noise), white)
+    lever, position = path.period, np.zeros(len(path.x))
+    if model.sums is not None:
+        turn, bx, by, xx, _, yy = model.sums
+        position = xx + yy - 2.0 * lever * (path.y * bx - path.x * by)
+        position += lever**2 * (path.x**2 + path.y**2) * turn
+    for turned, x, y in model.moves[:-1]:
+        position = position + np.square(x - lever * path.y * turned) + np.square(y + lever * path.x * turned)
     along: Array = 0.5 * np.maximum(position, 0.0)[np.minimum(ranges.tick, len(path.v))]
     return along
 
@@ -161,108 +215,279 @@ UNLIKELY = 25.0
 # --- a pair -----------------------------------------------------------------------------------------
 
 
-def without_drift(pair: PairRanges) -> PairRanges:
-    """Return `pair` with exact odometry, and with its noise added to the variances of the ranges."""
-    if pair.noise.odometry == VelocityNoise():
-        return pair
-    variance = np.square(pair.ranges.sigma)
-    for robot, path in enumerate(pair.paths):
-        added = _odometry_variance(path, pair.ranges, pair.noise)
-        added[pair.ranges.rows(1 - robot)] = 0.0
-        variance = variance + added
-    ranges = pair.ranges._replace(sigma=np.sqrt(variance))
-    return pair._replace(ranges=ranges, noise=replace(pair.noise, odometry=VelocityNoise()))
+class Placed(NamedTuple):
+    """A candidate for the placement of both robots in <W>, by the mutual ranges."""
+
+    start: Start
+    log_likelihood: float
+    """The log-likelihood of the mutual ranges used, and of the offsets, up to a constant."""
 
 
-def placements(of_a: Array, of_b: Array, pair: PairRanges) -> list[tuple[float, float]]:
-    """Return the most likely rotations (rad) of the two odometry frames in <W>, given the mutual ranges.
+class Residuals(NamedTuple):
+    """The residuals of n candidates for a placement, with N mutual ranges."""
 
-    `of_a` and `of_b` are the positions (m) of the anchors in these frames.
+    residuals: Array
+    """The measured minus the predicted ranges (m); shape (n, N)."""
+    jacobian: Array
+    """The derivatives of the predicted ranges; shape (n, N, 8)."""
+    gap: Array
+    """The vector (m) between the robots at the middle range; shape (n, 2)."""
+
+
+class Encounter(NamedTuple):
+    """One robot at the encounter, from the ranges to its own anchor alone.
+
+    Its position relative to its anchor, and its heading, are known up to one offset, which is common to all
+    mutual ranges: the uncertainty of the anchor, and the odometry noise since the last range to it.
+    """
+
+    x: Array
+    """The x (m) at the ticks of the mutual ranges, relative to the anchor, in the frame of the odometry."""
+    y: Array
+    root: Array
+    """A square root of the covariance of the offset in x, y and heading; shape (3, 3)."""
+    inverse: Array
+    """The transposed pseudo-inverse of `root`; shape (3, 3)."""
+    of_anchor: Array
+    """The part of that covariance that is due to the anchor; shape (3, 3)."""
+    odometry: tuple[OdometryNoiseModel, Projection] | None
+    """The odometry noise since the last range to the anchor, and the offset as rows; None if it is exact."""
+    since: int
+    """The tick of that range."""
+
+    def begun(self, own: Fit, z: Array) -> tuple[Array, tuple[Errors, ...]]:
+        """Return the anchor (m) and the odometry errors for the whitened offset `z`, shape (3,)."""
+        weights = self.inverse @ z
+        anchor = own.guess[:2] - (self.of_anchor @ weights)[:2]
+        if self.odometry is None:
+            return anchor, ()
+        model, rows = self.odometry
+        patterns = own.problem.patterns[0].copy()
+        patterns[:, :, : self.since] = 0.0
+        constant = constant_effects(model, rows)[:-1] @ weights
+        more = attributed(model, rows, weights) + np.tensordot(constant, patterns, 1)
+        begun = own.errors[0]
+        return anchor, (Errors(begun.v + more[0], begun.omega + more[1], begun.constant),)
+
+
+def _encounter(own: Fit, base: int, ticks: Places) -> Encounter:
+    """Return the robot of the fit `own` at `ticks`, with its offset at the tick `base`."""
+    (path,) = own.paths
+    x, y = path.x[ticks] - own.guess[0], path.y[ticks] - own.guess[1]
+    of_anchor = np.zeros((3, 3))
+    of_anchor[:2, :2] = own.covariance
+    covariance, odometry, since = of_anchor, None, 0
+    if own.errors:
+        earlier = own.ticks[own.ticks <= base]
+        since = int(earlier[-1]) if len(earlier) else 0
+        model = own.drift(0).since(since)
+        rows = Projection.pose(path, base)
+        odometry = (model, rows)
+        constant = constant_effects(model, rows)[:-1]
+        covariance = of_anchor + symmetric(*spread(model, rows), rows.ticks) + constant.T @ constant
+    variances, axes = np.linalg.eigh(covariance)
+    sigmas = np.sqrt(np.maximum(variances, 0.0))
+    inverse = axes * np.where(sigmas > LEAST_OFFSET, 1.0 / np.maximum(sigmas, LEAST_OFFSET), 0.0)
+    return Encounter(x, y, axes * sigmas, inverse, of_anchor, odometry, since)
+
+
+def placements(own: tuple[Fit, Fit], pair: PairRanges) -> list[Placed]:
+    """Return the most likely starts of a fit of both robots, given the mutual ranges, the likeliest first.
+
+    `own` contains a fit of each robot to the ranges to its anchor. Their odometry noise before the encounter
+    is not noise of each mutual range: it moves all of them at once. The unknowns are therefore the rotations
+    of both frames, and one offset of each robot (see `Encounter`).
 
     The robot nearer to its anchor is rotated through all headings. One mutual range then leaves two headings
     of the other robot, at the intersections of the circles about its anchor and about the first robot
-    (Section III.C with one circle rotated). The other mutual ranges determine which of the headings are
-    likely.
+    (Section III.C with one circle rotated). The circle about its anchor is also tried with other radii,
+    within its uncertainty. The other mutual ranges determine which candidates are likely.
     """
     mutual = pair.ranges.rows(2)
     ticks, rho, sigma = pair.ranges.tick[mutual], pair.ranges.rho[mutual], pair.ranges.sigma[mutual]
     places = pair.places if len(pair.places) >= SEED_RANGES else np.arange(len(ticks))
     some = places[_spread(len(places))]
+    sigma = np.sqrt(np.square(sigma) + pair.ranges.loosened(pair.noise.priors)[mutual])
     ticks, rho, sigma = ticks[some], rho[some], sigma[some]
-    place = [
-        placed(np.array([*one, 0.0]), path, ticks) for one, path in zip((of_a, of_b), pair.paths, strict=True)
-    ]
-    radii = [np.hypot(x, y) for x, y in place]
-    near, far = (0, 1) if float(np.mean(radii[0])) < float(np.mean(radii[1])) else (1, 0)
+    middle = len(ticks) // 2
+    robots = [_encounter(one, int(ticks[middle]), ticks) for one in own]
+    radii = [float(np.mean(np.hypot(one.x, one.y))) for one in robots]
+    near, far = (0, 1) if radii[0] < radii[1] else (1, 0)
     sign = 1.0 if far == 0 else -1.0
-    dx, dy = sign * pair.apart[0], sign * pair.apart[1]  # from the far robot's anchor to the near one's
-    scan = np.linspace(-math.pi, math.pi, SCAN, endpoint=False)
-    c, s = np.cos(scan), np.sin(scan)
-    seeds = []
-    for base in sorted({0, len(ticks) - 1}):
-        x = dx + c * place[near][0][base] - s * place[near][1][base]
-        y = dy + s * place[near][0][base] + c * place[near][1][base]
-        gap = np.maximum(np.hypot(x, y), SIGMA_FLOOR)
-        radius = max(float(radii[far][base]), SIGMA_FLOOR)
-        opening = np.arccos(np.clip((gap**2 + radius**2 - rho[base] ** 2) / (2.0 * gap * radius), -1.0, 1.0))
-        bearing = np.arctan2(y, x) - math.atan2(place[far][1][base], place[far][0][base])
-        seeds += [np.stack((scan, bearing + opening), 1), np.stack((scan, bearing - opening), 1)]
-    turns = np.concatenate(seeds)
-    lever = np.array([max(float(np.mean(radii[robot])), SHORTEST) for robot in (near, far)])
-    odometry = sum([_odometry_variance(path, pair.ranges, pair.noise)[mutual][some] for path in pair.paths])
-    turns = _turned(
-        turns, [place[near], place[far]], rho, np.sqrt(np.square(sigma) + odometry), (dx, dy), lever, pair
-    )
-    found = [(float(one), float(other)) for one, other in turns]
-    return found if near == 0 else [(other, one) for one, other in found]
+    apart = (sign * pair.apart[0], sign * pair.apart[1])  # from the far robot's anchor to the near one's
+    lever = np.array([max(radii[robot], SHORTEST) for robot in (near, far)])
+    ends = sorted({0, len(ticks) - 1})
+    z = np.concatenate([_scanned(robots[near], robots[far], i, float(rho[i]), apart, lever) for i in ends])
+    z, likely = _turned(z, (robots[near], robots[far]), middle, rho, sigma, apart, lever, pair)
+    found = []
+    for one, log_likelihood in zip(z, likely.tolist(), strict=True):
+        guess, errors = np.empty(6), []
+        for i, robot in enumerate((near, far)):
+            anchor, more = robots[robot].begun(own[robot], one[2 + 3 * i : 5 + 3 * i])
+            guess[3 * robot : 3 * robot + 3] = *anchor, one[i]
+            errors.append(more)
+        in_order = errors if near == 0 else errors[::-1]
+        found.append(Placed(Start(guess, tuple([one for more in in_order for one in more])), log_likelihood))
+    return found
+
+
+def _scanned(
+    near: Encounter, far: Encounter, i: int, rho: float, apart: tuple[float, float], lever: Array
+) -> Array:
+    """Return the candidates from the mutual range `rho` (m) with index `i`; shape (n, 8).
+
+    The columns are the rotations of the near and of the far robot, and the whitened offset of each.
+    """
+    own = max(math.hypot(far.x[i], far.y[i]), SIGMA_FLOOR)
+    outwards = np.array((far.x[i], far.y[i], 0.0)) / own @ far.root
+    uncertainty = float(np.linalg.norm(outwards))
+    offsets = OFFSETS if uncertainty > WIDE * math.tau / SCAN * lever[0] else OFFSETS[:1]
+    turn = np.linspace(-math.pi, math.pi, SCAN if len(offsets) == 1 else SCAN // 2, endpoint=False)
+    c, s = np.cos(turn), np.sin(turn)
+    x = apart[0] + c * near.x[i] - s * near.y[i]
+    y = apart[1] + s * near.x[i] + c * near.y[i]
+    gap = np.maximum(np.hypot(x, y), SIGMA_FLOOR)
+    bearing = np.arctan2(y, x) - math.atan2(far.y[i], far.x[i])
+    candidates = []
+    for offset in offsets:
+        radius = max(own + offset * uncertainty, SIGMA_FLOOR)
+        opening = np.arccos(np.clip((gap**2 + radius**2 - rho**2) / (2.0 * gap * radius), -1.0, 1.0))
+        for way in (1.0, -1.0):
+            z = np.zeros((len(turn), 8))
+            z[:, 0], z[:, 1] = turn, bearing + way * opening
+            if offset:
+                z[:, 5:8] = offset * outwards / uncertainty
+            candidates.append(z)
+    return np.concatenate(candidates)
 
 
 def _turned(
-    turns: Array,
-    place: Sequence[tuple[Array, Array]],
+    z: Array,
+    robots: tuple[Encounter, Encounter],
+    middle: int,
     rho: Array,
     sigma: Array,
     apart: tuple[float, float],
     lever: Array,
     pair: PairRanges,
-) -> Array:
-    """Return the most likely of `turns` (near, far) after refinement by Gauss-Newton on the mutual ranges."""
+) -> tuple[Array, Array]:
+    """Return the most likely of `z` after refinement by Gauss-Newton, with their log-likelihoods.
+
+    The noise of the search decreases from the resolution of the scan to that of the ranges, because
+    candidates between which the ranges distinguish would otherwise be merged.
+    """
+    residuals_at = partial(_residuals_at, robots=robots, middle=middle, rho=rho, apart=apart)
     coarse = 3.0 * math.tau / SCAN * float(lever[0])
-
-    def residuals_at(turns: Array) -> tuple[Array, Array, Array]:
-        (x1, y1), (x2, y2) = place
-        c1, s1, c2, s2 = (f(turns[:, i : i + 1]) for i in (0, 1) for f in (np.cos, np.sin))
-        nx, ny = c1 * x1 - s1 * y1, s1 * x1 + c1 * y1
-        fx, fy = c2 * x2 - s2 * y2, s2 * x2 + c2 * y2
-        dx, dy = fx - nx - apart[0], fy - ny - apart[1]
-        distance = np.maximum(np.hypot(dx, dy), SIGMA_FLOOR)
-        by_near = (dx * ny - dy * nx) / distance
-        by_far = (dy * fx - dx * fy) / distance
-        return rho - distance, by_near, by_far
-
-    for step in range(POLISHINGS):
+    finest = float(np.min(sigma))
+    steps = max(POLISHINGS, 1 + math.ceil(math.log(finest / coarse) / math.log(FINER_TURN)))
+    for step in range(steps):
         s = np.hypot(sigma, coarse * FINER_TURN**step)
-        residual, by_near, by_far = residuals_at(turns)
-        weight = mixture(residual, s, pair.noise)[1] / np.square(s)
-        nn, nf, ff = (
-            np.sum(weight * a * b, 1) for a, b in ((by_near, by_near), (by_near, by_far), (by_far, by_far))
-        )
-        gn, gf = np.sum(weight * by_near * residual, 1), np.sum(weight * by_far * residual, 1)
-        damping = 1e-3 * (nn + ff) + 1e-12
-        nn, ff = nn + damping, ff + damping
-        determinant = nn * ff - nf * nf
-        change = np.stack(((ff * gn - nf * gf) / determinant, (nn * gf - nf * gn) / determinant), 1)
-        longest = np.maximum(np.abs(change).max(1, keepdims=True), 1e-12)
-        turns = turns + change * np.minimum(1.0, TURN / longest)
-    likely = mixture(residuals_at(turns)[0], np.hypot(sigma, FINER * coarse), pair.noise)[0]
+        residuals, jacobian, _ = residuals_at(z)
+        weight = mixture(residuals, s, pair.noise)[1] / np.square(s)
+        weighted = np.swapaxes(jacobian * weight[..., None], 1, 2)
+        information, gradient = weighted @ jacobian, (weighted @ residuals[..., None])[..., 0]
+        gradient[:, 2:] -= z[:, 2:]
+        information.reshape(len(z), -1)[:, 2 * 8 + 2 :: 9] += 1.0
+        damping = DAMPING * FINER_TURN**step * (information[:, 0, 0] + information[:, 1, 1]) + 1e-12
+        information[:, 0, 0] += damping
+        information[:, 1, 1] += damping
+        change = np.linalg.solve(information, gradient[..., None])[..., 0]
+        longest = np.maximum(np.abs(change[:, :2]).max(1, keepdims=True), 1e-12)
+        z = z + change * np.minimum(1.0, TURN / longest)
+        if len(z) > CROWD:
+            likely, gap = _likelihood(
+                z, np.hypot(sigma, coarse * FINER_TURN ** (step + 1)), residuals_at, pair
+            )
+            z = z[_thinned(z, likely, gap, lever, NEAR * pair.sensing_range)]
+    return _likeliest(z, np.hypot(sigma, coarse * FINER_TURN**steps), residuals_at, lever, pair)
+
+
+def _thinned(z: Array, likely: Array, gap: Array, lever: Array, near: float) -> list[int]:
+    """Return the indices of the likeliest of `z` in each cell of `near` m, at most CROWD."""
+    cells = np.concatenate((np.remainder(z[:, :2], math.tau) * lever, gap), 1) / near
+    taken: dict[tuple[int, ...], int] = {}
+    order = np.argsort(-likely, kind="stable")
+    some = order[likely[order] >= likely[order[0]] - UNLIKELY]
+    for i, cell in zip(some.tolist(), np.round(cells[some]).astype(np.intp).tolist(), strict=True):
+        if taken.setdefault(tuple(cell), i) == i and len(taken) == CROWD:
+            break
+    return list(taken.values())
+
+
+def _likelihood(
+    z: Array, sigma: Array, residuals_at: Callable[..., Residuals], pair: PairRanges
+) -> tuple[Array, Array]:
+    """Return the log-likelihood of `z`, (n,), and the vector between the robots, (n, 2), in m."""
+    residuals, _, gap = residuals_at(z, derivatives=False)
+    return mixture(residuals, sigma, pair.noise)[0] - 0.5 * np.sum(np.square(z[:, 2:]), 1), gap
+
+
+def _residuals_at(
+    z: Array,
+    robots: tuple[Encounter, Encounter],
+    middle: int,
+    rho: Array,
+    apart: tuple[float, float],
+    *,
+    derivatives: bool = True,
+) -> Residuals:
+    """Return the residuals of `z` and their derivatives; these are empty unless they are asked for."""
+    moved = []
+    for i, one in enumerate(robots):
+        offset = z[:, 2 + 3 * i : 5 + 3 * i] @ one.root.T
+        qx, qy = one.x - one.x[middle], one.y - one.y[middle]
+        x = one.x + offset[:, :1] - offset[:, 2:] * qy
+        y = one.y + offset[:, 1:2] + offset[:, 2:] * qx
+        c, s = np.cos(z[:, i : i + 1]), np.sin(z[:, i : i + 1])
+        moved.append((c * x - s * y, s * x + c * y, c, s, qx, qy))
+    (nx, ny, *_), (fx, fy, *_) = moved
+    dx, dy = fx - nx - apart[0], fy - ny - apart[1]
+    distance = np.maximum(np.hypot(dx, dy), SIGMA_FLOOR)
+    gap = np.stack((dx[:, middle], dy[:, middle]), 1)
+    if not derivatives:
+        return Residuals(rho - distance, np.empty(0), gap)
+    ux, uy = dx / distance, dy / distance
+    jacobian = np.empty((*distance.shape, 8))
+    jacobian[..., 0] = ux * ny - uy * nx
+    jacobian[..., 1] = uy * fx - ux * fy
+    for i, (_, _, c, s, qx, qy) in enumerate(moved):
+        sign = 1.0 if i else -1.0
+        along, across = sign * (c * ux + s * uy), sign * (c * uy - s * ux)
+        by_offset = np.stack((along, across, across * qx - along * qy), -1)
+        jacobian[..., 2 + 3 * i : 5 + 3 * i] = by_offset @ robots[i].root
+    return Residuals(rho - distance, jacobian, gap)
+
+
+def _likeliest(
+    z: Array,
+    sigma: Array,
+    residuals_at: Callable[..., Residuals],
+    lever: Array,
+    pair: PairRanges,
+) -> tuple[Array, Array]:
+    """Return the most likely of `z`, at most STARTS, and their log-likelihoods, the likeliest first.
+
+    Two candidates are merged if the robots' positions differ by less than BENT R, unless the likelihood falls
+    between them.
+    """
+    likely, gap = _likelihood(z, sigma, residuals_at, pair)
     near = BENT * pair.sensing_range + TWINS * float(np.min(sigma))
-    return _best_turns(turns, likely, lever, near, MOST)
-
-
-def _best_turns(turns: Array, likely: Array, lever: Array, near: float, most: int) -> Array:
-    """Return the most likely of `turns`, whose resulting positions differ by more than `near` m."""
-    apart = lambda one, others: np.abs(np.remainder(others - one + math.pi, math.tau) - math.pi) @ lever  # noqa: E731
-    return _distinct(turns, likely, near, most, apart)
+    left = np.flatnonzero(likely >= np.max(likely) - UNLIKELY)
+    left = left[np.argsort(-likely[left], kind="stable")]
+    chosen: list[int] = []
+    while len(left) and len(chosen) < STARTS:
+        best = int(left[0])
+        chosen.append(best)
+        way = z[left] - z[best]
+        way[:, :2] = np.remainder(way[:, :2] + math.pi, math.tau) - math.pi
+        distance = np.abs(way[:, :2]) @ lever + np.abs(gap[left] - gap[best]).sum(1)
+        other = distance > near
+        close = np.flatnonzero(~other[1:]) + 1
+        if len(close):
+            between, _ = _likelihood(z[best] + 0.5 * way[close], sigma, residuals_at, pair)
+            other[close] = between < likely[left[close]] - RIDGE_BETWEEN
+        left = left[other]
+    return z[chosen], likely[chosen]
 
 
 def _distinct(

@@ -4,7 +4,7 @@ The unknowns are, for each robot, the position of its anchor in the frame of its
 that frame in <W>, and also the odometry errors at every tick. Because there are so many of the latter, the
 fit is done in the space of the ranges, where odometry noise becomes a covariance between each two ranges.
 Gauss-Newton, with the path corrected at each step, converges to the maximum a posteriori of the whole factor
-graph.
+graph. All fits to the same measurements are computed at once: the first axis of each array is the fit.
 
 With exact odometry there is no such covariance, and the fit has only two or six unknowns.
 """
@@ -13,36 +13,52 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
+from agent.estimation.gaussian.linear_model import ErrorSizes, Point, Problem, Start, product
 from agent.estimation.gaussian.odometry_noise import (
     Array,
     Errors,
     OdometryNoiseModel,
     Places,
     Projection,
+    Ticks,
     Track,
-    attributed,
-    shifted,
+    constant_effects,
     spread,
-    wander,
+    symmetric,
 )
-from agent.estimation.gaussian.range_model import Ranges, mixture, outliers, predict
-from protocol.noise import Noise, VelocityNoise
+from agent.estimation.gaussian.range_covariance import RangeCovariance, inverse_of, range_covariance
+from agent.estimation.gaussian.range_model import Ranges, inlier_probability, outliers
+from protocol.noise import Noise
 
 STEPS = 8
 """The maximum number of Gauss-Newton steps."""
 
-STILL = 1e-4
-"""The length of a step in sigmas below which the iteration stops."""
+STILL = 3e-3
+"""The expected length in sigmas of the next step from which on a step is the last.
+
+Steps of Gauss-Newton decrease by a constant factor, about 0.1 with ranges of a tenth of their length. The
+linear model is not computed again after the last step.
+"""
 
 SETTLED = 1e-2
 """The change of a weight below which the weights have converged."""
 
 LEAP = 1.0
 """The largest change of an unknown, in m and rad, in one step."""
+
+SHORTER_STEPS = (0.5, 0.25, 0.0625)
+"""The fractions of a step that are tried in turn if it does not descend.
+
+Gauss-Newton with full steps may alternate between two guesses for ever.
+"""
+
+DESCENT = 1e-6
+"""The increase of the cost, in units of chi-square, that is due to rounding."""
 
 RIDGE = 1e-12
 """The fraction of the information that is added to its diagonal, and an absolute part of the same size.
@@ -52,12 +68,6 @@ With it, the variance of an unknown that the ranges leave undetermined is large 
 
 FAR = 100.0
 """The standard deviation (m) of a range with the weight 0."""
-
-GRAIN = 1e-12
-"""The least variance of a range, as a fraction of the largest variance from odometry noise.
-
-With less, the covariance would be singular in floating point.
-"""
 
 BLIND = 1e-9
 """The least precision of a range's prediction, as a fraction of that with a known guess."""
@@ -72,7 +82,10 @@ class Fit(NamedTuple):
     errors: tuple[Errors, ...]
     """The estimated odometry errors of each path; empty if odometry is exact."""
     log_likelihood: float
-    """The log-likelihood of the ranges, with the odometry errors integrated out."""
+    """The log-likelihood of the ranges, with all errors of the odometry and the noise level integrated out.
+
+    With half the log-determinant of `covariance`, it is the evidence for the guess and its neighbourhood.
+    """
     residuals: Array
     """The measured minus the predicted ranges (m); shape (N,)."""
     weights: Array
@@ -82,38 +95,54 @@ class Fit(NamedTuple):
     information: Array
     """The inverse of the covariance."""
     chi2: float
-    """The squared innovations, weighted by their inverse covariance."""
+    """The squared innovations, weighted by their inverse covariance; as told, without `level`."""
+    inliers: int
+    """The number of ranges that are more probably inliers than outliers."""
     last_step: float
-    """The length of the next Gauss-Newton step, in sigmas."""
+    """The expected length of the next Gauss-Newton step, in sigmas."""
     ticks: Places
     """The tick of each range; shape (N,)."""
-    directions: tuple[Array, ...]
+    directions: Array
     """The derivatives of the ranges with respect to the positions; see `Predicted`."""
-    drifts: tuple[OdometryNoiseModel, ...]
-    """The noise model along each path; empty if odometry is exact."""
+    problem: Problem
     system: NormalEquations
+    """The last linear model. Directions and covariances are those of the point where it was computed."""
+    linear_guess: Array
+    """The guess of that point, before the last step."""
+    linear_paths: tuple[Track, ...]
+    """The paths of that point."""
+    level: float
+    """The estimate of the noise level tau^2: the factor by which all variances differ from the told ones."""
+
+    def drift(self, robot: int) -> OdometryNoiseModel:
+        """Return the noise model along the path of a robot; odometry is not exact."""
+        return self.problem.drift(self.paths[robot], robot)
+
+    def continued(self, path: Track) -> Fit:
+        """Return the fit of one robot with its `path` up to a later tick, without a further range."""
+        problem = Problem.of([path], self.problem.ranges, self.problem.noise, self.problem.apart)
+        point = problem.begin([Start(self.guess, self.errors)])
+        errors = problem.errors(*_of((point.sizes.constant, point.sizes.white), 0))
+        return self._replace(paths=problem.paths(point, 0), errors=errors, problem=problem)
 
 
 class NormalEquations(NamedTuple):
     """One Gauss-Newton step in the space of the ranges."""
 
     jacobian: Array
-    """The derivatives of the ranges with respect to the unknowns; shape (N, unknowns)."""
+    """The derivatives of the ranges with respect to the unknowns; shape (..., N, unknowns)."""
     innovation: Array
-    """The difference (m) of the ranges from their prediction with uncorrected odometry; shape (N,)."""
-    covariance: Array
-    """The covariance (m^2) of the ranges; shape (N, N), or (N,) for its diagonal if odometry is exact."""
+    """The difference (m) of the ranges from their prediction with uncorrected odometry; shape (..., N)."""
+    covariance: RangeCovariance
     weighted: Array
-    """The Jacobian and the innovation, multiplied by the inverse covariance; shape (N, unknowns + 1)."""
-    inverse: Array | None
-    """The inverse covariance, if it is needed for outliers and odometry is noisy."""
+    """The Jacobian and the innovation, multiplied by the inverse covariance; shape (..., N, unknowns + 1)."""
     information: Array
     of_guess: Array
     """The covariance of the guess, the inverse of the information."""
     change: Array
     """The change of the guess in this step."""
     multipliers: Array
-    """The innovation that remains after the change, multiplied by the inverse covariance; shape (N,)."""
+    """The innovation that remains after the change, multiplied by the inverse covariance; shape (..., N)."""
 
 
 def fit(
@@ -123,72 +152,210 @@ def fit(
     noise: Noise,
     apart: tuple[float, float] = (0.0, 0.0),
     steps: int = STEPS,
+    begun: Sequence[Errors] = (),
 ) -> Fit:
-    """Return the Gauss-Newton fit that begins at `guess` (see `predict`).
+    """Return the one fit that begins at `guess`, with the odometry errors `begun`; see `fits`."""
+    return fits([Start(guess, tuple(begun))], measured, ranges, noise, apart, steps)[0]
 
-    The weights of outliers decrease during the iteration. `apart` is M2 - M1 (m) in <W>.
+
+def fits(
+    starts: Sequence[Start],
+    measured: Sequence[Track],
+    ranges: Ranges,
+    noise: Noise,
+    apart: tuple[float, float] = (0.0, 0.0),
+    steps: int = STEPS,
+) -> list[Fit]:
+    """Return the Gauss-Newton fits that begin at `starts`, in this order.
+
+    A step that does not descend is shortened, because Gauss-Newton with full steps may alternate between two
+    guesses. The weights of outliers decrease during the iteration. `apart` is M2 - M1 (m) in <W>.
     """
-    free = slice(0, 2) if len(measured) == 1 else slice(0, 6)
-    paths: tuple[Track, ...] = tuple(measured)
-    drifts: tuple[OdometryNoiseModel, ...] = ()
-    errors: tuple[Errors, ...] = ()
-    guess, weights = guess.copy(), np.ones_like(ranges.rho)
-    noisy_odometry = noise.odometry != VelocityNoise()
+    if not starts:
+        return []
+    problem = Problem.of(measured, ranges, noise, apart)
+    point = problem.begin(starts)
+    weights = np.ones(point.residuals.shape)
+    ended: dict[int, Fit] = {}
+    left, before = list(range(len(starts))), np.zeros(len(starts))
     for step in range(steps + 1):
-        predicted = predict(guess, paths, ranges, apart)
-        residuals = ranges.rho - predicted.distance
-        odometry, innovation = None, residuals
-        if noisy_odometry:
-            seen = predicted.seen(paths, ranges)
-            drifts = tuple(
-                [wander(path, noise.odometry, was) for path, was in zip(paths, measured, strict=True)]
-            )
-            odometry = _odometry_covariance(drifts, seen)
-            for model, rows, error in zip(drifts, seen, errors, strict=False):
-                innovation = innovation + shifted(model, rows, error)
-        if noise.outliers and step == 0:
-            loose = np.zeros_like(residuals) if odometry is None else np.diagonal(odometry)
-            weights = mixture(residuals, np.sqrt(np.square(ranges.sigma) + loose), noise)[1]
+        linear = problem.linearised(point)
+        if problem.robust and step == 0:
+            weights = _weights(point.residuals, np.sqrt(problem.loosened(linear)), noise)
         variance = _variance(ranges.sigma, weights)
-        system = _solved(predicted.jacobian[:, free], innovation, variance, odometry, bool(noise.outliers))
-        updated = _inlier_probabilities(system, weights, ranges.sigma, noise) if noise.outliers else weights
-        change = system.change
-        last_step = math.sqrt(abs(float(change @ system.information @ change)))
-        still = last_step < STILL and float(np.max(np.abs(updated - weights))) < SETTLED
-        if step == steps or (still and (errors or not noisy_odometry)):  # the path is corrected at least once
+        covariance = range_covariance(variance, linear.columns, linear.dense)
+        system = _solved(point.predicted.jacobian[..., problem.free], linear.innovation, covariance)
+        updated = _inlier_probabilities(system, weights, ranges.sigma, noise) if problem.robust else weights
+        quality = _quality(system, weights, noise)
+        expected = np.square(quality.last_step) / np.maximum(np.maximum(quality.last_step, before), STILL)
+        still = (expected < STILL) & (np.abs(updated - weights).max(-1) < SETTLED)
+        still &= step > 0 or not problem.noisy  # the path is corrected at least once
+        if step == steps:
+            ended |= {
+                one: _fit(problem, i, point, point, weights, system, quality) for i, one in enumerate(left)
+            }
             break
-        weights = updated
-        change = change * min(1.0, LEAP / max(float(np.max(np.abs(change))), LEAP))
-        guess[free] += change
-        if noisy_odometry:
-            left = system.weighted[:, -1] - system.weighted[:, :-1] @ change
-            errors = tuple([attributed(model, rows, left) for model, rows in zip(drifts, seen, strict=True)])
-            paths = tuple([error.corrected(was) for error, was in zip(errors, measured, strict=True)])
-    chi2 = float(system.innovation @ system.multipliers)
+        change = system.change
+        change = change * np.minimum(1.0, LEAP / np.maximum(np.abs(change).max(-1, keepdims=True), LEAP))
+        following = point.guess.copy()
+        following[:, problem.free] += change
+        left_over = system.weighted[..., -1] - product(system.weighted[..., :-1], change)
+        sizes = problem.sizes(point, linear, left_over)
+        begun, point = point, _descended(problem, point, following, sizes, variance)
+        if still.any():
+            done, at_end = np.flatnonzero(still).tolist(), quality._replace(last_step=expected)
+            ended |= {left[i]: _fit(problem, i, point, begun, weights, system, at_end) for i in done}
+            left = [one for one, is_done in zip(left, still.tolist(), strict=True) if not is_done]
+            if not left:
+                break
+            point, updated, quality = _of((point, updated, quality), ~still)
+        weights, before = updated, quality.last_step
+    return [ended[i] for i in range(len(starts))]
+
+
+T = TypeVar("T")
+
+
+def _of(values: T, some: NDArray[np.bool] | Places | int) -> T:
+    """Return the part of `values`, a tuple of arrays or of such tuples, that belongs to some of the fits."""
+    if isinstance(values, tuple):
+        parts = [_of(value, some) for value in values]
+        return cast("T", type(values)(*parts) if hasattr(values, "_fields") else tuple(parts))
+    return cast("T", values[some]) if isinstance(values, np.ndarray) else values
+
+
+def _put(values: object, some: NDArray[np.bool] | Places, others: object) -> None:
+    """Replace the part of `values` that belongs to some of the fits by `others`."""
+    if isinstance(values, tuple) and isinstance(others, tuple):
+        for value, other in zip(values, others, strict=True):
+            _put(value, some, other)
+    elif isinstance(values, np.ndarray):
+        values[some] = others
+
+
+def _fit(
+    problem: Problem,
+    i: int,
+    points: Point,
+    linear_points: Point,
+    all_weights: Array,
+    systems: NormalEquations,
+    qualities: _Quality,
+) -> Fit:
+    """Return the fit with index `i`, which has ended at its point, with the linear model of another."""
+    point, weights, system, quality = _of((points, all_weights, systems, qualities), i)
+    chi2, inliers, level, last_step = float(quality[0]), int(quality[1]), float(quality[2]), quality[3]
+    if problem.noise.sigma_degrees:
+        correlation = residual_correlation(point.residuals, weights, problem.ranges)
+        level = noise_level(chi2, inliers - len(system.change), problem.noise, correlation)
     return Fit(
-        guess,
-        paths,
-        errors,
-        _log_likelihood(system, chi2, residuals, weights, ranges.sigma, noise),
-        residuals,
+        point.guess,
+        problem.paths(points, i),
+        problem.errors(point.sizes.constant, point.sizes.white),
+        _log_likelihood(system, chi2, point.residuals, weights, problem.ranges.sigma, level, problem.noise),
+        point.residuals,
         weights,
-        system.of_guess,
-        system.information,
+        level * system.of_guess,
+        system.information / level,
         chi2,
-        last_step,
-        ranges.tick,
-        predicted.directions,
-        drifts,
+        inliers,
+        float(last_step),
+        problem.ranges.tick,
+        linear_points.predicted.directions[i],
+        problem,
         system,
+        linear_points.guess[i],
+        problem.paths(linear_points, i),
+        level,
     )
 
 
-def _odometry_covariance(drifts: Sequence[OdometryNoiseModel], seen: Sequence[Projection]) -> Array:
-    """Return the covariance (m^2) of the ranges from the odometry noise of all robots; shape (N, N)."""
-    first, *others = [spread(model, rows) for model, rows in zip(drifts, seen, strict=True)]
-    for other in others:
-        first += other
-    return first
+class _Quality(NamedTuple):
+    """The agreement of the ranges with a linear model."""
+
+    chi2: Array
+    inliers: Array
+    level: Array
+    last_step: Array
+
+
+def _descended(problem: Problem, point: Point, guess: Array, sizes: ErrorSizes, variance: Array) -> Point:
+    """Return the point after a step to `guess` and `sizes`, or after that fraction of it that descends.
+
+    If none does, the point stays.
+    """
+    most = point.cost(variance) + DESCENT
+    following = problem.point(guess, sizes)
+    descends = following.cost(variance) <= most
+    if descends.all():
+        return following
+    climbing = np.flatnonzero(~descends)
+    for fraction in SHORTER_STEPS:
+        begin, end, ends = _of((point, guess, sizes), climbing)
+        shorter = [one + fraction * (other - one) for one, other in zip(begin.sizes, ends, strict=True)]
+        nearer = problem.point(begin.guess + fraction * (end - begin.guess), ErrorSizes(*shorter))
+        _put(following, climbing, nearer)
+        climbing = climbing[~(nearer.cost(variance[climbing]) <= most[climbing])]
+        if not len(climbing):
+            return following
+    _put(following, climbing, _of(point, climbing))
+    return following
+
+
+INLIER = 0.5
+"""The weight from which on a range counts as an inlier."""
+
+
+def _quality(system: NormalEquations, weights: Array, noise: Noise) -> _Quality:
+    """Return how well the ranges agree with a linear model."""
+    change = system.change
+    chi2 = np.maximum(np.add.reduce(system.innovation * system.multipliers, -1), 0.0)
+    inliers = np.add.reduce(weights > INLIER, -1)
+    told = zip(chi2.tolist(), inliers.tolist(), strict=True)
+    level = np.array([noise_level(one, count - change.shape[-1], noise) for one, count in told])
+    length = np.abs(np.add.reduce(change * product(system.information, change), -1))
+    return _Quality(chi2, inliers, level, np.sqrt(length / level))
+
+
+def noise_level(chi2: float, degrees: int, noise: Noise, correlation: float = 0.0) -> float:
+    """Return the posterior mean of the factor tau^2 of all variances (scaled inverse chi-square).
+
+    With the `correlation` r of neighbours, residuals are worth (1 - r) / (1 + r) of their number, for the
+    level and for everything else that they tell. The level grows by as much.
+    """
+    nu, n = noise.sigma_degrees, max(degrees, 0)
+    if not nu:
+        return 1.0
+    worth = (1.0 - correlation) / (1.0 + correlation)
+    return (nu + worth * chi2) / (nu + worth * n) / worth
+
+
+def residual_correlation(residuals: Array, weights: Array, ranges: Ranges) -> float:
+    """Return the correlation of each residual with the one before, from 0 to MOST_CORRELATED.
+
+    Both are of the same kind. The correlation is reduced by what chance may cause (see BY_CHANCE), and
+    strays count as 0.
+    """
+    scaled = np.where(weights > INLIER, residuals / ranges.sigma, 0.0)
+    products = scaled[1:] * scaled[:-1]
+    ends = np.cumsum(ranges.counts)[:2]
+    products[ends[(ends > 0) & (ends < len(scaled))] - 1] = 0.0
+    power = float(scaled @ scaled)
+    if not power > 0.0:
+        return 0.0
+    found = float(np.sum(products)) / power - BY_CHANCE / math.sqrt(len(scaled))
+    return min(max(found, 0.0), MOST_CORRELATED)
+
+
+BY_CHANCE = 2.0
+"""The number of standard deviations 1 / sqrt(N) of the correlation of N white residuals that is disregarded.
+
+With less, noise as told makes missions longer; with more, errors that are correlated over 20 ticks make
+claims too confident.
+"""
+
+MOST_CORRELATED = 0.8
+"""The largest correlation: the noise level grows by a factor of 9 at most."""
 
 
 def _variance(sigma: Array, weights: Array) -> Array:
@@ -197,28 +364,17 @@ def _variance(sigma: Array, weights: Array) -> Array:
     return variance
 
 
-def _solved(
-    jacobian: Array, innovation: Array, variance: Array, odometry: Array | None, invert: bool
-) -> NormalEquations:
-    columns = np.column_stack((jacobian, innovation))
-    covariance, inverse = variance, None
-    weighted: Array
-    if odometry is None:
-        weighted = columns / variance[:, None]
-    else:
-        covariance = odometry + np.diag(variance + GRAIN * float(np.max(np.diagonal(odometry))))
-        if invert:
-            inverse = inverse_of(covariance)
-            weighted = np.dot(inverse, columns)
-        else:
-            weighted = np.asarray(np.linalg.solve(covariance, columns), np.float64)
-    information = jacobian.T @ weighted[:, :-1]
-    information.flat[:: len(information) + 1] += RIDGE + RIDGE * np.diagonal(information)
+def _solved(jacobian: Array, innovation: Array, covariance: RangeCovariance) -> NormalEquations:
+    weighted = covariance.solve(np.concatenate((jacobian, innovation[..., None]), -1))
+    products = np.swapaxes(jacobian, -1, -2) @ weighted
+    information = products[..., :-1]
+    diagonal = np.einsum("...ii->...i", information)
+    diagonal += RIDGE + RIDGE * diagonal
     of_guess = inverse_of(information)
-    change = of_guess @ (jacobian.T @ weighted[:, -1])
-    multipliers = weighted[:, -1] - weighted[:, :-1] @ change
+    change = product(of_guess, products[..., -1])
+    multipliers = weighted[..., -1] - product(weighted[..., :-1], change)
     return NormalEquations(
-        jacobian, innovation, covariance, weighted, inverse, information, of_guess, change, multipliers
+        jacobian, innovation, covariance, weighted, information, of_guess, change, multipliers
     )
 
 
@@ -227,39 +383,68 @@ def deviation(variance: float) -> float:
     return math.sqrt(variance) if variance >= 0.0 else math.inf
 
 
-def inverse_of(matrix: Array) -> Array:
-    """Return the inverse of a matrix, or of each matrix in a stack."""
-    return np.asarray(np.linalg.inv(matrix), np.float64)
-
-
 def _inlier_probabilities(system: NormalEquations, weights: Array, sigma: Array, noise: Noise) -> Array:
     """Return the probability that each range is an inlier, given the prediction from all other ranges."""
-    alone = 1.0 / system.covariance if system.inverse is None else np.diagonal(system.inverse)
-    explained = np.sum((system.weighted[:, :-1] @ system.of_guess) * system.weighted[:, :-1], 1)
+    alone = system.covariance.precisions
+    weighted = system.weighted[..., :-1]
+    explained = np.add.reduce((weighted @ system.of_guess) * weighted, -1)
     precision = np.maximum(alone - explained, BLIND * alone)
     error = system.multipliers / precision
     variance = np.maximum(1.0 / precision - _variance(sigma, weights), 0.0) + np.square(sigma)
-    return mixture(error, np.sqrt(variance), noise)[1]
+    return _weights(error, np.sqrt(variance), noise)
+
+
+def _weights(errors: Array, sigma: Array, noise: Noise) -> Array:
+    """Return the probability that each range is an inlier, if `errors` (m) have the scale of their median.
+
+    Far from the minimum, all errors are large, and no range is an outlier because of that. At least about
+    half of the ranges are therefore inliers.
+    """
+    if noise.sigma_degrees:
+        ratios = np.abs(errors / sigma)
+        middle = ratios.shape[-1] // 2
+        median = np.partition(ratios, middle, -1)[..., middle, None]
+        sigma = sigma * np.maximum(1.0, median / MEDIAN)
+    return inlier_probability(errors, sigma, noise)
+
+
+MEDIAN = 0.6745
+"""The median of the absolute value of a standard normal variable."""
 
 
 def _log_likelihood(
-    system: NormalEquations, chi2: float, residuals: Array, weights: Array, sigma: Array, noise: Noise
+    system: NormalEquations,
+    chi2: float,
+    residuals: Array,
+    weights: Array,
+    sigma: Array,
+    level: float,
+    noise: Noise,
 ) -> float:
     """Return the log-likelihood of the inliers by their covariance, and of the outliers by their bias."""
-    good = weights > 0.5
-    if system.covariance.ndim == 2:
-        volume = float(np.linalg.slogdet(system.covariance)[1])
-    else:
-        volume = float(np.sum(np.log(system.covariance)))
-    volume -= float(np.sum(np.log(_variance(sigma, weights)[~good])))
-    count = int(np.count_nonzero(good))
-    log_likelihood = -0.5 * (chi2 + volume + math.log(2.0 * math.pi) * count)
-    if noise.outliers:
-        log_likelihood += count * math.log1p(-noise.outliers)
-        log_likelihood += float(
-            np.sum(outliers(residuals[~good], np.maximum(sigma[~good], SOFT * noise.outlier_bias[0]), noise))
-        )
+    good = weights > INLIER
+    volume, count = float(system.covariance.log_determinant), int(np.count_nonzero(good))
+    if count < len(good):
+        volume -= float(np.sum(np.log(_variance(sigma, weights)[~good])))
+    log_likelihood = -0.5 * (volume + math.log(2.0 * math.pi) * count)
+    log_likelihood += _misfit_log_likelihood(chi2, count - len(system.change), noise)
+    log_likelihood -= 0.5 * len(system.change) * math.log(level)  # of the covariance of the guess
+    if count == len(good):
+        return log_likelihood + count * math.log1p(-noise.outliers - noise.strays)
+    if noise.outliers or noise.strays:
+        log_likelihood += count * math.log1p(-noise.outliers - noise.strays)
+        soft = SOFT * noise.outlier_bias[0] if noise.outliers else 0.0
+        log_likelihood += float(np.sum(outliers(residuals[~good], np.maximum(sigma[~good], soft), noise)))
     return log_likelihood
+
+
+def _misfit_log_likelihood(chi2: float, degrees: int, noise: Noise) -> float:
+    """Return the log-likelihood of a chi-square, with the noise level integrated out (Student's t)."""
+    nu, n = noise.sigma_degrees, max(degrees, 0)
+    if not nu:
+        return -0.5 * chi2
+    scale = math.lgamma(0.5 * (nu + n)) - math.lgamma(0.5 * nu) - 0.5 * n * math.log(0.5 * nu)
+    return scale - 0.5 * (nu + n) * math.log1p(chi2 / nu)
 
 
 SOFT = 0.1
@@ -267,34 +452,40 @@ SOFT = 0.1
 
 
 def poses(fitted: Fit, apart: tuple[float, float]) -> tuple[Array, Array]:
-    """Return both poses at the last tick, relative to M1 along the axes of <W>, in m and rad.
+    """Return the poses at the last tick, relative to M1 along the axes of <W>, in m and rad.
 
-    The result is the mean of x, y, heading of a, then of b, shape (6,), and the covariance, shape (6, 6).
+    The result is the mean of x, y, heading of a, then of b, shape (6,), and the covariance, shape (6, 6). Of
+    one robot it is (3,) and (3, 3). With one anchor, the axes are those of the odometry's frame.
     """
-    mean, turn = np.empty(6), np.zeros((6, 6))
-    ends = []
+    size = 3 * len(fitted.paths)
+    mean, turn = np.empty(size), np.zeros((size, size))
     for robot, path in enumerate(fitted.paths):
-        mx, my, theta = fitted.guess[3 * robot : 3 * robot + 3]
-        c, s = math.cos(theta), math.sin(theta)
-        x, y = float(path.x[-1]) - mx, float(path.y[-1]) - my
-        wx, wy = c * x - s * y, s * x + c * y
-        i = 3 * robot
-        mean[i : i + 3] = wx + robot * apart[0], wy + robot * apart[1], theta + float(path.heading[-1])
-        turn[i : i + 3, i : i + 3] = ((-c, s, -wy), (-s, -c, wx), (0.0, 0.0, 1.0))
-        last = np.full(3, len(path.v), np.intp)
-        end = Projection.positions(path, last, np.array(((c, s, 0.0), (-s, c, 0.0))))
-        end.lever[2] = path.period
-        ends.append(end)
-    system = fitted.system
-    if not fitted.drifts:
-        return mean, turn @ system.of_guess @ turn.T
-    prior, cross = np.zeros((6, 6)), np.zeros((6, len(system.innovation)))
-    for robot, (path, model, u, end) in enumerate(
-        zip(fitted.paths, fitted.drifts, fitted.directions, ends, strict=True)
-    ):
-        rows = slice(3 * robot, 3 * robot + 3)
-        both = spread(model, end.then(Projection.positions(path, fitted.ticks, u)))
-        prior[rows, rows], cross[rows] = both[:3, :3], both[:3, 3:]
-    gain = np.linalg.solve(system.covariance, cross.T).T
+        wx, wy, heading = _placed(fitted.guess[3 * robot : 3 * robot + 3], path)
+        mean[3 * robot : 3 * robot + 3] = wx + robot * apart[0], wy + robot * apart[1], heading
+    for robot, path in enumerate(fitted.linear_paths):
+        own = slice(3 * robot, 3 * robot + 3)
+        c, s = math.cos(fitted.linear_guess[own][2]), math.sin(fitted.linear_guess[own][2])
+        wx, wy, _ = _placed(fitted.linear_guess[own], path)
+        turn[own, own] = ((-c, s, -wy), (-s, -c, wx), (0.0, 0.0, 1.0))
+    system, turn = fitted.system, turn[:, fitted.problem.free]
+    if not fitted.errors:
+        return mean, turn @ fitted.covariance @ turn.T
+    # the difference of large matrices: all of them are those of one point
+    prior, cross = np.zeros((size, size)), np.zeros((size, len(system.innovation)))
+    for robot, (path, u) in enumerate(zip(fitted.linear_paths, fitted.directions, strict=True)):
+        own, model = slice(3 * robot, 3 * robot + 3), fitted.problem.drift(path, robot)
+        end = Projection.pose(path, len(path.v), fitted.linear_guess[own][2])
+        rows = end.then(Projection.positions(path, Ticks.of(fitted.ticks, len(path.v)), u))
+        constant = constant_effects(model, rows)[:-1]
+        both = symmetric(*spread(model, rows), rows.ticks) + constant.T @ constant
+        prior[own, own], cross[own] = both[:3, :3], both[:3, 3:]
+    gain = system.covariance.solve(cross.T).T
     left = turn - gain @ system.jacobian
-    return mean, prior - gain @ cross.T + left @ system.of_guess @ left.T
+    return mean, fitted.level * (prior - gain @ cross.T + left @ system.of_guess @ left.T)
+
+
+def _placed(guess: Array, path: Track) -> tuple[float, float, float]:
+    """Return the last pose on `path`, relative to the anchor along the axes of <W>, in m and rad."""
+    c, s = math.cos(guess[2]), math.sin(guess[2])
+    x, y = float(path.x[-1]) - guess[0], float(path.y[-1]) - guess[1]
+    return c * x - s * y, s * x + c * y, guess[2] + float(path.heading[-1])

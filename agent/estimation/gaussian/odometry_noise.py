@@ -2,16 +2,19 @@
 
 Noise at one tick moves every later position, so errors are correlated along the path. The covariance between
 any two ticks follows from sums up to the earlier one.
+
+All arrays may have further axes in front, of paths that are computed at once: "..." in their shapes.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.noise import VelocityNoise
+from protocol.noise import Noise, VelocityNoise
 
 Array = NDArray[np.float64]
 Places = NDArray[np.intp]
@@ -21,38 +24,77 @@ class Track(NamedTuple):
     """A robot's odometry over [0, k], in the frame of tick 0."""
 
     v: Array
-    """The forward velocity (m/s) over each tick; shape (k,)."""
+    """The forward velocity (m/s) over each tick; shape (..., k)."""
     omega: Array
-    """The angular velocity (rad/s) over each tick; shape (k,)."""
+    """The angular velocity (rad/s) over each tick; shape (..., k)."""
     period: float
     """The sampling period T_s (s)."""
     x: Array
-    """The position (m) at each tick; shape (k + 1,)."""
+    """The position (m) at each tick; shape (..., k + 1)."""
     y: Array
     heading: Array
-    """The heading (rad, not wrapped) at each tick; shape (k + 1,)."""
+    """The heading (rad, not wrapped) at each tick; shape (..., k + 1)."""
     shift: Array
-    """The displacement per unit of v (s) over each tick; shape (2, k)."""
+    """The displacement per unit of v (s) over each tick; shape (..., 2, k)."""
+    slip: Array | None = None
+    """The angle (rad) from the chord of eq. (1a) to the displacement of each tick; shape (..., k).
+
+    None: 0.
+    """
+    extra: Array | None = None
+    """The variances of v and omega at each tick beyond those of the noise model; shape (2, k). None: 0."""
+
+    @property
+    def content(self) -> tuple[object, ...]:
+        """Return the measurements as values that can be compared."""
+        parts = (self.v, self.omega, self.slip, self.extra)
+        return (*[None if part is None else part.tobytes() for part in parts], self.period)
+
+    def until(self, tick: int) -> Track:
+        """Return the path of one robot up to `tick`."""
+        path = self.one((), tick)
+        return path if self.extra is None else path._replace(extra=self.extra[:, :tick])
+
+    def one(self, which: tuple[int, ...], ticks: int) -> Track:
+        """Return the first `ticks` of the path with this index in the further axes."""
+        v, omega, x, y, heading = (part[which] for part in (self.v, self.omega, *self[3:6]))
+        return Track(
+            v[:ticks],
+            omega[:ticks],
+            self.period,
+            x[: ticks + 1],
+            y[: ticks + 1],
+            heading[: ticks + 1],
+            self.shift[which][:, :ticks],
+            None if self.slip is None else self.slip[which][:ticks],
+        )
 
 
-def track(v: Array, omega: Array, period: float) -> Track:
-    """Return the path from dead reckoning with eq. (1a), from the origin."""
-    turn = period * omega
-    heading = _summed(turn)
-    half = 0.5 * turn
-    course = heading[:-1] + half
-    unit = period * _sinc(half)
-    shift = np.empty((2, len(v)))
-    np.multiply(unit, np.cos(course), out=shift[0])
-    np.multiply(unit, np.sin(course), out=shift[1])
-    x, y = _summed(v * shift)
-    return Track(v, omega, period, x, y, heading, shift)
+def track(v: Array, omega: Array, period: float, slip: Array | None = None) -> Track:
+    """Return the path from dead reckoning with eq. (1a), and with lateral `slip`, from the origin."""
+    heading = _summed(period * omega)
+    half = (0.5 * period) * omega
+    course = heading[..., :-1] + half
+    if slip is not None:
+        course += slip
+    half = np.where(half == 0.0, NO_TURN, half)
+    unit = period * (np.sin(half) / half)
+    shift = np.empty((*v.shape[:-1], 2, v.shape[-1]))
+    np.multiply(unit, np.cos(course), out=shift[..., 0, :])
+    np.multiply(unit, np.sin(course), out=shift[..., 1, :])
+    place = _summed(v[..., None, :] * shift)
+    return Track(v, omega, period, place[..., 0, :], place[..., 1, :], heading, shift, slip)
 
 
-def _sinc(half: Array) -> Array:
-    """Return sin(x) / x."""
-    safe = np.where(half == 0.0, 1.0, half)
-    return np.where(half == 0.0, 1.0, np.sin(safe) / safe)
+def corrected(measured: Array, correction: Array, period: float, slip: Array | None = None) -> Track:
+    """Return the path with the v and omega that were measured, and a correction; shape (..., 2, k) each."""
+    velocities = measured + correction
+    v, omega = velocities[..., 0, :], velocities[..., 1, :]
+    return track(v, omega, period, None if slip is None else slip + np.zeros_like(v))
+
+
+NO_TURN = 1e-20
+"""An angle (rad) in place of 0, whose sine is itself."""
 
 
 def _summed(values: Array) -> Array:
@@ -69,50 +111,97 @@ class OdometryNoiseModel(NamedTuple):
     lever = T_s u . perp(p_t). Noise e in v moves it by u . shift_j e.
     """
 
-    variances: Array
-    """The variances of v and omega, (m/s)^2 and (rad/s)^2, at each tick; shape (2, k)."""
     b: Array
-    """The vector b_j (m s) at each tick; shape (2, k)."""
+    """The vector b_j (m s) at each tick; shape (..., 2, k)."""
     shift: Array
-    """The displacement per unit of v (s) at each tick; shape (2, k)."""
-    sums: Array
-    """The prefix sums of six terms up to each tick; shape (6, k + 1).
+    """The displacement per unit of v (s) at each tick; shape (..., 2, k)."""
+    moves: Array
+    """The prefix sums of the effects on heading, x and y of each constant error, of one sigma, and then of
+    the correction of the measured path; shape (..., m + 1, 3, k + 1)."""
+    variances: Array | None
+    """The variances of v and omega, (m/s)^2 and (rad/s)^2, at each tick; shape (..., 2, k). None without
+    white noise."""
+    sums: Array | None
+    """The prefix sums of six terms up to each tick; shape (..., 6, k + 1).
 
-    The terms are q_omega; the x and y of q_omega b; the xx, xy and yy of q_omega b b' + q_v shift shift'.
+    The terms are q_omega; the x and y of -q_omega b; the xx, xy and yy of q_omega b b' + q_v shift shift'.
     """
 
+    def since(self, tick: int) -> OdometryNoiseModel:
+        """Return the model of a robot whose odometry was exact before `tick`."""
+        moves = self.moves - self.moves[:, :, tick : tick + 1]
+        moves[:, :, :tick] = 0.0
+        if self.variances is None or self.sums is None:
+            return self._replace(moves=moves)
+        variances, sums = self.variances.copy(), self.sums - self.sums[:, tick : tick + 1]
+        variances[:, :tick] = sums[:, :tick] = 0.0
+        return self._replace(moves=moves, variances=variances, sums=sums)
 
-def wander(path: Track, noise: VelocityNoise, measured: Track) -> OdometryNoiseModel:
-    """Return the prefix sums for the corrected `path`; the size of the noise follows from `measured`."""
-    k, period = len(path.v), path.period
-    variances = np.empty((2, k))
-    variances[0] = np.square(noise.v * measured.v) + noise.v_floor**2
-    variances[1] = np.square(noise.omega * measured.omega) + noise.omega_floor**2
-    sx, sy = path.shift
+
+def constant_errors(v: Array, omega: Array, noise: Noise) -> Array:
+    """Return the `patterns` of a robot that measured v and omega: two scale errors, and the bias of omega."""
+    priors = noise.priors
+    at_rest = noise.standstill_bound
+    moving = (np.abs(v) > at_rest[0]) | (np.abs(omega) > at_rest[1])
+    patterns = np.zeros((*v.shape[:-1], 3 * priors.of_odometry, 2, v.shape[-1]))
+    if priors.of_odometry:
+        np.multiply(v, priors.wheel_scale, out=patterns[..., 0, 0, :])
+        np.multiply(omega, priors.wheel_scale, out=patterns[..., 1, 1, :])
+        np.multiply(moving, priors.gyro_bias, out=patterns[..., 2, 1, :])
+    return patterns
+
+
+def variances(v: Array, omega: Array, noise: VelocityNoise) -> Array:
+    """Return the variances of the measured v and omega; (..., k) each -> (..., 2, k)."""
+    of_v = np.square(noise.v * v) + noise.v_floor**2
+    return np.stack((of_v, np.square(noise.omega * omega) + noise.omega_floor**2), -2)
+
+
+def is_noisy(noise: Noise) -> bool:
+    """Return whether odometry may differ from the executed motion."""
+    return noise.priors.of_odometry or noise.odometry != VelocityNoise()
+
+
+def wander(
+    path: Track, correction: Array, patterns: Array, variances: Array | None = None
+) -> OdometryNoiseModel:
+    """Return the prefix sums along `path`, for constant errors and white noise of that size.
+
+    `correction` is the difference of the path's v and omega from the measured ones; shape (..., 2, k).
+    """
+    period, shift = path.period, path.shift
     # omega changes the length of the chord, and rotates it by half the angle by which it rotates the robot
-    slope = path.v * _shortening(0.5 * period * path.omega, period)
-    across = 0.5 * period * path.v
-    b = np.empty((2, k))
-    b[0] = -period * path.y[1:] - (slope * sx - across * sy)
-    b[1] = period * path.x[1:] - (slope * sy + across * sx)
-    q_v, q_omega = variances
-    terms = np.empty((6, k))
-    terms[0] = q_omega
-    np.multiply(q_omega, b, out=terms[1:3])
-    np.multiply(terms[1], b, out=terms[3:5])
-    np.multiply(terms[2], b[1], out=terms[5])
-    along = q_v * path.shift
-    terms[3] += along[0] * sx
-    terms[4] += along[0] * sy
-    terms[5] += along[1] * sy
-    return OdometryNoiseModel(variances, b, path.shift, _summed(terms))
+    slope = path.v * _shortening((0.5 * period) * path.omega, period)
+    across = (0.5 * period) * path.v
+    b = np.empty(shift.shape)
+    np.subtract(across * shift[..., 1, :], slope * shift[..., 0, :], out=b[..., 0, :])
+    np.subtract(-across * shift[..., 0, :], slope * shift[..., 1, :], out=b[..., 1, :])
+    b[..., 0, :] -= period * path.y[..., 1:]
+    b[..., 1, :] += period * path.x[..., 1:]
+    velocities = np.empty((*correction.shape[:-2], patterns.shape[-3] + 1, *correction.shape[-2:]))
+    velocities[..., :-1, :, :], velocities[..., -1, :, :] = patterns, correction
+    turned = velocities[..., 1:, :]
+    moved = velocities[..., :1, :] * shift[..., None, :, :] - turned * b[..., None, :, :]
+    moves = _summed(np.concatenate((turned, moved), -2))
+    if variances is None:
+        return OdometryNoiseModel(b, shift, moves, None, None)
+    q_v, q_omega = variances[..., :1, :], variances[..., 1:, :]
+    terms = np.empty((*shift.shape[:-2], 6, shift.shape[-1]))
+    terms[..., :1, :] = q_omega
+    np.multiply(-q_omega, b, out=terms[..., 1:3, :])
+    along = q_v * shift
+    np.subtract(along * shift[..., :1, :], terms[..., 1:3, :] * b[..., :1, :], out=terms[..., 3:5, :])
+    last = along[..., 1, :] * shift[..., 1, :]
+    np.subtract(last, terms[..., 2, :] * b[..., 1, :], out=terms[..., 5, :])
+    return OdometryNoiseModel(b, shift, moves, variances, _summed(terms))
 
 
 def _shortening(half: Array, period: float) -> Array:
     """Return the relative change of a chord with omega, d(ln A) / d omega, in s; `half` is omega T_s / 2."""
-    safe = np.where(np.abs(half) < SLIGHT, 1.0, half)
-    by_half = np.where(np.abs(half) < SLIGHT, -half / 3.0, 1.0 / np.tan(safe) - 1.0 / safe)
-    shortening: Array = 0.5 * period * by_half
+    slight = np.abs(half) < SLIGHT
+    safe = np.where(slight, 1.0, half)
+    by_half = np.where(slight, half / -3.0, 1.0 / np.tan(safe) - 1.0 / safe)
+    shortening: Array = (0.5 * period) * by_half
     return shortening
 
 
@@ -120,77 +209,120 @@ SLIGHT = 1e-4
 """The half turn in rad below which the series of the derivative is used."""
 
 
+class Ticks(NamedTuple):
+    """The ticks of N rows, and their order."""
+
+    tick: Places
+    order: Places
+    """The rows from the last to the first; shape (N,)."""
+    after: Places
+    """The number of rows after each tick; shape (k,)."""
+
+    @staticmethod
+    def of(tick: Places, k: int) -> Ticks:
+        """Return the ticks of rows along a path of `k` ticks. Those beyond it are taken as its last one."""
+        tick = np.minimum(tick, k)
+        order = np.argsort(-tick, kind="stable")
+        after = np.searchsorted(-tick[order], -np.arange(k))
+        return Ticks(tick, order, after)
+
+
 class Projection(NamedTuple):
     """Linear functionals of a robot's trajectory, one for each of N rows: a tick, a direction and a lever."""
 
-    tick: Places
-    u: Array
-    """The direction in the frame of the odometry, or 0 if the row is of another robot; shape (2, N)."""
-    lever: Array
-    """The lever on noise in omega (m s); T_s if the row is a heading."""
+    ticks: Ticks
+    weights: Array
+    """The lever on noise in omega (m s), T_s if the row is a heading, and the direction in the frame of the
+    odometry, or 0 if the row is of another robot; shape (..., 3, N)."""
 
     @staticmethod
-    def positions(path: Track, tick: Places, u: Array) -> Projection:
-        """Return the rows for the robot's position at `tick` along `u`.
-
-        Rows with u = 0 do not involve this robot, and their tick may be beyond its path.
-        """
-        tick = np.minimum(tick, len(path.v))
-        return Projection(tick, u, path.period * (u[1] * path.x[tick] - u[0] * path.y[tick]))
+    def positions(path: Track, ticks: Ticks, u: Array) -> Projection:
+        """Return the rows for the robot's position at `ticks` along `u`, shape (..., 2, N)."""
+        weights = np.empty((*u.shape[:-2], 3, u.shape[-1]))
+        x, y = path.x[..., ticks.tick], path.y[..., ticks.tick]
+        np.multiply(path.period, u[..., 1, :] * x - u[..., 0, :] * y, out=weights[..., 0, :])
+        weights[..., 1:, :] = u
+        return Projection(ticks, weights)
 
     def then(self, more: Projection) -> Projection:
         """Return these rows followed by `more` of the same robot."""
-        return Projection(
-            np.concatenate((self.tick, more.tick)),
-            np.concatenate((self.u, more.u), axis=1),
-            np.concatenate((self.lever, more.lever)),
-        )
+        tick = np.concatenate((self.ticks.tick, more.ticks.tick))
+        weights = np.concatenate((self.weights, more.weights), axis=-1)
+        return Projection(Ticks.of(tick, len(self.ticks.after)), weights)
+
+    @staticmethod
+    def pose(path: Track, tick: int, turn: float = 0.0) -> Projection:
+        """Return the rows for the x, y and heading at `tick`, with x and y rotated by `turn` (rad)."""
+        c, s = math.cos(turn), math.sin(turn)
+        ticks = Ticks.of(np.full(3, tick, np.intp), len(path.v))
+        rows = Projection.positions(path, ticks, np.array(((c, s, 0.0), (-s, c, 0.0))))
+        rows.weights[0, 2] = path.period
+        return rows
 
 
-def spread(model: OdometryNoiseModel, rows: Projection) -> Array:
-    """Return the covariance (m^2) of N rows that is caused by odometry noise; shape (N, N)."""
-    at = np.minimum(rows.tick[:, None], rows.tick)
-    c0, bx, by, xx, xy, yy = model.sums[:, at]
-    (ux, uy), lever = rows.u, rows.lever
-    column, left, above = lever[:, None], ux[:, None], uy[:, None]
-    cross = column * (bx * ux + by * uy)
-    covariance: Array = column * lever * c0 - cross - cross.T
-    covariance += left * (xx * ux + xy * uy) + above * (xy * ux + yy * uy)
-    return covariance
+def constant_effects(model: OdometryNoiseModel, rows: Projection) -> Array:
+    """Return the effect (m) of one sigma of each constant error, and that of the correction of the measured
+    path, on N rows; shape (..., m + 1, N)."""
+    moves = model.moves[..., rows.ticks.tick]
+    return np.asarray(np.add.reduce(moves * rows.weights[..., None, :, :], -2), np.float64)
+
+
+def spread(model: OdometryNoiseModel, rows: Projection) -> tuple[Array, Array]:
+    """Return factors of the covariance (m^2) of N rows from white odometry noise; shape (..., 3, N) each.
+
+    Element (i, j) of the covariance is the product of column i of the first and column j of the second, if
+    row i is not earlier than row j; see `symmetric`.
+    """
+    if model.sums is None:
+        return rows.weights, np.zeros(rows.weights.shape)
+    sums = model.sums[..., rows.ticks.tick][..., MATRIX, :]
+    return rows.weights, np.add.reduce(sums * rows.weights[..., None, :, :], -2)
+
+
+MATRIX = np.array(((0, 1, 2), (1, 3, 4), (2, 4, 5)))
+"""The places in `OdometryNoiseModel.sums` of the elements of the matrix of a tick."""
+
+
+def symmetric(left: Array, right: Array, ticks: Ticks) -> Array:
+    """Return the covariance of rows from its factors (see `spread`), (..., n, N) each; shape (..., N, N)."""
+    product = np.swapaxes(left, -1, -2) @ right
+    return np.where(ticks.tick[:, None] >= ticks.tick, product, np.swapaxes(product, -1, -2))
 
 
 class Errors(NamedTuple):
-    """The odometry errors in v (m/s) and omega (rad/s) that a fit estimates; shapes (k,)."""
+    """The odometry errors of one robot that a fit estimates."""
 
     v: Array
+    """The white errors (m/s) of v at each tick; shape (k,)."""
     omega: Array
-
-    def corrected(self, measured: Track) -> Track:
-        """Return the path with these errors added to the `measured` velocities."""
-        return track(measured.v + self.v, measured.omega + self.omega, measured.period)
-
-
-def shifted(model: OdometryNoiseModel, rows: Projection, errors: Errors) -> Array:
-    """Return by how much (m) `errors` change the value of each row, to first order; shape (N,)."""
-    moves = np.empty((3, len(errors.v)))
-    moves[0] = errors.omega
-    moves[1:] = errors.v * model.shift - errors.omega * model.b
-    turned, x, y = _summed(moves)[:, rows.tick]
-    move: Array = rows.lever * turned + rows.u[0] * x + rows.u[1] * y
-    return move
+    """The white errors (rad/s) of omega at each tick; shape (k,)."""
+    constant: Array
+    """The constant errors in their sigmas; shape (m,)."""
 
 
-def attributed(model: OdometryNoiseModel, rows: Projection, residuals: Array) -> Errors:
-    """Return the odometry errors that explain `residuals` best.
-
-    The residuals are weighted by their inverse covariance; shape (N,).
-    """
-    k = model.b.shape[1]
-    after = np.zeros((3, k + 1))
-    for sums, weight in zip(after, (rows.lever, *rows.u), strict=True):
-        np.add.at(sums, rows.tick, residuals * weight)
-    lever, x, y = np.cumsum(after[:, :0:-1], axis=1)[:, ::-1]
-    q_v, q_omega = model.variances
-    return Errors(
-        q_v * (x * model.shift[0] + y * model.shift[1]), q_omega * (lever - x * model.b[0] - y * model.b[1])
+def rescaled(errors: Errors, told: Noise, other: Noise) -> Errors:
+    """Return `errors`, whose constant part is in the sigmas of `told`, in those of `other`."""
+    was, now = (
+        np.array((one.wheel_scale, one.wheel_scale, one.gyro_bias)) for one in (told.priors, other.priors)
     )
+    constant = np.zeros(3 * other.priors.of_odometry)
+    if len(errors.constant) and len(constant):
+        constant = errors.constant * was / np.where(now > 0.0, now, math.inf)
+    return errors._replace(constant=constant)
+
+
+def attributed(model: OdometryNoiseModel, rows: Projection, residuals: Array) -> Array:
+    """Return the white errors of v and omega that explain `residuals` best; shape (..., 2, k).
+
+    The residuals are weighted by their inverse covariance; shape (..., N).
+    """
+    if model.variances is None:
+        return np.zeros(model.shift.shape)
+    explaining = rows.weights * residuals[..., None, :]
+    after = _summed(explaining[..., rows.ticks.order])[..., rows.ticks.after]
+    lever, u = after[..., 0, :], after[..., 1:, :]
+    white = np.empty(model.shift.shape)
+    np.add.reduce(u * model.shift, -2, out=white[..., 0, :])
+    np.subtract(lever, np.add.reduce(u * model.b, -2), out=white[..., 1, :])
+    white *= model.variances
+    return white

@@ -12,9 +12,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from agent.estimation.gaussian.odometry_noise import Array, Places, Projection, Track
-from protocol.noise import Noise
+from agent.estimation.gaussian.odometry_noise import Array, Places, Track
+from protocol.noise import Noise, Priors, VelocityNoise
 
 SIGMA_FLOOR = 1e-6
 """The least standard deviation (m) that is assumed for a range."""
@@ -24,6 +25,22 @@ ELSEWHERE = 0.01
 
 IMPOSSIBLE = 6.0
 """The number of sigmas beyond R from which a range is an outlier under any guess."""
+
+
+MOST_RANGES = 96
+"""The most ranges of a kind that a fit weighs if odometry is noisy.
+
+The cost of a fit is cubic in their number: with 3 x 96, a search takes about 0.2 s. Old ranges tell little of
+the present pose then. Missions of the sweep `noise` have up to 70; with a bound of less than that, they would
+take longer, and with 1000, a search would take seconds.
+"""
+
+MOST_RANGES_BY_EXACT_ODOMETRY = 2048
+"""The most ranges of a kind without white odometry noise. The cost is linear, and old ranges tell as
+much as new ones.
+
+With it, a tick takes 10 ms. A mission that needs more ranges than that does not reach its accuracy.
+"""
 
 
 class Ranges(NamedTuple):
@@ -36,6 +53,11 @@ class Ranges(NamedTuple):
     """The standard deviation (m) of each range; shape (N,)."""
     counts: tuple[int, int, int]
     """The number of ranges of each of the three kinds."""
+    place: Array | None = None
+    """The position (m) of each range's anchor in <W>, relative to that of the guess, for one robot and
+    several anchors; shape (N, 2). None: each robot has one anchor."""
+    radio: Places | None = None
+    """The number of each range's anchor in this case; shape (N,)."""
 
     @staticmethod
     def of_lists(
@@ -55,6 +77,19 @@ class Ranges(NamedTuple):
             counts,
         )
 
+    @property
+    def content(self) -> tuple[object, ...]:
+        """Return all ranges as values that can be compared."""
+        parts = (*self[:3], self.place, self.radio)
+        return (*[None if part is None else part.tobytes() for part in parts], self.counts)
+
+    @property
+    def pairs(self) -> list[NDArray[np.bool]]:
+        """Return the ranges of each pair of radios that has some; shapes (N,)."""
+        which = self.radio if self.radio is not None else np.repeat(np.arange(3), self.counts)
+        # numpy.unique would import numpy.ma in the first search of a mission
+        return [which == one for one in sorted(set(which.tolist()))]
+
     def rows(self, kind: int) -> slice:
         """Return the rows of a kind: 0 and 1 are the ranges of that robot to its anchor, 2 is mutual."""
         begin = sum(self.counts[:kind])
@@ -65,13 +100,70 @@ class Ranges(NamedTuple):
         rows = self.rows(kind)
         return Ranges(self.rho[rows], self.tick[rows], self.sigma[rows], (self.counts[kind], 0, 0))
 
-    def within(self, sensing_range: float) -> Ranges:
+    def common_errors(self, priors: Priors) -> Array:
+        """Return the effect (m) of one sigma of each constant error on the ranges; shape (N, m).
+
+        The errors are a bias of all ranges, one of each pair of radios, and a scale. The scale multiplies the
+        measured ranges: then the effects are the same under each guess.
+        """
+        columns = []
+        if priors.range_bias:
+            columns.append(np.full(len(self.rho), priors.range_bias))
+        if priors.range_scale:
+            columns.append(priors.range_scale * self.rho)
+        if priors.pair_bias:
+            columns += [priors.pair_bias * own for own in self.pairs]
+        return np.stack(columns, 1) if columns else np.zeros((len(self.rho), 0))
+
+    def slow_errors(self, priors: Priors, period: float) -> Array | None:
+        """Return the covariance (m^2) of slowly varying errors, within each pair of radios; None without."""
+        if not priors.slow_sigma:
+            return None
+        covariance = np.zeros((len(self.rho), len(self.rho)))
+        for own in self.pairs:
+            rows = np.flatnonzero(own)
+            apart = np.abs(np.subtract.outer(self.tick[rows], self.tick[rows])) * (period / priors.slow_time)
+            covariance[np.ix_(rows, rows)] = priors.slow_sigma**2 * np.exp(-apart)
+        return covariance
+
+    def loosened(self, priors: Priors) -> Array:
+        """Return the variance (m^2) that constant and slow errors add to each range; shape (N,)."""
+        variance: Array = np.sum(np.square(self.common_errors(priors)), 1) + priors.slow_sigma**2
+        return variance
+
+    def within(self, sensing_range: float, priors: Priors) -> Ranges:
         """Return the ranges without those that are too long to be anything but outliers."""
-        possible = self.rho <= sensing_range + IMPOSSIBLE * self.sigma
-        if np.all(possible):
+        sigma = np.sqrt(np.square(self.sigma) + self.loosened(priors))
+        return self._only(self.rho <= sensing_range + IMPOSSIBLE * sigma)
+
+    def thinned(self, noise: Noise) -> Ranges:
+        """Return at most MOST_RANGES of each kind, or MOST_RANGES_BY_EXACT_ODOMETRY: all recent, some older.
+
+        It bounds the cost of a tick. Which of the older ones are left changes only when their number doubles.
+        """
+        correlated = noise.odometry != VelocityNoise() or noise.priors.slow_sigma > 0.0
+        most = MOST_RANGES if correlated else MOST_RANGES_BY_EXACT_ODOMETRY
+        if max(self.counts) <= most:
             return self
-        first, second, mutual = (int(np.count_nonzero(possible[self.rows(kind)])) for kind in range(3))
-        return Ranges(self.rho[possible], self.tick[possible], self.sigma[possible], (first, second, mutual))
+        left = np.zeros(len(self.rho), np.bool)
+        for kind in range(3):
+            rows, older = left[self.rows(kind)], self.counts[kind] - most // 2
+            if self.counts[kind] <= most:
+                rows[:] = True
+                continue
+            rows[older:] = True
+            rows[: older : 2 ** math.ceil(math.log2(older / (most - most // 2)))] = True
+        return self._only(left)
+
+    def _only(self, some: NDArray[np.bool]) -> Ranges:
+        """Return the ranges selected by `some`."""
+        if np.all(some):
+            return self
+        first, second, mutual = (int(np.count_nonzero(some[self.rows(kind)])) for kind in range(3))
+        place = None if self.place is None else self.place[some]
+        radio = None if self.radio is None else self.radio[some]
+        counts = (first, second, mutual)
+        return Ranges(self.rho[some], self.tick[some], self.sigma[some], counts, place, radio)
 
 
 class PairRanges(NamedTuple):
@@ -86,6 +178,21 @@ class PairRanges(NamedTuple):
     sensing_range: float
     noise: Noise
 
+    def __eq__(self, other: object) -> bool:
+        """Return whether `other` has the same measurements, to the bit."""
+        return isinstance(other, PairRanges) and self.content == other.content
+
+    def __hash__(self) -> int:
+        """Return the hash of all measurements."""
+        return hash(self.content)
+
+    @property
+    def content(self) -> tuple[object, ...]:
+        """Return all measurements as values that can be compared."""
+        silent = tuple([ticks.tobytes() for ticks in self.silent])
+        paths = tuple([path.content for path in self.paths])
+        return paths, self.ranges.content, silent, self.apart, self.sensing_range, self.noise
+
     @property
     def places(self) -> Places:
         """Return the indices of the first mutual range, and of each that follows a motion of a robot."""
@@ -99,60 +206,82 @@ class PairRanges(NamedTuple):
 
 
 class Predicted(NamedTuple):
-    """The ranges that a guess predicts, and their derivatives."""
+    """The ranges that guesses predict, and their derivatives."""
 
     distance: Array
-    """The predicted ranges (m); shape (N,)."""
+    """The predicted ranges (m); shape (..., N)."""
     jacobian: Array
-    """The derivatives with respect to the guess; shape (N, 3 robots)."""
-    directions: tuple[Array, ...]
-    """The derivatives with respect to each robot's position, in the frame of its odometry; shapes (2, N).
+    """The derivatives with respect to the guess; shape (..., N, 3 robots)."""
+    directions: Array
+    """The derivatives with respect to each robot's position, in the frame of its odometry.
 
-    They are 0 if a range does not involve the robot.
+    They are 0 if a range does not involve the robot; shape (..., robots, 2, N).
     """
-
-    def seen(self, paths: Sequence[Track], ranges: Ranges) -> list[Projection]:
-        """Return the derivatives as rows along the paths."""
-        return [
-            Projection.positions(path, ranges.tick, u) for path, u in zip(paths, self.directions, strict=True)
-        ]
 
 
 def predict(guess: Array, paths: Sequence[Track], ranges: Ranges, apart: tuple[float, float]) -> Predicted:
-    """Return the ranges that `guess` predicts.
+    """Return the ranges that `guess` predicts with the robots on `paths`; see `predicted`."""
+    ticks = [np.minimum(ranges.tick, len(path.v)) for path in paths]
+    return predicted(
+        guess,
+        np.stack([(path.x[tick], path.y[tick]) for path, tick in zip(paths, ticks, strict=True)]),
+        ranges,
+        apart,
+    )
 
-    `guess` contains for each robot the x and y (m) of its anchor in the frame of its odometry, and the
-    rotation (rad) of this frame in <W>; shape (3,) or (6,). `apart` is M2 - M1 (m) in <W>. With a single path
-    there are only ranges to its anchor, and they do not determine the rotation.
+
+def predicted(guess: Array, places: Array, ranges: Ranges, apart: tuple[float, float]) -> Predicted:
+    """Return the ranges that guesses predict with the robots at `places`.
+
+    A guess contains for each robot the x and y (m) of its anchor in the frame of its odometry, and the
+    rotation (rad) of this frame in <W>; shape (..., 3) or (..., 6). `places` are the positions (m) of the
+    robots at the ticks of the ranges, in these frames; shape (..., robots, 2, N). `apart` is M2 - M1 (m) in
+    <W>. With a single robot there are only ranges to its anchor, and they do not determine the rotation.
     """
-    n, ticks = len(ranges.rho), ranges.tick
-    distance, jacobian = np.empty(n), np.zeros((n, len(guess)))
-    directions = tuple([np.zeros((2, n)) for _ in paths])
-    for robot, path in enumerate(paths):
-        rows = ranges.rows(robot)
-        mx, my = guess[3 * robot : 3 * robot + 2]
-        x, y = path.x[ticks[rows]] - mx, path.y[ticks[rows]] - my
-        rho = np.maximum(np.hypot(x, y), TINY)
-        distance[rows] = rho
-        directions[robot][:, rows] = x / rho, y / rho
-    if len(paths) == 2 and ranges.counts[2]:
-        rows = ranges.rows(2)
-        (ax, ay), (bx, by) = (
-            placed(guess[3 * robot : 3 * robot + 3], path, ticks[rows]) for robot, path in enumerate(paths)
-        )
-        dx, dy = ax - bx - apart[0], ay - by - apart[1]
+    robots, n = places.shape[-3], len(ranges.rho)
+    anchors = guess.reshape(*guess.shape[:-1], robots, 3)
+    away = places - anchors[..., :2, None]
+    if ranges.place is not None:
+        return _predicted_to_places(anchors, away, ranges.place)
+    distances = np.maximum(np.hypot(away[..., 0, :], away[..., 1, :]), TINY)
+    directions = away / distances[..., None, :]
+    distance, jacobian = distances[..., 0, :], np.zeros((*guess.shape[:-1], n, 3 * robots))
+    if robots == 2:
+        of_a, of_b, mutual = (ranges.rows(kind) for kind in range(3))
+        distance[..., of_b] = distances[..., 1, of_b]
+        directions[..., 0, :, of_b], directions[..., 1, :, of_a] = 0.0, 0.0
+        c, s = np.cos(anchors[..., 2:]), np.sin(anchors[..., 2:])
+        x, y = away[..., 0, mutual], away[..., 1, mutual]
+        wx, wy = c * x - s * y, s * x + c * y
+        dx, dy = wx[..., 0, :] - wx[..., 1, :] - apart[0], wy[..., 0, :] - wy[..., 1, :] - apart[1]
         gap = np.maximum(np.hypot(dx, dy), TINY)
-        distance[rows] = gap
-        nx, ny = dx / gap, dy / gap
-        jacobian[rows, 2], jacobian[rows, 5] = ny * ax - nx * ay, nx * by - ny * bx
-        for robot, sign in ((0, 1.0), (1, -1.0)):
-            theta = guess[3 * robot + 2]
-            c, s = sign * math.cos(theta), sign * math.sin(theta)
-            directions[robot][:, rows] = c * nx + s * ny, c * ny - s * nx
-    for robot, u in enumerate(directions):
-        jacobian[:, 3 * robot : 3 * robot + 2] = -u.T
+        distance[..., mutual] = gap
+        nx, ny = (dx / gap)[..., None, :] * SIGNS, (dy / gap)[..., None, :] * SIGNS
+        jacobian[..., mutual, 2::3] = np.swapaxes(ny * wx - nx * wy, -1, -2)
+        directions[..., 0, mutual] = c * nx + s * ny
+        directions[..., 1, mutual] = c * ny - s * nx
+    for robot in range(robots):
+        np.negative(
+            np.swapaxes(directions[..., robot, :, :], -1, -2), out=jacobian[..., 3 * robot : 3 * robot + 2]
+        )
     return Predicted(distance, jacobian, directions)
 
+
+def _predicted_to_places(anchors: Array, away: Array, place: Array) -> Predicted:
+    """Return the ranges of one robot to several anchors; `place` is that of each range, shape (N, 2)."""
+    c, s = np.cos(anchors[..., 0, 2:]), np.sin(anchors[..., 0, 2:])
+    x, y = away[..., 0, 0, :], away[..., 0, 1, :]
+    wx, wy = c * x - s * y, s * x + c * y
+    dx, dy = wx - place[:, 0], wy - place[:, 1]
+    distance = np.maximum(np.hypot(dx, dy), TINY)
+    nx, ny = dx / distance, dy / distance
+    along, across = c * nx + s * ny, c * ny - s * nx
+    jacobian = np.stack((-along, -across, ny * wx - nx * wy), -1)
+    return Predicted(distance, jacobian, np.stack((along, across), -2)[..., None, :, :])
+
+
+SIGNS = np.array(((1.0,), (-1.0,)))
+"""The signs of the derivatives of a mutual range with respect to the positions of a and b."""
 
 TINY = 1e-12
 """The distance (m) below which a direction is not defined."""
@@ -166,13 +295,35 @@ def placed(guess: Array, path: Track, ticks: Places) -> tuple[Array, Array]:
     return c * x - s * y, s * x + c * y
 
 
+def inlier_probability(residuals: Array, sigma: Array, noise: Noise) -> Array:
+    """Return the probability that the range of each residual (m) is an inlier."""
+    if not (noise.outliers or noise.strays):
+        return np.ones_like(residuals)
+    # the log-density of outliers and strays, less that of inliers
+    misfit, told = 0.5 * np.square(residuals / sigma), _log_inlier(noise)
+    ratio = misfit + (math.log(noise.strays / STRAY_WIDTH) - told) if noise.strays else None
+    if noise.outliers:
+        least, most = noise.outlier_bias
+        beyond = residuals - np.minimum(np.maximum(residuals, least), most)
+        wide = np.log(sigma / np.maximum(most - least, sigma)) + (math.log(noise.outliers) - told)
+        outlier = misfit - 0.5 * np.square(beyond / sigma) + wide
+        ratio = outlier if ratio is None else np.logaddexp(outlier, ratio)
+    assert ratio is not None
+    probability: Array = 1.0 / (1.0 + np.exp(np.minimum(ratio, LARGEST_RATIO)))
+    return probability
+
+
+LARGEST_RATIO = 700.0
+"""The log-ratio beyond which an exponential would overflow."""
+
+
 def mixture(residuals: Array, sigma: Array, noise: Noise) -> tuple[Array, Array]:
     """Return the log-likelihood of the residuals (m), and the probability that each is an inlier.
 
     The log-likelihood is summed over the last axis; the probabilities have the shape of the residuals.
     """
     good = inliers(residuals, sigma, noise)
-    if not noise.outliers:
+    if not (noise.outliers or noise.strays):
         return np.sum(good, -1), np.ones_like(residuals)
     both = np.logaddexp(good, outliers(residuals, sigma, noise))
     return np.sum(both, -1), np.exp(good - both)
@@ -181,15 +332,34 @@ def mixture(residuals: Array, sigma: Array, noise: Noise) -> tuple[Array, Array]
 def inliers(residuals: Array, sigma: Array, noise: Noise) -> Array:
     """Return the joint log-density of each residual and of its being an inlier."""
     density: Array = -0.5 * np.square(residuals / sigma) - np.log(sigma)
-    return density + (math.log1p(-noise.outliers) - 0.5 * math.log(2.0 * math.pi))
+    return density + _log_inlier(noise)
+
+
+def _log_inlier(noise: Noise) -> float:
+    """Return the joint log-density of being an inlier and of a residual of 0, in units of sigma."""
+    return math.log1p(-noise.outliers - noise.strays) - 0.5 * math.log(2.0 * math.pi)
 
 
 def outliers(residuals: Array, sigma: Array, noise: Noise) -> Array:
-    """Return the joint log-density of each residual and of its being an outlier.
+    """Return the joint log-density of each residual and of its being an outlier or a stray.
 
-    The bias is uniform, and the ends of its density are smoothed by `sigma`.
+    The bias of an outlier is uniform, and the ends of its density are smoothed by `sigma`. A stray may be
+    anywhere (see STRAY_WIDTH).
     """
+    stray = None
+    if noise.strays:
+        stray = np.broadcast_to(math.log(noise.strays / STRAY_WIDTH) - np.log(sigma), residuals.shape)
+        if not noise.outliers:
+            return stray
     least, most = noise.outlier_bias
     beyond = np.maximum(np.maximum(least - residuals, residuals - most), 0.0)
     density: Array = -np.log(np.maximum(most - least, sigma)) - 0.5 * np.square(beyond / sigma)
-    return density + math.log(noise.outliers)
+    density += math.log(noise.outliers)
+    return density if stray is None else np.logaddexp(density, stray)
+
+
+STRAY_WIDTH = 100.0
+"""The width of the uniform density of strays, in sigmas of a range.
+
+With the default rate of strays, a range is more probably a stray than not from 4.6 sigmas on.
+"""

@@ -11,13 +11,13 @@ from typing import Any
 import msgspec
 import pyarrow as pa
 import pyarrow.parquet as pq
-from msgspec.structs import asdict, astuple
+from msgspec.structs import asdict
 
 from compose.recording.claim import nees
 from compose.recording.frames import Journaled
 from compose.recording.run import Run
 from compose.recording.ticks_csv import TickRow
-from protocol.messages import Estimate, Localised
+from protocol.messages import Estimate
 from protocol.motion import Covariance, Pose
 from world.referee import errors
 
@@ -100,23 +100,5 @@ def frames_csv(frames: Iterable[Journaled], check: Callable[[], object] = lambda
     writer.writerow(["journal", "place", "tick", "kind", "bytes", "message"])
     for one in frames:
         check()
-        text = msgspec.json.encode(_named(one.message)).decode()
-        writer.writerow([one.journal, one.place, one.tick, one.kind, len(one.frame), text])
+        writer.writerow([one.journal, one.place, one.tick, one.kind, len(one.frame), one.json])
     return out.getvalue()
-
-
-def _named(value: Any) -> Any:
-    """Return a message, or a value in one, with the names of its fields."""
-    if isinstance(value, tuple):
-        return [_named(one) for one in value]
-    if not isinstance(value, msgspec.Struct):
-        return value
-    named = {
-        name: one if type(one) in _PLAIN else _named(one)
-        for name, one in zip(value.__struct_fields__, astuple(value), strict=True)
-    }
-    return {"verdict": "localised", **named} if isinstance(value, Localised) else named
-
-
-_PLAIN = frozenset((int, float, str, bool, type(None)))
-"""The types of values without parts."""

@@ -14,6 +14,7 @@ from compose.recording.run_setup import of_configs
 from compose.view.run_data import RunData
 from compose.view.web.sources import UNANSWERED, WatchedRun
 from protocol.messages import (
+    AnyRobotConfig,
     Command,
     Estimate,
     FinalReport,
@@ -21,8 +22,7 @@ from protocol.messages import (
     Message,
     MissionEnd,
     Observation,
-    Report,
-    RobotConfig,
+    PeerReport,
 )
 from protocol.network import diagnosis, keys, session
 from protocol.network.endpoints import Endpoints
@@ -39,10 +39,10 @@ LISTENED = (
 )
 CARRIED: Mapping[Callable[..., str] | None, Any] = {
     keys.truth: GroundTruth,
-    keys.config: RobotConfig,
+    keys.config: AnyRobotConfig,
     keys.observation: Observation | MissionEnd | FinalReport,
     keys.command: Command | FinalReport,
-    keys.report: Report,
+    keys.report: PeerReport,
     keys.estimate: Estimate,
 }
 """The message types that each kind of key carries."""

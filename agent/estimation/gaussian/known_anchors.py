@@ -1,0 +1,196 @@
+"""Hypotheses about one robot from its ranges to several anchors, whose positions are known.
+
+The unknowns are those of a robot with one anchor, and the rotation of its odometry's frame, which several
+anchors determine.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, HIGHEST_LEVEL
+from agent.estimation.gaussian.hypotheses import (
+    WARM_STEPS,
+    Hypothesis,
+    ScoredHypothesis,
+    with_probability,
+)
+from agent.estimation.gaussian.inference import MUTUAL_RANGES, MUTUAL_RANGES_WITH_OUTLIERS
+from agent.estimation.gaussian.initial_guesses import anchors
+from agent.estimation.gaussian.least_squares import STEPS, deviation, fits
+from agent.estimation.gaussian.linear_model import Start
+from agent.estimation.gaussian.odometry_noise import Array, Places, Track
+from agent.estimation.gaussian.range_model import Ranges, mixture, predicted
+from protocol.mission import HEADING_ACCURACY
+from protocol.noise import Noise
+
+TURNS = 72
+"""The number of rotations that are tried. The refinement bridges half of the 5 degrees between them."""
+
+REFINEMENTS = 8
+"""The number of Gauss-Newton steps on all candidates."""
+
+COARSE = 0.1
+"""The expected error of a candidate's ranges at first, as a fraction of the longest range."""
+
+FINER = 0.4
+"""The factor by which it decreases in each step."""
+
+CANDIDATES = 8
+"""The number of candidates from which fits begin."""
+
+APART, TURNED = 0.05, 0.2
+"""The distance (as a fraction of the longest range) and the angle (rad) within which candidates are one."""
+
+FEWEST = 4
+"""The least number of ranges for hypotheses: there are three unknowns, and one range checks them."""
+
+MOST_STRAYS = 0.15
+"""The largest fraction of ranges that may be strays, in addition to the outliers that were told."""
+
+FEWEST_OF_ANCHOR = 3
+"""The least number of ranges to one anchor from which its place in the odometry's frame is guessed."""
+
+
+class AnchoredRobot(NamedTuple):
+    """The measurements of one robot with several anchors."""
+
+    path: Track
+    ranges: Ranges
+    """The ranges, with the places of their anchors."""
+    sensing_range: float
+    """The longest range (m) that is expected."""
+    noise: Noise
+
+
+def search(robot: AnchoredRobot, known: Sequence[Hypothesis] = ()) -> tuple[ScoredHypothesis, ...]:
+    """Return the hypotheses of a search of the whole plane, and those `known`, the likeliest first."""
+    if len(robot.ranges.rho) < FEWEST:
+        return ()
+    starts = [one.start for one in known] + [Start(guess) for guess in _candidates(robot)]
+    return _fitted(robot, starts, STEPS)
+
+
+def follow(robot: AnchoredRobot, known: Sequence[Hypothesis]) -> tuple[ScoredHypothesis, ...]:
+    """Return the hypotheses that follow from those `known` before the latest ranges."""
+    return _fitted(robot, [one.start for one in known], WARM_STEPS)
+
+
+def _fitted(robot: AnchoredRobot, starts: Sequence[Start], steps: int) -> tuple[ScoredHypothesis, ...]:
+    found = fits(starts, [robot.path], robot.ranges, robot.noise, steps=steps)
+    return with_probability([(one, 0.0) for one in found])
+
+
+def _candidates(robot: AnchoredRobot) -> list[Array]:
+    """Return initial guesses: each place of an anchor by its ranges alone, with all rotations, refined."""
+    ranges, places = robot.ranges, ranges_places(robot)
+    turns = np.linspace(-math.pi, math.pi, TURNS, endpoint=False)
+    guesses = []
+    for own in sorted(ranges.pairs, key=lambda rows: -int(np.count_nonzero(rows)))[:2]:
+        count = int(np.count_nonzero(own))
+        if count < FEWEST_OF_ANCHOR:
+            continue
+        alone = Ranges(ranges.rho[own], ranges.tick[own], ranges.sigma[own], (count, 0, 0))
+        ox, oy = places[np.flatnonzero(own)[0]]
+        c, s = np.cos(turns), np.sin(turns)
+        for mx, my in anchors(robot.path, alone, robot.sensing_range, robot.noise):
+            guesses.append(np.stack((mx - c * ox - s * oy, my - c * oy + s * ox, turns), 1))
+    return _refined(np.concatenate(guesses), robot) if guesses else []
+
+
+def ranges_places(robot: AnchoredRobot) -> Array:
+    """Return the place (m) of each range's anchor; shape (N, 2)."""
+    assert robot.ranges.place is not None
+    return robot.ranges.place
+
+
+def _refined(guesses: Array, robot: AnchoredRobot) -> list[Array]:
+    """Return the likeliest of `guesses` after Gauss-Newton steps on all ranges, with measured odometry."""
+    ranges, path = robot.ranges, robot.path
+    at = np.stack((path.x[ranges.tick], path.y[ranges.tick]))[None]
+    sigma = np.sqrt(np.square(ranges.sigma) + ranges.loosened(robot.noise.priors))
+    longest = float(np.max(ranges.rho))
+    for step in range(REFINEMENTS):
+        s = np.hypot(sigma, COARSE * longest * FINER**step)
+        model = predicted(guesses, np.broadcast_to(at, (len(guesses), *at.shape)), ranges, (0.0, 0.0))
+        residuals = ranges.rho - model.distance
+        weight = mixture(residuals, s, robot.noise)[1] / np.square(s)
+        weighted = np.swapaxes(model.jacobian * weight[..., None], 1, 2)
+        information = weighted @ model.jacobian
+        information.reshape(len(guesses), -1)[:, ::4] *= 1.0 + DAMPING
+        information.reshape(len(guesses), -1)[:, ::4] += DAMPING
+        change = np.linalg.solve(information, (weighted @ residuals[..., None]))[..., 0]
+        most = np.array((LONGEST_STEP * longest, LONGEST_STEP * longest, LARGEST_TURN))
+        guesses = guesses + change / np.maximum(np.max(np.abs(change) / most, 1, keepdims=True), 1.0)
+    model = predicted(guesses, np.broadcast_to(at, (len(guesses), *at.shape)), ranges, (0.0, 0.0))
+    likely = mixture(ranges.rho - model.distance, np.hypot(sigma, FINAL * longest), robot.noise)[0]
+    return _distinct(guesses, likely, at[0, :, -1], longest)
+
+
+DAMPING = 1e-6
+"""The damping of these steps, as a fraction of the information, and its least value."""
+
+LONGEST_STEP, LARGEST_TURN = 0.2, 0.3
+"""The largest step, as a fraction of the longest range, and the largest turn, in rad."""
+
+FINAL = 0.02
+"""The error of a prediction without a correction of the odometry, as a fraction of the longest range."""
+
+
+def _distinct(guesses: Array, likely: Array, last: Array, longest: float) -> list[Array]:
+    """Return the likeliest of `guesses` at different poses at the place `last` (m) of the path."""
+    c, s = np.cos(guesses[:, 2]), np.sin(guesses[:, 2])
+    x, y = last[0] - guesses[:, 0], last[1] - guesses[:, 1]
+    ends = np.stack((c * x - s * y, s * x + c * y), 1)
+    left: Places = np.argsort(-likely, kind="stable")
+    chosen: list[Array] = []
+    while len(left) and len(chosen) < CANDIDATES:
+        best = int(left[0])
+        chosen.append(guesses[best])
+        turn = np.remainder(guesses[left, 2] - guesses[best, 2] + math.pi, math.tau) - math.pi
+        far = np.hypot(*(ends[left] - ends[best]).T) > APART * longest
+        left = left[far | (np.abs(turn) > TURNED)]
+    return chosen
+
+
+def blocking_reason(
+    scored: Sequence[ScoredHypothesis], covariance: Array, robot: AnchoredRobot, accuracy: float, sure: float
+) -> str:
+    """Return the first condition for a claim that is not met, or an empty text.
+
+    The conditions are those of two robots: the probability `sure`, enough ranges, their consistency, and the
+    `accuracy` (m) of the position by the `covariance` of the pose.
+    """
+    best, ranges = scored[0], robot.ranges
+    required = MUTUAL_RANGES_WITH_OUTLIERS if robot.noise.outliers else MUTUAL_RANGES
+    if len(ranges.rho) < required:
+        return f"{len(ranges.rho)} of {required} required ranges"
+    if best.hypothesis.probability < sure:
+        probability = best.hypothesis.probability
+        return f"the most probable of {len(scored)} hypotheses has probability {probability:.6f}"
+    if best.fit.last_step > FINISHED:
+        return "the fit of the most probable hypothesis has not converged"
+    free = max(best.fit.inliers - 3, 1)
+    if chi2_p_value(best.fit.chi2 / HIGHEST_LEVEL, free) < CLAIM_P_VALUE:
+        return f"the residuals are too large: chi-square {best.fit.chi2:.3g} for {free} degrees of freedom"
+    strays = len(ranges.rho) - best.fit.inliers
+    if strays > (MOST_STRAYS + robot.noise.outliers) * len(ranges.rho):
+        return f"{strays} of {len(ranges.rho)} ranges fit no other"
+    position = deviation(float(covariance[0, 0] + covariance[1, 1]))
+    if not position <= accuracy:
+        return f"the sigma of the position is {position:.3g} m, required {accuracy:g}"
+    heading = deviation(float(covariance[2, 2]))
+    if not heading <= HEADING_ACCURACY:
+        return f"the sigma of the heading is {heading:.3g} rad, required {HEADING_ACCURACY:g}"
+    return ""
+
+
+def chi2_p_value(chi2: float, free: int) -> float:
+    """Return the probability of a larger chi-square with `free` degrees of freedom (Wilson and Hilferty)."""
+    spread = 2.0 / (9.0 * free)
+    normal = ((max(chi2, 0.0) / free) ** (1.0 / 3.0) - (1.0 - spread)) / math.sqrt(spread)
+    return 0.5 * math.erfc(normal / math.sqrt(2.0))

@@ -1,0 +1,183 @@
+"""The comparison of the noise that a robot was told with the profiles of common sensors.
+
+A robot does not blame its peer for what a profile explains, and claims no pose that a profile contradicts.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from msgspec.structs import replace
+
+from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, consistency_test
+from agent.estimation.gaussian.hypotheses import search
+from agent.estimation.gaussian.initial_guesses import anchors
+from agent.estimation.gaussian.least_squares import Fit, fit, fits
+from agent.estimation.gaussian.linear_model import Start
+from agent.estimation.gaussian.odometry_noise import Track, rescaled
+from agent.estimation.gaussian.range_model import PairRanges, Ranges
+from protocol.noise import PROFILES, UNTOLD_SIGMA, Noise, ProfileName
+
+DOUBTFUL = 3.0
+"""The log evidence for another profile from which on a robot doubts what it was told of its own sensors.
+
+With less, robots doubt their own sensors where a peer attacks; with more, honest peers are suspected where
+both robots have a bias that nobody told.
+"""
+
+LEANING = 1.0
+"""The log evidence of the own measurements for a profile from which on it may excuse the peer.
+
+The profile must then also explain all measurements without a contradiction. With less, robots excuse false
+reports whose size is that of a profile's priors; with more, they suspect honest peers with the same errors.
+"""
+
+DOUBTFUL_CLAIM = 12.0
+"""The log evidence of the ranges of both robots for another profile from which on a robot does not claim.
+
+Set on the sweeps `mismatch` and `mismatch-uwb`. Ranges with errors as told, or with larger ones, gave at most
+6, and errors that are correlated over 20 ticks 12. A bias of 0.35 m of the anchors' ranges gave at least 22,
+and wrong claims 15.
+"""
+
+DOUBTFUL_CLAIMS = 5
+"""The number of claims that a robot withholds for this reason before it ends with `undecided`."""
+
+FEWEST_RANGES = 4
+"""The least number of ranges for the test. Two determine the position of the anchor."""
+
+
+class Doubt(NamedTuple):
+    """The profile that explains measurements better than the noise that the robots were told."""
+
+    what: str
+    """The measurements that contradict the noise."""
+    profile: ProfileName
+    how: str
+    """The words for how much better the profile explains them."""
+
+    @property
+    def reason(self) -> str:
+        """Return the reason for the verdict Undecided."""
+        return (
+            f"{self.what} contradict mission.noise; the profile '{self.profile}' explains them {self.how}: "
+            f'try noise = "{self.profile}", or calibrate the sensors'
+        )
+
+
+OWN = "the own ranges to the anchor and the own odometry"
+"""The measurements that do not depend on the peer."""
+
+BOTH = "the ranges and the odometry of both robots"
+"""All measurements."""
+
+
+def doubt(
+    path: Track,
+    ranges: Ranges,
+    sensing_range: float,
+    noise: Noise,
+    pair: PairRanges | None = None,
+    robot: int = 0,
+) -> Doubt | None:
+    """Return the profile that explains a contradiction between the reports of the peer and the own ranges.
+
+    It explains the own `ranges` along `path` much better than `noise`; or a little better, and those of the
+    `pair` without a contradiction, as `robot` (0 or 1) tests it.
+    """
+    if len(ranges.rho) < FEWEST_RANGES:
+        return None
+    told = _log_evidence(path, ranges, sensing_range, noise)
+    others = {
+        name: _log_evidence(path, ranges, sensing_range, _profile(name, noise)) - told
+        for name in _others(noise)
+    }
+    found = _best(OWN, others, DOUBTFUL)
+    if found is not None or pair is None:
+        return found
+    leaning = [name for name in others if others[name] > LEANING]
+    return next(
+        (Doubt(BOTH, name, "without a contradiction") for name in leaning if _explains(name, pair, robot)),
+        None,
+    )
+
+
+def claim_doubt(fitted: Fit, pair: PairRanges) -> Doubt | None:
+    """Return the profile that explains the ranges of both robots much better than the told noise.
+
+    `fitted` is the fit that would be claimed. Only constant errors are compared: slow ones and strays do not
+    move a pose by more than the noise level that robots learn.
+    """
+    noise = pair.noise
+    told = _evidence(fitted)
+    others = {}
+    for name in _others(noise):
+        other = replace(_profile(name, noise), slow_sigma=noise.slow_sigma, strays=noise.strays)
+        begun = [rescaled(errors, noise, other) for errors in fitted.errors]
+        again = fit(fitted.guess, pair.paths, pair.ranges, other, pair.apart, begun=begun)
+        others[name] = _evidence(again) - told
+    return _best(BOTH, others, DOUBTFUL_CLAIM)
+
+
+def _explains(name: ProfileName, pair: PairRanges, robot: int) -> bool:
+    """Return whether the ranges and reports that `robot` (0 or 1) has are consistent under a profile.
+
+    The priors of the profile are smaller for accurate ranges, as the default ones are.
+    """
+    under = pair._replace(noise=_profile(name, pair.noise, _share(pair.noise)))
+    scored = search(under)
+    return bool(scored) and consistency_test(scored[0].fit, under, robot).p_value >= CLAIM_P_VALUE
+
+
+def _others(noise: Noise) -> list[ProfileName]:
+    """Return the profiles other than that of `noise`, the narrowest first."""
+    return [name for name in NARROWEST_FIRST if name != noise.profile]
+
+
+NARROWEST_FIRST: tuple[ProfileName, ...] = ("wheels", "uwb-calibrated", "uwb")
+"""The profiles, in the order of their priors."""
+
+
+def _best(what: str, log_evidence: dict[ProfileName, float], least: float) -> Doubt | None:
+    """Return the profile with the largest log evidence over the told noise, if it is more than `least`."""
+    best = max(log_evidence, key=log_evidence.__getitem__)
+    how = f"better (log evidence {log_evidence[best]:.3g})"
+    return Doubt(what, best, how) if log_evidence[best] > least else None
+
+
+def _share(noise: Noise) -> float:
+    """Return the fraction of the priors of a profile that remains for ranges of this accuracy."""
+    return min(1.0, max(noise.anchor_sigma, noise.mutual_sigma) / UNTOLD_SIGMA) ** 2
+
+
+SHRINKING = ("range_bias", "pair_bias", "range_scale", "slow_sigma", "wheel_scale", "gyro_bias")
+"""The priors of a profile that are smaller for more accurate ranges."""
+
+
+def _profile(name: ProfileName, noise: Noise, share: float = 1.0) -> Noise:
+    """Return `noise` with the priors of a profile, times `share`, and with its own white noise."""
+    priors = msgspec.convert(PROFILES[name], Noise).priors._asdict()
+    other = msgspec.convert({**PROFILES[name], **{one: share * priors[one] for one in SHRINKING}}, Noise)
+    return replace(
+        other,
+        anchor_sigma=noise.anchor_sigma,
+        mutual_sigma=noise.mutual_sigma,
+        outliers=noise.outliers,
+        outlier_bias=noise.outlier_bias,
+        actuation=noise.actuation,
+        odometry=noise.odometry,
+    )
+
+
+def _log_evidence(path: Track, ranges: Ranges, sensing_range: float, noise: Noise) -> float:
+    """Return the log evidence of the ranges under `noise`, with the anchor's position integrated out."""
+    points = anchors(path, ranges, sensing_range, noise)
+    found = fits([Start(np.array([*point, 0.0])) for point in points], [path], ranges, noise)
+    return max(map(_evidence, found))
+
+
+def _evidence(one: Fit) -> float:
+    """Return the log evidence of a fit, with its guess integrated out, up to a constant (Laplace)."""
+    return one.log_likelihood - 0.5 * float(np.linalg.slogdet(one.information)[1])

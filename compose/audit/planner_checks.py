@@ -1,0 +1,175 @@
+"""The checks of a planner of the user against its contract."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+from agent.planning.planner import Planner
+from compose.audit.planner_probe import BreaksContract, HostilityProbe, PurityProbe, Watched
+from compose.audit.rules import audit_run
+from compose.errors import PlannerFailed, UserError
+from compose.launch import in_process, planner_loader, processes
+from compose.launch.planner_guard import GuardedPlanner
+from compose.launch.supervisor import ChildFailed
+from compose.recording import run as recorded
+from compose.recording.recording_files import WORLD_JOURNAL
+from compose.recording.run import Run
+from compose.scenario.kills import Kill, parse
+from compose.scenario.scenario_file import run_name
+from protocol.journal.journal_file import MemoryJournal, packed
+from protocol.messages import RobotConfig
+from protocol.network.inbox import Inbox
+from world.scenario import Scenario
+
+TIMEOUT_S = 30.0
+"""The time in s without an answer after which a run as processes has failed."""
+POINTS = ("observation", "report", "journal", "command")
+"""The points of a tick at which processes are killed, in turn."""
+
+
+class QuietInbox(Inbox):
+    """An inbox that prints nothing: kills and restarts are part of a check."""
+
+    def say(self, line: str) -> None:
+        """Print nothing."""
+
+
+class Check(NamedTuple):
+    """The result of one check."""
+
+    what: str
+    """The rule of the contract."""
+    wrong: str | None = None
+    """The way in which the planner breaks it; None if it does not."""
+
+
+Journals = dict[str, list[bytes]]
+
+
+def check_planner(scenario: Scenario, inbox: Inbox) -> Iterator[Check]:
+    """Yield the results of all checks of the planner of `scenario`, which has been loaded before.
+
+    If it cannot complete the mission in one process, the checks after that one are left out.
+    """
+    what = "it completes a mission, with answers that can be sent"
+    try:
+        first, run = _journals(scenario)
+    except UserError as error:
+        yield Check(what, str(error))
+        return
+    yield Check(what)
+    yield Check("two runs in one process are the same", _other(first, _journals(scenario)[0]))
+    for rule, probe in (
+        ("equal arguments give equal answers, and are not changed", PurityProbe),
+        ("no report can make it fail", HostilityProbe),
+    ):
+        yield Check(rule, _probed(scenario, probe))
+    yield Check("a verdict is final", _taken_back(run))
+    yield _audited(run)
+    for rule, kills in (
+        ("it decides the same as processes over the network", ()),
+        ("killed processes resume and decide the same", _kills(scenario, run)),
+    ):
+        yield Check(rule, _as_processes(scenario, first, kills, inbox))
+
+
+def _journals(
+    scenario: Scenario,
+    planner_of: Callable[[RobotConfig], Planner[Any, Any]] = planner_loader.planner_of,
+) -> tuple[Journals, Run]:
+    """Run the mission in this process, and return the frames of its journals, and the run."""
+    sinks = {name: MemoryJournal() for name in in_process.journals(scenario)}
+    in_process.played(scenario, sinks, planner_of)
+    frames = {name: sinks[name].frames for name in (WORLD_JOURNAL, *sorted({*sinks} - {WORLD_JOURNAL}))}
+    return frames, recorded.of_frames(frames, scenario.name)
+
+
+def _probed(scenario: Scenario, probe: type[Watched]) -> str | None:
+    """Return what `probe` finds in a mission in this process."""
+
+    def watched(config: RobotConfig) -> Watched:
+        def fresh() -> Planner[Any, Any]:
+            return planner_loader.planner_copy(config.planner_name, config.planner_options, config.mission)
+
+        return probe(GuardedPlanner(config.planner_name, fresh()), fresh)
+
+    try:
+        _journals(scenario, watched)
+    except (BreaksContract, PlannerFailed) as error:
+        return str(error)
+    return None
+
+
+def _other(one: Mapping[str, list[bytes]], other: Mapping[str, list[bytes]]) -> str | None:
+    """Return where two recordings differ first; None if they are the same."""
+    runs = recorded.of_frames(one), recorded.of_frames(other)
+    for tick in range(max(run.length for run in runs)):
+        for robot in runs[0].robots:
+            found = [run.command(robot, tick) for run in runs]
+            if found[0] != found[1]:
+                return f"the Commands of {robot} at tick {tick} differ"
+    for name in one:
+        if one[name] != other[name]:
+            return f"the Commands are the same, but not {name}"
+    return None
+
+
+def _taken_back(run: Run) -> str | None:
+    for robot in run.robots:
+        verdict = None
+        for tick in range(run.length):
+            command = run.command(robot, tick)
+            if verdict is not None and command is not None and command.verdict != verdict:
+                return f"{robot} has another verdict at tick {tick} than at the tick before"
+            verdict = command.verdict if command is not None else verdict
+    return None
+
+
+def _audited(run: Run) -> Check:
+    what = f"the audit finds nothing (outcome: {run.end.outcome if run.end is not None else 'none'})"
+    violations = audit_run(run).violations
+    return Check(what, violations[0].line if violations else None)
+
+
+def _kills(scenario: Scenario, run: Run) -> tuple[Kill, ...]:
+    """Return kills of each robot and of the world, spread over the mission and the points of a tick."""
+    names = [*[robot.id for robot in scenario.robots], "world"]
+    found = [
+        parse(f"{name}@{tick}:{POINTS[i % len(POINTS)] if tick in _contact(run, name) else 'journal'}")
+        for i, name in enumerate(names * 2)
+        if (tick := run.length * (i + 1) // (2 * len(names) + 1)) > 0
+    ]
+    return tuple(found)
+
+
+def _contact(run: Run, name: str) -> set[int]:
+    """Return the ticks in which a process sends reports: there, a kill at any point happens."""
+    if name == "world":
+        return set(range(run.length))
+    return {tick for tick in range(run.length) if run.contact(name, tick) is not None}
+
+
+def _as_processes(scenario: Scenario, first: Journals, kills: tuple[Kill, ...], inbox: Inbox) -> str | None:
+    """Return how a run as processes differs from the one in this process; None if it does not."""
+    with TemporaryDirectory(prefix="tandem-check-") as folder:
+        try:
+            spared = processes.run_mission(
+                scenario,
+                Path(folder),
+                inbox,
+                run=run_name(scenario),
+                rate=None,
+                timeout=TIMEOUT_S,
+                kills=kills,
+            )
+        except ChildFailed as error:
+            return str(error)
+        if len(spared) == len(kills) and kills:
+            return "no kill took place"
+        for name, frames in first.items():
+            if (Path(folder) / name).read_bytes() != packed(frames):
+                return f"{name} has other bytes"
+    return None

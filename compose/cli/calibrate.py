@@ -1,0 +1,97 @@
+"""`tandem calibrate`: the errors of radios in a recording, as a table and as a noise profile."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from compose.cli.arguments import add_closing, add_part_of_recording, folder, names
+from compose.errors import ENDED, UserError
+from protocol import files
+from protocol.output import say
+
+if TYPE_CHECKING:
+    from compose.recording.estimating.radio_errors import RangeCalibration
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `tandem calibrate`."""
+    parser.add_argument(
+        "recording",
+        type=folder,
+        metavar="FILE",
+        help="range recording: a .pyfg or .mcap file, a folder of CSV files, or a recording of Tandem",
+    )
+    parser.add_argument(
+        "--robots", type=names, metavar="A,B", help="the robots whose radios are calibrated [default: all]"
+    )
+    add_part_of_recording(parser)
+    parser.add_argument(
+        "--without-truth",
+        action="store_true",
+        help="use no true poses, but those of an estimate with the profile uwb",
+    )
+    parser.add_argument(
+        "--out",
+        type=folder,
+        metavar="FILE",
+        help="TOML file for the profile, for `tandem estimate --noise` [default: it is printed]",
+    )
+    add_closing(
+        parser,
+        "tandem calibrate tests/data/uwb/tiers-a-b-30-s.pyfg --out radios.toml",
+        "docs/howto-estimate.md",
+    )
+
+
+def main(options: argparse.Namespace) -> int:
+    """Calibrate, print the table, and write or print the profile."""
+    from compose.recording.estimating.calibration import calibrated  # noqa: PLC0415  # they need numpy
+    from compose.recording.estimating.noise_profile import (  # noqa: PLC0415
+        correction_of,
+        noise_table,
+        profile_toml,
+    )
+    from compose.recording.ranging.range_files import read_ranges  # noqa: PLC0415
+
+    if options.out is not None and options.out.suffix != ".toml":
+        raise UserError(f"--out: {options.out} is not the path of a .toml file")
+    recording = read_ranges(options.recording, options.anchors)
+    found = calibrated(recording, options.robots, options.window, by_fit=options.without_truth)
+    anchors = frozenset([one.id for one in recording.anchors])
+    source = f"{found.source} of {recording.source}"
+    text = profile_toml(noise_table(found, anchors), correction_of(found), source)
+    say(*_lines(found))
+    if options.out is None:
+        say("", *text.splitlines())
+        return ENDED
+    path: Path = options.out
+    try:
+        files.write(path, text)
+    except OSError as error:
+        raise UserError(f"--out: {path} cannot be written: {error.strerror or error}") from None
+    say(str(path))
+    return ENDED
+
+
+def _lines(found: RangeCalibration) -> list[str]:
+    """Return the table of the errors of each pair of radios."""
+    from compose.terminal.tables import lines, table  # noqa: PLC0415  # it takes time
+
+    rows = [
+        (
+            "-".join(pair),
+            str(one.ranges),
+            f"{one.bias:+.3f}",
+            f"{one.bias_sigma:.3f}",
+            "-" if one.scale is None else f"{100.0 * one.scale:+.1f}",
+            f"{one.sigma:.3f}",
+            f"{one.slow_sigma:.3f}",
+            f"{100.0 * one.outliers:.1f}",
+        )
+        for pair, one in found.pairs.items()
+    ]
+    right = ("ranges", "bias m", "+-", "own scale %", "sigma m", "slow m", "outliers %")
+    common = f"common scale {100.0 * found.scale:+.2f} % +- {100.0 * found.scale_sigma:.2f} %"
+    return [*lines(table(("radios",), right, rows)), f"{common}; against {found.source}"]

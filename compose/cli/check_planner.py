@@ -1,0 +1,67 @@
+"""`tandem check-planner`: check a planner of the user against its contract, docs/own-planner.md."""
+
+from __future__ import annotations
+
+import argparse
+
+from compose.cli.arguments import SEED_HELP, add_closing, natural, planner_option
+from compose.errors import CLEAN, STOPPED, VIOLATED
+from compose.launch import supervisor
+from compose.launch.signals import stop_by_signal
+from compose.scenario.scenario_file import setting
+from compose.terminal import text_width
+from protocol.network.inbox import Interrupted
+from protocol.output import one_line, say
+
+MARKED = len("wrong  ")
+"""The width of the mark before each check."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `tandem check-planner`."""
+    parser.add_argument("planner", metavar="MODULE:CLASS", help="planner of your own, or an installed one")
+    parser.add_argument(
+        "--planner-option",
+        type=planner_option,
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="option of the planner; may be repeated",
+    )
+    parser.add_argument(
+        "--mission",
+        default="random",
+        metavar="FILE",
+        help="scenario in which it is tried: a name or a TOML file [default: %(default)s]",
+    )
+    parser.add_argument("--seed", type=natural, metavar="N", help=f"{SEED_HELP} [default: the scenario's]")
+    parser.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="FAULT",
+        help="fault of the radio, such as 'a->b: loss=0.3, delay=0..3'; may be repeated",
+    )
+    add_closing(parser, "tandem check-planner mine:Greedy --mission noisy", "docs/own-planner.md")
+
+
+def main(options: argparse.Namespace) -> int:
+    """Run all checks, print the result of each, and return VIOLATED if one failed."""
+    supervisor.fork_server()  # it imports modules while this process does
+    from compose.audit.planner_checks import QuietInbox, check_planner  # noqa: PLC0415  # it imports numpy
+
+    scenario = setting(options.mission, options.fault, options.planner, options.planner_option).seeded(
+        options.seed
+    )
+    inbox = QuietInbox("tandem check-planner")
+    stop_by_signal(inbox)
+    failed = False
+    try:
+        for one in check_planner(scenario, inbox):
+            line = f"wrong  {one.what}: {one.wrong}" if one.wrong else f"ok     {one.what}"
+            say(*text_width.wrapped(one_line(line), MARKED))
+            failed |= one.wrong is not None
+    except Interrupted as signal_name:
+        say(f"stopped by {signal_name}", error=True)
+        return STOPPED
+    return VIOLATED if failed else CLEAN

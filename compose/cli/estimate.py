@@ -1,0 +1,193 @@
+"""`tandem estimate`: the poses of recorded robots, from their odometry and ranges."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from compose.cli.arguments import add_closing, add_part_of_recording, confidence, folder, names, positive
+from compose.errors import ENDED, NOT_LOCALISED, STOPPED, UserError
+from compose.extras import need
+from compose.launch.signals import until_signal
+from compose.recording.recording_files import cannot_write, make_folder
+from compose.terminal.outcome import counting
+from protocol.output import say
+
+if TYPE_CHECKING:
+    from compose.recording.estimating.estimate_epoch import ClaimRule
+    from compose.recording.estimating.estimate_rows import EstimateSummary, RobotEstimate
+    from compose.recording.estimating.estimate_run import EstimationProblem, RecordingEstimate
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `tandem estimate`."""
+    parser.add_argument(
+        "recording",
+        type=folder,
+        metavar="FILE",
+        help="range recording: a .pyfg or .mcap file, a folder of CSV files, or a recording of Tandem; "
+        "with --follow, - is standard input",
+    )
+    parser.add_argument(
+        "--follow",
+        action="store_true",
+        help="read an MCAP stream from FILE, a pipe, and print the lines of estimate.csv as it arrives",
+    )
+    parser.add_argument(
+        "--robots",
+        type=names,
+        metavar="A,B",
+        help="one or two robots whose poses are estimated [default: all of a recording of one or two]",
+    )
+    parser.add_argument(
+        "--noise",
+        metavar="PROFILE",
+        help="assumed noise: a profile, or a TOML file with [mission.noise], as `tandem calibrate` writes "
+        "[default: the sigmas that the recording states, else uwb]",
+    )
+    add_part_of_recording(parser)
+    parser.add_argument(
+        "--accuracy",
+        type=positive,
+        default=0.3,
+        metavar="M",
+        help="sigma of the position in m that a claim needs [default: %(default)g]",
+    )
+    parser.add_argument(
+        "--confidence",
+        type=confidence,
+        default=0.9999,
+        metavar="P",
+        help="probability that a claim needs [default: %(default)g]",
+    )
+    parser.add_argument(
+        "--out",
+        type=folder,
+        metavar="DIR",
+        help="folder for estimate.csv, estimate.json and figures [default: none are written]",
+    )
+    add_closing(
+        parser,
+        "tandem estimate tests/data/uwb/tiers-a-b-30-s.pyfg --noise uwb-calibrated --out estimated",
+        "docs/howto-estimate.md",
+    )
+
+
+def main(options: argparse.Namespace) -> int:
+    """Estimate, print a table and write the files.
+
+    Return NOT_LOCALISED if a robot never knew its pose well enough for a claim, and STOPPED if a stream was
+    ended by a signal.
+    """
+    from compose.recording.estimating import estimate_epoch  # noqa: PLC0415
+    from compose.recording.estimating.estimate_run import estimated, measurements  # noqa: PLC0415  # numpy
+    from compose.recording.ranging.range_files import read_ranges  # noqa: PLC0415
+
+    stopped = False
+    rule = estimate_epoch.ClaimRule(options.accuracy, options.confidence)
+    if options.follow:
+        problem, estimate, stopped = _followed(options, rule)
+    else:
+        recording = read_ranges(options.recording, options.anchors)
+        problem = measurements(recording, options.robots, options.noise, options.window)
+        with counting("tandem estimate", problem.measured.epochs) as done:
+            estimate = estimated(problem, rule, done)
+    if options.out is not None:
+        written = _written(options.out, problem, estimate)
+        say(*map(str, written), error=options.follow)
+    if not options.follow:
+        say(*_lines(estimate.summary))
+    if stopped:
+        return STOPPED
+    localised = all(one.first_claim is not None for one in estimate.summary.robots.values())
+    return ENDED if localised else NOT_LOCALISED
+
+
+def _followed(
+    options: argparse.Namespace, rule: ClaimRule
+) -> tuple[EstimationProblem, RecordingEstimate, bool]:
+    """Print the estimates of a stream until it ends; return all of them, and whether a signal was the end."""
+    need("mcap")
+    from compose.recording.estimating.estimate_files import COLUMNS, csv_line  # noqa: PLC0415
+    from compose.recording.estimating.estimate_stream import StreamEstimate  # noqa: PLC0415
+    from compose.recording.estimating.noise_files import told_noise  # noqa: PLC0415
+    from compose.recording.ranging.range_mcap import rows_as_they_arrive  # noqa: PLC0415
+
+    if options.window is not None or options.anchors is not None:
+        raise UserError("--follow: a stream has its own anchors, and no window")
+    name = "standard input" if str(options.recording) == "-" else str(options.recording)
+    noise = (told_noise(options.noise), options.noise) if options.noise is not None else None
+    estimate = StreamEstimate(name, options.robots, noise, rule)
+    try:
+        stream = sys.stdin.buffer if str(options.recording) == "-" else options.recording.open("rb")
+    except OSError as error:
+        raise UserError(f"{name} cannot be read: {error.strerror or error}") from None
+    with stream, until_signal() as stopped:
+        say(",".join(COLUMNS))
+        for row in estimate.rows(rows_as_they_arrive(stream, name)):
+            say(csv_line(row))
+    return *estimate.result(), bool(stopped)
+
+
+def _written(out: Path, problem: EstimationProblem, estimate: RecordingEstimate) -> list[Path]:
+    """Write all files into `out`, and return their paths. Raises UserError."""
+    from compose.recording.estimating.estimate_files import write_estimate  # noqa: PLC0415  # they need numpy
+
+    make_folder(out)
+    try:
+        return [*write_estimate(out, estimate.rows, estimate.summary), *_drawn(out, problem, estimate)]
+    except OSError as error:
+        raise UserError(cannot_write(out, error)) from None
+
+
+def _drawn(out: Path, problem: EstimationProblem, estimate: RecordingEstimate) -> list[Path]:
+    """Draw the figures into `out`, and return their paths; none without Matplotlib. Raises OSError."""
+    if find_spec("matplotlib") is None:
+        say("tandem estimate: no figures: they need matplotlib (extra lab)", error=True)
+        return []
+    from compose.figures.estimated import estimate_figures  # noqa: PLC0415  # it takes time
+    from compose.figures.style import SCREEN, look, save  # noqa: PLC0415
+
+    with look(SCREEN):
+        return [
+            path
+            for name, figure in estimate_figures(problem, estimate)
+            for path in save(figure, out / name, ["svg", "png"], SCREEN.dpi)
+        ]
+
+
+def _lines(summary: EstimateSummary) -> list[str]:
+    """Return the table of the estimates, and what limits them."""
+    from compose.terminal.tables import lines, table  # noqa: PLC0415  # it takes time
+
+    rows = [_row(name, one, summary.begin_s) for name, one in summary.robots.items()]
+    right = ("first claim s", "x", "y", "heading", "sigma m", "error m", "NEES")
+    found = lines(table(("robot", "anchors"), right, rows))
+    found.append(f"noise: {summary.noise}; last pose in m and rad; time from the first odometry of both on")
+    if summary.blocking_reason:
+        found.append(f"no claim at the end: {summary.blocking_reason}")
+    for why, count in summary.unused_ranges.items():
+        found.append(f"{count} ranges not used: {why}")
+    return found
+
+
+def _row(name: str, one: RobotEstimate, begin_s: float) -> list[str]:
+    first, last = one.first_claim, one.final
+    if last is None:
+        return [name, ", ".join(one.anchors), *["-"] * 7]
+    x, y, heading = last.pose
+    sigma = (last.covariance[0][0] + last.covariance[1][1]) ** 0.5
+    return [
+        name,
+        ", ".join(one.anchors),
+        "-" if first is None else f"{first.t_s - begin_s:.1f}",
+        f"{x:.2f}",
+        f"{y:.2f}",
+        f"{heading:.2f}",
+        f"{sigma:.2f}",
+        "-" if last.position_error_m is None else f"{last.position_error_m:.2f}",
+        "-" if last.nees is None else f"{last.nees:.1f}",
+    ]

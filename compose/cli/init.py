@@ -1,0 +1,66 @@
+"""`tandem init`: write the files to start from."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+from importlib import resources
+from pathlib import Path
+
+from compose.cli.arguments import add_closing, folder
+from compose.errors import ENDED, UserError
+from compose.scenario.json_schema import json_schema
+from compose.scenario.scenario_file import ScenarioFile
+from compose.sweep.spec import SpecFile
+from protocol import files
+from protocol.output import say
+
+TEMPLATE = ".template"
+"""The suffix of starter files that are Python modules of the user, and not of Tandem."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `tandem init`."""
+    parser.add_argument(
+        "folder", type=folder, metavar="DIR", help="folder to which the files are written; none is replaced"
+    )
+    add_closing(parser, "tandem init mine", "docs/howto-scenario.md")
+
+
+def main(options: argparse.Namespace) -> int:
+    """Write a scenario, a sweep, a script, a driver and the schemas, and print the commands that use them."""
+    out: Path = options.folder
+    content = starter()
+    for name in content:
+        if (out / name).exists():
+            raise UserError(f"{out / name} already exists; choose another folder")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for name, text in content.items():
+            files.write(out / name, text)
+    except OSError as error:
+        raise UserError(f"{out} cannot be written: {error.strerror or error}") from None
+    say(*[str(out / name) for name in content], "", "to go on:")
+    say(*[f"  {command}" for command in commands(out)])
+    return ENDED
+
+
+def starter() -> dict[str, str]:
+    """Return the files to start from, by name."""
+    place = Path(str(resources.files("compose") / "scenario" / "starter"))
+    found = {path.name.removesuffix(TEMPLATE): path.read_text("utf-8") for path in sorted(place.iterdir())}
+    for name, kind in (("scenario", ScenarioFile), ("sweep", SpecFile)):
+        found[f"{name}.schema.json"] = json.dumps(json_schema(kind), indent=2) + "\n"
+    return found
+
+
+def commands(out: Path) -> list[str]:
+    """Return the commands that use the files in `out`."""
+    place = shlex.quote(str(out))
+    return [
+        f"tandem run {place}/scenario.toml --out {place}/recording",
+        f"tandem sweep {place}/sweep.toml --out {place}/results",
+        f"python {place}/analyse.py",
+        f"cd {place} && tandem check-driver myrobot:MyRobot --rate 10",
+    ]

@@ -1,0 +1,242 @@
+"""The figures of an estimate from a range recording: paths with ellipses, and its quality over time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from itertools import cycle
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+
+from compose.figures.sheet import EDGE, FOOT, GAP, Sheet, around
+from compose.figures.style import INK, MARKS, PALE, SCREEN, Medium
+from compose.recording.estimating.estimate_rows import PoseEstimateRow
+from compose.recording.estimating.estimate_run import EstimationProblem, RecordingEstimate
+from compose.recording.ranging.range_recording import Numbers, TruePath
+from compose.view.colours import COLOURS
+from protocol.mission import Role
+
+AXIS, TALL, TALLEST = 0.6, 1.0, 5.0
+"""The space left of a panel over time, its height, and the largest height of the plane, in inches."""
+ROLES: tuple[Role, Role] = ("a", "b")
+SIGMAS = 3.0
+"""The sigmas of the drawn ellipses and bounds."""
+ELLIPSES = 12
+"""The number of ellipses along a path."""
+NEES_BOUND = 11.34
+"""The NEES that 99 % of right covariances do not exceed: chi-square of three degrees of freedom."""
+MARGIN = 0.03
+LEAST_ERROR = 1e-3
+"""The smallest error drawn, in m."""
+OUTLIER = 0.5
+"""The weight below which a range is drawn as an outlier."""
+TOO_WIDE = 1.0
+"""The sigma (m) of a position above which no ellipse is drawn: it would cover all others."""
+
+
+ANCHOR_MARKS = "sDPX"
+"""The markers of anchors; they differ from those of robots."""
+
+
+class Drawn(NamedTuple):
+    """The content of the figures."""
+
+    problem: EstimationProblem
+    estimates: RecordingEstimate
+
+    @property
+    def roles(self) -> tuple[Role, ...]:
+        """The roles, and so the colours, of the robots."""
+        return ROLES[: len(self.problem.robots)]
+
+    def rows(self, i: int) -> list[PoseEstimateRow]:
+        """Return the rows of the robot with index `i`."""
+        name = self.problem.robots[i].id
+        return [row for row in self.estimates.rows if row.robot == name]
+
+    @property
+    def ranged(self) -> list[tuple[str, str]]:
+        """The pairs of radios that have ranges at the end."""
+        counts = self.estimates.epochs[-1].ranges
+        return [pair for pair, count in zip(self.problem.measured.pairs, counts, strict=True) if count]
+
+    def truth(self, i: int) -> TruePath | None:
+        """Return the true path of the robot with index `i`, if there is one."""
+        return self.problem.robots[i].truth
+
+    def since_begin(self, times: Any) -> Any:
+        """Return times in s from the first odometry of both robots on."""
+        return np.asarray(times, float) - self.problem.measured.t0
+
+    def from_claim(self, i: int) -> list[PoseEstimateRow]:
+        """Return the rows of a robot from its first claim on, or those of its last probable hypothesis."""
+        rows = self.rows(i)
+        first = next((k for k, row in enumerate(rows) if row.claim), None)
+        if first is None:
+            doubtful = [k for k, row in enumerate(rows[:-1]) if row.probability < PROBABLE]
+            first = doubtful[-1] + 1 if doubtful else 0
+        return rows[first:]
+
+
+PROBABLE = 0.99
+"""The probability from which on the path of a robot without a claim is drawn."""
+
+
+def estimate_figures(
+    problem: EstimationProblem, estimates: RecordingEstimate, medium: Medium = SCREEN
+) -> Iterator[tuple[str, Figure]]:
+    """Yield the figures and their names; none if there was never a hypothesis."""
+    drawn = Drawn(problem, estimates)
+    if not estimates.rows:
+        return
+    yield "estimate-path", _path(drawn, medium)
+    yield "estimate-over-time", _over_time(drawn, medium)
+
+
+def _title(drawn: Drawn) -> str:
+    names = " and ".join([one.id for one in drawn.problem.robots])
+    return f"{names} in {drawn.problem.source.rpartition('/')[2]}, noise {drawn.problem.noise}"
+
+
+def _path(drawn: Drawn, medium: Medium) -> Figure:
+    sheet = Sheet(medium, narrow=False, title=[_title(drawn)])
+    axes = sheet.panel()
+    points: list[tuple[float, float]] = []
+    for i, role in enumerate(drawn.roles):
+        colour, name = COLOURS[role], drawn.problem.robots[i].id
+        truth = drawn.truth(i)
+        if truth is not None:
+            axes.plot(*truth.poses[:, :2].T, color=colour, lw=2.6, alpha=0.3, label=f"{name}, truth")
+            points += [(float(x), float(y)) for x, y in truth.poses[:, :2]]
+        rows = drawn.from_claim(i)
+        claimed = any(row.claim for row in rows)
+        since = "from its first claim on" if claimed else "never claimed"
+        axes.plot(
+            [row.x for row in rows], [row.y for row in rows], color=colour, lw=1.0, label=f"{name}, {since}"
+        )
+        points += [(row.x, row.y) for row in rows]
+        for row in rows[:: max(1, len(rows) // ELLIPSES)]:
+            if math.sqrt(row.xx + row.yy) <= TOO_WIDE:
+                axes.add_patch(_ellipse(row, colour))
+                reach = [SIGMAS * math.sqrt(max(variance, 0.0)) for variance in (row.xx, row.yy)]
+                points += [(row.x + sign * reach[0], row.y + sign * reach[1]) for sign in (-1.0, 1.0)]
+        axes.plot(rows[0].x, rows[0].y, ls="", ms=5, **MARKS[role])
+    for anchor, marker in zip(drawn.problem.measured.anchors, cycle(ANCHOR_MARKS), strict=False):
+        axes.plot(anchor.x, anchor.y, ls="", marker=marker, ms=5, color=INK, label=f"anchor {anchor.id}")
+        points.append((anchor.x, anchor.y))
+    axes.plot([], [], color=PALE, lw=6.0, alpha=0.3, label="3 sigma")
+    sheet.plane(axes, around(points, MARGIN), TALLEST)
+    return sheet.finished()
+
+
+def _ellipse(row: PoseEstimateRow, colour: str) -> Ellipse:
+    """Return the ellipse of SIGMAS sigmas of a position."""
+    variances, directions = np.linalg.eigh(np.array(((row.xx, row.xy), (row.xy, row.yy))))
+    across, along = 2.0 * SIGMAS * np.sqrt(np.maximum(variances, 0.0))
+    angle = math.degrees(math.atan2(directions[1, 1], directions[0, 1]))
+    return Ellipse(
+        (row.x, row.y), along, across, angle=angle, facecolor=colour, edgecolor=colour, alpha=0.18, lw=0.8
+    )
+
+
+def _over_time(drawn: Drawn, medium: Medium) -> Figure:
+    """Return the figure of errors, NEES, hypotheses and residuals over time; the first two need the truth."""
+    sheet = Sheet(medium, narrow=False, title=[_title(drawn)])
+    known = any(row.nees is not None for row in drawn.estimates.rows)
+    panels = [_errors, _nees, _hypotheses] if known else [_sigmas, _hypotheses]
+    end = float(drawn.since_begin(drawn.estimates.epochs[-1].t))
+    for draw in panels:
+        axes = _panel(sheet, end)
+        draw(axes, drawn)
+        sheet.key_below(axes)
+    for which, pair in enumerate(drawn.ranged):
+        axes = _panel(sheet, end)
+        _residuals(axes, drawn, which, "-".join(pair))
+    return sheet.finished()
+
+
+def _panel(sheet: Sheet, end: float) -> Axes:
+    axes = sheet.panel()
+    sheet.place(axes, AXIS, sheet.top + GAP, sheet.width - AXIS - 3 * EDGE, TALL)
+    sheet.top += GAP + TALL + FOOT
+    axes.set_xlim(0.0, end)
+    axes.set_xlabel("time [s]")
+    axes.grid(color="0.9", lw=0.5)
+    return axes
+
+
+def _times(drawn: Drawn, i: int) -> Numbers:
+    times: Numbers = drawn.since_begin([row.t_s for row in drawn.rows(i)])
+    return times
+
+
+def _claim_line(axes: Axes, drawn: Drawn, i: int, role: Role) -> None:
+    claimed = next((row for row in drawn.rows(i) if row.claim), None)
+    if claimed is not None:
+        at = float(drawn.since_begin(claimed.t_s))
+        axes.axvline(at, color=COLOURS[role], lw=0.8, ls=":", zorder=0)
+
+
+def _sigmas(axes: Axes, drawn: Drawn) -> None:
+    for i, role in enumerate(drawn.roles):
+        name = drawn.problem.robots[i].id
+        bounds = [SIGMAS * math.sqrt(max(row.xx + row.yy, 0.0)) for row in drawn.rows(i)]
+        axes.plot(_times(drawn, i), bounds, color=COLOURS[role], ls="--", lw=1.0, label=f"{name}, 3 sigma")
+        _claim_line(axes, drawn, i, role)
+    axes.set_yscale("log")
+    axes.set_ylabel("position [m]")
+
+
+def _errors(axes: Axes, drawn: Drawn) -> None:
+    for i, role in enumerate(drawn.roles):
+        name = drawn.problem.robots[i].id
+        errors = [
+            math.nan if row.position_error_m is None else max(row.position_error_m, LEAST_ERROR)
+            for row in drawn.rows(i)
+        ]
+        axes.plot(_times(drawn, i), errors, color=COLOURS[role], lw=1.2, label=f"{name}, error")
+    _sigmas(axes, drawn)
+
+
+def _nees(axes: Axes, drawn: Drawn) -> None:
+    for i, role in enumerate(drawn.roles):
+        name = drawn.problem.robots[i].id
+        values = [math.nan if row.nees is None else row.nees for row in drawn.rows(i)]
+        axes.plot(_times(drawn, i), values, color=COLOURS[role], lw=1.2, label=f"{name}, NEES")
+        _claim_line(axes, drawn, i, role)
+    axes.axhline(NEES_BOUND, color=PALE, lw=0.8, ls="--", label="99 % of right covariances are below")
+    axes.set_yscale("log")
+    axes.set_ylabel("NEES")
+
+
+def _hypotheses(axes: Axes, drawn: Drawn) -> None:
+    epochs = [one for one in drawn.estimates.epochs if one.hypotheses]
+    times = drawn.since_begin([one.t for one in epochs])
+    best = [one.hypotheses[0].probability for one in epochs]
+    counts = [len(one.hypotheses) for one in epochs]
+    axes.plot(times, best, color=INK, lw=1.2, label="probability of the first hypothesis")
+    axes.plot([], [], color=PALE, lw=1.0, ls="-", drawstyle="steps-post", label="hypotheses (right)")
+    axes.set_ylim(0.0, 1.05)
+    axes.set_ylabel("probability")
+    right = axes.twinx()
+    right.plot(times, counts, color=PALE, lw=1.0, drawstyle="steps-post")
+    right.set_ylim(0.0, max(counts) + 0.5)
+    right.set_position(axes.get_position())
+
+
+def _residuals(axes: Axes, drawn: Drawn, which: int, name: str) -> None:
+    """Draw the residuals of one pair of radios by the last fit; outliers are crosses."""
+    last = drawn.estimates.epochs[-1]
+    if last.fit is None:
+        return
+    rows = last.used.ranges.pairs[which]
+    times = last.fit.ticks[rows] * drawn.problem.measured.period
+    residuals, good = last.fit.residuals[rows], last.fit.weights[rows] > OUTLIER
+    axes.axhline(0.0, color=PALE, lw=0.6)
+    axes.plot(times[good], residuals[good], ls="", marker="o", ms=2.5, color=INK)
+    axes.plot(times[~good], residuals[~good], ls="", marker="x", ms=4, color=COLOURS["b"])
+    axes.set_ylabel(f"{name} [m]")

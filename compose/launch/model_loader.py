@@ -1,0 +1,59 @@
+"""Range and radio models by name: shipped ones, and classes of the user (see `planner_loader`)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from compose.errors import UserError
+from compose.launch.class_loader import named
+from protocol.spelling import did_you_mean
+from world.radio_models import RADIO_MODELS
+from world.range_models import RANGE_MODELS
+from world.scenario import Scenario
+from world.world_models import OWN, ModelSpec, RadioModel, RangeModel
+
+KINDS: dict[str, tuple[type, dict[str, Any]]] = {
+    "range": (RangeModel, RANGE_MODELS),
+    "radio": (RadioModel, RADIO_MODELS),
+}
+"""The contract and the shipped models of each kind."""
+
+
+def check(kind: str, spec: ModelSpec) -> None:
+    """Load a model that the user has named, and create it.
+
+    Raises UserError, whose text begins with the field of the model's table.
+    """
+    contract, shipped = KINDS[kind]
+    if spec.model in shipped:
+        maker = shipped[spec.model]
+    elif ":" not in spec.model:
+        near = did_you_mean(spec.model, shipped) or "; a model of your own is MODULE:CLASS"
+        raise UserError(f"model: there is no '{spec.model}'; there are {', '.join(shipped)}{near}")
+    else:
+        try:
+            maker = trust(spec.model)
+        except UserError as error:
+            raise UserError(f"model: {error}") from None
+        if not issubclass(maker, contract):
+            raise UserError(f"model: {spec.model} is not a subclass of tandem.models.{contract.__name__}")
+    try:
+        maker(**spec.options)
+    except Exception as error:  # noqa: BLE001  # the user's code may raise anything
+        raise UserError(f"options: {spec.model} cannot be created: {type(error).__name__}: {error}") from None
+
+
+def trust(name: str) -> type:
+    """Load the class of a model that the user of this process has named. Raises UserError."""
+    found = named(name, "a model")
+    if not isinstance(found, type) or not issubclass(found, RangeModel | RadioModel):
+        raise UserError(f"{name} is not a range model or a radio model")
+    OWN[name] = found
+    return found
+
+
+def trust_all(scenario: Scenario) -> None:
+    """Load the models of a scenario that the user has named, in a process that a launcher started."""
+    for spec in (scenario.range_model, scenario.radio_model):
+        if spec is not None and ":" in spec.model:
+            trust(spec.model)

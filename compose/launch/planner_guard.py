@@ -1,0 +1,143 @@
+"""A guard around a planner of the user: its mistakes are one line that names the method and the tick."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from agent.planning.planner import Planner, Summary
+from agent.process.report_bodies import body_of, report_of
+from compose.errors import PlannerFailed
+from protocol.messages import Command, Estimate, Observation, Report, RobotConfig
+from protocol.mission import Mission
+from protocol.orbits import Rendezvous
+from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode, encode
+
+
+class GuardedPlanner(Planner[Any, Any]):
+    """A planner whose answers are checked. There is one for each robot.
+
+    Its methods raise PlannerFailed for whatever the planner raises, and for answers that no message can have.
+    """
+
+    def __init__(self, name: str, planner: Planner[Any, Any]) -> None:
+        """`planner` is the planner of the user, and `name` its name."""
+        self._name = name
+        self._planner = planner
+        self._robot = ""
+        self._tick: int | None = None
+        """The tick of the latest Observation."""
+        self.BODY = planner.BODY
+        self.MANOEUVRES = planner.MANOEUVRES
+        self.ACTIVE_SENSING = planner.ACTIVE_SENSING
+        self.REQUIRED_PLACES = planner.REQUIRED_PLACES
+
+    def start(self, config: RobotConfig) -> Any:
+        """Return the first state."""
+        self._robot = config.robot
+        return self._called(self._planner.start, config)
+
+    def observe(self, state: Any, observation: Observation) -> Any:
+        """Return the state with the sensor data."""
+        self._tick = observation.tick
+        return self._called(self._planner.observe, state, observation)
+
+    def report(self, state: Any) -> Any:
+        """Return the body of the report, once it is certain that the peer's decoder takes it."""
+        body = self._called(self._planner.report, state)
+        try:
+            report = report_of(body, self._tick or 0, self._robot)
+            frame = encode(report)
+            if len(frame) > MAX_REPORT_BYTES:
+                raise self._failed("report", f"its report has {len(frame)} bytes, at most {MAX_REPORT_BYTES}")
+            sent = decode(frame, type(report), MAX_REPORT_BYTES)
+            received = body_of(sent, self._planner)
+        except (MalformedFrame, TypeError, ValueError, OverflowError, msgspec.MsgspecError) as error:
+            raise self._failed("report", f"its report cannot be sent: {error}") from None
+        if isinstance(body, Report):
+            self._check_address("report", body)
+        why = self._called(self._planner.malformed, received)
+        if why is not None:
+            raise self._failed("report", f"its own decoder refuses its report: {why}")
+        return body
+
+    def decide(self, state: Any, reports: Sequence[Any] = ()) -> Any:
+        """Return the state with the reports."""
+        return self._called(self._planner.decide, state, reports)
+
+    def command(self, state: Any) -> Command:
+        """Return the command."""
+        found: Command = self._answer("command", self._planner.command, state, Command)
+        return found
+
+    def estimate(self, state: Any) -> Estimate:
+        """Return the estimate."""
+        found: Estimate = self._answer("estimate", self._planner.estimate, state, Estimate)
+        return found
+
+    def malformed(self, body: Any) -> str | None:
+        """Return why the planner's decoder refuses a body, or what it raises."""
+        try:
+            return self._planner.malformed(body)
+        except Exception as error:  # noqa: BLE001  # an unknown process may have sent the body
+            return f"the decoder of {self._name} raises {type(error).__name__}: {error}"
+
+    def summary(self, state: Any) -> Summary:
+        """Return the planner's part of the FinalReport."""
+        found = self._called(self._planner.summary, state)
+        if not isinstance(found, Summary):
+            raise self._failed("summary", f"returns {type(found).__name__}, expected Summary")
+        return found
+
+    def rendezvous(self, mission: Mission, distance: float) -> Rendezvous:
+        """Return the orbits."""
+        found = self._called(self._planner.rendezvous, mission, distance)
+        if not isinstance(found, Rendezvous):
+            raise self._failed("rendezvous", f"returns {type(found).__name__}, expected Rendezvous")
+        return found
+
+    def misreport(self, body: Any, observations: Sequence[Observation]) -> str | None:
+        """Return how a report contradicts the observations."""
+        found: str | None = self._called(self._planner.misreport, body, observations)
+        return found
+
+    def required_mutual_ranges(self, mission: Mission) -> int:
+        """Return the minimum number of mutual ranges before a claim."""
+        found: int = self._called(self._planner.required_mutual_ranges, mission)
+        return found
+
+    def _answer(self, method: str, answer: Callable[[Any], Any], state: Any, kind: type[Any]) -> Any:
+        """Return the answer, once it is certain that it is a message of this robot and this tick."""
+        found = self._called(answer, state)
+        if not isinstance(found, kind):
+            raise self._failed(method, f"returns {type(found).__name__}, expected {kind.__name__}")
+        try:
+            decode(encode(found), kind)
+        except (MalformedFrame, TypeError, ValueError, OverflowError, msgspec.MsgspecError) as error:
+            raise self._failed(method, f"its {kind.__name__} cannot be sent: {error}") from None
+        self._check_address(method, found)
+        return found
+
+    def _check_address(self, method: str, found: Any) -> None:
+        if (found.tick, found.robot) != (self._tick, self._robot):
+            raise self._failed(
+                method, f"returns a message of {found.robot} at tick {found.tick}, not of {self._robot}"
+            )
+
+    def _called(self, method: Callable[..., Any], *arguments: Any) -> Any:
+        try:
+            return method(*arguments)
+        except Exception as error:  # the user's code may raise anything
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            where = f"{Path(place.filename).name}:{place.lineno}"
+            raise self._failed(
+                method.__name__, f"raises {type(error).__name__}: {error} ({where})"
+            ) from error
+
+    def _failed(self, method: str, what: str) -> PlannerFailed:
+        tick = f" at tick {self._tick}" if self._tick is not None else ""
+        return PlannerFailed(f"the planner {self._name}: {method}(){tick} {what}")

@@ -1,0 +1,138 @@
+"""Planners by name: shipped ones, installed ones, and classes of the user.
+
+A name decides which code runs, so a process loads only planners that its user has named: on its command line,
+in a scenario file, or by installing a package with an entry point in the group `tandem.planners`. Names that
+come over the network or from a recording select among these, and never load anything else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from compose.errors import UserError
+from compose.launch.class_loader import named
+from protocol.mission import Mission
+from protocol.orbits import RENDEZVOUS, Rendezvous, rendezvous
+from protocol.spelling import did_you_mean
+
+if TYPE_CHECKING:
+    from agent.planning.planner import Planner
+    from protocol.messages import RobotConfig
+
+GROUP = "tandem.planners"
+"""The group of entry points with which packages add planners."""
+SHIPPED = tuple(sorted(RENDEZVOUS))
+"""The names of the shipped planners. Their orbits are known without loading them."""
+METHODS = ("start", "observe", "decide", "command", "estimate")
+"""The methods that a planner must define."""
+
+_trusted: set[str] = set()
+"""The names that the user of this process has given."""
+
+
+class UntrustedPlanner(UserError):
+    """A recording or a world names a planner that the user of this process has not named."""
+
+
+def trust(name: str) -> None:
+    """Permit this process to load the planner `name`, which its user has given."""
+    _trusted.add(name)
+
+
+def is_shipped(name: str) -> bool:
+    """Return whether `name` is a planner that is shipped with Tandem."""
+    return name in SHIPPED
+
+
+def installed() -> dict[str, Any]:
+    """Return the entry points of installed packages that add planners, by name."""
+    from importlib.metadata import entry_points  # noqa: PLC0415  # slow to import
+
+    return {one.name: one for one in entry_points(group=GROUP) if one.name not in SHIPPED}
+
+
+def check(name: str, options: Mapping[str, Any]) -> None:
+    """Load the planner that the user has named, and create it. Raises UserError if that is not possible."""
+    trust(name)
+    if is_shipped(name):
+        if options:
+            raise UserError(f"options: the planner '{name}' has none")
+        return
+    _created(name, options)
+
+
+def planner(name: str, options: Mapping[str, Any], mission: Mission) -> Planner[Any, Any]:
+    """Return a new planner for the noise of `mission`.
+
+    Raises UserError if it cannot be loaded or created, and UntrustedPlanner if the user has not named it.
+    """
+    if is_shipped(name):
+        from agent.planning import registry  # noqa: PLC0415  # it imports numpy
+
+        return registry.planner(name, mission)
+    if ":" in name and name not in _trusted:
+        raise UntrustedPlanner(f"the planner is {name}; to run its code, add --planner {name}")
+    from compose.launch.planner_guard import GuardedPlanner  # noqa: PLC0415  # it imports numpy
+
+    created = _created(name, options)
+    try:
+        return GuardedPlanner(name, created.suited(mission))
+    except Exception as error:  # noqa: BLE001  # the user's code may raise anything
+        raise UserError(f"{name}: suited() raised {type(error).__name__}: {error}") from None
+
+
+def planner_copy(name: str, options: Mapping[str, Any], mission: Mission) -> Planner[Any, Any]:
+    """Return a new planner for the noise of `mission`, without a guard. Raises UserError."""
+    return _created(name, options).suited(mission)
+
+
+def planner_of(config: RobotConfig) -> Planner[Any, Any]:
+    """Return the planner of the robot with this configuration. Raises like `planner`."""
+    return planner(config.planner_name, config.planner_options, config.mission)
+
+
+def orbits(name: str, options: Mapping[str, Any], mission: Mission, distance: float) -> Rendezvous:
+    """Return the orbits of a planner for anchors `distance` m (D) apart. Raises like `planner`."""
+    if is_shipped(name):
+        return rendezvous(mission, distance, name)
+    return planner(name, options, mission).rendezvous(mission, distance)
+
+
+def planner_class(name: str) -> type[Planner[Any, Any]]:
+    """Return the class of a planner. Raises UserError if it is not one."""
+    from agent.planning.planner import Planner  # noqa: PLC0415  # it imports numpy
+
+    if is_shipped(name):
+        from agent.planning.registry import SHIPPED as CLASSES  # noqa: PLC0415
+
+        return CLASSES[name]
+    found = named(name, "a planner") if ":" in name else _of_entry_point(name)
+    if not isinstance(found, type) or not issubclass(found, Planner):
+        raise UserError(f"{name}: is not a planner: not a subclass of tandem.planning.Planner")
+    missing = [method for method in METHODS if getattr(found, method) is getattr(Planner, method)]
+    if missing:
+        raise UserError(f"{name}: is not a planner: it does not define {', '.join(missing)}")
+    return found
+
+
+def _of_entry_point(name: str) -> Any:
+    known = installed()
+    if name not in known:
+        names = [*SHIPPED, *known]
+        near = did_you_mean(name, names) or "; a planner of your own is MODULE:CLASS"
+        raise UserError(f"there is no '{name}'; there are {', '.join(names)}{near}")
+    try:
+        return known[name].load()
+    except Exception as error:  # noqa: BLE001  # the code of the package may raise anything
+        raise UserError(
+            f"{name}: {known[name].value} cannot be loaded: {type(error).__name__}: {error}"
+        ) from None
+
+
+def _created(name: str, options: Mapping[str, Any]) -> Planner[Any, Any]:
+    maker = planner_class(name)
+    try:
+        return maker(**options)
+    except Exception as error:  # noqa: BLE001  # as above
+        raise UserError(f"options: {name} cannot be created: {type(error).__name__}: {error}") from None

@@ -1,0 +1,1 @@
+"""Estimation from range recordings, with the estimator of the missions."""

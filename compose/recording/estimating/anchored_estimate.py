@@ -1,0 +1,189 @@
+"""The measurements and estimates of one robot with any number of anchors."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from agent.estimation.gaussian.consistency import FINISHED
+from agent.estimation.gaussian.hypotheses import Hypothesis, ScoredHypothesis
+from agent.estimation.gaussian.known_anchors import FEWEST, AnchoredRobot, blocking_reason, follow, search
+from agent.estimation.gaussian.least_squares import poses
+from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges
+from compose.errors import UserError
+from compose.recording.estimating.estimate_epoch import ClaimRule, EstimateEpoch, of_centres
+from compose.recording.estimating.pair_measurements import (
+    EPOCH_S,
+    HALF,
+    HORIZON,
+    OneRobot,
+    levelled,
+    path_of_steps,
+    ticks_per_epoch,
+)
+from compose.recording.estimating.recorded_noise import RecordedNoise
+from compose.recording.estimating.sound_odometry import at_antenna, sound
+from compose.recording.ranging.range_recording import FixedAnchor, Numbers, RangeRecording, locked
+from compose.recording.ranging.range_steps import StepOptions, steps_of
+from protocol.noise import Noise
+
+
+class AnchoredMeasurements(NamedTuple):
+    """All measurements of one robot."""
+
+    robot: OneRobot
+    anchors: tuple[FixedAnchor, ...]
+    """The anchors to which it has ranges, that with the most ranges first."""
+    t0: float
+    """The time in s of tick 0."""
+    ticks_per_epoch: int
+    ranges: Ranges
+    """The ranges; `radio` is the index in `anchors`."""
+    t: Numbers
+    """The time in s of each range; shape (N,)."""
+    noise: Noise
+    unused: dict[str, int]
+    """The number of ranges that are not used, by the reason."""
+
+    @property
+    def period(self) -> float:
+        """The length of a tick in s."""
+        return EPOCH_S / self.ticks_per_epoch
+
+    @property
+    def epochs(self) -> int:
+        """The number of epochs with odometry."""
+        return len(self.robot.path.v) // self.ticks_per_epoch
+
+    @property
+    def sides(self) -> tuple[OneRobot, ...]:
+        """The robot."""
+        return (self.robot,)
+
+    @property
+    def pairs(self) -> tuple[tuple[str, str], ...]:
+        """The names of each pair of radios."""
+        return tuple([(self.robot.id, anchor.id) for anchor in self.anchors])
+
+    def anchors_of(self, robot: OneRobot) -> list[str]:
+        """Return the names of the anchors whose ranges to `robot` are used."""
+        del robot
+        return [anchor.id for anchor in self.anchors]
+
+    def until(self, epoch: int) -> AnchoredRobot:
+        """Return what was measured up to the end of `epoch`; the first is 1."""
+        known = self.t <= self.t0 + epoch * EPOCH_S
+        ranges, place, radio = self.ranges, self.ranges.place, self.ranges.radio
+        assert place is not None
+        assert radio is not None
+        count = int(np.count_nonzero(known))
+        some = Ranges(
+            ranges.rho[known],
+            ranges.tick[known],
+            ranges.sigma[known],
+            (count, 0, 0),
+            place[known],
+            radio[known],
+        )
+        reach = HORIZON * float(np.max(some.rho)) if count else 1.0
+        path = self.robot.path.until(epoch * self.ticks_per_epoch)
+        return AnchoredRobot(
+            path, some.within(reach, self.noise.priors).thinned(self.noise), reach, self.noise
+        )
+
+
+def anchored_measurements(
+    recording: RangeRecording, robot: str, assumed: RecordedNoise, *, ticks: int | None = None
+) -> AnchoredMeasurements:
+    """Return the measurements of one `robot`, with the noise that is `assumed`.
+
+    `ticks` is the number of them in an epoch; None: by the speed of the robot. Raises UserError unless it has
+    ranges to two anchors at different places.
+    """
+    noise, recorded = assumed.noise, recording.robot(robot)
+    prepared = sound(recorded.odometry, assumed.odometry)
+    moved = recorded._replace(odometry=at_antenna(prepared.odometry, *recorded.antenna[:2]))
+    first, last = recording.span
+    part = recording.part([robot], first, last)._replace(robots=(moved,))
+    ticks = ticks or ticks_per_epoch(part, noise)
+    steps = steps_of(part, [robot], StepOptions(period_s=EPOCH_S / ticks, range_spacing_s=EPOCH_S))
+    ranges = steps.ranges
+    counts = [int(np.count_nonzero(ranges.second == 1 + k)) for k in range(len(part.anchors))]
+    order = sorted([k for k, count in enumerate(counts) if count], key=lambda k: -counts[k])
+    anchors = tuple([part.anchors[k] for k in order])
+    if len({(one.x, one.y) for one in anchors}) < 2:
+        names = ", ".join([one.id for one in anchors]) or "no anchor"
+        raise UserError(
+            f"{recording.source}: one robot needs ranges to two anchors at different places: "
+            f"{robot} has ranges to {names}"
+        )
+    radio = np.argsort(order)[np.searchsorted(np.sort(order), ranges.second - 1)]
+    places = np.array([(one.x - anchors[0].x, one.y - anchors[0].y) for one in anchors])
+    heights = np.array([one.height for one in anchors])
+    rho, ratio = levelled(ranges.range, recorded.antenna[2] - heights[radio])
+    told = np.full(len(rho), noise.anchor_sigma)
+    if assumed.stated:
+        told = np.where(np.isfinite(ranges.sigma), ranges.sigma, told)
+    tick = steps.step + (steps.fraction >= HALF)
+    unused = {"within a second after another": steps.thinned, "without odometry": steps.outside}
+    path = path_of_steps(steps.increments[0], steps.covariance[0], EPOCH_S / ticks)
+    return AnchoredMeasurements(
+        OneRobot(robot, anchors[0], path, prepared, recorded.antenna),
+        anchors,
+        float(steps.t[0]),
+        ticks,
+        Ranges(
+            locked(rho),
+            locked(tick),
+            locked(np.maximum(told, SIGMA_FLOOR) * ratio),
+            (len(rho), 0, 0),
+            places[radio],
+            radio,
+        ),
+        ranges.t,
+        noise,
+        {why: count for why, count in unused.items() if count},
+    )
+
+
+SEARCH_AT = frozenset((FEWEST, *(8 * 2**n for n in range(12))))
+"""The numbers of ranges at which the whole plane is searched again, as in a mission."""
+
+
+class AnchoredEstimator:
+    """The estimate of one robot, which goes on from epoch to epoch."""
+
+    def __init__(self, rule: ClaimRule) -> None:
+        self._rule = rule
+        self._known: tuple[Hypothesis, ...] = ()
+        self._searched = 0
+        self._claimed = False
+
+    def epoch(self, measured: AnchoredMeasurements, number: int) -> EstimateEpoch:
+        """Return the estimate at the end of the epoch with this `number`, from 1 on, in their order."""
+        robot, t = measured.until(number), measured.t0 + number * EPOCH_S
+        count = len(robot.ranges.rho)
+        radio = robot.ranges.radio
+        assert radio is not None
+        counts = tuple([int(np.count_nonzero(radio == k)) for k in range(len(measured.anchors))])
+        due = any(self._searched < at <= count for at in SEARCH_AT)
+        scored = follow(robot, self._known) if self._known and not due else ()
+        reason = "" if not scored else self._reason(robot, scored)
+        moving = not scored or scored[0].fit.last_step > FINISHED
+        if count >= FEWEST and (moving or (not reason and not self._claimed)):
+            scored = search(robot, tuple([one.hypothesis for one in scored]) or self._known)
+            self._searched = count
+            reason = self._reason(robot, scored) if scored else ""
+        if not scored:
+            what = "no hypothesis explains the ranges" if count >= FEWEST else "too few ranges"
+            return EstimateEpoch(t, counts, (), (False,), what, None, robot)
+        self._known = tuple([one.hypothesis for one in scored])
+        self._claimed = self._claimed or not reason
+        found = [(one.hypothesis.probability, *poses(one.fit, (0.0, 0.0))) for one in scored]
+        hypotheses = tuple([of_centres(*one, measured.sides) for one in found])
+        return EstimateEpoch(t, counts, hypotheses, (not reason,), reason, scored[0].fit, robot)
+
+    def _reason(self, robot: AnchoredRobot, scored: tuple[ScoredHypothesis, ...]) -> str:
+        covariance = poses(scored[0].fit, (0.0, 0.0))[1]
+        return blocking_reason(scored, covariance, robot, self._rule.accuracy, self._rule.confidence)

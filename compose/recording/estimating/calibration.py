@@ -1,0 +1,83 @@
+"""The calibration of the radios of a recording, by its true poses, or by an estimate without them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from compose.errors import UserError
+from compose.recording.estimating.estimate_epoch import ClaimRule
+from compose.recording.estimating.estimate_run import estimated, measurements
+from compose.recording.estimating.learned_errors import learned_errors
+from compose.recording.estimating.radio_errors import (
+    FEWEST,
+    PairErrors,
+    RangeCalibration,
+    range_calibration,
+    true_errors,
+)
+from compose.recording.ranging.range_recording import Numbers, RangeRecording
+
+ASSUMED = "uwb"
+"""The profile of the estimate that replaces the truth: that of radios that nobody has calibrated."""
+
+RULE = ClaimRule(accuracy=1.0)
+"""The claim rule of that estimate: the radios' errors need the right hypothesis, not an accurate one."""
+
+
+def calibrated(
+    recording: RangeRecording,
+    robots: Sequence[str] | None,
+    window: tuple[float, float] | None,
+    *,
+    by_fit: bool = False,
+) -> RangeCalibration:
+    """Return the errors of the radios of `robots`, or of all, within `window` (s from the first odometry on).
+
+    They are against the truth if there is some, unless `by_fit`; else against an estimate of one or two
+    robots.
+    Raises UserError.
+    """
+    known = [one.id for one in recording.robots]
+    chosen = known if robots is None else list(robots)
+    for name in chosen:
+        if name not in known:
+            raise UserError(f"--robots: {recording.source} has no robot {name}; it has {', '.join(known)}")
+    begin, end = recording.span
+    part = recording.part(
+        chosen, *((begin, end) if window is None else (begin + window[0], begin + window[1]))
+    )
+    errors = {} if by_fit else true_errors(part)
+    if errors:
+        return range_calibration(errors, "the truth")
+    return _by_fit(recording, chosen, window)
+
+
+def _by_fit(
+    recording: RangeRecording, robots: Sequence[str], window: tuple[float, float] | None
+) -> RangeCalibration:
+    """Return the errors against the ranges that the estimate of one or two robots predicts."""
+    problem = measurements(recording, robots, ASSUMED, window)
+    estimate = estimated(problem, RULE)
+    last = estimate.epochs[-1] if estimate.epochs else None
+    if last is None or last.fit is None or not all(last.claims):
+        why = last.blocking_reason if last is not None else "there is no odometry of both"
+        raise UserError(
+            f"{recording.source}: without true poses, an estimate of {' and '.join(robots)} is needed, "
+            f"and there is none: {why or 'too few ranges'}"
+        )
+    errors, ranges = {}, last.used.ranges
+    ranged = [pair for pair, count in zip(problem.measured.pairs, last.ranges, strict=True) if count]
+    for pair, rows in zip(ranged, ranges.pairs, strict=True):
+        t: Numbers = problem.measured.t0 + problem.measured.period * ranges.tick[rows].astype(float)
+        if len(t) >= FEWEST:
+            errors[pair] = PairErrors(t, ranges.rho[rows], last.fit.residuals[rows])
+    if not errors:
+        raise UserError(f"{recording.source}: no pair of radios has {FEWEST} ranges")
+    found = range_calibration(errors, "the fit")
+    names = [side.id for side in problem.measured.sides]
+    learned = learned_errors(last.fit, names, ["-".join(pair) for pair in ranged])
+    bias, scale = learned.range_bias_m, learned.range_scale
+    return found._replace(
+        bias_sigma=bias.sigma if bias is not None else 0.0,
+        scale_sigma=max(found.scale_sigma, scale.sigma if scale is not None else 0.0),
+    )

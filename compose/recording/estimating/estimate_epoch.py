@@ -1,0 +1,72 @@
+"""The results of an estimate at one time, and the rule for claims."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from agent.estimation.gaussian.known_anchors import AnchoredRobot
+from agent.estimation.gaussian.least_squares import Fit
+from agent.estimation.gaussian.range_model import PairRanges
+from compose.recording.estimating.pair_measurements import OneRobot
+from compose.recording.ranging.range_recording import Numbers
+from protocol.motion import wrap
+
+
+class PosesHypothesis(NamedTuple):
+    """One hypothesis about all robots."""
+
+    probability: float
+    poses: Numbers
+    """x (m), y (m) and heading (rad) in <W> of each robot, at the end of the epoch; shape (R, 3)."""
+    covariance: Numbers
+    """The covariance of all poses; shape (3 R, 3 R)."""
+
+
+class EstimateEpoch(NamedTuple):
+    """The estimate at the end of one epoch."""
+
+    t: float
+    """The time in s, on the clock of the recording."""
+    ranges: tuple[int, ...]
+    """The number of ranges that are used, of each pair of radios."""
+    hypotheses: tuple[PosesHypothesis, ...]
+    """The hypotheses, the most probable first; none before there are enough ranges."""
+    claims: tuple[bool, ...]
+    """True if a robot may claim the pose of the first hypothesis."""
+    blocking_reason: str
+    """The condition for a claim that is not met; empty if all are."""
+    fit: Fit | None
+    """The fit of the first hypothesis."""
+    used: PairRanges | AnchoredRobot
+    """The measurements up to now."""
+
+
+class ClaimRule(NamedTuple):
+    """The accuracy and the confidence that a claim needs."""
+
+    accuracy: float = 0.3
+    """The largest sigma of the position in m: the root of the trace of its covariance."""
+    confidence: float = 0.9999
+    """The least probability of the hypothesis."""
+
+
+def of_centres(
+    probability: float, mean: Numbers, covariance: Numbers, robots: tuple[OneRobot, ...]
+) -> PosesHypothesis:
+    """Return a hypothesis about the centres of `robots`, in <W>.
+
+    `mean` and `covariance` are about their antennas, relative to the anchor of the first one.
+    """
+    poses = mean.reshape(-1, 3).copy()
+    poses[:, 0] += robots[0].anchor.x
+    poses[:, 1] += robots[0].anchor.y
+    centred = np.eye(len(mean))
+    for i, robot in enumerate(robots):
+        forward, left, _ = robot.antenna
+        offset = (forward + 1j * left) * np.exp(1j * poses[i, 2])
+        poses[i, :2] -= offset.real, offset.imag
+        centred[3 * i, 3 * i + 2], centred[3 * i + 1, 3 * i + 2] = offset.imag, -offset.real
+        poses[i, 2] = wrap(float(poses[i, 2]))
+    return PosesHypothesis(probability, poses, centred @ covariance @ centred.T)

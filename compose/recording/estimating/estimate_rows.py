@@ -1,0 +1,263 @@
+"""The results of an estimate: one row for each robot and epoch, and the summary."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+
+from compose.recording.estimating.anchored_estimate import AnchoredMeasurements
+from compose.recording.estimating.estimate_epoch import ClaimRule, EstimateEpoch
+from compose.recording.estimating.learned_errors import LearnedErrors, learned_errors
+from compose.recording.estimating.pair_measurements import PairMeasurements
+from compose.recording.ranging.range_recording import Numbers, RecordedRobot
+from protocol.motion import wrap
+
+
+class PoseEstimateRow(msgspec.Struct, frozen=True):
+    """The estimate of one robot at one time, by the most probable hypothesis."""
+
+    t_s: float
+    """The time in s, on the clock of the recording."""
+    robot: str
+    """The robot."""
+    hypotheses: int
+    """The number of hypotheses."""
+    probability: float
+    """The probability of the most probable one."""
+    x: float
+    """The x coordinate in m."""
+    y: float
+    """The y coordinate in m."""
+    heading: float
+    """The heading in rad, from -pi to pi."""
+    xx: float
+    """The variance of x in m^2."""
+    xy: float
+    """The covariance of x and y in m^2."""
+    xh: float
+    """The covariance of x and the heading in m rad."""
+    yy: float
+    """The variance of y in m^2."""
+    yh: float
+    """The covariance of y and the heading in m rad."""
+    hh: float
+    """The variance of the heading in rad^2."""
+    claim: bool
+    """True if the robot may claim this pose."""
+    true_x: float | None = None
+    """The true x coordinate in m; empty without truth."""
+    true_y: float | None = None
+    """The true y coordinate in m."""
+    true_heading: float | None = None
+    """The true heading in rad."""
+    position_error_m: float | None = None
+    """The distance of the estimate from the true position in m."""
+    heading_error_rad: float | None = None
+    """The error of the heading in rad, with its sign."""
+    nees: float | None = None
+    """The normalised error squared: 3 on average if covariances are right."""
+
+
+class PoseEstimate(msgspec.Struct, frozen=True):
+    """The pose of a robot at one time."""
+
+    t_s: float
+    """The time in s, on the clock of the recording."""
+    pose: tuple[float, float, float]
+    """x and y in m, and the heading in rad."""
+    covariance: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+    """The covariance of x, y and the heading."""
+    probability: float
+    """The probability of the hypothesis."""
+    position_error_m: float | None = None
+    """The distance from the true position in m; null without truth."""
+    heading_error_rad: float | None = None
+    """The error of the heading in rad; null without truth."""
+    nees: float | None = None
+    """The normalised error squared; null without truth."""
+
+
+class RobotEstimate(msgspec.Struct, frozen=True):
+    """The estimates of one robot."""
+
+    anchors: list[str]
+    """The anchors whose ranges are used."""
+    first_claim: PoseEstimate | None
+    """The first pose that the robot may claim; null if there is none."""
+    final: PoseEstimate | None
+    """The pose at the end; null if there was never a hypothesis."""
+    gross_increments: int
+    """The number of increments of its odometry that were replaced, because no robot moves like that."""
+    gaps: int
+    """The number of gaps in its odometry."""
+
+
+class FinalHypothesis(msgspec.Struct, frozen=True):
+    """One hypothesis at the end."""
+
+    probability: float
+    """The probability of the hypothesis."""
+    poses: dict[str, tuple[float, float, float]]
+    """The pose of each robot: x and y in m, and the heading in rad."""
+
+
+class EstimateSummary(msgspec.Struct, frozen=True):
+    """The content of `estimate.json`."""
+
+    source: str
+    """The recording."""
+    noise: str
+    """The assumed noise: a profile, a file, or what the recording states."""
+    begin_s: float
+    """The time in s, on the clock of the recording, from which on there is odometry of all robots."""
+    accuracy: float
+    """The accuracy in m that a claim needs."""
+    confidence: float
+    """The probability that a claim needs."""
+    robots: dict[str, RobotEstimate]
+    """The estimates of each robot."""
+    hypotheses: list[FinalHypothesis]
+    """All hypotheses at the end, the most probable first."""
+    calibration: LearnedErrors | None
+    """The constant errors that the most probable hypothesis implies at the end."""
+    ranges: dict[str, int]
+    """The number of used ranges of each pair of radios, at the end."""
+    unused_ranges: dict[str, int]
+    """The number of ranges that are not used, by the reason."""
+    blocking_reason: str
+    """The condition for a claim that is not met at the end; empty if all are."""
+
+
+def true_pose(robot: RecordedRobot, t: float) -> Numbers | None:
+    """Return the true pose at `t` s, interpolated; None without truth around that time; shape (3,)."""
+    truth = robot.truth
+    if truth is None or not truth.t[0] - TRUTH_GAP_S <= t <= truth.t[-1] + TRUTH_GAP_S:
+        return None
+    after = min(max(int(np.searchsorted(truth.t, t)), 1), len(truth.t) - 1)
+    before = max(after - 1, 0)
+    lasts = float(truth.t[after] - truth.t[before])
+    if lasts > TRUTH_GAP_S:
+        return None
+    share = min(max((t - float(truth.t[before])) / lasts, 0.0), 1.0) if lasts > 0.0 else 1.0
+    first, last = truth.poses[before], truth.poses[after]
+    moved = last - first
+    moved[2] = wrap(float(moved[2]))
+    pose: Numbers = first + share * moved
+    return pose
+
+
+TRUTH_GAP_S = 1.0
+"""The longest time in s between true poses within which they are interpolated."""
+
+
+def rows_of(epoch: EstimateEpoch, robots: Sequence[RecordedRobot]) -> list[PoseEstimateRow]:
+    """Return the rows of all robots at one epoch; none without hypotheses."""
+    rows = []
+    for i, robot in enumerate(robots):
+        if not epoch.hypotheses:
+            continue
+        best = epoch.hypotheses[0]
+        pose, covariance = best.poses[i], best.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
+        x, y, heading = pose.tolist()
+        row = PoseEstimateRow(
+            t_s=epoch.t,
+            robot=robot.id,
+            hypotheses=len(epoch.hypotheses),
+            probability=best.probability,
+            x=x,
+            y=y,
+            heading=heading,
+            xx=float(covariance[0, 0]),
+            xy=float(covariance[0, 1]),
+            xh=float(covariance[0, 2]),
+            yy=float(covariance[1, 1]),
+            yh=float(covariance[1, 2]),
+            hh=float(covariance[2, 2]),
+            claim=epoch.claims[i],
+        )
+        true = true_pose(robot, epoch.t)
+        rows.append(row if true is None else _with_truth(row, pose, covariance, true))
+    return rows
+
+
+def _with_truth(row: PoseEstimateRow, pose: Numbers, covariance: Numbers, true: Numbers) -> PoseEstimateRow:
+    """Return the row of an estimate with the truth and the errors."""
+    error = pose - true
+    error[2] = wrap(float(error[2]))
+    return msgspec.structs.replace(
+        row,
+        true_x=float(true[0]),
+        true_y=float(true[1]),
+        true_heading=wrap(float(true[2])),
+        position_error_m=math.hypot(error[0], error[1]),
+        heading_error_rad=float(error[2]),
+        nees=float(error @ np.linalg.solve(covariance, error)),
+    )
+
+
+def summary_of(
+    measured: PairMeasurements | AnchoredMeasurements,
+    rows: Sequence[PoseEstimateRow],
+    last: EstimateEpoch | None,
+    rule: ClaimRule,
+    source: str,
+    noise: str,
+) -> EstimateSummary:
+    """Return the summary of all `rows`; `last` is the last epoch."""
+    sides = measured.sides
+    robots = {}
+    for side in sides:
+        own = [row for row in rows if row.robot == side.id]
+        claimed = next((row for row in own if row.claim), None)
+        robots[side.id] = RobotEstimate(
+            measured.anchors_of(side),
+            _pose(claimed) if claimed is not None else None,
+            _pose(own[-1]) if own else None,
+            len(side.sound.gross),
+            len(side.sound.gaps),
+        )
+    pairs = ["-".join(pair) for pair in measured.pairs]
+    calibration = None
+    if last is not None and last.fit is not None:
+        ranged = [name for name, count in zip(pairs, last.ranges, strict=True) if count]
+        calibration = learned_errors(last.fit, [side.id for side in sides], ranged)
+    hypotheses = [
+        FinalHypothesis(
+            one.probability,
+            {side.id: _triple(one.poses[i]) for i, side in enumerate(sides)},
+        )
+        for one in (last.hypotheses if last is not None else ())
+    ]
+    return EstimateSummary(
+        source,
+        noise,
+        measured.t0,
+        rule.accuracy,
+        rule.confidence,
+        robots,
+        hypotheses,
+        calibration,
+        dict(zip(pairs, last.ranges if last is not None else (0,) * len(pairs), strict=True)),
+        measured.unused,
+        last.blocking_reason if last is not None else "there is no epoch",
+    )
+
+
+def _triple(values: Numbers) -> tuple[float, float, float]:
+    first, second, third = values.tolist()
+    return first, second, third
+
+
+def _pose(row: PoseEstimateRow) -> PoseEstimate:
+    return PoseEstimate(
+        row.t_s,
+        (row.x, row.y, row.heading),
+        ((row.xx, row.xy, row.xh), (row.xy, row.yy, row.yh), (row.xh, row.yh, row.hh)),
+        row.probability,
+        row.position_error_m,
+        row.heading_error_rad,
+        row.nees,
+    )

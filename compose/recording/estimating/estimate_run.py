@@ -1,0 +1,140 @@
+"""A whole estimate: from a recording and a user's choices to its rows and its summary."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from compose.errors import UserError
+from compose.recording.estimating.anchored_estimate import (
+    AnchoredEstimator,
+    AnchoredMeasurements,
+    anchored_measurements,
+)
+from compose.recording.estimating.estimate_epoch import ClaimRule, EstimateEpoch
+from compose.recording.estimating.estimate_rows import EstimateSummary, PoseEstimateRow, rows_of, summary_of
+from compose.recording.estimating.noise_files import ToldNoise, told_noise
+from compose.recording.estimating.pair_estimate import PairEstimator
+from compose.recording.estimating.pair_measurements import PairMeasurements, pair_measurements
+from compose.recording.estimating.recorded_noise import recorded_noise
+from compose.recording.ranging.range_recording import RangeRecording, RecordedRobot
+
+
+class EstimationProblem(NamedTuple):
+    """The measurements of one or two robots, and what is known of their source."""
+
+    measured: PairMeasurements | AnchoredMeasurements
+    robots: tuple[RecordedRobot, ...]
+    """The robots, with their truth if there is one."""
+    source: str
+    noise: str
+    """The name of the assumed noise."""
+
+
+class RecordingEstimate(NamedTuple):
+    """The result of an estimate."""
+
+    rows: list[PoseEstimateRow]
+    epochs: list[EstimateEpoch]
+    summary: EstimateSummary
+
+
+def measurements(
+    recording: RangeRecording,
+    robots: Sequence[str] | None,
+    noise: str | None,
+    window: tuple[float, float] | None,
+) -> EstimationProblem:
+    """Return the measurements of `robots` within `window`, in s from the first odometry on.
+
+    `noise` is the name of a profile or the path of a file; None: what the recording states. Raises UserError.
+    """
+    told = told_noise(noise) if noise is not None else None
+    return measurements_with(recording, robots, told, noise or "", window)
+
+
+def measurements_with(
+    recording: RangeRecording,
+    robots: Sequence[str] | None,
+    told: ToldNoise | None,
+    name: str = "",
+    window: tuple[float, float] | None = None,
+    *,
+    ticks: int | None = None,
+    anchors: tuple[str, str] | None = None,
+) -> EstimationProblem:
+    """Return the same for the noise `told` and its `name`.
+
+    `ticks` and `anchors` are those of `pair_measurements`.
+    """
+    chosen = _chosen(recording, robots)
+    begin, end = recording.span
+    if window is not None:
+        begin, end = begin + window[0], min(begin + window[1], end)
+        if begin >= end:
+            lasts = recording.span[1] - recording.span[0]
+            raise UserError(f"--window: {recording.source} has odometry of {lasts:.3f} s")
+    part = recording.part(chosen, begin, end)
+    assumed = recorded_noise(part, told.noise if told is not None else None, name)
+    if told is not None and told.correction is not None:
+        part = told.correction.corrected(part)
+    measured: PairMeasurements | AnchoredMeasurements
+    if len(chosen) == 1:
+        measured = anchored_measurements(part, chosen[0], assumed, ticks=ticks)
+    else:
+        measured = pair_measurements(part, chosen, assumed, ticks=ticks, anchors=anchors)
+    return EstimationProblem(measured, part.robots, recording.source, assumed.name)
+
+
+def _chosen(recording: RangeRecording, robots: Sequence[str] | None) -> Sequence[str]:
+    """Return the robots to be estimated; raise UserError unless there are one or two."""
+    known = [one.id for one in recording.robots]
+    names = known if robots is None else robots
+    for name in names:
+        if name not in known:
+            raise UserError(f"--robots: {recording.source} has no robot {name}; it has {', '.join(known)}")
+    if len(names) > 2:
+        raise UserError(
+            f"--robots: one or two robots are estimated at once; {recording.source} has {', '.join(known)}"
+        )
+    return names
+
+
+class RecordingEstimator:
+    """The estimate of one or two robots, which goes on from epoch to epoch."""
+
+    def __init__(self, rule: ClaimRule) -> None:
+        self._of_pair, self._of_one = PairEstimator(rule), AnchoredEstimator(rule)
+
+    def epoch(self, measured: PairMeasurements | AnchoredMeasurements, number: int) -> EstimateEpoch:
+        """Return the estimate at the end of the epoch with this `number`, from 1 on, in their order.
+
+        `measured` may have grown since the last call, and is otherwise the same.
+        """
+        if isinstance(measured, PairMeasurements):
+            return self._of_pair.epoch(measured, number)
+        return self._of_one.epoch(measured, number)
+
+
+def estimated(
+    problem: EstimationProblem, rule: ClaimRule, done: Callable[[], None] = lambda: None
+) -> RecordingEstimate:
+    """Return all estimates; `done` is called after each epoch."""
+    rows: list[PoseEstimateRow] = []
+    epochs: list[EstimateEpoch] = []
+    estimator = RecordingEstimator(rule)
+    for number in range(1, problem.measured.epochs + 1):
+        epoch = estimator.epoch(problem.measured, number)
+        rows += rows_of(epoch, problem.robots)
+        epochs.append(epoch)
+        done()
+    return with_summary(problem, rows, epochs, rule)
+
+
+def with_summary(
+    problem: EstimationProblem, rows: list[PoseEstimateRow], epochs: list[EstimateEpoch], rule: ClaimRule
+) -> RecordingEstimate:
+    """Return the result of all `rows` and `epochs`."""
+    last = epochs[-1] if epochs else None
+    summary = summary_of(problem.measured, rows, last, rule, problem.source, problem.noise)
+    return RecordingEstimate(rows, epochs, summary)

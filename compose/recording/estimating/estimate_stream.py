@@ -1,0 +1,108 @@
+"""The estimate of a stream of rows, at the rate of their arrival.
+
+An epoch is computed as soon as the odometry of both robots has reached its end. Rows must arrive in the order
+of time, as in a file: a range that comes later counts from the next epoch on.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+
+from compose.errors import UserError
+from compose.recording.estimating.estimate_epoch import ClaimRule, EstimateEpoch
+from compose.recording.estimating.estimate_rows import PoseEstimateRow, rows_of
+from compose.recording.estimating.estimate_run import (
+    EstimationProblem,
+    RecordingEstimate,
+    RecordingEstimator,
+    measurements_with,
+    with_summary,
+)
+from compose.recording.estimating.noise_files import ToldNoise
+from compose.recording.estimating.pair_measurements import EPOCH_S, NoAnchors, PairMeasurements
+from compose.recording.ranging.range_recording import SAME_TIME_S
+from compose.recording.ranging.recording_rows import (
+    AnyRow,
+    OdometryRow,
+    RecordingBuilder,
+    SourcePlace,
+)
+
+STREAM_TICKS = 20
+"""The number of ticks in an epoch of a stream. A robot of 0.5 m/s then moves by a quarter of 0.05 m in half a
+tick; the speed of the robots is not known before they have moved."""
+
+
+class StreamEstimate:
+    """An estimate of two robots that grows with the rows of a stream."""
+
+    def __init__(
+        self,
+        source: str,
+        robots: Sequence[str] | None,
+        noise: tuple[ToldNoise, str] | None,
+        rule: ClaimRule,
+    ) -> None:
+        """Begin the estimate of `robots` (None: the only two of the stream), with the noise and its name."""
+        self._builder = RecordingBuilder(source)
+        self._robots = robots
+        self._told = noise[0] if noise is not None else None
+        self._name = noise[1] if noise is not None else ""
+        self._rule = rule
+        self._estimator = RecordingEstimator(rule)
+        self._begins: dict[str, float] = {}
+        self._ends: dict[str, float] = {}
+        self._next = 1
+        self._problem: EstimationProblem | None = None
+        self._anchors: tuple[str, str] | None = None
+        self._rows: list[PoseEstimateRow] = []
+        self._epochs: list[EstimateEpoch] = []
+
+    def rows(self, arriving: Iterable[tuple[AnyRow, SourcePlace]]) -> Iterator[PoseEstimateRow]:
+        """Yield the estimates that follow from `arriving` rows, as soon as they do. Raises UserError."""
+        for row, place in arriving:
+            self._builder.add(row, place)
+            if isinstance(row, OdometryRow):
+                self._begins.setdefault(row.robot, row.t0)
+                self._ends[row.robot] = row.t1
+                yield from self._due()
+
+    def _due(self) -> Iterator[PoseEstimateRow]:
+        """Yield the estimates of all epochs whose odometry is complete."""
+        names = list(self._begins) if self._robots is None else self._robots
+        if not names or not all(name in self._begins for name in names):
+            return
+        begin = max(self._begins[name] for name in names)
+        end = min(self._ends[name] for name in names)
+        complete = math.floor((end - begin) / EPOCH_S + SAME_TIME_S)
+        if complete < self._next:
+            return
+        try:
+            self._problem = measurements_with(
+                self._builder.recording(),
+                names,
+                self._told,
+                self._name,
+                ticks=STREAM_TICKS,
+                anchors=self._anchors,
+            )
+        except NoAnchors:
+            return  # there will be ranges
+        measured = self._problem.measured
+        while self._next <= min(complete, measured.epochs):
+            epoch = self._estimator.epoch(measured, self._next)
+            if epoch.hypotheses and isinstance(measured, PairMeasurements):
+                self._anchors = (measured.a.anchor.id, measured.b.anchor.id)
+            self._next += 1
+            found = rows_of(epoch, self._problem.robots)
+            self._rows += found
+            self._epochs.append(epoch)
+            yield from found
+
+    def result(self) -> tuple[EstimationProblem, RecordingEstimate]:
+        """Return all estimates so far. Raises UserError if no epoch is complete."""
+        if self._problem is None:
+            what = "no second with odometry of two robots and ranges to two anchors"
+            raise UserError(f"{self._builder.source}: there is {what}")
+        return self._problem, with_summary(self._problem, self._rows, self._epochs, self._rule)

@@ -1,0 +1,132 @@
+"""The estimates of two robots over time, by the inference and the claim rule of the missions."""
+
+from __future__ import annotations
+
+from msgspec.structs import replace
+
+from agent.estimation.gaussian import inference
+from agent.estimation.gaussian.hypotheses import follow, search
+from agent.estimation.gaussian.inference import to_second_order
+from agent.estimation.gaussian.range_model import PairRanges
+from agent.estimation.knowledge import Belief, Knowledge
+from agent.planning.accuracy_seeking import (
+    FEWEST_MUTUAL_RANGES,
+    PairInference,
+    inferred,
+    may_claim,
+    weighed,
+)
+from compose.recording.estimating.estimate_epoch import ClaimRule, EstimateEpoch, of_centres
+from compose.recording.estimating.pair_measurements import EPOCH_S, OneRobot, PairMeasurements
+from compose.recording.ranging.range_recording import Numbers
+from protocol.messages import RobotConfig
+from protocol.mission import Anchor, Mission, Role
+from protocol.orbits import Orbit, Rendezvous
+
+ROLES: tuple[Role, Role] = ("a", "b")
+
+FREE_SPEED = 10.0
+"""The speed (m/s) and turn rate (rad/s) of the mission that stands for a recording; nothing is planned."""
+
+NO_ORBIT = Orbit(0.0, 0.0, 0.0)
+
+
+class PairEstimator:
+    """The estimate of two robots, which goes on from epoch to epoch.
+
+    Until both robots have claimed their poses, the plane is searched whenever it is in a mission. After that,
+    the hypotheses are only followed.
+    """
+
+    def __init__(self, rule: ClaimRule) -> None:
+        self._rule = rule
+        self._belief = Belief()
+        self._claimed = False
+
+    def epoch(self, measured: PairMeasurements, number: int) -> EstimateEpoch:
+        """Return the estimate at the end of the epoch with this `number`, from 1 on, in their order.
+
+        `measured` may have grown since the last call, and is otherwise the same.
+        """
+        pair, t = measured.until(number), measured.t0 + number * EPOCH_S
+        known = [_knowledge(measured, role, self._belief, pair, self._rule) for role in ROLES]
+        found, beliefs = _inferred(known, pair, follow_only=self._claimed)
+        if found is None or not found.scored:
+            reason = "no hypothesis explains the ranges" if found is not None else "too few mutual ranges"
+            return EstimateEpoch(t, pair.ranges.counts, (), (False, False), reason, None, pair)
+        self._belief = beliefs[0]
+        claims = [may_claim(one, pair) for one in beliefs]
+        self._claimed = self._claimed or all(claims)
+        reasons = [one.blocking_reason for one in beliefs if one.blocking_reason is not None]
+        return EstimateEpoch(
+            t,
+            pair.ranges.counts,
+            tuple([of_centres(*one, measured.sides) for one in _second_order(found, pair)]),
+            (claims[0], claims[1]),
+            reasons[0] if reasons else "" if all(claims) else "few ranges, and a small p-value",
+            found.scored[0].fit,
+            pair,
+        )
+
+
+def _knowledge(
+    measured: PairMeasurements, role: Role, belief: Belief, pair: PairRanges, rule: ClaimRule
+) -> Knowledge:
+    """Return what the robot with this role would know."""
+    sides: tuple[OneRobot, OneRobot] = (measured.a, measured.b)
+    own, peer = sides if role == "a" else sides[::-1]
+    mission = Mission(
+        sensing_range=pair.sensing_range,
+        period=measured.period,
+        max_speed=FREE_SPEED,
+        max_turn_rate=FREE_SPEED,
+        accuracy=rule.accuracy,
+        confidence=rule.confidence,
+        noise=measured.noise,
+    )
+    config = RobotConfig(
+        robot=own.id,
+        peer=peer.id,
+        role=role,
+        anchor=Anchor(own.anchor.x, own.anchor.y),
+        peer_anchor=Anchor(peer.anchor.x, peer.anchor.y),
+        mission=mission,
+        planner_name="assured",
+        rendezvous=Rendezvous(NO_ORBIT, NO_ORBIT, 0.0),
+        attack=None,
+        tick_s=None,
+    )
+    return Knowledge(config, belief=belief)
+
+
+def _inferred(
+    known: list[Knowledge], pair: PairRanges, *, follow_only: bool
+) -> tuple[PairInference | None, list[Belief]]:
+    """Return the hypotheses about both robots, and what each of the two makes of them."""
+    mutual = pair.ranges.counts[2]
+    if mutual < FEWEST_MUTUAL_RANGES:
+        return None, []
+    before = known[0].belief.pair
+    if follow_only and before:
+        found = weighed(known[0], pair, follow(before, pair), searched=False)
+    else:
+        found = inferred(known[0], pair)
+    beliefs = _tested(known, pair, found)
+    if not follow_only and not found.searched and any(may_claim(one, pair) for one in beliefs):
+        found = weighed(known[0], pair, search(pair, found.belief.pair), searched=True)
+        beliefs = _tested(known, pair, found)
+    return found, beliefs
+
+
+def _tested(known: list[Knowledge], pair: PairRanges, found: PairInference) -> list[Belief]:
+    """Return the beliefs of both robots, with every reason against a claim."""
+    own = found.belief
+    if found.searched:
+        own = replace(own, ranges_at_last_search=pair.ranges.counts[2])
+    peer = weighed(known[1], pair, found.scored, searched=found.searched).belief
+    return [inference.with_convergence_check(one, found.scored) for one in (own, peer)]
+
+
+def _second_order(found: PairInference, pair: PairRanges) -> list[tuple[float, Numbers, Numbers]]:
+    """Return the probability, the mean, (6,), and the covariance, (6, 6), of each hypothesis."""
+    return [(one.probability, *to_second_order(one, pair.apart)) for one in found.hypotheses]

@@ -1,0 +1,215 @@
+"""The errors of recorded ranges by pair of radios: against the true distances, or against a fit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from compose.recording.estimating.estimate_rows import TRUTH_GAP_S
+from compose.recording.ranging.range_recording import Numbers, Places, RangeRecording, RecordedRobot
+
+OUTLIER_SIGMAS = 4.0
+"""The distance from the line, in sigmas, from which on an error is an outlier.
+
+A Gaussian error is so far off once in 16 000. With less, honest errors become outliers; with more, outliers
+make the sigma larger.
+"""
+
+MEDIAN = 0.6745
+"""The median of the absolute value of a standard normal variable."""
+
+ROUNDS = 20
+"""The largest number of rounds in which outliers are found. Most recordings need five."""
+
+FEWEST = 8
+"""The least number of ranges of a pair from which its errors are determined."""
+
+LEVER = 0.5
+"""The least spread (m, one sigma) of a pair's ranges from which its own scale follows."""
+
+SLOW_LAG_S, SLOW_TIME_S = 1.0, 2.0
+"""The lag in s at which the correlation of errors is measured, and the time in s in which it is taken to fall
+to 1 / e. Errors within a second are correlated by 0.2 to 0.7 on UWB radios, white ones are not."""
+
+LAG_SHARE = 0.25
+"""The tolerance of the lag, as a fraction."""
+
+
+class RadioErrors(NamedTuple):
+    """The errors of the ranges of one pair of radios: measured minus true is bias + scale x measured."""
+
+    ranges: int
+    """The number of ranges."""
+    bias: float
+    """The bias in m, at the common scale."""
+    bias_sigma: float
+    """The standard deviation in m."""
+    scale: float | None
+    """The relative error by this pair alone; None if its ranges are too similar to tell."""
+    sigma: float
+    """The standard deviation in m of the errors without outliers."""
+    slow_sigma: float
+    """The part of it in m that varies slowly."""
+    outliers: float
+    """The fraction of outliers."""
+
+
+class RangeCalibration(NamedTuple):
+    """The errors of all pairs of radios."""
+
+    pairs: dict[tuple[str, str], RadioErrors]
+    """The errors of each pair, by the names of the radios."""
+    scale: float
+    """The relative error that all ranges have in common."""
+    scale_sigma: float
+    """The standard deviation."""
+    source: str
+    """The reference: the truth, or the fit."""
+    bias_sigma: float = 0.0
+    """The standard deviation (m) of what all biases have in common, if it is more than the lines tell."""
+
+
+class PairErrors(NamedTuple):
+    """The measured ranges of one pair with their errors."""
+
+    t: Numbers
+    """The times in s; shape (N,)."""
+    measured: Numbers
+    """The ranges in m; shape (N,)."""
+    error: Numbers
+    """Measured minus reference in m; shape (N,)."""
+
+
+def true_errors(recording: RangeRecording) -> dict[tuple[str, str], PairErrors]:
+    """Return the errors of all ranges whose both ends have a true position, by pair of radios."""
+    found = {}
+    robots = {one.id: one for one in recording.robots}
+    fixed = {one.id: one for one in recording.anchors}
+    for pair, rows in recording.pairs().items():
+        t, measured = recording.ranges.t[rows], recording.ranges.range[rows]
+        ends = []
+        for name in pair:
+            if name in robots:
+                ends.append(_antenna(robots[name], t))
+            else:
+                one = fixed[name]
+                ends.append(np.tile(np.array((one.x, one.y, one.height)), (len(t), 1)))
+        distance = np.sqrt(np.sum(np.square(ends[0] - ends[1]), 1))
+        known = np.isfinite(distance)
+        if np.count_nonzero(known) >= FEWEST:
+            found[pair] = PairErrors(t[known], measured[known], (measured - distance)[known])
+    return found
+
+
+def _antenna(robot: RecordedRobot, t: Numbers) -> Numbers:
+    """Return the true positions of the antenna at `t`; NaN where they are unknown; shape (N, 3)."""
+    truth = robot.truth
+    if truth is None:
+        return np.full((len(t), 3), np.nan)
+    forward, left, height = robot.antenna
+    heading = np.interp(t, truth.t, np.unwrap(truth.poses[:, 2]))
+    offset = (forward + 1j * left) * np.exp(1j * heading)
+    after = np.clip(np.searchsorted(truth.t, t), 1, len(truth.t) - 1)
+    unknown = (t < truth.t[0]) | (t > truth.t[-1]) | (truth.t[after] - truth.t[after - 1] > TRUTH_GAP_S)
+    x = np.interp(t, truth.t, truth.poses[:, 0]) + offset.real
+    y = np.interp(t, truth.t, truth.poses[:, 1]) + offset.imag
+    place = np.stack((x, y, np.full(len(t), height)), 1)
+    place[unknown] = np.nan
+    return place
+
+
+def range_calibration(errors: Mapping[tuple[str, str], PairErrors], source: str) -> RangeCalibration:
+    """Return a line through the errors of each pair, with one slope for all, and what is off the lines."""
+    names = list(errors)
+    count = len(names)
+    which = np.concatenate([np.full(len(errors[name].t), i, np.intp) for i, name in enumerate(names)])
+    measured = np.concatenate([errors[name].measured for name in names])
+    error = np.concatenate([errors[name].error for name in names])
+    repeated = np.array([_repeated(errors[name].t) for name in names])
+    good = np.ones(len(error), bool)
+    variance = np.ones(count)
+    for step in range(ROUNDS):
+        design = _Design(which, measured, np.where(good, 1.0, 0.0) / (variance * repeated)[which])
+        found, covariance = design.solve(error, count)
+        off = error - found[which] - found[-1] * measured
+        variance = np.square([_robust_sigma(off[which == i]) for i in range(count)])
+        before, good = good, np.square(off) <= OUTLIER_SIGMAS**2 * variance[which]
+        if step and np.array_equal(before, good):
+            break
+    pairs = {}
+    for i, name in enumerate(names):
+        own = which == i
+        inliers = own & good
+        pairs[name] = RadioErrors(
+            int(np.count_nonzero(own)),
+            float(found[i]),
+            math.sqrt(covariance[i, i]),
+            _own_scale(measured[inliers], error[inliers]),
+            float(np.std(off[inliers])),
+            _slow_sigma(errors[name].t[good[own]], off[inliers]),
+            1.0 - float(np.count_nonzero(inliers)) / float(np.count_nonzero(own)),
+        )
+    return RangeCalibration(pairs, float(found[-1]), math.sqrt(covariance[-1, -1]), source)
+
+
+def _repeated(t: Numbers) -> float:
+    """Return the number of ranges in a second in which there are some: together they tell as much as one."""
+    return len(t) / len(np.unique(np.floor(t / SLOW_LAG_S)))
+
+
+class _Design(NamedTuple):
+    """The linear model of all errors: a bias for each pair, and a common scale."""
+
+    which: Places
+    measured: Numbers
+    weight: Numbers
+    """The inverse variance (1 / m^2) of each error; 0 for outliers."""
+
+    def solve(self, error: Numbers, count: int) -> tuple[Numbers, Numbers]:
+        """Return the bias (m) of each pair and the scale, (count + 1,), and their covariance."""
+        design = np.zeros((len(error), count + 1))
+        design[np.arange(len(error)), self.which] = 1.0
+        design[:, -1] = self.measured
+        information = design.T @ (self.weight[:, None] * design)
+        information[-1, -1] += 1.0 / SCALE_PRIOR**2
+        covariance = np.asarray(np.linalg.inv(information), np.float64)
+        return covariance @ (design.T @ (self.weight * error)), covariance
+
+
+SCALE_PRIOR = 0.05
+"""The prior of the common scale: ranges of one length do not tell it from a bias."""
+
+
+def _robust_sigma(off: Numbers) -> float:
+    """Return the standard deviation by the median of the absolute values, in m."""
+    return max(float(np.median(np.abs(off - np.median(off)))) / MEDIAN, LEAST_SIGMA)
+
+
+LEAST_SIGMA = 1e-4
+"""The least sigma of ranges in m."""
+
+
+def _own_scale(measured: Numbers, error: Numbers) -> float | None:
+    if np.std(measured) < LEVER:
+        return None
+    return float(np.polyfit(measured, error, 1)[0])
+
+
+def _slow_sigma(t: Numbers, off: Numbers) -> float:
+    """Return the sigma (m) of what errors a second apart have in common; 0 if that is not known."""
+    after = np.searchsorted(t, t + SLOW_LAG_S)
+    inside = after < len(t)
+    first, second = np.flatnonzero(inside), after[inside]
+    near = np.abs(t[second] - t[first] - SLOW_LAG_S) <= LAG_SHARE * SLOW_LAG_S
+    if np.count_nonzero(near) < FEWEST:
+        return 0.0
+    centred = off - np.mean(off)
+    common = float(np.mean(centred[first[near]] * centred[second[near]])) * math.exp(SLOW_LAG_S / SLOW_TIME_S)
+    return math.sqrt(min(max(common, 0.0), MOST_SLOW * float(np.var(off))))
+
+
+MOST_SLOW = 0.8
+"""The largest part of the variance that is slow."""

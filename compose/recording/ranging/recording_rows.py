@@ -1,0 +1,295 @@
+"""The rows of a range recording, as its files state them, and the checks that turn rows into a recording."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable
+from typing import Annotated, Any, NamedTuple, TypeVar
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from compose.errors import BadRecording
+from compose.recording.ranging.range_recording import (
+    SAME_TIME_S,
+    FixedAnchor,
+    RangeRecording,
+    RangeSeries,
+    RecordedRobot,
+    RobotOdometry,
+    TruePath,
+    locked,
+)
+from protocol.units import Angle, Coordinate, Range, RobotId
+
+Stamp = Annotated[float, Meta(ge=-1e12, le=1e12)]
+"""A time in s, on a clock that all robots and radios of a recording share."""
+StatedSigma = Annotated[float, Meta(gt=0.0, le=1e4)]
+"""A standard deviation that a file states, in m or rad."""
+
+
+class SourcePlace(NamedTuple):
+    """The place of a row, for errors."""
+
+    path: object
+    number: int
+    kind: str = "line"
+
+    def __str__(self) -> str:
+        return f"{self.path}, {self.kind} {self.number}"
+
+
+class Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The base class of all rows."""
+
+
+class OdometryRow(Row, frozen=True):
+    """The motion of a robot over one interval: its pose at the end in the frame of its pose at the start."""
+
+    robot: RobotId
+    """The robot."""
+    t0: Stamp
+    """The start of the interval in s."""
+    t1: Stamp
+    """The end of the interval in s, not before its start."""
+    dx: Coordinate
+    """The motion forward in m."""
+    dy: Coordinate
+    """The motion to the left in m: lateral slip, and the sideways part of an arc."""
+    dheading: Angle
+    """The turn in rad, counter-clockwise."""
+    sigma_dx: StatedSigma | None = None
+    """The standard deviation of `dx` in m; all three or none."""
+    sigma_dy: StatedSigma | None = None
+    """The standard deviation of `dy` in m."""
+    sigma_dheading: StatedSigma | None = None
+    """The standard deviation of `dheading` in rad."""
+
+
+class RangeRow(Row, frozen=True):
+    """A measured range between two radios."""
+
+    t: Stamp
+    """The time of the measurement in s."""
+    first: RobotId = msgspec.field(name="from")
+    """The robot that ranged, or an anchor."""
+    second: RobotId = msgspec.field(name="to")
+    """The other robot or the anchor. At least one of the two is a robot."""
+    range: Range
+    """The measured distance in m."""
+    sigma: StatedSigma | None = None
+    """The standard deviation in m."""
+
+
+class AnchorRow(Row, frozen=True):
+    """An anchor at a known position."""
+
+    anchor: RobotId
+    """The name of the anchor."""
+    x: Coordinate
+    """The x coordinate in m."""
+    y: Coordinate
+    """The y coordinate in m."""
+    height: Coordinate = 0.0
+    """The height in m, above the same level as those of the robots' radios."""
+
+
+class AntennaRow(Row, frozen=True):
+    """The position of a robot's radio on the robot."""
+
+    robot: RobotId
+    """The robot."""
+    forward: Coordinate
+    """The distance in m by which it is in front of the robot's centre."""
+    left: Coordinate
+    """The distance in m by which it is to the left of the robot's centre."""
+    height: Coordinate = 0.0
+    """The height in m."""
+
+
+class TruePoseRow(Row, frozen=True):
+    """The true pose of a robot's centre."""
+
+    robot: RobotId
+    """The robot."""
+    t: Stamp
+    """The time in s."""
+    x: Coordinate
+    """The x coordinate in m."""
+    y: Coordinate
+    """The y coordinate in m."""
+    heading: Angle
+    """The heading in rad, counter-clockwise from the x-axis."""
+
+
+AnyRow = OdometryRow | RangeRow | AnchorRow | AntennaRow | TruePoseRow
+RowKind = TypeVar("RowKind", bound=Row)
+Covariance6 = tuple[float, float, float, float, float, float]
+"""The upper triangle of a covariance of (dx, dy, dheading), row by row."""
+UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+"""The place in a Covariance6 of each element of the matrix."""
+
+
+def row_of(values: Any, kind: type[RowKind], place: object) -> RowKind:
+    """Return the row with `values`, texts or numbers by field. Raises BadRecording, which names `place`."""
+    try:
+        return msgspec.convert(values, kind, strict=False)
+    except msgspec.ValidationError as error:
+        raise BadRecording(f"{place}: {wrong_field(error, values)}") from None
+
+
+def wrong_field(error: msgspec.ValidationError, values: object = None) -> str:
+    """Return the message of an error for a user: the field of `values`, and what is wrong with it."""
+    found = re.fullmatch(r"(?P<what>.*) - at `\$\.?(?P<field>.*)`", str(error), re.DOTALL)
+    what, field = (found["what"], found["field"]) if found else (str(error), "")
+    if isinstance(values, dict) and field in values:
+        expected = re.sub(r", got .*", "", what) + f", got {str(values[field])[:40]!a}"
+        what = re.sub(r"`str` matching regex '[^']*'", "a name of letters, digits, - and _", expected)
+    what = what.replace("Object ", "").replace("`float | null`", "a number").replace("`float`", "a number")
+    what = what[:1].lower() + what[1:].replace("`", "'")
+    return f"{field}: {what}" if field else what
+
+
+class RecordingBuilder:
+    """A range recording that is being read, row by row. Its errors are BadRecording and name the row."""
+
+    def __init__(self, source: object, anchors: Iterable[AnchorRow] = ()) -> None:
+        """Begin the recording in `source`. `anchors` replace those of the same names there."""
+        self.source = str(source)
+        self.unused: Counter[str] = Counter()
+        """The number of entries that are not used, by kind."""
+        self._odometry: dict[str, list[tuple[OdometryRow, Covariance6 | None]]] = {}
+        self._truth: dict[str, list[TruePoseRow]] = {}
+        self._given = {row.anchor: row for row in anchors}
+        self._anchors: dict[str, AnchorRow] = {}
+        self._antennas: dict[str, AntennaRow] = {}
+        self._ranges: list[tuple[RangeRow, object]] = []
+        self._last_range: dict[frozenset[str], float] = {}
+        self._claims: list[tuple[str, object]] = []
+
+    def add(self, row: AnyRow, place: object) -> None:
+        """Add the row at `place`. Raises BadRecording if it contradicts an earlier row."""
+        match row:
+            case OdometryRow():
+                sigmas = (row.sigma_dx, row.sigma_dy, row.sigma_dheading)
+                stated = [sigma for sigma in sigmas if sigma is not None]
+                if len(stated) not in (0, 3):
+                    raise BadRecording(
+                        f"{place}: it needs all of sigma_dx, sigma_dy, sigma_dheading, or none"
+                    )
+                self.add_odometry(row, _diagonal(*stated) if stated else None, place)
+            case RangeRow():
+                self._add_range(row, place)
+            case AnchorRow():
+                if row.anchor in self._anchors:
+                    raise BadRecording(f"{place}: there are two anchors {row.anchor}")
+                self._anchors[row.anchor] = self._given.get(row.anchor, row)
+            case AntennaRow():
+                if row.robot in self._antennas:
+                    raise BadRecording(f"{place}: there are two antennas of {row.robot}")
+                self._antennas[row.robot] = row
+                self._claims.append((row.robot, place))
+            case TruePoseRow():
+                path = self._truth.setdefault(row.robot, [])
+                if path and row.t < path[-1].t:
+                    before = f"the true pose before it is of {path[-1].t:.15g} s"
+                    raise BadRecording(f"{place}: t: it is of {row.t:.15g} s, and {before}")
+                path.append(row)
+                self._claims.append((row.robot, place))
+
+    def add_robot(self, robot: str) -> None:
+        """Add a robot, which may have no odometry."""
+        self._odometry.setdefault(robot, [])
+
+    def add_odometry(self, row: OdometryRow, covariance: Covariance6 | None, place: object) -> None:
+        """Add an increment with its covariance. Raises BadRecording if it overlaps the one before."""
+        if row.t1 < row.t0:
+            raise BadRecording(f"{place}: t1: {row.t1:.15g} s is before t0, {row.t0:.15g} s")
+        path = self._odometry.setdefault(row.robot, [])
+        if path and row.t0 < path[-1][0].t1 - SAME_TIME_S:
+            end = f"the increment of {row.robot} before it ends at {path[-1][0].t1:.15g} s"
+            raise BadRecording(f"{place}: t0: it starts at {row.t0:.15g} s, and {end}")
+        path.append((row, covariance))
+
+    def _add_range(self, row: RangeRow, place: object) -> None:
+        if row.first == row.second:
+            raise BadRecording(f"{place}: it is a range from {row.first} to itself")
+        pair = frozenset((row.first, row.second))
+        last = self._last_range.get(pair)
+        if last is not None and row.t < last:
+            before = f"the range between {row.first} and {row.second} before it is of {last:.15g} s"
+            raise BadRecording(f"{place}: t: it is of {row.t:.15g} s, and {before}")
+        self._last_range[pair] = row.t
+        self._ranges.append((row, place))
+
+    def recording(self) -> RangeRecording:
+        """Return the recording. Raises BadRecording if a name is unknown, or if there is no odometry."""
+        if not self._odometry:
+            raise BadRecording(f"{self.source}: there is no odometry")
+        for robot, place in self._claims:
+            if robot not in self._odometry:
+                raise BadRecording(f"{place}: robot: {robot} has no odometry")
+        self._anchors |= self._given
+        for anchor in self._anchors:
+            if anchor in self._odometry:
+                raise BadRecording(f"{self.source}: {anchor} is a robot and an anchor")
+        robots = tuple([self._robot(name) for name in self._odometry])
+        anchors = tuple([FixedAnchor(one.anchor, one.x, one.y, one.height) for one in self._anchors.values()])
+        return RangeRecording(self.source, robots, anchors, self._range_series(), dict(self.unused))
+
+    def _robot(self, name: str) -> RecordedRobot:
+        rows = self._odometry[name]
+        antenna = self._antennas.get(name)
+        truth = self._truth.get(name)
+        return RecordedRobot(
+            name,
+            RobotOdometry(
+                _column([row.t0 for row, _ in rows]),
+                _column([row.t1 for row, _ in rows]),
+                _table([(row.dx, row.dy, row.dheading) for row, _ in rows], 3),
+                locked(_table([stated or UNSTATED for _, stated in rows], 6)[:, UPPER]),
+            ),
+            TruePath(
+                _column([row.t for row in truth]), _table([(row.x, row.y, row.heading) for row in truth], 3)
+            )
+            if truth
+            else None,
+            (antenna.forward, antenna.left, antenna.height) if antenna is not None else (0.0, 0.0, 0.0),
+        )
+
+    def _range_series(self) -> RangeSeries:
+        radios = {name: i for i, name in enumerate([*self._odometry, *self._anchors])}
+        robots = len(self._odometry)
+        ends = np.empty((len(self._ranges), 2), np.intp)
+        for i, (row, place) in enumerate(self._ranges):
+            for name in (row.first, row.second):
+                if name not in radios:
+                    raise BadRecording(f"{place}: {name} is neither a robot with odometry nor a known anchor")
+            ends[i] = radios[row.first], radios[row.second]
+            if min(ends[i]) >= robots:
+                raise BadRecording(f"{place}: {row.first} and {row.second} are both anchors")
+            if ends[i, 0] >= robots:
+                ends[i] = ends[i, ::-1]
+        times = np.array([row.t for row, _ in self._ranges])
+        sigmas = [row.sigma if row.sigma is not None else np.nan for row, _ in self._ranges]
+        unsorted = RangeSeries(
+            times, ends[:, 0], ends[:, 1], np.array([row.range for row, _ in self._ranges]), np.array(sigmas)
+        )
+        return unsorted.rows(np.argsort(times, kind="stable"))
+
+
+UNSTATED = (np.nan,) * 6
+
+
+def _diagonal(dx: float, dy: float, dheading: float) -> Covariance6:
+    return (dx**2, 0.0, 0.0, dy**2, 0.0, dheading**2)
+
+
+def _column(values: list[float]) -> Any:
+    return locked(np.array(values, float))
+
+
+def _table(rows: list[Any], columns: int) -> Any:
+    return locked(np.array(rows, float).reshape(-1, columns))

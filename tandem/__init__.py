@@ -1,0 +1,105 @@
+"""The Python API: run missions and sweeps, and read recordings, as numpy arrays and tables.
+
+>>> import tandem
+>>> run = tandem.run("paper-1")
+>>> run.outcome, run.ticks
+('localised', 48)
+>>> run.truth["x"].shape  # one row per tick and robot
+(98,)
+
+Errors in arguments are `UserError`; their text is the line that the command `tandem` prints. Nothing is
+imported before it is used.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from tandem.clash import ModuleClash, check
+
+if TYPE_CHECKING:
+    from compose.audit.findings import Findings, Violation
+    from compose.errors import (
+        BadFault,
+        BadKill,
+        BadScenario,
+        BadSpec,
+        NoSuchField,
+        NotToml,
+        Unworkable,
+        UserError,
+    )
+    from compose.launch.supervisor import ChildFailed
+    from tandem.columns import Table
+    from tandem.missions import run
+    from tandem.results import Run
+    from tandem.results import open_recording as open  # noqa: A004  # used as tandem.open
+    from tandem.scenarios import Scenario
+    from tandem.sweeps import SweepIncomplete, SweepResults, sweep
+
+__all__ = [
+    "BadFault",
+    "BadKill",
+    "BadScenario",
+    "BadSpec",
+    "ChildFailed",
+    "Findings",
+    "ModuleClash",
+    "NoSuchField",
+    "NotToml",
+    "Run",
+    "Scenario",
+    "SweepIncomplete",
+    "SweepResults",
+    "Table",
+    "Unworkable",
+    "UserError",
+    "Violation",
+    "open",
+    "run",
+    "sweep",
+]
+
+_PLACES = {
+    "run": "tandem.missions:run",
+    "open": "tandem.results:open_recording",
+    "sweep": "tandem.sweeps:sweep",
+    "Run": "tandem.results:Run",
+    "Scenario": "tandem.scenarios:Scenario",
+    "SweepIncomplete": "tandem.sweeps:SweepIncomplete",
+    "SweepResults": "tandem.sweeps:SweepResults",
+    "Table": "tandem.columns:Table",
+    "Findings": "compose.audit.findings:Findings",
+    "Violation": "compose.audit.findings:Violation",
+    "ChildFailed": "compose.launch.supervisor:ChildFailed",
+    **{
+        error: f"compose.errors:{error}"
+        for error in (
+            "BadFault",
+            "BadKill",
+            "BadScenario",
+            "BadSpec",
+            "NoSuchField",
+            "NotToml",
+            "Unworkable",
+            "UserError",
+        )
+    },
+}
+"""The module and the name there of each public name that is imported when it is first used."""
+
+
+def __getattr__(name: str) -> Any:
+    """Import and return a public name. Raises ModuleClash, and AttributeError if there is no such name."""
+    if name not in _PLACES:
+        raise AttributeError(f"module 'tandem' has no attribute '{name}'")
+    check()
+    module, _, there = _PLACES[name].partition(":")
+    value = getattr(import_module(module), there)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,68 @@
+"""The names with which planners are written: the contract, its messages, and the shipped planners.
+
+>>> from tandem.planning import Paper
+>>> import tandem
+>>> tandem.run("paper-1", planner=Paper).outcome
+'localised'
+"""
+
+from __future__ import annotations
+
+from agent.estimation.gaussian.inference import PlanningHypothesis
+from agent.planning.accuracy_seeking import AccuracySeeking
+from agent.planning.assured import AssuredExact
+from agent.planning.log_exchange import LogPlanner
+from agent.planning.paper import Paper
+from agent.planning.phase3_last_manoeuvre import Plan, Question
+from agent.planning.planner import Planner, Summary
+from agent.planning.state import RobotState
+from protocol.messages import (
+    MAX_BODY_BYTES,
+    Command,
+    Contact,
+    Estimate,
+    Inconsistent,
+    Localised,
+    Observation,
+    Report,
+    RobotConfig,
+    Undecided,
+)
+from protocol.mission import Anchor, Mission
+from protocol.motion import REST, Controls, Covariance, Pose, compose, inverse, step, wrap
+from protocol.orbits import Orbit, Rendezvous
+
+__all__ = [
+    "MAX_BODY_BYTES",
+    "REST",
+    "AccuracySeeking",
+    "Anchor",
+    "AssuredExact",
+    "Command",
+    "Contact",
+    "Controls",
+    "Covariance",
+    "Estimate",
+    "Inconsistent",
+    "Localised",
+    "LogPlanner",
+    "Mission",
+    "Observation",
+    "Orbit",
+    "Paper",
+    "Plan",
+    "Planner",
+    "PlanningHypothesis",
+    "Pose",
+    "Question",
+    "Rendezvous",
+    "Report",
+    "RobotConfig",
+    "RobotState",
+    "Summary",
+    "Undecided",
+    "compose",
+    "inverse",
+    "step",
+    "wrap",
+]

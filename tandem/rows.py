@@ -1,0 +1,270 @@
+"""The rows of a run's tables. Poses are in the world frame unless stated."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import msgspec
+
+from compose.recording import run as recorded
+from compose.recording.claim import Claim, nees
+from compose.recording.frames import in_time
+from protocol.messages import Estimate
+from protocol.motion import Pose, wrap
+from world.referee import errors
+
+
+class TruthRow(msgspec.Struct, frozen=True):
+    """The true pose of one robot in one tick."""
+
+    tick: int
+    """The tick k."""
+    time_s: float
+    """The simulated time k T_s in s."""
+    robot: str
+    """The robot's name."""
+    x: float
+    """True x in m."""
+    y: float
+    """True y in m."""
+    heading: float
+    """True heading in rad, in (-pi, pi]."""
+
+
+class ObservationRow(msgspec.Struct, frozen=True):
+    """The measurements of one robot in one tick."""
+
+    tick: int
+    """The tick k."""
+    time_s: float
+    """The simulated time k T_s in s."""
+    robot: str
+    """The robot's name."""
+    v: float | None
+    """The odometry over the tick before: speed in m/s; missing in tick 0."""
+    omega: float | None
+    """The odometry over the tick before: turn rate in rad/s; missing in tick 0."""
+    anchor_range: float | None
+    """The range to the robot's anchor in m; missing without one."""
+    contact: bool
+    """True if the peer is within sensing range."""
+    mutual_range: float | None
+    """The range to the peer in m; missing without one."""
+
+
+class CommandRow(msgspec.Struct, frozen=True):
+    """The Command of one robot in one tick. A Command that was late has no row."""
+
+    tick: int
+    """The tick k."""
+    time_s: float
+    """The simulated time k T_s in s."""
+    robot: str
+    """The robot's name."""
+    v: float
+    """The commanded speed in m/s until the next tick."""
+    omega: float
+    """The commanded turn rate in rad/s until the next tick."""
+    phase: int
+    """The paper's phase, 1 to 3."""
+    state: str
+    """The state of the planner."""
+    verdict: str | None
+    """The final result: `localised`, `undecided` or `inconsistent`; missing until there is one."""
+
+
+class EstimateRow(msgspec.Struct, frozen=True):
+    """One hypothesis about the pose of one robot in one tick; a tick has as many rows as hypotheses."""
+
+    tick: int
+    """The tick k."""
+    time_s: float
+    """The simulated time k T_s in s."""
+    robot: str
+    """The robot's name."""
+    frame: str
+    """The frame of the pose: `world`, or `local`, the anchor frame, while its direction is unknown."""
+    hypothesis: int
+    """The number of the hypothesis, from 0; with probabilities, the most probable first."""
+    localised: bool
+    """True if the robot claims its pose."""
+    x: float
+    """Estimated x in m."""
+    y: float
+    """Estimated y in m."""
+    heading: float
+    """Estimated heading in rad, in (-pi, pi]."""
+    probability: float | None
+    """The probability of the hypothesis; missing with exact sensors."""
+    position_sigma_m: float | None
+    """The square root of the trace of the position covariance in m, of hypothesis 0 under noise."""
+    heading_sigma_rad: float | None
+    """The standard deviation of the heading in rad, likewise."""
+    position_error_m: float | None
+    """The distance from the true position in m; missing in the local frame and without ground truth."""
+    heading_error_rad: float | None
+    """The absolute error of the heading in rad, likewise."""
+    nees: float | None
+    """The normalised estimation error squared, of hypothesis 0 under noise, likewise."""
+
+
+class MessageRow(msgspec.Struct, frozen=True):
+    """One journaled frame."""
+
+    journal: str
+    """The file name of the journal."""
+    place: int
+    """The number of frames before it in the journal."""
+    tick: int
+    """The tick in which it was journaled."""
+    kind: str
+    """The kind of message, such as `report`."""
+    bytes: int
+    """The size of the frame in bytes."""
+    message: str
+    """The message as JSON."""
+
+
+class ClaimRow(msgspec.Struct, frozen=True):
+    """The result of one robot."""
+
+    robot: str
+    """The robot's name."""
+    localised: bool
+    """True if the robot claimed its pose."""
+    tick: int | None
+    """The tick of the claim; all columns from here to `nees` are missing without a claim."""
+    x: float | None
+    """Claimed x in m."""
+    y: float | None
+    """Claimed y in m."""
+    heading: float | None
+    """Claimed heading in rad, in (-pi, pi]."""
+    position_error_m: float | None
+    """The distance from the true position in m."""
+    heading_error_rad: float | None
+    """The absolute error of the heading in rad."""
+    position_sigma_m: float | None
+    """The claimed standard deviation of the position in m; missing with exact sensors."""
+    heading_sigma_rad: float | None
+    """The claimed standard deviation of the heading in rad; missing with exact sensors."""
+    nees: float | None
+    """The normalised estimation error squared; missing with exact sensors."""
+    anchor_ranges: int | None
+    """The number of ranges to the anchor; this and all below are missing if the robot sent no FinalReport."""
+    mutual_ranges: int | None
+    """The number of ranges to the peer."""
+    reports_sent: int | None
+    """The number of reports sent."""
+    reports_heard: int | None
+    """The number of reports received and used."""
+    bytes_sent: int | None
+    """The size of all reports sent in bytes."""
+
+
+def truth_rows(run: recorded.Run, period: float) -> Iterator[TruthRow]:
+    """Yield the true poses by tick; `period` is T_s in s. There are none in hardware mode."""
+    paths = {robot: run.truth(robot) for robot in run.robots}
+    for tick in range(run.length if run.world is not None else 0):
+        for robot, path in paths.items():
+            pose = path[tick]
+            yield TruthRow(tick, tick * period, robot, pose.x, pose.y, wrap(pose.heading))
+
+
+def observation_rows(run: recorded.Run, period: float) -> Iterator[ObservationRow]:
+    """Yield the measurements by tick; `period` is T_s in s."""
+    for tick, observations in enumerate(run.observations[: run.length]):
+        for robot, one in observations.items():
+            contact = next(iter(one.contacts), None)
+            yield ObservationRow(
+                tick,
+                tick * period,
+                robot,
+                one.executed.v if one.executed is not None else None,
+                one.executed.omega if one.executed is not None else None,
+                one.anchor_range,
+                contact is not None,
+                contact.range if contact is not None else None,
+            )
+
+
+def command_rows(run: recorded.Run, period: float) -> Iterator[CommandRow]:
+    """Yield the Commands by tick; `period` is T_s in s."""
+    for tick in range(run.length):
+        for robot in run.robots:
+            one = run.command(robot, tick)
+            if one is not None:
+                verdict = str(one.verdict.__struct_config__.tag) if one.verdict is not None else None
+                yield CommandRow(tick, tick * period, robot, one.v, one.omega, one.phase, one.state, verdict)
+
+
+def estimate_rows(run: recorded.Run, period: float) -> Iterator[EstimateRow]:
+    """Yield the estimates in the agents' journals by tick; `period` is T_s in s."""
+    paths = {robot: run.truth(robot) for robot in run.agents}
+    found = [one for agent in run.agents.values() for one in agent.estimates]
+    for one in sorted(found, key=lambda one: one.tick):
+        path = paths[one.robot]
+        yield from _hypotheses(one, path[one.tick] if one.tick < len(path) else None, period)
+
+
+def _hypotheses(one: Estimate, truth: Pose | None, period: float) -> Iterator[EstimateRow]:
+    for place, pose in enumerate(one.world or one.local):
+        covariance = one.covariance if one.world and not place else None
+        position, heading = errors(pose, truth) if one.world and truth is not None else (None, None)
+        yield EstimateRow(
+            one.tick,
+            one.tick * period,
+            one.robot,
+            "world" if one.world else "local",
+            place,
+            one.localised,
+            pose.x,
+            pose.y,
+            wrap(pose.heading),
+            one.probabilities[place] if one.probabilities else None,
+            covariance.position_sigma if covariance is not None else None,
+            covariance.heading_sigma if covariance is not None else None,
+            position,
+            heading,
+            nees(pose, truth, covariance) if covariance is not None and truth is not None else None,
+        )
+
+
+def message_rows(run: recorded.Run) -> Iterator[MessageRow]:
+    """Yield the frames of all journals, by tick."""
+    for one in in_time(run):
+        yield MessageRow(one.journal, one.place, one.tick, one.kind, len(one.frame), one.json)
+
+
+def claim_rows(run: recorded.Run) -> Iterator[ClaimRow]:
+    """Yield the result of each robot."""
+    for robot in run.robots:
+        claim, counts = _claim(run, robot), run.final_reports.get(robot)
+        covariance = claim.covariance if claim is not None else None
+        yield ClaimRow(
+            robot=robot,
+            localised=claim is not None,
+            tick=claim.tick if claim is not None else None,
+            x=claim.pose.x if claim is not None else None,
+            y=claim.pose.y if claim is not None else None,
+            heading=wrap(claim.pose.heading) if claim is not None else None,
+            position_error_m=claim.position_error if claim is not None else None,
+            heading_error_rad=claim.heading_error if claim is not None else None,
+            position_sigma_m=covariance.position_sigma if covariance is not None else None,
+            heading_sigma_rad=covariance.heading_sigma if covariance is not None else None,
+            nees=claim.nees if claim is not None else None,
+            **{name: getattr(counts, name, None) for name in _COUNTS},
+        )
+
+
+_COUNTS = ("anchor_ranges", "mutual_ranges", "reports_sent", "reports_heard", "bytes_sent")
+"""The columns of a ClaimRow that a FinalReport has."""
+
+
+def _claim(run: recorded.Run, robot: str) -> Claim | None:
+    """Return the first claim of `robot`; in hardware mode, its errors are NaN."""
+    if run.world is not None or robot not in run.agents or (found := run.agents[robot].claim) is None:
+        return run.claim(robot)
+    tick, verdict = found
+    return Claim(tick, verdict.pose, verdict.covariance, math.nan, math.nan, None)

@@ -1,0 +1,174 @@
+"""One robot finds its pose by ranges to several anchors, and says when they leave two possibilities."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from agent.estimation.gaussian.known_anchors import chi2_p_value
+from agent.estimation.gaussian.range_model import Ranges, predicted
+from compose.errors import UserError
+from compose.recording.estimating.anchored_estimate import AnchoredMeasurements
+from compose.recording.estimating.calibration import calibrated
+from compose.recording.estimating.estimate_epoch import ClaimRule
+from compose.recording.estimating.estimate_files import estimate_csv
+from compose.recording.estimating.estimate_run import RecordingEstimate, estimated, measurements
+from compose.recording.ranging.range_recording import (
+    FixedAnchor,
+    Numbers,
+    RangeRecording,
+    RangeSeries,
+    RecordedRobot,
+    RobotOdometry,
+    TruePath,
+)
+from compose.recording.ranging.range_steps import relative
+from tests.test_estimate import NEES_99_9
+
+ANCHORS = (
+    FixedAnchor("M0", 1.0, -2.0),
+    FixedAnchor("M1", 9.0, 0.0),
+    FixedAnchor("M2", 3.0, 8.0),
+    FixedAnchor("M3", 8.0, 7.0, 2.0),
+)
+STEP_S, STEPS = 0.1, 400
+
+
+def driven(
+    anchors: tuple[FixedAnchor, ...] = ANCHORS,
+    *,
+    turn_rate: float = 0.4,
+    sigma: float = 0.0,
+    scale: float = 0.0,
+    seed: int = 1,
+) -> RangeRecording:
+    """Return a recording of one robot for 40 s, whose turns alternate, with a range every 0.25 s.
+
+    The ranges have errors of `sigma` (m), and are longer by `scale`.
+    """
+    draws = np.random.default_rng(seed)
+    t = STEP_S * np.arange(STEPS + 1.0)
+    turn = turn_rate * STEP_S * np.sign(np.sin(0.3 * t[:-1] + 0.4))
+    heading = 0.5 + np.concatenate(([0.0], np.cumsum(turn)))
+    moved = 0.3 * STEP_S * np.exp(1j * (heading[:-1] + 0.5 * turn)) * np.sinc(0.5 * turn / math.pi)
+    place = 4.0 + 3.0j + np.concatenate(([0.0], np.cumsum(moved)))
+    poses = np.stack((place.real, place.imag, heading), 1)
+    increments = relative(poses[:-1], poses[1:])
+    covariance = np.tile(np.diag([1e-6, 1e-6, 1e-6]), (STEPS, 1, 1))
+    robot = RecordedRobot("A", RobotOdometry(t[:-1], t[1:], increments, covariance), TruePath(t, poses))
+    at = np.arange(0.05, 40.0, 0.25)
+    x, y = (np.interp(at, t, poses[:, axis]) for axis in (0, 1))
+    which = np.arange(len(at)) % len(anchors)
+    apart = np.array([(one.x, one.y, one.height) for one in anchors])[which]
+    true: Numbers = np.sqrt((x - apart[:, 0]) ** 2 + (y - apart[:, 1]) ** 2 + apart[:, 2] ** 2)
+    measured = true * (1.0 + scale) + sigma * draws.standard_normal(len(at))
+    series = RangeSeries(at, np.zeros(len(at), np.intp), 1 + which, measured, np.full(len(at), np.nan))
+    return RangeRecording("driven", (robot,), anchors, series)
+
+
+def estimate_of(recording: RangeRecording, noise: str = "uwb-calibrated") -> RecordingEstimate:
+    return estimated(measurements(recording, None, noise, None), ClaimRule(0.2))
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_a_robot_claims_its_pose_by_ranges_to_several_anchors(count: int) -> None:
+    found = estimate_of(driven(ANCHORS[:count], sigma=0.05))
+    (robot,) = found.summary.robots.values()
+    assert sorted(robot.anchors) == [one.id for one in ANCHORS[:count]]
+    assert robot.first_claim is not None
+    assert robot.first_claim.t_s < 25.0
+    claimed = [row for row in found.rows if row.claim]
+    assert all(row.nees is not None and row.nees < NEES_99_9 for row in claimed)
+    assert claimed[-1].position_error_m is not None
+    assert claimed[-1].position_error_m < 0.15
+
+
+def test_covariances_of_many_recordings_are_right() -> None:
+    nees = []
+    for seed in range(12):
+        last = estimate_of(driven(sigma=0.05, seed=seed)).rows[-1]
+        assert last.nees is not None
+        nees.append(last.nees)
+    assert 0.5 < np.mean(nees) < 5.0
+
+
+def test_a_scale_of_all_ranges_is_learned() -> None:
+    found = estimate_of(driven(scale=0.07, sigma=0.03), "uwb")
+    assert found.summary.calibration is not None
+    scale = found.summary.calibration.range_scale
+    assert scale is not None
+    bias = found.summary.calibration.range_bias_m
+    assert bias is not None
+    explained = scale.value * 5.0 + bias.value  # ranges are 3 to 7 m long
+    assert explained == pytest.approx(0.07 * 5.0, abs=0.12)
+    assert found.rows[-1].nees is not None
+    assert found.rows[-1].nees < NEES_99_9
+
+
+def test_a_straight_way_leaves_the_mirror_image_at_two_anchors() -> None:
+    found = estimate_of(driven(ANCHORS[:2], turn_rate=0.0))
+    last = found.rows[-1]
+    assert last.hypotheses == 2
+    assert 0.3 < last.probability < 0.7
+    assert not any(row.claim for row in found.rows)
+    assert "the most probable of 2 hypotheses has probability" in found.summary.blocking_reason
+
+
+def test_one_place_is_not_enough() -> None:
+    twice = (ANCHORS[0], ANCHORS[0]._replace(id="M9"))
+    with pytest.raises(UserError, match=r"ranges to two anchors at different places: A has ranges to M0, M9"):
+        measurements(driven(twice), None, None, None)
+
+
+def test_equal_recordings_give_equal_estimates() -> None:
+    assert estimate_csv(estimate_of(driven()).rows) == estimate_csv(estimate_of(driven()).rows)
+
+
+def test_ranges_belong_to_their_anchor() -> None:
+    measured = measurements(driven(), None, "uwb-calibrated", None).measured
+    assert isinstance(measured, AnchoredMeasurements)
+    ranges = measured.ranges
+    assert ranges.radio is not None
+    assert ranges.place is not None
+    for k, anchor in enumerate(measured.anchors):
+        own = ranges.radio == k
+        np.testing.assert_array_equal(ranges.place[own, 0], anchor.x - measured.anchors[0].x)
+        np.testing.assert_array_equal(ranges.place[own, 1], anchor.y - measured.anchors[0].y)
+    assert [int(np.count_nonzero(own)) for own in ranges.pairs] == [
+        int(np.count_nonzero(ranges.radio == k)) for k in range(4)
+    ]
+
+
+def test_the_derivatives_of_ranges_to_several_anchors_are_right() -> None:
+    draws = np.random.default_rng(3)
+    place = draws.uniform(-5.0, 5.0, (6, 2))
+    ranges = Ranges(np.ones(6), np.arange(6), np.ones(6), (6, 0, 0), place, np.arange(6))
+    at = draws.uniform(-5.0, 5.0, (1, 2, 6))
+    guess = draws.uniform(-2.0, 2.0, 3)
+    model, small = predicted(guess, at, ranges, (0.0, 0.0)), 1e-6
+    for i in range(3):
+        step = small * np.eye(3)[i]
+        more = predicted(guess + step, at, ranges, (0.0, 0.0)).distance
+        less = predicted(guess - step, at, ranges, (0.0, 0.0)).distance
+        np.testing.assert_allclose((more - less) / (2.0 * small), model.jacobian[:, i], atol=1e-6)
+    for axis in range(2):
+        shift = np.zeros((1, 2, 1))
+        shift[0, axis] = small
+        more = predicted(guess, at + shift, ranges, (0.0, 0.0)).distance
+        less = predicted(guess, at - shift, ranges, (0.0, 0.0)).distance
+        np.testing.assert_allclose((more - less) / (2.0 * small), model.directions[0, axis], atol=1e-6)
+
+
+def test_the_radios_of_one_robot_are_calibrated_without_truth() -> None:
+    recording = driven(sigma=0.05)
+    found = calibrated(recording, None, None, by_fit=True)
+    assert found.source == "the fit"
+    assert {pair[1] for pair in found.pairs} == {one.id for one in ANCHORS}
+    assert all(0.02 < one.sigma < 0.1 for one in found.pairs.values())
+
+
+def test_the_p_value_of_a_chi_square_is_that_of_its_distribution() -> None:
+    assert chi2_p_value(18.307, 10) == pytest.approx(0.05, abs=1e-3)
+    assert chi2_p_value(3.940, 10) == pytest.approx(0.95, abs=3e-3)

@@ -1,0 +1,136 @@
+"""Errors of radios are measured by pair, against the truth or without it, and become a noise profile."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from compose.errors import USER_ERROR
+from compose.recording.estimating.calibration import calibrated
+from compose.recording.estimating.estimate_epoch import ClaimRule
+from compose.recording.estimating.estimate_run import estimated, measurements
+from compose.recording.estimating.noise_files import told_noise
+from compose.recording.estimating.noise_profile import correction_of, noise_table, profile_toml
+from compose.recording.ranging.range_files import read_ranges
+from compose.recording.ranging.range_recording import Numbers, RangeRecording
+from protocol.noise import Noise
+from tests.commands import tandem
+from tests.test_estimate import NEES_99_9, SAMPLE, with_ranges
+
+BIAS, MORE, SCALE, OUTLIERS = 0.35, 0.15, 0.05, 0.05
+"""The errors that are added to the sample: a bias (m), a further one of A and B, a scale, and outliers."""
+
+
+@pytest.fixture(scope="module")
+def sample() -> RangeRecording:
+    return read_ranges(SAMPLE)
+
+
+@pytest.fixture(scope="module")
+def raw(sample: RangeRecording) -> RangeRecording:
+    """Return the sample with the errors of radios that nobody has calibrated."""
+    draws = np.random.default_rng(5)
+    lengths: Numbers = (sample.ranges.range + BIAS) / (1.0 - SCALE)
+    lengths[sample.pairs()["A", "B"]] += MORE / (1.0 - SCALE)
+    stray = draws.random(len(lengths)) < OUTLIERS
+    return with_ranges(sample, lengths + stray * draws.uniform(0.5, 2.0, len(lengths)))
+
+
+def test_the_errors_of_each_pair_are_measured_against_the_truth(raw: RangeRecording) -> None:
+    found = calibrated(raw, None, None)
+    assert found.source == "the truth"
+    assert abs(found.scale - SCALE) < 4.0 * found.scale_sigma
+    assert found.scale_sigma < 0.01
+    for pair, one in found.pairs.items():
+        expected = BIAS + MORE if pair == ("A", "B") else BIAS
+        assert abs(one.bias - expected) < 4.0 * one.bias_sigma
+        assert one.bias_sigma < 0.05
+        assert 0.025 < one.sigma < 0.06
+        assert 0.5 * OUTLIERS < one.outliers < 2.0 * OUTLIERS
+
+
+def test_without_outliers_there_are_none(sample: RangeRecording) -> None:
+    found = calibrated(sample, None, None)
+    assert all(one.outliers < 0.01 for one in found.pairs.values())
+    assert all(abs(one.bias) < 0.03 for one in found.pairs.values())
+
+
+def test_slow_errors_are_told_from_white_ones(sample: RangeRecording) -> None:
+    def slow(lengths: Numbers) -> float:
+        return calibrated(with_ranges(sample, lengths), None, None).pairs["A", "B"].slow_sigma
+
+    wave = 0.1 * np.sin(2.0 * np.pi * sample.ranges.t / 9.0)
+    white = np.random.default_rng(1).normal(0.0, 0.1, len(sample.ranges.t))
+    assert slow(sample.ranges.range + wave) > 0.05
+    assert slow(sample.ranges.range + white) < 0.05
+
+
+def test_the_profile_makes_raw_ranges_as_good_as_calibrated_ones(raw: RangeRecording, tmp_path: Path) -> None:
+    found = calibrated(raw, None, None)
+    anchors = frozenset(one.id for one in raw.anchors)
+    text = profile_toml(noise_table(found, anchors), correction_of(found), "the truth of it")
+    (tmp_path / "radios.toml").write_text(text)
+    told = told_noise(str(tmp_path / "radios.toml"))
+    assert told.correction == correction_of(found)
+    assert told.noise == msgspec.convert(noise_table(found, anchors), Noise)
+    estimate = estimated(measurements(raw, ("A", "B"), str(tmp_path / "radios.toml"), None), ClaimRule())
+    for robot in estimate.summary.robots.values():
+        assert robot.first_claim is not None
+        assert robot.first_claim.nees is not None
+        assert robot.first_claim.nees < NEES_99_9
+        assert robot.first_claim.t_s - estimate.summary.begin_s <= 25.0
+
+
+def test_a_profile_of_other_radios_has_their_mean_bias_and_its_spread(raw: RangeRecording) -> None:
+    of_pairs = calibrated(raw, None, None)
+    correction, table = correction_of(of_pairs), noise_table(of_pairs, frozenset({"LC0", "LC1"}))
+    biases = [one.bias for one in of_pairs.pairs.values()]
+    assert correction.range_bias == pytest.approx(np.mean(biases), abs=1e-3)
+    assert table["pair_bias"] == pytest.approx(np.std(biases, ddof=1), abs=1e-3)
+    unknown = replace(correction, pairs={}).corrected(raw).ranges.range
+    np.testing.assert_allclose(
+        raw.ranges.range - unknown, correction.range_bias + correction.range_scale * raw.ranges.range
+    )
+
+
+def test_without_truth_the_fit_is_the_reference(sample: RangeRecording) -> None:
+    blind = sample._replace(robots=tuple([one._replace(truth=None) for one in sample.robots]))
+    found = calibrated(blind, None, None)
+    assert found.source == "the fit"
+    assert set(found.pairs) == {("A", "LC0"), ("B", "LC1"), ("A", "B")}
+    table = noise_table(found, frozenset({"LC0", "LC1"}))
+    for one in found.pairs.values():
+        assert 0.01 < one.sigma < 0.06
+        assert abs(one.bias) < 3.0 * np.hypot(table["range_bias"], one.bias_sigma)
+    assert found.bias_sigma > 0.1  # 30 s tell little of a bias that all ranges share
+
+
+def test_the_command_prints_a_table_and_writes_the_profile(tmp_path: Path) -> None:
+    ended = tandem("calibrate", str(SAMPLE), "--out", "radios.toml", cwd=tmp_path)
+    assert (ended.status, ended.err) == (0, "")
+    assert "A-LC0" in ended.out
+    assert "against the truth" in ended.out
+    printed = tandem("calibrate", str(SAMPLE), cwd=tmp_path).out
+    assert (tmp_path / "radios.toml").read_text() in printed + "\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("bad.pyfg",), "bad.pyfg, line 1: VERTEX_XY has 1 fields and needs 3"),
+        ((str(SAMPLE), "--robots", "C"), "has no robot C; it has A, B"),
+        ((str(SAMPLE), "--out", "radios"), "--out: radios is not the path of a .toml file"),
+        ((str(SAMPLE), "--without-truth", "--window", "0..5"), "without true poses, an estimate of A and B"),
+        ((str(SAMPLE), "--without-truth", "--robots", "A"), "one robot needs ranges to two anchors"),
+    ],
+)
+def test_what_cannot_be_calibrated_is_one_line(words: tuple[str, ...], says: str, tmp_path: Path) -> None:
+    (tmp_path / "bad.pyfg").write_text("VERTEX_XY L0\n")
+    ended = tandem("calibrate", *words, cwd=tmp_path)
+    assert ended.status == USER_ERROR
+    assert ended.err.count("\n") == 1
+    assert says in ended.err

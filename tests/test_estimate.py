@@ -1,0 +1,389 @@
+"""Poses of recorded robots: claims are right, and what the odometry or the radios do wrong is found."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from functools import partial
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from agent.estimation.gaussian.linear_model import Problem
+from agent.estimation.gaussian.odometry_noise import track
+from agent.estimation.gaussian.range_model import PairRanges, Ranges
+from compose.errors import NOT_LOCALISED, USER_ERROR, UserError
+from compose.recording.estimating.estimate_epoch import ClaimRule
+from compose.recording.estimating.estimate_files import COLUMNS, estimate_csv
+from compose.recording.estimating.estimate_run import RecordingEstimate, estimated, measurements
+from compose.recording.estimating.noise_files import RangeCorrection, told_noise
+from compose.recording.estimating.pair_measurements import EPOCH_S
+from compose.recording.estimating.sound_odometry import GAP_MOTION_S, sound
+from compose.recording.ranging.range_files import read_ranges
+from compose.recording.ranging.range_recording import (
+    FixedAnchor,
+    Numbers,
+    RangeRecording,
+    RangeSeries,
+    RecordedRobot,
+    RobotOdometry,
+    TruePath,
+)
+from compose.recording.ranging.range_steps import dead_reckoned, relative
+from docs import recorded_claims
+from protocol.noise import Noise, VelocityNoise
+from tests.commands import tandem
+
+SAMPLE = Path(__file__).parent / "data" / "uwb" / "tiers-a-b-30-s.pyfg"
+NEES_99_9 = 16.27
+"""The NEES that 99.9 % of right covariances do not exceed: chi-square of three degrees of freedom."""
+STEP_S = 0.1
+ANCHORS = (FixedAnchor("M1", 0.0, 0.0), FixedAnchor("M2", 8.0, 1.0))
+
+
+def sample_estimates(
+    recording: RangeRecording, noise: str = "uwb-calibrated", accuracy: float = 0.3
+) -> RecordingEstimate:
+    return estimated(measurements(recording, ("A", "B"), noise, None), ClaimRule(accuracy))
+
+
+def with_ranges(recording: RangeRecording, lengths: Numbers) -> RangeRecording:
+    return recording._replace(ranges=recording.ranges._replace(range=lengths))
+
+
+def with_odometry(recording: RangeRecording, robot: str, odometry: RobotOdometry) -> RangeRecording:
+    return recording._replace(
+        robots=tuple(
+            [one._replace(odometry=odometry) if one.id == robot else one for one in recording.robots]
+        )
+    )
+
+
+@pytest.fixture(scope="module")
+def sample() -> RangeRecording:
+    return read_ranges(SAMPLE)
+
+
+@pytest.fixture(scope="module")
+def of_sample(sample: RangeRecording) -> RecordingEstimate:
+    return sample_estimates(sample)
+
+
+def simulated(
+    antenna: tuple[float, float, float] = (0.0, 0.0, 0.0), height: float = 0.0, slip: float = 0.0
+) -> RangeRecording:
+    """Return a recording of two robots on arcs for 30 s, with exact ranges every 0.5 s and exact odometry.
+
+    `antenna` is that of the first robot, `height` that of its anchor, and `slip` the velocity to the left of
+    both, in m/s.
+    """
+    t = STEP_S * np.arange(301.0)
+    robots, places = [], []
+    for name, begin, v, rate in (("A", (2.0, 1.0, 0.3), 0.4, 0.5), ("B", (6.0, 3.0, -2.0), 0.35, -0.45)):
+        turn = rate * STEP_S * np.sign(np.sin(0.35 * t[:-1]))
+        heading = begin[2] + np.concatenate(([0.0], np.cumsum(turn)))
+        forward = np.exp(1j * (heading[:-1] + 0.5 * turn)) * np.sinc(0.5 * turn / math.pi) * STEP_S
+        at = begin[0] + 1j * begin[1] + np.concatenate(([0.0], np.cumsum(forward * (v + 1j * slip))))
+        poses = np.stack((at.real, at.imag, heading), 1)
+        own = antenna if name == "A" else (0.0, 0.0, 0.0)
+        odometry = RobotOdometry(t[:-1], t[1:], relative(poses[:-1], poses[1:]), np.full((300, 3, 3), np.nan))
+        robots.append(RecordedRobot(name, odometry, TruePath(t, poses), own))
+        places.append(at + (own[0] + 1j * own[1]) * np.exp(1j * heading))
+    anchors = (ANCHORS[0]._replace(height=height), ANCHORS[1])
+    at_ranges = np.arange(0, 301, 5)
+    m1, m2 = (complex(one.x, one.y) for one in anchors)
+    a, b = places[0][at_ranges], places[1][at_ranges]
+    up = antenna[2]
+    lengths = np.stack(
+        (np.hypot(np.abs(a - m1), up - height), np.abs(b - m2), np.hypot(np.abs(a - b), up)), 1
+    )
+    count = len(at_ranges)
+    series = RangeSeries(
+        np.repeat(t[at_ranges], 3),
+        np.tile(np.array([0, 1, 0]), count),
+        np.tile(np.array([2, 3, 1]), count),
+        lengths.ravel(),
+        np.full(3 * count, 0.05),
+    )
+    return RangeRecording("simulated", tuple(robots), anchors, series)
+
+
+# --- claims ---------------------------------------------------------------------------------------------
+
+
+def test_both_robots_of_the_sample_claim_poses_that_contain_the_truth(of_sample: RecordingEstimate) -> None:
+    for robot in of_sample.summary.robots.values():
+        assert robot.first_claim is not None
+        assert robot.first_claim.t_s - of_sample.summary.begin_s <= 25.0
+        assert robot.first_claim.position_error_m is not None
+        assert robot.first_claim.position_error_m < 0.5
+        assert robot.first_claim.probability >= 0.9999
+    claimed = [row for row in of_sample.rows if row.claim]
+    assert len(claimed) > 10
+    assert all(row.nees is not None and row.nees < NEES_99_9 for row in claimed)
+
+
+def test_equal_inputs_give_equal_bytes(sample: RangeRecording, of_sample: RecordingEstimate) -> None:
+    again = sample_estimates(sample)
+    assert estimate_csv(again.rows) == estimate_csv(of_sample.rows)
+    assert msgspec.json.encode(again.summary) == msgspec.json.encode(of_sample.summary)
+
+
+def test_an_estimate_uses_nothing_that_was_measured_later(
+    sample: RangeRecording, of_sample: RecordingEstimate
+) -> None:
+    begin = sample.span[0]
+    problem = measurements(sample, ("A", "B"), "uwb-calibrated", (0.0, 15.2))
+    early = estimated(problem, ClaimRule()).rows
+    assert problem.measured.ticks_per_epoch == 13  # that of the whole sample: the robots are as fast
+    assert early
+    assert max(row.t_s for row in early) <= begin + 15.2
+    assert estimate_csv(early) == estimate_csv(of_sample.rows[: len(early)])
+
+
+def test_a_claim_waits_for_the_accuracy_that_is_asked_for(sample: RangeRecording) -> None:
+    strict = sample_estimates(sample, accuracy=0.01)
+    assert not any(row.claim for row in strict.rows)
+    assert "required 0.01" in strict.summary.blocking_reason
+
+
+def test_a_bias_of_all_ranges_is_learned_with_the_profile_of_raw_radios(sample: RangeRecording) -> None:
+    found = sample_estimates(with_ranges(sample, sample.ranges.range + 0.35), "uwb")
+    assert found.summary.calibration is not None
+    bias = found.summary.calibration.range_bias_m
+    assert bias is not None
+    assert bias.sigma < 0.3
+    assert abs(bias.value - 0.35) < 3.0 * bias.sigma
+    last = found.rows[-2:]
+    assert all(row.nees is not None and row.nees < NEES_99_9 for row in last)
+
+
+def test_a_recording_of_tandem_is_estimated_with_the_noise_that_its_robots_assume(tmp_path: Path) -> None:
+    assert tandem("run", "noisy", "--seed", "3", "--out", "run", cwd=tmp_path).status == 0
+    found = estimated(measurements(read_ranges(tmp_path / "run"), None, None, None), ClaimRule())
+    assert found.summary.noise == "stated in the recording"
+    for robot in found.summary.robots.values():
+        assert robot.first_claim is not None
+        assert robot.first_claim.nees is not None
+        assert robot.first_claim.nees < NEES_99_9
+
+
+# --- odometry -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("slip", [0.0, 0.2])
+def test_the_path_is_that_of_the_odometry_with_its_lateral_slip(slip: float) -> None:
+    recording = simulated(slip=slip)
+    measured = measurements(recording, None, "uwb-calibrated", None).measured
+    path = measured.sides[1].path
+    t = measured.t0 + measured.period * np.arange(float(len(path.x)))
+    expected = dead_reckoned(recording.robots[1].odometry, t)
+    np.testing.assert_allclose(np.stack((path.x, path.y, path.heading), 1), expected, atol=1e-9)
+
+
+def test_lateral_slip_is_followed() -> None:
+    found = estimated(measurements(simulated(slip=0.2), None, "uwb-calibrated", None), ClaimRule())
+    for robot in found.summary.robots.values():
+        assert robot.first_claim is not None
+        assert robot.final is not None
+        assert robot.final.position_error_m is not None
+        assert robot.final.position_error_m < 0.05
+
+
+def test_lateral_slip_turns_the_path_and_extra_variances_add_to_the_noise() -> None:
+    v, omega, noise = np.full(4, 1.0), np.zeros(4), Noise(0.1, 0.1, odometry=VelocityNoise(v_floor=0.1))
+    straight = track(v, omega, 1.0)
+    left = track(v, omega, 1.0, np.full(4, 0.5 * math.pi))
+    np.testing.assert_allclose(left.y, straight.x, atol=1e-12)
+    extra = np.array([[0.0, 0.0, 3.0, 0.0], [0.0, 2.0, 0.0, 0.0]])
+    ranges = Ranges.of_lists([(1, 1.0), (3, 2.0)], (), (), noise)
+    plain, more = (
+        Problem.of([path], ranges, noise, (0.0, 0.0)) for path in (straight, left._replace(extra=extra))
+    )
+    assert plain.variances is not None
+    assert more.variances is not None
+    assert plain.slip is None
+    assert more.slip is not None
+    np.testing.assert_allclose(more.variances - plain.variances, [extra])
+    np.testing.assert_array_equal(more.slip, [np.full(4, 0.5 * math.pi)])
+
+
+def test_measurements_that_differ_in_slip_variance_or_sigma_are_not_the_same(sample: RangeRecording) -> None:
+    pair = measurements(sample, ("A", "B"), "uwb-calibrated", None).measured.until(10)
+    assert isinstance(pair, PairRanges)
+    path, ranges = pair.paths[0], pair.ranges
+    assert path.slip is not None
+    assert path.extra is not None
+    again = pair._replace(paths=(path.until(len(path.v)), pair.paths[1]))
+    assert pair == again
+    assert hash(pair) == hash(again)
+    for other in (path._replace(slip=path.slip + 0.1), path._replace(extra=2.0 * path.extra)):
+        assert pair.content != pair._replace(paths=(other, pair.paths[1])).content
+    assert pair.content != pair._replace(ranges=ranges._replace(sigma=2.0 * ranges.sigma)).content
+
+
+def test_a_gross_increment_is_found_and_replaced(
+    sample: RangeRecording, of_sample: RecordingEstimate
+) -> None:
+    odometry = sample.robot("A").odometry
+    increments = odometry.increments.copy()
+    increments[150, 2] += 1.5
+    found = sample_estimates(with_odometry(sample, "A", odometry._replace(increments=increments)))
+    assert found.summary.robots["A"].gross_increments == 1
+    assert of_sample.summary.robots["A"].gross_increments == 0
+    claimed = [row for row in found.rows if row.claim]
+    assert claimed
+    assert all(row.nees is not None and row.nees < NEES_99_9 for row in claimed)
+
+
+def test_the_motion_in_a_gap_is_unknown(sample: RangeRecording) -> None:
+    odometry = sample.robot("B").odometry
+    kept = np.r_[0:200, 240:600]
+    cut = RobotOdometry(*[part[kept] for part in odometry])
+    filled = sound(cut).odometry
+    assert len(sound(cut).gaps) == 1
+    assert not len(filled.gaps)
+    (row,) = np.flatnonzero(filled.t1 - filled.t0 > 1.0)
+    assert np.sqrt(filled.covariance[row, 0, 0]) > 0.2
+    assert np.hypot(*filled.increments[row, :2]) <= GAP_MOTION_S * 0.4
+    found = sample_estimates(with_odometry(sample, "B", cut))
+    assert found.summary.robots["B"].gaps == 1
+    assert all(row.nees is not None and row.nees < NEES_99_9 for row in found.rows if row.claim)
+
+
+# --- radios ---------------------------------------------------------------------------------------------
+
+
+def test_antennas_beside_the_centre_and_at_other_heights_are_taken_into_account() -> None:
+    recording = simulated(antenna=(0.3, -0.2, 0.4), height=1.5)
+    found = estimated(measurements(recording, None, "uwb-calibrated", None), ClaimRule())
+    for robot in found.summary.robots.values():
+        assert robot.final is not None
+        assert robot.final.position_error_m is not None
+        assert robot.final.position_error_m < 0.05
+        assert robot.final.heading_error_rad is not None
+        assert abs(robot.final.heading_error_rad) < 0.05
+
+
+def test_each_pair_of_radios_has_one_range_a_second_at_the_nearest_tick(sample: RangeRecording) -> None:
+    measured = measurements(sample, ("A", "B"), "uwb-calibrated", None).measured
+    ticks = (measured.t - measured.t0) / measured.period
+    assert np.max(np.abs(ticks - measured.ranges.tick)) <= 0.5 + 1e-6
+    for kind in range(3):
+        assert np.min(np.diff(measured.t[measured.ranges.rows(kind)])) >= EPOCH_S - 1e-6
+
+
+def test_known_errors_of_ranges_are_removed(sample: RangeRecording, tmp_path: Path) -> None:
+    (tmp_path / "radios.toml").write_text(
+        '[mission]\nnoise = "uwb-calibrated"\n\n'
+        "[calibration]\nrange_bias = 0.1\n\n[calibration.pairs]\nB-A = 0.3\n"
+    )
+    told = told_noise(str(tmp_path / "radios.toml"))
+    assert told.correction == RangeCorrection(0.1, 0.0, {"B-A": 0.3})
+    shorter = sample.ranges.range - told.correction.corrected(sample).ranges.range
+    pairs = sample.pairs()
+    np.testing.assert_allclose(shorter[pairs["A", "B"]], 0.3)
+    np.testing.assert_allclose(shorter[pairs["A", "LC0"]], 0.1)
+
+
+def test_robots_with_ranges_to_one_anchor_only_are_refused(sample: RangeRecording) -> None:
+    first = with_ranges(sample, sample.ranges.range)
+    ranges = first.ranges.rows(first.ranges.second != first.radios.index("LC1"))
+    with pytest.raises(UserError, match=r"need ranges to two anchors .* A has ranges to LC0, B has ranges"):
+        measurements(first._replace(ranges=ranges), ("A", "B"), None, None)
+
+
+# --- the table of claims -------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("change", "noise", "accuracy", "claims"),
+    [
+        (recorded_claims.unchanged, "uwb-calibrated", 0.3, 4),
+        (partial(recorded_claims.longer, bias=0.35), "uwb", 0.5, 2),
+        (partial(recorded_claims.longer, scale=1.07), "uwb", 0.5, 2),
+        (recorded_claims.with_outliers, "uwb", 0.5, 2),
+    ],
+    ids=["as recorded", "bias", "scale", "outliers"],
+)
+def test_both_orders_of_the_robots_of_the_sample_claim_and_none_is_wrong(
+    change: recorded_claims.Change, noise: str, accuracy: float, claims: int
+) -> None:
+    trials = recorded_claims.trials_of(SAMPLE, change, noise, accuracy, (0.0, 2.0))
+    row = recorded_claims.row_of("", trials, [recorded_claims.claimed(one) for one in trials])
+    cells = dict(zip(recorded_claims.HEAD, [cell.strip() for cell in row.split("|")[1:-1]], strict=True))
+    assert int(cells["claims"].removesuffix(" of 4")) >= claims
+    assert cells["wrong"] == "0"
+    assert float(cells["truth in 99 % region %"]) >= 85.0
+    assert float(cells["p90 m"]) <= accuracy
+
+
+# --- the command ----------------------------------------------------------------------------------------
+
+
+def test_the_command_writes_a_table_a_summary_and_figures(tmp_path: Path) -> None:
+    ended = tandem("estimate", str(SAMPLE), "--noise", "uwb-calibrated", "--out", "found", cwd=tmp_path)
+    assert (ended.status, ended.err) == (0, "")
+    names = {"estimate.csv", "estimate.json", "estimate-path.svg", "estimate-over-time.svg"}
+    assert names <= {path.name for path in (tmp_path / "found").iterdir()}
+    with (tmp_path / "found" / "estimate.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert tuple(rows[0]) == COLUMNS
+    assert {row["robot"] for row in rows} == {"A", "B"}
+    summary = json.loads((tmp_path / "found" / "estimate.json").read_text())
+    claim = summary["robots"]["A"]["first_claim"]
+    assert set(claim) == {
+        "t_s", "pose", "covariance", "probability", "position_error_m", "heading_error_rad", "nees",
+    }  # fmt: skip
+    assert [len(claim["covariance"]), len(claim["covariance"][0]), len(claim["pose"])] == [3, 3, 3]
+    assert summary["hypotheses"][0]["probability"] > 0.99
+    assert set(summary["calibration"]["pair_bias_m"]) == {"A-LC0", "B-LC1", "A-B"}
+    first = next(row for row in rows if row["robot"] == "A" and row["claim"] == "true")
+    assert [float(first[name]) for name in ("t_s", "x", "y", "heading")] == [claim["t_s"], *claim["pose"]]
+
+
+def test_without_truth_there_are_no_errors(tmp_path: Path) -> None:
+    lines = [line for line in SAMPLE.read_text().splitlines() if not line.startswith("VERTEX_SE2")]
+    first = [line for line in SAMPLE.read_text().splitlines() if line.startswith(("VERTEX_SE2 0.3107", "V"))]
+    begin = [line for line in first if line.split()[2] in ("A100", "B100")]
+    (tmp_path / "blind.pyfg").write_text("\n".join([*begin, *lines, ""]))
+    ended = tandem(
+        "estimate", "blind.pyfg", "--noise", "uwb-calibrated", "--window", "0..12", "--out", ".", cwd=tmp_path
+    )
+    assert ended.status == NOT_LOCALISED
+    assert "no claim at the end: " in ended.out
+    with (tmp_path / "estimate.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["nees"] for row in rows} == {""}
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("bad.pyfg",), "bad.pyfg, line 2: EDGE_RANGE has 3 fields and needs 5"),
+        (("no.pyfg",), "no.pyfg cannot be read: No such file or directory"),
+        ((str(SAMPLE), "--robots", "A,C"), "has no robot C; it has A, B"),
+        ((str(SAMPLE), "--robots", "A"), "one robot needs ranges to two anchors at different places: A has"),
+        ((str(SAMPLE), "--noise", "ubw"), "'ubw' is neither a profile (uwb, uwb-calibrated, wheels)"),
+        (
+            (str(SAMPLE), "--noise", "bad.toml"),
+            "bad.toml: mission.noise: unknown field 'range_bais'; did you mean 'range_bias'?",
+        ),
+        ((str(SAMPLE), "--window", "40..50"), "has odometry of 30.0"),
+        ((str(SAMPLE), "--window", "10"), "'10' is not a window in seconds such as 10..40"),
+        ((str(SAMPLE), "--anchors", "bad.csv"), "bad.csv, line 2: y: expected a number, got 'x'"),
+    ],
+)
+def test_bad_input_is_one_line_with_its_place(words: tuple[str, ...], says: str, tmp_path: Path) -> None:
+    (tmp_path / "bad.pyfg").write_text("VERTEX_XY L0 4.0 5.0\nEDGE_RANGE 0.6 A1 B1\n")
+    (tmp_path / "bad.toml").write_text("[mission.noise]\nrange_bais = 0.1\n")
+    (tmp_path / "bad.csv").write_text("anchor,x,y\nLC0,1,x\n")
+    ended = tandem("estimate", *words, cwd=tmp_path)
+    assert ended.status == USER_ERROR
+    assert ended.out == ""
+    assert ended.err.count("\n") == 1
+    assert says in ended.err

@@ -1,0 +1,53 @@
+"""The examples in docs/examples run, are short, and are listed on the page of the Python API."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
+SMALL: dict[str, dict[str, Any]] = {
+    "run_and_plot": {},
+    "loss_sweep": {"trials": 1, "workers": 1},
+    "greedy_planner": {"trials": 1, "workers": 1},
+    "planners_and_radios": {"trials": 1, "workers": 1},
+}
+"""The arguments with which `main` of each example takes seconds."""
+WITHOUT_FIGURE = ("last_manoeuvre", "own_radio")
+"""The examples that only print."""
+MAX_LINES = 100
+
+
+def test_every_example_is_run_and_listed() -> None:
+    assert {path.stem for path in EXAMPLES.glob("*.py")} == {*SMALL, *WITHOUT_FIGURE}
+    page = (EXAMPLES.parent / "python-api.md").read_text()
+    for name in (*SMALL, *WITHOUT_FIGURE):
+        assert f"`docs/examples/{name}.py`" in page
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_an_example_runs_and_writes_its_figure(name: str, tmp_path: Path) -> None:
+    assert len((EXAMPLES / f"{name}.py").read_text().splitlines()) < MAX_LINES
+    import_module(f"docs.examples.{name}").main(str(tmp_path / "figure.png"), **SMALL[name])
+    assert (tmp_path / "figure.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("name", WITHOUT_FIGURE)
+def test_an_example_without_a_figure_runs(name: str) -> None:
+    assert len((EXAMPLES / f"{name}.py").read_text().splitlines()) < MAX_LINES
+    import_module(f"docs.examples.{name}").main()
+
+
+def test_the_notebook_runs_from_its_first_cell_to_its_last() -> None:
+    notebook = json.loads((EXAMPLES / "tandem.ipynb").read_text())
+    cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    code = "\n".join([*cells, "print(hasty.outcome, lossy.name)"])
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ended.stdout == "localised random\n"
+    assert "`docs/examples/tandem.ipynb`" in (EXAMPLES.parent / "python-api.md").read_text()

@@ -1,0 +1,200 @@
+"""A stream is estimated while it arrives, by the code that estimates files."""
+
+from __future__ import annotations
+
+import io
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from mcap.writer import Writer
+
+from compose.errors import STOPPED, USER_ERROR
+from compose.recording.estimating import estimate_stream
+from compose.recording.estimating.estimate_epoch import ClaimRule
+from compose.recording.estimating.estimate_files import COLUMNS, estimate_csv
+from compose.recording.estimating.estimate_run import estimated, measurements
+from compose.recording.estimating.estimate_stream import StreamEstimate
+from compose.recording.estimating.noise_files import told_noise
+from compose.recording.ranging.range_files import read_ranges
+from compose.recording.ranging.range_mcap import rows_as_they_arrive
+from compose.recording.ranging.range_recording import RangeRecording
+from tests.commands import tandem
+from tests.test_estimate import SAMPLE
+from tests.test_house import HOUSE
+
+PROFILE = "uwb-calibrated"
+Messages = list[tuple[float, str, dict[str, object]]]
+BOUND_S = 120.0
+
+
+def messages_of(recording: RangeRecording) -> Messages:
+    """Return time, topic and content of each message of a stream, anchors first, then by time."""
+    found: Messages = [
+        (-1.0, "/anchors", {"anchor": one.id, "x": one.x, "y": one.y}) for one in recording.anchors
+    ]
+    for robot in recording.robots:
+        odometry = robot.odometry
+        for t0, t1, (dx, dy, turn), covariance in zip(
+            odometry.t0.tolist(),
+            odometry.t1.tolist(),
+            odometry.increments.tolist(),
+            odometry.covariance.tolist(),
+            strict=True,
+        ):
+            row = {"robot": robot.id, "t0": t0, "t1": t1, "dx": dx, "dy": dy, "dheading": turn}
+            names = ("sigma_dx", "sigma_dy", "sigma_dheading")
+            sigmas = {name: covariance[i][i] ** 0.5 for i, name in enumerate(names)}
+            found.append((t1, "/odometry", row | sigmas))
+        assert robot.truth is not None
+        for t, (x, y, heading) in zip(robot.truth.t.tolist(), robot.truth.poses.tolist(), strict=True):
+            found.append((t, "/truth", {"robot": robot.id, "t": t, "x": x, "y": y, "heading": heading}))
+    radios, ranges = recording.radios, recording.ranges
+    for t, first, second, measured, sigma in zip(*[part.tolist() for part in ranges], strict=True):
+        row = {"t": t, "from": radios[first], "to": radios[second], "range": measured, "sigma": sigma}
+        found.append((t, "/ranges", row))
+    return sorted(found, key=lambda one: (one[0], one[1] != "/ranges"))
+
+
+def stream(messages: Messages) -> tuple[io.BytesIO, Writer, dict[str, int]]:
+    """Return a stream that has begun, its writer and the numbers of its topics."""
+    target = io.BytesIO()
+    writer = Writer(target, use_chunking=False)
+    writer.start()
+    topics = {
+        topic: writer.register_channel(topic, "json", 0)
+        for topic in dict.fromkeys(one[1] for one in messages)
+    }
+    return target, writer, topics
+
+
+def written(messages: Messages, *, whole: bool = True) -> bytes:
+    target, writer, topics = stream(messages)
+    for t, topic, content in messages:
+        time_ns = round(max(t, 0.0) * 1e9)
+        writer.add_message(topics[topic], time_ns, json.dumps(content).encode(), time_ns)
+    if whole:
+        writer.finish()  # type: ignore[no-untyped-call]
+    return target.getvalue()
+
+
+@pytest.fixture(scope="module")
+def messages() -> Messages:
+    return messages_of(read_ranges(SAMPLE))
+
+
+def test_a_stream_gives_what_its_file_gives(messages: Messages) -> None:
+    recording = read_ranges(SAMPLE)
+    followed = StreamEstimate("it", ("A", "B"), (told_noise(PROFILE), PROFILE), ClaimRule())
+    rows = list(followed.rows(rows_as_they_arrive(io.BytesIO(written(messages)), "it")))
+    problem = measurements(recording, None, PROFILE, None)
+    measured = problem.measured
+    assert measured.ticks_per_epoch != estimate_stream.STREAM_TICKS
+    _, result = followed.result()
+    claims = {name: one.first_claim for name, one in result.summary.robots.items()}
+    assert all(one is not None and one.nees is not None and one.nees < 16.27 for one in claims.values())
+    of_file = estimated(problem, ClaimRule()).rows
+    for row, other in zip(rows, of_file, strict=True):
+        assert row.robot == other.robot
+        assert row.t_s == pytest.approx(other.t_s)
+        if row.claim and other.claim:
+            assert abs(row.x - other.x) < 0.05
+            assert abs(row.y - other.y) < 0.05
+
+
+def test_a_stream_that_breaks_off_gives_the_estimates_before_that(messages: Messages) -> None:
+    def rows(data: bytes) -> str:
+        estimate = StreamEstimate("it", None, (told_noise(PROFILE), PROFILE), ClaimRule())
+        return estimate_csv(list(estimate.rows(rows_as_they_arrive(io.BytesIO(data), "it"))))
+
+    early = [one for one in messages if one[0] <= 12.4]
+    whole = rows(written(early))
+    assert whole.count("\n") > 10
+    assert rows(written(early, whole=False)) == whole
+    assert rows(written(early, whole=False)[:-20]) == whole
+
+
+def test_estimates_are_printed_while_the_stream_is_open(messages: Messages, tmp_path: Path) -> None:
+    words = [
+        sys.executable,
+        "-m",
+        "tandem",
+        "estimate",
+        "-",
+        "--follow",
+        "--noise",
+        PROFILE,
+        "--out",
+        "found",
+    ]
+    early = [one for one in messages if one[0] <= 12.0]
+    with subprocess.Popen(
+        words,
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(HOUSE), "PATH": "/usr/bin:/bin"},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        first = written(early, whole=False)
+        process.stdin.write(first)
+        process.stdin.flush()
+        assert process.stdout.readline().decode().strip() == ",".join(COLUMNS)
+        lines = [process.stdout.readline().decode().split(",") for _ in range(10)]
+        assert {line[1] for line in lines} == {"A", "B"}
+        assert process.poll() is None
+        process.stdin.write(written(messages)[len(first) :])
+        rest, errors = process.communicate(timeout=BOUND_S)
+    assert process.returncode == 0, errors
+    assert rest.decode().count(",true,") > 10
+    assert (tmp_path / "found" / "estimate.json").exists()
+
+
+def test_ctrl_c_ends_a_stream_and_the_files_are_written(messages: Messages, tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "tandem", "estimate", "-", "--follow", "--out", "found"]
+    words += ["--noise", PROFILE]
+    with subprocess.Popen(
+        words,
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(HOUSE), "PATH": "/usr/bin:/bin"},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        process.stdin.write(written([one for one in messages if one[0] <= 9.0], whole=False))
+        process.stdin.flush()
+        for _ in range(3):
+            process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=BOUND_S)
+    assert process.returncode == STOPPED, errors
+    assert (tmp_path / "found" / "estimate.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("bad.mcap", "--follow"), "bad.mcap, /ranges, message 1: range: expected a number, got 'str'"),
+        (("empty.mcap", "--follow"), "empty.mcap: there is no second with odometry of two robots"),
+        (("no.mcap", "--follow"), "no.mcap cannot be read: No such file or directory"),
+        (
+            ("bad.mcap", "--follow", "--window", "1..2"),
+            "--follow: a stream has its own anchors, and no window",
+        ),
+    ],
+)
+def test_a_wrong_stream_is_one_line(words: tuple[str, ...], says: str, tmp_path: Path) -> None:
+    wrong: Messages = [(0.0, "/ranges", {"t": 0.0, "from": "A", "to": "B", "range": "x"})]
+    (tmp_path / "bad.mcap").write_bytes(written(wrong))
+    (tmp_path / "empty.mcap").write_bytes(b"")
+    ended = tandem("estimate", *words, cwd=tmp_path)
+    assert ended.status == USER_ERROR
+    assert ended.err.count("\n") == 1
+    assert says in ended.err

@@ -1,0 +1,331 @@
+"""The Python API: runs, scenarios, sweeps and recordings as values, arrays and tables."""
+
+from __future__ import annotations
+
+import doctest
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tandem
+from compose import extras
+from compose.audit.rules import audit
+from compose.recording.summary_json import summary
+from compose.recording.ticks_csv import rows
+from tandem.columns import Table
+from tests.commands import tandem as command
+
+MODULES = ("", ".clash", ".columns", ".missions", ".results", ".rows", ".scenarios", ".sweeps")
+TABLES = ("truth", "observations", "commands", "estimates", "messages", "claims")
+
+
+@pytest.fixture(scope="module")
+def run() -> tandem.Run:
+    return tandem.run("random", seed=3, faults="a->b: loss=0.3")
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the recording of the same run by the command line."""
+    out = tmp_path_factory.mktemp("api") / "recording"
+    ended = command("run", "random", "--seed", "3", "--fault", "a->b: loss=0.3", "--out", str(out))
+    assert ended.status == 0, ended
+    return out
+
+
+def same(one: Table, other: Table) -> bool:
+    return one.columns == other.columns and all(
+        np.array_equal(one[name], other[name], equal_nan=one[name].dtype == float) for name in one.columns
+    )
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_the_examples_in_docstrings_give_what_they_show(module: str) -> None:
+    found = doctest.testmod(import_module(f"tandem{module}"), optionflags=doctest.ELLIPSIS)
+    assert found.failed == 0
+
+
+def test_every_public_name_is_there_and_listed() -> None:
+    assert set(tandem.__all__) <= set(dir(tandem))
+    for name in tandem.__all__:
+        assert getattr(tandem, name) is not None
+    with pytest.raises(AttributeError, match="module 'tandem' has no attribute 'rnu'"):
+        _ = tandem.rnu
+
+
+# --- runs ---------------------------------------------------------------------------------------------
+
+
+def test_a_run_in_one_process_has_everything_that_a_recording_has(run: tandem.Run, recording: Path) -> None:
+    opened = tandem.open(recording)
+    for name in TABLES:
+        assert same(getattr(run, name), getattr(opened, name)), name
+    assert run.audit() == opened.audit() == audit(recording)
+    assert run.audit().violations == ()
+    assert opened.mode == "processes"
+    assert opened.wall_s is not None
+
+
+def test_a_saved_run_has_the_bytes_of_the_recording(run: tandem.Run, recording: Path, tmp_path: Path) -> None:
+    saved = run.save(tmp_path / "saved")
+    for name in ("world.journal", "agent-a.journal", "agent-b.journal", "ticks.csv"):
+        assert (saved / name).read_bytes() == (recording / name).read_bytes(), name
+    assert (saved / "summary.json").exists()
+    assert command("replay", str(saved)).status == 0
+    with pytest.raises(tandem.UserError, match=r"already contains a recording; choose another folder$"):
+        run.save(saved)
+
+
+def test_a_run_as_processes_with_a_kill_has_the_same_data() -> None:
+    alone = tandem.run("paper-1")
+    killed = tandem.run("paper-1", processes=True, kills="a@17")
+    for name in TABLES:
+        assert same(getattr(killed, name), getattr(alone, name)), name
+    assert (alone.mode, killed.mode) == ("in-process", "processes")
+
+
+def test_the_tables_hold_what_the_files_hold(run: tandem.Run) -> None:
+    ticks = list(rows(run.model))
+    for name in ("tick", "robot", "x", "y", "heading"):
+        assert run.truth[name].tolist() == [getattr(row, name) for row in ticks]
+    for name in ("anchor_range", "mutual_range"):
+        assert [None if np.isnan(one) else one for one in run.observations[name]] == [
+            getattr(row, name) for row in ticks
+        ]
+    assert run.commands["state"].tolist() == [row.state for row in ticks]
+    robots = summary(run.model, None, None)["robots"]
+    for name in ("position_error_m", "heading_error_rad", "mutual_ranges", "reports_heard"):
+        assert run.claims[name].tolist() == [robot[name] for robot in robots.values()]
+    assert len(run.messages) == sum(len(one.frames) for one in run.model.journals.values())
+    assert run.summary["outcome"] == run.outcome == "localised"
+
+
+def test_estimates_have_errors_only_where_a_pose_is_known_and_probabilities_that_sum_to_one() -> None:
+    found = tandem.run("noisy", seed=7).estimates
+    local = found["frame"] == "local"
+    assert np.isnan(found["position_error_m"][local]).all()
+    assert (found["position_error_m"][~local] >= 0.0).all()
+    for robot in ("a", "b"):
+        of = found.where(robot=robot)
+        known = ~np.isnan(of["probability"])
+        sums = np.bincount(of["tick"][known], of["probability"][known])
+        assert sums[sums > 0.0] == pytest.approx(1.0)
+    assert found.where(localised=True)["nees"].max() < 30.0
+
+
+def test_figures_of_a_run_are_those_of_the_command(run: tandem.Run) -> None:
+    found = run.figures("trajectory", "ranges", paper=True)
+    assert list(found) == ["trajectory-a-b", "ranges-a-b"]
+    with pytest.raises(tandem.UserError, match=r"there is no figure 'range'; .*; did you mean 'ranges'"):
+        run.figures("range")
+
+
+def test_a_notebook_shows_the_outcome_and_the_picture(run: tandem.Run) -> None:
+    page = run._repr_html_()
+    assert "localised after" in page
+    assert '<img src="data:image/svg+xml;base64,' in page
+    assert "<td>a</td>" in page
+
+
+def test_without_matplotlib_a_notebook_shows_the_outcome(
+    run: tandem.Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(extras, "find_spec", lambda _: None)
+    page = run._repr_html_()
+    assert "localised after" in page
+    assert "<img" not in page
+    with pytest.raises(tandem.UserError, match=r"^needs matplotlib: install `tandem-ranging\[lab\]`$"):
+        run.figures()
+
+
+# --- tables -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_table_converts_to_arrow_pandas_and_polars(run: tandem.Run, name: str) -> None:
+    table: Table = getattr(run, name)
+    arrow, pandas, polars = table.arrow(), table.pandas(), table.polars()
+    assert (*arrow.column_names,) == (*pandas.columns,) == (*polars.columns,) == table.columns
+    assert len(arrow) == len(pandas) == len(polars) == len(table) > 0
+    for column in table.columns:
+        missing = pandas[column].isna().sum()
+        assert arrow[column].null_count == polars[column].null_count() == missing
+
+
+def test_a_table_is_read_by_libraries_of_arrow_streams(run: tandem.Run) -> None:
+    polars = pytest.importorskip("polars")
+    assert polars.DataFrame(run.truth).shape == (len(run.truth), 6)
+
+
+def test_an_array_of_a_table_cannot_be_changed_by_accident(run: tandem.Run) -> None:
+    with pytest.raises(ValueError, match="read-only"):
+        run.truth["x"][0] = 0.0
+    frame = run.truth.pandas()
+    frame.loc[0, "x"] = 0.0
+    assert run.truth["x"][0] != 0.0
+
+
+def test_an_unknown_column_is_named_with_the_known_ones(run: tandem.Run) -> None:
+    with pytest.raises(KeyError, match=r"no column 'headng'; there are tick, .*; did you mean 'heading'\?"):
+        run.truth["headng"]
+    with pytest.raises(KeyError, match="no column 'robt'"):
+        run.truth.where(robt="a")
+
+
+def test_a_recording_of_hardware_mode_has_no_truth_and_no_errors(tmp_path: Path) -> None:
+    saved = tandem.run("noisy", seed=7).save(tmp_path / "recording")
+    for name in ("world.journal", "summary.json"):
+        (saved / name).unlink()
+    run = tandem.open(saved)
+    assert (run.outcome, run.seed, run.mode, len(run.truth)) == ("localised", None, None, 0)
+    assert run.claims["localised"].all()
+    assert not np.isnan(run.claims["x"]).any()
+    assert np.isnan(run.claims["position_error_m"]).all()
+    assert np.isnan(run.estimates["position_error_m"]).all()
+    assert run.audit().violations == ()
+    assert "hardware mode" in run._repr_html_()
+    with pytest.raises(tandem.UserError, match=r"there is no world\.journal$"):
+        _ = run.summary
+    again = tandem.open(run.save(tmp_path / "again"))
+    assert same(again.messages, run.messages)
+
+
+@pytest.mark.parametrize(("method", "library"), [("arrow", "pyarrow"), ("pandas",) * 2, ("polars",) * 2])
+def test_a_missing_library_is_named_with_its_extra(
+    run: tandem.Run, method: str, library: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(extras, "find_spec", lambda _: None)
+    with pytest.raises(tandem.UserError, match=rf"^needs {library}.*: install `tandem-ranging\[tables\]`$"):
+        getattr(run.truth, method)()
+
+
+# --- errors: the text of the command -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words", "kind"),
+    [
+        ({"scenario": "papr-1"}, ["papr-1"], tandem.BadScenario),
+        ({"scenario": "noise"}, ["noise"], tandem.BadScenario),
+        ({"scenario": "paper-1", "faults": "a->c: loss=1"}, ["paper-1", "--fault", "a->c: loss=1"], None),
+        ({"scenario": "paper-1", "faults": ["los=1"]}, ["paper-1", "--fault", "los=1"], tandem.BadScenario),
+        ({"scenario": "paper-1", "kills": "c@3"}, ["paper-1", "--kill", "c@3"], tandem.BadKill),
+    ],
+)
+def test_an_invalid_argument_raises_the_line_of_the_command(
+    arguments: dict[str, str], words: list[str], kind: type[Exception] | None
+) -> None:
+    with pytest.raises(kind or tandem.UserError) as raised:
+        tandem.run(**arguments)  # type: ignore[arg-type]
+    ended = command("run", *words)
+    assert ended.status == 2
+    assert ended.err.splitlines() == [f"tandem run: {raised.value}"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ({"kills": "a@3"}, "kills: a run in one process has no processes to kill; set processes=True"),
+        ({"rate": 1.0}, "rate: a run in one process cannot run in real time; set processes=True"),
+        ({"processes": True, "timeout": 0}, "timeout: 0 is not a positive number"),
+        ({"seed": -1}, "paper-1: seed: expected 'int' >= 0"),
+    ],
+)
+def test_an_argument_that_does_not_fit_is_refused_in_one_line(
+    arguments: dict[str, object], text: str
+) -> None:
+    with pytest.raises(tandem.UserError) as raised:
+        tandem.run("paper-1", **arguments)  # type: ignore[arg-type]
+    assert str(raised.value) == text
+
+
+def test_a_folder_without_a_recording_is_an_error_of_one_line(tmp_path: Path) -> None:
+    with pytest.raises(tandem.UserError, match=r"contains no recording: there is no world\.journal$"):
+        tandem.open(tmp_path)
+
+
+# --- scenarios ----------------------------------------------------------------------------------------
+
+
+def test_a_scenario_is_changed_by_paths_and_stays_as_it_is() -> None:
+    scenario = tandem.Scenario.load("random")
+    changed = scenario.with_({"robot.a.start": np.array([1.0, 0.0, 0.5]), "planner.name": "paper"}, seed=9)
+    assert changed.table["robot"][0]["start"] == [1.0, 0.0, 0.5]
+    assert (changed.seed, changed.template.scenario.planner_name) == (9, "paper")
+    assert "start" not in scenario.table["robot"][0]
+    assert tandem.Scenario.from_dict(changed.table) == tandem.Scenario.from_dict(changed.table)
+
+
+def test_the_seed_of_a_run_is_that_of_its_scenario() -> None:
+    scenario = tandem.Scenario.load("random").with_(seed=5)
+    assert same(tandem.run(scenario).truth, tandem.run("random", seed=5).truth)
+
+
+def test_faults_are_texts_or_tables() -> None:
+    scenario = tandem.Scenario.load("random")
+    assert (
+        scenario.with_faults("a->b: loss=0.5").template.scenario.faults
+        == scenario.with_faults({"link": "a->b", "loss": 0.5}).template.scenario.faults
+        == scenario.with_({"fault": [{"link": "a->b", "loss": 0.5}]}).template.scenario.faults
+    )
+
+
+# --- sweeps -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def results() -> tandem.SweepResults:
+    return tandem.sweep("random", {"fault[0].loss": [0.0, 0.9]}, trials=2, workers=1)
+
+
+def test_a_sweep_of_a_scenario_has_a_row_per_trial_and_per_cell(results: tandem.SweepResults) -> None:
+    assert results.cells["fault[0].loss"].tolist() == [0.0, 0.9]
+    assert results.cells["trials"].tolist() == [2, 2]
+    assert results.trials["outcome"].tolist() == ["localised"] * 4
+    assert results.trials.arrow()["ticks"].to_pylist() == results.trials["ticks"].tolist()
+    assert "<td>0.9</td>" in results._repr_html_()
+
+
+def test_a_trial_of_a_sweep_can_be_run_again(results: tandem.SweepResults) -> None:
+    again = tandem.run(results.scenario(1, 1))
+    assert again.ticks == results.trials.where(cell=1, trial=1)["ticks"].item()
+    with pytest.raises(tandem.UserError, match="random has no cell 7"):
+        results.scenario(7, 0)
+
+
+def test_a_sweep_is_given_by_a_dict_and_its_folder_is_that_of_the_command(
+    results: tandem.SweepResults, tmp_path: Path
+) -> None:
+    axis = {"field": "fault[0].loss", "values": [0.0, 0.9]}
+    content = {"name": "random", "scenario": tandem.Scenario.load("random"), "trials": 2, "axis": [axis]}
+    same_results = tandem.sweep(content, out=tmp_path / "out", workers=1)
+    for name in ("seed", "ticks", "outcome"):
+        assert same_results.trials[name].tolist() == results.trials[name].tolist()
+    assert (tmp_path / "out" / "trials.parquet").exists()
+
+
+def test_a_mistake_in_a_sweep_is_one_line() -> None:
+    for arguments, text in (
+        (
+            ("random", {"fault[0].los": [1.0]}),
+            "random: axis[0].field: 'fault[0].los': .*; did you mean 'loss'",
+        ),
+        (("nose",), "nose: neither a file nor a shipped sweep .*; did you mean 'noise'"),
+        ((tandem.Scenario.load("random"),), "sweep: a scenario needs axes"),
+    ):
+        with pytest.raises(tandem.UserError, match=text.replace("[", r"\[")):
+            tandem.sweep(*arguments)
+
+
+def test_importing_tandem_imports_no_other_package() -> None:
+    code = (
+        "import sys; before = {*sys.modules}; import tandem; "
+        "loaded = {name.partition('.')[0] for name in {*sys.modules} - before}; "
+        "print(*loaded - sys.stdlib_module_names)"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout.split() == ["tandem"]

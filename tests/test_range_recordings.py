@@ -1,0 +1,566 @@
+"""Range recordings: every format gives the same data, and an invalid file is one line with its place."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io  # type: ignore[import-untyped]
+from mcap.writer import Writer
+
+from compose.errors import USER_ERROR, BadRecording, UserError
+from compose.launch import in_process
+from compose.recording.ranging.pyfg import written_pyfg
+from compose.recording.ranging.range_csv import read_csv
+from compose.recording.ranging.range_files import read_ranges
+from compose.recording.ranging.range_recording import RangeRecording
+from compose.recording.ranging.run_ranges import LEAST_SIGMA, increment_covariance, ranges_of_run
+from compose.recording.run import Run
+from compose.scenario.scenario_file import load
+from docs import plaza_csv
+from protocol.motion import ORIGIN, Controls, step
+from protocol.noise import VelocityNoise
+from tests.commands import tandem
+from tests.uwb_sample import NAMES
+
+SAMPLE = Path(__file__).parent / "data" / "uwb" / "tiers-a-b-30-s.pyfg"
+MAX_SAMPLE_BYTES = 200_000
+
+TABLES = {
+    "odometry": [
+        {"robot": "a", "t0": 0.0, "t1": 0.5, "dx": 0.1, "dy": 0.01, "dheading": 0.2},
+        {"robot": "b", "t0": 0.1, "t1": 0.4, "dx": 0.2, "dy": 0.0, "dheading": -0.1},
+        {"robot": "a", "t0": 0.5, "t1": 1.0, "dx": 0.3, "dy": -0.01, "dheading": 0.0},
+        {"robot": "a", "t0": 2.0, "t1": 2.5, "dx": 0.3, "dy": -0.01, "dheading": 0.0},
+    ],
+    "ranges": [
+        {"t": 0.3, "from": "a", "to": "b", "range": 2.5, "sigma": 0.1},
+        {"t": 0.2, "from": "M1", "to": "a", "range": 1.5},
+    ],
+    "anchors": [{"anchor": "M1", "x": 3.0, "y": -4.0, "height": 1.25}],
+    "antennas": [{"robot": "b", "forward": 0.2, "left": -0.1, "height": 0.3}],
+    "truth": [
+        {"robot": "a", "t": 0.0, "x": 1.0, "y": 2.0, "heading": 3.0},
+        {"robot": "a", "t": 0.0, "x": 1.0, "y": 2.0, "heading": 3.0},
+        {"robot": "a", "t": 0.4, "x": 1.1, "y": 2.1, "heading": 3.1},
+    ],
+}
+SIGMAS = {"sigma_dx": 0.01, "sigma_dy": 0.02, "sigma_dheading": 0.03}
+Tables = Mapping[str, Iterable[Mapping[str, object]]]
+
+
+def written_csv(folder: Path, tables: Tables) -> Path:
+    """Write a CSV file for each of `tables` to `folder`."""
+    folder.mkdir(exist_ok=True)
+    for name, rows in tables.items():
+        columns = list(dict.fromkeys(column for row in rows for column in row))
+        lines = [",".join(str(row.get(column, "")) for column in columns) for row in rows]
+        (folder / f"{name}.csv").write_text("\n".join([",".join(columns), *lines, ""]))
+    return folder
+
+
+def written_mcap(path: Path, tables: Tables, encoding: str = "json") -> Path:
+    """Write a message for each row of `tables` to `path`, and one on a topic that is not read."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        for name, rows in {**tables, "battery": [{"volts": 12}]}.items():
+            channel = writer.register_channel(f"/{name}", encoding, 0)
+            for row in rows:
+                writer.add_message(channel, 0, json.dumps(row).encode(), 0)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return path
+
+
+def same(one: RangeRecording, other: RangeRecording) -> None:
+    """Fail unless both recordings have the same numbers, to the bit, apart from the names of radios."""
+    assert [tuple(anchor[1:]) for anchor in one.anchors] == [tuple(anchor[1:]) for anchor in other.anchors]
+    assert len(one.robots) == len(other.robots)
+    columns = [(*one.ranges,), (*other.ranges,)]
+    for mine, its in zip(one.robots, other.robots, strict=True):
+        assert mine.antenna == its.antenna
+        assert (mine.truth is None) == (its.truth is None)
+        columns[0] += (*mine.odometry, *(mine.truth or ()))
+        columns[1] += (*its.odometry, *(its.truth or ()))
+    for left, right in zip(*columns, strict=True):
+        np.testing.assert_array_equal(left, right)
+
+
+@pytest.fixture(scope="module")
+def noisy() -> Run:
+    return in_process.run_mission(load("noisy"))
+
+
+# --- the formats ------------------------------------------------------------------------------------------
+
+
+def test_a_csv_folder_is_read_with_everything_that_it_states(tmp_path: Path) -> None:
+    tables = {**TABLES, "odometry": [TABLES["odometry"][0] | SIGMAS, *TABLES["odometry"][1:]]}
+    recording = read_ranges(written_csv(tmp_path, tables))
+    assert recording.radios == ("a", "b", "M1")
+    a, b = recording.robots
+    np.testing.assert_array_equal(a.odometry.t0, [0.0, 0.5, 2.0])
+    np.testing.assert_array_equal(a.odometry.increments[0], [0.1, 0.01, 0.2])
+    np.testing.assert_allclose(a.odometry.covariance[0], np.diag([1e-4, 4e-4, 9e-4]))
+    assert np.isnan(a.odometry.covariance[1:]).all()
+    np.testing.assert_array_equal(a.odometry.gaps, [[1.0, 2.0]])
+    assert (a.antenna, b.antenna) == ((0.0, 0.0, 0.0), (0.2, -0.1, 0.3))
+    assert a.truth is not None
+    np.testing.assert_array_equal(a.truth.poses[-1], [1.1, 2.1, 3.1])
+    assert b.truth is None
+    assert recording.anchors[0] == ("M1", 3.0, -4.0, 1.25)
+    np.testing.assert_array_equal(recording.ranges.t, [0.2, 0.3])  # in the order of time
+    np.testing.assert_array_equal(recording.ranges.first, [0, 0])  # the robot is always first
+    np.testing.assert_array_equal(recording.ranges.second, [2, 1])
+    np.testing.assert_array_equal(recording.ranges.sigma, [math.nan, 0.1])
+    assert recording.span == (0.0, 2.5)
+    assert {pair: list(rows) for pair, rows in recording.pairs().items()} == {
+        ("a", "b"): [1],
+        ("a", "M1"): [0],
+    }
+
+
+def test_an_mcap_file_gives_the_same_as_csv_files_and_counts_what_it_does_not_use(tmp_path: Path) -> None:
+    recording = read_ranges(written_mcap(tmp_path / "one.mcap", TABLES))
+    same(recording, read_csv(written_csv(tmp_path / "csv", TABLES)))
+    assert recording.radios == ("a", "b", "M1")
+    assert recording.unused == {"messages on /battery": 1}
+
+
+def test_a_recording_cannot_be_changed(tmp_path: Path) -> None:
+    recording = read_ranges(written_csv(tmp_path, TABLES))
+    arrays = [*recording.ranges, *recording.robots[0].odometry, *(recording.robots[0].truth or ())]
+    assert not any(array.flags.writeable for array in arrays)
+
+
+def test_anchors_of_another_file_are_added_and_replace_those_of_the_same_names(tmp_path: Path) -> None:
+    other = tmp_path / "surveyed.csv"
+    other.write_text("anchor,x,y\nM1,30,40\nM2,5,6\n")
+    ranges = [*TABLES["ranges"], {"t": 1.0, "from": "b", "to": "M2", "range": 3.5}]
+    tables = {**TABLES, "ranges": ranges}
+    for path in (written_csv(tmp_path / "csv", tables), written_mcap(tmp_path / "one.mcap", tables)):
+        assert "M2 is neither a robot" in refused(path)
+        recording = read_ranges(path, other)
+        assert recording.anchors == (("M1", 30.0, 40.0, 0.0), ("M2", 5.0, 6.0, 0.0))
+        assert recording.radios[recording.ranges.second[-1]] == "M2"
+    for text, says in (
+        ("LC0,30,x", "line 2: y: expected a number, got 'x'"),
+        ("LC0,1,2\nLC0,1,2", "line 3: there are two anchors LC0"),
+    ):
+        other.write_text(f"anchor,x,y\n{text}\n")
+        with pytest.raises(BadRecording) as error:
+            read_ranges(SAMPLE, other)
+        assert str(error.value) == f"{other}, {says}"
+    other.write_text("anchor,x,y\nLC0,30,40\n")
+    assert read_ranges(SAMPLE, other).anchors[0] == ("LC0", 30.0, 40.0, 0.0)
+
+
+def test_the_sample_has_its_licence_and_is_small() -> None:
+    assert sum(path.stat().st_size for path in SAMPLE.parent.iterdir()) <= MAX_SAMPLE_BYTES
+    assert (SAMPLE.parent / "LICENSE").read_text().startswith("MIT License")
+
+
+def test_the_sample_is_two_robots_with_truth_for_30_s() -> None:
+    recording = read_ranges(SAMPLE)
+    assert recording.radios == ("A", "B", "LC0", "LC1")
+    assert 29.9 <= recording.span[1] - recording.span[0] <= 30.1
+    for robot in recording.robots:
+        assert len(robot.odometry.t0) == 600
+        assert not len(robot.odometry.gaps)
+        assert robot.truth is not None
+        assert len(robot.truth.t) == 601
+    assert {pair: len(rows) for pair, rows in recording.pairs().items()} == {
+        ("A", "B"): 184,
+        ("A", "LC0"): 171,
+        ("B", "LC0"): 133,
+        ("B", "LC1"): 133,
+    }
+
+
+def test_odometry_and_ranges_of_the_sample_agree_with_its_truth() -> None:
+    """The stamps of edges are the ends of increments: turns then differ from the truth half as much."""
+    recording = read_ranges(SAMPLE)
+    places = []
+    for robot in recording.robots:
+        assert robot.truth is not None
+        heading = np.unwrap(robot.truth.poses[:, 2])
+        turned = np.diff(np.interp(robot.odometry.t1, robot.truth.t, heading))
+        assert np.std(turned - robot.odometry.increments[1:, 2]) < 0.003  # starts: 0.004 to 0.005
+        t = recording.ranges.t
+        places.append([np.interp(t, robot.truth.t, robot.truth.poses[:, axis]) for axis in (0, 1)])
+    count = len(recording.ranges.t)
+    places += [[np.full(count, anchor.x), np.full(count, anchor.y)] for anchor in recording.anchors]
+    at = np.array(places)
+    rows = np.arange(len(recording.ranges.t))
+    apart = at[recording.ranges.first, :, rows] - at[recording.ranges.second, :, rows]
+    residuals = recording.ranges.range - np.hypot(*apart.T)
+    assert abs(np.mean(residuals)) < 0.01
+    assert np.std(residuals) < 0.05
+
+
+def test_a_part_has_the_chosen_robots_and_the_chosen_time() -> None:
+    whole = read_ranges(SAMPLE)
+    part = whole.part("B", 10.0, 20.0)
+    assert part.radios == ("B", "LC0", "LC1")
+    (robot,) = part.robots
+    assert robot.odometry.t0[0] >= 10.0
+    assert robot.odometry.t1[-1] <= 20.0
+    assert robot.truth is not None
+    assert robot.truth.t[0] >= 10.0
+    assert set(part.pairs()) == {("B", "LC0"), ("B", "LC1")}
+    rows = whole.pairs()["B", "LC0"]
+    inside = [row for row in rows if 10.0 <= whole.ranges.t[row] <= 20.0]
+    of_part = part.pairs()["B", "LC0"]
+    np.testing.assert_array_equal(part.ranges.range[of_part], whole.ranges.range[inside])
+
+
+PYFG = """\
+VERTEX_SE2 0.1 A0 1.0 2.0 0.5
+VERTEX_SE2 1.1 A1 1.5 2.0 0.5
+VERTEX_XY L0 4.0 5.0
+EDGE_SE2 {first} A0 A1 0.5 0.1 0.0 0.01 0 0 0.02 0 0.03
+EDGE_SE2 {second} A1 A2 0.25 0.0 0.1 0.01 0 0 0.02 0 0.03
+EDGE_SE2 9.0 A0 A2 0.25 0.0 0.1 0.01 0 0 0.02 0 0.03
+VERTEX_XY:PRIOR 0.0 L0 4.0 5.0 1 0 1
+EDGE_RANGE 0.6 L0 A1 3.5 0.04
+"""
+
+
+def test_the_stamps_of_edges_are_the_ends_of_increments_or_their_starts(tmp_path: Path) -> None:
+    path = tmp_path / "one.pyfg"
+    path.write_text(PYFG.format(first=1.12, second=2.0))
+    ends = read_ranges(path)
+    np.testing.assert_array_equal(ends.robots[0].odometry.t0, [0.1, 1.12])
+    np.testing.assert_array_equal(ends.robots[0].odometry.t1, [1.12, 2.0])
+    path.write_text(
+        PYFG.replace("VERTEX_XY L0", "VERTEX_SE2 2.2 A2 1 2 3\nVERTEX_XY L0").format(first=0.0, second=1.0)
+    )
+    starts = read_ranges(path)
+    np.testing.assert_array_equal(starts.robots[0].odometry.t0, [0.0, 1.0])
+    np.testing.assert_array_equal(starts.robots[0].odometry.t1, [1.0, 2.2])
+    np.testing.assert_array_equal(ends.robots[0].odometry.covariance[0], np.diag([0.01, 0.02, 0.03]))
+    np.testing.assert_array_equal(ends.ranges.sigma, [0.2])
+    assert ends.radios == ("A", "L0")
+    assert ends.unused == {"EDGE_SE2 between poses that do not follow each other": 1, "VERTEX_XY:PRIOR": 1}
+
+
+# --- runs of Tandem ---------------------------------------------------------------------------------------
+
+
+def test_a_run_gives_what_its_robots_measured(noisy: Run) -> None:
+    recording = ranges_of_run(noisy)
+    mission = noisy.scenario.mission
+    assert recording.radios == ("a", "b", "anchor-a", "anchor-b")
+    for robot in recording.robots:
+        assert robot.truth is not None
+        assert [tuple(pose) for pose in robot.truth.poses] == [
+            (pose.x, pose.y, pose.heading) for pose in noisy.truth(robot.id)
+        ]
+        for tick, moved in enumerate(robot.odometry.increments, 1):
+            executed = noisy.observations[tick][robot.id].executed
+            assert executed is not None
+            end = step(ORIGIN, executed.v, executed.omega, mission.period)
+            assert tuple(moved) == (end.x, end.y, end.heading)
+    measured = {
+        (tick * mission.period, robot): observation.anchor_range
+        for tick, observations in enumerate(noisy.observations)
+        for robot, observation in observations.items()
+        if observation.anchor_range is not None
+    }
+    rows = [row for pair, rows in recording.pairs().items() if pair != ("a", "b") for row in rows]
+    ranges = recording.ranges
+    assert measured == {(ranges.t[i], recording.radios[ranges.first[i]]): ranges.range[i] for i in rows}
+    mutual = recording.pairs()["a", "b"]
+    contacts = [noisy.contact("a", tick) for tick in range(noisy.length)]
+    assert list(ranges.range[mutual]) == [one.range for one in contacts if one is not None and one.range]
+    assert ranges.sigma[mutual[0]] == math.hypot(mission.noise.mutual_sigma, LEAST_SIGMA)
+
+
+def test_a_run_in_hardware_mode_has_no_truth_and_a_robot_alone_no_mutual_ranges(
+    noisy: Run, tmp_path: Path
+) -> None:
+    in_process.run_mission(load("noisy"), tmp_path)
+    (tmp_path / "world.journal").unlink()
+    pair, with_truth = read_ranges(tmp_path), ranges_of_run(noisy)
+    assert [robot.truth for robot in pair.robots] == [None, None]
+    np.testing.assert_array_equal(pair.ranges.range, with_truth.ranges.range)
+    ended = tandem("export", tmp_path, "--pyfg")
+    unknown = "the true poses of a, which a .pyfg file needs, are unknown"
+    assert ended == (USER_ERROR, "", f"tandem export: {tmp_path}: {unknown}\n")
+    (tmp_path / "agent-b.journal").unlink()
+    alone = read_ranges(tmp_path)
+    assert alone.radios == ("a", "anchor-a")
+    assert set(alone.pairs()) == {("a", "anchor-a")}
+
+
+@pytest.mark.parametrize("omega", [0.0, 1e-5, 0.7, -2.0])
+def test_the_covariance_of_an_increment_is_that_of_its_derivatives(omega: float) -> None:
+    noise, executed, h = (
+        VelocityNoise(v=0.1, omega=0.05, v_floor=0.02, omega_floor=0.03),
+        Controls(0.8, omega),
+        1e-6,
+    )
+
+    def end(v: float, turn_rate: float) -> np.ndarray:
+        pose = step(ORIGIN, v, turn_rate, 0.5)
+        return np.array([pose.x, pose.y, pose.heading])
+
+    by_v = (end(executed.v + h, omega) - end(executed.v - h, omega)) / (2 * h)
+    by_omega = (end(executed.v, omega + h) - end(executed.v, omega - h)) / (2 * h)
+    q_v, q_omega = noise.variances(executed.v, omega)
+    expected = q_v * np.outer(by_v, by_v) + q_omega * np.outer(by_omega, by_omega) + 1e-12 * np.eye(3)
+    found = increment_covariance(executed, 0.5, noise)
+    np.testing.assert_allclose(found, expected[np.triu_indices(3)], rtol=1e-6, atol=1e-12)
+
+
+# --- export -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["paper-1", "noisy"])
+def test_an_exported_run_is_read_back_without_loss(name: str, tmp_path: Path) -> None:
+    recording = tmp_path / "recording"
+    recording.mkdir()
+    run = in_process.run_mission(load(name), recording)
+    ended = tandem("export", recording, "--pyfg", "--out", tmp_path / "out")
+    path = tmp_path / "out" / "run.pyfg"
+    assert ended == (0, f"{path}\na is A, b is B, anchor-a is L0, anchor-b is L1\n", "")
+    assert list(path.parent.iterdir()) == [path]
+    same(read_ranges(path), ranges_of_run(run))
+    same(read_ranges(recording), ranges_of_run(run))
+
+
+def test_an_exported_graph_has_the_layout_that_pyfactorgraph_reads(noisy: Run) -> None:
+    """The rules of its `read_from_pyfg_text`, which is not in the package registry.
+
+    The first line is a pose; fields are separated by one space, and their number is fixed; names of poses
+    are one capital other than L and a number, those of landmarks begin with L; a name appears before it is
+    used; variances are positive.
+    """
+    known: set[str] = set()
+    kinds = {"VERTEX_SE2": 6, "VERTEX_XY": 4, "EDGE_SE2": 13, "EDGE_RANGE": 6}
+    lines = written_pyfg(ranges_of_run(noisy)).text.splitlines()
+    assert lines[0].startswith("VERTEX_SE2 ")
+    for line in lines:
+        words = line.split(" ")
+        assert len(words) == kinds[words[0]]
+        named = [words[place] for place in NAMES[words[0]]]
+        match words[0]:
+            case "VERTEX_SE2":
+                assert named[0][0] in "AB"
+                known.add(named[0])
+            case "VERTEX_XY":
+                assert words[1].startswith("L")
+                known.add(words[1])
+            case "EDGE_SE2":
+                assert int(named[1][1:]) == int(named[0][1:]) + 1
+                matrix = np.array(words[7:], float)[[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+                assert np.linalg.eigvalsh(matrix)[0] > 0.0
+            case _:
+                assert not named[0].startswith("L")
+                assert float(words[5]) > 0.0
+        assert set(named) <= known
+        assert all(math.isfinite(float(word)) for word in words if word[:1] in "-0123456789")
+
+
+def test_the_sample_is_written_as_it_was_read(tmp_path: Path) -> None:
+    recording = read_ranges(SAMPLE)
+    written = written_pyfg(recording)
+    assert written.names == {"A": "A", "B": "B", "LC0": "L0", "LC1": "L1"}
+    (tmp_path / "again.pyfg").write_text(written.text)
+    same(read_ranges(tmp_path / "again.pyfg"), recording)
+
+
+@pytest.mark.parametrize(
+    ("without", "says"),
+    [
+        ("truth", "the true poses of b, which a .pyfg file needs, are unknown"),
+        ("antennas", "a .pyfg file cannot hold the antenna of b"),
+    ],
+)
+def test_what_a_factor_graph_cannot_hold_is_refused(without: str, says: str, tmp_path: Path) -> None:
+    odometry = [row | SIGMAS for row in TABLES["odometry"] if row["robot"] == "b"]
+    tables = {"odometry": odometry, "ranges": [], "antennas": TABLES["antennas"]}
+    if without == "truth":
+        tables["antennas"] = []
+    written_csv(tmp_path, tables)
+    (tmp_path / "ranges.csv").write_text("t,from,to,range\n")
+    if without == "truth":
+        (tmp_path / "antennas.csv").unlink()
+    with pytest.raises(UserError) as error:
+        written_pyfg(read_ranges(tmp_path))
+    assert str(error.value) == f"{tmp_path}: {says}"
+
+
+# --- invalid files ----------------------------------------------------------------------------------------
+
+
+def refused(path: Path) -> str:
+    """Return the one line with which `path` is refused."""
+    with pytest.raises(UserError) as error:
+        read_ranges(path)
+    assert error.value.exit_status == USER_ERROR
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def changed(table: str, row: int, **fields: object) -> Tables:
+    rows = [*TABLES[table]]
+    rows[row] = {name: value for name, value in {**rows[row], **fields}.items() if value is not None}
+    return {**TABLES, table: rows}
+
+
+INVALID: list[tuple[str, int, dict[str, object], str]] = [
+    ("odometry", 1, {"dx": "fast"}, "dx: expected a number, got 'fast'"),
+    ("odometry", 1, {"dx": "nan"}, "dx: expected a number >= -10000000.0, got 'nan'"),
+    ("odometry", 1, {"t0": "inf"}, "t0: expected a number <= 1000000000000.0, got 'inf'"),
+    ("odometry", 0, {"t1": -0.5}, "t1: -0.5 s is before t0, 0 s"),
+    ("odometry", 2, {"t0": 0.25}, "t0: it starts at 0.25 s, and the increment of a before it ends at 0.5 s"),
+    ("odometry", 1, {"robot": "b/c"}, "robot: expected a name of letters, digits, - and _, got 'b/c'"),
+    ("odometry", 1, {"dx": None}, "missing required field 'dx'"),
+    ("odometry", 1, {"sigma_dx": 0.1}, "it needs all of sigma_dx, sigma_dy, sigma_dheading, or none"),
+    ("ranges", 1, {"range": -1.5}, "range: expected a number >= 0.0, got '-1.5'"),
+    ("ranges", 1, {"sigma": 0}, "sigma: expected a number > 0.0, got '0'"),
+    ("ranges", 1, {"from": "M2"}, "M2 is neither a robot with odometry nor a known anchor"),
+    ("ranges", 1, {"to": "M1"}, "it is a range from M1 to itself"),
+    ("ranges", 1, {"from": "b"}, "t: it is of 0.2 s, and the range between b and a before it is of 0.3 s"),
+    ("antennas", 0, {"robot": "c"}, "robot: c has no odometry"),
+    ("truth", 2, {"t": -1}, "t: it is of -1 s, and the true pose before it is of 0 s"),
+]
+
+
+@pytest.mark.parametrize(("table", "row", "fields", "says"), INVALID)
+def test_an_invalid_row_is_one_line_with_its_place(
+    table: str, row: int, fields: dict[str, object], says: str, tmp_path: Path
+) -> None:
+    tables = changed(table, row, **fields)
+    said = refused(written_csv(tmp_path / "csv", tables))
+    assert said == f"{tmp_path}/csv/{table}.csv, line {row + 2}: {says}"
+    if "number" not in says and "name of" not in says:  # numbers are numbers in JSON
+        said = refused(written_mcap(tmp_path / "one.mcap", tables))
+        assert said == f"{tmp_path}/one.mcap, /{table}, message {row + 1}: {says}"
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", ": there is no odometry"),
+        ("VERTEX_SE3:QUAT 0 A0 0 0 0 0 0 0 1", ", line 1: unknown kind of line 'VERTEX_SE3:QUAT'; only two-"),
+        ("\nEDGE_SE 1", ", line 2: unknown kind of line 'EDGE_SE'"),
+        ("VERTEX_SE2 0 A0 0 0", ", line 1: VERTEX_SE2 has 4 fields and needs 5"),
+        ("VERTEX_SE2 0 A 0 0 0", ", line 1: 'A' is not the name of a pose, such as A17"),
+        ("VERTEX_SE2 0 L0 0 0 0", ", line 1: 'L0' is not the name of a pose, such as A17"),
+        ("VERTEX_SE2 x A0 0 0 0", ", line 1: t: expected a number, got 'x'"),
+        ("VERTEX_SE2 0 A0 0 0 0\nVERTEX_SE2 1 A0 0 0 0", ", line 2: there are two poses A0"),
+        (
+            "VERTEX_SE2 1 A0 0 0 0\nVERTEX_SE2 0 A1 0 0 0",
+            ", line 2: t: it is of 0 s, and the true pose before",
+        ),
+        ("EDGE_SE2 1 A0 A1 0 0 0 1 0 0 1 0 1", ", line 1: the time of A0 is unknown: it has no VERTEX_SE2"),
+        ("EDGE_SE2 1 A0 A1 0 0 0 1 0 0 -1 0 1", ", line 1: cov_yy: the variance -1 is negative"),
+        ("EDGE_SE2 1 A0 A1 0 0 0 1 nan 0 1 0 1", ", line 1: cov_xy: 'nan' is not a number"),
+        (
+            "VERTEX_SE2 0 A0 0 0 0\nEDGE_RANGE 0 A0 B0 1 1",
+            ", line 2: B is neither a robot with odometry nor a",
+        ),
+        ("VERTEX_SE2 0 A0 0 0 0\nEDGE_RANGE 0 A0 L0 1 0", ", line 2: variance: 0 is not positive"),
+        (
+            "VERTEX_SE2 0 A0 0 0 0\nEDGE_SE2 2 A0 A1 0 0 0 1 0 0 1 0 1\nEDGE_SE2 1 A1 A2 0 0 0 1 0 0 1 0 1",
+            ", line 3: t: it is of 1 s, and the edge before it is of 2 s",
+        ),
+        ("VERTEX_XY L0 0 0\nVERTEX_XY L0 1 1", ", line 2: there are two anchors L0"),
+    ],
+)
+def test_an_invalid_graph_is_one_line_with_its_place(text: str, says: str, tmp_path: Path) -> None:
+    path = tmp_path / "one.pyfg"
+    path.write_text(text)
+    assert refused(path).startswith(f"{path}{says}")
+
+
+@pytest.mark.parametrize(
+    ("head", "says"),
+    [
+        (
+            "t,from,to,rnage",
+            "unknown column 'rnage'; it has t, from, to, range, sigma; did you mean 'range'?",
+        ),
+        ("t,from,to", "the column range is missing"),
+        ("t,t,from,to,range", "there are two columns t"),
+        ("", "the column t is missing"),
+    ],
+)
+def test_a_wrong_head_of_a_table_is_refused(head: str, says: str, tmp_path: Path) -> None:
+    written_csv(tmp_path, TABLES)
+    (tmp_path / "ranges.csv").write_text(f"{head}\n")
+    assert refused(tmp_path) == f"{tmp_path}/ranges.csv, line 1: {says}"
+
+
+def test_what_is_no_recording_is_refused_with_the_formats(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("hello")
+    formats = (
+        "it is not a .pyfg file, an .mcap file, a folder with odometry.csv and ranges.csv, or a recording"
+    )
+    assert refused(tmp_path / "notes.txt").startswith(f"{tmp_path}/notes.txt: {formats}")
+    assert refused(tmp_path).startswith(f"{tmp_path}: {formats}")
+    assert (
+        refused(tmp_path / "none.pyfg") == f"{tmp_path}/none.pyfg cannot be read: No such file or directory"
+    )
+    (tmp_path / "odometry.csv").write_text("robot,t0,t1,dx,dy,dheading\na,0,1,1,0\n")
+    assert refused(tmp_path) == f"{tmp_path}/odometry.csv, line 2: it has 5 fields, and the first line 6"
+    (tmp_path / "odometry.csv").write_bytes(b"\xff\xfe")
+    assert refused(tmp_path) == f"{tmp_path}/odometry.csv: it is not UTF-8 text"
+    (tmp_path / "odometry.csv").write_text("robot,t0,t1,dx,dy,dheading\na,0,1,1,0,0\n")
+    assert refused(tmp_path) == f"{tmp_path}/ranges.csv cannot be read: No such file or directory"
+
+
+def test_a_damaged_mcap_file_is_refused(tmp_path: Path) -> None:
+    path = written_mcap(tmp_path / "one.mcap", TABLES)
+    whole = path.read_bytes()
+    for content in (b"", b"not at all", whole[: len(whole) // 2], whole[:200] + b"\x00" * 40 + whole[240:]):
+        path.write_bytes(content)
+        assert refused(path).startswith(f"{path}: it is not a complete MCAP file")
+    written_mcap(path, TABLES, encoding="cbor")
+    assert refused(path) == f"{path}: /odometry is encoded as 'cbor', not as 'json'"
+
+
+def test_names_of_robots_and_anchors_do_not_overlap(tmp_path: Path) -> None:
+    tables = {**TABLES, "anchors": [{"anchor": "a", "x": 0, "y": 0}], "ranges": TABLES["ranges"][:1]}
+    assert refused(written_csv(tmp_path, tables)) == f"{tmp_path}: a is a robot and an anchor"
+    tables = {**TABLES, "anchors": [*TABLES["anchors"], {"anchor": "M2", "x": 0, "y": 0}]}
+    tables["ranges"] = [{"t": 0, "from": "M1", "to": "M2", "range": 1}]
+    said = refused(written_csv(tmp_path, tables))
+    assert said == f"{tmp_path}/ranges.csv, line 2: M1 and M2 are both anchors"
+
+
+# --- converters -------------------------------------------------------------------------------------------
+
+
+def test_the_script_for_plaza_writes_a_recording_that_is_read(tmp_path: Path) -> None:
+    turn = 0.25
+    scipy.io.savemat(
+        tmp_path / "plaza.mat",
+        {
+            "GT": [[10.0, 1.0, 2.0, 0.5], [11.0, 2.0, 2.0, 0.75]],
+            "DR": [[11.0, 1.0, turn]],
+            "TD": [[10.75, 2, 6, 5.5], [10.5, 2, 6, 5.0], [10.25, 2, 1, 4.5]],
+            "TL": [[6, 20.0, 30.0], [1, -1.0, -2.0]],
+        },
+    )
+    plaza_csv.convert(tmp_path / "plaza.mat", tmp_path / "out")
+    recording = read_ranges(tmp_path / "out")
+    assert recording.radios == ("mower", "6", "1")
+    (mower,) = recording.robots
+    np.testing.assert_allclose(
+        mower.odometry.increments, [[math.sin(turn) / turn, (1 - math.cos(turn)) / turn, turn]], rtol=1e-12
+    )
+    np.testing.assert_array_equal(mower.odometry.t0, [10.0])
+    assert mower.truth is not None
+    np.testing.assert_array_equal(mower.truth.poses[1], [2.0, 2.0, 0.75])
+    np.testing.assert_array_equal(recording.ranges.range, [4.5, 5.0, 5.5])
+
+
+def test_bad_recording_is_a_users_mistake() -> None:
+    assert issubclass(BadRecording, UserError)

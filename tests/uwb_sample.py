@@ -1,0 +1,63 @@
+"""The sample of recorded UWB ranges in tests/data/uwb, cut from the recording of which its README tells.
+
+The recording has one anchor, and a pair of robots needs two. The second is made from the truth and from the
+residuals of a robot's ranges to the first: its errors are those of a radio.
+
+`uv run python -m tests.uwb_sample tiers.pyfg tests/data/uwb/tiers-a-b-30-s.pyfg` writes it.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from compose.recording.ranging.pyfg import read_pyfg
+from docs.recorded_claims import SECOND_ANCHOR, second_place, second_ranges
+
+ROBOTS = "AB"
+BEGIN_S = 1671300425.0
+"""The time that is subtracted from all stamps, in s."""
+LAST_POSE = 700
+"""The number of the last pose of each robot: 600 poses, at 20 Hz, after the first, which is 100."""
+STAMP_DIGITS, VALUE_DIGITS = 4, 6
+"""The decimals of stamps (s), and of lengths (m) and angles (rad): far below the errors of the sensors."""
+NAMES = {"VERTEX_SE2": (2,), "VERTEX_XY": (), "EDGE_SE2": (2, 3), "EDGE_RANGE": (2, 3)}
+"""The places of the poses and landmarks in each kind of line."""
+
+
+def sample_lines(lines: Sequence[str]) -> Iterator[str]:
+    """Yield the lines of the sample, with fewer decimals and with stamps from 0 s on."""
+    for words in map(str.split, lines):
+        if not all(_kept(words[place]) for place in NAMES[words[0]]):
+            continue
+        if words[0] != "VERTEX_XY":
+            words[1] = f"{float(words[1]) - BEGIN_S:.{STAMP_DIGITS}f}"
+        values = words[:4] if words[0].startswith("EDGE") else words[:3]
+        rest = [f"{round(float(word), VALUE_DIGITS) or 0.0:.7g}" for word in words[len(values) :]]
+        if words[0] == "VERTEX_XY":
+            values, rest = words[:2], [f"{float(word):.{VALUE_DIGITS}f}" for word in words[2:]]
+        yield " ".join([*values, *rest])
+
+
+def _kept(name: str) -> bool:
+    return name.startswith("L") or (name[0] in ROBOTS and int(name[1:]) <= LAST_POSE)
+
+
+def second_lines(path: Path, robot: str = ROBOTS[-1]) -> Iterator[str]:
+    """Yield the lines of the second anchor for the sample at `path`, in which it is in addition."""
+    recording = read_pyfg(path)
+    place = second_place(recording)
+    yield f"VERTEX_XY {SECOND_ANCHOR} {place[0]:.{VALUE_DIGITS}f} {place[1]:.{VALUE_DIGITS}f}"
+    _, measured = second_ranges(recording, robot, place)
+    lengths = iter(measured.tolist())
+    first = recording.anchors[0].id
+    for words in map(str.split, path.read_text().splitlines()):
+        if words[0] == "EDGE_RANGE" and words[2][0] == robot and words[3] == first:
+            yield f"{' '.join(words[:3])} {SECOND_ANCHOR} {next(lengths):.{VALUE_DIGITS}f} {words[5]}"
+
+
+if __name__ == "__main__":
+    source, target = map(Path, sys.argv[1:])
+    target.write_text("\n".join([*sample_lines(source.read_text().splitlines()), ""]))
+    target.write_text(target.read_text() + "\n".join([*second_lines(target), ""]))
