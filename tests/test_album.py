@@ -296,6 +296,7 @@ def test_ranges_are_those_that_were_measured_and_contact_is_shaded(recordings: P
 
 
 @pytest.mark.parametrize("name", ["paper-1", "noisy"])
+@pytest.mark.long
 def test_the_last_error_is_that_of_the_claim(name: str, recordings: Path) -> None:
     told = pair(recorded(name, recordings))
     figure = drawn(over_time.errors(told))

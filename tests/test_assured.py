@@ -363,7 +363,7 @@ def known(recording: Run, robot: str) -> int:
     return next(moment.truth.tick for moment in recording.ticks if moment.commands[robot].phase > 1)
 
 
-@pytest.mark.parametrize("reach", [1.0, 3.0, 5.0])
+@pytest.mark.parametrize("reach", series([1.0, 3.0, 5.0]))
 def test_driving_back_is_never_slower_than_circling_for_a_slow_turner(
     reach: float,
 ) -> None:
@@ -623,13 +623,13 @@ def hard(setting: Setting) -> Iterator[tuple[float, float]]:
     return ((rho0, heading + offset) for rho0, heading, offset in product(radii, RADIAL_AND_TANGENT, offsets))
 
 
-@pytest.mark.parametrize("setting", series(HARD[::3] + HARD[1::3] + HARD[2::3], 2))
+@pytest.mark.parametrize("setting", series(HARD[::3] + HARD[1::3] + HARD[2::3]))
 def test_b_localises_from_nearly_indistinguishable_starts(setting: Setting) -> None:
     for rho0, heading in hard(setting):
         assert_localised(released(setting, None, Pose(setting.distance + rho0, 0.0, heading)))
 
 
-@pytest.mark.parametrize("setting", series(HARD[::3] + HARD[1::3] + HARD[2::3], 2))
+@pytest.mark.parametrize("setting", series(HARD[::3] + HARD[1::3] + HARD[2::3]))
 def test_both_localise_from_nearly_mirrored_starts(setting: Setting) -> None:
     for rho0, heading in hard(setting):
         a = Pose(rho0, 0.0, heading)

@@ -156,6 +156,7 @@ def test_a_run_as_processes_violates_no_rule_and_the_command_reports_it(tmp_path
     assert lines[6].split() == ["observation", str(2 * (last + 1)), "0"]
 
 
+@pytest.mark.long
 def test_a_run_in_real_time_with_missed_commands_violates_no_rule(tmp_path: Path) -> None:
     out = tmp_path / "out"
     (tmp_path / "assured.toml").write_text(REAL_TIME)
@@ -206,7 +207,7 @@ def paper_1() -> dict[str, list[bytes]]:
     return kept(load("paper-1"))
 
 
-@pytest.mark.parametrize("name", [WORLD_JOURNAL, A, B])
+@pytest.mark.parametrize("name", series([WORLD_JOURNAL, A, B]))
 def test_a_journal_that_breaks_off_anywhere_breaks_no_other_rule(
     name: str, paper_1: dict[str, list[bytes]]
 ) -> None:

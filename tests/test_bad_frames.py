@@ -196,6 +196,7 @@ def test_invalid_frames_before_the_first_tick_are_refused_counted_and_reported_o
     assert [robots[name]["frames_refused"] for name in "abcd"] == [observations + reports, 0, 0, 0]
 
 
+@pytest.mark.long
 def test_a_mission_is_not_disturbed_by_invalid_frames(tmp_path: Path) -> None:
     scenario, out, alone = tmp_path / "long.toml", tmp_path / "out", tmp_path / "alone"
     scenario.write_text(LONG)

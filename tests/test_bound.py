@@ -100,6 +100,7 @@ def test_the_bound_grows_with_the_odometrys_noise() -> None:
 
 
 @pytest.mark.parametrize("noise", [SIGMA, f"{SIGMA}\n{WHEELS}\n{ODOMETRY}"], ids=["ranges", "odometry"])
+@pytest.mark.long
 def test_claims_are_as_wide_as_the_bound(noise: str) -> None:
     for seed in SEEDS:
         recording = survey(noise, seed)

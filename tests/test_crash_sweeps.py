@@ -75,6 +75,7 @@ def left(tmp_path: Path) -> list[int]:
 # --- trials -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_run_with_kills_has_the_recording_of_the_run_without_kills(tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(SMALL)
     ended = tandem("sweep", "small.toml", "--out", "out", cwd=tmp_path)

@@ -34,6 +34,7 @@ from protocol.network.diagnosis import MUTE
 from protocol.network.endpoints import configured, listening
 from protocol.wire import VERSION
 from tests.commands import ENDLESS, LONG, Ended, TandemProcess, tandem, world
+from tests.series import series
 from tests.test_keys import expire, give_foreign, last, world_of
 from tests.test_topologies import Router, connect, listen, record_of, routing, same
 
@@ -239,7 +240,7 @@ def test_a_refusal_by_the_router_is_explained(keys: Path, mine: Path) -> None:
     assert link == f"router: no router at {endpoint}: this certificate has expired; check the certificate"
 
 
-@pytest.mark.parametrize("command", ["doctor", "ps"])
+@pytest.mark.parametrize("command", series(["doctor", "ps"]))
 def test_the_wait_for_a_listener_that_sends_nothing_is_bounded_and_can_be_interrupted(
     command: str,
 ) -> None:
@@ -377,11 +378,13 @@ READ = "robot/b/command, robot/b/observation, world/truth"
 
 @pytest.mark.parametrize(
     ("change", "fixes"),
-    [
-        (enforce, []),
-        (enforce_nothing, [f"can publish {FORGED};", f"can read {READ} in mine;"]),
-        (let_read_truth, ["can publish world/truth;", "can read world/truth in mine;"]),
-    ],
+    series(
+        [
+            (enforce, []),
+            (enforce_nothing, [f"can publish {FORGED};", f"can read {READ} in mine;"]),
+            (let_read_truth, ["can publish world/truth;", "can read world/truth in mine;"]),
+        ]
+    ),
 )
 def test_rules_are_tried_while_a_mission_runs(
     change: Callable[[dict[str, Any]], None], fixes: list[str], keys: Path, tmp_path: Path
@@ -426,6 +429,7 @@ def test_access_rules_without_the_robot_are_a_problem(keys: Path, tmp_path: Path
     only_fix(ended, "rules: agent-c cannot publish Reports of c; the router must enforce the rules")
 
 
+@pytest.mark.long
 def test_a_check_that_needs_a_running_mission_is_not_reported_as_passed(keys: Path, tmp_path: Path) -> None:
     with router_by(keys, enforce, tmp_path) as endpoint, ExitStack() as stack:
         flags = ("--connect", endpoint, "--keys", keys / "agent-a", "--timeout", "0.2")

@@ -94,7 +94,7 @@ def long(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("number", series([SIGINT, SIGTERM]), ids=["SIGINT", "SIGTERM"])
-@pytest.mark.parametrize("moment", series(MOMENTS, 9))
+@pytest.mark.parametrize("moment", series(MOMENTS, 4))
 def test_an_interrupted_run_reports_it_and_leaves_no_process(
     moment: str, number: signal.Signals, endless: Path, tmp_path: Path
 ) -> None:
@@ -188,6 +188,7 @@ def test_a_process_that_dies_ends_the_run_at_once_and_is_named(
     assert summary["ticks"] > 0
 
 
+@pytest.mark.long
 def test_a_robot_that_stops_sending_fails_the_run_within_the_timeout(endless: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with TandemProcess("run", endless, "--out", out, "--timeout", TIMEOUT, "-q") as run:
@@ -214,7 +215,7 @@ def test_an_agent_whose_world_dies_ends_within_its_timeout(tmp_path: Path) -> No
     ]
 
 
-@pytest.mark.parametrize("comes", ["nobody", "a"])
+@pytest.mark.parametrize("comes", series(["nobody", "a"]))
 def test_a_world_whose_robot_never_connects_fails_and_names_it(comes: str, tmp_path: Path) -> None:
     missing = {"nobody": "a (not connected), b (not connected)", "a": "b (not connected)"}[comes]
     reason = f"no answer from {missing} at tick 0 for {TIMEOUT} s"

@@ -11,6 +11,8 @@ from typing import Any
 
 import pytest
 
+from tests.series import series
+
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
 SMALL: dict[str, dict[str, Any]] = {
     "run_and_plot": {},
@@ -31,7 +33,7 @@ def test_every_example_is_run_and_listed() -> None:
         assert f"`docs/examples/{name}.py`" in page
 
 
-@pytest.mark.parametrize("name", SMALL)
+@pytest.mark.parametrize("name", series(SMALL))
 def test_an_example_runs_and_writes_its_figure(name: str, tmp_path: Path) -> None:
     assert len((EXAMPLES / f"{name}.py").read_text().splitlines()) < MAX_LINES
     import_module(f"docs.examples.{name}").main(str(tmp_path / "figure.png"), **SMALL[name])
@@ -39,6 +41,7 @@ def test_an_example_runs_and_writes_its_figure(name: str, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("name", WITHOUT_FIGURE)
+@pytest.mark.long
 def test_an_example_without_a_figure_runs(name: str) -> None:
     assert len((EXAMPLES / f"{name}.py").read_text().splitlines()) < MAX_LINES
     import_module(f"docs.examples.{name}").main()

@@ -11,7 +11,6 @@ import io
 import itertools
 import json
 import math
-import os
 import random
 import re
 import shutil
@@ -30,6 +29,7 @@ from typing import Any
 import msgpack
 import msgspec
 import numpy as np
+import psutil
 import pyarrow.parquet as pq
 import pytest
 import websockets
@@ -57,6 +57,7 @@ from protocol.wire import decode
 from tests.commands import BOUND_S, OVER, REAL_TIME, TandemProcess, processes_of, tandem, until
 from tests.doctor import complaints
 from tests.replays import journals_of, killed
+from tests.series import series
 from world.referee import errors
 from world.scenario import Scenario
 
@@ -351,7 +352,7 @@ def test_a_torn_journal_is_exported_to_the_tear(name: str, faulty: Path, tmp_pat
     assert complaints(torn / "run.mcap") == []
 
 
-@pytest.mark.parametrize("number", [1, 2, 3])
+@pytest.mark.parametrize("number", series([1, 2, 3]))
 def test_what_a_killed_process_leaves_is_exported_and_replayed(number: int, tmp_path: Path) -> None:
     what, whole = killed(random.Random(number), tmp_path)
     assert whole, what
@@ -604,19 +605,12 @@ def asking(port: int, heads: dict[str, str]) -> http.client.HTTPConnection:
 
 def listened_by(pids: Iterable[int]) -> set[tuple[str, int]]:
     """Return the IPv4 addresses and ports on which these processes listen."""
-    inodes = {
-        os.readlink(link)
+    return {
+        (str(link.laddr.ip), int(link.laddr.port))
         for pid in pids
-        for link in Path(f"/proc/{pid}/fd").iterdir()
-        if os.path.lexists(link)
+        for link in psutil.Process(pid).net_connections("inet4")
+        if link.status == psutil.CONN_LISTEN
     }
-    found = set()
-    for line in Path("/proc/net/tcp").read_text().splitlines()[1:]:
-        _, local, _, state, *rest = line.split()
-        host, port = local.split(":")
-        if state == "0A" and f"socket:[{rest[5]}]" in inodes:
-            found.add((socket.inet_ntoa(int(host, 16).to_bytes(4, sys.byteorder)), int(port, 16)))
-    return found
 
 
 def test_a_page_s_origin_is_named_as_a_browser_sends_it() -> None:

@@ -173,6 +173,7 @@ def test_a_robot_whose_agent_is_killed_stands_still_and_resumes(tmp_path: Path, 
     )
 
 
+@pytest.mark.long
 def test_a_robot_whose_agent_is_suspended_stands_still_within_a_period_and_resumes(
     tmp_path: Path,
 ) -> None:

@@ -215,6 +215,7 @@ def test_a_recording_of_another_mission_is_refused(pair: Pair, tmp_path: Path) -
     assert "it belongs to another mission: its RobotConfig differs; choose another folder" in other.err
 
 
+@pytest.mark.long
 def test_a_driver_that_cannot_resume_is_refused_and_not_moved(pair: Pair, tmp_path: Path) -> None:
     pair.robots["a"].until_written(pair.path("a"), 1500)
     pair.kill("a", "b")
@@ -236,6 +237,7 @@ def test_a_driver_that_cannot_resume_is_refused_and_not_moved(pair: Pair, tmp_pa
     assert {path.name: path.read_bytes() for path in (tmp_path / "a").iterdir()} == before
 
 
+@pytest.mark.long
 def test_a_rover_whose_body_is_not_on_file_is_not_made_up_elsewhere(pair: Pair, tmp_path: Path) -> None:
     pair.robots["a"].until_written(pair.path("a"), 1500)
     pair.kill("a", "b")

@@ -218,6 +218,7 @@ def test_a_recording_always_gives_the_same_figure(noisy: Path, drawn: Path, tmp_
     assert "<dc:date>" not in svg.read_text()
 
 
+@pytest.mark.long
 def test_where_panels_stand_does_not_depend_on_the_last_bits_of_their_layout(
     noisy: Path, tmp_path: Path
 ) -> None:
@@ -229,6 +230,7 @@ def test_where_panels_stand_does_not_depend_on_the_last_bits_of_their_layout(
     assert np.array_equal(corners, corners.round(PLACES))
 
 
+@pytest.mark.long
 def test_an_exact_recording_has_counts_for_probabilities_and_no_ellipse(tmp_path: Path) -> None:
     svg = picture(recorded(load("paper-1"), tmp_path), "a")
     words, found = texts(svg), ids(svg)
@@ -238,6 +240,7 @@ def test_an_exact_recording_has_counts_for_probabilities_and_no_ellipse(tmp_path
     assert not [name for name in found if name.startswith(("ellipse-", "probability-"))]
 
 
+@pytest.mark.long
 def test_seconds_stand_below_the_ticks_where_a_tick_is_no_second(tmp_path: Path) -> None:
     text = PAPER_1.replace("period = 1.0", "period = 0.5").replace("max_speed = 1.0", "max_speed = 2.0")
     words = texts(picture(recorded(parse(text, "half"), tmp_path), "a"))
@@ -282,6 +285,7 @@ def test_a_truncated_recording_is_drawn_as_far_as_it_goes(ticks: int, noisy: Pat
         assert {"$M_1$", "$M_2$", "start"} <= words
 
 
+@pytest.mark.long
 def test_an_agent_killed_before_its_configuration_has_a_figure_without_estimates(
     noisy: Path, tmp_path: Path
 ) -> None:

@@ -105,6 +105,7 @@ def test_a_stream_gives_what_its_file_gives(messages: Messages) -> None:
             assert abs(row.y - other.y) < 0.05
 
 
+@pytest.mark.long
 def test_a_stream_that_breaks_off_gives_the_estimates_before_that(messages: Messages) -> None:
     def rows(data: bytes) -> str:
         estimate = StreamEstimate("it", None, (told_noise(PROFILE), PROFILE), ClaimRule())

@@ -32,6 +32,7 @@ from tests.commands import (
     until,
     world,
 )
+from tests.series import series
 
 ON_LINUX = pytest.mark.skipif(sys.platform != "linux", reason="a feature of Linux")
 CAP_SYS_ADMIN, CAP_SYS_RESOURCE = 21, 24
@@ -202,6 +203,7 @@ def test_a_run_whose_fork_server_is_stopped_can_be_stopped_all_the_same(
     assert not processes_of(out)
 
 
+@pytest.mark.long
 def test_a_run_whose_fork_server_is_suspended_comes_to_its_end() -> None:
     with TandemProcess("run", "paper-1", "--rate", "20") as run:
         until(lambda: fork_servers_of(run.pid), "there is a fork server")
@@ -245,7 +247,7 @@ def test_processes_that_are_stopped_end_too_when_their_launcher_is_killed(
         until(lambda: not processes_of(out) and gone(server), "all have ended")
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM], ids=["SIGKILL", "SIGTERM"])
+@pytest.mark.parametrize("number", series([signal.SIGKILL, signal.SIGTERM]), ids=["SIGKILL", "SIGTERM"])
 def test_a_fork_server_that_still_imports_ends_with_its_launcher(
     number: signal.Signals, endless: Path, tmp_path: Path
 ) -> None:
@@ -327,6 +329,7 @@ def test_as_many_robots_as_you_like_localise_as_processes_as_they_do_in_one(
     assert journals(tmp_path / "processes") == journals(tmp_path / "one")
 
 
+@pytest.mark.long
 def test_a_robot_that_has_answered_gets_fewer_repetitions(tmp_path: Path) -> None:
     path = tmp_path / "pairs.toml"
     path.write_text(several_pairs(2))

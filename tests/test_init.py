@@ -21,6 +21,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.long
 def test_every_printed_command_succeeds(folder: Path) -> None:
     shown = tandem("init", "others", cwd=folder).out.partition("to go on:")[2]
     for line in shown.strip().splitlines():

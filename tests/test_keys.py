@@ -25,6 +25,7 @@ from protocol.network import session
 from protocol.network.diagnosis import MUTE
 from protocol.network.endpoints import BadConfiguration, Endpoints, configured, listening
 from tests.commands import Ended, TandemProcess, journals, tandem
+from tests.series import series
 
 EVERYBODY = ("agent-a", "agent-b", "router", "viewer", "world")
 
@@ -248,11 +249,13 @@ def take_away(own: Path, _keys: Path) -> None:
 
 @pytest.mark.parametrize(
     ("spoil", "words"),
-    [
-        (expire, "this certificate has expired; check the certificate"),
-        (give_foreign, "it does not trust the authority of this certificate; check the certificate"),
-        (take_away, "it requires a certificate, and there is none; check the certificate"),
-    ],
+    series(
+        [
+            (expire, "this certificate has expired; check the certificate"),
+            (give_foreign, "it does not trust the authority of this certificate; check the certificate"),
+            (take_away, "it requires a certificate, and there is none; check the certificate"),
+        ]
+    ),
 )
 def test_an_invalid_certificate_is_refused_with_the_reason(
     spoil: Callable[[Path, Path], None], words: str, keys: Path, mine: Path

@@ -6,6 +6,7 @@ import pytest
 
 from compose.launch.in_process import run_mission
 from compose.recording.summary_json import summary
+from tests.series import series
 from tests.surveys import SIGMA, scenario_of, states, survey
 
 FINE = "anchor_sigma = 0.001\nmutual_sigma = 0.001\nstrays = 0.0"
@@ -18,7 +19,7 @@ ITS_OWN = {
 """The states of the paper, which are the same as with exact sensors."""
 
 
-@pytest.mark.parametrize("noise", [FINE, SIGMA], ids=["fine", "coarse"])
+@pytest.mark.parametrize("noise", series([FINE, SIGMA]), ids=["fine", "coarse"])
 def test_the_paper_planner_drives_only_the_papers_manoeuvres(noise: str) -> None:
     for seed in SEEDS:
         recording = survey(noise, seed, "paper")

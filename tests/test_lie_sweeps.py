@@ -95,6 +95,7 @@ def test_the_figures_show_the_outcomes_of_each_attack(results: execution.Results
     assert all(np.all(line.get_ydata() == 1.0) for line in panel.lines), "every lie before any honest one"
 
 
+@pytest.mark.long
 def test_a_sweep_without_attacks_has_no_figures_of_attacks(tmp_path: Path) -> None:
     (tmp_path / "few.toml").write_text('name = "few"\nscenario = "random"\ntrials = 2\nseed = 1\n')
     progress = execution.Progress(say=lambda _: None, begin=lambda *_: None, done=lambda _: None)

@@ -20,6 +20,7 @@ from compose.scenario.scenario_file import parse, shipped
 from protocol.attack import Attack, Kind, Part
 from protocol.messages import Inconsistent, Ranged, Report, Undecided
 from protocol.motion import ORIGIN, Pose, Segment, follow
+from tests.series import series
 from tests.steps import Step, planner_of, steps
 
 DEGREE = math.pi / 180.0
@@ -105,11 +106,13 @@ def test_an_attacker_gives_up_when_its_peer_is_inconsistent() -> None:
 
 @pytest.mark.parametrize(
     "attack",
-    [
-        Attack("scale", 0.5, "orbit"),
-        Attack("scale", 0.5, "encounter"),
-        Attack("rotate", 15.0 * DEGREE, "encounter"),
-    ],
+    series(
+        [
+            Attack("scale", 0.5, "orbit"),
+            Attack("scale", 0.5, "encounter"),
+            Attack("rotate", 15.0 * DEGREE, "encounter"),
+        ]
+    ),
     ids=lambda attack: f"{attack.kind}-{attack.part}",
 )
 def test_an_attack_larger_than_the_noise_is_inconsistent(attack: Attack) -> None:
@@ -128,7 +131,7 @@ def test_an_attack_larger_than_the_noise_is_inconsistent(attack: Attack) -> None
         assert alarm.residual > 3.0
 
 
-@pytest.mark.parametrize("seed", [30, 49, 109])
+@pytest.mark.parametrize("seed", series([30, 49, 109]))
 def test_a_robot_misled_by_false_data_finds_other_places_to_range_from(seed: int) -> None:
     assert outcome(mission(seed, {"a": Attack("scale", 0.5, "phase-1")}, FINE)) == "inconsistent"
 

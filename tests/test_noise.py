@@ -252,7 +252,7 @@ def test_another_seed_is_another_noise() -> None:
     assert not set(one) & set(other)
 
 
-@pytest.mark.parametrize("share", [0.05, 0.25])
+@pytest.mark.parametrize("share", series([0.05, 0.25]))
 def test_outliers_have_their_probability_and_a_uniform_positive_bias(share: float) -> None:
     least, most = 0.4, 1.6
     scenario = near(f"outliers = {share}\noutlier_bias = [{least}, {most}]")
@@ -286,7 +286,7 @@ def test_outliers_and_sigmas_add_up() -> None:
     assert is_gaussian(told[told <= 0.5], 0.1)
 
 
-@pytest.mark.parametrize("share", [0.02, 0.5])
+@pytest.mark.parametrize("share", series([0.02, 0.5]))
 def test_drop_outs_have_their_probability_each_sensor_on_its_own(share: float) -> None:
     gone = [
         np.array([rho is None for rho in told], float) for told in all_ranges(near(f"drop_outs = {share}"))
@@ -547,7 +547,7 @@ def test_a_recording_gives_the_same_truth_again(noise: str, tmp_path: Path) -> N
 
 
 @by_noise
-@pytest.mark.parametrize("seed", [2, 10, 11])
+@pytest.mark.parametrize("seed", series([2, 10, 11]))
 def test_the_recording_of_a_mission_is_read_as_it_ran(noise: str, seed: int, tmp_path: Path) -> None:
     played = in_process.run_mission(load(str(noisy(noise, tmp_path)), seed=seed), tmp_path)
     assert read(tmp_path).world == played.world

@@ -216,7 +216,7 @@ def test_a_robot_that_joins_is_on_the_timeline_once_the_page_has_its_setup(
     assert opened(address).evaluate(JOINED) == [["a"], 1]
 
 
-@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize("dark", series([False, True]))
 def test_without_the_truth_the_page_opens_with_the_estimates(
     dark: bool, opened: Open, paper_1: Path, tmp_path: Path
 ) -> None:
@@ -308,6 +308,7 @@ def state(page: Page) -> list[object]:
     return found
 
 
+@pytest.mark.long
 def test_space_plays_though_the_closed_help_still_has_the_focus(opened: Open, address: str) -> None:
     """For a moment after it closes, longer on a slow machine, keys still go to its button."""
     page = opened(f"{address}#tick=20")

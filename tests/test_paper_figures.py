@@ -66,6 +66,7 @@ def test_each_figure_is_one_or_two_columns_wide_in_small_text_and_embedded_fonts
     assert widths == set(WIDTHS)
 
 
+@pytest.mark.long
 def test_only_figures_to_look_at_have_a_title(folder: Path) -> None:
     pair = pair_of(folder)
     for name, figure in figures(pair, PAPER):
@@ -75,11 +76,12 @@ def test_only_figures_to_look_at_have_a_title(folder: Path) -> None:
         assert figure.texts, name
 
 
-@pytest.mark.parametrize("medium", [SCREEN, PAPER], ids=["screen", "paper"])
+@pytest.mark.parametrize("medium", series([SCREEN, PAPER]), ids=["screen", "paper"])
 def test_all_text_is_on_the_sheet_and_no_key_covers_a_panel(folder: Path, medium: Medium) -> None:
     checked(pair_of(folder), medium)
 
 
+@pytest.mark.long
 def test_figures_in_hardware_mode_are_laid_out_as_well(folder: Path, tmp_path: Path) -> None:
     for robot in "ab":
         name = f"agent-{robot}.journal"

@@ -110,6 +110,7 @@ def test_a_network_without_a_mission_is_reported() -> None:
         assert told(endpoint) == []
 
 
+@pytest.mark.long
 def test_an_endpoint_without_an_answer_is_reported_next_to_one_with_an_answer() -> None:
     nowhere = free_endpoint()
     with world("paper-1", "--run", "mine") as (_, endpoint):

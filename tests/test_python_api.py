@@ -176,6 +176,7 @@ def test_an_unknown_column_is_named_with_the_known_ones(run: tandem.Run) -> None
         run.truth.where(robt="a")
 
 
+@pytest.mark.long
 def test_a_recording_of_hardware_mode_has_no_truth_and_no_errors(tmp_path: Path) -> None:
     saved = tandem.run("noisy", seed=7).save(tmp_path / "recording")
     for name in ("world.journal", "summary.json"):

@@ -114,6 +114,7 @@ def test_a_robot_whose_agent_is_suspended_stands_still_and_the_mission_continues
     assert {(row["v"], row["omega"]) for row in rows} == {("0.0", "0.0")}
 
 
+@pytest.mark.long
 def test_a_world_prints_the_reason_for_a_missing_final_report(tmp_path: Path) -> None:
     """Both answer only the first tick; then b ends."""
     out = tmp_path / "out"

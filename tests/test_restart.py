@@ -55,6 +55,7 @@ from tests.commands import (
     tandem,
     world,
 )
+from tests.series import series
 from world.scenario import Scenario
 from world.simulation import Simulation, resumed
 from world.world_journal import world_history
@@ -88,15 +89,17 @@ def options(kills: str) -> list[str]:
 
 @pytest.mark.parametrize(
     "kills",
-    [
-        "a@7 a@46:report a@20:journal a@31:command",
-        "b@0:command b@47:report b@33 b@48:journal",
-        "world@0 world@46:report world@30:command world@48:journal",
-        "a@47:report b@47:report",
-        "a@12 world@12:report b@48:command",
-        "b@46 b@46 b@46:command",
-        "a@48:journal b@48:command world@48:command",
-    ],
+    series(
+        [
+            "a@7 a@46:report a@20:journal a@31:command",
+            "b@0:command b@47:report b@33 b@48:journal",
+            "world@0 world@46:report world@30:command world@48:journal",
+            "a@47:report b@47:report",
+            "a@12 world@12:report b@48:command",
+            "b@46 b@46 b@46:command",
+            "a@48:journal b@48:command world@48:command",
+        ]
+    ),
 )
 def test_a_run_whose_processes_are_killed_ends_with_the_same_recording(
     kills: str, undisturbed: Path, tmp_path: Path
@@ -150,6 +153,7 @@ def test_a_robot_that_returns_after_the_timeout_fails_the_run(tmp_path: Path) ->
     assert not processes_of(tmp_path / "out")
 
 
+@pytest.mark.long
 def test_an_absent_robot_stands_still_in_real_time_and_learns_what_it_missed(tmp_path: Path) -> None:
     out = tmp_path / "out"
     (tmp_path / "assured.toml").write_text(REAL_TIME)

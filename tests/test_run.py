@@ -376,6 +376,7 @@ for short, long in zip("abcdef", LONG_IDS, strict=True):
     NAMED_AT_LENGTH = NAMED_AT_LENGTH.replace(f'"{short}"', f'"{long}"')
 
 
+@pytest.mark.long
 def test_no_table_is_broken_by_a_terminal_of_80_columns(tmp_path: Path) -> None:
     (tmp_path / "long.toml").write_text(NAMED_AT_LENGTH)
     out = tmp_path / "out"

@@ -499,6 +499,7 @@ def cost(told: Told, found: Fit) -> float:
 
 @some
 @given(seeds, st.sampled_from([Noise(0.05, 0.05).as_told, DRIFTING]), st.floats(0.1, 2.0))
+@pytest.mark.long
 def test_no_step_of_a_fit_climbs(seed: int, noise: Noise, by: float) -> None:
     one = told(seed, noise)
     guess = nudged(one, seed, by)

@@ -7,7 +7,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from signal import SIGCONT, SIGSTOP
 
@@ -70,10 +70,11 @@ def give_up() -> None:
 
 def states(pid: int) -> set[str]:
     """Return the states of all threads of a process; T means stopped."""
-    return {
-        (task / "stat").read_text().rpartition(")")[2].split()[0]
-        for task in Path(f"/proc/{pid}/task").iterdir()
-    }
+    found = set()
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        with suppress(FileNotFoundError, ProcessLookupError):  # this thread has ended meanwhile
+            found.add((task / "stat").read_text().rpartition(")")[2].split()[0])
+    return found
 
 
 def stop(pid: int) -> None:
@@ -129,6 +130,7 @@ def test_a_run_continues_after_each_process_is_suspended_for_a_moment(
 
 
 @pytest.mark.parametrize("name", series(NAMES))
+@pytest.mark.long
 def test_a_process_suspended_until_its_link_times_out_continues(
     name: str, undisturbed: Path, tmp_path: Path
 ) -> None:
@@ -172,6 +174,7 @@ def test_a_process_suspended_for_longer_than_the_timeout_fails_the_run(
     assert not processes_of(out)
 
 
+@pytest.mark.long
 def test_a_link_over_which_nothing_comes_is_replaced_by_another() -> None:
     endpoint, config, inbox = free_endpoint(), load("paper-1").config("a", None), Inbox("a mute world")
     with session.open_router(listening(endpoint)) as link:
@@ -272,6 +275,7 @@ def test_a_suspended_robot_stands_still_from_the_next_period_in_real_time(
     assert {int(row["tick"]) for row in away} <= missed
 
 
+@pytest.mark.long
 def test_in_real_time_a_world_that_is_stopped_goes_on(assured: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with TandemProcess("run", assured, "--rate", "20", "--out", out, "-q") as run:

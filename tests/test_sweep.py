@@ -544,6 +544,7 @@ def test_a_cell_in_which_no_robots_can_meet_is_refused(folder: Path) -> None:
     assert not (folder / "none").exists()
 
 
+@pytest.mark.long
 def test_a_sweep_in_which_none_localises_has_its_figures(folder: Path) -> None:
     (folder / "short.toml").write_text(
         'name = "short"\nscenario = "base.toml"\ntrials = 1\n[[axis]]\nfield = "max_ticks"\nvalues = [1, 2]\n'
@@ -597,6 +598,7 @@ def test_a_base_scenario_whose_table_is_none_is_one_line(noise: str, folder: Pat
     )
 
 
+@pytest.mark.long
 def test_a_figure_distinguishes_the_values_of_the_other_axes_while_they_are_few(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -628,6 +630,7 @@ def test_every_shipped_sweep_runs(name: str) -> None:
     assert f"{name:10} " in tandem("scenarios").out
 
 
+@pytest.mark.long
 def test_the_sweep_of_noise_has_the_same_starts_in_every_cell() -> None:
     sweep = spec.load("noise")
     settings = [setting_of(sweep, cell) for cell in cells(sweep)]

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from agent.estimation.closed_forms import placements
 from agent.estimation.exact import branches
 from protocol.motion import ORIGIN, TAU, Controls, Pose, compose, step, wrap
+from tests.series import series
 
 Reals = NDArray[np.float64]
 Three = tuple[complex, complex, complex]
@@ -189,6 +190,7 @@ def test_for_any_n_a_rotation_about_the_anchor_is_indistinguishable(
 
 @settings(max_examples=300)
 @given(st.floats(0.5, 3.0), angles, st.lists(forwards, min_size=2, max_size=6))
+@pytest.mark.long
 def test_three_points_or_more_that_are_not_collinear_leave_rotations_only(
     rho0: float, heading: float, controls: list[Controls]
 ) -> None:
@@ -281,6 +283,7 @@ def test_3_plus_1_leaves_two_trajectories(
 
 @settings(max_examples=300)
 @given(st.tuples(points, points), st.floats(1.0, 10.0), points, angles)
+@pytest.mark.long
 def test_2_plus_1_leaves_two_trajectories_for_each_distance_of_q_2_from_m_1(
     odometry: tuple[complex, complex], distance: float, start: complex, heading: float
 ) -> None:
@@ -386,12 +389,14 @@ def counted(draw: Callable[..., Setting], *, same: bool, draws: int = DRAWS) -> 
 
 @pytest.mark.parametrize(
     ("draw", "same", "numbers"),
-    [
-        (anywhere, True, {2, 4}),
-        (anywhere, False, {2, 4, 6}),
-        (meeting, True, {4}),
-        (meeting, False, {2, 4, 6}),
-    ],
+    series(
+        [
+            (anywhere, True, {2, 4}),
+            (anywhere, False, {2, 4, 6}),
+            (meeting, True, {4}),
+            (meeting, False, {2, 4, 6}),
+        ]
+    ),
     ids=["2+1 anywhere", "1+1+1 anywhere", "2+1 of the pair", "1+1+1 of the pair"],
 )
 def test_both_bounds_are_reached(draw: Callable[..., Setting], same: bool, numbers: set[int]) -> None:

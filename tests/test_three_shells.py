@@ -181,6 +181,7 @@ def test_an_agent_waits_until_the_robot_s_former_process_has_disappeared(
     assert search.pauses >= 20
 
 
+@pytest.mark.long
 def test_a_second_agent_of_the_same_robot_is_refused(waiting: str) -> None:
     ended = tandem("agent", "a", "--connect", waiting)
     assert ended == (2, "", "tandem agent: robot 'a' is in run 'mine' already\n")

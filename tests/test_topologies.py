@@ -201,6 +201,7 @@ def test_a_world_without_its_router_prints_what_to_check_and_gives_up(tmp_path: 
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.long
 def test_a_world_that_listens_reports_a_missing_router_and_runs(
     tmp_path: Path,
 ) -> None:

@@ -293,6 +293,7 @@ def test_any_body_is_a_message_or_refused(body: bytes) -> None:
 
 @settings(max_examples=500)
 @given(st.sampled_from(EXAMPLES), st.data(), msgpack_values)
+@pytest.mark.long
 def test_a_message_with_anything_anywhere_is_a_message_or_refused(
     message: Message, data: st.DataObject, value: object
 ) -> None:

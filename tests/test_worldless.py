@@ -25,13 +25,14 @@ from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from tests.commands import several_pairs, tandem
 from tests.doctor import complaints
 from tests.replays import journals_of
+from tests.series import series
 from tests.test_album import drawn, line, pair
 
 KNOWN_TO_A_WORLD = ("x", "y", "heading")
 MEASURED = ("tick", "robot", "anchor_range", "mutual_range", "phase", "state")
 
 
-@pytest.fixture(scope="module", params=["paper-1", "noisy"])
+@pytest.fixture(scope="module", params=series(["paper-1", "noisy"]))
 def folders(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Return a recording, and a folder with only the robots' journals of it."""
     whole, alone = tmp_path_factory.mktemp("whole"), tmp_path_factory.mktemp("alone")
@@ -74,6 +75,7 @@ def test_an_export_of_hardware_mode_has_measurements_and_estimates_and_no_truth(
     assert complaints(alone / "run.mcap") == []
 
 
+@pytest.mark.long
 def test_paths_are_the_odometry_laid_through_the_claim(folders: tuple[Path, Path]) -> None:
     whole, alone = folders
     known, told = pair(whole), pair(alone)
@@ -90,6 +92,7 @@ def test_paths_are_the_odometry_laid_through_the_claim(folders: tuple[Path, Path
     assert line(figure, "path-a") == [(p.x, p.y) for p in told.a.path]
 
 
+@pytest.mark.long
 def test_figures_without_the_truth_are_drawn_as_in_simulation(folders: tuple[Path, Path]) -> None:
     whole, alone = folders
     known, told = pair(whole), pair(alone)
@@ -166,6 +169,7 @@ def test_a_robot_without_a_configuration_is_skipped(folders: tuple[Path, Path], 
     assert ended.err.endswith("there is no world.journal, and no robot's journal has a configuration\n")
 
 
+@pytest.mark.long
 def test_a_shorter_journal_does_not_shorten_that_of_the_peer(
     folders: tuple[Path, Path], tmp_path: Path
 ) -> None:
