@@ -378,13 +378,17 @@ READ = "robot/b/command, robot/b/observation, world/truth"
 
 @pytest.mark.parametrize(
     ("change", "fixes"),
-    series(
-        [
-            (enforce, []),
-            (enforce_nothing, [f"can publish {FORGED};", f"can read {READ} in mine;"]),
-            (let_read_truth, ["can publish world/truth;", "can read world/truth in mine;"]),
-        ]
-    ),
+    [
+        (enforce, []),
+        pytest.param(
+            enforce_nothing, [f"can publish {FORGED};", f"can read {READ} in mine;"], marks=pytest.mark.long
+        ),
+        pytest.param(
+            let_read_truth,
+            ["can publish world/truth;", "can read world/truth in mine;"],
+            marks=pytest.mark.long,
+        ),
+    ],
 )
 def test_rules_are_tried_while_a_mission_runs(
     change: Callable[[dict[str, Any]], None], fixes: list[str], keys: Path, tmp_path: Path

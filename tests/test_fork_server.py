@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import os
 import re
 import signal
 import subprocess
 import sys
+import threading
 from collections import Counter
+from functools import partial
 from pathlib import Path
 from signal import SIGKILL, SIGSTOP
 
 import pytest
 
+from compose.launch import forked
 from compose.launch.forked import ForkServer
 from compose.launch.processes import free_endpoint
 from protocol.network import keys, session
@@ -43,6 +47,7 @@ FAR_PAIR = (("c", "d", 0.0), ("d", "c", 400.0))
 NAMES = ("world", "agent a", "agent b")
 IMPORTS = """
 import sys
+import threading
 from msgspec.structs import replace
 from compose.cli import warm_up
 from compose.launch.in_process import run_mission
@@ -267,6 +272,36 @@ def test_no_fork_server_outlasts_a_run() -> None:
         assert all(map(gone, servers))
 
 
+def let_another_thread_take_signals() -> None:
+    """Warm up a fork server whose main thread no signal on the end of a child interrupts."""
+    threading.Thread(target=threading.Event().wait, daemon=True).start()
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGCHLD])
+
+
+def test_the_end_of_a_process_is_reported_whichever_thread_takes_the_signal() -> None:
+    server = ForkServer("tests.test_fork_server:let_another_thread_take_signals")
+    for _ in range(3):
+        process = server.start("os:getpid", "one that ends at once")
+        assert process.wait(BOUND_S)
+        assert process.end() == 0
+    assert not server.gone
+    server.close()
+
+
+@pytest.mark.filterwarnings("error::ResourceWarning")
+def test_a_fork_server_that_takes_the_place_of_another_leaves_nothing_open() -> None:
+    first = forked.fork_server("os:getpid")
+    first.kill()
+    until(partial(getattr, first, "gone"), "its end is noticed")
+    second = forked.fork_server("os:getpid")
+    assert second is not first
+    assert forked.fork_server("os:getpid") is second
+    del first
+    gc.collect()
+    second.kill()
+    until(lambda: second.gone, "its end is noticed")
+
+
 def test_a_fork_server_that_cannot_start_prints_the_reason_in_one_line() -> None:
     server = ForkServer("nowhere:nothing")
     with open(os.devnull, "wb") as nowhere:
@@ -282,6 +317,7 @@ def test_a_fork_server_that_cannot_start_prints_the_reason_in_one_line() -> None
 
 CROWD = """
 import os, resource, signal, threading
+from compose.launch import forked
 from compose.launch.forked import ForkServer
 
 server = ForkServer("os:getpid")

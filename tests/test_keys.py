@@ -25,7 +25,6 @@ from protocol.network import session
 from protocol.network.diagnosis import MUTE
 from protocol.network.endpoints import BadConfiguration, Endpoints, configured, listening
 from tests.commands import Ended, TandemProcess, journals, tandem
-from tests.series import series
 
 EVERYBODY = ("agent-a", "agent-b", "router", "viewer", "world")
 
@@ -249,13 +248,19 @@ def take_away(own: Path, _keys: Path) -> None:
 
 @pytest.mark.parametrize(
     ("spoil", "words"),
-    series(
-        [
-            (expire, "this certificate has expired; check the certificate"),
-            (give_foreign, "it does not trust the authority of this certificate; check the certificate"),
-            (take_away, "it requires a certificate, and there is none; check the certificate"),
-        ]
-    ),
+    [
+        (expire, "this certificate has expired; check the certificate"),
+        pytest.param(
+            give_foreign,
+            "it does not trust the authority of this certificate; check the certificate",
+            marks=pytest.mark.long,
+        ),
+        pytest.param(
+            take_away,
+            "it requires a certificate, and there is none; check the certificate",
+            marks=pytest.mark.long,
+        ),
+    ],
 )
 def test_an_invalid_certificate_is_refused_with_the_reason(
     spoil: Callable[[Path, Path], None], words: str, keys: Path, mine: Path

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from agent.estimation.closed_forms import placements
 from agent.estimation.exact import branches
 from protocol.motion import ORIGIN, TAU, Controls, Pose, compose, step, wrap
-from tests.series import series
 
 Reals = NDArray[np.float64]
 Three = tuple[complex, complex, complex]
@@ -389,14 +388,12 @@ def counted(draw: Callable[..., Setting], *, same: bool, draws: int = DRAWS) -> 
 
 @pytest.mark.parametrize(
     ("draw", "same", "numbers"),
-    series(
-        [
-            (anywhere, True, {2, 4}),
-            (anywhere, False, {2, 4, 6}),
-            (meeting, True, {4}),
-            (meeting, False, {2, 4, 6}),
-        ]
-    ),
+    [
+        (anywhere, True, {2, 4}),
+        pytest.param(anywhere, False, {2, 4, 6}, marks=pytest.mark.long),
+        pytest.param(meeting, True, {4}, marks=pytest.mark.long),
+        pytest.param(meeting, False, {2, 4, 6}, marks=pytest.mark.long),
+    ],
     ids=["2+1 anywhere", "1+1+1 anywhere", "2+1 of the pair", "1+1+1 of the pair"],
 )
 def test_both_bounds_are_reached(draw: Callable[..., Setting], same: bool, numbers: set[int]) -> None:

@@ -54,12 +54,15 @@ def run(words: list[str], folder: Path | None, out: IO[bytes], err: IO[bytes], w
     with tempfile.NamedTemporaryFile() as file:
         file.write(msgspec.msgpack.encode(command))
         file.flush()
-        process = forked.fork_server(WARM_UP).start(
+        server = forked.fork_server(WARM_UP)
+        process = server.start(
             MAIN, "tandem", file.name, f"/proc/{os.getpid()}/fd/{out.fileno()}", errors=err.fileno()
         )
         if not process.wait(within):
             process.end()
             raise AssertionError(f"still running after {within:g} s: {words}")
+        if server.gone:
+            raise AssertionError(f"{process.how_ended()}: {words}")
     return process.end()
 
 

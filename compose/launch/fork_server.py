@@ -11,6 +11,7 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
+import select
 import signal
 import socket
 import sys
@@ -28,8 +29,6 @@ NOT_FORKED = 71
 """The exit status reported for a process that could not be forked (EX_OSERR)."""
 LINGER_S = 5.0
 """Time in s that processes have to end after their launcher has ended; then they are killed."""
-POLL_S = 0.01
-"""The polling interval in s."""
 PR_SET_PDEATHSIG = 1
 """The option of prctl(2) for a signal on the end of the parent, from <sys/prctl.h>."""
 
@@ -41,29 +40,45 @@ class _RequestLoop:
         self._launcher = launcher
         self._numbers: dict[int, int] = {}
         self._decoder = msgspec.msgpack.Decoder(ForkRequest | Signal)
+        # a signal that arrives just before a blocking call does not interrupt it, but it fills this pipe
+        self._ends, self._wake_up = os.pipe()
+        os.set_blocking(self._wake_up, False)
+        self._news = select.poll()
+        self._news.register(self._ends, select.POLLIN)
 
     def serve(self) -> ForkRequest | None:
         """Handle the launcher's requests until the launcher has ended, then return None.
 
         It also returns in each forked process: there, the request for that process.
         """
-        signal.signal(signal.SIGCHLD, self._reap)
-        while (received := self._request()) is not None:
-            request, streams = received
-            # a child that ends during the request is reaped after it
-            signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGCHLD])
-            if isinstance(request, Signal):
-                self._send(request)
-            elif self._fork(request, streams):
-                return request
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGCHLD])
-        return None
+        signal.signal(signal.SIGCHLD, lambda *_: None)
+        signal.set_wakeup_fd(self._wake_up, warn_on_full_buffer=False)
+        self._news.register(self._launcher, select.POLLIN)
+        while True:
+            if self._launcher.fileno() in self._wait(None):
+                received = self._request()
+                if received is None:
+                    return None
+                request, streams = received
+                if isinstance(request, Signal):
+                    self._send(request)
+                elif self._fork(request, streams):
+                    return request
 
     def linger(self) -> None:
         """Wait at most LINGER_S until all children have ended."""
+        self._news.unregister(self._launcher)
         give_up = time.monotonic() + LINGER_S
-        while self._numbers and time.monotonic() < give_up:
-            time.sleep(POLL_S)
+        while self._numbers and (left := give_up - time.monotonic()) > 0.0:
+            self._wait(left)
+
+    def _wait(self, within: float | None) -> set[int]:
+        """Wait at most `within` seconds for news, report ended children, and return where the news came from."""
+        found = {source for source, _ in self._news.poll(None if within is None else 1e3 * within)}
+        if self._ends in found:
+            os.read(self._ends, select.PIPE_BUF)
+            self._reap()
+        return found
 
     def _request(self) -> tuple[ForkRequest | Signal, list[int]] | None:
         request, streams, _, _ = socket.recv_fds(self._launcher, REQUEST_BYTES, STREAMS)
@@ -80,6 +95,9 @@ class _RequestLoop:
         else:
             if not pid:
                 self._launcher.detach()  # its descriptor becomes the child's standard input
+                signal.set_wakeup_fd(-1)
+                os.close(self._ends)
+                os.close(self._wake_up)
                 _become(start, streams, parent)
                 return True
             self._numbers[pid] = start.number
@@ -95,7 +113,7 @@ class _RequestLoop:
                 except ProcessLookupError:  # it has not created its process group yet
                     os.kill(pid, request.signal)
 
-    def _reap(self, _number: int, _frame: object) -> None:
+    def _reap(self) -> None:
         with suppress(ChildProcessError):
             while (found := os.waitpid(-1, os.WNOHANG))[0]:
                 pid, status = found
@@ -109,7 +127,6 @@ class _RequestLoop:
 def _become(start: ForkRequest, streams: list[int], parent: int) -> None:
     """Give this forked process its own session, default signals, standard streams, arguments and title."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGCHLD])
     os.setsid()
     _signal_when_parent_ends(signal.SIGKILL)
     if os.getppid() != parent:

@@ -226,10 +226,11 @@ _lock = threading.Lock()
 def fork_server(warm_up: str) -> ForkServer:
     """Return this process's fork server that has called `warm_up`; start it if none runs."""
     with _lock:
-        server = _servers.get(warm_up)
-        if server is None or server.gone:
-            server = _servers[warm_up] = ForkServer(warm_up)
-        return server
+        if warm_up in _servers and _servers[warm_up].gone:
+            _servers.pop(warm_up).close()
+        if warm_up not in _servers:
+            _servers[warm_up] = ForkServer(warm_up)
+        return _servers[warm_up]
 
 
 def close() -> None:
