@@ -73,7 +73,7 @@ class _RequestLoop:
             self._wait(left)
 
     def _wait(self, within: float | None) -> set[int]:
-        """Wait at most `within` seconds for news, report ended children, and return where the news came from."""
+        """Wait at most `within` seconds for news, report ended children, and return where it is from."""
         found = {source for source, _ in self._news.poll(None if within is None else 1e3 * within)}
         if self._ends in found:
             os.read(self._ends, select.PIPE_BUF)
