@@ -67,8 +67,8 @@ class Rover:
         self._executed = REST
         """The motion that the last reading reported."""
         self._tick = 0
-        self._has_sensed = False
-        """True once this process has taken a reading."""
+        self._is_under_way = False
+        """True once this process has taken or resumed a reading."""
         self._give_up_s = float(timeout)
         self._state = Path(state) if state else None
         self._found = self._state is not None and self._state.exists()
@@ -85,7 +85,7 @@ class Rover:
         """Return the motion since the last reading, and the ranges at the pose now."""
         self._settle()
         executed, self._driven = self._driven, REST
-        self._tick, self._executed, self._has_sensed = tick, executed, True
+        self._tick, self._executed, self._is_under_way = tick, executed, True
         self._save()
         anchor, reach = self._config.anchor, self._config.mission.sensing_range
         rho = math.hypot(self.pose.x - anchor.x, self.pose.y - anchor.y)
@@ -101,6 +101,7 @@ class Rover:
         """Report an unrecorded reading again, from the same pose. Raises RuntimeError without a `state`."""
         if not self._found:
             raise RuntimeError("where the body was is not known without --option state=FILE")
+        self._is_under_way = True
         if self._tick > tick:
             self._driven = Controls(
                 self._executed.v + self._driven.v, self._executed.omega + self._driven.omega
@@ -116,7 +117,7 @@ class Rover:
         if self._done < 1.0:
             self._controls, self._done = REST, 1.0
         self._save()
-        if self._has_sensed:
+        if self._is_under_way:
             self._send(self._tick, parked=True)
 
     def close(self) -> None:

@@ -291,3 +291,20 @@ def test_a_rover_is_parked_for_its_peer_only_at_the_end_of_its_mission() -> None
         rover.stop()
         until(lambda: json.loads(air.recv(1024))["parked"], "it is parked")
         rover.close()
+
+
+def test_a_rover_that_is_restarted_after_the_end_of_its_mission_is_parked_for_its_peer(
+    tmp_path: Path,
+) -> None:
+    """Its peer may still need a range, and no reading of this process follows."""
+    config, state = load("paper-1").config("a"), str(tmp_path / "body")
+    Rover(config, 1.0, state=state).sense(0)  # killed after the end, before it was parked
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as air:
+        air.bind(("127.0.0.1", 0))
+        air.settimeout(BOUND_S)
+        again = Rover(config, 1.0, state=state, beacon=f"127.0.0.1:{air.getsockname()[1]}")
+        again.stop()
+        again.resume(0, ())
+        again.stop()  # the end of the mission is in the recording
+        assert json.loads(air.recv(1024))["parked"]
+        again.close()
