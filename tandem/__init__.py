@@ -1,4 +1,4 @@
-"""The Python API: run missions and sweeps, and read recordings, as numpy arrays and tables.
+"""The Python API: run missions and sweeps, read recordings and estimate poses; data are numpy arrays.
 
 >>> import tandem
 >>> run = tandem.run("paper-1")
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     )
     from compose.launch.supervisor import ChildFailed
     from tandem.columns import Table
+    from tandem.estimates import PoseEstimates, estimate
     from tandem.missions import run
     from tandem.results import Run
     from tandem.results import open_recording as open  # noqa: A004  # used as tandem.open
@@ -48,6 +49,7 @@ __all__ = [
     "ModuleClash",
     "NoSuchField",
     "NotToml",
+    "PoseEstimates",
     "Run",
     "Scenario",
     "SweepIncomplete",
@@ -56,6 +58,7 @@ __all__ = [
     "Unworkable",
     "UserError",
     "Violation",
+    "estimate",
     "open",
     "run",
     "sweep",
@@ -65,6 +68,8 @@ _PLACES = {
     "run": "tandem.missions:run",
     "open": "tandem.results:open_recording",
     "sweep": "tandem.sweeps:sweep",
+    "estimate": "tandem.estimates:estimate",
+    "PoseEstimates": "tandem.estimates:PoseEstimates",
     "Run": "tandem.results:Run",
     "Scenario": "tandem.scenarios:Scenario",
     "SweepIncomplete": "tandem.sweeps:SweepIncomplete",

@@ -19,9 +19,10 @@ SMALL: dict[str, dict[str, Any]] = {
     "loss_sweep": {"trials": 1, "workers": 1},
     "greedy_planner": {"trials": 1, "workers": 1},
     "planners_and_radios": {"trials": 1, "workers": 1},
+    "estimate_ranges": {},
 }
 """The arguments with which `main` of each example takes seconds."""
-WITHOUT_FIGURE = ("last_manoeuvre", "own_radio")
+WITHOUT_FIGURE = ("last_manoeuvre", "own_driver", "own_radio")
 """The examples that only print."""
 MAX_LINES = 100
 

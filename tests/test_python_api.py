@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import doctest
+import re
 import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,12 +16,14 @@ import pytest
 import tandem
 from compose import extras
 from compose.audit.rules import audit
+from compose.recording.estimating.estimate_rows import PoseEstimateRow
 from compose.recording.summary_json import summary
 from compose.recording.ticks_csv import rows
 from tandem.columns import Table
 from tests.commands import tandem as command
 
-MODULES = ("", ".clash", ".columns", ".missions", ".results", ".rows", ".scenarios", ".sweeps")
+MODULES = ("", ".clash", ".columns", ".estimates", ".missions", ".results", ".rows", ".scenarios", ".sweeps")
+SAMPLE = Path(__file__).parent / "data" / "uwb" / "tiers-a-b-30-s.pyfg"
 TABLES = ("truth", "observations", "commands", "estimates", "messages", "claims")
 
 
@@ -330,3 +334,43 @@ def test_importing_tandem_imports_no_other_package() -> None:
     )
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ran.stdout.split() == ["tandem"]
+
+
+# --- estimates ----------------------------------------------------------------------------------------
+
+
+def test_estimates_are_those_of_the_command(tmp_path: Path) -> None:
+    words = ("--noise", "uwb-calibrated", "--window", "0..12", "--out", "found")
+    assert command("estimate", str(SAMPLE), *words, cwd=tmp_path).status == 1, (
+        "12 s are not enough for a claim"
+    )
+    found = tandem.estimate(SAMPLE, noise="uwb-calibrated", window=(0.0, 12.0))
+    assert "makes no claim" in repr(found)
+    saved = found.save(tmp_path / "saved")
+    for name in ("estimate.csv", "estimate.json"):
+        assert (saved / name).read_bytes() == (tmp_path / "found" / name).read_bytes()
+    assert found.rows.columns == PoseEstimateRow.__struct_fields__
+    assert {*found.figures()} == {path.stem for path in (tmp_path / "found").glob("*.svg")}
+    assert "<td>A</td>" in found._repr_html_()
+
+
+def test_a_run_and_its_recording_have_the_same_estimates(tmp_path: Path) -> None:
+    run = tandem.run("noisy")
+    found, again = tandem.estimate(run), tandem.estimate(run.save(tmp_path / "recording"))
+    assert same(found.rows, again.rows)
+    assert len(found.rows) == len(found.robots) * len({*found.rows["t_s"]})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"accuracy": 0.0}, "accuracy: 0.0 is not a positive number"),
+        ({"confidence": 1.0}, "confidence: 1.0 is not a probability from 0.5 to below 1"),
+        ({"robots": ["C"]}, "has no robot C; it has A, B"),
+        ({"noise": "uwbb"}, "uwbb"),
+    ],
+)
+def test_a_wrong_argument_of_an_estimate_is_one_line(arguments: dict[str, Any], says: str) -> None:
+    with pytest.raises(tandem.UserError, match=re.escape(says)) as found:
+        tandem.estimate(SAMPLE, **arguments)
+    assert "\n" not in str(found.value)

@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(options: argparse.Namespace) -> int:
-    """Write a scenario, a sweep, a script, a driver and the schemas, and print the commands that use them."""
+    """Write the files to start from, and print the commands that use them."""
     out: Path = options.folder
     content = starter()
     for name in content:
@@ -62,5 +62,6 @@ def commands(out: Path) -> list[str]:
         f"tandem run {place}/scenario.toml --out {place}/recording",
         f"tandem sweep {place}/sweep.toml --out {place}/results",
         f"python {place}/analyse.py",
+        f"cd {place} && tandem check-planner myplanner:MyPlanner --mission scenario.toml",
         f"cd {place} && tandem check-driver myrobot:MyRobot --rate 10",
     ]

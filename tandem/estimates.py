@@ -1,0 +1,139 @@
+"""The estimates of recorded robots, from their odometry and ranges."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Sequence
+from functools import cached_property
+from math import inf
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from compose.errors import UserError
+from compose.extras import need
+from compose.recording.estimating.estimate_epoch import ClaimRule
+from compose.recording.estimating.estimate_files import write_estimate
+from compose.recording.estimating.estimate_rows import EstimateSummary, PoseEstimateRow
+from compose.recording.estimating.estimate_run import (
+    EstimationProblem,
+    RecordingEstimate,
+    estimated,
+    measurements,
+)
+from compose.recording.ranging.range_files import read_ranges
+from compose.recording.ranging.run_ranges import ranges_of_run
+from compose.recording.recording_files import make_folder, user_errors
+from tandem.columns import Table, table_of
+from tandem.results import Run
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+DEFAULTS = ClaimRule()
+
+
+class PoseEstimates(msgspec.Struct, frozen=True, dict=True, eq=False):
+    """The estimated poses of one or two recorded robots over time, as `tandem estimate` writes them.
+
+    `tandem.estimate` returns one.
+    """
+
+    problem: EstimationProblem
+    """The measurements on which the estimate works; the type may change with any version."""
+    result: RecordingEstimate
+    """The estimate on which the command line works; likewise."""
+
+    @property
+    def summary(self) -> EstimateSummary:
+        """The content of `estimate.json`: claims, last poses, hypotheses and learned errors."""
+        return self.result.summary
+
+    @property
+    def robots(self) -> tuple[str, ...]:
+        """The names of the robots."""
+        return tuple(self.summary.robots)
+
+    @cached_property
+    def rows(self) -> Table:
+        """The estimates, one row per time and robot: the columns of `estimate.csv`."""
+        return table_of(PoseEstimateRow, self.result.rows)
+
+    def figures(self) -> dict[str, Figure]:
+        """Return the figures of `tandem estimate`, by name. Raises UserError without the extra `lab`."""
+        need("matplotlib")
+        from compose.figures.estimated import estimate_figures  # noqa: PLC0415  # optional
+        from compose.figures.style import SCREEN, look  # noqa: PLC0415
+
+        with look(SCREEN):
+            return dict(estimate_figures(self.problem, self.result))
+
+    def save(self, folder: str | Path) -> Path:
+        """Write `estimate.csv` and `estimate.json` to `folder`, and return its path. Raises UserError."""
+        out = Path(folder)
+        make_folder(out)
+        try:
+            write_estimate(out, self.result.rows, self.summary)
+        except OSError as error:
+            raise UserError(f"{out} cannot be written: {error.strerror or error}") from None
+        return out
+
+    def __repr__(self) -> str:
+        return f"<PoseEstimates {self._title}>"
+
+    @property
+    def _title(self) -> str:
+        claims = [
+            f"{name} claims after {one.first_claim.t_s - self.summary.begin_s:.1f} s"
+            if one.first_claim is not None
+            else f"{name} makes no claim"
+            for name, one in self.summary.robots.items()
+        ]
+        return f"{self.summary.source}: {', '.join(claims)}"
+
+    def _repr_html_(self) -> str:
+        """Return the claims and the first rows, as a notebook shows them."""
+        return f"<p><b>{html.escape(self._title)}</b></p>{self.rows._repr_html_()}"
+
+
+def estimate(
+    recording: str | Path | Run,
+    *,
+    robots: Sequence[str] | None = None,
+    noise: str | Path | None = None,
+    window: tuple[float, float] | None = None,
+    anchors: str | Path | None = None,
+    accuracy: float = DEFAULTS.accuracy,
+    confidence: float = DEFAULTS.confidence,
+) -> PoseEstimates:
+    """Return the poses of recorded robots over time, estimated from their odometry and ranges.
+
+    `recording` is the path of a range recording (a .pyfg or .mcap file, a folder of CSV files, or a
+    recording of Tandem), or a Run. `robots` are one or two of its robots, by default all. `noise` is the
+    assumed noise: the name of a profile or the path of a TOML file, by default what the recording states.
+    `window` is the part that is used, in s from the first odometry on. `anchors` is a CSV file of further
+    anchors. A claim needs the standard deviation `accuracy` in m and the probability `confidence`.
+
+    Raises UserError for invalid arguments, and if the recording cannot be read.
+
+    >>> import tandem
+    >>> found = tandem.estimate(tandem.run("noisy"), accuracy=0.1)
+    >>> found.robots
+    ('a', 'b')
+    >>> bool(found.rows["position_error_m"][-1] < 0.5)
+    True
+    """
+    if not 0.0 < accuracy < inf:
+        raise UserError(f"accuracy: {accuracy} is not a positive number")
+    if not 0.5 <= confidence < 1.0:
+        raise UserError(f"confidence: {confidence} is not a probability from 0.5 to below 1")
+    if isinstance(recording, Run):
+        if anchors is not None:
+            raise UserError("anchors: a run has its own anchors")
+        with user_errors(Path(str(recording.model.source))):
+            ranges = ranges_of_run(recording.model)
+    else:
+        ranges = read_ranges(Path(recording), Path(anchors) if anchors is not None else None)
+    problem = measurements(ranges, robots, str(noise) if noise is not None else None, window)
+    return PoseEstimates(problem, estimated(problem, ClaimRule(accuracy, confidence)))
