@@ -26,10 +26,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder for run.mcap, frames.csv and ticks.parquet [default: the recording's]",
     )
-    parser.add_argument(
+    kinds = parser.add_mutually_exclusive_group()
+    kinds.add_argument(
         "--pyfg",
         action="store_true",
         help="write only run.pyfg: odometry, ranges and true poses as a factor graph for other estimators",
+    )
+    kinds.add_argument(
+        "--html",
+        action="store_true",
+        help="write only run.html: the page of the run in one file, which a browser opens without a server",
     )
     add_closing(parser, "tandem export recording --out exported", "docs/recordings.md")
 
@@ -42,6 +48,8 @@ def main(options: argparse.Namespace) -> int:
     out: Path = options.out or options.recording
     if options.pyfg:
         return _pyfg(options.recording, out)
+    if options.html:
+        return _html(options.recording, out)
     need(*MODULES)
     inbox = Inbox("tandem export")
     stop_by_signal(inbox)
@@ -66,11 +74,27 @@ def _pyfg(recording: Path, out: Path) -> int:
 
     with user_errors(recording):
         graph = written_pyfg(ranges_of_run(read(recording)))
+    say(str(_written(out, "run.pyfg", graph.text)))
+    say(", ".join([f"{name} is {letter}" for name, letter in graph.names.items()]))
+    return ENDED
+
+
+def _html(recording: Path, out: Path) -> int:
+    """Write run.html to `out`, and print its path and what the recording lacks."""
+    from compose.view.web.standalone import standalone_page  # noqa: PLC0415  # it imports Zenoh
+
+    page = standalone_page(recording)
+    say(str(_written(out, "run.html", page.html)))
+    for note in page.notes:
+        say(note, error=True)
+    return ENDED
+
+
+def _written(out: Path, name: str, text: str) -> Path:
+    """Write a file to the folder `out`, and return its path. Raises UserError."""
     make_folder(out)
-    path = out / "run.pyfg"
     try:
-        files.write(path, graph.text)
+        files.write(out / name, text)
     except OSError as error:
         raise UserError(cannot_write(out, error)) from None
-    say(str(path), ", ".join([f"{name} is {letter}" for name, letter in graph.names.items()]))
-    return ENDED
+    return out / name

@@ -12,7 +12,6 @@ import signal
 import socket
 from collections.abc import AsyncIterator, Callable
 from contextlib import nullcontext, suppress
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -31,10 +30,9 @@ from compose.view.recorded import scenes
 from compose.view.web import sweep_page
 from compose.view.web.origin import refusal
 from compose.view.web.site import Site
-from compose.view.web.sources import WatchedRun
+from compose.view.web.standalone import PAGE
 
 LOOPBACK = "127.0.0.1"
-PAGE = Path(__file__).parent / "page"
 POLL_S = 0.05
 """The interval in s at which runs are polled and updates are sent to pages while a mission is live."""
 IDLE_S = 0.5
@@ -86,7 +84,7 @@ class _Answers:
         show = self._site.shows.get(request.path_params["name"])
         if show is None:
             return _json({"error": "there is no such mission"}, 404)
-        return _json({"stage": show.setup, **_state(show), "version": show.version})
+        return _json(show.mission)
 
     async def scenes(self, request: Request) -> Response:
         show = self._site.shows.get(request.path_params["name"])
@@ -162,18 +160,6 @@ def _json(value: object, status: int = 200) -> Response:
     return Response(msgspec.json.encode(value), status, media_type="application/json")
 
 
-def _state(show: WatchedRun) -> dict[str, Any]:
-    return {
-        "last": show.head,
-        "first": next(iter(show.known.ticks), 0),
-        "live": show.live,
-        "has_truth": show.known.has_truth,
-        "end": show.known.end,
-        "farewells": show.known.final_reports,
-        "notes": show.notes,
-    }
-
-
 async def _news(site: Site, name: str | None, version: int) -> AsyncIterator[bytes]:
     """Yield server-sent events: the list of runs when it changes, and updates of the show called `name`.
 
@@ -190,7 +176,7 @@ async def _news(site: Site, name: str | None, version: int) -> AsyncIterator[byt
         if show is not None and show.setup is not None:
             since = show.since(version)
             version = show.version
-            now = _state(show)
+            now = show.state
             if since is not None or now != state:
                 state = now
                 head = show.head

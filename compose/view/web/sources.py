@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from compose.recording.recording_files import WORLD_JOURNAL, agent_journal, journals_in
 from compose.recording.run_setup import RunSetup
@@ -71,6 +72,24 @@ class WatchedRun(ABC):
             if data is not None and len(data.commands) + len(data.late) >= robots:
                 return tick
         return last
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """The state of the run for the page, as its value in JSON."""
+        return {
+            "last": self.head,
+            "first": next(iter(self.known.ticks), 0),
+            "live": self.live,
+            "has_truth": self.known.has_truth,
+            "end": self.known.end,
+            "farewells": self.known.final_reports,
+            "notes": self.notes,
+        }
+
+    @property
+    def mission(self) -> dict[str, Any]:
+        """The static data and the state of the run for the page, likewise."""
+        return {"stage": self.setup, **self.state, "version": self.version}
 
 
 class Recorded(WatchedRun):

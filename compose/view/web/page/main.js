@@ -2,6 +2,7 @@
 
 import { sweep } from "./sweep.js";
 import { Cards, make } from "./cards.js";
+import * as data from "./data.js";
 import { leads } from "./held.js";
 import { Log } from "./log.js";
 import { Plane } from "./plane.js";
@@ -61,10 +62,7 @@ function update_address() {
 
 function listen() {
   source?.close();
-  const query = store ? `?show=${encodeURIComponent(store.name)}&since=${store.version}` : "";
-  source = new EventSource(`/api/news${query}`);
-  source.onmessage = ({ data }) => {
-    const news = JSON.parse(data);
+  source = data.listen(store, (news) => {
     document.body.classList.remove("lost");
     if (news.list) on_list(news.list);
     if (news.show && store) {
@@ -74,11 +72,10 @@ function listen() {
       else if (view.follow && !store.live && ahead !== store.last) view.tick = Math.max(store.last, 0);
     }
     draw();
-  };
-  source.onerror = () => {
+  }, () => {
     document.body.classList.add("lost");
     draw();
-  };
+  });
 }
 
 async function on_list(list) {
@@ -102,10 +99,10 @@ async function open(name) {
   if (opening === name) return;
   opening = name;
   try {
-    const answer = await fetch(`/api/shows/${encodeURIComponent(name)}`);
-    if (!answer.ok) return;
+    const mission = await data.mission(name);
+    if (!mission) return;
     store?.close();
-    store = new Store(name, await answer.json(), draw);
+    store = new Store(name, mission, draw);
     store.onstage = staged;
     store.onforget = (tick) => { timeline.forget(tick); log.forget(tick); };
     const { tick, robot, truth } = address_state();

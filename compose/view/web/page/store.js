@@ -1,6 +1,8 @@
 // The client-side copy of one mission: its static data and its scenes by tick. The server pushes the newest
 // scenes; the store fetches all others in the background.
 
+import * as data from "./data.js";
+
 const COUNTERS = ["anchor", "mutual", "sent", "heard", "refused", "lost", "bytes"];
 
 export class Store {
@@ -73,7 +75,7 @@ export class Store {
   }
 
   async #restage() {
-    const mission = await (await fetch(`/api/shows/${encodeURIComponent(this.name)}`)).json();
+    const mission = await data.mission(this.name);
     this.stage = mission.stage;
     this.places = new Map(mission.stage.robots.map((robot, place) => [robot.id, place]));
     this.#counts = mission.stage.robots.map(() => []);
@@ -112,8 +114,7 @@ export class Store {
       }
       try {
         this.#stale = Infinity;
-        const path = `/api/shows/${encodeURIComponent(this.name)}/scenes?from=${from}&to=${this.last}`;
-        const answer = await (await fetch(path)).json();
+        const answer = await data.scenes(this.name, from, this.last);
         for (const scene of answer.scenes) if (scene.tick < this.#stale) this.scenes[scene.tick] = scene;
         for (let tick = answer.from; tick <= Math.min(answer.to, this.#stale - 1); tick++) {
           this.scenes[tick] ??= { tick, players: this.stage.robots.map(unknown), passages: [], events: [] };

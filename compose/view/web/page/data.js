@@ -1,0 +1,33 @@
+// Where the data of the page come from: the server, or the file itself if `tandem export --html` has written it.
+
+const kept = document.getElementById("recording");
+const recording = kept && JSON.parse(kept.textContent);
+
+async function asked(path) {
+  const answer = await fetch(path);
+  return answer.ok ? answer.json() : null;
+}
+
+/** Returns the static data and the state of a mission; null if there is none of that name. */
+export async function mission(name) {
+  return recording ? recording.mission : asked(`/api/shows/${encodeURIComponent(name)}`);
+}
+
+/** Returns the scenes of the ticks from `from` to `to`, or of those of them that fit in one answer. */
+export async function scenes(name, from, to) {
+  if (recording) return { from: 0, to: recording.mission.last, scenes: recording.scenes };
+  return asked(`/api/shows/${encodeURIComponent(name)}/scenes?from=${from}&to=${to}`);
+}
+
+/** Calls `on_news` with the list of missions and the updates of `store`, and `on_lost` without a server. */
+export function listen(store, on_news, on_lost) {
+  if (recording) {
+    if (!store) queueMicrotask(() => on_news({ list: recording.list }));
+    return { close() {} };
+  }
+  const query = store ? `?show=${encodeURIComponent(store.name)}&since=${store.version}` : "";
+  const source = new EventSource(`/api/news${query}`);
+  source.onmessage = ({ data }) => on_news(JSON.parse(data));
+  source.onerror = on_lost;
+  return source;
+}

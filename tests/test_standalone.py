@@ -1,0 +1,93 @@
+"""The page in one file: it opens from disk without a network, and shows what the server's page shows."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, expect
+
+from compose.launch import in_process
+from compose.scenario.scenario_file import load
+from compose.view.web.standalone import standalone_page
+from tests.browser import BOUND_MS, Open, picture, shot, until_shown
+from tests.commands import tandem
+
+MOST_BYTES = 2_000_000
+"""The largest size of the file for a mission of 100 ticks."""
+
+
+@pytest.fixture(scope="module")
+def file(paper_1: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the file of paper-1, written by the command."""
+    out = tmp_path_factory.mktemp("one") / "file"
+    ended = tandem("export", paper_1, "--html", "--out", out)
+    assert (ended.status, ended.out, ended.err) == (0, f"{out / 'run.html'}\n", "")
+    return out / "run.html"
+
+
+def test_it_plays_from_disk_to_its_end_without_a_network(browser: Browser, file: Path) -> None:
+    with browser.new_context(offline=True, viewport={"width": 1280, "height": 800}) as context:
+        requests: list[str] = []
+        complaints: list[str] = []
+        page = context.new_page()
+        page.set_default_timeout(BOUND_MS)
+        page.on("request", lambda request: requests.append(request.url.partition(":")[0]))
+        page.on("console", lambda entry: complaints.append(entry.text) if entry.type == "error" else None)
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.goto(file.as_uri())
+        until_shown(page, 0)
+        expect(page).to_have_title("paper-1 · Tandem")
+        page.locator("#speed").select_option("50")
+        page.locator("#play").click()
+        until_shown(page, 48)
+        expect(page.locator("#status")).to_have_text("localised after 48 ticks")
+        page.goto(f"{file.as_uri()}#tick=46&robot=a")
+        until_shown(page, 46)
+        shot(page, "standalone")
+        assert {*requests} <= {"file", "data"}
+        assert not complaints
+
+
+def test_it_shows_what_the_page_of_the_server_shows(
+    browser: Browser, opened: Open, file: Path, address: str
+) -> None:
+    served = opened(f"{address}#tick=46")
+    until_shown(served, 46)
+    with browser.new_context(viewport={"width": 1280, "height": 800}, color_scheme="light") as context:
+        page = context.new_page()
+        page.goto(f"{file.as_uri()}#tick=46")
+        until_shown(page, 46)
+        assert picture(page) == picture(served)
+        assert page.locator("#log").inner_text() == served.locator("#log").inner_text()
+
+
+def test_it_is_small_and_the_same_each_time(tmp_path: Path) -> None:
+    run = in_process.run_mission(load("noisy", seed=3), tmp_path)
+    page = standalone_page(tmp_path).html
+    assert page == standalone_page(tmp_path).html
+    assert len(page.encode()) < MOST_BYTES * max(1.0, run.length / 100)
+
+
+def test_no_text_of_a_run_ends_its_script(tmp_path: Path) -> None:
+    """A verdict is written by a robot, which may be anybody's."""
+    in_process.run_mission(load("paper-1"), tmp_path)
+    page = standalone_page(tmp_path).html
+    inside = re.search(r'<script type="application/json" id="recording">(.*?)</script>', page, re.DOTALL)
+    assert inside is not None
+    assert "<" not in inside[1]
+    assert json.loads(inside[1])["mission"]["stage"]["name"] == "paper-1"
+
+
+def test_what_is_no_recording_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    ended = tandem("export", "empty", "--html", cwd=tmp_path)
+    assert ended.status == 2
+    assert (
+        ended.err == "tandem export: empty contains no recording, no sweep, and no folders with recordings\n"
+    )
+    ended = tandem("export", "empty", "--html", "--pyfg", cwd=tmp_path)
+    assert ended.status == 2
+    assert "not allowed with argument" in ended.err
