@@ -85,6 +85,7 @@ def test_a_robot_claims_its_pose_by_ranges_to_several_anchors(count: int) -> Non
     assert claimed[-1].position_error_m < 0.15
 
 
+@pytest.mark.long
 def test_covariances_of_many_recordings_are_right() -> None:
     nees = []
     for seed in range(12):

@@ -78,6 +78,7 @@ def by_differences(recording: Run, sigma: float) -> tuple[float, float]:
     return a, b
 
 
+@pytest.mark.long
 def test_the_bound_is_that_of_the_fisher_information_of_all_ranges() -> None:
     for seed in SEEDS:
         recording = survey(SIGMA, seed)

@@ -68,6 +68,7 @@ def test_the_shipped_sweep_has_the_attacks_of_its_labels() -> None:
         assert attack.size == pytest.approx(math.radians(float(size)) if "deg" in label else float(size))
 
 
+@pytest.mark.long
 def test_honest_missions_localise_and_attacks_are_inconsistent(results: execution.Results) -> None:
     outcomes: dict[tuple[int, ...], set[str]] = {cell.place: set() for cell in results.cells}
     places = {cell.index: cell.place for cell in results.cells}

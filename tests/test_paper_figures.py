@@ -28,7 +28,7 @@ WIDTHS = {3.5: (252.0, 1050), 7.16: (515.52, 2148)}
 STYLE = Path(__file__).parent.parent / "compose/view/web/page/style.css"
 
 
-@pytest.fixture(scope="module", params=series(["noisy", "paper-1", "paper-2"]))
+@pytest.fixture(scope="module", params=series(["paper-1", "noisy", "paper-2"]))
 def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp(request.param)
     run_mission(load(request.param), folder)

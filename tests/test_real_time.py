@@ -73,6 +73,7 @@ def robots_at(endpoint: str, answers: Callable[[Observation], bool]) -> Iterator
         assert tokens
 
 
+@pytest.mark.long
 def test_a_tick_may_last_longer_than_the_timeout(tmp_path: Path) -> None:
     scenario = tmp_path / "slow.toml"
     scenario.write_text("max_ticks = 2\n" + PAPER_1)

@@ -113,6 +113,7 @@ def test_several_pairs_localise_side_by_side_in_one_world(pairs: int, tmp_path: 
 # --- no world -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_an_agent_without_a_world_reports_it_and_gives_up(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     ended = tandem("agent", "a", "--connect", endpoint, "--connect-timeout", "6", "--out", tmp_path / "out")

@@ -178,6 +178,7 @@ def toml(folder: Path, name: str) -> Path:
 
 
 @pytest.mark.parametrize("name", series(["own", "byte-rate"]))
+@pytest.mark.long
 def test_processes_and_killed_processes_write_the_same_journals(name: str, tmp_path: Path) -> None:
     scenario = toml(tmp_path, name)
     for out, flags in (
