@@ -10,6 +10,7 @@ from functools import partial
 import pytest
 from msgspec.structs import replace
 
+import tandem
 from agent.estimation.gaussian.hypotheses import Hypothesis, ScoredHypothesis, search
 from agent.estimation.gaussian.range_model import PairRanges
 from agent.planning import accuracy_seeking
@@ -150,6 +151,23 @@ def test_a_mission_whose_search_once_missed_the_truth_is_not_wrong(
     recording = run_mission(scenario_of(noise, seed, accuracy=accuracy))
     assert summary(recording, "in-process", None)["outcome"] in ("localised", "undecided")
     assert all(recording.truth_held(robot) is not False for robot in recording.robots)
+
+
+@pytest.mark.parametrize("seed", series([101, 129]))
+def test_a_tick_without_a_range_excludes_no_truth_where_detection_fades(seed: int) -> None:
+    """In both missions, a placement that explained the missing ranges was claimed, more than 1 m off."""
+    scenario = tandem.Scenario.load("random").with_(
+        {
+            "mission.noise.anchor_sigma": 0.05,
+            "mission.noise.mutual_sigma": 0.05,
+            "mission.accuracy": 0.1,
+            "world.noise.detection_exponent": 4.0,
+        },
+        seed=seed,
+    )
+    run = tandem.run(scenario)
+    assert run.outcome in ("localised", "undecided")
+    assert all(run.model.truth_held(robot) is not False for robot in run.robots)
 
 
 def test_nearly_exact_ranges_need_no_number_of_ranges() -> None:

@@ -91,7 +91,10 @@ def with_probability(found: Sequence[tuple[Fit, float]]) -> tuple[ScoredHypothes
 
     Each fit is paired with the log-likelihood of its detections and of its ticks without one.
     """
-    scored = [(one.log_likelihood + 0.5 * _log_volume(one) + silent, one, silent) for one, silent in found]
+    scored = [
+        (one.log_likelihood + 0.5 * _log_volume(one) + max(silent, LEAST_EVIDENCE), one, silent)
+        for one, silent in found
+    ]
     scored.sort(key=lambda one: -one[0])
     left: list[tuple[float, Fit, float]] = []
     for weight, one, silent in scored:
@@ -104,6 +107,13 @@ def with_probability(found: Sequence[tuple[Fit, float]]) -> tuple[ScoredHypothes
         ScoredHypothesis(Hypothesis.of_fit(one, probability / total), one, silent)
         for probability, one, silent in left
     )
+
+
+LEAST_EVIDENCE = -math.log(100.0)
+"""The least log-likelihood of detections and of ticks without one that counts for a probability.
+
+R may not be as it was told, and detection may fade with range. So they never suffice for a claim.
+"""
 
 
 def _same(one: Fit, other: Fit) -> bool:
