@@ -296,7 +296,7 @@ def test_a_rover_is_parked_for_its_peer_only_at_the_end_of_its_mission() -> None
 def test_a_rover_that_is_restarted_after_the_end_of_its_mission_is_parked_for_its_peer(
     tmp_path: Path,
 ) -> None:
-    """Its peer may still need a range, and no reading of this process follows."""
+    """The peer may still need a range, and no reading of this process follows."""
     config, state = load("paper-1").config("a"), str(tmp_path / "body")
     Rover(config, 1.0, state=state).sense(0)  # killed after the end, before it was parked
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as air:

@@ -29,9 +29,9 @@ class RangeSensor(NamedTuple):
     sigma: float
     """The standard deviation of its errors in m."""
     bias: float
-    """Its bias in m."""
+    """The bias in m."""
     scale: float
-    """Its relative error."""
+    """The relative error."""
 
 
 class Lobes(NamedTuple):
@@ -57,9 +57,9 @@ class Odometer(NamedTuple):
     """The constants of the odometry of one robot."""
 
     scale: float
-    """Its relative error of v."""
+    """The relative error of v."""
     gyro_bias: float
-    """Its bias of omega in rad/s."""
+    """The bias of omega in rad/s."""
 
 
 class SensorModel(msgspec.Struct, frozen=True):
