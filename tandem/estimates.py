@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DEFAULTS = ClaimRule()
+"""The accuracy in m and the probability that a claim needs by default."""
 
 
 class PoseEstimates(msgspec.Struct, frozen=True, dict=True, eq=False):

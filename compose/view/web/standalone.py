@@ -51,7 +51,7 @@ def _page(title: str, recording: str) -> str:
     """Return the page with its style, modules and icon, and `recording`, a value in JSON."""
     modules = {f"page/{path.name}": _data_url(path, "text/javascript") for path in sorted(PAGE.glob("*.js"))}
     imports = msgspec.json.encode({"imports": modules}).decode()
-    style = (PAGE / "style.css").read_text()
+    style = (PAGE / "style.css").read_text("utf-8")
     inside = {
         "<title>Tandem</title>": f"<title>{html.escape(title)} · Tandem</title>\n"
         f'  <meta http-equiv="Content-Security-Policy" content="{POLICY}">',
@@ -65,7 +65,7 @@ def _page(title: str, recording: str) -> str:
             ]
         ),
     }
-    page = (PAGE / "index.html").read_text()
+    page = (PAGE / "index.html").read_text("utf-8")
     for outside, content in inside.items():
         before, found, after = page.partition(outside)
         assert found, outside
@@ -75,7 +75,7 @@ def _page(title: str, recording: str) -> str:
 
 def _data_url(path: Path, kind: str) -> str:
     """Return a file as a URL; modules import others by the names in the import map."""
-    text = IMPORTED.sub(r'from "page/\1"', path.read_text())
+    text = IMPORTED.sub(r'from "page/\1"', path.read_text("utf-8"))
     return f"data:{kind};base64,{base64.b64encode(text.encode()).decode()}"
 
 
