@@ -105,6 +105,7 @@ def estimate(
     noise: str | Path | None = None,
     window: tuple[float, float] | None = None,
     anchors: str | Path | None = None,
+    all_anchors: bool = False,
     accuracy: float = DEFAULTS.accuracy,
     confidence: float = DEFAULTS.confidence,
 ) -> PoseEstimates:
@@ -114,7 +115,8 @@ def estimate(
     recording of Tandem), or a Run. `robots` are one or two of its robots, by default all. `noise` is the
     assumed noise: the name of a profile or the path of a TOML file, by default what the recording states.
     `window` is the part that is used, in s from the first odometry on. `anchors` is a CSV file of further
-    anchors. A claim needs the standard deviation `accuracy` in m and the probability `confidence`.
+    anchors. Two robots use one anchor each unless `all_anchors` is set; one robot uses all. A claim needs the
+    standard deviation `accuracy` in m and the probability `confidence`.
 
     Raises UserError for invalid arguments, and if the recording cannot be read.
 
@@ -136,5 +138,6 @@ def estimate(
             ranges = ranges_of_run(recording.model)
     else:
         ranges = read_ranges(Path(recording), Path(anchors) if anchors is not None else None)
-    problem = measurements(ranges, robots, str(noise) if noise is not None else None, window)
+    name = str(noise) if noise is not None else None
+    problem = measurements(ranges, robots, name, window, all_anchors=all_anchors)
     return PoseEstimates(problem, estimated(problem, ClaimRule(accuracy, confidence)))

@@ -11,6 +11,7 @@ import re
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -98,6 +99,12 @@ def shot(page: Page, name: str) -> None:
         page.screenshot(path=Path(folder) / f"{name}.png")
 
 
+def stop_clock(page: Page) -> None:
+    """Stop the clock of the page: from now on, its time passes only by `page.clock.fast_forward`."""
+    page.clock.install()
+    page.clock.pause_at(datetime.now(UTC) + timedelta(minutes=1))
+
+
 def picture(page: Page) -> str:
     """Return the canvas as a data URL, after all pending drawing."""
     page.evaluate("() => new Promise(drawn => requestAnimationFrame(() => requestAnimationFrame(drawn)))")
@@ -107,7 +114,8 @@ def picture(page: Page) -> str:
 INKS = """() => {
   const canvas = document.getElementById('canvas'), style = getComputedStyle(document.documentElement);
   const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data, found = {};
-  for (const name of ['ring', 'orbit', 'ghost', 'range', 'link', 'fault', 'robot-a', 'robot-b']) {
+  const tints = [1, 2, 3, 4].map((i) => `tint-${i}`);
+  for (const name of ['ring', 'orbit', 'ghost', 'range', 'link', 'fault', 'robot-a', 'robot-b', ...tints]) {
     const hex = style.getPropertyValue('--' + name).trim();
     const ink = [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16));
     found[name] = 0;

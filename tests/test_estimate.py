@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import math
+import warnings
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -18,6 +20,7 @@ from agent.estimation.gaussian.range_model import PairRanges, Ranges
 from compose.errors import NOT_LOCALISED, USER_ERROR, UserError
 from compose.recording.estimating.estimate_epoch import ClaimRule
 from compose.recording.estimating.estimate_files import COLUMNS, estimate_csv
+from compose.recording.estimating.estimate_rows import PoseEstimate
 from compose.recording.estimating.estimate_run import RecordingEstimate, estimated, measurements
 from compose.recording.estimating.noise_files import RangeCorrection, told_noise
 from compose.recording.estimating.pair_measurements import EPOCH_S
@@ -266,6 +269,111 @@ def test_antennas_beside_the_centre_and_at_other_heights_are_taken_into_account(
         assert robot.final.position_error_m < 0.05
         assert robot.final.heading_error_rad is not None
         assert abs(robot.final.heading_error_rad) < 0.05
+
+
+def with_third_anchor(recording: RangeRecording, seed: int, sigma: float = 0.05) -> RangeRecording:
+    """Return `recording` with a third anchor, to which both robots range each second, and with noise."""
+    third, ranges = FixedAnchor("LC", 4.0, -3.0), recording.ranges
+    t, lengths, robots = [ranges.t], [ranges.range], [ranges.first]
+    for number, robot in enumerate(recording.robots):
+        assert robot.truth is not None
+        rows = np.arange(0, 301, 10)
+        x, y, _ = robot.truth.poses[rows].T
+        t.append(robot.truth.t[rows])
+        lengths.append(np.hypot(x - third.x, y - third.y))
+        robots.append(np.full(len(rows), number))
+    count = sum(map(len, t[1:]))
+    second = np.concatenate((ranges.second, np.full(count, len(recording.radios))))
+    order = np.argsort(np.concatenate(t), kind="stable")
+    noise = np.random.default_rng(seed).normal(0.0, sigma, len(order))
+    series = RangeSeries(
+        np.concatenate(t)[order],
+        np.concatenate(robots)[order],
+        second[order],
+        (np.concatenate(lengths) + noise)[order],
+        np.full(len(order), 0.05),
+    )
+    return recording._replace(anchors=(*recording.anchors, third), ranges=series)
+
+
+def test_two_robots_range_to_any_number_of_anchors() -> None:
+    recording = with_third_anchor(simulated(), 1)
+    problem = measurements(recording, None, "uwb-calibrated", None, all_anchors=True)
+    found = estimated(problem, ClaimRule()).summary
+    assert [one.anchors for one in found.robots.values()] == [["M1", "LC"], ["M2", "LC"]]
+    assert list(found.ranges) == ["A-M1", "A-LC", "B-M2", "B-LC", "A-B"]
+    assert all(count >= 29 for count in found.ranges.values())
+    assert "to other anchors" not in found.unused_ranges
+    without = estimated(measurements(recording, None, "uwb-calibrated", None), ClaimRule()).summary
+    assert [one.anchors for one in without.robots.values()] == [["M1"], ["M2"]]
+    assert without.unused_ranges["to other anchors"] == 62
+    for name, robot in found.robots.items():
+        assert robot.first_claim is not None
+        assert robot.final is not None
+        assert robot.final.position_error_m is not None
+        assert robot.final.position_error_m < 0.15
+        fewer = without.robots[name].final
+        assert fewer is not None
+        assert position_sigma(robot.final) < 0.8 * position_sigma(fewer)
+
+
+def first_of(ranges: RangeSeries, count: int) -> RangeSeries:
+    t, first, second, lengths, sigma = ranges
+    return RangeSeries(t[:count], first[:count], second[:count], lengths[:count], sigma[:count])
+
+
+@pytest.mark.long
+def test_ranges_of_zero_length_are_no_estimate_and_no_warning() -> None:
+    recording = simulated()
+    some = recording._replace(ranges=first_of(recording.ranges, 30))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        found = estimated(measurements(with_ranges(some, np.zeros(30)), None, "uwb", None), ClaimRule())
+    assert all(one.first_claim is None for one in found.summary.robots.values())
+
+
+def with_a_range_to_each(recording: RangeRecording, places: Sequence[tuple[float, float]]) -> RangeRecording:
+    """Return `recording` with anchors at `places`, and one range of the first robot to each of them."""
+    count, ranges = len(places), recording.ranges
+    more = tuple([FixedAnchor(f"L{number}", *place) for number, place in enumerate(places)])
+    base = len(recording.robots) + len(recording.anchors)
+    added = (np.full(count, 29.0), np.zeros(count, np.intp), base + np.arange(count))
+    lengths = (np.full(count, 5.0), np.full(count, 0.05))
+    series = [np.concatenate(both) for both in zip(ranges, (*added, *lengths), strict=True)]
+    return recording._replace(anchors=(*recording.anchors, *more), ranges=RangeSeries(*series))
+
+
+def test_the_anchors_with_the_most_ranges_are_found_among_thousands() -> None:
+    many = [(10.0 + number, 0.0) for number in range(20_000)]
+    problem = measurements(with_a_range_to_each(simulated(), many), None, "uwb", None)
+    assert [anchor.id for anchor in problem.measured.anchors] == ["M1", "M2"]
+
+
+def test_a_message_names_a_few_of_many_anchors() -> None:
+    recording = simulated()._replace(anchors=())
+    recording = recording._replace(ranges=first_of(recording.ranges, 0))
+    recording = with_a_range_to_each(recording, [(1.0, 1.0)] * 30)
+    with pytest.raises(
+        UserError, match=r"A has ranges to L0, L1, .*, L7 and 22 more, B has ranges to no anchor$"
+    ):
+        measurements(recording, None, "uwb", None)
+
+
+def position_sigma(pose: PoseEstimate) -> float:
+    return math.sqrt(pose.covariance[0][0] + pose.covariance[1][1])
+
+
+@pytest.mark.long
+def test_poses_by_three_anchors_are_off_by_what_their_covariance_says() -> None:
+    """The mean of 2 x 20 values of NEES with 3 degrees of freedom is 3 +- 1.3 in 99.9 %."""
+    nees = []
+    for seed in range(20):
+        recording = with_third_anchor(simulated(), seed)
+        problem = measurements(recording, None, "uwb-calibrated", None, all_anchors=True)
+        found = estimated(problem, ClaimRule()).summary
+        nees += [one.final.nees for one in found.robots.values() if one.final and one.final.nees is not None]
+    assert len(nees) == 40
+    assert 1.0 < np.mean(nees) < 4.3
 
 
 def test_each_pair_of_radios_has_one_range_a_second_at_the_nearest_tick(sample: RangeRecording) -> None:

@@ -61,7 +61,7 @@ from tests.series import series
 from world.referee import errors
 from world.scenario import Scenario
 
-FILES = ["frames.csv", "run.mcap", "ticks.csv", "ticks.parquet"]
+FILES = ["frames.csv", "run.foxglove.json", "run.mcap", "ticks.csv", "ticks.parquet"]
 A, B = agent_journal("a"), agent_journal("b")
 
 
@@ -149,7 +149,7 @@ def test_every_viewers_channel_decodes_with_its_own_schema(faulty: Path) -> None
         topics = {
             channel.topic
             for _, channel, _ in told(faulty / "run.mcap")
-            if not channel.topic.startswith("/journal/")
+            if channel.message_encoding == "protobuf"
         }
         decoded = Counter(
             (
@@ -271,13 +271,80 @@ def test_viewers_read_what_happens(paper_1: Path) -> None:
     assert lines[-1] == "The mission ends: localised"
 
 
+def test_viewers_plot_the_numbers_that_the_tables_have(noisy: Path) -> None:
+    numbers = [
+        json.loads(message.data)
+        for _, channel, message in told(noisy / "run.mcap")
+        if channel.topic == "/a/numbers"
+    ]
+    table = [row for row in pq.ParquetFile(noisy / "ticks.parquet").read().to_pylist() if row["robot"] == "a"]
+    assert len(numbers) == len(table)
+    for shown, row in zip(numbers, table, strict=True):
+        assert shown["hypotheses"] == len(row["world"] or row["local"])
+        assert shown.get("position_error_m") == row["position_error_m"]
+        assert shown.get("anchor_range_m") == row["anchor_range"]
+        sigma = row["position_sigma_m"]
+        assert shown.get("position_bound_m") == (None if sigma is None else 3.0 * sigma)
+    assert sum("mutual_range_m" in shown for shown in numbers) > 1
+
+
+def values_in(part: Any, key: str) -> Iterator[str]:
+    """Yield the texts of `key` in a JSON value, at any depth."""
+    if isinstance(part, dict):
+        if isinstance(part.get(key), str):
+            yield part[key]
+        part = list(part.values())
+    if isinstance(part, list):
+        for one in part:
+            yield from values_in(one, key)
+
+
+@pytest.mark.parametrize("recording", ["paper_1", "noisy"])
+def test_every_topic_path_and_panel_of_the_layout_exists(
+    recording: str, request: pytest.FixtureRequest
+) -> None:
+    folder: Path = request.getfixturevalue(recording)
+    layout = json.loads((folder / "run.foxglove.json").read_bytes())
+    numbers: dict[str, set[str]] = {}
+    topics = set()
+    for schema, channel, message in told(folder / "run.mcap"):
+        topics.add(channel.topic)
+        if channel.topic.endswith("/numbers"):
+            assert set(json.loads(message.data)) <= set(json.loads(schema.data)["properties"])
+            numbers.setdefault(channel.topic, set()).update(json.loads(message.data))
+    panels = layout["configById"]
+    scene = panels["3D!scene"]
+    assert {topic for topic, one in scene["topics"].items() if one["visible"]} == {
+        *("/stage", "/contact", "/a/body", "/b/body", "/a/belief", "/b/belief")
+    }
+    assert {*scene["topics"], *values_in(panels, "topicToRender")} <= topics
+    frames = {one.child_frame_id for tf in seen(folder / "run.mcap", "/tf") for one in tf.transforms}
+    assert {name.removeprefix("frame:") for name in scene["transforms"]} == {"world", *frames}
+    plotted = [path.partition(".") for path in values_in(panels, "value")]
+    assert len(plotted) == 10
+    exact = {"position_bound_m"} if recording == "paper_1" else set()  # without noise there is no sigma
+    assert all(number in numbers[topic] | exact for topic, _, number in plotted)
+    named = [*values_in(layout["layout"], "first"), *values_in(layout["layout"], "second")]
+    assert sorted(named) == sorted(panels)
+
+
+def test_the_layout_shows_all_anchors_and_orbits_from_above(paper_1: Path) -> None:
+    camera = json.loads((paper_1 / "run.foxglove.json").read_bytes())["configById"]["3D!scene"]["cameraState"]
+    (stage,) = seen(paper_1 / "run.mcap", "/stage")
+    assert not camera["perspective"]
+    for line in [line for entity in stage.entities for line in entity.lines]:
+        for point in line.points:
+            assert abs(point.x - camera["targetOffset"][0]) < camera["distance"] / 2
+            assert abs(point.y - camera["targetOffset"][1]) < camera["distance"] / 2
+
+
 def test_a_recording_always_gives_the_same_bytes(paper_1: Path, tmp_path: Path) -> None:
     first = {name: (paper_1 / name).read_bytes() for name in FILES}
     ended = tandem("export", paper_1, "--out", tmp_path / "elsewhere")
     assert (ended.status, ended.err) == (0, "")
     assert ended.out.splitlines() == [
         str(tmp_path / "elsewhere" / name)
-        for name in ("run.mcap", "frames.csv", "ticks.csv", "ticks.parquet")
+        for name in ("run.mcap", "run.foxglove.json", "frames.csv", "ticks.csv", "ticks.parquet")
     ]
     assert {name: (tmp_path / "elsewhere" / name).read_bytes() for name in FILES} == first
     assert sorted(path.name for path in (tmp_path / "elsewhere").iterdir()) == FILES
@@ -397,7 +464,7 @@ def test_a_run_exports_its_recording_at_its_end(mode: list[str], paper_1: Path, 
     ended_without = tandem("run", "paper-1", "-q", "--out", tmp_path / "bare", "--no-export", *mode)
     assert ended_without.status == 0
     assert {path.name for path in out.iterdir()} - {path.name for path in (tmp_path / "bare").iterdir()} == {
-        *("run.mcap", "frames.csv", "ticks.parquet")
+        *("run.mcap", "run.foxglove.json", "frames.csv", "ticks.parquet")
     }
     assert tandem("run", "paper-1", "-q", "--export", *mode).status == 2
 
@@ -449,8 +516,8 @@ def test_ctrl_c_ends_an_export_and_leaves_nothing_half_written(paper_1: Path, tm
     export(read(paper_1), tmp_path / "whole", check=lambda: next(all_checks))
     for checks, left in (
         (10, set()),
-        (60, {"run.mcap"}),
-        (next(all_checks) - 1, {"run.mcap", "frames.csv", "ticks.csv"}),
+        (60, {"run.mcap", "run.foxglove.json"}),
+        (next(all_checks) - 1, {*FILES} - {"ticks.parquet"}),
     ):
         some = iter(range(checks))
         with pytest.raises(StopIteration):

@@ -7,7 +7,6 @@ shares only the model with `agent.estimation.gaussian.least_squares`.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from itertools import islice, product
 from pathlib import Path
@@ -16,11 +15,10 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
 from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis, search
-from agent.estimation.gaussian.least_squares import Fit, poses
+from agent.estimation.gaussian.least_squares import poses
 from agent.estimation.gaussian.range_model import PairRanges
 from agent.planning.accuracy_seeking import AccuracySeeking
 from agent.planning.state import Done, RobotState
@@ -38,7 +36,7 @@ from protocol.messages import (
     RobotConfig,
     Undecided,
 )
-from protocol.motion import Controls, Pose, compose, step
+from protocol.motion import Controls, Pose, step
 from protocol.noise import Noise, VelocityNoise
 from protocol.wire import decode
 from tests.series import series
@@ -46,18 +44,13 @@ from tests.series import series
 pytest.importorskip("gtsam", reason="gtsam has no wheel for this platform or this Python")
 import gtsam
 
-Array = NDArray[np.float64]
+from tests.factor_graph import Array, Optimum, arc, manoeuvre_of, nudged, optimum, pose_of, wrapped
 
 MISSIONS = 50
 AGREED = 0.01
 """The maximum difference of a pose from gtsam's, in standard deviations."""
 AGREED_COVARIANCE = 0.01
 """The maximum difference of a covariance element, as a fraction of the product of its two sigmas."""
-STILL = 1e-7
-"""The size of a step, in m, m/s and rad, below which gtsam's Gauss-Newton iteration ends."""
-STEPS = 200
-"""The maximum number of steps."""
-
 SIGMAS = ((0.01, 0.01), (0.02, 0.05), (0.1, 0.1))
 """The standard deviations in m of ranges to anchors and between robots."""
 DRIFTS = (
@@ -181,46 +174,8 @@ def remembered(folder: Path, robot: str) -> tuple[RobotState, Localised]:
 # --- gtsam --------------------------------------------------------------------------------------------
 
 
-class Optimum(NamedTuple):
-    """The optimum of the graph, computed by gtsam."""
-
-    mean: Array
-    """The poses of both robots at the last tick, in the order of `least_squares.poses`."""
-    covariance: Array
-    error: float
-    """Half the sum of squared residuals."""
-
-
-def pose_of(robot: int, tick: int) -> int:
-    return int(gtsam.symbol("ab"[robot], tick))
-
-
-def manoeuvre_of(robot: int, tick: int) -> int:
-    """Return the key of the executed v and omega over [tick, tick + 1]."""
-    return int(gtsam.symbol("vw"[robot], tick))
-
-
 def anchor_of(robot: int) -> int:
     return int(gtsam.symbol("m", robot))
-
-
-def arc(robot: int, tick: int, period: float) -> gtsam.CustomFactor:
-    """Return the factor of the exact unicycle step: an exponential map of SE(2) over a tick."""
-    keys = [pose_of(robot, tick), manoeuvre_of(robot, tick), pose_of(robot, tick + 1)]
-
-    def broken(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
-        v, omega = values.atPoint2(keys[1])
-        twist = np.array((v * period, 0.0, omega * period))
-        driven = gtsam.Pose2.Expmap(twist)
-        ahead = values.atPose2(keys[2]).between(values.atPose2(keys[0]).compose(driven))
-        if jacobians is not None:
-            by_end = gtsam.Pose2.LogmapDerivative(ahead)
-            jacobians[0] = by_end @ driven.inverse().AdjointMap()
-            jacobians[1] = by_end @ gtsam.Pose2.ExpmapDerivative(twist)[:, [0, 2]] * period
-            jacobians[2] = -by_end @ ahead.inverse().AdjointMap()
-        return np.asarray(gtsam.Pose2.Logmap(ahead))
-
-    return gtsam.CustomFactor(gtsam.noiseModel.Constrained.All(3), keys, broken)
 
 
 def graph_of(
@@ -263,27 +218,6 @@ def begun(
     return values
 
 
-def optimum(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: Sequence[int]) -> Optimum:
-    """Return the optimum, by single Gauss-Newton steps: gtsam's `optimize` ends when the error grows once."""
-    for _ in range(STEPS):
-        optimiser = gtsam.GaussNewtonOptimizer(graph, values)
-        optimiser.iterate()
-        change = values.localCoordinates(optimiser.values()).norm()
-        values = optimiser.values()
-        if change < STILL:
-            break
-    else:
-        raise AssertionError("gtsam has found no optimum")
-    local = gtsam.Marginals(graph, values).jointMarginalCovariance(last).fullMatrix()
-    mean, turn = np.empty(6), np.zeros((6, 6))
-    for robot, key in enumerate(last):  # gtsam's covariance is in the frame of the robot
-        pose, i = values.atPose2(key), 3 * robot
-        mean[i : i + 3] = pose.x(), pose.y(), pose.theta()
-        turn[i : i + 2, i : i + 2] = pose.rotation().matrix()
-        turn[i + 2, i + 2] = 1.0
-    return Optimum(mean, turn @ local @ turn.T, graph.error(values))
-
-
 # --- both ---------------------------------------------------------------------------------------------
 
 
@@ -314,22 +248,6 @@ def mission(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     values = begun(robots, starts, period, anchors)
     theirs = optimum(graph, values, [pose_of(robot, state.tick) for robot in (0, 1)])
     return Compared(state.config, claimed, pair, ours, theirs)
-
-
-def nudged(fit: Fit, anchors: Sequence[Array], draw: np.random.Generator) -> list[Pose]:
-    """Return random starts of both robots, drawn from the estimated distribution."""
-    guess = draw.multivariate_normal(fit.guess, fit.covariance)
-    starts = []
-    for (mx, my, turn), (x, y) in zip(guess.reshape(2, 3).tolist(), anchors, strict=True):
-        starts.append(compose(Pose(float(x), float(y), turn), Pose(-mx, -my, 0.0)))
-    return starts
-
-
-def wrapped(change: Array) -> Array:
-    """Return the difference of two means, with headings wrapped to [-pi, pi]."""
-    change = change.copy()
-    change[2::3] = np.remainder(change[2::3] + math.pi, math.tau) - math.pi
-    return change
 
 
 def test_the_claim_came_of_this_fit(mission: Compared) -> None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from agent.estimation import closed_forms
 from agent.estimation.closed_forms import Placement, same_placement
-from agent.estimation.gaussian import hypotheses
+from agent.estimation.gaussian import hypotheses, inference
 from agent.estimation.gaussian.hypotheses import (
     ScoredHypothesis,
     _alone,
@@ -25,7 +25,7 @@ from agent.estimation.gaussian.hypotheses import (
     search,
 )
 from agent.estimation.gaussian.initial_guesses import Residuals, _encounter, _likeliest
-from agent.estimation.gaussian.least_squares import fit, fits, poses
+from agent.estimation.gaussian.least_squares import COARSE_STILL, fit, fits, poses
 from agent.estimation.gaussian.odometry_noise import Array, constant_errors, track
 from agent.estimation.gaussian.range_model import (
     MOST_RANGES,
@@ -298,7 +298,32 @@ def test_a_search_is_repeated_only_if_a_measurement_differs_in_a_bit() -> None:
     rho = pair.ranges.rho.copy()
     rho[-1] = np.nextafter(rho[-1], 0.0)
     assert search(pair._replace(ranges=pair.ranges._replace(rho=rho))) is not search(pair)
-    assert pair != pair._replace(sensing_range=2.0)
+
+
+def test_what_follows_from_a_hypothesis_is_computed_once_for_both_robots() -> None:
+    pair, _ = after_a_long_way(0)
+    again, _ = after_a_long_way(0)
+    ours, theirs = (inference.pair_planning_hypotheses(search(one), one) for one in (pair, again))
+    assert all(one is other for one, other in zip(ours, theirs, strict=True))
+    fitted = search(pair)[0].fit
+    assert hash(fitted) != hash(fitted._replace(level=fitted.level)), (
+        "another fit, though it has the same values"
+    )
+
+
+def test_a_followed_anchor_ends_after_one_linear_model_near_the_fit_of_all_steps() -> None:
+    draw, noise, count = np.random.default_rng(3), Noise(anchor_sigma=0.05, mutual_sigma=0.05), 20
+    path = track(draw.uniform(0.3, 0.8, count), draw.uniform(-1.0, 1.0, count), 1.0)
+    rho = np.hypot(path.x - 0.8, path.y + 0.5) + 0.05 * draw.normal(size=count + 1)
+    ranges = Ranges.of_lists(list(enumerate(rho.tolist())), (), (), noise)
+    before = Ranges.of_lists(list(enumerate(rho[:-1].tolist())), (), (), noise)
+    held = of_anchor((), path.until(count - 1), before, NONE, REACH, noise)
+    (followed, *_) = of_anchor([one.hypothesis for one in held], path, ranges, NONE, REACH, noise)
+    (whole,) = fits([held[0].hypothesis.start], [path], ranges, noise)
+    sigmas = np.sqrt(np.diagonal(whole.covariance))
+    assert followed.fit.linear_guess.tolist() == list(held[0].hypothesis.guess), "no second linear model"
+    assert followed.fit.last_step < COARSE_STILL
+    assert np.max(np.abs(followed.fit.guess - whole.guess)[:2] / sigmas) < COARSE_STILL
 
 
 @pytest.mark.parametrize(("sigma", "left"), [(1e-9, 2), (1e-3, 1)])
@@ -308,8 +333,7 @@ def test_two_placements_between_which_the_likelihood_falls_are_not_merged(sigma:
     z = np.zeros((2, 8))
     z[:, 0] = -0.005, 0.005
 
-    def residuals_at(z: Array, *, derivatives: bool = True) -> Residuals:
-        assert not derivatives
+    def residuals_at(z: Array) -> Residuals:
         return Residuals(z[:, :1] ** 2 - 0.005**2, np.empty(0), np.zeros((len(z), 2)))
 
     found, _ = _likeliest(z, np.array([sigma]), residuals_at, np.ones(2), pair)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from compose.launch.processes import free_endpoint
 from protocol.motion import Controls, Pose, step, wrap
 from tests import ros_base
-from tests.commands import tandem
+from tests.commands import BOUND_S, TandemProcess, tandem
 from world.hardware import ros2
 
 LITTLE_ENDIAN = b"\x00\x01\x00\x00"
@@ -140,8 +140,15 @@ def test_a_base_behind_a_bridge_fulfils_the_driver_contract(tmp_path: Path) -> N
     (tmp_path / "ros.toml").write_text(SCENARIO)
     endpoint = free_endpoint()
     with ros_base.base(endpoint, (1.0, 0.5), 3.0) as base:
-        ended = tandem(
-            *("check-driver", "world.hardware.ros2:Ros2", "--mission", tmp_path / "ros.toml", "--rate", "1"),
+        with TandemProcess(
+            *(
+                "check-driver",
+                "world.hardware.ros2:Ros2",
+                "--mission",
+                tmp_path / "ros.toml",
+                "--rate",
+                "0.5",
+            ),
             *(
                 "--option",
                 f"connect={endpoint}",
@@ -151,7 +158,8 @@ def test_a_base_behind_a_bridge_fulfils_the_driver_contract(tmp_path: Path) -> N
                 "odom=bot/odom",
             ),
             *("--option", "anchor_range=bot/uwb", "--option", "peer_range=bot/peer"),
-        )
+        ) as checked:
+            ended = checked.ended(3.0 * BOUND_S)  # the exercise lasts in proportion to its manoeuvres
         assert ended.status == 0, ended.out + ended.err
         assert ended.out.count("ok     ") == 8
         assert math.dist((base.pose.x, base.pose.y), (0.3, -0.4)) > 3.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import re
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -297,11 +298,21 @@ def test_a_world_with_a_closed_output_does_not_blame_its_journal(tmp_path: Path)
     assert ended.err == "tandem world: cannot continue: No space left on device\n"
 
 
-def test_a_terminal_shows_each_robots_phase_and_state_while_it_runs() -> None:
+def test_a_terminal_shows_a_map_and_each_robots_phase_and_state_while_it_runs() -> None:
     status, shown = on_a_terminal("run", "far")
     assert status == 0
-    for words in ("phase", "state", "orbiting", "tick ", "localised after"):
+    for words in ("phase", "orbiting", "tick ", "hypothes", "anchor +", "localised after"):
         assert words in shown, shown
+    assert re.search("[\u2801-\u28ff]", shown)
+
+
+def test_of_many_robots_a_terminal_shows_numbers_instead_of_a_map(tmp_path: Path) -> None:
+    scenario = tmp_path / "pairs.toml"
+    scenario.write_text(several_pairs(5).replace("seed", "max_ticks = 150\nseed"))
+    _, shown = on_a_terminal("run", scenario)
+    for words in ("outcome", "10 localised", "10 phase 3"):
+        assert words in shown, shown
+    assert not re.search("[\u2801-\u28ff]", shown)
 
 
 @pytest.mark.parametrize("mode", [[], ["--in-process"]], ids=["processes", "in-process"])

@@ -239,6 +239,14 @@ def clear(told: Told) -> bool:
 EXACT = Noise().as_told
 
 
+def with_other_anchors(one: Told, seed: int) -> Told:
+    """Return `one` with every other range of a robot to an anchor at another place."""
+    draw, ranges = np.random.default_rng(seed), one.ranges
+    place = draw.uniform(-3.0, 3.0, (len(ranges.rho), 2))
+    place[::2], place[ranges.rows(2)] = 0.0, 0.0
+    return one._replace(ranges=ranges._replace(place=place, radio=np.arange(len(ranges.rho))))
+
+
 @few
 @given(seeds)
 def test_the_true_guess_predicts_the_true_ranges(seed: int) -> None:
@@ -246,21 +254,25 @@ def test_the_true_guess_predicts_the_true_ranges(seed: int) -> None:
     assert distances(one, one.guess) == pytest.approx(one.ranges.rho, abs=1e-12)
 
 
+@pytest.mark.parametrize("anchors", ["one each", "several"])
 @some
-@given(seeds)
-def test_a_range_changes_with_the_guess_as_predicted(seed: int) -> None:
+@given(seed=seeds)
+def test_a_range_changes_with_the_guess_as_predicted(seed: int, anchors: str) -> None:
     one = told(seed, EXACT)
+    one = with_other_anchors(one, seed) if anchors == "several" else one
     assume(clear(one))
     predicted = predict(one.guess, one.measured, one.ranges, one.apart)
     by_guess = derivative(lambda guess: distances(one, guess), one.guess)
     assert predicted.jacobian == pytest.approx(by_guess, abs=1e-6)
 
 
+@pytest.mark.parametrize("anchors", ["one each", "several"])
 @some
-@given(seeds)
-def test_a_range_looks_at_a_robot_along_its_direction(seed: int) -> None:
+@given(seed=seeds)
+def test_a_range_looks_at_a_robot_along_its_direction(seed: int, anchors: str) -> None:
     """A displacement in the frame of its odometry changes the range of a robot by the same amount."""
     one = told(seed, EXACT)
+    one = with_other_anchors(one, seed) if anchors == "several" else one
     assume(clear(one))
     predicted = predict(one.guess, one.measured, one.ranges, one.apart)
     for robot in (0, 1):

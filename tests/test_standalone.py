@@ -85,8 +85,8 @@ def test_what_is_no_recording_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     ended = tandem("export", "empty", "--html", cwd=tmp_path)
     assert ended.status == 2
-    assert (
-        ended.err == "tandem export: empty contains no recording, no sweep, and no folders with recordings\n"
+    assert ended.err == (
+        "tandem export: empty contains no recording, no sweep, no estimate, and no folders with recordings\n"
     )
     ended = tandem("export", "empty", "--html", "--pyfg", cwd=tmp_path)
     assert ended.status == 2

@@ -11,8 +11,11 @@ import pytest
 from msgspec.structs import replace
 
 import tandem
+from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.hypotheses import Hypothesis, ScoredHypothesis, search
 from agent.estimation.gaussian.range_model import PairRanges
+from agent.estimation.knowledge import Belief
+from agent.peer.motion_log import MotionLog
 from agent.planning import accuracy_seeking
 from agent.planning.accuracy_seeking import OFF_RADIUS, AccuracySeeking
 from agent.planning.phase2_orbit import Aligning, Radial, orientation
@@ -20,7 +23,7 @@ from agent.planning.state import RobotState
 from compose.launch.in_process import run_mission
 from compose.recording.run import Run
 from compose.recording.summary_json import summary
-from protocol.messages import Undecided
+from protocol.messages import Ranged, Undecided
 from protocol.motion import Pose
 from protocol.noise import Noise
 from protocol.wire import encode
@@ -153,19 +156,24 @@ def test_a_mission_whose_search_once_missed_the_truth_is_not_wrong(
     assert all(recording.truth_held(robot) is not False for robot in recording.robots)
 
 
+NOISE = {"mission.noise.anchor_sigma": 0.05, "mission.noise.mutual_sigma": 0.05, "mission.accuracy": 0.1}
+
+
 @pytest.mark.parametrize("seed", series([101, 129]))
 def test_a_tick_without_a_range_excludes_no_truth_where_detection_fades(seed: int) -> None:
     """In both missions, a placement that explained the missing ranges was claimed, more than 1 m off."""
     scenario = tandem.Scenario.load("random").with_(
-        {
-            "mission.noise.anchor_sigma": 0.05,
-            "mission.noise.mutual_sigma": 0.05,
-            "mission.accuracy": 0.1,
-            "world.noise.detection_exponent": 4.0,
-        },
-        seed=seed,
+        {**NOISE, "world.noise.detection_exponent": 4.0}, seed=seed
     )
     run = tandem.run(scenario)
+    assert run.outcome in ("localised", "undecided")
+    assert all(run.model.truth_held(robot) is not False for robot in run.robots)
+
+
+@pytest.mark.parametrize("seed", series([1027, 1049]))
+def test_an_outlier_among_few_mutual_ranges_hides_no_placement(seed: int) -> None:
+    """In both missions, every fit took the outlier in, and a placement 0.4 m off was claimed."""
+    run = tandem.run(tandem.Scenario.load("random").with_({**NOISE, "world.noise.outliers": 0.1}, seed=seed))
     assert run.outcome in ("localised", "undecided")
     assert all(run.model.truth_held(robot) is not False for robot in run.robots)
 
@@ -337,6 +345,17 @@ def first_impossible(count: int) -> list[int]:
 def test_a_robot_whose_first_range_is_impossible_localises() -> None:
     for seed in first_impossible(4):
         assert_localised(survey(MANY, seed))
+
+
+def test_a_waiting_robot_fits_its_anchor_again_when_a_quarter_more_ranges_are_in() -> None:
+    def due(fitted: int, ranges: int, probability: float = 1.0) -> bool:
+        belief = Belief(own=(Hypothesis((0.0, 0.0, 0.0), probability),), ranges_at_last_fit=fitted)
+        log = MotionLog(ranges=tuple([Ranged(tick, 1.0) for tick in range(ranges)]))
+        return inference.is_fit_due(RobotState(scenario_of(SIGMA, 1).config("b"), log=log, belief=belief))
+
+    assert [due(8, ranges) for ranges in (8, 9, 10)] == [False, False, True]
+    assert [due(100, ranges) for ranges in (104, 105)] == [False, True]
+    assert due(100, 101, probability=0.99), "the branch is not certain"
 
 
 def test_drop_outs_that_add_up_do_not_keep_a_robot_in_phase_1() -> None:

@@ -22,7 +22,7 @@ import pytest
 from msgspec.structs import replace
 from playwright.sync_api import expect
 
-from compose.errors import UserError
+from compose.errors import USER_ERROR, UserError
 from compose.launch import in_process
 from compose.recording.run import read
 from compose.scenario.scenario_file import load
@@ -44,6 +44,7 @@ from tests.commands import (
     world,
 )
 
+UWB_SAMPLE = Path(__file__).parent / "data" / "uwb" / "tiers-a-b-30-s.pyfg"
 FAST_TICKS = 1000
 """The number of ticks of about a second at full speed."""
 WITH_TIMEOUT = ("--timeout", "600")
@@ -85,7 +86,11 @@ def test_the_plane_is_drawn_in_the_colours_of_what_happens(opened: Open, address
         seen[tick] = inks(page)
     assert seen[0]["range"] > 3 * seen[20]["range"]  # both are in range of their anchors; neither is
     assert seen[45]["link"] == 0 < seen[46]["link"]  # phase 3 begins
-    assert seen[47]["ghost"] > 3 * seen[46]["ghost"] > 300  # one placement each is possible, then four
+    assert seen[46]["ghost"] > 100  # one placement each is possible, then four
+    tints = [f"tint-{i}" for i in range(1, 5)]
+    assert not any(seen[46][tint] for tint in tints)
+    assert min(seen[47][tint] for tint in tints) > 60
+    assert [seen[48][tint] > 60 for tint in tints] == [True, False, False, False]
     for robot in ("robot-a", "robot-b"):
         assert 0 < seen[0][robot] < seen[20][robot] < seen[45][robot] < seen[48][robot]  # trails
     page.locator("#truth").uncheck()
@@ -272,11 +277,13 @@ def test_lost_late_and_damaged_reports_are_shown(opened: Open, tmp_path: Path) -
         until_shown(page, 26)
         expect(page.locator("#log")).to_contain_text("is lost")
         expect(page.locator("#log")).to_contain_text("ticks late")
-        expect(page.locator(".probability li").first).to_contain_text("%")
         page.keyboard.press("n")
         shot(page, "faults")
         page.locator("#radio").uncheck()
         expect(page.locator("#log")).not_to_contain_text("is lost")
+        page = opened(f"{where}#tick=15")
+        until_shown(page, 15)
+        expect(page.locator(".probability li").first).to_contain_text("%")
 
 
 @pytest.mark.long
@@ -290,11 +297,37 @@ def test_the_recordings_in_a_folder_are_listed(opened: Open, paper_1: Path, tmp_
         links = page.locator("#list a")
         expect(links).to_have_count(2)
         expect(links.first).to_contain_text("incomplete, ends at tick")
+        expect(links.last.locator(".chip")).to_have_text("★ localised after 48 ticks")
+        expect(page.locator(".thumbnail").last).to_have_js_property("complete", value=True)
+        assert page.locator(".thumbnail").last.evaluate("picture => picture.naturalWidth") > 0
         shot(page, "list")
         links.last.click()
         expect(page.locator("#status")).to_have_text("localised after 48 ticks")
         page.locator("#home").click()
         expect(links).to_have_count(2)
+
+
+@pytest.mark.long
+def test_an_estimate_shows_its_robots_and_its_figures(opened: Open, tmp_path: Path) -> None:
+    folder = tmp_path / "estimated"
+    assert tandem("estimate", str(UWB_SAMPLE), "--window", "0..12", "--out", str(folder)).status in (0, 1)
+    with watching(folder) as (_, where):
+        page = opened(where)
+        expect(page.locator("#title")).to_have_text("tiers-a-b-30-s.pyfg")
+        expect(page.locator("#status")).to_have_text("estimate")
+        expect(page.locator("#sweep tbody tr")).to_have_count(2)
+        expect(page.locator("#sweep tbody tr").first).to_contain_text("LC0")
+        expect(page.locator("#sweep img")).to_have_count(2)
+        expect(page.locator("#sweep img").first).to_have_js_property("complete", value=True)
+        shot(page, "estimate")
+
+
+def test_what_is_no_summary_of_an_estimate_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "estimate.json").write_text('{"robots": 3}')
+    ended = tandem("watch", str(tmp_path))
+    assert ended.status == USER_ERROR
+    assert "estimate.json is not the summary of an estimate" in ended.err
+    assert ended.err.count("\n") == 1
 
 
 @pytest.mark.long
@@ -310,8 +343,8 @@ def test_a_sweep_shows_its_cells_and_its_figures(opened: Open, tmp_path: Path) -
     with watching(folder) as (_, where):
         page = opened(where)
         expect(page.locator("#title")).to_have_text("speeds")
-        expect(page.locator("tbody tr")).to_have_count(2)
-        expect(page.locator("tbody tr").first).to_contain_text("100.0 %")
+        expect(page.locator("#sweep > .wide tbody tr")).to_have_count(2)
+        expect(page.locator("#sweep > .wide tbody tr").first).to_contain_text("100.0 %")
         expect(page.locator("#sweep")).to_contain_text("Individual trials are not recorded")
         expect(page.locator("#sweep img").first).to_have_js_property("complete", value=True)
         shot(page, "sweep")
@@ -470,7 +503,7 @@ def test_ctrl_c_ends_a_page_that_is_open_in_a_browser(paper_1: Path) -> None:
     ("arguments", "complaint"),
     [
         (["nowhere"], "nowhere is not a folder"),
-        (["."], ". contains no recording, no sweep, and no folders with recordings"),
+        (["."], ". contains no recording, no sweep, no estimate, and no folders with recordings"),
         (
             [".", "--connect", "tcp/127.0.0.1:7447"],
             "--connect: a recording needs no network; give either DIR or --connect",

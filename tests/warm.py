@@ -25,6 +25,9 @@ MAIN = "tests.warm:run_command"
 DRAWING = ("matplotlib.backends.backend_pdf", "matplotlib.backends.backend_svg")
 """modules that Matplotlib imports only when it writes a file"""
 
+THREADED = "compose.view.export.rerun_recording"
+"""a module whose library starts threads, which a process that forks must not have"""
+
 
 class Request(msgspec.Struct, frozen=True):
     """A command line, its working directory and its environment."""
@@ -39,7 +42,7 @@ def warm_up() -> None:
     """Import all modules that commands need, in the process that they are forked from."""
     missions()
     for module in pkgutil.walk_packages(compose.__path__, "compose."):
-        if not module.name.endswith(".__main__"):
+        if not module.name.endswith(".__main__") and module.name != THREADED:
             import_module(module.name)
     for name in DRAWING:
         import_module(name)

@@ -51,6 +51,8 @@ class Belief(msgspec.Struct, frozen=True):
     """Noisy sensors: the hypotheses about the position of the own anchor, the most probable first."""
     branches: tuple[Branch, ...] = ()
     """The branch that corresponds to each hypothesis in `own`."""
+    ranges_at_last_fit: int = 0
+    """Noisy sensors: the number of anchor ranges at the latest fit of `own`."""
     pair: tuple[Hypothesis, ...] = ()
     """Noisy sensors: the hypotheses about both robots' poses in <W>, the most probable first."""
     poses: tuple[Pose, ...] = ()

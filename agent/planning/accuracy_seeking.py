@@ -207,7 +207,7 @@ def _continue_phase1(state: RobotState) -> RobotState:
             state, belief=replace(state.belief, branch_kind=kind, phase1_done_tick=phase1_done_tick)
         )
         return _start_phase2(state)
-    command = active_sensing.plan_alone(inference.anchor_planning_hypotheses(scored), mission)
+    command = active_sensing.plan_alone(inference.anchor_planning_hypotheses(state), mission)
     return replace(state, mode=Surveying("anchor", command))
 
 
@@ -250,8 +250,10 @@ def _start_phase2(state: RobotState) -> RobotState:
 def _continue_phase2(state: RobotState, ranged: bool) -> RobotState:
     """Continue phase 2 with the latest anchor range, if `ranged`. Robot b takes ranges while it waits."""
     mission = state.config.mission
-    scored: Sequence[ScoredHypothesis] = ()
-    if ranged and is_planning_tick(state) and (scored := inference.own_anchor(state)):
+    planning = ranged and is_planning_tick(state)
+    waiting = isinstance(state.mode, Orbiting) and state.orbit.v == 0.0
+    due = planning and (not waiting or inference.is_fit_due(state))
+    if due and (scored := inference.own_anchor(state)):
         state = replace(state, belief=inference.with_own(state, scored))
         if isinstance(state.mode, Radial) and abs(phase2_orbit.orientation(state.local_pose)) > OFF_RADIUS:
             return _start_phase2(state)
@@ -272,9 +274,9 @@ def _continue_phase2(state: RobotState, ranged: bool) -> RobotState:
             return _return_to_anchor(state)
         if state.orbit.v != 0.0:
             command = phase2_orbit.pursuit(state.local_pose, state.orbit, mission)
-        elif scored:
+        elif planning and state.belief.own:
             command = active_sensing.plan_alone(
-                inference.anchor_planning_hypotheses(scored), mission, state.orbit.radius
+                inference.anchor_planning_hypotheses(state), mission, state.orbit.radius
             )
         else:
             command = REST if is_planning_tick(state) else mode.command or REST
@@ -376,7 +378,7 @@ class PairInference(NamedTuple):
     """The hypotheses about both robots in one tick."""
 
     scored: tuple[ScoredHypothesis, ...]
-    hypotheses: list[PlanningHypothesis]
+    hypotheses: tuple[PlanningHypothesis, ...]
     belief: Belief
     searched: bool
     """True if the hypotheses are from a search of the whole plane."""

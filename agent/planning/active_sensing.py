@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, lru_cache
 from typing import NamedTuple
 
 import msgspec
@@ -172,6 +172,14 @@ def plan_together(
     than the safety distance under any hypothesis; `rho` is the latest range between them in m. If no
     manoeuvre meets this condition, both stand still.
     """
+    return _planned_together(tuple(hypotheses), m2, rho, mission)
+
+
+@lru_cache(maxsize=2)
+def _planned_together(
+    hypotheses: tuple[PlanningHypothesis, ...], m2: tuple[float, float], rho: float, mission: Mission
+) -> tuple[Controls, Controls]:
+    """Return the manoeuvres of `plan_together`, which both robots of one process ask for."""
     ways = choice(mission)
     stand = len(ways.v) - 1
     still = np.array([stand])

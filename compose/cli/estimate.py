@@ -50,6 +50,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_part_of_recording(parser)
     parser.add_argument(
+        "--all-anchors",
+        action="store_true",
+        help="use the ranges of two robots to all anchors [default: for each robot, the ranges to one "
+        "anchor; a single robot always uses all]",
+    )
+    parser.add_argument(
         "--accuracy",
         type=positive,
         default=0.3,
@@ -92,7 +98,9 @@ def main(options: argparse.Namespace) -> int:
         problem, estimate, stopped = _followed(options, rule)
     else:
         recording = read_ranges(options.recording, options.anchors)
-        problem = measurements(recording, options.robots, options.noise, options.window)
+        problem = measurements(
+            recording, options.robots, options.noise, options.window, all_anchors=options.all_anchors
+        )
         with counting("tandem estimate", problem.measured.epochs) as done:
             estimate = estimated(problem, rule, done)
     if options.out is not None:
@@ -120,7 +128,7 @@ def _followed(
         raise UserError("--follow: a stream has its own anchors, and no window")
     name = "standard input" if str(options.recording) == "-" else str(options.recording)
     noise = (told_noise(options.noise), options.noise) if options.noise is not None else None
-    estimate = StreamEstimate(name, options.robots, noise, rule)
+    estimate = StreamEstimate(name, options.robots, noise, rule, all_anchors=options.all_anchors)
     try:
         stream = sys.stdin.buffer if str(options.recording) == "-" else options.recording.open("rb")
     except OSError as error:
@@ -175,14 +183,16 @@ def _lines(summary: EstimateSummary) -> list[str]:
 
 
 def _row(name: str, one: RobotEstimate, begin_s: float) -> list[str]:
+    from compose.recording.estimating.pair_measurements import listed  # noqa: PLC0415  # it takes time
+
     first, last = one.first_claim, one.final
     if last is None:
-        return [name, ", ".join(one.anchors), *["-"] * 7]
+        return [name, listed(one.anchors), *["-"] * 7]
     x, y, heading = last.pose
     sigma = (last.covariance[0][0] + last.covariance[1][1]) ** 0.5
     return [
         name,
-        ", ".join(one.anchors),
+        listed(one.anchors),
         "-" if first is None else f"{first.t_s - begin_s:.1f}",
         f"{x:.2f}",
         f"{y:.2f}",

@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out",
         type=folder,
         metavar="DIR",
-        help="folder for run.mcap, frames.csv and ticks.parquet [default: the recording's]",
+        help="folder for the files [default: the recording's]",
     )
     kinds = parser.add_mutually_exclusive_group()
     kinds.add_argument(
@@ -36,6 +36,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--html",
         action="store_true",
         help="write only run.html: the page of the run in one file, which a browser opens without a server",
+    )
+    kinds.add_argument(
+        "--rerun",
+        action="store_true",
+        help="write only run.rrd: a recording for Rerun, with its views in place (extra rerun)",
     )
     add_closing(parser, "tandem export recording --out exported", "docs/recordings.md")
 
@@ -50,6 +55,8 @@ def main(options: argparse.Namespace) -> int:
         return _pyfg(options.recording, out)
     if options.html:
         return _html(options.recording, out)
+    if options.rerun:
+        return _rerun(options.recording, out)
     need(*MODULES)
     inbox = Inbox("tandem export")
     stop_by_signal(inbox)
@@ -90,7 +97,21 @@ def _html(recording: Path, out: Path) -> int:
     return ENDED
 
 
-def _written(out: Path, name: str, text: str) -> Path:
+def _rerun(recording: Path, out: Path) -> int:
+    """Write run.rrd to `out`, and print its path."""
+    need("rerun", extra="rerun")
+    from compose.view.export.rerun_recording import rerun_recording  # noqa: PLC0415  # slow, and optional
+    from compose.view.recorded import checked, scenes_of  # noqa: PLC0415
+
+    with user_errors(recording):
+        run = read(recording)
+        _, setup = checked(run)
+        content = rerun_recording(setup, scenes_of(run))
+    say(str(_written(out, "run.rrd", content)))
+    return ENDED
+
+
+def _written(out: Path, name: str, text: str | bytes) -> Path:
     """Write a file to the folder `out`, and return its path. Raises UserError."""
     make_folder(out)
     try:

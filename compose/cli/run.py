@@ -20,7 +20,7 @@ from compose.recording.recording_files import folder_for
 from compose.recording.run import Run, read
 from compose.scenario.kills import Kill
 from compose.scenario.scenario_file import check_rate, run_name, setting
-from compose.terminal.outcome import break_off, conclude, shown_live
+from compose.terminal.outcome import break_off, conclude, shown_live, shows_live
 from protocol.journal.journal_file import CannotRecord
 from protocol.network.inbox import Inbox, Interrupted
 from world.scenario import Scenario
@@ -164,7 +164,7 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
                     timeout=options.timeout,
                     kills=kills,
                     keys=keys,
-                    agents_journal=bool(options.out is not None or kills or viewers),
+                    agents_journal=bool(options.out is not None or kills or viewers or shows_live(options)),
                 )
         except supervisor.ChildFailed as failure:
             inbox.say(f"failed: {failure}")

@@ -38,7 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=folder,
         nargs="?",
         metavar="DIR",
-        help="folder of a recording, of several recordings, or of a sweep [default: live missions]",
+        help="folder of a recording, of several recordings, of a sweep or of an estimate "
+        "[default: live missions]",
     )
     add_models(parser)
     add_connection(parser)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from datetime import timedelta
 from pathlib import Path
 
 from rich import progress as bars
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from compose.sweep.cells import Cell
@@ -51,20 +52,35 @@ class _Rate(bars.ProgressColumn):
 
     def render(self, task: bars.Task) -> Text:
         """Return the rate as text; Rich calls this method."""
-        return Text(f"{task.speed:.3g}/s" if task.speed else "")
+        return Text(f"{task.speed:.3g} trials/s" if task.speed else "")
+
+
+class _Times(bars.ProgressColumn):
+    """The progress column with the elapsed and the remaining time, each with its name."""
+
+    def render(self, task: bars.Task) -> Text:
+        """Return the times as text; Rich calls this method."""
+        left = f", {_clock(task.time_remaining)} left" if task.time_remaining is not None else ""
+        return Text(f"{_clock(task.elapsed or 0.0)} elapsed{left}")
+
+
+def _clock(seconds: float) -> str:
+    """Return a time as hours, minutes and seconds."""
+    return str(timedelta(seconds=round(seconds)))
 
 
 @contextmanager
 def progress(name: str, say: Callable[[str], None], visible: bool) -> Iterator[Progress]:
-    """Yield the progress callbacks. If `visible`, they show a bar with the rate and the remaining time."""
+    """Yield the progress callbacks. If `visible`, they show a bar with the rate and the times."""
     bar = bars.Progress(
         bars.TextColumn("{task.description}"),
-        bars.BarColumn(),
+        bars.BarColumn(bar_width=None, table_column=Column(ratio=1)),
         bars.MofNCompleteColumn(),
-        _Rate(),
-        bars.TimeRemainingColumn(),
+        _Rate(Column(no_wrap=True)),
+        _Times(Column(no_wrap=True)),
         disable=not visible,
         transient=True,
+        expand=True,
         speed_estimate_period=RATE_OVER_S,
     )
     with bar:

@@ -1,23 +1,13 @@
-"""The live table of a run, with each robot's phase and state, and the table at its end."""
+"""The table at the end of a run."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rich.live import Live
-from rich.table import Table
-
-from compose.recording.recording_files import WORLD_JOURNAL
 from compose.recording.summary_json import outcome_line
 from compose.terminal import tables, text_width
-from protocol.journal.journal_file import Tail
-from protocol.messages import Command, DeadlineMissed, FinalReport, MissionEnd
-from protocol.output import one_line, say
-from protocol.wire import MAX_FRAME_BYTES, decode
-from world.scenario import RecordedScenario, Scenario
+from protocol.output import say
 
 TRUTH, ESTIMATE, ERROR, SIGMA = "true x, y, heading", "estimate", "error m", "sigma m"
 RANGES, REPORTS, LATE = "ranges", "reports", "late"
@@ -40,54 +30,6 @@ LISTED = 4
 """The largest number of robots that are shown as a list if the table of all columns does not fit."""
 NAMED = 10
 """The largest number of robots named in a sentence."""
-
-
-@contextmanager
-def live(scenario: Scenario, folder: Path) -> Iterator[None]:
-    """Show the progress of the run recorded in `folder`, ten times a second."""
-    journal = Tail(folder / WORLD_JOURNAL)
-    commands: dict[str, Command] = {}
-
-    def update() -> None:
-        with suppress(OSError, ValueError):
-            for frame in journal.news():
-                message = decode(
-                    frame,
-                    RecordedScenario | Command | DeadlineMissed | MissionEnd | FinalReport,
-                    MAX_FRAME_BYTES,
-                )
-                if isinstance(message, Command):
-                    commands[message.robot] = message
-
-    def table() -> Table:
-        update()
-        ids = [robot.id for robot in scenario.robots]
-        latest = max((command.tick for command in commands.values()), default=0)
-        rows = Table(title=f"{scenario.name}, tick {latest} of {scenario.max_ticks} at most")
-        for heading in ("robot", "phase", "state", "v m/s", "omega rad/s"):
-            rows.add_column(heading, no_wrap=True)
-        for robot in ids:
-            command = commands.get(robot)
-            if command is None:
-                rows.add_row(robot, "", "waiting for it", "", "")
-            else:
-                rows.add_row(
-                    robot,
-                    str(command.phase),
-                    one_line(command.state),
-                    f"{command.v:.3f}",
-                    f"{command.omega:.3f}",
-                )
-        return rows
-
-    with Live(
-        get_renderable=table,
-        console=tables.console(),
-        auto_refresh=True,
-        transient=True,
-        refresh_per_second=10,
-    ):
-        yield
 
 
 def result(summary: Mapping[str, Any], rate: float | None = None) -> None:

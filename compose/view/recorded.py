@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
 
+from compose.errors import UserError
 from compose.recording.recording_files import WORLD_JOURNAL, agent_journal, journals_in, robot_of
 from compose.recording.run import Run
 from compose.recording.run_setup import RunSetup, of_configs, of_scenario
@@ -55,6 +57,25 @@ def scenes(setup: RunSetup, known: RunData, first: int = 0, last: int | None = N
             shown.append(scene(setup, before, now, known.end))
         before = now
     return tuple(shown)
+
+
+def checked(run: Run) -> tuple[Sequence[str], RunSetup]:
+    """Return all robots of `run`, also those without a journal, and its static data.
+
+    Raises OSError or CorruptJournal if a journal cannot be read to its end, UserError if there is no
+    configuration.
+    """
+    run.readable(*run.journals)
+    for robot in run.robots:
+        if agent_journal(robot) in run.journals:
+            run.agent(robot)
+    setup = run.setup
+    if setup is None:
+        raise UserError(
+            f"{run.source}: there is no {WORLD_JOURNAL}, and no robot's journal has a configuration"
+        )
+    peers = [] if run.world is not None else [robot_setup.peer for robot_setup in setup.robots]
+    return list(dict.fromkeys([*run.robots, *sorted(peers)])), setup
 
 
 class Journals:

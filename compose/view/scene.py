@@ -5,6 +5,8 @@ from __future__ import annotations
 import msgspec
 
 from compose.recording.run_setup import RobotSetup, RunSetup
+from compose.view.captions import Caption, captions
+from compose.view.configurations import Configurations, configurations
 from compose.view.deliveries import Passage, passages
 from compose.view.events import Event, events
 from compose.view.run_data import TickData
@@ -92,6 +94,9 @@ class Scene(msgspec.Struct, frozen=True):
     """One entry per robot, in the order of `RunSetup.robots`."""
     passages: tuple[Passage, ...]
     events: tuple[Event, ...]
+    captions: tuple[Caption, ...] = ()
+    configurations: tuple[Configurations, ...] = ()
+    """The configurations of each pair whose robots hold the same ones."""
 
     def player(self, robot: str) -> Player:
         """Return the entry of `robot`. Raises KeyError if there is no such robot."""
@@ -105,7 +110,14 @@ def scene(setup: RunSetup, before: TickData | None, now: TickData, end: MissionE
     """Return the scene of the tick of `now`; `before` is the previous tick, if it is known."""
     players = tuple([_player(robot_setup, now) for robot_setup in setup.robots])
     deliveries = tuple(passages(setup, before, now))
-    return Scene(now.tick, players, deliveries, tuple(events(setup, before, now, deliveries, end)))
+    return Scene(
+        now.tick,
+        players,
+        deliveries,
+        tuple(events(setup, before, now, deliveries, end)),
+        tuple(captions(setup, before, now, deliveries, end)),
+        tuple(configurations(setup, before, now)),
+    )
 
 
 def _sent(report: PeerReport, size: int) -> Sent:

@@ -22,7 +22,16 @@ from agent.estimation.gaussian.initial_guesses import (
     anchors,
     placements,
 )
-from agent.estimation.gaussian.least_squares import STEPS, Fit, deviation, fit, fits
+from agent.estimation.gaussian.least_squares import (
+    COARSE_STILL,
+    STEPS,
+    WARM_DECREASE,
+    Fit,
+    deviation,
+    fit,
+    fits,
+    without_outliers,
+)
 from agent.estimation.gaussian.linear_model import Start
 from agent.estimation.gaussian.odometry_noise import Array, Errors, Places, Track
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Ranges, placed
@@ -63,6 +72,8 @@ class Hypothesis(NamedTuple):
 
     A fit that began on the measured path again could end in another mode. Empty if odometry is exact.
     """
+    covariance: tuple[tuple[float, ...], ...] = ()
+    """The covariance of the guess by its fit."""
 
     @property
     def start(self) -> Start:
@@ -74,7 +85,8 @@ class Hypothesis(NamedTuple):
     def of_fit(one: Fit, probability: float) -> Hypothesis:
         """Return the hypothesis of a fit."""
         errors = [tuple([tuple(part.tolist()) for part in error]) for error in one.errors]
-        return Hypothesis(tuple(one.guess.tolist()), probability, tuple(errors))
+        covariance = tuple([tuple(row) for row in one.covariance.tolist()])
+        return Hypothesis(tuple(one.guess.tolist()), probability, tuple(errors), covariance)
 
 
 class ScoredHypothesis(NamedTuple):
@@ -172,15 +184,15 @@ def of_anchor(
     known = tuple(before)
     lost = bool(len(silent)) and silent[-1] == len(path.x) - 1
     enough = SEED_RANGES if noise.outliers else FOLLOWED_RANGES
-    if known and len(ranges.rho) > enough and not lost:
+    warm = bool(known) and len(ranges.rho) > enough and not lost
+    if warm:
         starts = [one.start for one in known]
-        steps = WARM_STEPS
     else:
         places = [one.guess[:2] for one in known]
         points = anchors(path, ranges, sensing_range, noise, places)
         starts = [Start(np.array([*point, 0.0])) for point in points]
-        steps = STEPS
-    found = fits(starts, [path], ranges, noise, steps=steps)
+    steps, decrease = (WARM_STEPS, WARM_DECREASE) if warm else (STEPS, 1.0)
+    found = fits(starts, [path], ranges, noise, steps=steps, shortest=COARSE_STILL, decrease=decrease)
     return with_probability(
         [(one, _anchor_log_likelihood(one, 0, silent, ranges.tick, sensing_range, noise)) for one in found]
     )
@@ -252,7 +264,14 @@ def search(pair: PairRanges, known: tuple[Hypothesis, ...] = ()) -> tuple[Scored
     ]
     found.sort(key=lambda one: -one[0])
     starts = [start for weight, start in found[:STARTS] if weight > found[0][0] - UNLIKELY]
+    starts += without_outliers(
+        starts[:STARTS_WITHOUT_OUTLIERS], pair.paths, pair.ranges, pair.noise, pair.apart
+    )
     return _fitted([*[one.start for one in known], *starts], pair, STEPS)
+
+
+STARTS_WITHOUT_OUTLIERS = 4
+"""The number of the likeliest starts whose outliers are left out of a second fit."""
 
 
 def _alone(pair: PairRanges, robot: int) -> tuple[ScoredHypothesis, ...]:
@@ -311,7 +330,7 @@ def _detection_log_likelihood(one: Fit, pair: PairRanges) -> float:
     """Return the log-likelihood of all detections and ticks without one, given the fit."""
     weight = 0.0
     for robot in (0, 1):
-        ranged = pair.ranges.tick[pair.ranges.rows(robot)]
+        ranged = pair.ranges.only(robot).tick
         weight += _anchor_log_likelihood(
             one, robot, pair.silent[robot], ranged, pair.sensing_range, pair.noise
         )
@@ -359,6 +378,7 @@ def anchor_evidence(one: Fit, path: Track, ranges: Ranges, sensing_range: float)
     return one.log_likelihood + volume - prior + _log_widths((path,), ranges, sensing_range)
 
 
+@lru_cache(maxsize=2)
 def mutual_evidence(one: Fit, pair: PairRanges) -> float:
     """Return the logarithm of the Bayes factor for the mutual ranges under a fit of both robots.
 
@@ -370,6 +390,8 @@ def mutual_evidence(one: Fit, pair: PairRanges) -> float:
         begun = one.errors[robot : robot + 1]
         own = fit(guess, [pair.paths[robot]], pair.ranges.only(robot), pair.noise, begun=begun)
         weight -= own.log_likelihood + 0.5 * _log_volume(own)
+        for others in pair.ranges.to_others(robot):
+            weight += _log_widths((pair.paths[robot],), others, pair.sensing_range)
     return weight + _log_widths(pair.paths, pair.ranges.only(2), pair.sensing_range)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from agent.estimation.gaussian.hypotheses import (
     mutual_evidence,
     of_anchor,
 )
+from agent.estimation.gaussian.initial_guesses import STARTS
 from agent.estimation.gaussian.least_squares import Fit, deviation, poses
 from agent.estimation.gaussian.odometry_noise import Array, Track, track
 from agent.estimation.gaussian.own_sensors import DOUBTFUL_CLAIMS, Doubt, claim_doubt, doubt
@@ -25,7 +27,7 @@ from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Range
 from agent.estimation.knowledge import Belief, Knowledge
 from agent.peer.motion_log import MotionLog
 from protocol.mission import HEADING_ACCURACY, Mission
-from protocol.motion import Covariance, Pose, compose, inverse, wrap
+from protocol.motion import Covariance, Pose, Segment, compose, inverse, wrap
 
 
 class PlanningHypothesis(NamedTuple):
@@ -37,14 +39,29 @@ class PlanningHypothesis(NamedTuple):
     covariance: Array
     """The covariance of the anchor's position, (2, 2), or of both poses, (6, 6)."""
 
+    def __hash__(self) -> int:
+        """Return the hash of this object."""
+        return id(self)
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether `other` is this hypothesis itself: what follows from one is computed once."""
+        return self is other
+
 
 def path_of(log: MotionLog, through: int, period: float) -> Track:
     """Return the odometry of `log` up to tick `through`."""
-    runs = log.runs
+    return _path_of(log.runs, through, period)
+
+
+@lru_cache(maxsize=4)
+def _path_of(runs: tuple[Segment, ...], through: int, period: float) -> Track:
+    """Return the path of `path_of`, which robots ask for several times in a tick."""
     ticks = [run.ticks for run in runs]
-    v = np.repeat([run.v for run in runs], ticks)[:through]
-    omega = np.repeat([run.omega for run in runs], ticks)[:through]
-    return track(v, omega, period)
+    v, omega = (
+        np.repeat(one, ticks)[:through] for one in ([run.v for run in runs], [run.omega for run in runs])
+    )
+    # -0.0 and 0.0 are the same to the cache
+    return track(v + 0.0, omega + 0.0, period)
 
 
 def own_anchor(knowledge: Knowledge) -> tuple[ScoredHypothesis, ...]:
@@ -87,7 +104,26 @@ def with_own(knowledge: Knowledge, scored: Sequence[ScoredHypothesis]) -> Belief
     """Return the belief with the hypotheses `scored` about its anchor, and with the most probable branch."""
     own = tuple([one.hypothesis for one in scored])
     branches = tuple([branch_of(knowledge, one) for one in scored])
-    return replace(knowledge.belief, own=own, branches=branches, branch=branches[0])
+    fitted = len(knowledge.log.ranges)
+    return replace(
+        knowledge.belief, own=own, branches=branches, branch=branches[0], ranges_at_last_fit=fitted
+    )
+
+
+def is_fit_due(knowledge: Knowledge) -> bool:
+    """Return whether a robot that waits for its peer fits its anchor's hypotheses again."""
+    belief, ranges = knowledge.belief, len(knowledge.log.ranges)
+    if not belief.own or belief.own[0].probability < SURE_OF_BRANCH:
+        return True
+    return ranges - belief.ranges_at_last_fit >= min(FEW_MORE * belief.ranges_at_last_fit, MANY_MORE)
+
+
+FEW_MORE, MANY_MORE = 0.25, 5
+"""The ranges that are due for such a fit: a fraction of those fitted, and their number at the most.
+
+A further range hardly moves a pose that follows from 20, and each search fits all of them. With more, a robot
+whose odometry is noisy strays from its place; with less, the fits take most of the time of phase 2.
+"""
 
 
 def branch_of(knowledge: Knowledge, scored: ScoredHypothesis) -> Branch:
@@ -102,14 +138,19 @@ def branch_of(knowledge: Knowledge, scored: ScoredHypothesis) -> Branch:
     return Branch(wrap(-frame), start)
 
 
-def anchor_planning_hypotheses(scored: Sequence[ScoredHypothesis]) -> list[PlanningHypothesis]:
-    """Return the hypotheses about the pose relative to the anchor, in the form that planning needs."""
+def anchor_planning_hypotheses(knowledge: Knowledge) -> list[PlanningHypothesis]:
+    """Return the hypotheses about the pose relative to the anchor, in the form that planning needs.
+
+    Since their fits, the robot has moved by its odometry.
+    """
     hypotheses = []
-    for one in scored:
-        mx, my = one.hypothesis.guess[:2]
-        path = one.fit.paths[0]
-        now = np.array((path.x[-1] - mx, path.y[-1] - my, path.heading[-1]))
-        hypotheses.append(PlanningHypothesis(one.hypothesis.probability, now, one.fit.covariance))
+    for one, branch in zip(knowledge.belief.own, knowledge.belief.branches, strict=True):
+        pose = compose(branch.start, knowledge.odometry)
+        c, s = math.cos(branch.alpha), math.sin(branch.alpha)
+        turn = np.array(((c, -s), (s, c)))
+        covariance = turn @ np.array(one.covariance) @ turn.T
+        now = np.array((pose.x, pose.y, pose.heading))
+        hypotheses.append(PlanningHypothesis(one.probability, now, covariance))
     return hypotheses
 
 
@@ -213,9 +254,16 @@ def pair_of(knowledge: Knowledge) -> PairRanges:
 
 def pair_planning_hypotheses(
     scored: Sequence[ScoredHypothesis], pair: PairRanges
-) -> list[PlanningHypothesis]:
+) -> tuple[PlanningHypothesis, ...]:
     """Return the hypotheses about both poses relative to M1, in the form that planning needs."""
-    return [PlanningHypothesis(one.hypothesis.probability, *poses(one.fit, pair.apart)) for one in scored]
+    return tuple(
+        [_pair_planning_hypothesis(one.hypothesis.probability, one.fit, pair.apart) for one in scored]
+    )
+
+
+@lru_cache(maxsize=STARTS)
+def _pair_planning_hypothesis(probability: float, one: Fit, apart: tuple[float, float]) -> PlanningHypothesis:
+    return PlanningHypothesis(probability, *poses(one, apart))
 
 
 def blocking_reason_for(
@@ -354,6 +402,7 @@ def claim(hypothesis: PlanningHypothesis, robot: int, pair: PairRanges) -> tuple
     )
 
 
+@lru_cache(maxsize=STARTS)
 def to_second_order(hypothesis: PlanningHypothesis, m2: tuple[float, float]) -> tuple[Array, Array]:
     """Return the mean and the covariance of both poses, if ranges and bearings are Gaussian.
 

@@ -32,7 +32,7 @@ from agent.estimation.gaussian.odometry_noise import (
     variances,
     wander,
 )
-from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Ranges, mixture
+from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Ranges, inlier_probability, mixture
 from protocol.noise import Noise
 
 SEED_RANGES = 10
@@ -81,7 +81,7 @@ LEAST_OFFSET = 1e-9
 """The sigma (m, rad) of an offset below which it is not attributed to anything."""
 
 POLISHINGS = 4
-"""The least number of Gauss-Newton steps on an initial guess."""
+"""The least number of Gauss-Newton steps on an initial guess, after that on the rotations of a placement."""
 
 FINER, FINER_TURN = 0.1, 0.2
 """The factors by which the expected errors of a position and of a heading decrease at each of these steps."""
@@ -190,9 +190,10 @@ def _polished(
     for step in range(POLISHINGS):
         s = np.hypot(sigma, near * FINER**step)
         residual, ux, uy, _ = residuals_at(points)
-        weight = mixture(residual, s, noise)[1] / np.square(s)
-        xx, xy, yy = (np.sum(weight * a * b, 1) for a, b in ((ux, ux), (ux, uy), (uy, uy)))
-        gx, gy = -np.sum(weight * ux * residual, 1), -np.sum(weight * uy * residual, 1)
+        weight = inlier_probability(residual, s, noise) / np.square(s)
+        wx, wy = weight * ux, weight * uy
+        xx, xy, yy = np.add.reduce(wx * ux, 1), np.add.reduce(wx * uy, 1), np.add.reduce(wy * uy, 1)
+        gx, gy = -np.add.reduce(wx * residual, 1), -np.add.reduce(wy * residual, 1)
         damping = 1e-6 * (xx + yy) + 1e-12
         xx, yy = xx + damping, yy + damping
         determinant = xx * yy - xy * xy
@@ -229,7 +230,7 @@ class Residuals(NamedTuple):
     residuals: Array
     """The measured minus the predicted ranges (m); shape (n, N)."""
     jacobian: Array
-    """The derivatives of the predicted ranges; shape (n, N, 8)."""
+    """The derivatives of the predicted ranges by the first unknowns; shape (n, N, unknowns)."""
     gap: Array
     """The vector (m) between the robots at the middle range; shape (n, 2)."""
 
@@ -379,21 +380,21 @@ def _turned(
     residuals_at = partial(_residuals_at, robots=robots, middle=middle, rho=rho, apart=apart)
     coarse = 3.0 * math.tau / SCAN * float(lever[0])
     finest = float(np.min(sigma))
-    steps = max(POLISHINGS, 1 + math.ceil(math.log(finest / coarse) / math.log(FINER_TURN)))
+    steps = max(POLISHINGS + 1, 1 + math.ceil(math.log(finest / coarse) / math.log(FINER_TURN)))
     for step in range(steps):
         s = np.hypot(sigma, coarse * FINER_TURN**step)
-        residuals, jacobian, _ = residuals_at(z)
-        weight = mixture(residuals, s, pair.noise)[1] / np.square(s)
+        unknowns = 8 if len(z) <= CROWD else 2  # of the many candidates of the scan, only the rotations
+        residuals, jacobian, _ = residuals_at(z, unknowns)
+        weight = inlier_probability(residuals, s, pair.noise) / np.square(s)
         weighted = np.swapaxes(jacobian * weight[..., None], 1, 2)
         information, gradient = weighted @ jacobian, (weighted @ residuals[..., None])[..., 0]
-        gradient[:, 2:] -= z[:, 2:]
-        information.reshape(len(z), -1)[:, 2 * 8 + 2 :: 9] += 1.0
-        damping = DAMPING * FINER_TURN**step * (information[:, 0, 0] + information[:, 1, 1]) + 1e-12
-        information[:, 0, 0] += damping
-        information[:, 1, 1] += damping
+        gradient[:, 2:] -= z[:, 2:unknowns]
+        diagonal = np.einsum("...ii->...i", information)
+        diagonal[:, 2:] += 1.0
+        diagonal[:, :2] += DAMPING * FINER_TURN**step * diagonal[:, :2].sum(1, keepdims=True) + 1e-12
         change = np.linalg.solve(information, gradient[..., None])[..., 0]
         longest = np.maximum(np.abs(change[:, :2]).max(1, keepdims=True), 1e-12)
-        z = z + change * np.minimum(1.0, TURN / longest)
+        z[:, :unknowns] += change * np.minimum(1.0, TURN / longest)
         if len(z) > CROWD:
             likely, gap = _likelihood(
                 z, np.hypot(sigma, coarse * FINER_TURN ** (step + 1)), residuals_at, pair
@@ -418,20 +419,20 @@ def _likelihood(
     z: Array, sigma: Array, residuals_at: Callable[..., Residuals], pair: PairRanges
 ) -> tuple[Array, Array]:
     """Return the log-likelihood of `z`, (n,), and the vector between the robots, (n, 2), in m."""
-    residuals, _, gap = residuals_at(z, derivatives=False)
+    residuals, _, gap = residuals_at(z)
     return mixture(residuals, sigma, pair.noise)[0] - 0.5 * np.sum(np.square(z[:, 2:]), 1), gap
 
 
 def _residuals_at(
     z: Array,
+    unknowns: int = 0,
+    *,
     robots: tuple[Encounter, Encounter],
     middle: int,
     rho: Array,
     apart: tuple[float, float],
-    *,
-    derivatives: bool = True,
 ) -> Residuals:
-    """Return the residuals of `z` and their derivatives; these are empty unless they are asked for."""
+    """Return the residuals of `z`, and their derivatives by the first `unknowns`: 0, 2 (rotations) or 8."""
     moved = []
     for i, one in enumerate(robots):
         offset = z[:, 2 + 3 * i : 5 + 3 * i] @ one.root.T
@@ -444,17 +445,19 @@ def _residuals_at(
     dx, dy = fx - nx - apart[0], fy - ny - apart[1]
     distance = np.maximum(np.hypot(dx, dy), SIGMA_FLOOR)
     gap = np.stack((dx[:, middle], dy[:, middle]), 1)
-    if not derivatives:
-        return Residuals(rho - distance, np.empty(0), gap)
+    jacobian = np.empty((*distance.shape, unknowns))
+    if not unknowns:
+        return Residuals(rho - distance, jacobian, gap)
     ux, uy = dx / distance, dy / distance
-    jacobian = np.empty((*distance.shape, 8))
     jacobian[..., 0] = ux * ny - uy * nx
     jacobian[..., 1] = uy * fx - ux * fy
+    if unknowns == 2:
+        return Residuals(rho - distance, jacobian, gap)
     for i, (_, _, c, s, qx, qy) in enumerate(moved):
         sign = 1.0 if i else -1.0
         along, across = sign * (c * ux + s * uy), sign * (c * uy - s * ux)
-        by_offset = np.stack((along, across, across * qx - along * qy), -1)
-        jacobian[..., 2 + 3 * i : 5 + 3 * i] = by_offset @ robots[i].root
+        by_offset = np.stack((along, across, across * qx - along * qy), -1).reshape(-1, 3) @ robots[i].root
+        jacobian[..., 2 + 3 * i : 5 + 3 * i] = by_offset.reshape(*distance.shape, 3)
     return Residuals(rho - distance, jacobian, gap)
 
 

@@ -18,7 +18,7 @@ from typing import NamedTuple, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian.linear_model import ErrorSizes, Point, Problem, Start, product
+from agent.estimation.gaussian.linear_model import ErrorSizes, LinearModel, Point, Problem, Start, product
 from agent.estimation.gaussian.odometry_noise import (
     Array,
     Errors,
@@ -44,6 +44,15 @@ STILL = 3e-3
 Steps of Gauss-Newton decrease by a constant factor, about 0.1 with ranges of a tenth of their length. The
 linear model is not computed again after the last step.
 """
+
+COARSE_STILL = 0.05
+"""The value of STILL for fits on which only the robot's way depends.
+
+No claim does: each search fits all ranges again. With STILL, such a fit takes twice as long.
+"""
+
+WARM_DECREASE = 0.1
+"""The expected decrease of the first step of a fit that begins at the last one, which has one range less."""
 
 SETTLED = 1e-2
 """The change of a weight below which the weights have converged."""
@@ -102,17 +111,38 @@ class Fit(NamedTuple):
     """The expected length of the next Gauss-Newton step, in sigmas."""
     ticks: Places
     """The tick of each range; shape (N,)."""
-    directions: Array
-    """The derivatives of the ranges with respect to the positions; see `Predicted`."""
     problem: Problem
     system: NormalEquations
     """The last linear model. Directions and covariances are those of the point where it was computed."""
-    linear_guess: Array
-    """The guess of that point, before the last step."""
-    linear_paths: tuple[Track, ...]
-    """The paths of that point."""
+    linear: Point
+    """That point, before the last step, among those of other fits."""
+    row: int
+    """The row of this fit in that."""
     level: float
     """The estimate of the noise level tau^2: the factor by which all variances differ from the told ones."""
+
+    @property
+    def directions(self) -> Array:
+        """The derivatives of the ranges with respect to the positions; see `Predicted`."""
+        return np.asarray(self.linear.predicted.directions[self.row], np.float64)
+
+    @property
+    def linear_guess(self) -> Array:
+        """The guess of the linear model."""
+        return np.asarray(self.linear.guess[self.row], np.float64)
+
+    @property
+    def linear_paths(self) -> tuple[Track, ...]:
+        """The paths of the linear model."""
+        return self.problem.paths(self.linear, self.row)
+
+    def __hash__(self) -> int:
+        """Return the hash of this object."""
+        return id(self)
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether `other` is this fit itself: what follows from one fit is computed once."""
+        return self is other
 
     def drift(self, robot: int) -> OdometryNoiseModel:
         """Return the noise model along the path of a robot; odometry is not exact."""
@@ -122,7 +152,7 @@ class Fit(NamedTuple):
         """Return the fit of one robot with its `path` up to a later tick, without a further range."""
         problem = Problem.of([path], self.problem.ranges, self.problem.noise, self.problem.apart)
         point = problem.begin([Start(self.guess, self.errors)])
-        errors = problem.errors(*_of((point.sizes.constant, point.sizes.white), 0))
+        errors = problem.errors(point.sizes.constant[0], point.sizes.white[0])
         return self._replace(paths=problem.paths(point, 0), errors=errors, problem=problem)
 
 
@@ -143,6 +173,12 @@ class NormalEquations(NamedTuple):
     """The change of the guess in this step."""
     multipliers: Array
     """The innovation that remains after the change, multiplied by the inverse covariance; shape (..., N)."""
+
+    def one(self, i: int) -> NormalEquations:
+        """Return those of the fit with index `i`."""
+        jacobian, innovation, covariance, *others = self
+        of_one = RangeCovariance(*[part[i] for part in covariance])
+        return NormalEquations(jacobian[i], innovation[i], of_one, *[part[i] for part in others])
 
 
 def fit(
@@ -165,10 +201,15 @@ def fits(
     noise: Noise,
     apart: tuple[float, float] = (0.0, 0.0),
     steps: int = STEPS,
+    *,
+    shortest: float = STILL,
+    decrease: float = 1.0,
 ) -> list[Fit]:
     """Return the Gauss-Newton fits that begin at `starts`, in this order.
 
-    A step that does not descend is shortened, because Gauss-Newton with full steps may alternate between two
+    A step is the last if the next one is expected to be shorter than `shortest`. The second step is expected
+    to be shorter than the first by the factor `decrease`, which is less than 1 for starts that are fits. A
+    step that does not descend is shortened, because Gauss-Newton with full steps may alternate between two
     guesses. The weights of outliers decrease during the iteration. `apart` is M2 - M1 (m) in <W>.
     """
     if not starts:
@@ -176,24 +217,25 @@ def fits(
     problem = Problem.of(measured, ranges, noise, apart)
     point = problem.begin(starts)
     weights = np.ones(point.residuals.shape)
-    ended: dict[int, Fit] = {}
+    ended: dict[int, Fit] = {}  # by the index of the start
     left, before = list(range(len(starts))), np.zeros(len(starts))
     for step in range(steps + 1):
         linear = problem.linearised(point)
         if problem.robust and step == 0:
-            weights = _weights(point.residuals, np.sqrt(problem.loosened(linear)), noise)
+            weights = _first_weights(problem, starts, point, linear)
         variance = _variance(ranges.sigma, weights)
         covariance = range_covariance(variance, linear.columns, linear.dense)
         system = _solved(point.predicted.jacobian[..., problem.free], linear.innovation, covariance)
         updated = _inlier_probabilities(system, weights, ranges.sigma, noise) if problem.robust else weights
         quality = _quality(system, weights, noise)
+        if step == 0:
+            before = quality.last_step / decrease
         expected = np.square(quality.last_step) / np.maximum(np.maximum(quality.last_step, before), STILL)
-        still = (expected < STILL) & (np.abs(updated - weights).max(-1) < SETTLED)
-        still &= step > 0 or not problem.noisy  # the path is corrected at least once
+        still = (expected < shortest) & (np.maximum.reduce(np.abs(updated - weights), -1) < SETTLED)
+        still &= step > 0 or decrease < 1.0 or not problem.noisy  # the path is corrected at least once
         if step == steps:
-            ended |= {
-                one: _fit(problem, i, point, point, weights, system, quality) for i, one in enumerate(left)
-            }
+            for i in left:
+                ended[i] = _fit(problem, i, point, point, weights, system, quality)
             break
         change = system.change
         change = change * np.minimum(1.0, LEAP / np.maximum(np.abs(change).max(-1, keepdims=True), LEAP))
@@ -202,21 +244,54 @@ def fits(
         left_over = system.weighted[..., -1] - product(system.weighted[..., :-1], change)
         sizes = problem.sizes(point, linear, left_over)
         begun, point = point, _descended(problem, point, following, sizes, variance)
-        if still.any():
-            done, at_end = np.flatnonzero(still).tolist(), quality._replace(last_step=expected)
-            ended |= {left[i]: _fit(problem, i, point, begun, weights, system, at_end) for i in done}
-            left = [one for one, is_done in zip(left, still.tolist(), strict=True) if not is_done]
-            if not left:
-                break
-            point, updated, quality = _of((point, updated, quality), ~still)
+        # fits that have ended go on with the others: to leave them out takes longer
+        done, at_end = still.tolist(), quality._replace(last_step=expected)
+        for i in left:
+            if done[i]:
+                ended[i] = _fit(problem, i, point, begun, weights, system, at_end)
+        left = [i for i in left if not done[i]]
+        if not left:
+            break
         weights, before = updated, quality.last_step
     return [ended[i] for i in range(len(starts))]
+
+
+def _first_weights(problem: Problem, starts: Sequence[Start], point: Point, linear: LinearModel) -> Array:
+    """Return the weights with which fits begin: those of their starts, or by their residuals."""
+    weights = _weights(point.residuals, np.sqrt(problem.loosened(linear)), problem.noise)
+    for i, start in enumerate(starts):
+        if start.weights is not None:
+            weights[i] = start.weights
+    return weights
+
+
+def without_outliers(
+    starts: Sequence[Start],
+    measured: Sequence[Track],
+    ranges: Ranges,
+    noise: Noise,
+    apart: tuple[float, float] = (0.0, 0.0),
+) -> list[Start]:
+    """Return the `starts` under which some range is an outlier, with weights that leave these ranges out.
+
+    The weights follow from the residuals and the sigmas of the ranges alone, as if the start were exact.
+    Without them, a fit first allows for the uncertainty of the odometry too, which can explain an outlier
+    and draw the fit away from the start.
+    """
+    problem = Problem.of(measured, ranges, noise, apart)
+    if not (starts and problem.robust):
+        return []
+    sigma = np.sqrt(np.square(ranges.sigma) + ranges.loosened(noise.priors))
+    weights = _weights(problem.begin(starts).residuals, sigma, noise)
+    return [
+        start._replace(weights=own) for start, own in zip(starts, weights, strict=True) if own.min() < INLIER
+    ]
 
 
 T = TypeVar("T")
 
 
-def _of(values: T, some: NDArray[np.bool] | Places | int) -> T:
+def _of(values: T, some: NDArray[np.bool] | Places) -> T:
     """Return the part of `values`, a tuple of arrays or of such tuples, that belongs to some of the fits."""
     if isinstance(values, tuple):
         parts = [_of(value, some) for value in values]
@@ -243,29 +318,28 @@ def _fit(
     qualities: _Quality,
 ) -> Fit:
     """Return the fit with index `i`, which has ended at its point, with the linear model of another."""
-    point, weights, system, quality = _of((points, all_weights, systems, qualities), i)
-    chi2, inliers, level, last_step = float(quality[0]), int(quality[1]), float(quality[2]), quality[3]
+    residuals, weights, system = points.residuals[i], all_weights[i], systems.one(i)
+    chi2, inliers, level = float(qualities.chi2[i]), int(qualities.inliers[i]), float(qualities.level[i])
     if problem.noise.sigma_degrees:
-        correlation = residual_correlation(point.residuals, weights, problem.ranges)
+        correlation = residual_correlation(points.own[i], weights, problem.ranges)
         level = noise_level(chi2, inliers - len(system.change), problem.noise, correlation)
     return Fit(
-        point.guess,
+        points.guess[i],
         problem.paths(points, i),
-        problem.errors(point.sizes.constant, point.sizes.white),
-        _log_likelihood(system, chi2, point.residuals, weights, problem.ranges.sigma, level, problem.noise),
-        point.residuals,
+        problem.errors(points.sizes.constant[i], points.sizes.white[i]),
+        _log_likelihood(system, chi2, residuals, weights, problem.ranges.sigma, level, problem.noise),
+        residuals,
         weights,
         level * system.of_guess,
         system.information / level,
         chi2,
         inliers,
-        float(last_step),
+        float(qualities.last_step[i]),
         problem.ranges.tick,
-        linear_points.predicted.directions[i],
         problem,
         system,
-        linear_points.guess[i],
-        problem.paths(linear_points, i),
+        linear_points,
+        i,
         level,
     )
 
@@ -336,14 +410,15 @@ def residual_correlation(residuals: Array, weights: Array, ranges: Ranges) -> fl
     Both are of the same kind. The correlation is reduced by what chance may cause (see BY_CHANCE), and
     strays count as 0.
     """
-    scaled = np.where(weights > INLIER, residuals / ranges.sigma, 0.0)
-    products = scaled[1:] * scaled[:-1]
-    ends = np.cumsum(ranges.counts)[:2]
-    products[ends[(ends > 0) & (ends < len(scaled))] - 1] = 0.0
-    power = float(scaled @ scaled)
+    scaled = (weights > INLIER) * (residuals / ranges.sigma)
+    power, neighbours = float(scaled @ scaled), float(scaled[1:] @ scaled[:-1])
+    first, second, _ = ranges.counts
+    for end in {first, first + second}:
+        if 0 < end < len(scaled):
+            neighbours -= float(scaled[end] * scaled[end - 1])
     if not power > 0.0:
         return 0.0
-    found = float(np.sum(products)) / power - BY_CHANCE / math.sqrt(len(scaled))
+    found = neighbours / power - BY_CHANCE / math.sqrt(len(scaled))
     return min(max(found, 0.0), MOST_CORRELATED)
 
 

@@ -38,6 +38,8 @@ class Start(NamedTuple):
     """The guess, in the layout of `range_model.predicted`; shape (3,) or (6,)."""
     errors: tuple[Errors, ...] = ()
     """The odometry errors of each path; by default none."""
+    weights: Array | None = None
+    """The probability that each range is an inlier, shape (N,); by default it follows from the residuals."""
 
 
 class ErrorSizes(NamedTuple):

@@ -99,8 +99,9 @@ NO_TURN = 1e-20
 
 def _summed(values: Array) -> Array:
     """Return the sums of all values before each tick, along the last axis; (..., k) -> (..., k + 1)."""
-    sums = np.zeros((*values.shape[:-1], values.shape[-1] + 1))
-    np.cumsum(values, axis=-1, out=sums[..., 1:])
+    sums = np.empty((*values.shape[:-1], values.shape[-1] + 1))
+    sums[..., 0] = 0.0
+    np.add.accumulate(values, -1, out=sums[..., 1:])
     return sums
 
 
@@ -210,21 +211,22 @@ SLIGHT = 1e-4
 
 
 class Ticks(NamedTuple):
-    """The ticks of N rows, and their order."""
+    """The ticks of N rows along a path."""
 
     tick: Places
-    order: Places
-    """The rows from the last to the first; shape (N,)."""
-    after: Places
-    """The number of rows after each tick; shape (k,)."""
+    k: int
+    """The number of ticks of the path."""
 
     @staticmethod
     def of(tick: Places, k: int) -> Ticks:
         """Return the ticks of rows along a path of `k` ticks. Those beyond it are taken as its last one."""
-        tick = np.minimum(tick, k)
-        order = np.argsort(-tick, kind="stable")
-        after = np.searchsorted(-tick[order], -np.arange(k))
-        return Ticks(tick, order, after)
+        return Ticks(np.minimum(tick, k), k)
+
+    def sum_after(self, values: Array) -> Array:
+        """Return the sums over the rows after each tick; (..., N) -> (..., k)."""
+        order = np.argsort(-self.tick, kind="stable")
+        after = np.searchsorted(-self.tick[order], -np.arange(self.k))
+        return np.asarray(_summed(values[..., order])[..., after], np.float64)
 
 
 class Projection(NamedTuple):
@@ -248,7 +250,7 @@ class Projection(NamedTuple):
         """Return these rows followed by `more` of the same robot."""
         tick = np.concatenate((self.ticks.tick, more.ticks.tick))
         weights = np.concatenate((self.weights, more.weights), axis=-1)
-        return Projection(Ticks.of(tick, len(self.ticks.after)), weights)
+        return Projection(Ticks.of(tick, self.ticks.k), weights)
 
     @staticmethod
     def pose(path: Track, tick: int, turn: float = 0.0) -> Projection:
@@ -318,8 +320,7 @@ def attributed(model: OdometryNoiseModel, rows: Projection, residuals: Array) ->
     """
     if model.variances is None:
         return np.zeros(model.shift.shape)
-    explaining = rows.weights * residuals[..., None, :]
-    after = _summed(explaining[..., rows.ticks.order])[..., rows.ticks.after]
+    after = rows.ticks.sum_after(rows.weights * residuals[..., None, :])
     lever, u = after[..., 0, :], after[..., 1:, :]
     white = np.empty(model.shift.shape)
     np.add.reduce(u * model.shift, -2, out=white[..., 0, :])

@@ -2,8 +2,8 @@
 
 Constant errors, such as the bias of a radio or the scale of a wheel, are few: they have low rank. White
 errors of ranges are independent. Therefore the inverse is computed with the Woodbury identity, and only white
-odometry noise and slow errors of ranges make a matrix of shape (N, N). The identity is used with a QR
-decomposition: with a normal matrix it cancels where ranges are much more accurate than a prior.
+odometry noise and slow errors of ranges make a matrix of shape (N, N). Where ranges are much more accurate
+than a prior, the identity cancels with a normal matrix; it is then used with a QR decomposition.
 """
 
 from __future__ import annotations
@@ -27,10 +27,12 @@ class RangeCovariance(NamedTuple):
     """C (m); shape (..., N, m). It has no columns if `white` contains them."""
     inverse: Array
     """The inverse of `white`, in the same shape."""
-    weighted: Array
-    """D^-1/2 Q, with the QR decomposition of [D^-1/2 C; I] and the first N rows of Q; shape (..., N, m)."""
-    root: Array
-    """The factor R of it: R' R = I + C' D^-1 C; shape (..., m, m)."""
+    left: Array
+    """The first factor of what C subtracts from `inverse`; shape (..., N, m)."""
+    right: Array
+    """The second factor. The inverse covariance is `inverse` - `left` `right`'."""
+    normal: Array
+    """The matrix I + C' D^-1 C; shape (..., m, m)."""
 
     @property
     def _dense(self) -> bool:
@@ -42,7 +44,7 @@ class RangeCovariance(NamedTuple):
             return np.asarray(self.inverse @ columns, np.float64)
         solved: Array = self.inverse[..., None] * columns
         if self.columns.shape[-1]:
-            solved -= self.weighted @ (np.swapaxes(self.weighted, -1, -2) @ columns)
+            solved -= self.left @ (np.swapaxes(self.right, -1, -2) @ columns)
         return solved
 
     @property
@@ -50,7 +52,7 @@ class RangeCovariance(NamedTuple):
         """The diagonal of the inverse covariance; shape (..., N)."""
         if self._dense:
             return np.diagonal(self.inverse, axis1=-2, axis2=-1)
-        explained: Array = np.add.reduce(np.square(self.weighted), -1)
+        explained: Array = np.add.reduce(self.left * self.right, -1)
         return self.inverse - explained
 
     @property
@@ -59,9 +61,7 @@ class RangeCovariance(NamedTuple):
         if self._dense:
             return np.asarray(np.linalg.slogdet(self.white)[1], np.float64)
         volume: Array = np.sum(np.log(self.white), -1)
-        diagonal = np.diagonal(self.root, axis1=-2, axis2=-1)
-        volume += 2.0 * np.sum(np.log(np.abs(diagonal)), -1)
-        return volume
+        return volume + np.asarray(np.linalg.slogdet(self.normal)[1], np.float64)
 
 
 def range_covariance(variance: Array, columns: Array, dense: Array | None) -> RangeCovariance:
@@ -75,14 +75,33 @@ def range_covariance(variance: Array, columns: Array, dense: Array | None) -> Ra
         diagonal = np.einsum("...ii->...i", whole)
         diagonal += variance + GRAIN * diagonal.max(-1, keepdims=True)
         empty = columns[..., :0]
-        return RangeCovariance(whole, empty, inverse_of(whole), empty, empty[..., :0, :])
+        return RangeCovariance(whole, empty, inverse_of(whole), empty, empty, empty[..., :0, :])
     inverse = 1.0 / variance
+    right = inverse[..., None] * columns
+    normal = np.swapaxes(columns, -1, -2) @ right
+    diagonal = np.einsum("...ii->...i", normal)
+    diagonal += 1.0
+    if diagonal.size and diagonal.max() > MOST_INFORMATION:
+        left = right = _decomposed(inverse, columns)
+    else:
+        left = right @ inverse_of(normal)
+    return RangeCovariance(variance, columns, inverse, left, right, normal)
+
+
+def _decomposed(inverse: Array, columns: Array) -> Array:
+    """Return D^-1/2 Q, with the QR decomposition of [D^-1/2 C; I] and the first N rows of Q."""
     white = np.sqrt(inverse)[..., None]
     n, m = columns.shape[-2:]
     stacked = np.empty((*columns.shape[:-2], n + m, m))
     stacked[..., :n, :], stacked[..., n:, :] = white * columns, np.eye(m)
-    q, root = np.linalg.qr(stacked)
-    return RangeCovariance(variance, columns, inverse, white * q[..., :n, :], root)
+    return np.asarray(white * np.linalg.qr(stacked)[0][..., :n, :], np.float64)
+
+
+MOST_INFORMATION = 1e6
+"""The information on a constant error, in units of its prior, above which the identity is used with QR.
+
+The normal matrix loses as many digits as this has, and QR takes longer.
+"""
 
 
 GRAIN = 1e-12

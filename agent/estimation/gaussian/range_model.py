@@ -54,10 +54,10 @@ class Ranges(NamedTuple):
     counts: tuple[int, int, int]
     """The number of ranges of each of the three kinds."""
     place: Array | None = None
-    """The position (m) of each range's anchor in <W>, relative to that of the guess, for one robot and
-    several anchors; shape (N, 2). None: each robot has one anchor."""
+    """The position (m) of each range's anchor in <W>, relative to the anchor of the robot's guess; 0 for
+    mutual ranges; shape (N, 2). None if each robot has one anchor."""
     radio: Places | None = None
-    """The number of each range's anchor in this case; shape (N,)."""
+    """The index of each range's pair of radios; shape (N,). None if each robot has one anchor."""
 
     @staticmethod
     def of_lists(
@@ -96,9 +96,27 @@ class Ranges(NamedTuple):
         return slice(begin, begin + self.counts[kind])
 
     def only(self, kind: int) -> Ranges:
-        """Return the ranges of one robot to its anchor, as the ranges of a single robot."""
+        """Return the ranges of one kind, as the ranges of a single robot.
+
+        For `kind` 0 or 1, these are the ranges of a or b to the anchor of its guess; for 2, the mutual
+        ranges.
+        """
         rows = self.rows(kind)
-        return Ranges(self.rho[rows], self.tick[rows], self.sigma[rows], (self.counts[kind], 0, 0))
+        if self.place is None or kind == 2:
+            return Ranges(self.rho[rows], self.tick[rows], self.sigma[rows], (self.counts[kind], 0, 0))
+        return self._alone(rows, ~np.any(self.place[rows], 1))
+
+    def to_others(self, robot: int) -> list[Ranges]:
+        """Return the ranges of `robot` to each of its other anchors, as the ranges of a single robot."""
+        if self.place is None or self.radio is None:
+            return []
+        rows = self.rows(robot)
+        radios = np.where(np.any(self.place[rows], 1), self.radio[rows], -1)
+        return [self._alone(rows, radios == one) for one in sorted(set(radios.tolist()) - {-1})]
+
+    def _alone(self, rows: slice, some: NDArray[np.bool]) -> Ranges:
+        count = int(np.count_nonzero(some))
+        return Ranges(self.rho[rows][some], self.tick[rows][some], self.sigma[rows][some], (count, 0, 0))
 
     def common_errors(self, priors: Priors) -> Array:
         """Return the effect (m) of one sigma of each constant error on the ranges; shape (N, m).
@@ -241,8 +259,8 @@ def predicted(guess: Array, places: Array, ranges: Ranges, apart: tuple[float, f
     robots, n = places.shape[-3], len(ranges.rho)
     anchors = guess.reshape(*guess.shape[:-1], robots, 3)
     away = places - anchors[..., :2, None]
-    if ranges.place is not None:
-        return _predicted_to_places(anchors, away, ranges.place)
+    if ranges.place is not None and robots == 1:
+        return _to_places(anchors[..., 0, 2:], away[..., 0, :, :], ranges.place)
     distances = np.maximum(np.hypot(away[..., 0, :], away[..., 1, :]), TINY)
     directions = away / distances[..., None, :]
     distance, jacobian = distances[..., 0, :], np.zeros((*guess.shape[:-1], n, 3 * robots))
@@ -260,6 +278,11 @@ def predicted(guess: Array, places: Array, ranges: Ranges, apart: tuple[float, f
         jacobian[..., mutual, 2::3] = np.swapaxes(ny * wx - nx * wy, -1, -2)
         directions[..., 0, mutual] = c * nx + s * ny
         directions[..., 1, mutual] = c * ny - s * nx
+        for robot, rows in enumerate((of_a, of_b) if ranges.place is not None else ()):
+            assert ranges.place is not None
+            own = _to_places(anchors[..., robot, 2:], away[..., robot, :, rows], ranges.place[rows])
+            distance[..., rows], directions[..., robot, :, rows] = own.distance, own.directions[..., 0, :, :]
+            jacobian[..., rows, 3 * robot + 2] = own.jacobian[..., 2]
     for robot in range(robots):
         np.negative(
             np.swapaxes(directions[..., robot, :, :], -1, -2), out=jacobian[..., 3 * robot : 3 * robot + 2]
@@ -267,10 +290,15 @@ def predicted(guess: Array, places: Array, ranges: Ranges, apart: tuple[float, f
     return Predicted(distance, jacobian, directions)
 
 
-def _predicted_to_places(anchors: Array, away: Array, place: Array) -> Predicted:
-    """Return the ranges of one robot to several anchors; `place` is that of each range, shape (N, 2)."""
-    c, s = np.cos(anchors[..., 0, 2:]), np.sin(anchors[..., 0, 2:])
-    x, y = away[..., 0, 0, :], away[..., 0, 1, :]
+def _to_places(rotation: Array, away: Array, place: Array) -> Predicted:
+    """Return the predicted ranges of one robot to several anchors.
+
+    `rotation` is the rotation (rad) of the robot's frame, shape (..., 1). `away` has its positions (m) in
+    its frame, relative to the anchor of its guess, shape (..., 2, N). `place` is `Ranges.place` of these
+    ranges, shape (N, 2).
+    """
+    c, s = np.cos(rotation), np.sin(rotation)
+    x, y = away[..., 0, :], away[..., 1, :]
     wx, wy = c * x - s * y, s * x + c * y
     dx, dy = wx - place[:, 0], wy - place[:, 1]
     distance = np.maximum(np.hypot(dx, dy), TINY)

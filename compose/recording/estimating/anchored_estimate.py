@@ -16,9 +16,10 @@ from compose.recording.estimating.estimate_epoch import ClaimRule, EstimateEpoch
 from compose.recording.estimating.pair_measurements import (
     EPOCH_S,
     HALF,
-    HORIZON,
     OneRobot,
+    horizon,
     levelled,
+    listed,
     path_of_steps,
     ticks_per_epoch,
 )
@@ -33,13 +34,11 @@ class AnchoredMeasurements(NamedTuple):
     """All measurements of one robot."""
 
     robot: OneRobot
-    anchors: tuple[FixedAnchor, ...]
-    """The anchors to which it has ranges, that with the most ranges first."""
     t0: float
     """The time in s of tick 0."""
     ticks_per_epoch: int
     ranges: Ranges
-    """The ranges; `radio` is the index in `anchors`."""
+    """The ranges; `radio` is the index in the robot's anchors."""
     t: Numbers
     """The time in s of each range; shape (N,)."""
     noise: Noise
@@ -66,10 +65,10 @@ class AnchoredMeasurements(NamedTuple):
         """The names of each pair of radios."""
         return tuple([(self.robot.id, anchor.id) for anchor in self.anchors])
 
-    def anchors_of(self, robot: OneRobot) -> list[str]:
-        """Return the names of the anchors whose ranges to `robot` are used."""
-        del robot
-        return [anchor.id for anchor in self.anchors]
+    @property
+    def anchors(self) -> tuple[FixedAnchor, ...]:
+        """The anchors of the robot."""
+        return self.robot.anchors
 
     def until(self, epoch: int) -> AnchoredRobot:
         """Return what was measured up to the end of `epoch`; the first is 1."""
@@ -86,7 +85,7 @@ class AnchoredMeasurements(NamedTuple):
             place[known],
             radio[known],
         )
-        reach = HORIZON * float(np.max(some.rho)) if count else 1.0
+        reach = horizon(some)
         path = self.robot.path.until(epoch * self.ticks_per_epoch)
         return AnchoredRobot(
             path, some.within(reach, self.noise.priors).thinned(self.noise), reach, self.noise
@@ -113,7 +112,7 @@ def anchored_measurements(
     order = sorted([k for k, count in enumerate(counts) if count], key=lambda k: -counts[k])
     anchors = tuple([part.anchors[k] for k in order])
     if len({(one.x, one.y) for one in anchors}) < 2:
-        names = ", ".join([one.id for one in anchors]) or "no anchor"
+        names = listed([one.id for one in anchors]) or "no anchor"
         raise UserError(
             f"{recording.source}: one robot needs ranges to two anchors at different places: "
             f"{robot} has ranges to {names}"
@@ -129,8 +128,7 @@ def anchored_measurements(
     unused = {"within a second after another": steps.thinned, "without odometry": steps.outside}
     path = path_of_steps(steps.increments[0], steps.covariance[0], EPOCH_S / ticks)
     return AnchoredMeasurements(
-        OneRobot(robot, anchors[0], path, prepared, recorded.antenna),
-        anchors,
+        OneRobot(robot, anchors, path, prepared, recorded.antenna),
         float(steps.t[0]),
         ticks,
         Ranges(

@@ -213,7 +213,7 @@ def summary_of(
         own = [row for row in rows if row.robot == side.id]
         claimed = next((row for row in own if row.claim), None)
         robots[side.id] = RobotEstimate(
-            measured.anchors_of(side),
+            [one.id for one in side.anchors],
             _pose(claimed) if claimed is not None else None,
             _pose(own[-1]) if own else None,
             len(side.sound.gross),

@@ -44,13 +44,16 @@ def measurements(
     robots: Sequence[str] | None,
     noise: str | None,
     window: tuple[float, float] | None,
+    *,
+    all_anchors: bool = False,
 ) -> EstimationProblem:
     """Return the measurements of `robots` within `window`, in s from the first odometry on.
 
-    `noise` is the name of a profile or the path of a file; None: what the recording states. Raises UserError.
+    `noise` is the name of a profile or the path of a file; None: what the recording states. Two robots use
+    one anchor each unless `all_anchors` is set. Raises UserError.
     """
     told = told_noise(noise) if noise is not None else None
-    return measurements_with(recording, robots, told, noise or "", window)
+    return measurements_with(recording, robots, told, noise or "", window, all_anchors=all_anchors)
 
 
 def measurements_with(
@@ -62,10 +65,11 @@ def measurements_with(
     *,
     ticks: int | None = None,
     anchors: tuple[str, str] | None = None,
+    all_anchors: bool = False,
 ) -> EstimationProblem:
-    """Return the same for the noise `told` and its `name`.
+    """Return the measurements as `measurements` does, with the noise `told`, whose name is `name`.
 
-    `ticks` and `anchors` are those of `pair_measurements`.
+    `ticks`, `anchors` and `all_anchors` are those of `pair_measurements`.
     """
     chosen = _chosen(recording, robots)
     begin, end = recording.span
@@ -82,7 +86,9 @@ def measurements_with(
     if len(chosen) == 1:
         measured = anchored_measurements(part, chosen[0], assumed, ticks=ticks)
     else:
-        measured = pair_measurements(part, chosen, assumed, ticks=ticks, anchors=anchors)
+        measured = pair_measurements(
+            part, chosen, assumed, ticks=ticks, anchors=anchors, all_anchors=all_anchors
+        )
     return EstimationProblem(measured, part.robots, recording.source, assumed.name)
 
 

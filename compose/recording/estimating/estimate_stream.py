@@ -43,13 +43,19 @@ class StreamEstimate:
         robots: Sequence[str] | None,
         noise: tuple[ToldNoise, str] | None,
         rule: ClaimRule,
+        *,
+        all_anchors: bool = False,
     ) -> None:
-        """Begin the estimate of `robots` (None: the only two of the stream), with the noise and its name."""
+        """Begin the estimate of `robots` (None: the only two of the stream), with the noise and its name.
+
+        The robots use one anchor each unless `all_anchors` is set.
+        """
         self._builder = RecordingBuilder(source)
         self._robots = robots
         self._told = noise[0] if noise is not None else None
         self._name = noise[1] if noise is not None else ""
         self._rule = rule
+        self._all_anchors = all_anchors
         self._estimator = RecordingEstimator(rule)
         self._begins: dict[str, float] = {}
         self._ends: dict[str, float] = {}
@@ -86,6 +92,7 @@ class StreamEstimate:
                 self._name,
                 ticks=STREAM_TICKS,
                 anchors=self._anchors,
+                all_anchors=self._all_anchors,
             )
         except NoAnchors:
             return  # there will be ranges

@@ -53,14 +53,14 @@ class PairEstimator:
         found, beliefs = _inferred(known, pair, follow_only=self._claimed)
         if found is None or not found.scored:
             reason = "no hypothesis explains the ranges" if found is not None else "too few mutual ranges"
-            return EstimateEpoch(t, pair.ranges.counts, (), (False, False), reason, None, pair)
+            return EstimateEpoch(t, measured.counts(pair.ranges), (), (False, False), reason, None, pair)
         self._belief = beliefs[0]
         claims = [may_claim(one, pair) for one in beliefs]
         self._claimed = self._claimed or all(claims)
         reasons = [one.blocking_reason for one in beliefs if one.blocking_reason is not None]
         return EstimateEpoch(
             t,
-            pair.ranges.counts,
+            measured.counts(pair.ranges),
             tuple([of_centres(*one, measured.sides) for one in _second_order(found, pair)]),
             (claims[0], claims[1]),
             reasons[0] if reasons else "" if all(claims) else "few ranges, and a small p-value",

@@ -51,6 +51,15 @@ the estimator would take it for information that no range is longer.
 """
 
 
+SHORTEST_RANGE_M = 1e-3
+"""The least length in m of the longest range. A recording whose ranges are all 0 says nothing."""
+
+
+def horizon(ranges: Ranges) -> float:
+    """Return the assumed sensing range (m), for which `ranges` are those so far."""
+    return HORIZON * max(float(np.max(ranges.rho, initial=0.0)), SHORTEST_RANGE_M)
+
+
 class NoAnchors(UserError):
     """The robots have no ranges to two anchors at different places."""
 
@@ -59,12 +68,17 @@ class OneRobot(NamedTuple):
     """One robot: its path in ticks, and how it was prepared."""
 
     id: str
-    anchor: FixedAnchor
-    """The anchor whose ranges are used; the first of several."""
+    anchors: tuple[FixedAnchor, ...]
+    """The anchors to which it has ranges. Poses are relative to the first, which has the most."""
     path: Track
     """The path of the antenna, in the frame of its first pose."""
     sound: SoundOdometry
     antenna: tuple[float, float, float]
+
+    @property
+    def anchor(self) -> FixedAnchor:
+        """The first of its anchors."""
+        return self.anchors[0]
 
 
 class PairMeasurements(NamedTuple):
@@ -99,18 +113,20 @@ class PairMeasurements(NamedTuple):
 
     @property
     def pairs(self) -> tuple[tuple[str, str], ...]:
-        """The names of each pair of radios, in the order of the ranges."""
-        a, b = self.a, self.b
-        return (a.id, a.anchor.id), (b.id, b.anchor.id), (a.id, b.id)
+        """The names of each pair of radios, in the order of `Ranges.pairs`."""
+        to_anchors = [(side.id, anchor.id) for side in self.sides for anchor in side.anchors]
+        return (*to_anchors, (self.a.id, self.b.id))
 
     @property
     def anchors(self) -> tuple[FixedAnchor, ...]:
-        """The anchors whose ranges are used."""
-        return self.a.anchor, self.b.anchor
+        """The anchors of both robots."""
+        return tuple({one.id: one for side in self.sides for one in side.anchors}.values())
 
-    def anchors_of(self, robot: OneRobot) -> list[str]:
-        """Return the names of the anchors whose ranges to `robot` are used."""
-        return [robot.anchor.id]
+    def counts(self, ranges: Ranges) -> tuple[int, ...]:
+        """Return the number of `ranges` of each of the `pairs`."""
+        if ranges.radio is None:
+            return ranges.counts
+        return tuple(np.bincount(ranges.radio, minlength=len(self.pairs)).tolist())
 
     @property
     def apart(self) -> tuple[float, float]:
@@ -123,14 +139,16 @@ class PairMeasurements(NamedTuple):
         known = self.t <= self.t0 + epoch * EPOCH_S
         counts = tuple([int(np.count_nonzero(known[self.ranges.rows(kind)])) for kind in range(3)])
         first, second, mutual = counts
+        place, radio = self.ranges.place, self.ranges.radio
         some = Ranges(
             self.ranges.rho[known],
             self.ranges.tick[known],
             self.ranges.sigma[known],
             (first, second, mutual),
+            place[known] if place is not None else None,
+            radio[known] if radio is not None else None,
         )
-        longest = float(np.max(some.rho)) if len(some.rho) else 1.0
-        reach = HORIZON * longest
+        reach = horizon(some)
         nothing = np.empty(0, np.intp)
         return PairRanges(
             (self.a.path.until(ticks), self.b.path.until(ticks)),
@@ -149,11 +167,13 @@ def pair_measurements(
     *,
     ticks: int | None = None,
     anchors: tuple[str, str] | None = None,
+    all_anchors: bool = False,
 ) -> PairMeasurements:
     """Return the measurements of two `robots`, with the noise that is `assumed`.
 
     `ticks` is the number of them in an epoch; None: by the speed of the robots. Each robot ranges to one of
-    two `anchors`; None: to those with the most ranges. Raises UserError if there are none.
+    two `anchors`; None: those with the most ranges. Ranges to other anchors are used only if `all_anchors` is
+    set. Raises UserError if there are no two such anchors.
     """
     noise = assumed.noise
     prepared = [sound(recording.robot(name).odometry, assumed.odometry) for name in robots]
@@ -177,12 +197,16 @@ def pair_measurements(
         first, second = anchors
         of_anchor = _anchor(part, first), _anchor(part, second)
     tick = steps.step + (steps.fraction >= HALF)
-    lists: list[Places] = []
-    for robot, anchor in enumerate(of_anchor):
-        to_anchor = (ranges.first == robot) & (ranges.second == radios.index(anchor.id))
-        lists.append(np.flatnonzero(to_anchor))
-    lists.append(np.flatnonzero((ranges.first < len(robots)) & (ranges.second < len(robots))))
+    mutual = (ranges.first < len(robots)) & (ranges.second < len(robots))
+    lists = [
+        np.flatnonzero(
+            ~mutual & (ranges.first == robot) & (all_anchors | (ranges.second == radios.index(anchor.id)))
+        )
+        for robot, anchor in enumerate(of_anchor)
+    ]
+    lists.append(np.flatnonzero(mutual))
     used = np.concatenate(lists)
+    of_robot = [_anchors_of(part, ranges.second[lists[i]], one) for i, one in enumerate(of_anchor)]
     heights = np.array([*[one.antenna[2] for one in part.robots], *[one.height for one in part.anchors]])
     rho, ratio = levelled(ranges.range[used], heights[ranges.first[used]] - heights[ranges.second[used]])
     counts = (len(lists[0]), len(lists[1]), len(lists[2]))
@@ -191,9 +215,10 @@ def pair_measurements(
         told = np.where(np.isfinite(ranges.sigma[used]), ranges.sigma[used], told)
     sigma = np.maximum(told, SIGMA_FLOOR) * ratio
     sides = []
-    for i, (name, anchor) in enumerate(zip(robots, of_anchor, strict=True)):
+    for i, (name, own) in enumerate(zip(robots, of_robot, strict=True)):
         path = path_of_steps(steps.increments[i], steps.covariance[i], EPOCH_S / ticks)
-        sides.append(OneRobot(name, anchor, path, prepared[i], part.robots[i].antenna))
+        sides.append(OneRobot(name, own, path, prepared[i], part.robots[i].antenna))
+    place, radio = _several(of_robot, [[radios[k] for k in ranges.second[rows]] for rows in lists])
     unused = {
         "to other anchors": len(ranges.t) - len(used),
         "within a second after another": steps.thinned,
@@ -204,7 +229,7 @@ def pair_measurements(
         sides[1],
         float(steps.t[0]),
         ticks,
-        Ranges(locked(rho), locked(tick[used]), locked(sigma), counts),
+        Ranges(locked(rho), locked(tick[used]), locked(sigma), counts, place, radio),
         locked(ranges.t[used].copy()),
         noise,
         {why: count for why, count in unused.items() if count},
@@ -212,6 +237,32 @@ def pair_measurements(
 
 
 HALF = 0.5
+
+
+def _anchors_of(recording: RangeRecording, ranged: Places, first: FixedAnchor) -> tuple[FixedAnchor, ...]:
+    """Return `first`, and then all other anchors among the second radios of ranges, `ranged`."""
+    names = {recording.radios[k] for k in set(ranged.tolist())}
+    return (first, *[one for one in recording.anchors if one.id in names and one.id != first.id])
+
+
+def _several(
+    anchors: Sequence[tuple[FixedAnchor, ...]], ranged: Sequence[Sequence[str]]
+) -> tuple[Numbers | None, Places | None]:
+    """Return `place` and `radio` of `Ranges`; None each if both robots have one anchor.
+
+    `anchors` are those of each robot, and `ranged` the names of the second radio of each range: those to the
+    anchors of a robot, in the order of the robots, and then the mutual ones.
+    """
+    if all(len(own) == 1 for own in anchors):
+        return None, None
+    place, radio, before = [], [], 0
+    for own, names in zip(anchors, ranged, strict=False):
+        index = {one.id: k for k, one in enumerate(own)}
+        place += [(own[index[name]].x - own[0].x, own[index[name]].y - own[0].y) for name in names]
+        radio += [before + index[name] for name in names]
+        before += len(own)
+    mutual = len(ranged[-1])
+    return np.array([*place, *[(0.0, 0.0)] * mutual]), np.array([*radio, *[before] * mutual], np.intp)
 
 
 def _anchor(recording: RangeRecording, name: str) -> FixedAnchor:
@@ -245,13 +296,13 @@ def _own_anchors(
     """Return the anchor of each robot: of all choices of two different places, that with the most ranges."""
     anchors, base = recording.anchors, len(recording.robots)
     counts = [
-        [int(np.count_nonzero((first == robot) & (second == base + k))) for k in range(len(anchors))]
+        np.bincount(second[(first == robot) & (second >= base)] - base, minlength=len(anchors)).tolist()
         for robot in range(2)
     ]
     best: tuple[int, int, int] | None = None
-    for i, one in enumerate(anchors):
-        for j, other in enumerate(anchors):
-            if (one.x, one.y) == (other.x, other.y) or not min(counts[0][i], counts[1][j]):
+    for i in _most_ranged(anchors, counts[0]):
+        for j in _most_ranged(anchors, counts[1]):
+            if (anchors[i].x, anchors[i].y) == (anchors[j].x, anchors[j].y):
                 continue
             many = counts[0][i] + counts[1][j]
             if best is None or many > best[0]:
@@ -260,12 +311,33 @@ def _own_anchors(
         heard = []
         for name, row in zip(robots, counts, strict=True):
             known = [anchors[k].id for k, count in enumerate(row) if count]
-            heard.append(f"{name} has ranges to {', '.join(known) or 'no anchor'}")
+            heard.append(f"{name} has ranges to {listed(known) or 'no anchor'}")
         raise NoAnchors(
             f"{recording.source}: two robots need ranges to two anchors at different places: "
             + ", ".join(heard)
         )
     return anchors[best[1]], anchors[best[2]]
+
+
+def _most_ranged(anchors: Sequence[FixedAnchor], counts: Sequence[int]) -> list[int]:
+    """Return the indices of two anchors with ranges, at different places, which have the largest `counts`.
+
+    The anchors of two robots at different places, with the most ranges in all, are among these two of each.
+    """
+    found: dict[tuple[float, float], int] = {}
+    for k in sorted([k for k, count in enumerate(counts) if count], key=lambda k: -counts[k]):
+        found.setdefault((anchors[k].x, anchors[k].y), k)
+    return sorted(list(found.values())[:2])
+
+
+MOST_LISTED = 8
+"""The largest number of names in a list for a user."""
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return `names` in one line: the first MOST_LISTED, and the number of the others."""
+    more = len(names) - MOST_LISTED
+    return ", ".join(names[:MOST_LISTED]) + (f" and {more} more" if more > 0 else "")
 
 
 def levelled(measured: Numbers, higher: Numbers) -> tuple[Numbers, Numbers]:

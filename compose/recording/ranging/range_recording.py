@@ -147,7 +147,8 @@ class RangeRecording(NamedTuple):
         """
         found = tuple([_between(self.robot(name), first_s, last_s) for name in robots])
         radios = [*[one.id for one in found], *[one.id for one in self.anchors]]
-        place = np.array([radios.index(one) if one in radios else -1 for one in self.radios], np.intp)
+        places = {name: number for number, name in reversed([*enumerate(radios)])}
+        place = np.array([places.get(one, -1) for one in self.radios], np.intp)
         ranges = self.ranges
         first, second = place[ranges.first], place[ranges.second]
         kept = (first >= 0) & (second >= 0) & (first_s <= ranges.t) & (ranges.t <= last_s)

@@ -1,4 +1,4 @@
-"""The files of an export: `run.mcap`, `frames.csv`, `ticks.csv` and `ticks.parquet`."""
+"""The files of an export: `run.mcap` with a layout for it, `frames.csv`, `ticks.csv` and `ticks.parquet`."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import msgspec
 
 from compose.errors import UserError
 from compose.recording.frames import in_time
-from compose.recording.recording_files import WORLD_JOURNAL, agent_journal, cannot_write, make_folder
+from compose.recording.recording_files import agent_journal, cannot_write, make_folder
 from compose.recording.run import Run
-from compose.recording.run_setup import RunSetup
 from compose.recording.ticks_csv import rows, table
 from compose.view.export.parquet import frames_csv, write_ticks
+from compose.view.foxglove.layout import layout
 from compose.view.foxglove.mcap import TooLong, write_mcap
-from compose.view.recorded import scenes_of
+from compose.view.recorded import checked, scenes_of
 from protocol import files
 
 
@@ -30,7 +30,7 @@ class Exported(msgspec.Struct, frozen=True):
     """The names of missing robot journals."""
 
 
-FILES = ("run.mcap", "frames.csv", "ticks.csv", "ticks.parquet")
+FILES = ("run.mcap", "run.foxglove.json", "frames.csv", "ticks.csv", "ticks.parquet")
 
 
 def export(
@@ -46,7 +46,7 @@ def export(
     Raises OSError or CorruptJournal if a journal cannot be read to its end, UserError if there is no
     configuration, the run is too long for a format or `out` cannot be written.
     """
-    robots, setup = _checked(run)
+    robots, setup = checked(run)
     check()
     frames = in_time(run)
     ticks = list(rows(run))
@@ -55,6 +55,7 @@ def export(
     paths = tuple([out / name for name in FILES])
     writers: Sequence[Callable[[Path], object]] = (
         lambda path: write_mcap(setup, frames, scenes_of(run), path, check),
+        lambda path: path.write_bytes(layout(setup)),
         lambda path: path.write_text(frames_csv(frames, check), encoding="utf-8"),
         lambda path: path.write_text(table(ticks), encoding="utf-8"),
         lambda path: write_ticks(run, ticks, setup.mission.period, path),
@@ -75,18 +76,3 @@ def export(
         torn={name: journal.torn for name, journal in run.journals.items() if journal.torn},
         missing=tuple([name for name in names if name not in run.journals]),
     )
-
-
-def _checked(run: Run) -> tuple[Sequence[str], RunSetup]:
-    """Return all robots of `run`, also those without a journal, and its static data. Raises like `export`."""
-    run.readable(*run.journals)
-    for robot in run.robots:
-        if agent_journal(robot) in run.journals:
-            run.agent(robot)
-    setup = run.setup
-    if setup is None:
-        raise UserError(
-            f"{run.source}: there is no {WORLD_JOURNAL}, and no robot's journal has a configuration"
-        )
-    peers = [] if run.world is not None else [robot_setup.peer for robot_setup in setup.robots]
-    return list(dict.fromkeys([*run.robots, *sorted(peers)])), setup

@@ -19,14 +19,17 @@ from foxglove.mcap import MCAPWriteOptions
 from compose.recording.frames import Journaled, OfWorld, kind_of
 from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
 from compose.recording.run_setup import RunSetup
-from compose.view.foxglove.schemas import schema
+from compose.view.foxglove.schemas import object_schema, schema
 from compose.view.foxglove.views import Views, nanoseconds, topics
+from compose.view.numbers import Numbers
 from compose.view.scene import Scene
 from protocol.messages import OfRobot
 from protocol.wire import VERSION
 
 CHUNK_BYTES = 1 << 18
 """The size of a chunk. Trails of consecutive ticks are similar, so large chunks compress ten times better."""
+NUMBERS = Schema(name="tandem.Numbers", encoding="jsonschema", data=object_schema(Numbers))
+"""The schema of the numbers of a robot, which are JSON objects."""
 LONGEST_S = 2**32
 """The largest time in s that Foxglove's timestamps can represent."""
 
@@ -87,8 +90,12 @@ class Channels:
         """Create all channels for scenes, including those that stay empty."""
         for topic, kind in topics(robots).items():
             if topic not in self._views:
+                numbers = kind is Numbers
                 self._views[topic] = Channel(
-                    topic, message_encoding="protobuf", schema=kind.get_schema(), context=self._context
+                    topic,
+                    message_encoding="json" if numbers else "protobuf",
+                    schema=NUMBERS if numbers else kind.get_schema(),
+                    context=self._context,
                 )
 
     def view(self, topic: str, message: Any, at: int) -> None:

@@ -1,4 +1,4 @@
-"""The wire format of messages as JSON Schema: arrays of the message's name and its fields."""
+"""The formats of messages as JSON Schema."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from msgspec import inspect
 
 @cache
 def schema(kind: type[msgspec.Struct]) -> bytes:
-    """Return the JSON Schema of messages of type `kind`.
+    """Return the JSON Schema of messages of type `kind` on the wire: arrays of its name and its fields.
 
     It extends msgspec's schema, which has no field names in arrays and regular expressions in Python syntax.
     """
@@ -26,6 +26,11 @@ def schema(kind: type[msgspec.Struct]) -> bytes:
                 {"title": title, **item} for title, item in zip(titles, part["prefixItems"], strict=True)
             ]
     return msgspec.json.encode(_in_ecma(described), order="sorted")
+
+
+def object_schema(kind: type[msgspec.Struct]) -> bytes:
+    """Return the JSON Schema of objects of type `kind`, without references, which not all viewers follow."""
+    return msgspec.json.encode(msgspec.json.schema(kind)["$defs"][kind.__name__], order="sorted")
 
 
 def _structs(info: Any) -> set[type[msgspec.Struct]]:

@@ -8,12 +8,8 @@ from functools import lru_cache
 
 from foxglove import messages as fox
 
-from protocol.motion import Covariance, Pose, compose
+from protocol.motion import Pose
 
-CORNERS = 72
-"""The number of corners of a polygon drawn for a circle."""
-SIGMAS = 3.0
-"""The size of an error ellipse, in standard deviations."""
 NOWHERE = fox.Pose(position=fox.Vector3(), orientation=fox.Quaternion(w=1.0))
 """The pose of the reference frame in itself."""
 CACHED = 1000
@@ -61,25 +57,6 @@ def line(points: Sequence[fox.Point3], tint: fox.Color, width: float) -> fox.Lin
         points=list(points),
         color=tint,
     )
-
-
-def circle(centre: tuple[float, float], radius: float) -> list[tuple[float, float]]:
-    """Return the points of a closed polygon with CORNERS corners, in m."""
-    turns = [2.0 * math.pi * i / CORNERS for i in range(CORNERS + 1)]
-    return [(centre[0] + radius * math.cos(turn), centre[1] + radius * math.sin(turn)) for turn in turns]
-
-
-def ellipse(centre: Pose, covariance: Covariance) -> list[tuple[float, float]]:
-    """Return the points of the error ellipse of a position, SIGMAS standard deviations large.
-
-    Its axes follow from the eigenvalues of the position block of the covariance.
-    """
-    mean = (covariance.xx + covariance.yy) / 2.0
-    spread = math.hypot((covariance.xx - covariance.yy) / 2.0, covariance.xy)
-    axis = Pose(centre.x, centre.y, math.atan2(2.0 * covariance.xy, covariance.xx - covariance.yy) / 2.0)
-    long, short = (SIGMAS * math.sqrt(max(0.0, one)) for one in (mean + spread, mean - spread))
-    points = [compose(axis, Pose(long * x, short * y, 0.0)) for x, y in circle((0.0, 0.0), 1.0)]
-    return [(point.x, point.y) for point in points]
 
 
 def arrow(at: Pose, size: float, tint: fox.Color) -> fox.ArrowPrimitive:

@@ -16,6 +16,8 @@ from compose.recording.run_setup import RobotSetup, RunSetup
 from compose.view import colours
 from compose.view.events import Event
 from compose.view.foxglove import shapes
+from compose.view.numbers import Numbers
+from compose.view.outlines import circle, ellipse
 from compose.view.scene import HeldPoses, Player, Scene
 from protocol.mission import Role
 from protocol.motion import Pose
@@ -44,7 +46,7 @@ class Shown(NamedTuple):
 
     topic: str
     message: Any
-    """A message of Foxglove's schemas."""
+    """A message of Foxglove's schemas, or Numbers."""
 
 
 def topics(robots: Iterable[str]) -> dict[str, Any]:
@@ -61,6 +63,7 @@ def topics(robots: Iterable[str]) -> dict[str, Any]:
         found[f"/{robot}/body"] = fox.SceneUpdate
         found[f"/{robot}/hypotheses"] = fox.PosesInFrame
         found[f"/{robot}/belief"] = fox.SceneUpdate
+        found[f"/{robot}/numbers"] = Numbers
     return found
 
 
@@ -165,6 +168,7 @@ class Views:
 
     def _robot(self, player: Player, at: fox.Timestamp) -> Iterator[Shown]:
         robot, robot_setup = player.robot, self.setup.robot_setup(player.robot)
+        yield Shown(f"/{robot}/numbers", Numbers.of(player))
         if player.pose is not None:
             pose = fox.PoseInFrame(timestamp=at, frame_id=WORLD, pose=shapes.pose(player.pose))
             yield Shown(f"/{robot}/pose", pose)
@@ -214,9 +218,9 @@ class Views:
             cubes=[fox.CubePrimitive(pose=shapes.pose(here), size=size, color=shapes.colour(colour))],
             lines=[
                 shapes.strip(
-                    shapes.circle(centre, self.setup.mission.sensing_range), shapes.colour(colour, 0.6), 1.5
+                    circle(centre, self.setup.mission.sensing_range), shapes.colour(colour, 0.6), 1.5
                 ),
-                shapes.strip(shapes.circle(centre, robot_setup.orbit.radius), shapes.colour(GREY, 0.5), 1.0),
+                shapes.strip(circle(centre, robot_setup.orbit.radius), shapes.colour(GREY, 0.5), 1.0),
             ],
             texts=[shapes.words(f"{robot_setup.id}'s anchor", here, self._unit, shapes.colour(colour))],
         )
@@ -252,9 +256,7 @@ class Views:
         probability = held.probability or (1.0 / max(1, len(poses)),) * len(poses)
         lines = []
         if held.covariance is not None and held.world:
-            lines.append(
-                shapes.strip(shapes.ellipse(held.world[0], held.covariance), shapes.colour(colour), 1.5)
-            )
+            lines.append(shapes.strip(ellipse(held.world[0], held.covariance), shapes.colour(colour), 1.5))
         shades = [shapes.colour(colour, max(LEAST, share)) for share in probability]
         texts = [
             shapes.words(f"{share:.3g}", pose, self._unit, shade)

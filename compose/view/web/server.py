@@ -12,6 +12,7 @@ import signal
 import socket
 from collections.abc import AsyncIterator, Callable
 from contextlib import nullcontext, suppress
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -27,10 +28,11 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from compose.errors import UserError
 from compose.view.recorded import scenes
-from compose.view.web import sweep_page
+from compose.view.web import estimate_page, sweep_page
 from compose.view.web.origin import refusal
 from compose.view.web.site import Site
 from compose.view.web.standalone import PAGE
+from compose.view.web.thumbnail import thumbnail
 
 LOOPBACK = "127.0.0.1"
 POLL_S = 0.05
@@ -62,29 +64,47 @@ class _Answers:
 
     def __init__(self, site: Site) -> None:
         self._site = site
+        self._running = asyncio.Lock()
+        """Held while a trial is run: one at a time."""
 
     async def index(self, _request: Request) -> Response:
         return FileResponse(PAGE / "index.html")
 
     async def sweep(self, _request: Request) -> Response:
-        if self._site.folder is None:
-            return _json({"error": "this server shows no sweep"}, 404)
-        try:
-            return _json(sweep_page.contents(self._site.folder))
-        except UserError as error:
-            return _json({"error": str(error)}, 500)
+        return _results(self._site.folder, sweep_page.contents, "sweep")
 
     async def figure(self, request: Request) -> Response:
-        folder, name = self._site.folder, request.path_params["name"]
-        if folder is None or name not in sweep_page.figures(folder):
+        figure = self._site.figure(request.path_params["name"])
+        if figure is None:
             return _json({"error": "there is no such figure"}, 404)
-        return FileResponse(folder / sweep_page.FIGURES / name, media_type="image/svg+xml")
+        return FileResponse(figure, media_type="image/svg+xml")
+
+    async def estimate(self, _request: Request) -> Response:
+        return _results(self._site.estimate, estimate_page.contents, "estimate")
+
+    async def worst(self, request: Request) -> Response:
+        """Run the worst trial of a cell, unless that has been done, and return the name of its recording."""
+        trials, cell = self._site.trials, request.path_params["cell"]
+        if trials is None:
+            return _json({"error": "this server shows no sweep"}, 404)
+        try:
+            async with self._running:
+                worst = await asyncio.to_thread(trials.worst, cell)
+        except UserError as error:
+            return _json({"error": str(error)}, 409)
+        return _json({"show": worst.show.name, "outcome": worst.outcome, "trial": worst.trial})
 
     async def show(self, request: Request) -> Response:
         show = self._site.shows.get(request.path_params["name"])
         if show is None:
             return _json({"error": "there is no such mission"}, 404)
         return _json(show.mission)
+
+    async def thumbnail(self, request: Request) -> Response:
+        show = self._site.shows.get(request.path_params["name"])
+        if show is None or show.setup is None:
+            return _json({"error": "there is no such mission"}, 404)
+        return Response(thumbnail(show.setup, show.known), media_type="image/svg+xml")
 
     async def scenes(self, request: Request) -> Response:
         show = self._site.shows.get(request.path_params["name"])
@@ -101,6 +121,16 @@ class _Answers:
         return StreamingResponse(stream, media_type="text/event-stream")
 
 
+def _results(folder: Path | None, contents: Callable[[Path], dict[str, Any]], what: str) -> Response:
+    """Return the `contents` of a folder of results; an error if the server shows none."""
+    if folder is None:
+        return _json({"error": f"this server shows no {what}"}, 404)
+    try:
+        return _json(contents(folder))
+    except UserError as error:
+        return _json({"error": str(error)}, 500)
+
+
 def application(site: Site) -> Starlette:
     """Return the web application of `site`, which refuses requests of foreign web pages."""
     answers = _Answers(site)
@@ -108,9 +138,12 @@ def application(site: Site) -> Starlette:
         routes=[
             Route("/", answers.index),
             Route("/api/sweep", answers.sweep),
+            Route("/api/estimate", answers.estimate),
             Route("/api/figures/{name}", answers.figure),
+            Route("/api/cells/{cell:int}/worst", answers.worst, methods=["POST"]),
             Route("/api/shows/{name}", answers.show),
             Route("/api/shows/{name}/scenes", answers.scenes),
+            Route("/api/shows/{name}/thumbnail", answers.thumbnail),
             Route("/api/news", answers.news),
             Mount("/page", StaticFiles(directory=PAGE)),
         ],

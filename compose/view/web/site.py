@@ -1,4 +1,4 @@
-"""The content of one server: recordings, a sweep, or missions on a network."""
+"""The content of one server: recordings, a sweep, an estimate, or missions on a network."""
 
 from __future__ import annotations
 
@@ -9,23 +9,30 @@ from typing import Any
 
 from compose.errors import UserError
 from compose.recording.recording_files import journals_in
-from compose.view.web import sweep_page
+from compose.view.web import estimate_page, sweep_page
 from compose.view.web.live import Listener
 from compose.view.web.sources import Recorded, WatchedRun
+from compose.view.web.trials import Trials
 from protocol.network.endpoints import Endpoints
 
 
 class Site:
-    """The runs, or the sweep, that one server shows."""
+    """The runs, the sweep or the estimate that one server shows."""
 
     def __init__(
         self,
         shows: list[Recorded] | None = None,
         listeners: list[Listener] | None = None,
         folder: Path | None = None,
+        estimate: Path | None = None,
     ) -> None:
-        """Create the content of a server. `folder` is the folder of a sweep; None if there is none."""
+        """Create the content of a server.
+
+        `folder` is the folder of a sweep, and `estimate` that of an estimate; None if there is none.
+        """
         self.folder = folder
+        self.estimate = estimate
+        self.trials = Trials(folder) if folder is not None else None
         self.recorded = shows or []
         self.listeners = listeners or []
         self.over = False
@@ -34,7 +41,8 @@ class Site:
     @property
     def shows(self) -> dict[str, WatchedRun]:
         """The runs whose static data is known, by name."""
-        found: dict[str, WatchedRun] = {show.name: show for show in self.recorded}
+        trials = self.trials.shows if self.trials is not None else []
+        found: dict[str, WatchedRun] = {show.name: show for show in [*self.recorded, *trials]}
         for i, listener in enumerate(self.listeners):
             for run, show in listener.shows.items():
                 found[run if run not in found else f"{run}.{i}"] = show
@@ -50,15 +58,25 @@ class Site:
         """One line for each part of a recording that cannot be read."""
         return [note for show in self.recorded for note in show.notes]
 
+    def figure(self, name: str) -> Path | None:
+        """Return the path of the figure called `name`; None if there is none."""
+        if self.folder is not None and name in sweep_page.figures(self.folder):
+            return self.folder / sweep_page.FIGURES / name
+        if self.estimate is not None and name in estimate_page.figures(self.estimate):
+            return self.estimate / name
+        return None
+
     def start(self) -> None:
         """Start listening on the network."""
         for listener in self.listeners:
             listener.start()
 
     def stop(self) -> None:
-        """Stop listening on the network."""
+        """Stop listening on the network, and delete the recordings of trials."""
         for listener in self.listeners:
             listener.stop()
+        if self.trials is not None:
+            self.trials.close()
 
     def poll(self) -> None:
         """Read new data."""
@@ -77,6 +95,7 @@ class Site:
         """Return the list of runs for the page."""
         return {
             "sweep": self.folder is not None,
+            "estimate": self.estimate is not None,
             "network": [{"endpoint": one.endpoint, "reached": one.reached} for one in self.listeners],
             "waiting": self.waiting,
             "shows": [
@@ -104,7 +123,7 @@ def of_network(places: Sequence[Endpoints]) -> Site:
 
 
 def of_folder(folder: Path) -> Site:
-    """Return the content for a recording, a sweep, or the recordings in the subfolders of `folder`.
+    """Return the content for a recording, a sweep, an estimate, or recordings in the subfolders of `folder`.
 
     Raises UserError if there is none of these.
     """
@@ -116,6 +135,9 @@ def of_folder(folder: Path) -> Site:
             return Site(folder=folder)
         folders = [folder]
         if not any(journals_in(folder)):
+            if estimate_page.is_estimate(folder):
+                estimate_page.contents(folder)
+                return Site(estimate=folder)
             folders = sorted(one for one in folder.iterdir() if one.is_dir() and any(journals_in(one)))
         shows = [Recorded(one.resolve().name, one) for one in folders]
     except OSError as error:
@@ -127,7 +149,9 @@ def of_folder(folder: Path) -> Site:
             show.live = False
             show.notes.append(f"{error.filename or show.folder} cannot be read: {error.strerror or error}")
     if not shows:
-        raise UserError(f"{folder} contains no recording, no sweep, and no folders with recordings")
+        raise UserError(
+            f"{folder} contains no recording, no sweep, no estimate, and no folders with recordings"
+        )
     if not any(show.live or show.setup is not None for show in shows):
         why = "; ".join(note for show in shows for note in show.notes) or "its journals are empty"
         raise UserError(f"the recordings in {folder} cannot be shown: {why}")

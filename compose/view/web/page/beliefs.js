@@ -1,8 +1,9 @@
 // The poses that robots consider possible, and those that they have just ruled out.
 
+import { shown } from "./configurations.js";
 import { between, compose, distance, ellipse, frame_of, step, TAU } from "./geometry.js";
 import { held_now } from "./held.js";
-import { cross, label, shape } from "./pen.js";
+import { cross, fading, shape } from "./pen.js";
 import { probability } from "./words.js";
 
 const FADING = 3;
@@ -16,14 +17,16 @@ export class Beliefs {
     const { store, scene, truth, look, size, tick } = view;
     const player = scene.players[store.places.get(robot.id)], held = player?.held;
     if (!held) return this.#somewhere(view, robot, player);
-    const pen = this.plane.context, { poses, covariance } = held_now(view, robot);
+    if (this.#eliminating(view, robot)) return undefined;
+    const pen = this.plane.context, { poses, covariance } = held_now(view, robot), { labels } = this.plane;
+    const tints = this.plane.tints.of(store, tick, robot.id);
     if (!poses.length) return this.#somewhere(view, robot, player);
     this.#ruled_out(view, robot);
     if (!held.world.length && !truth) this.#any_bearing(view, robot, poses[0]);
     poses.slice(0, 60).forEach((pose, place) => {
       const chance = held.probability[place] ?? 1 / poses.length;
       const [x, y] = this.plane.at(pose);
-      pen.globalAlpha = 0.3 + 0.7 * Math.sqrt(chance);
+      pen.globalAlpha = tints.length ? 0.55 + 0.45 * Math.sqrt(chance) : 0.3 + 0.7 * Math.sqrt(chance);
       if (place === 0 && covariance && held.world.length) this.#ellipse(pose, covariance, look);
       const grown = truth ? size * 1.45 : size * 1.15;
       shape(pen, robot.role, x, y, pose[2], grown);
@@ -31,34 +34,64 @@ export class Beliefs {
         pen.fillStyle = player.down ? look.paper : look.robot[robot.role];
         pen.fill();
       }
-      pen.strokeStyle = look.ghost;
-      pen.lineWidth = 2;
+      const colour = tints.length ? look.tint(tints[place]) : look.ghost;
+      pen.strokeStyle = colour;
+      pen.lineWidth = tints.length ? 2.6 : 2;
       pen.setLineDash(held.world.length || !truth ? [] : [3, 3]);
       pen.stroke();
       pen.setLineDash([]);
-      if (held.probability.length > 1 && place < 6 && chance > 0.01 && size > 6) {
-        label(pen, probability(chance), x - grown - 4, y + grown + 8, look.ghost, "right", look);
+      const many = held.probability.length > 1 && chance > 0.01;
+      const parts = [...(tints.length > 1 ? [String(tints[place] + 1)] : []), ...(many ? [probability(chance)] : [])];
+      if (parts.length && place < 6 && size > 6) {
+        labels.put(parts.join(": "), x - grown - 4, y + grown + 8, colour, "right", { around: grown + 4 });
       }
       if (!truth && place === 0 && player.down) cross(pen, x, y, grown, look);
-      if (!truth && place === 0) label(pen, player.down ? `${robot.id} is down` : robot.id, x + grown + 3, y - grown, look.ink, "left", look, look.bold);
+      if (!truth && place === 0) {
+        const name = player.down ? `${robot.id} is down` : robot.id;
+        labels.put(name, x + grown + 3, y - grown, look.ink, "left", { font: look.bold, name: true, around: grown + 3 });
+      }
     });
     pen.globalAlpha = 1;
     return undefined;
   }
 
+  /** Draws the configurations while a range rules some out, one by one; returns whether it does. */
+  #eliminating(view, robot) {
+    if (view.eliminated >= 1) return false;
+    const { look, size, store } = view, pen = this.plane.context;
+    const of_a = robot.role === "a" ? robot : store.stage.robots.find(({ id }) => id === robot.peer);
+    if (!of_a) return false;
+    const { all } = shown(view, of_a, this.plane.tints), grown = 1.45 * size;
+    if (all.length < 2) return false;
+    for (const { tint, out, [robot.role]: pose } of all) {
+      const [x, y] = this.plane.at(pose), colour = look.tint(tint);
+      pen.globalAlpha = out ? 0.5 : 1;
+      shape(pen, robot.role, x, y, pose[2], grown);
+      pen.strokeStyle = colour;
+      pen.lineWidth = 2.6;
+      pen.stroke();
+      if (out) cross(pen, x, y, size, look);
+      else if (size > 6) this.plane.labels.put(String(tint + 1), x - grown - 4, y + grown + 8, colour, "right", { around: grown + 4 });
+    }
+    pen.globalAlpha = 1;
+    return true;
+  }
+
   /** Draws the circle on which the robot is, or its anchor's sensing range, before it has a pose. */
-  #somewhere({ look, truth, store }, robot, player) {
-    if (truth || !player) return;
+  #somewhere({ look, truth, store, moving, share }, robot, player) {
+    if (!player || (truth && player.anchor_range === undefined)) return;
     const pen = this.plane.context, [x, y] = this.plane.at(robot.anchor);
     const range = player.anchor_range ?? store.stage.mission.sensing_range;
     pen.beginPath();
     pen.arc(x, y, range * this.plane.scale, 0, TAU);
     pen.strokeStyle = look.ghost;
     pen.lineWidth = 3;
+    pen.globalAlpha = truth ? fading(share, moving) : 1; // the true robot leaves the circle
     pen.setLineDash([2, 6]);
     pen.stroke();
     pen.setLineDash([]);
-    label(pen, `${robot.id}: position unknown`, x, y - range * this.plane.scale - 6, look.ghost, "center", look);
+    pen.globalAlpha = 1;
+    if (!truth) this.plane.labels.put(`${robot.id}: position unknown`, x, y - range * this.plane.scale - 6, look.ghost, "center");
   }
 
   /** Draws the circle of possible positions of a robot whose bearing from its anchor is unknown. */
@@ -74,7 +107,7 @@ export class Beliefs {
     pen.stroke();
     pen.setLineDash([]);
     pen.globalAlpha = 1;
-    label(pen, `${robot.id}: bearing unknown`, x, y - radius - 6, look.ghost, "center", look);
+    this.plane.labels.put(`${robot.id}: bearing unknown`, x, y - radius - 6, look.ghost, "center");
   }
 
   /** Draws the poses ruled out in the last FADING ticks, propagated by odometry to the current tick. */

@@ -1,18 +1,24 @@
 // The entry point of the page: view state, playback, keys, and the address (#show=…&tick=46&robot=a&truth=0).
 
+import { address_state } from "./address.js";
+import { estimate } from "./estimate.js";
 import { sweep } from "./sweep.js";
 import { Cards, make } from "./cards.js";
 import * as data from "./data.js";
-import { leads } from "./held.js";
+import { needed, release_focus } from "./focus.js";
+import { Guide } from "./guide.js";
+import { fill_help } from "./help.js";
 import { Log } from "./log.js";
+import { list_missions, state_of } from "./missions.js";
 import { Plane } from "./plane.js";
+import { activities, Announcer, described } from "./spoken.js";
+import { Predictions } from "./predictions.js";
 import { Store } from "./store.js";
 import { Timeline } from "./timeline.js";
-import { KEYS, MEANINGS, place, plural, rad, without_error } from "./words.js";
+import { plural } from "./words.js";
 
 const SPEEDS = [0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000];
 const USUAL = 5;
-const ANNOUNCE_MS = 900;
 
 const $ = (id) => document.getElementById(id);
 const still = matchMedia("(prefers-reduced-motion: reduce)");
@@ -20,6 +26,10 @@ let store = null;
 const view = {
   tick: 0, share: 0, playing: false, follow: true, focus: null, moving: false, speed: USUAL,
   wanted: true,
+  /** True for guided play; false for a plain speed. */
+  guided: true,
+  /** In guided play: the place of the current caption among those of the tick, and for how many seconds it is shown. */
+  beat: null, held: 0,
   /** True if the ground truth is shown; always false if the run has none. */
   get truth() { return this.wanted && (store?.has_truth ?? true); },
 };
@@ -28,7 +38,10 @@ let source = null;
 let due = false;
 let before = null;
 
+const guide = new Guide();
+const announcer = new Announcer();
 const plane = new Plane($("canvas"), () => draw());
+const predictions = new Predictions($("predictions"), plane);
 const timeline = new Timeline($("line"), $("bands"), $("scrub"), (tick) => go(tick));
 const cards = new Cards($("robots"), $("roster"), (robot) => focus(view.focus === robot ? null : robot));
 const log = new Log($("log"), $("states"), $("radio"), (tick) => go(tick));
@@ -36,21 +49,10 @@ log.onchange = () => draw();
 
 // --- the address ---
 
-function address_state() {
-  const fields = new URLSearchParams(location.hash.slice(1));
-  const tick = fields.get("tick");
-  return {
-    show: fields.get("show"),
-    tick: tick !== null && /^\d+$/.test(tick) ? Number(tick) : null,
-    robot: fields.get("robot"),
-    truth: fields.get("truth") !== "0",
-  };
-}
-
 function update_address() {
   if (!store) return;
   const fields = new URLSearchParams();
-  if (listed && listed.shows.length > 1) fields.set("show", store.name);
+  if (listed && (listed.sweep || listed.shows.length > 1)) fields.set("show", store.name);
   if (!(view.follow && store.live)) fields.set("tick", view.tick);
   if (view.focus) fields.set("robot", view.focus);
   if (!view.wanted) fields.set("truth", "0");
@@ -80,7 +82,14 @@ function listen() {
 
 async function on_list(list) {
   listed = list;
-  if (list.sweep) {
+  if (list.estimate) {
+    if (!$("sweep").hidden) return;
+    text($("title"), await estimate($("sweep")));
+    document.title = `${$("title").textContent} · Tandem`;
+    return void text($("status"), "estimate");
+  }
+  if (list.sweep && !address_state().show) {
+    if (store) return void location.assign("/");
     if ($("sweep").hidden) {
       text($("title"), await sweep($("sweep")));
       document.title = `${$("title").textContent} · Tandem`;
@@ -104,22 +113,26 @@ async function open(name) {
     store?.close();
     store = new Store(name, mission, draw);
     store.onstage = staged;
-    store.onforget = (tick) => { timeline.forget(tick); log.forget(tick); };
+    store.onforget = (tick) => { timeline.forget(tick); log.forget(tick); guide.forget(tick); };
     const { tick, robot, truth } = address_state();
     view.follow = tick === null;
     view.tick = tick ?? (store.live ? Math.max(store.last, 0) : store.first);
     view.wanted = truth;
     view.playing = false;
+    view.beat = null;
+    plane.following = plane.freed = false;
     view.focus = store.places.has(robot) ? robot : null;
     staged();
     listen();
+    if (listed?.sweep) play(true);
   } finally {
     opening = null;
   }
 }
 
 function staged() {
-  $("home").hidden = !listed || listed.shows.length < 2;
+  $("home").hidden = !listed || (listed.shows.length < 2 && !listed.sweep);
+  if (listed?.sweep) $("home").textContent = "The sweep";
   for (const id of ["mission", "time", "view"]) $(id).hidden = false;
   for (const id of ["list", "sweep"]) $(id).hidden = true;
   $("title").textContent = store.stage.name;
@@ -129,6 +142,7 @@ function staged() {
   cards.stage(store);
   timeline.stage(store);
   log.stage(store);
+  guide.stage(store);
   plane.fitted = true;
   draw();
 }
@@ -137,30 +151,11 @@ function show_list() {
   store?.close();
   store = null;
   for (const id of ["mission", "time", "view"]) $(id).hidden = true;
-  const root = $("list");
-  root.hidden = false;
   $("home").hidden = true;
   $("title").textContent = "Missions";
   document.title = "Missions · Tandem";
-  const where = listed.network.map(({ endpoint, reached }) => `${endpoint}${reached ? "" : " (no router yet)"}`);
   $("status").textContent = listed.shows.length ? plural(listed.shows.length, "mission") : listed.waiting ? "waiting for a mission" : "no missions";
-  root.replaceChildren(
-    ...(where.length ? [make("p", { className: "note", textContent: `Listening on ${where.join(", ")}.` })] : []),
-    make("ul", {}, ...listed.shows.map((one) => {
-      const link = make("a", { href: `#show=${encodeURIComponent(one.name)}` },
-        make("b", { textContent: one.name }), " ",
-        ...(one.title !== one.name ? [make("span", { textContent: one.title }), " "] : []),
-        make("span", { textContent: plural(one.robots, "robot") }), " ",
-        make("span", { className: "chip", textContent: state_of(one.live, one.last, one.end && { tick: one.end[1], outcome: one.end[2] }) }));
-      return make("li", {}, link);
-    })),
-  );
-}
-
-function state_of(live, last, end) {
-  if (end) return `${end.outcome} after ${end.tick} ticks`;
-  if (live) return `● running, tick ${Math.max(last, 0)}`;
-  return `incomplete, ends at tick ${last}`;
+  list_missions($("list"), listed);
 }
 
 // --- navigation ---
@@ -169,6 +164,7 @@ function go(tick, { keep_playing = false } = {}) {
   if (!store) return;
   view.tick = Math.min(Math.max(tick, store.first), Math.max(store.last, 0));
   view.share = 0;
+  view.beat = null;
   if (!keep_playing) view.playing = false;
   view.follow = store.live && view.tick >= store.last;
   store.want(view.tick);
@@ -184,9 +180,12 @@ function focus(robot) {
 function play(on = !view.playing) {
   if (!store) return;
   if (on && view.tick >= store.last && !store.live) view.tick = store.first;
+  if (on && view.guided && !plane.freed) plane.following = true;
   view.playing = on;
   view.follow = false;
   view.share = 0;
+  view.beat = null;
+  view.held = 0;
   before = null;
   draw();
 }
@@ -195,6 +194,12 @@ function advance(now) {
   if (!view.playing || !store) return;
   const s = before === null ? 0 : Math.min((now - before) / 1000, 0.25);
   before = now;
+  if (view.guided) {
+    view.playing = guide.advance(view, s);
+    if (!view.playing) view.follow = store.live;
+    store.want(view.tick);
+    return;
+  }
   const time = view.tick + view.share + s * view.speed;
   if (time >= store.last) {
     view.tick = store.last;
@@ -223,24 +228,23 @@ function draw() {
     if (!store) return;
     advance(now);
     store.want(view.tick);
-    view.moving = view.playing && !still.matches && view.speed <= 60;
+    view.moving = view.playing && !still.matches && (view.guided || view.speed <= 60);
+    view.eliminated = guide.eliminated(view);
+    if (plane.following) plane.follow(view, store, guide.pair(view.focus), still.matches ? null : now);
     document.body.dataset.tick = view.tick;
     document.body.dataset.shown = store.scene(view.tick) ? view.tick : "";
+    predictions.draw(view, store, guide.pair(view.focus));
     plane.draw(store, view);
     cards.draw(view);
     log.draw(view);
-    timeline.draw(view, activities());
+    timeline.draw(view, activities(store, view));
     controls();
-    announce(now);
-    if (view.playing) draw();
-    else update_address();
+    text($("caption"), guide.text(view));
+    const news = view.playing && view.guided ? null : announcer.text(store, view, now);
+    if (news !== null) text($("live"), news);
+    if (view.playing || plane.easing) draw();
+    if (!view.playing) update_address();
   });
-}
-
-function activities() {
-  const players = store.scene(view.tick)?.players ?? [];
-  const chosen = view.focus ? players.filter((player) => player.robot === view.focus) : players.slice(0, 4);
-  return chosen.map((player) => player.activity).join(". ");
 }
 
 function controls() {
@@ -251,6 +255,10 @@ function controls() {
   text($("tick"), `tick ${view.tick} of ${Math.max(store.last, 0)}`);
   $("play").classList.toggle("on", view.playing);
   $("play").setAttribute("aria-label", view.playing ? "Pause" : "Play");
+  $("play").classList.toggle("invite", view.guided && !view.playing && !store.live && view.tick === store.first);
+  $("guide").setAttribute("aria-pressed", String(view.guided));
+  $("caption").setAttribute("aria-live", view.guided && view.playing ? "polite" : "off");
+  $("camera").setAttribute("aria-pressed", String(plane.following));
   $("follow").hidden = !store.live;
   $("follow").setAttribute("aria-pressed", String(view.follow));
   $("truth").checked = view.truth;
@@ -265,7 +273,7 @@ function controls() {
   const only = store.has_truth ? `only the belief of ${subject}` : `no ground truth: only the belief of ${subject}`;
   const unknown = store.scene(view.tick)?.players.every((player) => !player.pose) ? "the ground truth of this tick is unknown" : "";
   text($("seen"), !view.truth ? `${only}${bearing}` : unknown || (view.focus ? `ground truth and the belief of ${subject}` : ""));
-  $("canvas").setAttribute("aria-label", described());
+  $("canvas").setAttribute("aria-label", described(store, view));
 }
 
 function knows_bearing() {
@@ -273,33 +281,8 @@ function knows_bearing() {
   return players.filter((player) => !view.focus || player.robot === view.focus).every((player) => player.held?.world.length);
 }
 
-function described() {
-  const scene = store.scene(view.tick);
-  if (!scene) return `Tick ${view.tick}, not loaded yet`;
-  const shown = scene.players.filter((player) => !view.focus || player.robot === view.focus).slice(0, 4);
-  const at = shown.map((player) => {
-    const { robot, held } = player, pose = view.truth ? player.pose : held && leads(held) ? held.world[0] : null;
-    if (pose) return `${robot} at ${place(pose)}, heading ${rad(pose[2])}`;
-    return held?.world.length > 1 ? `${robot} at one of ${held.world.length} poses` : `${robot} at an unknown pose`;
-  });
-  return `The plane at tick ${view.tick}: ${at.join("; ")}`;
-}
-
 function text(element, content) {
   if (element.textContent !== content) element.textContent = content;
-}
-
-/** Writes the tick's events for screen readers, at most once per ANNOUNCE_MS while playing. */
-let announced = null;
-let announced_at = 0;
-function announce(now) {
-  const scene = store.scene(view.tick);
-  if (!scene || announced === view.tick || ((view.playing || view.follow) && now - announced_at < ANNOUNCE_MS)) return;
-  announced = view.tick;
-  announced_at = now;
-  const events = scene.events.filter((event) => !view.focus || !event.robot || event.robot === view.focus).slice(0, 6);
-  const texts = events.map((event) => (view.truth ? event.text : without_error(event.text)));
-  if (texts.length || !(view.playing || view.follow)) text($("live"), `Tick ${view.tick}. ${texts.join(". ") || activities()}`);
 }
 
 // --- keys and buttons ---
@@ -316,7 +299,20 @@ function to_event(direction) {
 
 function pace(direction) {
   const place = Math.min(Math.max(SPEEDS.indexOf(view.speed) + direction, 0), SPEEDS.length - 1);
-  view.speed = SPEEDS[place];
+  guided(false, SPEEDS[place]);
+}
+
+/** Switches between guided play and a plain speed in ticks per second. */
+function guided(on, speed = view.speed) {
+  Object.assign(view, { guided: on, speed, beat: null, held: 0 });
+  if (on && view.playing && !plane.freed) plane.following = true;
+  draw();
+}
+
+/** Lets the camera follow the story, or leaves it where it is. */
+function follow_story(on = !plane.following) {
+  plane.following = on;
+  plane.freed = !on;
   draw();
 }
 
@@ -327,27 +323,8 @@ function show_truth(on) {
 
 function fit() {
   plane.fit(store, view.focus, view.truth);
+  plane.freed = true;
   draw();
-}
-
-/** True if the focused element handles that key itself. */
-function needed({ target, key }) {
-  const { tagName, type } = target;
-  if (target.closest("dialog")) return false; // the dialog has just closed and still has the focus
-  if (tagName === "SELECT") {
-    return ["ArrowUp", "ArrowDown", "Enter"].includes(key) || (target === $("robot") ? /^[\w-]$/ : /^\d$/).test(key);
-  }
-  return [" ", "Enter"].includes(key) && (["BUTTON", "A"].includes(tagName) || (tagName === "INPUT" && type === "checkbox"));
-}
-
-/** Removes the focus from a control after a click, so that the space key starts playback. */
-let pointing = false;
-for (const [name, on] of [["pointerdown", true], ["keydown", false]]) document.addEventListener(name, () => { pointing = on; }, true);
-for (const name of ["click", "change"]) {
-  document.addEventListener(name, ({ target }) => {
-    const control = target.closest("button, a, select, input[type=checkbox]");
-    if (pointing && control && (name === "change" || control.tagName !== "SELECT")) control.blur();
-  });
 }
 
 function pressed(event) {
@@ -360,6 +337,7 @@ function pressed(event) {
     Home: () => go(store.first), End: () => go(store.last), ",": () => to_event(-1), ".": () => to_event(1),
     "[": () => pace(-1), "]": () => pace(1), l: () => go(store.last), t: () => show_truth(!view.truth),
     r: () => next_robot(event.shiftKey ? -1 : 1), a: () => focus(null), f: fit, n: () => plane.near(store, view),
+    g: () => guided(!view.guided), c: () => follow_story(),
     "+": () => plane.zoom(1.25), "=": () => plane.zoom(1.25), "-": () => plane.zoom(0.8),
     w: () => plane.shift(event.shiftKey ? 60 : 0, event.shiftKey ? 0 : 60),
     s: () => plane.shift(event.shiftKey ? -60 : 0, event.shiftKey ? 0 : -60),
@@ -371,6 +349,7 @@ function pressed(event) {
   action();
 }
 
+release_focus();
 document.addEventListener("keydown", pressed);
 $("play").addEventListener("click", () => play());
 $("back").addEventListener("click", () => go(view.tick - 1));
@@ -380,28 +359,19 @@ $("last").addEventListener("click", () => go(store.last));
 $("follow").addEventListener("click", () => go(store.last));
 $("truth").addEventListener("change", () => show_truth($("truth").checked));
 $("robot").addEventListener("change", () => focus($("robot").value || null));
-$("speed").addEventListener("change", () => { view.speed = Number($("speed").value); draw(); });
+$("speed").addEventListener("change", () => guided(false, Number($("speed").value)));
+$("guide").addEventListener("click", () => guided(!view.guided));
+$("camera").addEventListener("click", () => follow_story());
 $("fit").addEventListener("click", fit);
 $("near").addEventListener("click", () => plane.near(store, view));
 $("help").addEventListener("click", () => $("keys").showModal());
 $("view").addEventListener("submit", (event) => event.preventDefault());
 $("speed").append(...SPEEDS.map((speed) => make("option", { value: speed, textContent: speed })));
-$("key-list").append(...KEYS.flatMap(([key, action]) => [make("dt", {}, make("kbd", { textContent: key })), make("dd", { textContent: action })]));
-$("signs").append(...MEANINGS.map(([sign, meaning]) => make("li", {}, make("b", { textContent: sign }), `: ${meaning}`)));
-for (const role of ["a", "b"]) {
-  const item = make("li", { textContent: `role ${role}` });
-  item.dataset.role = role;
-  $("legend").append(item);
-}
-for (const phase of [1, 2, 3]) {
-  const item = make("li", { textContent: `phase ${phase}` });
-  item.dataset.phase = phase;
-  $("legend").append(item);
-}
+fill_help($("key-list"), $("signs"), $("legend"));
 
 window.addEventListener("hashchange", () => {
   const { show, tick, robot, truth } = address_state();
-  if (!store || (show || store.name) !== store.name || (!show && listed?.shows.length > 1)) return void (listed && on_list(listed));
+  if (!store || (show || store.name) !== store.name || (!show && (listed?.sweep || listed?.shows.length > 1))) return void (listed && on_list(listed));
   view.focus = store.places.has(robot) ? robot : null;
   view.wanted = truth;
   if (tick !== null) go(tick);

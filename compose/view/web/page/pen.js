@@ -1,4 +1,4 @@
-// Drawing primitives for a canvas: colours, fonts, robot shapes and labels.
+// Drawing primitives for a canvas: colours, fonts, robot shapes and opacities.
 
 import { TAU } from "./geometry.js";
 
@@ -20,6 +20,9 @@ export function shape(pen, role, x, y, heading, size) {
   pen.closePath();
 }
 
+/** Returns the opacity of a range, which fades until the next tick. */
+export const fading = (share, moving) => (moving ? Math.max(0, 1 - 1.6 * share) : 1);
+
 /** Draws a cross over a robot. */
 export function cross(pen, x, y, size, look) {
   const r = 0.7 * size;
@@ -30,16 +33,6 @@ export function cross(pen, x, y, size, look) {
   pen.stroke();
 }
 
-export function label(pen, text, x, y, colour, align, look, font = look.font) {
-  pen.font = font;
-  pen.textAlign = align;
-  pen.lineWidth = 3.5;
-  pen.strokeStyle = look.paper;
-  pen.strokeText(text, x, y);
-  pen.fillStyle = colour;
-  pen.fillText(text, x, y);
-}
-
 export class Look {
   constructor(style) {
     const of = (name) => style.getPropertyValue(`--${name}`).trim();
@@ -47,9 +40,13 @@ export class Look {
       this[name] = of(name);
     }
     this.robot = { a: of("robot-a"), b: of("robot-b") };
+    this.tints = [1, 2, 3, 4, 5, 6].map((i) => of(`tint-${i}`));
     const family = of("font");
     const size = 12.5;
     this.font = `${size}px ${family}`;
     this.bold = `600 ${size + 2.5}px ${family}`;
   }
+
+  /** Returns the colour of a configuration by its number from 0. */
+  tint(number) { return this.tints[number] ?? this.ghost; }
 }

@@ -1,11 +1,23 @@
 // The plane in one tick: anchors, trails, robots, ranges, reports and beliefs.
 
 import { Beliefs } from "./beliefs.js";
-import { between, TAU } from "./geometry.js";
-import { cross, label, Look, shape, unit } from "./pen.js";
+import { Configurations } from "./configurations.js";
+import { scenario_discs, story_discs } from "./camera.js";
+import { between, distance, TAU } from "./geometry.js";
+import { Labels } from "./labels.js";
+import { cross, Look, shape, unit } from "./pen.js";
 import { Signals } from "./signals.js";
+import { Tints } from "./tints.js";
 import { Trails } from "./trails.js";
 import { metres } from "./words.js";
+
+/** The time in s in which the camera covers most of the way to where it is needed. */
+const EASE_S = 0.45;
+/** The distance in pixels from which on the camera is where it is needed. */
+const NEAR_PX = 0.5;
+const LIST_PX = 42;
+/** The least width and height in pixels of a picture: a lower window shows a part of it. */
+const LEAST_PX = 40;
 
 /** The map from the world to the canvas, with pan and zoom, and the order in which things are drawn. */
 export class Plane {
@@ -15,10 +27,17 @@ export class Plane {
     this.centre = [0, 0];
     this.scale = 40;
     this.fitted = true;
+    /** True if the camera follows the story of guided play. */
+    this.following = false;
+    /** True if the user has moved the camera, which then does not follow the story by itself. */
+    this.freed = false;
+    this.easing = false;
     this.#redraw = redraw;
     this.#trails = new Trails(this);
     this.#beliefs = new Beliefs(this);
     this.#signals = new Signals(this);
+    this.#configurations = new Configurations(this);
+    this.tints = new Tints();
     canvas.addEventListener("wheel", (event) => {
       event.preventDefault();
       this.zoom(Math.exp(-event.deltaY * 0.0015), [event.offsetX / unit(), event.offsetY / unit()]);
@@ -40,19 +59,25 @@ export class Plane {
   #trails;
   #beliefs;
   #signals;
+  #configurations;
   #revision = -1;
 
   get width() { return this.canvas.clientWidth / unit(); }
   get height() { return this.canvas.clientHeight / unit(); }
 
+  #free() {
+    this.fitted = this.following = this.easing = false;
+    this.freed = true;
+  }
+
   shift(dx, dy) {
-    this.fitted = false;
+    this.#free();
     this.centre = [this.centre[0] - dx / this.scale, this.centre[1] + dy / this.scale];
     this.#redraw();
   }
 
   zoom(factor, [x, y] = [this.width / 2, this.height / 2]) {
-    this.fitted = false;
+    this.#free();
     const dx = (x - this.width / 2) / this.scale, dy = -(y - this.height / 2) / this.scale;
     const scale = Math.min(Math.max(this.scale * factor, 1e-4), 1e6);
     const share = 1 - this.scale / scale;
@@ -64,31 +89,53 @@ export class Plane {
   /** Zooms to the whole scenario, or to the pair of the selected robot if there are several pairs. */
   fit(store, focus, truth = true) {
     this.fitted = true;
+    this.following = this.easing = false;
     const { robots, mission } = store.stage, reach = mission.sensing_range;
     if (!truth && focus) {
       const { anchor, orbit } = robots.find((robot) => robot.id === focus);
       return this.#frame([[anchor, Math.max(reach, orbit[0]) + reach]]);
     }
     const chosen = focus && robots.length > 2 ? robots.filter((r) => r.id === focus || r.peer === focus) : robots;
-    return this.#frame(chosen.map((robot) => [robot.anchor, Math.max(reach, robot.orbit[0])]));
+    return this.#frame(scenario_discs(chosen, reach));
   }
 
-  /** Zooms to the current poses of the robots, or of the pair of the selected robot. */
+  /** Zooms to the robots and to all poses that they consider possible, or to those of the selected robot's pair. */
   near(store, { tick, focus, truth }) {
     const reach = store.stage.mission.sensing_range, discs = [];
     for (const robot of store.stage.robots) {
       if (focus && robot.id !== focus && (robot.peer !== focus || !truth)) continue;
       const player = store.player(tick, robot.id);
-      const pose = (truth && player?.pose) || player?.held?.world[0];
-      if (pose) discs.push([pose, 0.6 * reach]);
-      else discs.push([robot.anchor, reach]);
+      const poses = [...(truth && player?.pose ? [player.pose] : []), ...(player?.held?.world ?? [])];
+      discs.push(...(poses.length ? poses.map((pose) => [pose, 0.3 * reach]) : [[robot.anchor, reach]]));
     }
     this.#frame(discs);
-    this.fitted = false;
+    this.#free();
     this.#redraw();
   }
 
-  #frame(discs) {
+  /** Eases the camera to what the story needs in view; without delay if `now`, in ms, is null. */
+  follow(view, store, pair, now) {
+    this.fitted = false;
+    const { scale, centre } = this.#framed(story_discs({ ...view, truth: view.truth, store }, pair), this.#list_height());
+    const s = now === null ? Infinity : Math.min(now - (this.easing || now - 16), 250) / 1000;
+    const part = 1 - Math.exp(-s / EASE_S);
+    this.scale *= (scale / this.scale) ** part;
+    this.centre = this.centre.map((one, i) => one + part * (centre[i] - one));
+    const off = Math.max(Math.abs(Math.log(scale / this.scale)) * this.width, distance(centre, this.centre) * this.scale);
+    this.easing = off > NEAR_PX ? now : false;
+    if (!this.easing) Object.assign(this, { scale, centre });
+  }
+
+  /** Returns the height in pixels of the list of predicted distances, of which the camera keeps clear. */
+  #list_height() {
+    const over = this.canvas.parentElement.querySelector("#over");
+    return Math.max(over.offsetTop + over.offsetHeight, LIST_PX) / unit() - 12;
+  }
+
+  #frame(discs) { Object.assign(this, this.#framed(discs)); }
+
+  /** Returns the scale and the centre with which `discs` are in view, below the uppermost `top` pixels. */
+  #framed(discs, top = 0) {
     const low = [Infinity, Infinity], high = [-Infinity, -Infinity];
     for (const [[x, y], radius] of discs) {
       low[0] = Math.min(low[0], x - radius); low[1] = Math.min(low[1], y - radius);
@@ -96,8 +143,9 @@ export class Plane {
     }
     const margin = Math.min(28, 0.05 * this.width);
     const wide = Math.max(high[0] - low[0], 1e-6), tall = Math.max(high[1] - low[1], 1e-6);
-    this.scale = Math.min((this.width - 2 * margin) / wide, (this.height - 2 * margin - 24) / tall);
-    this.centre = [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2 - 8 / this.scale];
+    const width = Math.max(this.width - 2 * margin, LEAST_PX), height = Math.max(this.height - 2 * margin - 24 - top, LEAST_PX);
+    const scale = Math.min(width / wide, height / tall);
+    return { scale, centre: [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2 + (top / 2 - 8) / scale] };
   }
 
   at([x, y]) {
@@ -107,7 +155,7 @@ export class Plane {
     ];
   }
 
-  draw(store, { tick, share, focus, truth, moving }) {
+  draw(store, { tick, share, focus, truth, moving, eliminated }) {
     const ratio = (window.devicePixelRatio || 1) * unit();
     const width = Math.round(this.width * ratio), height = Math.round(this.height * ratio);
     if (this.canvas.width !== width || this.canvas.height !== height) {
@@ -117,6 +165,7 @@ export class Plane {
     if (this.fitted) this.fit(store, focus, truth);
     if (this.#revision !== store.revision) {
       this.#trails.forget();
+      this.tints.forget();
       this.#revision = store.revision;
     }
     const look = new Look(getComputedStyle(document.documentElement));
@@ -125,22 +174,39 @@ export class Plane {
     pen.clearRect(0, 0, this.width, this.height);
     pen.lineCap = pen.lineJoin = "round";
     pen.font = look.font;
-    const view = { store, tick, share, focus, truth, moving, look, scene: store.scene(tick) };
+    const view = { store, tick, share, focus, truth, moving, eliminated, look, scene: store.scene(tick) };
+    this.labels = new Labels(pen, look, this.width, this.height, this.#overlays());
     this.#grid(view);
     const shown = (robot) => truth || !focus || robot.id === focus;
     const robots = store.stage.robots.filter(shown);
     for (const robot of robots) this.#anchor(view, robot);
     if (truth) for (const robot of robots) this.#trails.trail(view, robot);
     else for (const robot of robots) this.#trails.believed_trail(view, robot);
-    if (!view.scene) return;
+    if (view.scene) this.#scene(view, robots);
+    this.labels.draw();
+    this.canvas.labels = this.labels.drawn;
+  }
+
+  #scene(view, robots) {
+    const { store, truth, focus } = view;
     const size = Math.max(4.5, Math.min(11, 0.18 * store.stage.mission.sensing_range * this.scale));
     view.size = size;
     view.places = new Map(store.stage.robots.map((robot) => [robot.id, this.#place(view, robot)]));
+    for (const robot of robots) if (robot.role === "a") this.#configurations.draw(view, robot);
     for (const robot of robots) if (!focus || robot.id === focus) this.#beliefs.belief(view, robot);
     for (const robot of robots) this.#signals.anchor_range(view, robot);
     if (truth) for (const robot of robots) if (robot.role === "a") this.#signals.contact(view, robot);
     if (!truth) for (const robot of robots) this.#signals.mutual_ring(view, robot);
     if (truth) for (const robot of robots) this.#robot(view, robot, view.places.get(robot.id));
+  }
+
+  /** Returns the boxes of the texts over the plane, as [left, top, right, bottom]. */
+  #overlays() {
+    const { left, top } = this.canvas.getBoundingClientRect(), scale = unit();
+    return [...this.canvas.parentElement.querySelectorAll("p, ul")].filter((one) => one.textContent && !one.hidden).map((one) => {
+      const box = one.getBoundingClientRect();
+      return [(box.left - left) / scale, (box.top - top) / scale, (box.right - left) / scale, (box.bottom - top) / scale];
+    });
   }
 
   // --- grid and anchors ---
@@ -170,6 +236,7 @@ export class Plane {
     pen.stroke();
     pen.textAlign = "right";
     pen.fillText(unit >= 1 ? `${unit} m` : metres(unit), x - 5, y - 5);
+    this.labels.placed.push([x - Math.max(bar, 60), y - 18, x, y + 4]);
   }
 
   #anchor(view, robot) {
@@ -197,7 +264,7 @@ export class Plane {
     pen.moveTo(x, y - r); pen.lineTo(x + r, y + r * 0.75); pen.lineTo(x - r, y + r * 0.75); pen.closePath();
     pen.fillStyle = look.ink;
     pen.fill();
-    if (reach > 26) label(pen, `anchor of ${robot.id}`, x, y + r + 12, look.faint, "center", look);
+    if (reach > 26) this.labels.put(`anchor of ${robot.id}`, x, y + r + 12, look.faint, "center");
     pen.globalAlpha = 1;
   }
 
@@ -226,8 +293,10 @@ export class Plane {
     pen.strokeStyle = down ? look.robot[robot.role] : look.ink;
     pen.stroke();
     if (down) cross(pen, x, y, size, look);
+    if (size > 6) this.labels.placed.push([x - size, y - size, x + size, y + size]);
     if (size > 6 || down || robot.id === focus) {
-      label(pen, down ? `${robot.id} is down` : robot.id, x + size + 4, y - size - 2, look.ink, "left", look, look.bold);
+      const name = down ? `${robot.id} is down` : robot.id;
+      this.labels.put(name, x + size + 4, y - size - 2, look.ink, "left", { font: look.bold, name: true, around: size + 4 });
     }
     pen.globalAlpha = 1;
   }

@@ -2,13 +2,10 @@
 
 import { distance, TAU } from "./geometry.js";
 import { held_now, leads } from "./held.js";
-import { label } from "./pen.js";
+import { fading } from "./pen.js";
 import { metres } from "./words.js";
 
 const MOST_ORIGINS = 6;
-
-/** Returns the opacity of a range, which fades until the next tick. */
-const fading = (share, moving) => (moving ? Math.max(0, 1 - 1.6 * share) : 1);
 
 export class Signals {
   constructor(plane) { this.plane = plane; }
@@ -38,7 +35,7 @@ export class Signals {
     pen.lineWidth = 1.8;
     pen.stroke();
     if (distance(from, to) > 46) {
-      label(pen, metres(range), (from[0] + to[0]) / 2, (from[1] + to[1]) / 2 - 5, look.range, "center", look);
+      this.plane.labels.put(metres(range), (from[0] + to[0]) / 2, (from[1] + to[1]) / 2 - 5, look.range, "center");
     }
     pen.globalAlpha = 1;
   }
@@ -61,7 +58,7 @@ export class Signals {
     }
     pen.setLineDash([]);
     const [x, y] = this.plane.at(poses[0]);
-    label(pen, `${contact[0]}: ${metres(contact[1])}`, x, y + radius + 14, look.link, "center", look);
+    this.plane.labels.put(`${contact[0]}: ${metres(contact[1])}`, x, y + radius + 14, look.link, "center");
     pen.globalAlpha = 1;
   }
 
@@ -85,7 +82,7 @@ export class Signals {
     }
     if (contact[1] !== null && length > 60) {
       const x = (one[0] + other[0]) / 2 + 16 * across[0], y = (one[1] + other[1]) / 2 + 16 * across[1];
-      label(pen, metres(contact[1]), x, y, look.link, across[0] < 0 ? "right" : "left", look);
+      this.plane.labels.put(metres(contact[1]), x, y, look.link, across[0] < 0 ? "right" : "left", { around: 16 * Math.abs(across[0]) });
     }
     if (length > 3 * size && size > 6) {
       this.#reports(view, robot.id, robot.peer, one, other, across, 3.5);

@@ -1,8 +1,11 @@
-// The page of a sweep: its parameters, one row per cell, and its figures. Trials are not recorded.
+// The page of a sweep: its figures, a map of its cells, and a table. A cell plays its worst trial, which the server runs again.
 
 import { make } from "./cards.js";
+import { heat_map } from "./heat.js";
+import { style } from "./thumbnail.js";
 
 export async function sweep(root) {
+  style();
   const answer = await fetch("/api/sweep"), result = await answer.json();
   root.hidden = false;
   if (!answer.ok) {
@@ -10,29 +13,41 @@ export async function sweep(root) {
     return "Sweep";
   }
   const { name, rows, axes, trials, seed, refused, under_way, folder, figures } = result;
-  const run = rows.reduce((sum, row) => sum + Number(row.trials), 0);
-  const localised = rows.reduce((sum, row) => sum + Number(row.localised), 0);
-  const wrong = rows.reduce((sum, row) => sum + Number(row.wrong), 0);
-  const broken = rows.reduce((sum, row) => sum + Number(row.violations || 0), 0);
+  const sum = (field) => rows.reduce((total, row) => total + Number(row[field] || 0), 0);
   const facts = [
-    ["cells", rows.length || "none finished yet"], ["trials per cell", trials], ["trials run", run],
-    ["localised", localised], ["wrong", wrong], ["violations found", broken], ["seed", seed],
+    ["localised", share(sum("localised"), sum("trials"))], ["wrong", sum("wrong")], ["inconsistent", sum("inconsistent")],
+    ["undecided", sum("undecided")], ["failed", sum("failed")], ["violations found", sum("violations")],
+    ["cells", rows.length || "none finished yet"], ["trials per cell", trials], ["seed", seed],
   ];
   if (Object.keys(refused).length) facts.push(["cells refused", Object.keys(refused).length]);
   root.replaceChildren(
     make("dl", { className: "facts" }, ...facts.map(([what, value]) => make("div", {}, make("dt", { textContent: what }), make("dd", { textContent: value })))),
   );
   if (under_way) root.append(make("p", { className: "note", textContent: "The sweep is running or was stopped. The table shows the cells finished so far." }));
+  const said = make("p", { id: "trial", className: "note" });
+  said.setAttribute("role", "status");
+  if (rows.length) root.append(heat_map(axes, rows, (row, button) => play(row, button, said)), said);
+  root.append(make("div", { className: "figures" }, ...figures.map((figure) => make("figure", {},
+    make("img", { src: `/api/figures/${encodeURIComponent(figure)}`, alt: figure.replace(".svg", "").replaceAll("-", " "), loading: "lazy" })))));
   if (rows.length) root.append(table(rows, axes));
   const cell = String(rows[0]?.cell ?? 0).padStart(3, "0");
-  root.append(
-    make("p", { className: "note" }, "Individual trials are not recorded. Re-run a trial, bit-identically, with the seed of its row in trials.parquet: ",
-      make("code", { textContent: `tandem run ${folder}/cells/${cell}.toml --seed SEED --watch` })),
-    make("div", { className: "figures" }, ...figures.map((figure) => make("figure", {},
-      make("img", { src: `/api/figures/${encodeURIComponent(figure)}`, alt: figure.replace(".svg", "").replaceAll("-", " "), loading: "lazy" })))),
-  );
+  root.append(make("p", { className: "note" }, "Individual trials are not recorded. Re-run a trial, bit-identically, with the seed of its row in trials.parquet: ",
+    make("code", { textContent: `tandem run ${folder}/cells/${cell}.toml --seed SEED --watch` })));
   return name;
 }
+
+/** Has the server run the worst trial of a cell, and goes to its page, where it plays. */
+async function play(row, button, said) {
+  said.textContent = `Running the worst trial of cell ${row.cell} again …`;
+  button.setAttribute("aria-busy", "true");
+  const answer = await fetch(`/api/cells/${row.cell}/worst`, { method: "POST" }).catch(() => null);
+  const result = await answer?.json().catch(() => null) ?? { error: "the server cannot run this trial" };
+  button.removeAttribute("aria-busy");
+  if (result.show) location.hash = `show=${encodeURIComponent(result.show)}`;
+  else said.textContent = result.error;
+}
+
+const share = (part, whole) => (whole ? `${(100 * part / whole).toFixed(1)} % of ${whole}` : "–");
 
 const FIGURES = [
   ["trials", "trials"], ["rate", "localised"], ["ticks_p50", "ticks, median"], ["ticks_p95", "ticks, 95 %"], ["ticks_max", "ticks, maximum"],

@@ -115,7 +115,7 @@ export class Timeline {
         } else {
           pen.fillRect(left, y + (band - inner) / 2, width, inner);
         }
-        if (width > 54) {
+        if (width > 54 && band > 10) {
           pen.fillStyle = value === 3 ? of("paper") : of("faint");
           if (value < 0) pen.fillText("down", left + 5, y + band - 3.5);
           if (value === 3) pen.fillText(`phase ${value}`, left + 5, y + band - 3.5);

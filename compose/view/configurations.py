@@ -1,0 +1,153 @@
+"""The configurations of a pair: the poses of both robots that belong together, and its last manoeuvre."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import msgspec
+
+from compose.recording.run_setup import RunSetup
+from compose.view.pair_data import PairData
+from compose.view.run_data import TickData
+from protocol.messages import Command, Estimate
+from protocol.motion import ORIGIN, Pose, compose, inverse
+
+FITTING_M = 1e-3
+"""The largest difference in m between an exact range and the distance of two poses of one configuration."""
+MOST = 60
+"""The largest number of configurations; with more, there are none.
+
+Robots hold far fewer. The manoeuvres are compared by each pair of configurations: with thousands in a damaged
+recording, or from a hostile publisher, memory would run out.
+"""
+SHOWN_EVERY = 12
+"""Every twelfth turn rate of eq. (8) is shown."""
+
+
+class Reachable(msgspec.Struct, frozen=True):
+    """An end point of the last manoeuvre, relative to the pose before it: x ahead and y to the left, in m."""
+
+    x: float
+    y: float
+    separation_m2: float
+    """J of eq. (8): the smallest difference of the predicted squared ranges of two configurations, in m^2."""
+
+
+class ComparedManoeuvre(msgspec.Struct, frozen=True):
+    """The last manoeuvre that a robot has chosen in this tick, and a selection of those that it compared."""
+
+    robot: str
+    separation_m2: float
+    """J of eq. (8) in m^2 for the chosen manoeuvre."""
+    reachable: tuple[Reachable, ...]
+    """End points with the chosen speed, in the order of their turn rates."""
+
+
+class Configurations(msgspec.Struct, frozen=True, omit_defaults=True):
+    """The possible configurations of a pair: the i-th poses of both robots in the world belong together."""
+
+    robots: tuple[str, str]
+    """The robots of role a and b."""
+    count: int
+    manoeuvre: ComparedManoeuvre | None = None
+
+
+def configurations(setup: RunSetup, before: TickData | None, now: TickData) -> Iterator[Configurations]:
+    """Yield the configurations of each pair whose robots hold the same ones, at most MOST."""
+    for robots in setup.pairs():
+        pair = PairData(robots, setup.mission.noise.exact, before, now)
+        poses = _joined(pair)
+        if poses:
+            manoeuvre = _manoeuvre(pair, setup, poses) if len(poses) > 1 else None
+            yield Configurations((pair.ids[0], pair.ids[1]), len(poses), manoeuvre)
+
+
+def _joined(pair: PairData) -> list[tuple[Pose, Pose]]:
+    """Return the poses of a and b in each configuration; empty if the robots do not hold the same ones.
+
+    With noise, the robots hold the same configurations if these have the same probabilities. Exact poses of a
+    and b belong together if their distance is the range of this tick, or that of the tick before if the
+    robots held as many poses then.
+    """
+    held = [pair.held(robot)[1] for robot in pair.ids]
+    if not _as_many(held) or any(one is not None and len(one.world) > MOST for one in held):
+        return []
+    poses = list(zip(*[one.world for one in held if one is not None], strict=True))
+    earlier = [pair.held(robot)[0] for robot in pair.ids]
+    if not pair.exact:
+        joined = _same(held) or (len(poses) == 1 and _same(earlier))
+        return poses if joined and not any(_outdated(pair, robot) for robot in pair.ids) else []
+    same = _as_many(earlier) and all(
+        one is not None and two is not None and len(one.world) == len(two.world)
+        for one, two in zip(earlier, held, strict=True)
+    )
+    fitting = _fit(pair, pair.now, held) or (same and _fit(pair, pair.before, earlier))
+    return poses if fitting else []
+
+
+def _as_many(held: list[Estimate | None]) -> bool:
+    counts = {len(one.world) if one is not None else 0 for one in held}
+    return len(counts) == 1 and counts != {0}
+
+
+def _outdated(pair: PairData, robot: str) -> bool:
+    """Return whether the robot has driven, but its estimate is still that of the tick before.
+
+    A robot that only drives back into its peer's range under noise does not estimate again until it is there.
+    """
+    earlier, held = pair.held(robot)
+    return pair.drove(robot) and earlier is not None and held is not None and earlier.world == held.world
+
+
+def _same(held: list[Estimate | None]) -> bool:
+    """Return whether noisy estimates have several probabilities, and the same ones."""
+    found = {one.probabilities if one is not None and one.world else () for one in held}
+    return len(found) == 1 and len(next(iter(found))) > 1
+
+
+def _fit(pair: PairData, data: TickData | None, held: list[Estimate | None]) -> bool:
+    contact = pair.contact(data)
+    if contact is None or contact.range is None:
+        return False
+    a, b = [one.world for one in held if one is not None]
+    distances = [math.hypot(p.x - q.x, p.y - q.y) for p, q in zip(a, b, strict=True)]
+    return all(abs(distance - contact.range) < FITTING_M for distance in distances)
+
+
+def _manoeuvre(pair: PairData, setup: RunSetup, poses: list[tuple[Pose, Pose]]) -> ComparedManoeuvre | None:
+    """Return the last manoeuvre that a robot of the pair has begun, compared as its planner compares it."""
+    for robot in pair.ids:
+        command = pair.commands(robot)[1]
+        if command is not None and pair.begins(robot, "last-manoeuvre"):
+            return _compared(robot, command, setup, poses, robot == pair.ids[0])
+    return None
+
+
+def _compared(
+    robot: str, command: Command, setup: RunSetup, poses: list[tuple[Pose, Pose]], moves_a: bool
+) -> ComparedManoeuvre | None:
+    from agent.estimation.closed_forms import Placement  # noqa: PLC0415  # numpy, for few ticks only
+    from agent.planning.phase3_last_manoeuvre import Question, compared  # noqa: PLC0415
+    from agent.planning.registry import SHIPPED  # noqa: PLC0415
+
+    planner = SHIPPED.get(setup.planner_name)
+    manoeuvres = planner().suited(setup.mission).MANOEUVRES if planner is not None else None
+    if manoeuvres is None:
+        return None
+    relative = [compose(inverse(b), a) for a, b in poses]
+    places = tuple([Placement(one.heading, one.x, one.y) for one in relative])
+    ways = compared(Question("a" if moves_a else "b", ORIGIN, ORIGIN, places), setup.mission, manoeuvres)
+    row = int(abs(ways.reach.v[:, 0] - command.v).argmin())
+    column = int(abs(ways.reach.omega - command.omega).argmin())
+    columns = range(0, len(ways.reach.omega), SHOWN_EVERY)
+    return ComparedManoeuvre(
+        robot,
+        float(ways.gap[row, column]),
+        tuple(
+            [
+                Reachable(float(ways.reach.x[row, i]), float(ways.reach.y[row, i]), float(ways.gap[row, i]))
+                for i in columns
+            ]
+        ),
+    )

@@ -1,0 +1,60 @@
+"""The numbers of one robot in one tick that viewers plot over time."""
+
+from __future__ import annotations
+
+import msgspec
+from msgspec import UNSET, UnsetType
+
+from compose.view.outlines import SIGMAS
+from compose.view.scene import Player
+from world.referee import errors
+
+
+class Numbers(msgspec.Struct, frozen=True):
+    """The numbers of one robot in one tick. A number that is unknown in this tick is absent."""
+
+    hypotheses: int | UnsetType = UNSET
+    """The number of poses that the robot considers possible."""
+    probability: float | UnsetType = UNSET
+    """The probability of the first of them."""
+    position_error_m: float | UnsetType = UNSET
+    """The distance of the first pose in the world frame from the true position."""
+    position_bound_m: float | UnsetType = UNSET
+    """SIGMAS times the robot's standard deviation of that position."""
+    anchor_range_m: float | UnsetType = UNSET
+    mutual_range_m: float | UnsetType = UNSET
+
+    @staticmethod
+    def of(player: Player) -> Numbers:
+        """Return the numbers of a robot's scene."""
+        held = player.held
+        hypotheses = held.world or held.local if held is not None else ()
+        first = held.world[0] if held is not None and held.world else None
+        covariance = held.covariance if first is not None and held is not None else None
+        ranges = [contact.range for contact in player.contacts if contact.range is not None]
+        probability: float | UnsetType = UNSET
+        if held is not None and hypotheses:
+            probability = held.probability[0] if held.probability else 1.0 / len(hypotheses)
+        return Numbers(
+            hypotheses=len(hypotheses) if held is not None else UNSET,
+            probability=probability,
+            position_error_m=errors(first, player.pose)[0] if first and player.pose else UNSET,
+            position_bound_m=SIGMAS * covariance.position_sigma if covariance is not None else UNSET,
+            anchor_range_m=player.anchor_range if player.anchor_range is not None else UNSET,
+            mutual_range_m=ranges[0] if ranges else UNSET,
+        )
+
+    def encode(self) -> bytes:
+        """Return the numbers as a JSON object."""
+        return msgspec.json.encode(self)
+
+
+HYPOTHESES, RANGES = "Hypotheses", "Ranges, m"
+PLOTS: dict[str, tuple[str, ...]] = {
+    HYPOTHESES: ("hypotheses",),
+    "Error and 3 sigma, m": ("position_error_m", "position_bound_m"),
+    RANGES: ("anchor_range_m", "mutual_range_m"),
+}
+"""The plots of a viewer: the title of each, and its numbers."""
+PLOTTED = 6
+"""The largest number of robots that are plotted: with more, no curve can be followed."""

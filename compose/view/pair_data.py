@@ -1,0 +1,62 @@
+"""The data of one pair of robots in a tick and in the one before."""
+
+from __future__ import annotations
+
+import msgspec
+
+from compose.recording.run_setup import RobotSetup
+from compose.view.deliveries import contact_of
+from compose.view.run_data import TickData
+from protocol.messages import Command, Contact, Estimate
+from protocol.motion import REST
+
+
+class PairData(msgspec.Struct, frozen=True):
+    """The robots of a pair, or one whose peer is unknown, with their data."""
+
+    robots: tuple[RobotSetup, ...]
+    """The robot of role a first."""
+    exact: bool
+    """True if sensors are exact."""
+    before: TickData | None
+    """The data of the tick before; None if it is unknown."""
+    now: TickData
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """The ids of the robots."""
+        return tuple([robot.id for robot in self.robots])
+
+    def contact(self, data: TickData | None) -> Contact | None:
+        """Return the contact of the pair in `data`, as one of its robots observes it."""
+        found = [contact_of(data, robot.id, robot.peer) for robot in self.robots] if data is not None else []
+        return next((one for one in found if one is not None), None)
+
+    def held(self, robot: str) -> tuple[Estimate | None, Estimate | None]:
+        """Return the robot's estimates of the tick before and of this one."""
+        earlier = self.before.estimates.get(robot) if self.before is not None else None
+        return earlier, self.now.estimates.get(robot)
+
+    def commands(self, robot: str) -> tuple[Command | None, Command | None]:
+        """Return the robot's commands of the tick before and of this one."""
+        earlier = self.before.commands.get(robot) if self.before is not None else None
+        return earlier, self.now.commands.get(robot)
+
+    def drove(self, robot: str) -> bool:
+        """Return whether the robot has driven since the tick before."""
+        observation = self.now.observations.get(robot)
+        return observation is not None and observation.executed not in (None, REST)
+
+    def begins(self, robot: str, state: str) -> bool:
+        """Return whether the robot's command begins a manoeuvre of one tick with the name `state`.
+
+        A robot that has not driven since its command of the tick before repeats it, and begins nothing.
+        """
+        earlier, command = self.commands(robot)
+        begun = earlier is not None and earlier.state == state and not self.drove(robot)
+        return command is not None and command.state == state and not begun
+
+    def state(self, robot: str) -> str | None:
+        """Return the state of the robot's command of this tick."""
+        command = self.now.commands.get(robot)
+        return command.state if command is not None else None

@@ -1,0 +1,35 @@
+// The camera of guided play: the whole pair during the search, and all that counts from the encounter on.
+
+import { compose, frame_of } from "./geometry.js";
+
+const AROUND = 0.25; // of the sensing range, around each pose
+
+/** Returns the discs [position, radius] of the scenario: the anchors of `robots` with their ranges and orbits. */
+export function scenario_discs(robots, sensing_range) {
+  return robots.map((robot) => [robot.anchor, Math.max(sensing_range, robot.orbit[0])]);
+}
+
+/**
+ * Returns the discs that the story needs in view in this tick.
+ *
+ * From the encounter on, these are the robots and all poses that they consider possible, now and in the next tick, and
+ * those that are being ruled out. Once the pair has finished, these are all pairs.
+ */
+export function story_discs({ store, tick, focus, truth, eliminated }, pair) {
+  const { robots, mission: { sensing_range } } = store.stage;
+  const finished = pair.every((robot) => store.player(tick - 1, robot.id)?.command?.verdict);
+  if (finished && truth && robots.length > pair.length) return scenario_discs(robots, sensing_range);
+  const shown = truth || !focus ? pair : pair.filter((robot) => robot.id === focus);
+  const discs = scenario_discs(shown, sensing_range);
+  if (!pair.some((robot) => store.phase(tick, robot.id) === 3)) return discs;
+  const poses = [];
+  for (const robot of shown) {
+    const ticks = [tick, tick + 1, ...(eliminated < 1 ? [tick - 1] : [])];
+    const players = ticks.map((k) => store.player(k, robot.id));
+    if (truth) poses.push(...players.map((player) => player?.pose).filter(Boolean));
+    for (const player of players) poses.push(...(player?.held?.world ?? []));
+    const held = store.player(tick, robot.id)?.held;
+    if (!truth && held && !held.world.length) poses.push(...held.local.map((local) => compose(frame_of(robot, truth), local)));
+  }
+  return poses.length ? poses.map((pose) => [pose, AROUND * sensing_range]) : discs;
+}

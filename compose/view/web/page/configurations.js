@@ -1,0 +1,124 @@
+// The configurations of a pair: each in its tint, joined by a line, with the distance that it predicts as a circle
+// around the robot that drives, and the manoeuvres between which that robot has chosen.
+
+import { compose, distance, step, TAU } from "./geometry.js";
+import { held_now } from "./held.js";
+import { joined, poses_of } from "./tints.js";
+
+const MOST = 12; // configurations that are drawn
+const THICK = 5; // the width in pixels of the reachable arc where J is largest
+
+/**
+ * Returns the configurations to show, of the pair of `robot` of role a.
+ *
+ * While a range rules some out, these are those of the tick before, after the drive: they are crossed out in the order
+ * of the distances that they predict, the most wrong first.
+ */
+export function shown(view, robot, tints) {
+  const { store, tick, eliminated } = view, pair = [robot.id, robot.peer], scene = store.scene(tick);
+  const now = joined(scene, robot.id), before = joined(store.scene(tick - 1), robot.id);
+  const measured = store.player(tick, robot.id)?.contacts?.[0]?.[1] ?? null;
+  const left = tints.of(store, tick, robot.id);
+  if (before && eliminated < 1 && before.count > (now?.count ?? 0)) {
+    const had = tints.of(store, tick - 1, robot.id), { period } = store.stage.mission;
+    const driven = pair.map((id) => store.player(tick, id)?.executed ?? [0, 0]);
+    const all = poses_of(store, tick - 1, pair).map((poses, i) => {
+      const [a, b] = poses.map((pose, r) => step(pose, ...driven[r], period));
+      return { tint: had[i], a, b, predicted: distance(a, b), out: false };
+    });
+    const gone = all.filter(({ tint }) => !left.includes(tint));
+    gone.sort((one, other) => Math.abs(other.predicted - measured) - Math.abs(one.predicted - measured));
+    gone.forEach((one, i) => { one.out = eliminated >= (i + 1) / (gone.length + 1); });
+    return { all, measured };
+  }
+  if (!now) return { all: [], measured };
+  const robots = pair.map((id) => store.stage.robots.find((one) => one.id === id));
+  const [a, b] = robots.map((one) => held_now({ ...view, scene, truth: true }, one).poses);
+  return { all: a.map((pose, i) => ({ tint: left[i], a: pose, b: b[i], predicted: distance(pose, b[i]), out: false })), measured };
+}
+
+/** Returns the distances that the configurations of `tick` predict for after the commands of that tick. */
+export function predicted(store, tick, robot, tints) {
+  const { period } = store.stage.mission, pair = [robot.id, robot.peer];
+  const commands = pair.map((id) => store.player(tick, id)?.command);
+  if (commands.some((command) => !command)) return [];
+  return poses_of(store, tick, pair).map((poses, i) => {
+    const [a, b] = poses.map((pose, r) => step(pose, commands[r].v, commands[r].omega, period));
+    return { tint: tints.of(store, tick, robot.id)[i], predicted: distance(a, b), out: false };
+  });
+}
+
+export class Configurations {
+  constructor(plane) { this.plane = plane; }
+
+  /** Draws the lines, circles and arcs of the pair of `robot` of role a. */
+  draw(view, robot) {
+    const { store, scene, tick, look, truth, places, focus } = view, pen = this.plane.context;
+    if (focus && !truth) return;
+    const { all, measured } = shown(view, robot, this.plane.tints), live = all.slice(0, MOST);
+    if (live.length < 2) return;
+    const manoeuvre = joined(scene, robot.id)?.manoeuvre;
+    if (manoeuvre) this.#arc(view, robot, manoeuvre, live);
+    pen.lineWidth = 1.3;
+    for (const { tint, a, b, out } of live) {
+      pen.globalAlpha = out ? 0.25 : 0.9;
+      pen.strokeStyle = look.tint(tint);
+      pen.beginPath();
+      pen.moveTo(...this.plane.at(a)); pen.lineTo(...this.plane.at(b));
+      pen.stroke();
+    }
+    const ruling = view.eliminated < 1 && measured !== null;
+    const driving = view.moving && view.share > 0 && store.player(tick, robot.id)?.contacts?.length;
+    if (ruling || driving) {
+      const mover = this.#mover(store, ruling ? tick - 1 : tick, robot), of_a = mover === robot.id;
+      for (const one of live) {
+        const centre = truth ? places.get(mover) : of_a ? one.a : one.b;
+        if (centre) this.#circle(centre, one.predicted, look.tint(one.tint), one.out ? 0.2 : 0.9, [5, 4]);
+      }
+      const centre = places.get(mover);
+      if (ruling && truth && centre) this.#circle(centre, measured, look.link, 1, [], 2.6);
+    }
+    pen.globalAlpha = 1;
+  }
+
+  /** Returns the robot that makes the last manoeuvre; b if both drive. */
+  #mover(store, tick, robot) {
+    return joined(store.scene(tick), robot.id)?.manoeuvre?.robot ?? robot.peer;
+  }
+
+  #circle(centre, radius, colour, alpha, dash, width = 1.6) {
+    const pen = this.plane.context;
+    pen.globalAlpha = alpha;
+    pen.strokeStyle = colour;
+    pen.lineWidth = width;
+    pen.setLineDash(dash);
+    pen.beginPath();
+    pen.arc(...this.plane.at(centre), radius * this.plane.scale, 0, TAU);
+    pen.stroke();
+    pen.setLineDash([]);
+  }
+
+  /** Draws where the robot can be after the tick: the wider the arc, the larger J; and where it will be. */
+  #arc({ store, tick, look, truth, scene }, robot, { robot: mover, reachable, separation_m2 }, live) {
+    const pen = this.plane.context, { period } = store.stage.mission, { command } = store.player(tick, mover);
+    const player = scene.players[store.places.get(mover)], most = Math.max(separation_m2, 1e-9);
+    const starts = truth && player.pose ? [player.pose] : live.map((one) => (mover === robot.id ? one.a : one.b));
+    for (const start of starts) {
+      const ends = reachable.map(({ x, y }) => this.plane.at(compose(start, [x, y, 0])));
+      pen.globalAlpha = 1;
+      pen.strokeStyle = look.faint;
+      for (let i = 1; i < ends.length; i++) {
+        pen.lineWidth = 0.8 + THICK * Math.min(reachable[i].separation_m2 / most, 1);
+        pen.beginPath();
+        pen.moveTo(...ends[i - 1]); pen.lineTo(...ends[i]);
+        pen.stroke();
+      }
+      const [x, y] = this.plane.at(step(start, command.v, command.omega, period));
+      pen.strokeStyle = look.ink;
+      pen.lineWidth = 2.4;
+      pen.beginPath();
+      pen.moveTo(x - 5, y - 5); pen.lineTo(x + 5, y + 5); pen.moveTo(x + 5, y - 5); pen.lineTo(x - 5, y + 5);
+      pen.stroke();
+    }
+  }
+}

@@ -1,0 +1,137 @@
+// Guided play. Time passes fast between the ticks with captions, the beats, and stops at each caption. A mission of any
+// length takes about a minute.
+
+const SEARCH_S = 6; // phases 1 and 2 together, and again the time after the pair has finished
+const ENCOUNTER_S = 24; // the ticks of phase 3 together
+const LONGEST_TICK_S = { search: 0.25, encounter: 1.5 };
+const MANOEUVRE_S = 2.5;
+const ELIMINATION_S = 3.5;
+const HOLDS_S = 45; // all captions together
+const PASSING = new Set(["report-lost", "process"]); // kinds of captions for which time does not stop
+
+export class Guide {
+  stage(store) {
+    this.store = store;
+    this.beats = [];
+    this.read = 0;
+    this.#span = null;
+  }
+
+  #span;
+
+  /** Discards the captions of `tick` and later, because they have changed. */
+  forget(tick) {
+    this.read = Math.min(this.read, tick);
+    while (this.beats.length && this.beats.at(-1).tick >= tick) this.beats.pop();
+    this.#span = null;
+  }
+
+  /** Returns the robots that the story follows: the pair of the selected robot, or the first one. */
+  pair(focus) {
+    const { robots } = this.store.stage;
+    const chosen = robots.find((robot) => robot.id === focus) ?? robots[0];
+    return robots.filter((robot) => robot === chosen || robot.id === chosen.peer);
+  }
+
+  /** Returns the captions of `tick` about the pair or about all robots. */
+  captions({ tick, focus }) {
+    return this.#about(this.store.scene(tick)?.captions ?? [], focus);
+  }
+
+  #about(captions, focus) {
+    const [one] = this.pair(focus);
+    return captions.filter(({ robots }) => !robots?.length || robots.includes(one.id));
+  }
+
+  #read() {
+    for (; this.read < this.store.whole; this.read++) {
+      const captions = this.store.scene(this.read)?.captions ?? [];
+      if (captions.length) this.beats.push({ tick: this.read, captions });
+    }
+  }
+
+  /** Returns the text to show: the current caption, all captions of the tick if time has stopped, or the latest one. */
+  text(view) {
+    this.#read();
+    const here = this.captions(view), with_truth = ({ text, truth }) => (view.truth && truth ? `${text} ${truth}` : text);
+    if (view.beat !== null && here.length) return with_truth(here[Math.min(view.beat, here.length - 1)]);
+    if (here.length) return here.map(with_truth).join(" ");
+    for (let i = this.beats.length - 1; i >= 0; i--) {
+      if (this.beats[i].tick >= view.tick) continue;
+      const earlier = this.#about(this.beats[i].captions, view.focus).filter(({ kind }) => !PASSING.has(kind));
+      if (earlier.length) return with_truth(earlier.at(-1));
+    }
+    return "";
+  }
+
+  /** Returns how much of the elimination of configurations has been shown in this tick, from 0 to 1. */
+  eliminated(view) {
+    if (view.beat === null) return 1;
+    const here = this.captions(view), place = here.findIndex(({ kind }) => kind === "ruled-out");
+    if (place < 0 || view.beat > place) return 1;
+    return view.beat < place ? 0 : Math.min(1, view.held / this.#hold(here[place], view.focus));
+  }
+
+  /** Passes `s` seconds. Returns false once the story has ended. */
+  advance(view, s) {
+    const { store } = this;
+    this.#read();
+    view.beat ??= 0;
+    for (let left = s; left > 0;) {
+      if (!store.scene(view.tick)) return true; // it is being loaded
+      const here = this.captions(view);
+      if (view.beat < here.length) {
+        const rest = this.#hold(here[view.beat], view.focus) - view.held;
+        if (left < rest) { view.held += left; return true; }
+        left -= rest;
+        view.beat += 1;
+        view.held = 0;
+        continue;
+      }
+      if (view.tick >= store.last) return false;
+      const lasts = this.#lasts(view, here), rest = (1 - view.share) * lasts;
+      if (left < rest) { view.share += left / lasts; return true; }
+      left -= rest;
+      Object.assign(view, { tick: view.tick + 1, share: 0, beat: 0, held: 0 });
+    }
+    return true;
+  }
+
+  /** Returns for how many seconds time stops at a caption: long enough to read it. */
+  #hold({ kind, text, truth }, focus) {
+    if (PASSING.has(kind)) return 0;
+    const seconds = (one) => {
+      const reading = Math.min(1 + 0.03 * (one.text.length + (one.truth?.length ?? 0)), 4.5);
+      return one.kind === "ruled-out" ? Math.max(reading, ELIMINATION_S) : reading;
+    };
+    let all = 0;
+    for (const { captions } of this.beats) {
+      for (const one of this.#about(captions, focus)) all += PASSING.has(one.kind) ? 0 : seconds(one);
+    }
+    return seconds({ kind, text, truth }) * Math.min(1, HOLDS_S / Math.max(all, 1));
+  }
+
+  /** Returns the seconds that the robots drive from this tick to the next. */
+  #lasts({ tick, focus }, captions) {
+    const { store } = this, { from, to } = this.#encounter(focus);
+    if (tick < from || tick >= to) {
+      const ticks = tick < from ? from - store.first : store.last - to;
+      return Math.min(SEARCH_S / Math.max(ticks, 1), LONGEST_TICK_S.search);
+    }
+    const usual = Math.min(ENCOUNTER_S / Math.max(Math.min(to, store.last) - from, 1), LONGEST_TICK_S.encounter);
+    return captions.some(({ kind }) => kind === "manoeuvre") ? Math.max(usual, MANOEUVRE_S) : usual;
+  }
+
+  /** Returns the tick in which the pair's phase 3 begins, and that in which both have a verdict, as far as known. */
+  #encounter(focus) {
+    const { store } = this, pair = this.pair(focus), key = pair[0].id;
+    if (this.#span?.key !== key) this.#span = { key, read: store.first, from: null, to: null };
+    const span = this.#span;
+    for (; span.read < store.whole && span.to === null; span.read++) {
+      const commands = pair.map((robot) => store.player(span.read, robot.id)?.command);
+      if (span.from === null && commands.some((command) => command?.phase === 3)) span.from = span.read;
+      if (commands.every((command) => command?.verdict)) span.to = span.read;
+    }
+    return { from: span.from ?? span.to ?? store.last, to: span.to ?? Infinity };
+  }
+}

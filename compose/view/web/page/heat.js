@@ -1,0 +1,56 @@
+// The map of a sweep's cells: the first axis goes down, the second across; of more axes, one map for each combination.
+
+import { make } from "./cards.js";
+import { SIGNS } from "./thumbnail.js";
+
+const OUTCOMES = ["wrong", "inconsistent", "failed", "undecided"];
+
+/** Returns the maps of `rows`, whose cells are buttons that call `on_cell` with the row and the button. */
+export function heat_map(axes, rows, on_cell) {
+  const by_cell = new Map(rows.map((row) => [Number(row.cell), row]));
+  const [down, across, ...rest] = axes;
+  const maps = combinations(rest).map((chosen) => map(down, across, rest, chosen, axes, by_cell, on_cell));
+  const signs = OUTCOMES.filter((outcome) => rows.some((row) => Number(row[outcome]))).map((outcome) => `${SIGNS[outcome]} ${outcome}`);
+  return make("section", { className: "heat" },
+    make("h2", { textContent: "Share of trials that localised" }),
+    make("p", { className: "note", textContent: `Select a cell to play its worst trial.${signs.length ? ` Signs with numbers of trials: ${signs.join(", ")}.` : ""}` }),
+    ...maps);
+}
+
+function map(down, across, rest, chosen, axes, by_cell, on_cell) {
+  const columns = across ? labels(across) : [""], lines = down ? labels(down) : ["all"];
+  const caption = rest.map((axis, i) => `${title(axis)} ${labels(axis)[chosen[i]]}`).join(", ");
+  const head = make("tr", {}, make("th", { textContent: [down, across].filter(Boolean).map(title).join(" ↓ by ") + (across ? " →" : "") }),
+    ...columns.map((label) => make("th", { scope: "col", textContent: label })));
+  const body = lines.map((label, i) => make("tr", {}, make("th", { scope: "row", textContent: label }),
+    ...columns.map((column, j) => {
+      const place = [...(down ? [i] : []), ...(across ? [j] : []), ...chosen];
+      const row = by_cell.get(place.reduce((index, at, axis) => index * labels(axes[axis]).length + at, 0));
+      return make("td", {}, row ? cell(row, [[down, label], [across, column]], caption, on_cell) : "–");
+    })));
+  return make("div", { className: "wide", tabIndex: 0, role: "group", ariaLabel: caption || "Cells" }, make("table", {},
+    ...(caption ? [make("caption", { textContent: caption })] : []), make("thead", {}, head), make("tbody", {}, ...body)));
+}
+
+function cell(row, axes, caption, on_cell) {
+  if (row.rate === "") return make("span", { textContent: row.refused ? "refused" : "–", title: row.refused || "" });
+  const percent = `${Math.round(100 * Number(row.rate))} %`;
+  const bad = OUTCOMES.filter((outcome) => Number(row[outcome]));
+  const button = make("button", { type: "button", className: "cell" }, make("b", { textContent: percent }),
+    make("span", { textContent: bad.map((outcome) => `${SIGNS[outcome]}${row[outcome]}`).join(" ") }));
+  button.style.setProperty("--share", row.rate);
+  if (Number(row.wrong) || Number(row.violations)) button.classList.add("bad");
+  const where = [caption, ...axes.filter(([axis]) => axis).map(([axis, label]) => `${title(axis)} ${label}`)].filter(Boolean).join(", ");
+  const counts = bad.map((outcome) => `, ${row[outcome]} ${outcome}`).join("");
+  button.ariaLabel = button.title = `Cell ${row.cell}${where && ` (${where})`}: ${percent} of ${row.trials} localised${counts}. Play its worst trial`;
+  button.addEventListener("click", () => on_cell(row, button));
+  return button;
+}
+
+const title = (axis) => axis.name.split(".").at(-1);
+const labels = (axis) => axis.labels ?? axis.values.map((value) => [value].flat().map((one) => one ?? "–").join(", "));
+
+/** Returns all combinations of places on `axes`; one without places if there are no axes. */
+function combinations(axes) {
+  return axes.reduce((found, axis) => found.flatMap((places) => labels(axis).map((_, i) => [...places, i])), [[]]);
+}

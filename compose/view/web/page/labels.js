@@ -1,0 +1,64 @@
+// The labels of the plane, placed so that none overlaps another.
+
+const GAP = 2;
+const LEAST_ALPHA = 0.9;
+
+export class Labels {
+  /** Starts a picture of `width` x `height`; labels keep clear of `obstacles`, [left, top, right, bottom]. */
+  constructor(pen, look, width, height, obstacles) {
+    Object.assign(this, { pen, look, width, height, placed: [...obstacles], asked: [] });
+    /** The drawn labels as { text, box }. */
+    this.drawn = [];
+  }
+
+  /**
+   * Asks for a label at (x, y). Names are placed first; any other label is left out where there is no room for it.
+   *
+   * `align` is "left", "right" or "center"; `around` is the distance to what is labelled, for places on its other sides.
+   */
+  put(text, x, y, colour, align, { font = this.look.font, name = false, around = 0 } = {}) {
+    this.asked.push({ text, x, y, colour, align, font, name, around, alpha: this.pen.globalAlpha });
+  }
+
+  draw() {
+    const { pen } = this;
+    for (const one of [...this.asked].sort((a, b) => b.name - a.name)) {
+      pen.font = one.font;
+      const wide = pen.measureText(one.text).width, tall = Number(/(\d+(\.\d+)?)px/.exec(one.font)[1]);
+      const spot = this.#spots(one, tall).map(([x, y, align]) => ({ x, y, align, box: box_of(x, y, align, wide, tall) }))
+        .find(({ box }) => this.#free(box, one.name));
+      if (!spot) continue;
+      this.placed.push(spot.box);
+      this.drawn.push({ text: one.text, box: spot.box });
+      pen.globalAlpha = Math.max(one.alpha, LEAST_ALPHA);
+      pen.textAlign = spot.align;
+      pen.lineWidth = 3.5;
+      pen.strokeStyle = this.look.paper;
+      pen.strokeText(one.text, spot.x, spot.y);
+      pen.fillStyle = one.colour;
+      pen.fillText(one.text, spot.x, spot.y);
+    }
+    pen.globalAlpha = 1;
+  }
+
+  /** Returns places for a label: where it is asked for, then mirrored, then farther away. */
+  #spots({ x, y, align, around, name }, tall) {
+    const other = { left: "right", right: "left", center: "center" }[align], beside = align === "left" ? -2 * around : 2 * around;
+    const mirrored = align === "center" ? [x, y, align] : [x + beside, y, other];
+    const spots = [[x, y, align], mirrored];
+    for (let row = 1; row <= (name ? 4 : 2); row++) {
+      for (const dy of [row * (tall + GAP), -row * (tall + GAP)]) spots.push([x, y + dy, align], [mirrored[0], y + dy, other]);
+    }
+    return spots;
+  }
+
+  #free([left, top, right, bottom]) {
+    if (left < 0 || top < 0 || right > this.width || bottom > this.height) return false;
+    return this.placed.every(([l, t, r, b]) => right + GAP <= l || r + GAP <= left || bottom + GAP <= t || b + GAP <= top);
+  }
+}
+
+function box_of(x, y, align, wide, tall) {
+  const left = { left: x, center: x - wide / 2, right: x - wide }[align];
+  return [left, y - 0.8 * tall, left + wide, y + 0.25 * tall];
+}

@@ -1,0 +1,248 @@
+"""The captions of a mission say what happened, for every outcome."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+
+import pytest
+from msgspec.structs import replace
+
+from compose.launch import in_process
+from compose.recording.run import Run, read
+from compose.recording.run_setup import RunSetup
+from compose.scenario.scenario_file import load, parse, shipped
+from compose.view.captions import Caption, captions
+from compose.view.recorded import run_data, scenes_of
+from compose.view.run_data import TickData
+from compose.view.scene import Scene
+from protocol.attack import Attack
+from protocol.messages import Contact, Inconsistent, Localised, MissionEnd, Outcome, Undecided
+from tests.commands import SECTION_IV
+from world.scenario import Scenario
+
+Record = Callable[[Scenario], Run]
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Scenario], Run]:
+    """Return a function that runs a scenario; its recording has the robots' estimates."""
+
+    def record(scenario: Scenario) -> Run:
+        folder = tmp_path_factory.mktemp("recorded")
+        in_process.run_mission(scenario, folder)
+        return read(folder)
+
+    return record
+
+
+@pytest.fixture(scope="module")
+def paper_1(recorded: Record) -> Run:
+    return recorded(load("paper-1"))
+
+
+def told(run: Run) -> list[tuple[int, str]]:
+    return [(scene.tick, caption.text) for scene in scenes_of(run) for caption in scene.captions]
+
+
+def test_the_story_of_paper_1_has_a_caption_for_each_of_its_beats(paper_1: Run) -> None:
+    assert told(paper_1) == [
+        (
+            0,
+            "Each robot measures the distance to one beacon, its anchor. "
+            "It knows how far away that is, not where.",
+        ),
+        (
+            5,
+            "Each robot knows its path relative to its anchor, but not on which side of it. "
+            "They drive on circles around their anchors to find each other.",
+        ),
+        (
+            46,
+            "a and b meet. They measure the distance between them, 2.95 m. "
+            "They exchange reports of their paths.",
+        ),
+        (47, "Four configurations of the robots fit what was measured and reported."),
+        (47, "b makes one manoeuvre, chosen so that the four predict distances that differ most."),
+        (48, "With the distance now measured, 2.39 m, only one of the four configurations is left."),
+        (48, "Both are localised."),
+    ]
+    assert scenes_of(paper_1)[-1].captions[-1].truth == "The largest error of a claim is less than 1 µm."
+
+
+def test_under_noise_captions_speak_of_estimates_and_probabilities(recorded: Record) -> None:
+    text = " ".join(text for _, text in told(recorded(load("noisy"))))
+    assert "Each robot has an estimate of its path" in text
+    assert "a drives on a circle around its anchor to find b, which waits near its own." in text
+    assert re.search(r"the most probable with \d\d %\.", text)
+    assert "Both drive to where the next distances are expected to distinguish them" in text
+    assert "only one of the two configurations is left. It is not claimed yet." in text
+    assert text.endswith("Both are localised.")
+
+
+def test_robots_that_lose_contact_are_told_to_meet_again(recorded: Record) -> None:
+    text = [text for _, text in told(recorded(load("noisy", seed=18)))]
+    left = text.index("They have left each other's range.")
+    assert text[left + 1].startswith("a and b are in range of each other again.")
+    assert text[left + 2].startswith("Four configurations of the robots fit now, instead of one")
+
+
+def test_a_detected_attack_is_told_as_a_contradiction_and_named_with_the_truth_only(recorded: Record) -> None:
+    scenario = parse(shipped()["random"].read_text(), "random", seed=1)
+    robots = tuple(
+        replace(one, attack=Attack("scale", 0.5, "orbit") if one.id == "a" else None)
+        for one in scenario.robots
+    )
+    run = recorded(replace(scenario, robots=robots))
+    captions = [caption for scene in scenes_of(run) for caption in scene.captions]
+    assert captions[-2].text.startswith("b finds that the reports of a contradict what it measured: ")
+    assert captions[-1].text.startswith(
+        "The mission ends, because measurements and reports contradict each other: "
+    )
+    assert [one.truth for one in captions if one.truth and "false data" in one.truth] == [
+        "a will report false data about itself.",
+        "a does report false data about itself.",
+    ]
+    assert not any("localised" in one.text or "false data" in one.text for one in captions)
+
+
+def test_what_each_robot_of_a_pair_finds_at_another_time_is_told_of_it_alone(recorded: Record) -> None:
+    run = recorded(load("random", seed=3, faults=["loss=0.5, delay=0..3"]))
+    text = " ".join(text for _, text in told(run))
+    for one in (
+        "A report of a is lost.",
+        "For a, two configurations of the robots fit",
+        "For b, two configurations of the robots fit",
+        "for b, only one of the two configurations is left.",
+        "b claims to know its pose.",
+    ):
+        assert one in text
+
+
+def test_each_pair_of_several_has_its_captions_and_the_end_counts_all(recorded: Record) -> None:
+    robots = "".join(
+        f'[[robot]]\nid = "{role}{i}"\npeer = "{peer}{i}"\nanchor = [{x}, {25.0 * i}]\n'
+        for i in range(2)
+        for role, peer, x in (("a", "b", 0.0), ("b", "a", 10.0))
+    )
+    scenes = scenes_of(recorded(parse(f'name = "four"\nseed = 5\n{SECTION_IV}{robots}', "four")))
+    for pair in (("a0", "b0"), ("a1", "b1")):
+        kinds = [one.kind for scene in scenes for one in scene.captions if one.robots == pair]
+        assert kinds[0] == "ranging"
+        assert any(
+            one.text.startswith(f"{pair[0]} and {pair[1]} are one of 2 pairs. ") for one in scenes[0].captions
+        )
+        assert "contact" in kinds
+        assert "ruled-out" in kinds
+    assert scenes[-1].captions[-1].text == "All 4 robots are localised."
+    assert scenes[-1].captions[-1].robots == ()
+
+
+# --- endings and ticks that paper-1 does not have -----------------------------------------------------
+
+
+def last(run: Run, **changes: object) -> tuple[RunSetup, TickData, TickData]:
+    """Return the setup of a run, and the data of its last two ticks, the last one with `changes`."""
+    assert run.setup is not None
+    ticks = run_data(run).ticks
+    return run.setup, ticks[47], replace(ticks[48], **changes)
+
+
+def with_verdicts(now: TickData, **verdicts: object) -> TickData:
+    commands = {
+        robot: replace(command, verdict=verdicts.get(robot)) for robot, command in now.commands.items()
+    }
+    return replace(now, commands=commands)
+
+
+@pytest.mark.parametrize(
+    ("outcome", "reason", "text"),
+    [
+        ("undecided", "b: too few ranges", "The mission ends undecided: b: too few ranges."),
+        ("wrong", "a is off by 2 m", "The mission ends with a wrong claim: a is off by 2 m."),
+        ("failed", "no answer of b within 30 s", "The mission fails: no answer of b within 30 s."),
+        ("localised", None, "Both are localised."),
+    ],
+)
+def test_only_an_end_that_is_localised_says_so(
+    paper_1: Run, outcome: Outcome, reason: str | None, text: str
+) -> None:
+    setup, before, now = last(paper_1)
+    told = [one.text for one in captions(setup, before, now, (), MissionEnd(48, outcome, reason))]
+    assert told[-1] == text
+    assert ("Both claim to know their poses." in told) == (outcome != "localised")
+
+
+def test_a_robot_that_stops_without_a_claim_is_told_with_its_reason(paper_1: Run) -> None:
+    setup, before, now = last(paper_1)
+    pose = now.commands["b"].verdict
+    assert isinstance(pose, Localised)
+    now = with_verdicts(now, a=Undecided("too few ranges"), b=pose)
+    told = [one.text for one in captions(setup, before, now, (), None)]
+    assert told[-2:] == ["a stops without a claim: too few ranges.", "b claims to know its pose."]
+
+
+def test_a_contradiction_is_not_blamed_on_an_honest_robot(paper_1: Run) -> None:
+    setup, before, now = last(paper_1)
+    now = with_verdicts(now, b=Inconsistent("its path"))
+    told = [one for one in captions(setup, before, now, (), None) if one.kind == "inconsistent"]
+    assert told == [
+        Caption(
+            "inconsistent",
+            "b finds that the reports of a contradict what it measured: its path.",
+            ("a", "b"),
+            "No robot reports false data.",
+        )
+    ]
+
+
+def test_without_a_range_or_an_answer_captions_claim_neither(paper_1: Run) -> None:
+    setup, before, now = last(paper_1)
+    known = run_data(paper_1).ticks
+    dropped = {
+        robot: replace(one, contacts=tuple([Contact(two.peer, None, ()) for two in one.contacts]))
+        for robot, one in known[46].observations.items()
+    }
+    (meeting,) = captions(setup, known[45], replace(known[46], observations=dropped), (), None)
+    assert meeting.text == "a and b meet. The distance between them is not measured in this tick."
+    lacking: tuple[dict[str, object], ...] = (
+        {"commands": {}},
+        {"estimates": {}},
+        {"observations": {}},
+        {"truth": {}},
+    )
+    for missing in lacking:
+        list(captions(setup, before, replace(now, **missing), (), None))
+        list(captions(setup, replace(before, **missing), now, (), None))
+    assert not list(captions(setup, None, TickData(0), (), None))
+
+
+def test_no_configuration_and_more_configurations_are_told(paper_1: Run) -> None:
+    setup, before, now = last(paper_1)
+    held = before.estimates
+    none = {robot: replace(one, world=()) for robot, one in held.items()}
+    assert texts(setup, before, replace(now, estimates=none))[0] == (
+        "No configuration fits what was measured and reported any more."
+    )
+    two = {robot: replace(one, world=one.world[:2]) for robot, one in held.items()}
+    assert texts(setup, replace(before, estimates=two), replace(now, estimates=held))[0] == (
+        "Four configurations of the robots fit now, instead of two."
+    )
+
+
+def texts(setup: RunSetup, before: TickData, now: TickData) -> list[str]:
+    return [one.text for one in captions(setup, before, now, (), None)]
+
+
+def sentences(scenes: tuple[Scene, ...]) -> Iterator[str]:
+    for scene in scenes:
+        for caption in scene.captions:
+            yield caption.text
+            if caption.truth:
+                yield caption.truth
+
+
+def test_every_caption_is_made_of_whole_sentences(paper_1: Run) -> None:
+    for text in sentences(scenes_of(paper_1)):
+        assert text.endswith(".")
+        assert ".." not in text

@@ -1,0 +1,244 @@
+"""Guided play: its time, its captions, its camera and its controls, in a browser with a clock of its own."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from tests.browser import INKS, Open, picture, stop_clock, until_shown
+
+STEP_MS = 250
+"""The time in ms between two frames of the page."""
+BUSY = "document.getElementById('play').getAttribute('aria-label') === 'Pause'"
+NOW = f"""() => [
+  Number(document.body.dataset.tick), document.getElementById('caption').textContent, {BUSY},
+]"""
+
+
+def started(opened: Open, address: str, tick: int = 0, *, reduced: bool = False) -> Page:
+    """Return a page on which guided play has begun. From then on, time passes only by `played`."""
+    page = opened(f"{address}#tick={tick}")
+    page.emulate_media(reduced_motion="reduce" if reduced else "no-preference")
+    until_shown(page, tick)
+    stop_clock(page)
+    page.keyboard.press("Space")
+    return page
+
+
+def played(page: Page, most_s: float = 90.0) -> Iterator[tuple[int, str]]:
+    """Yield the tick and the caption of a page every STEP_MS, until it stops playing."""
+    for _ in range(round(1000 * most_s / STEP_MS)):
+        page.clock.fast_forward(STEP_MS)
+        tick, caption, busy = page.evaluate(NOW)
+        yield tick, caption
+        if not busy:
+            return
+    raise AssertionError(f"the page still plays after {most_s} s")
+
+
+def test_guided_play_tells_paper_1_in_forty_seconds_most_of_them_at_the_encounter(
+    opened: Open, address: str
+) -> None:
+    page = started(opened, address)
+    expect(page.locator("#guide")).to_have_attribute("aria-pressed", "true")
+    seen = list(played(page))
+    told = list(dict.fromkeys(caption for _, caption in seen))
+    assert [re.split(r"[.,]", one)[0] for one in told] == [
+        "Each robot measures the distance to one beacon",
+        "Each robot knows its path relative to its anchor",
+        "a and b meet",
+        "Four configurations of the robots fit what was measured and reported",
+        "b makes one manoeuvre",
+        "With the distance now measured",
+        "Both are localised",
+    ]
+    assert 25.0 < 0.001 * STEP_MS * len(seen) < 40.0
+    assert sum(tick >= 46 for tick, _ in seen) > 0.5 * len(seen)
+    assert seen[-1][0] == 48
+
+
+LONG = """async ([encounter, last, captions]) => {
+  const { Guide } = await import('/page/guide.js');
+  const robots = [{ id: 'a', role: 'a', peer: 'b' }, { id: 'b', role: 'b', peer: 'a' }];
+  const scene = (tick) => ({ tick, captions: captions[tick] ?? [] });
+  const store = {
+    stage: { robots }, first: 0, last, whole: last + 1, scene,
+    player: (tick) => ({ command: { phase: tick < encounter ? 2 : 3, verdict: null } }),
+  };
+  const guide = new Guide(), view = { tick: 0, share: 0, beat: null, held: 0, focus: null, truth: true };
+  guide.stage(store);
+  const ticks = [];
+  while (guide.advance(view, 0.1)) { guide.text(view); ticks.push(view.tick); }
+  return ticks;
+}"""
+
+
+def test_guided_play_of_thousands_of_ticks_takes_about_a_minute(opened: Open, address: str) -> None:
+    """There is a caption in every third tick of the encounter."""
+    page = opened(address)
+    told = [{"kind": "ruled-out", "text": "x" * 90, "robots": ["a", "b"]}]
+    encounter, last = 6000, 6600
+    captions = dict.fromkeys(range(encounter, last, 3), told)
+    ticks = page.evaluate(LONG, [encounter, last, captions])
+    assert 60.0 < 0.1 * len(ticks) < 80.0
+    assert 50 < sum(tick < encounter for tick in ticks) < 70
+
+
+@pytest.mark.long
+def test_the_camera_follows_the_story_until_it_is_moved(opened: Open, address: str) -> None:
+    page = started(opened, address, 44)
+    camera = page.locator("#camera")
+    for tick, _ in played(page):
+        if tick == 47:
+            break
+    expect(camera).to_have_attribute("aria-pressed", "true")
+    page.keyboard.press("Space")
+    settle(page)
+    near = picture_now(page)
+    page.keyboard.press("w")
+    page.clock.fast_forward(STEP_MS)
+    expect(camera).to_have_attribute("aria-pressed", "false")
+    assert picture_now(page) != near
+    page.keyboard.press("Space")
+    page.clock.fast_forward(STEP_MS)
+    expect(camera).to_have_attribute("aria-pressed", "false")
+    page.keyboard.press("Space")
+    page.keyboard.press("c")
+    settle(page)
+    expect(camera).to_have_attribute("aria-pressed", "true")
+    assert picture_now(page) == near
+
+
+def settle(page: Page) -> None:
+    """Let enough time pass for the camera to arrive."""
+    for _ in range(20):
+        page.clock.fast_forward(STEP_MS)
+
+
+def picture_now(page: Page) -> str:
+    """Return the canvas as a data URL; unlike `picture`, it does not wait for the clock."""
+    return str(page.evaluate("document.getElementById('canvas').toDataURL()"))
+
+
+DISCS = """async () => {
+  const { story_discs } = await import('/page/camera.js');
+  const [{ name }] = await new Promise((done) => {
+    const source = new EventSource('/api/news');
+    source.onmessage = ({ data }) => { source.close(); done(JSON.parse(data).list.shows); };
+  });
+  const { stage } = await (await fetch(`/api/shows/${name}`)).json();
+  const { scenes } = await (await fetch(`/api/shows/${name}/scenes?from=0&to=48`)).json();
+  const player = (tick, robot) => scenes[tick]?.players.find((one) => one.robot === robot);
+  const phase = (tick, robot) => player(tick, robot)?.command?.phase ?? 1;
+  const view = { store: { stage, player, phase }, share: 0, focus: null, truth: true };
+  return [[46, 1], [47, 1], [48, 0], [48, 1]].map(([tick, eliminated]) => {
+    const inside = ([x, y]) => story_discs({ ...view, tick, eliminated }, stage.robots).some(
+      ([at, radius]) => Math.hypot(x - at[0], y - at[1]) < radius
+    );
+    const shown = (k) => scenes[k].players.flatMap((one) => one.held.world).filter(inside).length;
+    return [shown(47), shown(48)];
+  });
+}"""
+
+
+def test_the_camera_keeps_every_hypothesis_in_view_and_those_being_ruled_out(
+    opened: Open, address: str
+) -> None:
+    ahead, with_four, ruling_out, after = opened(address).evaluate(DISCS)
+    assert ahead[0] == 8
+    assert with_four == ruling_out == [8, 2]
+    assert after[1] == 2
+    assert after[0] < 8
+
+
+FINISHED = """async (verdicts) => {
+  const { story_discs } = await import('/page/camera.js');
+  const robots = ['a0', 'b0', 'a1', 'b1'].map((id, i) => ({ id, anchor: [10 * i, 0], orbit: [6.5] }));
+  const player = (tick, robot) => ({
+    pose: [1, 2, 0], command: { phase: 3, verdict: verdicts.includes(robot) ? ['localised'] : null },
+  });
+  const store = { stage: { robots, mission: { sensing_range: 3 } }, player, phase: () => 3 };
+  const view = { store, tick: 5, focus: null, truth: true, eliminated: 1 };
+  return story_discs(view, robots.slice(0, 2)).map(([at]) => at[0]);
+}"""
+
+
+def test_once_its_pair_has_finished_the_camera_shows_all_pairs(opened: Open, address: str) -> None:
+    page = opened(address)
+    assert set(page.evaluate(FINISHED, ["a0"])) == {1}
+    assert page.evaluate(FINISHED, ["a0", "b0"]) == [0, 10, 20, 30]
+
+
+def test_the_camera_recovers_from_a_window_too_low_for_a_picture(opened: Open, address: str) -> None:
+    page = started(opened, address, 46)
+    for height in (170, 800):
+        page.set_viewport_size({"width": 1000, "height": height})
+        for _ in range(20):
+            page.clock.fast_forward(STEP_MS)
+            picture_now(page)
+    assert page.evaluate(INKS)["robot-b"] > 60
+
+
+@pytest.mark.long
+def test_guided_play_can_be_left_and_entered_by_keys_and_buttons(opened: Open, address: str) -> None:
+    page = opened(address)
+    until_shown(page, 0)
+    guide = page.locator("#guide")
+    for action, pressed in (
+        (lambda: page.keyboard.press("g"), "false"),
+        (lambda: page.keyboard.press("g"), "true"),
+        (lambda: page.locator("#speed").select_option("10"), "false"),
+        (guide.click, "true"),
+        (lambda: page.keyboard.press("]"), "false"),
+    ):
+        action()
+        expect(guide).to_have_attribute("aria-pressed", pressed)
+    expect(page.locator("#speed")).to_have_value("20")
+    before = picture(page)
+    page.keyboard.press("Space")
+    until_shown(page, 48)
+    expect(page.locator("#camera")).to_have_attribute("aria-pressed", "false")
+    page.keyboard.press("Home")
+    until_shown(page, 0)
+    assert picture(page) == before  # a plain speed leaves the camera where it is
+
+
+@pytest.mark.long
+def test_captions_are_announced_while_the_story_is_played_and_events_otherwise(
+    opened: Open, address: str
+) -> None:
+    page = started(opened, address, 44)
+    caption, live = page.locator("#caption"), page.locator("#live")
+    page.clock.fast_forward(STEP_MS)
+    expect(caption).to_have_attribute("aria-live", "polite")
+    said = live.text_content()
+    for tick, _ in played(page):
+        if tick == 46:
+            break
+    assert live.text_content() == said
+    page.keyboard.press("Space")
+    settle(page)
+    expect(caption).to_have_attribute("aria-live", "off")
+    expect(live).to_contain_text("Tick 46. a and b are in range of each other")
+
+
+@pytest.mark.long
+def test_with_reduced_motion_nothing_moves_between_two_ticks(opened: Open, address: str) -> None:
+    page = started(opened, address, 44, reduced=True)
+    pictures: dict[tuple[int, str], set[str]] = {}
+    for tick, caption in played(page):
+        if tick >= 46:
+            pictures.setdefault((tick, caption), set()).add(picture_now(page))
+    assert {tick for tick, _ in pictures} == {46, 47, 48}
+    assert all(len(found) == 1 for (tick, _), found in pictures.items() if tick < 48)
+
+
+def test_captions_do_not_tell_the_truth_if_it_is_hidden(opened: Open, address: str) -> None:
+    page = opened(f"{address}#tick=48")
+    until_shown(page, 48)
+    expect(page.locator("#caption")).to_contain_text("Both are localised. The largest error of a claim is")
+    page.keyboard.press("t")
+    expect(page.locator("#caption")).to_have_text(re.compile(r"Both are localised\.$"))

@@ -1,0 +1,213 @@
+"""Configurations on the page: their tints, the distances that they predict, and labels that are apart."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from itertools import combinations
+from typing import Any
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from compose.launch import in_process
+from compose.scenario.scenario_file import load
+from compose.view.web.standalone import PAGE
+from tests.browser import INKS, SCRUB, Open, inks, picture, stop_clock, until_shown, watching
+from tests.series import series
+
+STEP_MS = 250
+
+
+@pytest.fixture(scope="module")
+def noisy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Yield the address of the page on the recording of noisy."""
+    folder = tmp_path_factory.mktemp("noisy")
+    in_process.run_mission(load("noisy"), folder)
+    with watching(folder) as (_, found):
+        yield found
+
+
+# --- labels -------------------------------------------------------------------------------------------
+
+BOXES = """() => {
+  const canvas = document.getElementById('canvas'), { left, top } = canvas.getBoundingClientRect();
+  const texts = [...canvas.parentElement.querySelectorAll('p, ul')];
+  const over = texts.filter((one) => one.textContent && !one.hidden).map((one) => {
+    const box = one.getBoundingClientRect();
+    return { text: one.id, box: [box.left - left, box.top - top, box.right - left, box.bottom - top] };
+  });
+  return [...canvas.labels, ...over];
+}"""
+
+
+def overlapping(page: Page) -> list[tuple[str, str]]:
+    """Return the pairs of labels and texts over the plane whose boxes overlap."""
+    boxes: list[dict[str, Any]] = page.evaluate(BOXES)
+    found = []
+    for one, other in combinations(boxes, 2):
+        (left, top, right, bottom), (l2, t2, r2, b2) = one["box"], other["box"]
+        if left < r2 and l2 < right and top < b2 and t2 < bottom:
+            found.append((one["text"], other["text"]))
+    return found
+
+
+SIZES = [(1280, 720), (390, 844), (800, 600), (1600, 1000)]
+
+
+@pytest.mark.parametrize("size", series(SIZES, 1), ids=str)
+def test_no_label_of_paper_1_overlaps_another(size: tuple[int, int], opened: Open, address: str) -> None:
+    page = opened(address, width=size[0], height=size[1])
+    for tick in (0, 5, 20, 46, 47, 48):
+        page.locator("#scrub").evaluate(SCRUB, tick)
+        until_shown(page, tick)
+        for near in ("f", "n"):
+            page.keyboard.press(near)
+            picture(page)
+            assert not overlapping(page), tick
+            assert {"a", "b"} <= {
+                one["text"] for one in page.evaluate("document.getElementById('canvas').labels")
+            }
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("size", SIZES, ids=str)
+def test_no_label_under_noise_overlaps_another(size: tuple[int, int], opened: Open, noisy: str) -> None:
+    page = opened(noisy, width=size[0], height=size[1])
+    for tick in (3, 15, 16, 20):
+        page.locator("#scrub").evaluate(SCRUB, tick)
+        until_shown(page, tick)
+        for key in ("n", "t"):
+            page.keyboard.press(key)
+            picture(page)
+            assert not overlapping(page), (tick, key)
+
+
+# --- tints --------------------------------------------------------------------------------------------
+
+
+def test_tints_circles_and_orbits_stand_out_in_both_themes() -> None:
+    themes = (PAGE / "style.css").read_text("utf-8").split("@media (prefers-color-scheme: dark)")
+    for theme in themes[0], themes[1].split("box-sizing")[0]:
+        colours = dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6});", theme))
+        assert min(contrast(colours[f"tint-{i}"], colours["paper"]) for i in range(1, 7)) > 4.5
+        assert contrast(colours["faint"], colours["soft"]) > 4.5
+        assert min(contrast(colours[name], colours["paper"]) for name in ("ring", "orbit")) > 3.0
+
+
+def contrast(one: str, other: str) -> float:
+    """Return the contrast ratio of two colours, as WCAG defines it."""
+    dark, light = sorted([luminance(one), luminance(other)])
+    return (light + 0.05) / (dark + 0.05)
+
+
+def luminance(colour: str) -> float:
+    """Return the relative luminance of a colour, as WCAG defines it."""
+    parts = [int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5)]
+    linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+@pytest.mark.long
+def test_a_first_range_is_a_circle_on_which_the_robot_may_be(opened: Open, address: str) -> None:
+    page = opened(f"{address}#tick=0")
+    until_shown(page, 0)
+    first = inks(page)["ghost"]
+    page.keyboard.press("ArrowRight")
+    until_shown(page, 1)
+    page.keyboard.press("ArrowRight")
+    until_shown(page, 2)  # a has no range here, and b knows its path
+    assert first > 300 > inks(page)["ghost"]
+
+
+@pytest.mark.long
+def test_each_configuration_of_paper_1_has_its_tint_and_the_last_one_keeps_it(
+    opened: Open, address: str
+) -> None:
+    page = opened(f"{address}#tick=46")
+    shown = {}
+    for tick in (46, 47, 48):
+        page.locator("#scrub").evaluate(SCRUB, tick)
+        until_shown(page, tick)
+        drawn = inks(page)
+        shown[tick] = [drawn[f"tint-{i}"] > 60 for i in range(1, 5)]
+    assert shown == {46: [False] * 4, 47: [True] * 4, 48: [True, False, False, False]}
+
+
+TINTS = """async (ticks) => {
+  const { Tints } = await import('/page/tints.js');
+  const scenes = ticks.map(([a, b], tick) => ({
+    tick, configurations: [{ robots: ['a', 'b'], count: a.length }],
+    players: [a, b].map((world) => ({ executed: [1, 0], held: { world: world.map(([x, y]) => [x, y, 0]) } })),
+  }));
+  const store = {
+    first: 0, whole: scenes.length, scene: (tick) => scenes[tick],
+    stage: { mission: { period: 1, sensing_range: 3 } },
+    player: (tick, robot) => scenes[tick].players['ab'.indexOf(robot)],
+  };
+  return scenes.map((_, tick) => new Tints().of(store, tick, 'b'));
+}"""
+
+
+def test_a_configuration_keeps_its_tint_though_its_place_changes(opened: Open, address: str) -> None:
+    """Each robot drives 1 m along x; under noise, the order is that of the probabilities."""
+    far = [5, 5]
+    ticks = [
+        [[[0, 0], far], [[1, 1], [6, 6]]],
+        [[[6, 5], [1.1, 0]], [[7, 6], [2, 1]]],
+        [[[2.1, 0], [0, -5], [7, 5]], [[3, 1], [0, -4], [8, 6]]],
+        [[[8, 5]], [[9, 6]]],
+    ]
+    assert opened(address).evaluate(TINTS, ticks) == [[0, 1], [1, 0], [0, 2, 1], [1]]
+
+
+# --- predicted distances ------------------------------------------------------------------------------
+
+
+def test_the_predicted_distances_and_j_of_the_last_manoeuvre_are_listed(opened: Open, address: str) -> None:
+    page = opened(f"{address}#tick=47")
+    until_shown(page, 47)
+    listed = page.locator("#predictions li")
+    expect(listed).to_have_text(
+        ["predicted distances", "1: 2.39 m", "2: 2.75 m", "3: 1.14 m", "4: 3.06 m", "J = 1.80 m²"]
+    )
+    page.keyboard.press("ArrowLeft")
+    expect(page.locator("#predictions")).to_be_hidden()
+
+
+def test_the_measured_range_rules_configurations_out_one_by_one_the_worst_first(
+    opened: Open, address: str
+) -> None:
+    page = opened(f"{address}#tick=47")
+    until_shown(page, 47)
+    stop_clock(page)
+    page.keyboard.press("Space")
+    out: list[list[str]] = []
+    for _ in range(200):
+        page.clock.fast_forward(STEP_MS)
+        found = page.locator("#predictions .out").all_text_contents()
+        if not out or out[-1] != found:
+            out.append(found)
+        if len(found) == 3:
+            break
+        assert not overlapping(page)
+    assert [len(found) for found in out] == [0, 1, 2, 3]
+    assert out[1] == ["3: 1.14 m"]
+    assert out[2] == ["3: 1.14 m", "4: 3.06 m"]
+    expect(page.locator("#predictions .measured")).to_have_text("measured 2.39 m")
+
+
+@pytest.mark.long
+def test_the_predicted_distances_are_circles_while_the_robot_drives(opened: Open, address: str) -> None:
+    page = opened(f"{address}#tick=47")
+    until_shown(page, 47)
+    tints = [f"tint-{i}" for i in range(1, 5)]
+    before = inks(page)
+    stop_clock(page)
+    page.keyboard.press("Space")
+    most = dict(before)
+    while page.locator("body").get_attribute("data-tick") == "47":
+        page.clock.fast_forward(STEP_MS)
+        drawn = page.evaluate(INKS)
+        most = {name: max(most[name], drawn[name]) for name in most}
+    assert all(most[tint] > before[tint] + 200 for tint in tints)

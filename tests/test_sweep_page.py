@@ -1,0 +1,130 @@
+"""The page of a sweep: a map of its cells, from which the worst trial of a cell is played, and thumbnails."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Route, expect
+
+from compose.errors import UserError
+from compose.launch import in_process
+from compose.recording.run import read
+from compose.scenario.scenario_file import load
+from compose.view.outlines import box
+from compose.view.recorded import run_data
+from compose.view.web.thumbnail import HEIGHT, WIDTH, thumbnail
+from compose.view.web.trials import Trials
+from tests.browser import Open, shot, watching
+from tests.commands import BOUND_S, TandemProcess
+
+COLUMNS = (
+    "cell,way,mission.max_speed,trials,localised,undecided,inconsistent,wrong,failed,rate,violations,refused"
+)
+ROWS = (
+    "0,lossless,0.5,4,4,0,0,0,0,1.0,0,",
+    "1,lossless,1,4,3,1,0,0,0,0.75,0,",
+    "2,90 % loss,0.5,4,1,1,0,2,0,0.25,0,",
+    "3,90 % loss,1,0,0,0,0,0,0,,,infeasible",
+)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Return a folder that has what the page reads of a sweep."""
+    axes = [
+        {"name": "way", "fields": ["fault.x"], "labels": ["lossless", "90 % loss"], "values": [[0], [1]]},
+        {"name": "mission.max_speed", "fields": ["mission.max_speed"], "values": [[0.5], [1.0]]},
+    ]
+    sweep = {"name": "ways", "trials": 4, "seed": 1, "axes": axes}
+    (tmp_path / "sweep.json").write_text(json.dumps({"sweep": sweep, "refused": {"3": "infeasible"}}))
+    (tmp_path / "summary.csv").write_text("\n".join([COLUMNS, *ROWS, ""]))
+    return tmp_path
+
+
+def test_the_map_has_each_cell_in_its_place_with_its_outcomes_in_words(opened: Open, folder: Path) -> None:
+    with watching(folder) as (_, where):
+        page = opened(where)
+        cells = page.locator(".heat td")
+        expect(cells).to_have_text(["100 %", "75 %?1", "25 %✕2 ?1", "refused"])
+        expect(page.locator(".heat tbody th")).to_have_text(["lossless", "90 % loss"])
+        expect(page.locator(".heat thead th")).to_have_text(["way ↓ by max_speed →", "0.5", "1"])
+        expect(page.get_by_role("button", name="25 % of 4 localised, 2 wrong, 1 undecided")).to_have_count(1)
+        expect(page.locator(".facts dd").first).to_have_text("66.7 % of 12")
+        shot(page, "sweep-map")
+
+
+@pytest.mark.long
+def test_a_cell_is_played_from_the_keyboard(opened: Open, folder: Path) -> None:
+    asked: list[str] = []
+
+    def answer(route: Route) -> None:
+        asked.append(f"{route.request.method} {route.request.url.rpartition('/api')[2]}")
+        route.fulfill(json={"error": "cell 0 has no trials"})
+
+    with watching(folder) as (_, where):
+        page = opened(where)
+        page.route("**/api/cells/**", answer)
+        expect(page.locator(".cell")).to_have_count(3)
+        for _ in range(3):  # the skip link, the scrolling map, the first cell
+            page.keyboard.press("Tab")
+        expect(page.locator(".cell").first).to_be_focused()
+        page.keyboard.press("Enter")
+        expect(page.locator("#trial")).to_have_text("cell 0 has no trials")
+        assert asked == ["POST /cells/0/worst"]
+
+
+def test_a_cell_that_cannot_be_run_is_one_line(folder: Path) -> None:
+    trials = Trials(folder)
+    with pytest.raises(UserError, match=r"^cell 0 cannot be run: "):
+        trials.worst(0)
+    trials.close()
+
+
+@pytest.mark.long
+def test_a_cell_plays_its_worst_trial_at_once_and_leads_back(opened: Open, tmp_path: Path) -> None:
+    (tmp_path / "speeds.toml").write_text(
+        'name = "speeds"\nscenario = "random"\ntrials = 3\nseed = 1\n'
+        '[[axis]]\nfield = "mission.max_speed"\nvalues = [0.5, 1.0]\n'
+    )
+    words = (
+        "sweep",
+        tmp_path / "speeds.toml",
+        "--out",
+        tmp_path / "out",
+        "--workers",
+        "1",
+        "-q",
+        "--no-audit",
+    )
+    with TandemProcess(*words) as sweep:
+        assert sweep.ended(4 * BOUND_S).status == 0
+    with watching(tmp_path / "out") as (_, where):
+        page = opened(where)
+        page.locator(".cell").last.click()
+        expect(page.locator("#status")).to_contain_text("localised after")
+        expect(page.locator("#play")).to_have_attribute("aria-label", "Pause")
+        assert "#show=cell-1-trial-" in page.url
+        page.locator("#home").click()
+        expect(page.locator(".cell")).to_have_count(2)
+        assert page.url == where
+
+
+@pytest.mark.long
+def test_a_thumbnail_ends_each_path_at_the_robots_last_pose_and_has_few_points(tmp_path: Path) -> None:
+    in_process.run_mission(load("far"), tmp_path)
+    run = read(tmp_path)
+    assert run.setup is not None
+    picture = thumbnail(run.setup, run_data(run))
+    assert len(picture) < 10_000
+    ends = re.findall(r'points="[^"]*?([-0-9.]+),([-0-9.]+)" .*?cx="([-0-9.]+)" cy="([-0-9.]+)"', picture)
+    assert [(x, y) for x, y, _, _ in ends] == [(x, y) for _, _, x, y in ends]
+    assert len(ends) == 2
+    last = run.ticks[-1].truth.poses
+    (a, b) = [(float(x), float(y)) for x, y, _, _ in ends]
+    shown = box(run.setup)
+    scale = min(WIDTH / shown.width, HEIGHT / shown.height) * 0.96
+    assert a[0] - b[0] == pytest.approx((last[0].x - last[1].x) * scale, abs=0.2)
+    assert a[1] - b[1] == pytest.approx((last[1].y - last[0].y) * scale, abs=0.2)
