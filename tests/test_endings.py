@@ -7,6 +7,8 @@ import os
 import re
 import signal
 import socket
+import sys
+import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -20,7 +22,7 @@ from compose.launch.processes import free_endpoint
 from compose.launch.supervisor import Supervisor
 from compose.launch.viewers import Viewer, stay
 from protocol.network.diagnosis import MUTE
-from protocol.network.inbox import Arrival, Inbox
+from protocol.network.inbox import Arrival, Inbox, Interrupted
 from tests.commands import (
     ENDLESS,
     LONG,
@@ -105,6 +107,28 @@ def test_an_interrupted_run_reports_it_and_leaves_no_process(
         ended = run.ended(AT_ONCE_S)
     assert ended == (130, "", f"tandem run: stopped by {number.name}\n")
     assert not processes_of(out)
+
+
+def test_a_signal_that_does_not_interrupt_a_wait_ends_it_all_the_same() -> None:
+    inbox = Inbox("the test")
+    main = threading.main_thread().ident
+    before = signal.signal(signal.SIGUSR1, lambda *_: inbox.put("stop", "SIGUSR1"))
+
+    def waits() -> bool:
+        return sys._current_frames()[main or 0].f_code is Inbox._queued.__code__
+
+    def take() -> None:  # the main thread is not interrupted, as if the signal came just before its wait
+        until(waits, "the main thread waits")
+        signal.raise_signal(signal.SIGUSR1)
+
+    other = threading.Thread(target=take)
+    try:
+        other.start()
+        with pytest.raises(Interrupted, match="SIGUSR1"):
+            inbox.next(AT_ONCE_S)
+    finally:
+        other.join()
+        signal.signal(signal.SIGUSR1, before)
 
 
 @pytest.mark.parametrize("number", series([SIGINT, SIGTERM]), ids=["SIGINT", "SIGTERM"])

@@ -264,6 +264,42 @@ def test_a_fork_server_that_still_imports_ends_with_its_launcher(
     assert not processes_of(tmp_path / "out")
 
 
+def never_end() -> None:
+    """Warm up a fork server that imports for ever."""
+    threading.Event().wait()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL], ids=["SIGTERM", "SIGKILL"])
+def test_a_process_whose_fork_server_still_imports_can_be_stopped_at_once(number: signal.Signals) -> None:
+    server = ForkServer("tests.test_fork_server:never_end")
+    try:
+        first, second = (server.start("os:abort", name) for name in ("first", "second"))
+        first.signal(number)
+        assert not first.running
+        assert first.end() == -number
+        assert second.running
+        assert not server.gone
+    finally:
+        second.signal(signal.SIGKILL)
+        second.end()
+        server.close()
+
+
+def test_a_process_that_was_stopped_before_it_began_does_not_begin_later() -> None:
+    server = ForkServer("compose.cli.warm_up:missions")
+    try:
+        os.kill(server.pid, SIGSTOP)
+        unborn = server.start("threading:main_thread", "unborn")
+        unborn.terminate()
+        assert unborn.end() == -signal.SIGTERM
+        os.kill(server.pid, signal.SIGCONT)
+        assert server.start("threading:main_thread", "next").end(BOUND_S) == 0
+        until(lambda: not children_of(server.pid), "no process is left")
+        assert not server.gone
+    finally:
+        server.close()
+
+
 def test_no_fork_server_outlasts_a_run() -> None:
     with TandemProcess("run", "paper-1", "-q") as run:
         run.until(lambda: fork_servers_of(run.pid), "it has a fork server")

@@ -22,7 +22,7 @@ from importlib import import_module
 import msgspec
 from setproctitle import setproctitle
 
-from compose.launch.forked import REQUEST_BYTES, STREAMS, Ended, ForkRequest, Signal
+from compose.launch.forked import REQUEST_BYTES, STREAMS, Ended, ForkRequest, Imported, Signal
 from protocol.output import one_line
 
 NOT_FORKED = 71
@@ -54,6 +54,7 @@ class _RequestLoop:
         signal.signal(signal.SIGCHLD, lambda *_: None)
         signal.set_wakeup_fd(self._wake_up, warn_on_full_buffer=False)
         self._news.register(self._launcher, select.POLLIN)
+        self._report(Imported())
         while True:
             if self._launcher.fileno() in self._wait(None):
                 received = self._request()
@@ -119,9 +120,9 @@ class _RequestLoop:
                 pid, status = found
                 self._report(Ended(self._numbers.pop(pid), os.waitstatus_to_exitcode(status)))
 
-    def _report(self, end: Ended) -> None:
+    def _report(self, event: Ended | Imported) -> None:
         with suppress(OSError):  # the launcher has ended
-            self._launcher.send(msgspec.msgpack.encode(end))
+            self._launcher.send(msgspec.msgpack.encode(event))
 
 
 def _become(start: ForkRequest, streams: list[int], parent: int) -> None:

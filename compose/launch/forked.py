@@ -60,7 +60,15 @@ TRY_AGAIN_S = 0.001
 """The interval in s between these retries."""
 
 
-class Ended(msgspec.Struct, frozen=True):
+LETHAL = (signal.SIGTERM, signal.SIGKILL)
+"""The signals that end a process that has not begun yet."""
+
+
+class Imported(msgspec.Struct, frozen=True, tag=True):
+    """The report to the launcher that the fork server has imported its modules, and forks from now on."""
+
+
+class Ended(msgspec.Struct, frozen=True, tag=True):
     """The report to the launcher that a process has ended."""
 
     number: int
@@ -90,6 +98,8 @@ class ForkServer:
         self._numbers = count()
         self._running: dict[int, ChildProcess] = {}
         self._lock = threading.Lock()
+        self._imports = True
+        """True until the server has imported its modules. None of its processes has begun before."""
         self.gone = False
         """True once the server, and with it all its processes, has ended."""
         self._listener = threading.Thread(target=self._listen, daemon=True)
@@ -129,9 +139,18 @@ class ForkServer:
         return process
 
     def signal(self, process: int, number: int) -> None:
-        """Send signal `number` to the process numbered `process`, unless it has ended."""
+        """Send signal `number` to the process numbered `process`, unless it has ended.
+
+        A process that has not begun counts as ended at once by SIGTERM and SIGKILL: importing may take
+        longer than a process is given to end.
+        """
+        unborn = None
         with self._lock:
             self._ask(Signal(process, number), [])
+            if self._imports and number in LETHAL:
+                unborn = self._running.pop(process, None)
+        if unborn is not None:
+            unborn.ended(-number)
 
     def why_gone(self) -> str:
         """Return how the server ended, in a line; it is waited for, and then killed, if it has not ended."""
@@ -184,11 +203,16 @@ class ForkServer:
             time.sleep(TRY_AGAIN_S)
 
     def _listen(self) -> None:
-        decoder = msgspec.msgpack.Decoder(Ended)
+        decoder = msgspec.msgpack.Decoder(Ended | Imported)
         with suppress(OSError):
             while received := self._received():
-                one = decoder.decode(received)
-                self._running.pop(one.number).ended(one.status)
+                match decoder.decode(received):
+                    case Imported():
+                        self._imports = False
+                    case Ended(number, status) if (process := self._running.pop(number, None)) is not None:
+                        process.ended(status)
+                    case Ended():  # it was ended before it began
+                        pass
         self.gone = True
         self._end_all()
 

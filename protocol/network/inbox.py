@@ -27,6 +27,10 @@ ARRIVAL_BYTES = 200
 """The approximate memory that a queued frame takes in addition to its own bytes."""
 
 
+LOOK_S = 0.5
+"""The longest wait in s without a look for signals. One that arrives just before a wait does not end it."""
+
+
 class Interrupted(Exception):
     """The process received a signal to stop. The text of the error is the name of the signal."""
 
@@ -133,10 +137,15 @@ class Inbox:
 
     def _queued(self, timeout: float | None) -> Arrival:
         """Return the next event of the queue, or NOTHING after `timeout` s. Raises Interrupted."""
-        try:
-            arrival = self._queue.get(timeout=max(timeout, 0.0) if timeout is not None else None)
-        except Empty:
-            return NOTHING
+        until = time.monotonic() + timeout if timeout is not None else math.inf
+        while True:
+            try:
+                arrival = self._queue.get(timeout=min(max(until - time.monotonic(), 0.0), LOOK_S))
+            except Empty:
+                if time.monotonic() >= until:
+                    return NOTHING
+            else:
+                break
         with self._lock:
             self._waiting[arrival.topic] -= _size(arrival)
         if arrival.topic == "stop":
