@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian.least_squares import Fit
+from agent.estimation.gaussian.fitted import Fit
 from protocol.motion import Pose, compose
 
 Array = NDArray[np.float64]
@@ -25,7 +25,7 @@ class Optimum(NamedTuple):
     """The optimum of the graph, computed by gtsam."""
 
     mean: Array
-    """The poses of both robots at the last tick, in the order of `least_squares.poses`."""
+    """The poses of both robots at the last tick, in the order of `fitted_poses.poses`."""
     covariance: Array
     error: float
     """Half the sum of squared residuals."""

@@ -17,8 +17,8 @@ import pytest
 from msgspec.structs import replace
 
 from agent.estimation.gaussian import inference
+from agent.estimation.gaussian.fitted_poses import poses
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis, search
-from agent.estimation.gaussian.least_squares import poses
 from agent.estimation.gaussian.range_model import PairRanges
 from agent.planning.accuracy_seeking import AccuracySeeking
 from agent.planning.state import Done, RobotState

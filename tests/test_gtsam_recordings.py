@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from agent.estimation.gaussian.least_squares import Fit, poses
+from agent.estimation.gaussian.fitted import Fit
+from agent.estimation.gaussian.fitted_poses import poses
 from agent.estimation.gaussian.range_model import PairRanges
 from compose.recording.estimating.estimate_epoch import ClaimRule
 from compose.recording.estimating.estimate_run import estimated, measurements

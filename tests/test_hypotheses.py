@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from agent.estimation import closed_forms
 from agent.estimation.closed_forms import Placement, same_placement
 from agent.estimation.gaussian import hypotheses, inference
+from agent.estimation.gaussian.fitted_poses import poses
 from agent.estimation.gaussian.hypotheses import (
     ScoredHypothesis,
     _alone,
@@ -25,7 +26,7 @@ from agent.estimation.gaussian.hypotheses import (
     search,
 )
 from agent.estimation.gaussian.initial_guesses import Residuals, _encounter, _likeliest
-from agent.estimation.gaussian.least_squares import COARSE_STILL, fit, fits, poses
+from agent.estimation.gaussian.least_squares import COARSE_STILL, fit, fits
 from agent.estimation.gaussian.odometry_noise import Array, constant_errors, track
 from agent.estimation.gaussian.range_model import (
     MOST_RANGES,

@@ -13,7 +13,8 @@ from msgspec.structs import replace
 from scipy import stats  # type: ignore[import-untyped]
 
 from agent.estimation.gaussian.consistency import beta_binomial_tail, f_tail, fisher, sigmas
-from agent.estimation.gaussian.least_squares import fit, noise_level, residual_correlation
+from agent.estimation.gaussian.least_squares import fit
+from agent.estimation.gaussian.noise_level import noise_level, residual_correlation
 from agent.estimation.gaussian.odometry_noise import (
     Errors,
     Track,

@@ -14,7 +14,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from agent.estimation.gaussian import odometry_noise
-from agent.estimation.gaussian.least_squares import STILL, Fit, deviation, fit, fits, poses
+from agent.estimation.gaussian.fitted import Fit
+from agent.estimation.gaussian.fitted_poses import deviation, poses
+from agent.estimation.gaussian.least_squares import STILL, fit, fits
 from agent.estimation.gaussian.linear_model import Start
 from agent.estimation.gaussian.odometry_noise import (
     OdometryNoiseModel,

@@ -11,7 +11,8 @@ import math
 
 import numpy as np
 
-from agent.estimation.gaussian.least_squares import deviation, fit, poses
+from agent.estimation.gaussian.fitted_poses import deviation, poses
+from agent.estimation.gaussian.least_squares import fit
 from agent.estimation.gaussian.odometry_noise import Track, track
 from agent.estimation.gaussian.range_model import Ranges
 from compose.recording.run import Run

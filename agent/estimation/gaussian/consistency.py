@@ -8,7 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.gaussian.least_squares import INLIER, Fit, fit
+from agent.estimation.gaussian.fitted import Fit
+from agent.estimation.gaussian.least_squares import fit
+from agent.estimation.gaussian.noise_level import INLIER
 from agent.estimation.gaussian.range_model import PairRanges
 from protocol.messages import Inconsistent
 from protocol.noise import Noise

@@ -14,6 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from agent.estimation.gaussian.fitted import Fit
+from agent.estimation.gaussian.fitted_poses import deviation
 from agent.estimation.gaussian.initial_guesses import (
     MOST,
     SEED_RANGES,
@@ -26,8 +28,6 @@ from agent.estimation.gaussian.least_squares import (
     COARSE_STILL,
     STEPS,
     WARM_DECREASE,
-    Fit,
-    deviation,
     fit,
     fits,
     without_outliers,

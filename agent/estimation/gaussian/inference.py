@@ -12,6 +12,8 @@ from msgspec.structs import replace
 
 from agent.estimation.exact import Branch
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, Inconsistency, consistency_test
+from agent.estimation.gaussian.fitted import Fit
+from agent.estimation.gaussian.fitted_poses import deviation, poses
 from agent.estimation.gaussian.hypotheses import (
     ScoredHypothesis,
     anchor_evidence,
@@ -20,7 +22,6 @@ from agent.estimation.gaussian.hypotheses import (
     of_anchor,
 )
 from agent.estimation.gaussian.initial_guesses import STARTS
-from agent.estimation.gaussian.least_squares import Fit, deviation, poses
 from agent.estimation.gaussian.odometry_noise import Array, Track, track
 from agent.estimation.gaussian.own_sensors import DOUBTFUL_CLAIMS, Doubt, claim_doubt, doubt
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Ranges

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.gaussian.least_squares import Fit
+from agent.estimation.gaussian.fitted import Fit
 from agent.estimation.gaussian.linear_model import Start
 from agent.estimation.gaussian.odometry_noise import (
     Array,

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, HIGHEST_LEVEL
+from agent.estimation.gaussian.fitted_poses import deviation
 from agent.estimation.gaussian.hypotheses import (
     WARM_STEPS,
     Hypothesis,
@@ -21,7 +22,7 @@ from agent.estimation.gaussian.hypotheses import (
 )
 from agent.estimation.gaussian.inference import MUTUAL_RANGES, MUTUAL_RANGES_WITH_OUTLIERS
 from agent.estimation.gaussian.initial_guesses import anchors
-from agent.estimation.gaussian.least_squares import STEPS, deviation, fits
+from agent.estimation.gaussian.least_squares import STEPS, fits
 from agent.estimation.gaussian.linear_model import Start
 from agent.estimation.gaussian.odometry_noise import Array, Places, Track
 from agent.estimation.gaussian.range_model import Ranges, mixture, predicted

@@ -18,18 +18,19 @@ from typing import NamedTuple, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.estimation.gaussian.fitted import Fit, NormalEquations
 from agent.estimation.gaussian.linear_model import ErrorSizes, LinearModel, Point, Problem, Start, product
+from agent.estimation.gaussian.noise_level import (
+    INLIER,
+    misfit_log_likelihood,
+    noise_level,
+    residual_correlation,
+)
 from agent.estimation.gaussian.odometry_noise import (
     Array,
     Errors,
-    OdometryNoiseModel,
     Places,
-    Projection,
-    Ticks,
     Track,
-    constant_effects,
-    spread,
-    symmetric,
 )
 from agent.estimation.gaussian.range_covariance import RangeCovariance, inverse_of, range_covariance
 from agent.estimation.gaussian.range_model import Ranges, inlier_probability, outliers
@@ -80,105 +81,6 @@ FAR = 100.0
 
 BLIND = 1e-9
 """The least precision of a range's prediction, as a fraction of that with a known guess."""
-
-
-class Fit(NamedTuple):
-    """The most probable guess in the neighbourhood of the initial one, with its uncertainty."""
-
-    guess: Array
-    paths: tuple[Track, ...]
-    """The paths with the odometry errors corrected."""
-    errors: tuple[Errors, ...]
-    """The estimated odometry errors of each path; empty if odometry is exact."""
-    log_likelihood: float
-    """The log-likelihood of the ranges, with all errors of the odometry and the noise level integrated out.
-
-    With half the log-determinant of `covariance`, it is the evidence for the guess and its neighbourhood.
-    """
-    residuals: Array
-    """The measured minus the predicted ranges (m); shape (N,)."""
-    weights: Array
-    """The probability that each range is an inlier; shape (N,)."""
-    covariance: Array
-    """The covariance of the guess: (2, 2) for one robot, whose rotation is not observable, or (6, 6)."""
-    information: Array
-    """The inverse of the covariance."""
-    chi2: float
-    """The squared innovations, weighted by their inverse covariance; as told, without `level`."""
-    inliers: int
-    """The number of ranges that are more probably inliers than outliers."""
-    last_step: float
-    """The expected length of the next Gauss-Newton step, in sigmas."""
-    ticks: Places
-    """The tick of each range; shape (N,)."""
-    problem: Problem
-    system: NormalEquations
-    """The last linear model. Directions and covariances are those of the point where it was computed."""
-    linear: Point
-    """That point, before the last step, among those of other fits."""
-    row: int
-    """The row of this fit in that."""
-    level: float
-    """The estimate of the noise level tau^2: the factor by which all variances differ from the told ones."""
-
-    @property
-    def directions(self) -> Array:
-        """The derivatives of the ranges with respect to the positions; see `Predicted`."""
-        return np.asarray(self.linear.predicted.directions[self.row], np.float64)
-
-    @property
-    def linear_guess(self) -> Array:
-        """The guess of the linear model."""
-        return np.asarray(self.linear.guess[self.row], np.float64)
-
-    @property
-    def linear_paths(self) -> tuple[Track, ...]:
-        """The paths of the linear model."""
-        return self.problem.paths(self.linear, self.row)
-
-    def __hash__(self) -> int:
-        """Return the hash of this object."""
-        return id(self)
-
-    def __eq__(self, other: object) -> bool:
-        """Return whether `other` is this fit itself: what follows from one fit is computed once."""
-        return self is other
-
-    def drift(self, robot: int) -> OdometryNoiseModel:
-        """Return the noise model along the path of a robot; odometry is not exact."""
-        return self.problem.drift(self.paths[robot], robot)
-
-    def continued(self, path: Track) -> Fit:
-        """Return the fit of one robot with its `path` up to a later tick, without a further range."""
-        problem = Problem.of([path], self.problem.ranges, self.problem.noise, self.problem.apart)
-        point = problem.begin([Start(self.guess, self.errors)])
-        errors = problem.errors(point.sizes.constant[0], point.sizes.white[0])
-        return self._replace(paths=problem.paths(point, 0), errors=errors, problem=problem)
-
-
-class NormalEquations(NamedTuple):
-    """One Gauss-Newton step in the space of the ranges."""
-
-    jacobian: Array
-    """The derivatives of the ranges with respect to the unknowns; shape (..., N, unknowns)."""
-    innovation: Array
-    """The difference (m) of the ranges from their prediction with uncorrected odometry; shape (..., N)."""
-    covariance: RangeCovariance
-    weighted: Array
-    """The Jacobian and the innovation, multiplied by the inverse covariance; shape (..., N, unknowns + 1)."""
-    information: Array
-    of_guess: Array
-    """The covariance of the guess, the inverse of the information."""
-    change: Array
-    """The change of the guess in this step."""
-    multipliers: Array
-    """The innovation that remains after the change, multiplied by the inverse covariance; shape (..., N)."""
-
-    def one(self, i: int) -> NormalEquations:
-        """Return those of the fit with index `i`."""
-        jacobian, innovation, covariance, *others = self
-        of_one = RangeCovariance(*[part[i] for part in covariance])
-        return NormalEquations(jacobian[i], innovation[i], of_one, *[part[i] for part in others])
 
 
 def fit(
@@ -376,10 +278,6 @@ def _descended(problem: Problem, point: Point, guess: Array, sizes: ErrorSizes, 
     return following
 
 
-INLIER = 0.5
-"""The weight from which on a range counts as an inlier."""
-
-
 def _quality(system: NormalEquations, weights: Array, noise: Noise) -> _Quality:
     """Return how well the ranges agree with a linear model."""
     change = system.change
@@ -389,48 +287,6 @@ def _quality(system: NormalEquations, weights: Array, noise: Noise) -> _Quality:
     level = np.array([noise_level(one, count - change.shape[-1], noise) for one, count in told])
     length = np.abs(np.add.reduce(change * product(system.information, change), -1))
     return _Quality(chi2, inliers, level, np.sqrt(length / level))
-
-
-def noise_level(chi2: float, degrees: int, noise: Noise, correlation: float = 0.0) -> float:
-    """Return the posterior mean of the factor tau^2 of all variances (scaled inverse chi-square).
-
-    With the `correlation` r of neighbours, residuals are worth (1 - r) / (1 + r) of their number, for the
-    level and for everything else that they tell. The level grows by as much.
-    """
-    nu, n = noise.sigma_degrees, max(degrees, 0)
-    if not nu:
-        return 1.0
-    worth = (1.0 - correlation) / (1.0 + correlation)
-    return (nu + worth * chi2) / (nu + worth * n) / worth
-
-
-def residual_correlation(residuals: Array, weights: Array, ranges: Ranges) -> float:
-    """Return the correlation of each residual with the one before, from 0 to MOST_CORRELATED.
-
-    Both are of the same kind. The correlation is reduced by what chance may cause (see BY_CHANCE), and
-    strays count as 0.
-    """
-    scaled = (weights > INLIER) * (residuals / ranges.sigma)
-    power, neighbours = float(scaled @ scaled), float(scaled[1:] @ scaled[:-1])
-    first, second, _ = ranges.counts
-    for end in {first, first + second}:
-        if 0 < end < len(scaled):
-            neighbours -= float(scaled[end] * scaled[end - 1])
-    if not power > 0.0:
-        return 0.0
-    found = neighbours / power - BY_CHANCE / math.sqrt(len(scaled))
-    return min(max(found, 0.0), MOST_CORRELATED)
-
-
-BY_CHANCE = 2.0
-"""The number of standard deviations 1 / sqrt(N) of the correlation of N white residuals that is disregarded.
-
-With less, noise as told makes missions longer; with more, errors that are correlated over 20 ticks make
-claims too confident.
-"""
-
-MOST_CORRELATED = 0.8
-"""The largest correlation: the noise level grows by a factor of 9 at most."""
 
 
 def _variance(sigma: Array, weights: Array) -> Array:
@@ -451,11 +307,6 @@ def _solved(jacobian: Array, innovation: Array, covariance: RangeCovariance) -> 
     return NormalEquations(
         jacobian, innovation, covariance, weighted, information, of_guess, change, multipliers
     )
-
-
-def deviation(variance: float) -> float:
-    """Return the standard deviation; infinite if rounding made the variance negative."""
-    return math.sqrt(variance) if variance >= 0.0 else math.inf
 
 
 def _inlier_probabilities(system: NormalEquations, weights: Array, sigma: Array, noise: Noise) -> Array:
@@ -502,7 +353,7 @@ def _log_likelihood(
     if count < len(good):
         volume -= float(np.sum(np.log(_variance(sigma, weights)[~good])))
     log_likelihood = -0.5 * (volume + math.log(2.0 * math.pi) * count)
-    log_likelihood += _misfit_log_likelihood(chi2, count - len(system.change), noise)
+    log_likelihood += misfit_log_likelihood(chi2, count - len(system.change), noise)
     log_likelihood -= 0.5 * len(system.change) * math.log(level)  # of the covariance of the guess
     if count == len(good):
         return log_likelihood + count * math.log1p(-noise.outliers - noise.strays)
@@ -513,54 +364,5 @@ def _log_likelihood(
     return log_likelihood
 
 
-def _misfit_log_likelihood(chi2: float, degrees: int, noise: Noise) -> float:
-    """Return the log-likelihood of a chi-square, with the noise level integrated out (Student's t)."""
-    nu, n = noise.sigma_degrees, max(degrees, 0)
-    if not nu:
-        return -0.5 * chi2
-    scale = math.lgamma(0.5 * (nu + n)) - math.lgamma(0.5 * nu) - 0.5 * n * math.log(0.5 * nu)
-    return scale - 0.5 * (nu + n) * math.log1p(chi2 / nu)
-
-
 SOFT = 0.1
 """The least smoothing of the ends of the outlier density, as a fraction of the least bias."""
-
-
-def poses(fitted: Fit, apart: tuple[float, float]) -> tuple[Array, Array]:
-    """Return the poses at the last tick, relative to M1 along the axes of <W>, in m and rad.
-
-    The result is the mean of x, y, heading of a, then of b, shape (6,), and the covariance, shape (6, 6). Of
-    one robot it is (3,) and (3, 3). With one anchor, the axes are those of the odometry's frame.
-    """
-    size = 3 * len(fitted.paths)
-    mean, turn = np.empty(size), np.zeros((size, size))
-    for robot, path in enumerate(fitted.paths):
-        wx, wy, heading = _placed(fitted.guess[3 * robot : 3 * robot + 3], path)
-        mean[3 * robot : 3 * robot + 3] = wx + robot * apart[0], wy + robot * apart[1], heading
-    for robot, path in enumerate(fitted.linear_paths):
-        own = slice(3 * robot, 3 * robot + 3)
-        c, s = math.cos(fitted.linear_guess[own][2]), math.sin(fitted.linear_guess[own][2])
-        wx, wy, _ = _placed(fitted.linear_guess[own], path)
-        turn[own, own] = ((-c, s, -wy), (-s, -c, wx), (0.0, 0.0, 1.0))
-    system, turn = fitted.system, turn[:, fitted.problem.free]
-    if not fitted.errors:
-        return mean, turn @ fitted.covariance @ turn.T
-    # the difference of large matrices: all of them are those of one point
-    prior, cross = np.zeros((size, size)), np.zeros((size, len(system.innovation)))
-    for robot, (path, u) in enumerate(zip(fitted.linear_paths, fitted.directions, strict=True)):
-        own, model = slice(3 * robot, 3 * robot + 3), fitted.problem.drift(path, robot)
-        end = Projection.pose(path, len(path.v), fitted.linear_guess[own][2])
-        rows = end.then(Projection.positions(path, Ticks.of(fitted.ticks, len(path.v)), u))
-        constant = constant_effects(model, rows)[:-1]
-        both = symmetric(*spread(model, rows), rows.ticks) + constant.T @ constant
-        prior[own, own], cross[own] = both[:3, :3], both[:3, 3:]
-    gain = system.covariance.solve(cross.T).T
-    left = turn - gain @ system.jacobian
-    return mean, fitted.level * (prior - gain @ cross.T + left @ system.of_guess @ left.T)
-
-
-def _placed(guess: Array, path: Track) -> tuple[float, float, float]:
-    """Return the last pose on `path`, relative to the anchor along the axes of <W>, in m and rad."""
-    c, s = math.cos(guess[2]), math.sin(guess[2])
-    x, y = float(path.x[-1]) - guess[0], float(path.y[-1]) - guess[1]
-    return c * x - s * y, s * x + c * y, guess[2] + float(path.heading[-1])

@@ -13,7 +13,8 @@ from functools import lru_cache
 import numpy as np
 from msgspec.structs import replace
 
-from agent.estimation.gaussian.least_squares import deviation, fit, poses
+from agent.estimation.gaussian.fitted_poses import deviation, poses
+from agent.estimation.gaussian.least_squares import fit
 from agent.estimation.gaussian.odometry_noise import Track, track
 from agent.estimation.gaussian.range_model import Ranges, predict
 from protocol.mission import Mission

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from agent.estimation.gaussian.consistency import FINISHED
+from agent.estimation.gaussian.fitted_poses import poses
 from agent.estimation.gaussian.hypotheses import Hypothesis, ScoredHypothesis
 from agent.estimation.gaussian.known_anchors import FEWEST, AnchoredRobot, blocking_reason, follow, search
-from agent.estimation.gaussian.least_squares import poses
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges
 from compose.errors import UserError
 from compose.recording.estimating.estimate_epoch import ClaimRule, EstimateEpoch, of_centres

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from agent.estimation.gaussian.fitted import Fit
 from agent.estimation.gaussian.known_anchors import AnchoredRobot
-from agent.estimation.gaussian.least_squares import Fit
 from agent.estimation.gaussian.range_model import PairRanges
 from compose.recording.estimating.pair_measurements import OneRobot
 from compose.recording.ranging.range_recording import Numbers

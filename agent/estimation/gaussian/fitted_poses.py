@@ -1,0 +1,63 @@
+"""The poses of the robots at the last tick of a fit, with their covariance."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from agent.estimation.gaussian.fitted import Fit
+from agent.estimation.gaussian.odometry_noise import (
+    Array,
+    Projection,
+    Ticks,
+    Track,
+    constant_effects,
+    spread,
+    symmetric,
+)
+
+
+def deviation(variance: float) -> float:
+    """Return the standard deviation; infinite if rounding made the variance negative."""
+    return math.sqrt(variance) if variance >= 0.0 else math.inf
+
+
+def poses(fitted: Fit, apart: tuple[float, float]) -> tuple[Array, Array]:
+    """Return the poses at the last tick, relative to M1 along the axes of <W>, in m and rad.
+
+    The result is the mean of x, y, heading of a, then of b, shape (6,), and the covariance, shape (6, 6). Of
+    one robot it is (3,) and (3, 3). With one anchor, the axes are those of the odometry's frame.
+    """
+    size = 3 * len(fitted.paths)
+    mean, turn = np.empty(size), np.zeros((size, size))
+    for robot, path in enumerate(fitted.paths):
+        wx, wy, heading = _placed(fitted.guess[3 * robot : 3 * robot + 3], path)
+        mean[3 * robot : 3 * robot + 3] = wx + robot * apart[0], wy + robot * apart[1], heading
+    for robot, path in enumerate(fitted.linear_paths):
+        own = slice(3 * robot, 3 * robot + 3)
+        c, s = math.cos(fitted.linear_guess[own][2]), math.sin(fitted.linear_guess[own][2])
+        wx, wy, _ = _placed(fitted.linear_guess[own], path)
+        turn[own, own] = ((-c, s, -wy), (-s, -c, wx), (0.0, 0.0, 1.0))
+    system, turn = fitted.system, turn[:, fitted.problem.free]
+    if not fitted.errors:
+        return mean, turn @ fitted.covariance @ turn.T
+    # the difference of large matrices: all of them are those of one point
+    prior, cross = np.zeros((size, size)), np.zeros((size, len(system.innovation)))
+    for robot, (path, u) in enumerate(zip(fitted.linear_paths, fitted.directions, strict=True)):
+        own, model = slice(3 * robot, 3 * robot + 3), fitted.problem.drift(path, robot)
+        end = Projection.pose(path, len(path.v), fitted.linear_guess[own][2])
+        rows = end.then(Projection.positions(path, Ticks.of(fitted.ticks, len(path.v)), u))
+        constant = constant_effects(model, rows)[:-1]
+        both = symmetric(*spread(model, rows), rows.ticks) + constant.T @ constant
+        prior[own, own], cross[own] = both[:3, :3], both[:3, 3:]
+    gain = system.covariance.solve(cross.T).T
+    left = turn - gain @ system.jacobian
+    return mean, fitted.level * (prior - gain @ cross.T + left @ system.of_guess @ left.T)
+
+
+def _placed(guess: Array, path: Track) -> tuple[float, float, float]:
+    """Return the last pose on `path`, relative to the anchor along the axes of <W>, in m and rad."""
+    c, s = math.cos(guess[2]), math.sin(guess[2])
+    x, y = float(path.x[-1]) - guess[0], float(path.y[-1]) - guess[1]
+    return c * x - s * y, s * x + c * y, guess[2] + float(path.heading[-1])
