@@ -25,9 +25,9 @@ from agent.estimation.gaussian.hypotheses import (
     of_anchor,
     search,
 )
-from agent.estimation.gaussian.initial_guesses import Residuals, _encounter, _likeliest
 from agent.estimation.gaussian.least_squares import COARSE_STILL, fit, fits
 from agent.estimation.gaussian.odometry_noise import Array, constant_errors, track
+from agent.estimation.gaussian.placement_guesses import Residuals, _encounter, _likeliest
 from agent.estimation.gaussian.range_model import (
     MOST_RANGES,
     MOST_RANGES_BY_EXACT_ODOMETRY,

@@ -1,8 +1,8 @@
 """Hypotheses about the poses of one robot or of both, with their probabilities, under noise.
 
-Each hypothesis begins at an initial guess (see `initial_guesses`) and is fitted to all ranges. Ranges and
-ticks without a detection determine its probability. A hypothesis is dropped when its probability becomes
-small, and no single measurement excludes it.
+Each hypothesis begins at an initial guess (see `anchor_guesses` and `placement_guesses`) and is fitted to all
+ranges. Ranges and ticks without a detection determine its probability. A hypothesis is dropped when its
+probability becomes small, and no single measurement excludes it.
 """
 
 from __future__ import annotations
@@ -14,16 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from agent.estimation.gaussian.anchor_guesses import MOST, SEED_RANGES, UNLIKELY, anchors
 from agent.estimation.gaussian.fitted import Fit
 from agent.estimation.gaussian.fitted_poses import deviation
-from agent.estimation.gaussian.initial_guesses import (
-    MOST,
-    SEED_RANGES,
-    STARTS,
-    UNLIKELY,
-    anchors,
-    placements,
-)
 from agent.estimation.gaussian.least_squares import (
     COARSE_STILL,
     STEPS,
@@ -34,6 +27,7 @@ from agent.estimation.gaussian.least_squares import (
 )
 from agent.estimation.gaussian.linear_model import Start
 from agent.estimation.gaussian.odometry_noise import Array, Errors, Places, Track
+from agent.estimation.gaussian.placement_guesses import STARTS, placements
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Ranges, placed
 from protocol.noise import Noise
 

@@ -21,9 +21,9 @@ from agent.estimation.gaussian.hypotheses import (
     mutual_evidence,
     of_anchor,
 )
-from agent.estimation.gaussian.initial_guesses import STARTS
 from agent.estimation.gaussian.odometry_noise import Array, Track, track
 from agent.estimation.gaussian.own_sensors import DOUBTFUL_CLAIMS, Doubt, claim_doubt, doubt
+from agent.estimation.gaussian.placement_guesses import STARTS
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Ranges
 from agent.estimation.knowledge import Belief, Knowledge
 from agent.peer.motion_log import MotionLog

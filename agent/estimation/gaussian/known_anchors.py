@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from agent.estimation.gaussian.anchor_guesses import anchors
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, HIGHEST_LEVEL
 from agent.estimation.gaussian.fitted_poses import deviation
 from agent.estimation.gaussian.hypotheses import (
@@ -21,7 +22,6 @@ from agent.estimation.gaussian.hypotheses import (
     with_probability,
 )
 from agent.estimation.gaussian.inference import MUTUAL_RANGES, MUTUAL_RANGES_WITH_OUTLIERS
-from agent.estimation.gaussian.initial_guesses import anchors
 from agent.estimation.gaussian.least_squares import STEPS, fits
 from agent.estimation.gaussian.linear_model import Start
 from agent.estimation.gaussian.odometry_noise import Array, Places, Track

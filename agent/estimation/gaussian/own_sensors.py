@@ -12,10 +12,10 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
+from agent.estimation.gaussian.anchor_guesses import anchors
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, consistency_test
 from agent.estimation.gaussian.fitted import Fit
 from agent.estimation.gaussian.hypotheses import search
-from agent.estimation.gaussian.initial_guesses import anchors
 from agent.estimation.gaussian.least_squares import STEPS, fit, fits
 from agent.estimation.gaussian.linear_model import Start
 from agent.estimation.gaussian.odometry_noise import Track, rescaled

@@ -1,19 +1,26 @@
-"""Initial guesses for the fits, from closed forms of a few ranges; ticks without a detection are ignored.
+"""Initial guesses for the placement of both robots in <W>, from closed forms of a few mutual ranges.
 
-The guesses for an anchor are the intersections of two range circles. For a placement, one robot is rotated
-through all headings, and a mutual range leaves two headings of the other. Each guess is refined by
-Gauss-Newton on all ranges of its kind, with odometry noise treated as noise of the ranges.
+One robot is rotated through all headings, and a mutual range leaves two headings of the other. Each guess is
+refined by Gauss-Newton on all mutual ranges. Ticks without a detection are ignored.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
+from agent.estimation.gaussian.anchor_guesses import (
+    NEAR,
+    POLISHINGS,
+    SEED_RANGES,
+    TWINS,
+    UNLIKELY,
+    spread_out,
+)
 from agent.estimation.gaussian.fitted import Fit
 from agent.estimation.gaussian.linear_model import Start
 from agent.estimation.gaussian.odometry_noise import (
@@ -22,27 +29,12 @@ from agent.estimation.gaussian.odometry_noise import (
     OdometryNoiseModel,
     Places,
     Projection,
-    Track,
     attributed,
     constant_effects,
-    constant_errors,
-    is_noisy,
     spread,
     symmetric,
-    variances,
-    wander,
 )
-from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Ranges, inlier_probability, mixture
-from protocol.noise import Noise
-
-SEED_RANGES = 10
-"""The largest number of ranges that initial guesses are made from.
-
-With more ranges to the anchor, only the remaining hypotheses about its position are followed.
-"""
-
-NEAR = 0.02
-"""The expected error of an initial guess, as a fraction of R; guesses closer than this are merged."""
+from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, inlier_probability, mixture
 
 SCAN = 72
 """The number of headings that are tried for the robot nearer to its anchor.
@@ -80,140 +72,14 @@ STARTS = 12
 LEAST_OFFSET = 1e-9
 """The sigma (m, rad) of an offset below which it is not attributed to anything."""
 
-POLISHINGS = 4
-"""The least number of Gauss-Newton steps on an initial guess, after that on the rotations of a placement."""
-
-FINER, FINER_TURN = 0.1, 0.2
-"""The factors by which the expected errors of a position and of a heading decrease at each of these steps."""
+FINER_TURN = 0.2
+"""The factor by which the expected error of a heading decreases at each step of the refinement."""
 
 TURN = 0.3
 """The largest change of a heading (rad) in one of these steps."""
 
-TWINS = 0.3
-"""The distance in sigmas of a range below which guesses are merged, in addition to the limits above."""
-
 SHORTEST = 0.1
 """The least lever (m) that is assumed for a heading."""
-
-MOST = 6
-"""The maximum number of hypotheses that are followed at once."""
-
-
-def anchors(
-    path: Track,
-    ranges: Ranges,
-    sensing_range: float,
-    noise: Noise,
-    known: Sequence[Sequence[float]] = (),
-) -> Array:
-    """Return initial guesses for the anchor (m) in the frame of the odometry, from the ranges; shape (n, 2).
-
-    `known` contains earlier guesses, which are refined as well.
-    """
-    points = np.concatenate((np.array(known).reshape(-1, 2), _crossings(path, ranges)))
-    if not len(points):
-        return points
-    variance = np.square(ranges.sigma) + _odometry_variance(path, ranges, noise)
-    variance += ranges.loosened(noise.priors)
-    return _polished(points, path, ranges, np.sqrt(variance), noise, sensing_range)
-
-
-def _odometry_variance(path: Track, ranges: Ranges, noise: Noise) -> Array:
-    """Return the approximate variance (m^2) that odometry noise adds to each range, without correlations."""
-    if not is_noisy(noise):
-        return np.zeros_like(ranges.rho)
-    v, omega = path.v, path.omega
-    white = variances(v, omega, noise.odometry)
-    if path.extra is not None:
-        white += path.extra
-    model = wander(path, np.zeros(path.shift.shape), constant_errors(v, omega, noise), white)
-    lever, position = path.period, np.zeros(len(path.x))
-    if model.sums is not None:
-        turn, bx, by, xx, _, yy = model.sums
-        position = xx + yy - 2.0 * lever * (path.y * bx - path.x * by)
-        position += lever**2 * (path.x**2 + path.y**2) * turn
-    for turned, x, y in model.moves[:-1]:
-        position = position + np.square(x - lever * path.y * turned) + np.square(y + lever * path.x * turned)
-    along: Array = 0.5 * np.maximum(position, 0.0)[np.minimum(ranges.tick, len(path.v))]
-    return along
-
-
-def _spread(count: int) -> Places:
-    """Return at most SEED_RANGES of the indices below `count`, evenly spaced."""
-    # numpy.unique would import numpy.ma in the first search of a mission
-    spread = np.linspace(0, count - 1, SEED_RANGES).round().astype(np.intp)
-    return spread[np.diff(spread, prepend=-1) > 0]
-
-
-def _crossings(path: Track, ranges: Ranges) -> Array:
-    """Return the intersections (m) of each two range circles, in the frame of the odometry; shape (n, 2).
-
-    If noise keeps two circles apart, a point between them is used.
-    """
-    if len(ranges.rho) < 2:
-        return np.empty((0, 2))
-    chosen = _spread(len(ranges.rho))
-    i, j = np.triu_indices(len(chosen), 1)
-    i, j = chosen[i], chosen[j]
-    x, y, rho = path.x[ranges.tick], path.y[ranges.tick], ranges.rho
-    dx, dy = x[j] - x[i], y[j] - y[i]
-    apart = np.hypot(dx, dy)
-    some = apart > SIGMA_FLOOR
-    i, j, dx, dy, apart = i[some], j[some], dx[some], dy[some], apart[some]
-    along = (apart**2 + rho[i] ** 2 - rho[j] ** 2) / (2.0 * apart)
-    across = np.sqrt(np.maximum(rho[i] ** 2 - along**2, 0.0))
-    points = [
-        np.stack(
-            (
-                (x[i] + (along * dx - s * across * dy) / apart),
-                (y[i] + (along * dy + s * across * dx) / apart),
-            ),
-            1,
-        )
-        for s in (1.0, -1.0)
-    ]
-    return np.concatenate(points)
-
-
-def _polished(
-    points: Array, path: Track, ranges: Ranges, sigma: Array, noise: Noise, sensing_range: float
-) -> Array:
-    """Return the most likely of `points` after refinement on all ranges, without duplicates; shape (n, 2)."""
-    x, y, rho = path.x[ranges.tick], path.y[ranges.tick], ranges.rho
-    near = NEAR * sensing_range
-
-    def residuals_at(points: Array) -> tuple[Array, Array, Array, Array]:
-        dx, dy = x - points[:, :1], y - points[:, 1:]
-        distance = np.maximum(np.hypot(dx, dy), SIGMA_FLOOR)
-        return rho - distance, dx / distance, dy / distance, distance
-
-    for step in range(POLISHINGS):
-        s = np.hypot(sigma, near * FINER**step)
-        residual, ux, uy, _ = residuals_at(points)
-        weight = inlier_probability(residual, s, noise) / np.square(s)
-        wx, wy = weight * ux, weight * uy
-        xx, xy, yy = np.add.reduce(wx * ux, 1), np.add.reduce(wx * uy, 1), np.add.reduce(wy * uy, 1)
-        gx, gy = -np.add.reduce(wx * residual, 1), -np.add.reduce(wy * residual, 1)
-        damping = 1e-6 * (xx + yy) + 1e-12
-        xx, yy = xx + damping, yy + damping
-        determinant = xx * yy - xy * xy
-        change = np.stack(((yy * gx - xy * gy) / determinant, (xx * gy - xy * gx) / determinant), 1)
-        longest = np.maximum(np.abs(change).max(1, keepdims=True), 1e-12)
-        points = points + change * np.minimum(1.0, 0.5 * sensing_range / longest)
-    likely = mixture(residuals_at(points)[0], np.hypot(sigma, near * FINER**POLISHINGS), noise)[0]
-    return _best(points, likely, near * FINER + TWINS * float(np.min(sigma)))
-
-
-def _best(points: Array, likely: Array, near: float) -> Array:
-    """Return the most likely points, with at least `near` m between any two."""
-    return _distinct(points, likely, near, MOST, lambda one, others: np.abs(others - one).sum(1))
-
-
-UNLIKELY = 25.0
-"""The difference in log-likelihood to the best guess beyond which a guess is dropped."""
-
-
-# --- a pair -----------------------------------------------------------------------------------------
 
 
 class Placed(NamedTuple):
@@ -307,7 +173,7 @@ def placements(own: tuple[Fit, Fit], pair: PairRanges) -> list[Placed]:
     mutual = pair.ranges.rows(2)
     ticks, rho, sigma = pair.ranges.tick[mutual], pair.ranges.rho[mutual], pair.ranges.sigma[mutual]
     places = pair.places if len(pair.places) >= SEED_RANGES else np.arange(len(ticks))
-    some = places[_spread(len(places))]
+    some = places[spread_out(len(places))]
     sigma = np.sqrt(np.square(sigma) + pair.ranges.loosened(pair.noise.priors)[mutual])
     ticks, rho, sigma = ticks[some], rho[some], sigma[some]
     middle = len(ticks) // 2
@@ -491,16 +357,3 @@ def _likeliest(
             other[close] = between < likely[left[close]] - RIDGE_BETWEEN
         left = left[other]
     return z[chosen], likely[chosen]
-
-
-def _distinct(
-    points: Array, likely: Array, near: float, most: int, apart: Callable[[Array, Array], Array]
-) -> Array:
-    """Return the most likely of `points`, with more than `near` between any two by the metric `apart`."""
-    left = np.flatnonzero(likely >= np.max(likely) - UNLIKELY)
-    left = left[np.argsort(-likely[left], kind="stable")]
-    chosen: list[int] = []
-    while len(left) and len(chosen) < most:
-        chosen.append(int(left[0]))
-        left = left[apart(points[left[0]], points[left]) > near]
-    return points[chosen]
