@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,12 +13,6 @@ from compose.launch import in_process
 from compose.scenario.scenario_file import load
 from tests.browser import Open, chromium, pages, watching
 from tests.commands import tandem
-
-if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
-    # Thousands of short processes would otherwise compile the same modules again.
-    compiled = Path(__file__).parents[1] / ".pytest_cache" / "compiled"
-    sys.pycache_prefix = os.environ["PYTHONPYCACHEPREFIX"] = str(compiled)
-    sys.dont_write_bytecode = False
 
 settings.register_profile("tandem", derandomize=True, deadline=None, database=None)
 settings.load_profile("tandem")
