@@ -115,7 +115,7 @@ def checks(findings: Findings) -> dict[str, int]:
     [
         *[pytest.param(load(name), id=name) for name in ("paper-1", "paper-2", "noisy")],
         *[pytest.param(load("random", seed=seed), id=f"random-{seed}") for seed in range(40)],
-        *series([noise(seed, name) for seed in range(3) for name in ("assured", "paper")], 2),
+        *series([noise(seed, name) for seed in range(3) for name in ("assured", "paper")], 1),
         *series([load("noisy", seed=seed) for seed in range(3)], 0),
         pytest.param(parse(several_pairs(3), "pairs"), id="three-pairs"),
     ],

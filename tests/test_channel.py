@@ -189,6 +189,7 @@ def test_a_partition_lets_nothing_through() -> None:
     assert not any(heard_at_once([Fault(partition=True)], ticks=50))
 
 
+@pytest.mark.long
 def test_a_delay_is_uniform_between_its_bounds_both_included() -> None:
     assert {now - tick for now, tick, _ in came(flown([Fault(delay=(3, 3))], [True] * 50))} == {3}
     lags = Counter(now - tick for now, tick, _ in came(flown([Fault(delay=(2, 5))], [True] * N)))
@@ -196,6 +197,7 @@ def test_a_delay_is_uniform_between_its_bounds_both_included() -> None:
     assert all(has_share(count, lags.total(), 0.25) for count in lags.values())
 
 
+@pytest.mark.long
 def test_a_doubled_report_comes_twice_each_with_a_delay_of_its_own() -> None:
     copies = Counter(tick for _, tick, _ in came(flown([Fault(duplicate=0.3)], [True] * N)))
     assert set(copies.values()) == {1, 2}

@@ -232,6 +232,7 @@ def test_an_endpoint_without_a_listener_is_reported_with_a_remedy() -> None:
     assert said[-1] == "alive: mine: its world, all with this protocol version; not alive: a, b"
 
 
+@pytest.mark.long
 def test_a_refusal_by_the_router_is_explained(keys: Path, mine: Path) -> None:
     expire(mine, keys)
     with world_of(keys) as endpoint:

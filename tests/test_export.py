@@ -447,7 +447,7 @@ def test_a_missing_recording_and_an_unwritable_folder_are_refused(paper_1: Path,
 # --- exports during a run, and the Foxglove server --------------------------------------------------------
 
 
-@pytest.mark.parametrize("mode", [[], ["--in-process"]])
+@pytest.mark.parametrize("mode", series([[], ["--in-process"]]))
 def test_a_run_exports_its_recording_at_its_end(mode: list[str], paper_1: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     ended = subprocess.run(
@@ -569,6 +569,7 @@ def log_message(channel: dict[str, Any], data: bytes) -> str:
     return str(decoder(data).message)
 
 
+@pytest.mark.long
 def test_a_viewer_sees_a_run_from_its_start_to_its_end(tmp_path: Path) -> None:
     port = int(free_endpoint().rsplit(":", 1)[1])
     out = tmp_path / "out"

@@ -258,7 +258,7 @@ def test_probabilities_are_shown_with_their_significant_digits(probability: floa
 # --- all kinds of recordings ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("noise", ["", NOISE])
+@pytest.mark.parametrize("noise", series(["", NOISE]))
 @pytest.mark.parametrize("planner_name", series(["assured", "paper"]))
 def test_a_mission_that_ends_undecided_is_drawn(noise: str, planner_name: str, tmp_path: Path) -> None:
     text = BRIEF.replace("assured", planner_name).replace("[planner]", f"{noise}[planner]")
@@ -347,6 +347,7 @@ def test_where_nothing_can_be_written_is_refused(noisy: Path, tmp_path: Path) ->
     refused(draw(folder), "figures cannot be written: Is a directory")
 
 
+@pytest.mark.long
 def test_a_robot_without_a_journal_is_named_and_the_others_are_drawn(noisy: Path, tmp_path: Path) -> None:
     folder = copied(noisy, tmp_path)
     (folder / "agent-a.journal").unlink()

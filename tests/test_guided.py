@@ -39,6 +39,7 @@ def played(page: Page, most_s: float = 90.0) -> Iterator[tuple[int, str]]:
     raise AssertionError(f"the page still plays after {most_s} s")
 
 
+@pytest.mark.long
 def test_guided_play_tells_paper_1_in_forty_seconds_most_of_them_at_the_encounter(
     opened: Open, address: str
 ) -> None:

@@ -271,6 +271,7 @@ def test_an_invalid_certificate_is_refused_with_the_reason(
     assert ended == (3, "", f"tandem agent a: no world at {endpoint}; gave up after 2 s: {words}\n")
 
 
+@pytest.mark.long
 def test_a_world_of_another_authority_is_refused(mine: Path, tmp_path: Path) -> None:
     other = tmp_path / "others"
     assert tandem("keys", other, "--robots", "a,b").status == 0
@@ -280,6 +281,7 @@ def test_a_world_of_another_authority_is_refused(mine: Path, tmp_path: Path) -> 
     assert "its certificate is not valid here: unable to get local issuer certificate" in ended.err
 
 
+@pytest.mark.long
 def test_a_world_with_an_expired_certificate_is_refused(keys: Path, mine: Path, tmp_path: Path) -> None:
     shutil.copytree(keys / "world", tmp_path / "old" / "world")
     expire(tmp_path / "old" / "world", keys)

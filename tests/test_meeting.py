@@ -92,6 +92,7 @@ def meeting(setting: Setting, a: Orbit, b: Orbit, phases: tuple[int, int]) -> Ar
 @pytest.mark.parametrize(
     "setting", series(SETTINGS[::3] + SETTINGS[1::3] + SETTINGS[2::3], len(SETTINGS[::9]))
 )
+@pytest.mark.long
 def test_they_meet_within_the_bound_from_all_phases_and_no_sooner_from_some(setting: Setting) -> None:
     distance, _, period, _, _ = setting
     plan = rendezvous(mission_of(setting), distance, "assured")

@@ -44,6 +44,7 @@ from tests import own_planners
 from tests.commands import PAPER_1, TandemProcess
 from tests.commands import tandem as command
 from tests.own_planners import Parcel, Wrapping
+from tests.series import series
 from world.hardware.termination import Ending
 
 OWN = "tests.own_planners:Wrapping"
@@ -79,7 +80,9 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # --- all modes ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kills", [(), ("--kill", "a@11:report", "--kill", "b@8", "--kill", "world@9")])
+@pytest.mark.parametrize(
+    "kills", series([(), ("--kill", "a@11:report", "--kill", "b@8", "--kill", "world@9")])
+)
 def test_processes_and_killed_processes_write_the_same_journals(
     recording: Path, kills: tuple[str, ...], tmp_path: Path
 ) -> None:
@@ -112,6 +115,7 @@ def test_reports_and_options_are_in_the_recording(recording: Path) -> None:
     assert run.final_reports["a"].reports_heard == len(bodies)
 
 
+@pytest.mark.long
 def test_figures_and_exports_need_no_code_of_the_planner(recording: Path) -> None:
     ended = command("figures", recording, "--format", "svg")
     assert ended.status == 0, ended

@@ -44,6 +44,7 @@ def figures(pair: PairRecord, medium: Medium) -> Iterator[tuple[str, Figure]]:
                     yield name, figure
 
 
+@pytest.mark.long
 def test_each_figure_is_one_or_two_columns_wide_in_small_text_and_embedded_fonts(
     folder: Path, tmp_path: Path
 ) -> None:
@@ -76,7 +77,7 @@ def test_only_figures_to_look_at_have_a_title(folder: Path) -> None:
         assert figure.texts, name
 
 
-@pytest.mark.parametrize("medium", series([SCREEN, PAPER]), ids=["screen", "paper"])
+@pytest.mark.parametrize("medium", series([SCREEN, PAPER], 0), ids=["screen", "paper"])
 def test_all_text_is_on_the_sheet_and_no_key_covers_a_panel(folder: Path, medium: Medium) -> None:
     checked(pair_of(folder), medium)
 

@@ -339,6 +339,7 @@ def test_importing_tandem_imports_no_other_package() -> None:
 # --- estimates ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_estimates_are_those_of_the_command(tmp_path: Path) -> None:
     words = ("--noise", "uwb-calibrated", "--window", "0..12", "--out", "found")
     assert command("estimate", str(SAMPLE), *words, cwd=tmp_path).status == 1, (

@@ -94,6 +94,7 @@ def test_a_rate_out_of_bounds_is_refused(rate: str, lasts: str) -> None:
     assert ended.err.count("\n") == 1
 
 
+@pytest.mark.long
 def test_a_robot_whose_agent_is_suspended_stands_still_and_the_mission_continues(tmp_path: Path) -> None:
     out = tmp_path / "out"
     (tmp_path / "assured.toml").write_text(REAL_TIME)

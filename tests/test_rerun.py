@@ -73,6 +73,7 @@ def views(part: Any) -> Iterator[Any]:
         yield from views(one)
 
 
+@pytest.mark.long
 def test_the_blueprint_is_in_the_file_and_shows_only_what_it_has(recording: Path, tmp_path: Path) -> None:
     from compose.view.export.rerun_recording import blueprint  # noqa: PLC0415  # it imports Rerun
 

@@ -576,6 +576,7 @@ def test_a_journal_is_locked_as_long_as_it_is_open(tmp_path: Path) -> None:
     Retrace(path).close()
 
 
+@pytest.mark.long
 def test_an_agent_refuses_a_world_that_has_lost_its_journal(recording: Path, paper_1: str) -> None:
     with TandemProcess("agent", "b", "--connect", paper_1):
         ended = tandem("agent", "a", "--connect", paper_1, "--out", recording)

@@ -440,6 +440,7 @@ def test_a_fit_ends_where_no_pose_and_no_error_of_the_odometry_is_likelier(seed:
 
 @few
 @given(seeds, noises)
+@pytest.mark.long
 def test_the_covariance_of_both_poses_is_that_of_all_unknowns_at_once(seed: int, noise: Noise) -> None:
     one = told(seed, noise)
     assume(clear(one))

@@ -211,6 +211,7 @@ def repeating(put: Callable[[], None]) -> Iterator[None]:
     thread.join()
 
 
+@pytest.mark.long
 def test_an_agent_s_session_that_receives_and_cannot_send_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     endpoint, inbox, unlinked = free_endpoint(), Inbox("agent a"), Unlinked(monkeypatch)
     link = AgentLink(load("paper-1").config("a", None), "mute", inbox)

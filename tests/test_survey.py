@@ -91,7 +91,8 @@ def test_both_localise_in_the_same_tick_to_the_required_accuracy(noise: str) -> 
             partial(scenario_of, SIGMA, period=0.5),
             partial(scenario_of, SIGMA, reach=1.5),
             partial(scenario_of, SIGMA, turn_rate=0.5),
-        ]
+        ],
+        0,
     ),
     ids=["period", "reach", "turn-rate"],
 )
@@ -201,6 +202,7 @@ def test_the_robots_keep_apart_and_b_stays_in_range_of_its_anchor(noise: str) ->
                 assert apart(b, Pose(anchor.anchor.x, anchor.anchor.y, 0.0)) <= reach
 
 
+@pytest.mark.long
 def test_a_lost_contact_is_found_again() -> None:
     """After a tick without contact there is one with contact, and the mission ends localised."""
     lost = 0

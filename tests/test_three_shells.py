@@ -92,7 +92,7 @@ def test_each_shell_may_write_its_journal_to_its_own_folder(paper_1: Path, tmp_p
     assert found == journals(paper_1)
 
 
-@pytest.mark.parametrize("pairs", series([2, 3]))
+@pytest.mark.parametrize("pairs", series([2, 3], 0))
 def test_several_pairs_localise_side_by_side_in_one_world(pairs: int, tmp_path: Path) -> None:
     scenario, out = tmp_path / "pairs.toml", tmp_path / "out"
     scenario.write_text(several_pairs(pairs))

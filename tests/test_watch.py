@@ -353,6 +353,7 @@ def test_a_sweep_shows_its_cells_and_its_figures(opened: Open, tmp_path: Path) -
 # --- live -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_mission_is_followed_to_its_end_from_its_journals_and_from_the_network(
     opened: Open, tmp_path: Path
 ) -> None:

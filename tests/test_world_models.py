@@ -158,7 +158,7 @@ MODELS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("name", series(MODELS))
+@pytest.mark.parametrize("name", series(MODELS, 0))
 def test_missions_are_audited_without_a_violation(name: str) -> None:
     table = {**scenario_table("noisy"), "world": MODELS[name]}
     mission = table["mission"]

@@ -117,6 +117,7 @@ def test_figures_without_the_truth_are_drawn_as_in_simulation(folders: tuple[Pat
     assert "true separation" not in labels
 
 
+@pytest.mark.long
 def test_the_command_draws_what_it_can_and_reports_the_rest(folders: tuple[Path, Path]) -> None:
     _, alone = folders
     ended = tandem("figures", alone, "--format", "png")
