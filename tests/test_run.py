@@ -96,7 +96,15 @@ def test_summary_has_every_documented_value_of_a_run(played: tuple[str, Path]) -
             "outlier_bias": [0.3, 2.0],
             **dict.fromkeys(("actuation", "odometry"), EXACT_WHEELS),
             **dict.fromkeys(
-                ("profile", "range_bias", "pair_bias", "range_scale", "wheel_scale", "gyro_bias")
+                (
+                    "profile",
+                    "range_bias",
+                    "pair_bias",
+                    "range_scale",
+                    "wheel_scale",
+                    "gyro_bias",
+                    "survey_error",
+                )
             ),
             "slow_sigma": 0.0,
             "slow_time": 2.0,

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from agent.estimation.gaussian import odometry_noise
@@ -596,3 +597,24 @@ def test_exact_ranges_and_strides_of_a_kilometre_leave_a_covariance_that_can_be_
     assert found.guess == pytest.approx(anchor, abs=1e-3)
     assert np.min(np.linalg.eigvalsh(found.covariance)) > 0.0
     assert found.last_step < STILL
+
+
+@few
+@given(seeds, st.sampled_from([VelocityNoise(), VelocityNoise(2e-4, 2e-4, 1e-4, 2e-4)]))
+def test_the_covariance_has_the_surveying_errors_of_both_anchors(seed: int, odometry: VelocityNoise) -> None:
+    noise = Noise(1e-4, 3e-4, odometry=odometry).as_told  # small errors: curvature is left out
+    one = told(seed, noise)
+    assume(clear(one))
+
+    def placed_if(error: Array) -> Array:
+        """Return the poses that the ranges tell if the anchors are off by `error`: x and y of each."""
+        moved = (one.apart[0] + error[2] - error[0], one.apart[1] + error[3] - error[1])
+        mean = poses(settled(one._replace(apart=moved)), moved)[0]
+        mean += np.array((error[0], error[1], 0.0, error[0], error[1], 0.0))
+        return mean
+
+    surveyed = one._replace(noise=replace(noise, survey_error=0.02))
+    more = poses(settled(surveyed), one.apart)[1] - poses(settled(one), one.apart)[1]
+    by_error = derivative(placed_if, np.zeros(4))
+    expected = 0.02**2 * by_error @ by_error.T
+    assert more == pytest.approx(expected, abs=0.01 * float(np.max(np.abs(expected))))

@@ -26,8 +26,9 @@ def deviation(variance: float) -> float:
 def poses(fitted: Fit, apart: tuple[float, float]) -> tuple[Array, Array]:
     """Return the poses at the last tick, relative to M1 along the axes of <W>, in m and rad.
 
-    The result is the mean of x, y, heading of a, then of b, shape (6,), and the covariance, shape (6, 6). Of
-    one robot it is (3,) and (3, 3). With one anchor, the axes are those of the odometry's frame.
+    The result is the mean of x, y, heading of a, then of b, shape (6,), and the covariance, shape (6, 6). It
+    includes the surveying errors of the anchors. Of one robot, it is (3,) and (3, 3), relative to its anchor,
+    wherever that is. With one anchor, the axes are those of the odometry's frame.
     """
     size = 3 * len(fitted.paths)
     mean, turn = np.empty(size), np.zeros((size, size))
@@ -40,8 +41,9 @@ def poses(fitted: Fit, apart: tuple[float, float]) -> tuple[Array, Array]:
         wx, wy, _ = _placed(fitted.linear_guess[own], path)
         turn[own, own] = ((-c, s, -wy), (-s, -c, wx), (0.0, 0.0, 1.0))
     system, turn = fitted.system, turn[:, fitted.problem.free]
+    to_guess = system.of_guess @ system.weighted[:, :-1].T
     if not fitted.errors:
-        return mean, turn @ fitted.covariance @ turn.T
+        return mean, turn @ fitted.covariance @ turn.T + _of_survey(fitted, turn @ to_guess)
     # the difference of large matrices: all of them are those of one point
     prior, cross = np.zeros((size, size)), np.zeros((size, len(system.innovation)))
     for robot, (path, u) in enumerate(zip(fitted.linear_paths, fitted.directions, strict=True)):
@@ -53,7 +55,30 @@ def poses(fitted: Fit, apart: tuple[float, float]) -> tuple[Array, Array]:
         prior[own, own], cross[own] = both[:3, :3], both[:3, 3:]
     gain = system.covariance.solve(cross.T).T
     left = turn - gain @ system.jacobian
-    return mean, fitted.level * (prior - gain @ cross.T + left @ system.of_guess @ left.T)
+    covariance = fitted.level * (prior - gain @ cross.T + left @ system.of_guess @ left.T)
+    return mean, covariance + _of_survey(fitted, gain + left @ to_guess)
+
+
+def _of_survey(fitted: Fit, by_range: Array) -> Array | float:
+    """Return the covariance of the poses of both robots that is due to the surveying errors of their anchors.
+
+    `by_range` are the derivatives of the poses with respect to the ranges, shape (6, N). An error across the
+    line between the anchors, or common to both, changes no residual. Surveying errors are therefore not
+    estimated, but considered (Schmidt-Kalman): the poses keep their mean, and their covariance grows.
+    """
+    sigma = fitted.problem.noise.priors.survey_error
+    if not sigma or len(fitted.paths) == 1:
+        return 0.0
+    mutual = fitted.problem.ranges.rows(2)
+    rotation = fitted.linear_guess[5]
+    c, s = math.cos(rotation), math.sin(rotation)
+    x, y = fitted.directions[1][:, mutual]  # of b, whose range changes with M2 - M1 as with its position
+    along = by_range[:, mutual] @ np.stack((c * x - s * y, s * x + c * y), 1)
+    by_error = np.concatenate((-along, along), 1)
+    by_error[0:2, 0:2] -= np.eye(2)  # the claim is relative to where M1 and M2 should be
+    by_error[3:5, 2:4] -= np.eye(2)
+    covariance: Array = sigma**2 * by_error @ by_error.T
+    return covariance
 
 
 def _placed(guess: Array, path: Track) -> tuple[float, float, float]:

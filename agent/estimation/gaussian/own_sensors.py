@@ -166,7 +166,15 @@ def _share(noise: Noise) -> float:
     return min(1.0, max(noise.anchor_sigma, noise.mutual_sigma) / UNTOLD_SIGMA) ** 2
 
 
-SHRINKING = ("range_bias", "pair_bias", "range_scale", "slow_sigma", "wheel_scale", "gyro_bias")
+SHRINKING = (
+    "range_bias",
+    "pair_bias",
+    "range_scale",
+    "slow_sigma",
+    "wheel_scale",
+    "gyro_bias",
+    "survey_error",
+)
 """The priors of a profile that are smaller for more accurate ranges."""
 
 

@@ -27,6 +27,7 @@ PRIORS = {
     "slow_sigma": "take ranges with a clear line of sight",
     "wheel_scale": "drive a known distance, and a known number of turns",
     "gyro_bias": "measure the gyro at rest, and while a robot drives straight on",
+    "survey_error": "survey the anchors more accurately",
 }
 """The priors that may forbid an accuracy, and what makes each of them narrower."""
 
