@@ -18,9 +18,9 @@ export function heat_map(axes, rows, on_cell) {
 }
 
 function map(down, across, rest, chosen, axes, by_cell, on_cell) {
-  const columns = across ? labels(across) : [""], lines = down ? labels(down) : ["all"];
+  const columns = across ? labels(across) : ["localised"], lines = down ? labels(down) : ["all"];
   const caption = rest.map((axis, i) => `${title(axis)} ${labels(axis)[chosen[i]]}`).join(", ");
-  const head = make("tr", {}, make("th", { textContent: [down, across].filter(Boolean).map(title).join(" ↓ by ") + (across ? " →" : "") }),
+  const head = make("tr", {}, make("th", { textContent: [down, across].filter(Boolean).map(title).join(" ↓ by ") + (across ? " →" : "") || "cells" }),
     ...columns.map((label) => make("th", { scope: "col", textContent: label })));
   const body = lines.map((label, i) => make("tr", {}, make("th", { scope: "row", textContent: label }),
     ...columns.map((column, j) => {
