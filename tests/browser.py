@@ -1,21 +1,25 @@
 """Helpers that test the page in Debian's browser: `apt-get install chromium`.
 
 A test that uses the fixture `opened` (tests/conftest.py) is skipped if no browser is installed. If
-TANDEM_SHOTS names a folder, `shot` writes screenshots to it.
+TANDEM_SHOTS names a folder, `shot` writes screenshots to it. If TANDEM_BROWSER is "firefox", the tests use
+Firefox: `apt-get install firefox-esr`.
 """
 
 from __future__ import annotations
 
 import os
 import re
+import shlex
 import shutil
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, Page, Route, expect, sync_playwright
 
 from tests.commands import BOUND_S, TandemProcess
 
@@ -25,6 +29,8 @@ SERVER_GONE = "ERR_(CONNECTION_(REFUSED|RESET|CLOSED)|EMPTY_RESPONSE|INCOMPLETE_
 
 The error depends on whether the browser was connecting, waiting for an answer, or reading one.
 """
+DOCUMENT = re.compile(r"^http://127\.0\.0\.1:\d+/(#.*)?$")
+"""The addresses of the page, in which other addresses of the server do not match."""
 SCRUB = "(scrub, tick) => { scrub.value = tick; scrub.dispatchEvent(new Event('input')); }"
 Open = Callable[..., Page]
 
@@ -32,13 +38,37 @@ expect.set_options(timeout=BOUND_MS)
 
 
 @contextmanager
+def launched(name: str = os.environ.get("TANDEM_BROWSER", "chromium")) -> Iterator[Browser]:
+    """Yield the browser `name`, chromium or firefox; skip the test if it is not installed."""
+    with chromium() if name == "chromium" else firefox() as browser:
+        yield browser
+
+
+@contextmanager
 def chromium() -> Iterator[Browser]:
-    """Yield a browser; skip the test if none is installed."""
+    """Yield Chromium; skip the test if it is not installed."""
     found = shutil.which("chromium") or shutil.which("chromium-browser")
     if found is None:
         pytest.skip("there is no chromium: apt-get install chromium")
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@contextmanager
+def firefox() -> Iterator[Browser]:
+    """Yield Firefox; skip the test if it is not installed."""
+    if not (shutil.which("firefox-esr") or shutil.which("firefox")):
+        pytest.skip("there is no firefox: apt-get install firefox-esr")
+    with TemporaryDirectory() as folder, sync_playwright() as playwright:
+        started = Path(folder) / "firefox"
+        program = Path(__file__).with_name("firefox.py")
+        started.write_text(
+            f'#!/bin/sh\nexec {shlex.quote(sys.executable)} {shlex.quote(str(program))} "$@"\n'
+        )
+        started.chmod(0o755)
+        browser = playwright.firefox.launch(channel="moz-firefox", executable_path=started)
         yield browser
         browser.close()
 
@@ -62,6 +92,8 @@ def pages(browser: Browser) -> Iterator[Open]:
         page.on("pageerror", lambda error: complaints.append(str(error)))
         page.on("request", lambda request: hosts.add(re.sub(r"^(\w+://[^/:]+).*", r"\1", request.url)))
         page.set_default_timeout(BOUND_MS)
+        if browser.browser_type.name == "firefox":
+            page.route(DOCUMENT, without_policy)
         page.goto(address)
         return page
 
@@ -71,6 +103,16 @@ def pages(browser: Browser) -> Iterator[Open]:
     unexpected = [text for text in complaints if not re.search(SERVER_GONE, text)]
     assert not unexpected, unexpected
     assert hosts <= {"http://127.0.0.1"}
+
+
+def without_policy(route: Route) -> None:
+    """Answer with a document without its content security policy.
+
+    In Firefox, the policy also applies to the scripts of tests.
+    """
+    response = route.fetch()
+    headers = {name: text for name, text in response.headers.items() if name != "content-security-policy"}
+    route.fulfill(response=response, headers=headers)
 
 
 @contextmanager

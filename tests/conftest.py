@@ -11,7 +11,7 @@ from playwright.sync_api import Browser
 
 from compose.launch import in_process
 from compose.scenario.scenario_file import load
-from tests.browser import Open, chromium, pages, watching
+from tests.browser import Open, launched, pages, watching
 from tests.commands import tandem
 
 settings.register_profile("tandem", derandomize=True, deadline=None, database=None)
@@ -41,7 +41,7 @@ def mine(keys: Path, tmp_path: Path) -> Path:
 @pytest.fixture(scope="module")  # a longer scope would leave playwright's event loop running in other modules
 def browser() -> Iterator[Browser]:
     """Yield a browser; skip the test if none is installed."""
-    with chromium() as found:
+    with launched() as found:
         yield found
 
 
