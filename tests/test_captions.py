@@ -19,6 +19,7 @@ from compose.view.scene import Scene
 from protocol.attack import Attack
 from protocol.messages import Contact, Inconsistent, Localised, MissionEnd, Outcome, Undecided
 from tests.commands import SECTION_IV
+from world.faults import Fault, LinkSelector
 from world.scenario import Scenario
 
 Record = Callable[[Scenario], Run]
@@ -161,6 +162,11 @@ def with_verdicts(now: TickData, **verdicts: object) -> TickData:
         ("undecided", "b: too few ranges", "The mission ends undecided: b: too few ranges."),
         ("wrong", "a is off by 2 m", "The mission ends with a wrong claim: a is off by 2 m."),
         ("failed", "no answer of b within 30 s", "The mission fails: no answer of b within 30 s."),
+        (
+            "undecided",
+            "max_ticks: a, b not localised by then",
+            "The mission ends undecided: the time is up, and a and b are not localised.",
+        ),
         ("localised", None, "Both are localised."),
     ],
 )
@@ -171,6 +177,21 @@ def test_only_an_end_that_is_localised_says_so(
     told = [one.text for one in captions(setup, before, now, (), MissionEnd(48, outcome, reason))]
     assert told[-1] == text
     assert ("Both claim to know their poses." in told) == (outcome != "localised")
+
+
+def test_a_link_that_delivers_nothing_is_named_at_the_end_with_the_truth(paper_1: Run) -> None:
+    setup, before, now = last(paper_1)
+    end = MissionEnd(48, "undecided", "max_ticks: b not localised by then")
+    lost = Fault(link=LinkSelector("a", "b", both=False), loss=1.0)
+    for faults, text in (
+        ((lost,), "No report from a to b ever arrives."),
+        ((Fault(partition=True),), "No report from a to b or from b to a ever arrives."),
+        ((replace(lost, ticks=(0, 5)),), None),
+        ((replace(lost, loss=0.9),), None),
+    ):
+        *_, told = captions(replace(setup, faults=faults), before, now, (), end)
+        assert told.text == "The mission ends undecided: the time is up, and b is not localised."
+        assert (told.truth or "").startswith(text or "The largest error")
 
 
 def test_a_robot_that_stops_without_a_claim_is_told_with_its_reason(paper_1: Run) -> None:

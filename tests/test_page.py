@@ -66,7 +66,7 @@ def test_late_data_of_a_tick_appears_on_the_time_line_and_in_the_log(
         expect(page.locator("#log")).to_contain_text("a and b are in range of each other: 2.95 m")
         assert marks(page) > 20  # the mark of the contact
         grow(48, 48)
-        expect(page.locator("#log")).to_contain_text("b has 4 possible placements of the pair")
+        expect(page.locator("#log")).to_contain_text("b has 4 possible configurations of the pair")
         expect(page.locator("#log")).to_contain_text("a and b are in range of each other: 2.95 m")
 
 
@@ -261,6 +261,12 @@ def test_the_error_is_that_of_the_likeliest_pose_or_else_a_range(
     page.locator("#truth").check()
     page.keyboard.press("End")
     expect(error).to_have_text(re.compile(r"^error \S+ \S*m$"))
+
+
+def test_a_tick_after_the_end_is_corrected_in_the_address(opened: Open, address: str) -> None:
+    page = opened(f"{address}#tick=99999")
+    until_shown(page, 48)
+    expect(page).to_have_url(f"{address}#tick=48")
 
 
 # --- keys -------------------------------------------------------------------------------------------

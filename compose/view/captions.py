@@ -18,6 +18,7 @@ from compose.view.deliveries import Passage, contact_of
 from compose.view.events import metres
 from compose.view.pair_data import PairData
 from compose.view.run_data import TickData
+from compose.view.words import end_reason
 from protocol.messages import Estimate, Inconsistent, Localised, MissionEnd, Undecided
 
 CaptionKind = Literal[
@@ -40,6 +41,8 @@ COUNTS = (
     "twelve",
 )
 """Small numbers as words."""
+MOST_LINKS = 2
+"""With more links, a sentence has their number."""
 
 
 class Caption(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -294,16 +297,21 @@ def _concluding(pair: PairData, ended: MissionEnd | None) -> Iterator[Caption]:
 
 
 def _end(setup: RunSetup, now: TickData, end: MissionEnd) -> Caption:
-    why = f": {_stopped(end.reason)}" if end.reason else "."
+    why = f": {_stopped(end_reason(end.reason))}" if end.reason else "."
     errors = _claim_errors(setup, now)
     largest = f"The largest error of a claim is {_size(max(errors))}." if errors else None
+    silent = _silent_links(setup)
     robots = len(setup.robots)
     match end.outcome:
         case "localised":
             who = {1: setup.ids[0], 2: "Both"}.get(robots, f"All {robots} robots")
             return Caption("end", f"{who} {'is' if robots == 1 else 'are'} localised.", truth=largest)
         case "undecided":
-            return Caption("end", f"The mission ends undecided{why}", truth=largest)
+            return Caption(
+                "end",
+                f"The mission ends undecided{why}",
+                truth=" ".join(filter(None, [silent, largest])) or None,
+            )
         case "inconsistent":
             text = f"The mission ends, because measurements and reports contradict each other{why}"
             return Caption("end", text, truth=largest)
@@ -311,6 +319,23 @@ def _end(setup: RunSetup, now: TickData, end: MissionEnd) -> Caption:
             return Caption("end", f"The mission ends with a wrong claim{why}", truth=largest)
         case _:
             return Caption("end", f"The mission fails{why}", truth=largest)
+
+
+def _silent_links(setup: RunSetup) -> str | None:
+    """Return a sentence about the links that deliver nothing all the time; None if there are none."""
+    dead = [
+        fault
+        for fault in setup.faults
+        if (fault.partition or not fault.let_through) and fault.ticks is None and fault.contact_ticks is None
+    ]
+    links = [
+        f"from {robot.id} to {robot.peer}"
+        for robot in setup.robots
+        if any(fault.on(robot.id, robot.peer) for fault in dead)
+    ]
+    if len(links) > MOST_LINKS:
+        return f"No report arrives on {len(links)} of the {len(setup.robots)} links between robots."
+    return f"No report {' or '.join(links)} ever arrives." if links else None
 
 
 def _claim_errors(setup: RunSetup, now: TickData) -> list[float]:

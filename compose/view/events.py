@@ -12,7 +12,7 @@ import msgspec
 from compose.recording.run_setup import RobotSetup, RunSetup
 from compose.view.deliveries import Passage, contact_of
 from compose.view.run_data import TickData
-from compose.view.words import doing
+from compose.view.words import doing, end_reason
 from protocol.messages import Command, Inconsistent, Localised, MissionEnd
 from protocol.motion import wrap
 
@@ -53,7 +53,7 @@ def events(
         yield from _believing(robot_setup, before, now)
     yield from _radio(now.tick, passages)
     if end is not None and end.tick == now.tick:
-        why = f" ({end.reason})" if end.reason else ""
+        why = f" ({end_reason(end.reason)})" if end.reason else ""
         yield Event(now.tick, "end", None, f"The mission ends: {end.outcome}{why}")
 
 
@@ -158,11 +158,11 @@ def _believing(robot_setup: RobotSetup, before: TickData | None, now: TickData) 
         yield Event(tick, "branch", robot, text)
     previous, current = len(earlier.world), len(held.world)
     if previous == 0 < current:
-        text = f"{robot} has {current} possible placement{'s' if current > 1 else ''} of the pair"
+        text = f"{robot} has {current} possible configuration{'s' if current > 1 else ''} of the pair"
         yield Event(tick, "candidates", robot, text)
     elif previous != current > 0:
         change = "fall" if current < previous else "rise"
-        text = f"{robot}'s possible placements {change} from {previous} to {current}"
+        text = f"{robot}'s possible configurations {change} from {previous} to {current}"
         yield Event(tick, "candidates", robot, text)
 
 

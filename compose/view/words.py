@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from compose.recording.run_setup import RobotSetup
 from protocol.messages import Inconsistent, Undecided, Verdict
 
@@ -27,7 +29,7 @@ DOING = {
     "orbiting": "{robot} drives on its orbit until {peer} is in range",
     "standing": "{robot} stands still and waits for {peer}'s second range",
     "waiting": "{robot} stands still and waits for {peer}'s last manoeuvre",
-    "last-manoeuvre": "{robot} drives to where the remaining placements predict different ranges",
+    "last-manoeuvre": "{robot} drives to where the remaining configurations predict different ranges",
     "returning": "{robot} has left {peer}'s range and drives the same arc back to report to it",
     "retreating": "{robot} has left {peer}'s range and drives back along its path, and as far again",
     "listening": "{robot} stands still within {peer}'s range and waits for missing reports",
@@ -36,6 +38,25 @@ DOING = {
 """Sentences by state name, of all other states."""
 WAITING = "{robot} waits beside its anchor until {peer} comes into range"
 """The sentence of the state "orbiting" of a robot whose plan has no speed."""
+
+
+TIME_IS_UP = re.compile(r"max_ticks: (.+) not localised by then")
+"""The reason of a mission that ends at its largest number of ticks, as the world writes it."""
+MOST_NAMES = 4
+"""With more robots, a sentence has their number."""
+
+
+def end_reason(reason: str) -> str:
+    """Return the reason of a mission's end as a clause without the names of fields."""
+    found = TIME_IS_UP.fullmatch(reason)
+    if found is None:
+        return reason
+    robots = found[1].split(", ")
+    if len(robots) > MOST_NAMES:
+        names = f"{len(robots)} robots"
+    else:
+        names = " and ".join([", ".join(robots[:-1]), robots[-1]] if len(robots) > 1 else robots)
+    return f"the time is up, and {names} {'are' if len(robots) > 1 else 'is'} not localised"
 
 
 def doing(robot_setup: RobotSetup, phase: int, state: str, verdict: Verdict | None) -> str:

@@ -160,9 +160,9 @@ function believed({ local, world, probability: chances, covariance, localised })
   const sigma = covariance && world.length ? `, sigma ${metres(Math.sqrt(Math.max(0, covariance[0] + covariance[3])))}` : "";
   if (world.length === 1) {
     const at = `${place(world[0])}, ${rad(wrap(world[0][2]))}${sigma}`;
-    return localised ? `localised at ${at}` : `1 possible placement: ${at}`;
+    return localised ? `localised at ${at}` : `1 possible configuration: ${at}`;
   }
-  if (world.length) return `${world.length} possible placements${chances.length ? "" : ", equally probable"}${sigma}`;
+  if (world.length) return `${world.length} possible configurations${chances.length ? "" : ", equally probable"}${sigma}`;
   if (local.length > 1) return `${local.length} possible branches in the anchor's frame`;
   if (local.length) return `${metres(Math.hypot(local[0][0], local[0][1]))} from its anchor, bearing unknown`;
   return "pose unknown";

@@ -116,7 +116,8 @@ async function open(name) {
     store.onforget = (tick) => { timeline.forget(tick); log.forget(tick); guide.forget(tick); };
     const { tick, robot, truth } = address_state();
     view.follow = tick === null;
-    view.tick = tick ?? (store.live ? Math.max(store.last, 0) : store.first);
+    const start = store.live ? store.last : store.first;
+    view.tick = Math.max(Math.min(tick ?? start, store.last), store.first, 0);
     view.wanted = truth;
     view.playing = false;
     view.beat = null;

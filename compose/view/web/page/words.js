@@ -38,7 +38,7 @@ export const SIGNS = {
 
 export const KIND_NAMES = {
   anchor: "anchor in range", "anchor-lost": "anchor out of range", contact: "contact", "contact-lost": "contact lost",
-  phase: "phase", state: "state", branch: "branch chosen", candidates: "possible placements", claim: "claim",
+  phase: "phase", state: "state", branch: "branch chosen", candidates: "possible configurations", claim: "claim",
   undecided: "undecided", inconsistent: "inconsistent", late: "deadline missed", end: "end", down: "process gone",
   back: "process back", "report-lost": "report lost", "report-damaged": "report damaged",
   "report-late": "report late", "report-doubled": "report duplicated",
