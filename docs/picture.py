@@ -1,4 +1,4 @@
-"""Draw the figures of single missions in the documentation again: `uv run docs/picture.py`."""
+"""Draw the figures and the film of single missions in the documentation again: `uv run docs/picture.py`."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from compose.figures.style import SCREEN, look, save
 from compose.launch import in_process
 from compose.recording.run import read
 from compose.scenario import scenario_file
+from compose.view.web.film import film
 
 DOCS = Path(__file__).parent
 SHOWN: dict[str, dict[str, str]] = {
@@ -34,12 +35,17 @@ SHOWN: dict[str, dict[str, str]] = {
 }
 """By scenario: the titles of the figures of `tandem figures` that pages show, and their file names here."""
 
+FILMED = "paper-1"
+"""The scenario whose guided play is page.gif."""
+
 
 def main() -> None:
     """Draw the figures that `tandem run SCENARIO --out DIR` and `tandem figures DIR --format svg` write."""
     for name, shown in SHOWN.items():
         with tempfile.TemporaryDirectory() as folder:
             draw(name, shown, Path(folder))
+            if name == FILMED:
+                (DOCS / "page.gif").write_bytes(film(Path(folder)))
 
 
 def draw(name: str, shown: Mapping[str, str], folder: Path) -> None:

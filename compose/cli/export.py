@@ -42,6 +42,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="write only run.rrd: a recording for Rerun, with its views in place (extra rerun)",
     )
+    kinds.add_argument(
+        "--gif",
+        action="store_true",
+        help="write only run.gif: the guided play as an animated picture (extra film, and Chromium)",
+    )
     add_closing(parser, "tandem export recording --out exported", "docs/recordings.md")
 
 
@@ -55,6 +60,8 @@ def main(options: argparse.Namespace) -> int:
         return _pyfg(options.recording, out)
     if options.html:
         return _html(options.recording, out)
+    if options.gif:
+        return _gif(options.recording, out)
     if options.rerun:
         return _rerun(options.recording, out)
     need(*MODULES)
@@ -94,6 +101,15 @@ def _html(recording: Path, out: Path) -> int:
     say(str(_written(out, "run.html", page.html)))
     for note in page.notes:
         say(note, error=True)
+    return ENDED
+
+
+def _gif(recording: Path, out: Path) -> int:
+    """Write run.gif to `out`, and print its path."""
+    need("PIL", "playwright", extra="film")
+    from compose.view.web.film import film  # noqa: PLC0415  # it imports Zenoh
+
+    say(str(_written(out, "run.gif", film(recording))))
     return ENDED
 
 
