@@ -31,7 +31,7 @@ from compose.recording.ticks_csv import TickRow
 from compose.scenario.fault_syntax import FaultTable
 from compose.scenario.json_schema import described
 from compose.scenario.kills import KillTable
-from compose.scenario.scenario_file import PlannerTable, RobotTable, ScenarioFile, WorldTable
+from compose.scenario.scenario_tables import PlannerTable, RobotTable, ScenarioFile, WorldTable
 from compose.sweep.draws import DrawTable, StartsTable
 from compose.sweep.spec import AxisTable, RowTable, SpecFile
 from compose.sweep.trial import RobotRow, TrialRow

@@ -67,7 +67,7 @@ class Priors(NamedTuple):
         return self.wheel_scale > 0.0 or self.gyro_bias > 0.0
 
 
-UNTOLD = Priors(0.02, 0.01, 0.005, 0.0, 2.0, 0.005, 0.003, 0.02)
+UNTOLD = Priors(0.02, 0.01, 0.005, 0.0, 2.0, 0.005, 0.003, 0.01)
 """The priors of whoever tells none, for ranges with a sigma of UNTOLD_SIGMA or more.
 
 They are as wide as costs at most 5 % more ticks if the noise is as told: see docs/assumptions.md.

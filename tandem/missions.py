@@ -17,7 +17,7 @@ from compose.launch.class_loader import need_module
 from compose.recording import run as recorded
 from compose.recording.recording_files import WORLD_JOURNAL, folder_for
 from compose.scenario.kills import Kill, parse
-from compose.scenario.scenario_file import check_rate, run_name
+from compose.scenario.run_settings import check_rate, run_name
 from protocol.journal.journal_file import MemoryJournal
 from protocol.network.inbox import Inbox
 from tandem.results import Run

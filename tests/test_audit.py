@@ -25,7 +25,8 @@ from compose.launch.planner_loader import planner_of
 from compose.recording.frames import KINDS
 from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
 from compose.recording.run import of_frames, read
-from compose.scenario.scenario_file import load, parse, shipped
+from compose.scenario.scenario_file import load, parse
+from compose.scenario.shipped_files import shipped
 from protocol.attack import Attack
 from protocol.journal import journal_file
 from protocol.journal.journal_file import CorruptJournal, MemoryJournal

@@ -11,7 +11,8 @@ from msgspec.structs import replace
 from compose.launch import in_process
 from compose.recording.run import Run, read
 from compose.recording.run_setup import RunSetup
-from compose.scenario.scenario_file import load, parse, shipped
+from compose.scenario.scenario_file import load, parse
+from compose.scenario.shipped_files import shipped
 from compose.view.captions import Caption, captions
 from compose.view.recorded import run_data, scenes_of
 from compose.view.run_data import TickData

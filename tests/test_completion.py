@@ -10,7 +10,7 @@ import pytest
 
 from compose.cli.main import COMMANDS
 from compose.figures import PICTURES
-from compose.scenario.scenario_file import shipped
+from compose.scenario.shipped_files import shipped
 from tests.commands import tandem
 
 

@@ -10,7 +10,8 @@ from msgspec.structs import replace
 from compose.figures.agent_replay import agent_replay
 from compose.launch import in_process
 from compose.recording.run import Run, read
-from compose.scenario.scenario_file import load, parse, shipped
+from compose.scenario.scenario_file import load, parse
+from compose.scenario.shipped_files import shipped
 from compose.view.configurations import Configurations, configurations
 from compose.view.recorded import run_data, scenes_of
 from protocol.attack import Attack

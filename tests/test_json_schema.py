@@ -11,7 +11,8 @@ import msgspec
 import pytest
 
 from compose.scenario.json_schema import json_schema
-from compose.scenario.scenario_file import ScenarioFile, shipped
+from compose.scenario.scenario_tables import ScenarioFile
+from compose.scenario.shipped_files import shipped
 from compose.sweep.spec import SpecFile
 from tests.commands import tandem
 

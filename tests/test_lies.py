@@ -16,7 +16,8 @@ from compose.errors import BadScenario
 from compose.launch.in_process import run_mission
 from compose.recording.run import Run
 from compose.recording.summary_json import summary
-from compose.scenario.scenario_file import parse, shipped
+from compose.scenario.scenario_file import parse
+from compose.scenario.shipped_files import shipped
 from protocol.attack import Attack, Kind, Part
 from protocol.messages import Inconsistent, Ranged, Report, Undecided
 from protocol.motion import ORIGIN, Pose, Segment, follow

@@ -7,7 +7,7 @@ from collections import Counter
 import pytest
 
 from compose.launch import in_process
-from compose.scenario import scenario_file
+from compose.scenario import scenario_file, shipped_files
 from protocol.messages import Localised
 from tests.series import series
 from world.referee import errors
@@ -19,7 +19,7 @@ SHARES = 10
 
 
 def started(seed: int, planner_name: str) -> Scenario:
-    text = scenario_file.shipped()["random"].read_text()
+    text = shipped_files.shipped()["random"].read_text()
     return scenario_file.parse(f'{text}\n[planner]\nname = "{planner_name}"\n', "random", seed=seed)
 
 

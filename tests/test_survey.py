@@ -24,7 +24,7 @@ from compose.launch.in_process import run_mission
 from compose.recording.run import Run
 from compose.recording.summary_json import summary
 from protocol.messages import Ranged, Undecided
-from protocol.motion import Pose
+from protocol.motion import Pose, compose, inverse
 from protocol.noise import Noise
 from protocol.wire import encode
 from tests.series import series
@@ -418,3 +418,15 @@ def test_nothing_is_claimed_by_a_fit_that_still_moves(monkeypatch: pytest.Monkey
         "has not converged" in (final_report.blocking_reason or "")
         for final_report in recording.final_reports.values()
     )
+
+
+def test_between_two_estimates_the_poses_of_a_robot_move_with_its_odometry() -> None:
+    config = scenario_of(SIGMA, 0).config("a", None)
+    then, now = Pose(1.0, 2.0, 0.5), Pose(1.6, 2.2, 0.9)
+    possible = (Pose(4.0, -1.0, 2.0), Pose(0.0, 0.0, -1.0))
+    state = RobotState(config, odometry=now, belief=Belief(poses=possible, odometry=then))
+    moved = compose(inverse(then), now)
+    for before, after in zip(possible, PLANNER.estimate(state).world, strict=True):
+        way = compose(inverse(before), after)
+        assert (way.x, way.y, way.heading) == pytest.approx((moved.x, moved.y, moved.heading))
+    assert PLANNER.estimate(replace(state, odometry=then)).world == possible

@@ -9,7 +9,8 @@ from msgspec.structs import replace
 
 from agent.estimation import precision
 from compose.launch.in_process import run_mission
-from compose.scenario.scenario_file import parse, shipped
+from compose.scenario.scenario_file import parse
+from compose.scenario.shipped_files import shipped
 from protocol.messages import Command, Localised, Report, Undecided
 from protocol.motion import ORIGIN, Covariance
 from tests.series import series

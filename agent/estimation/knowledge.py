@@ -14,7 +14,7 @@ from agent.peer.motion_log import MotionLog
 from agent.peer.peer_state import PeerState
 from protocol import messages
 from protocol.messages import Ranged, RobotConfig
-from protocol.motion import ORIGIN, Covariance, Pose, compose
+from protocol.motion import ORIGIN, Covariance, Pose, compose, inverse
 from protocol.orbits import Orbit
 
 
@@ -56,7 +56,9 @@ class Belief(msgspec.Struct, frozen=True):
     pair: tuple[Hypothesis, ...] = ()
     """Noisy sensors: the hypotheses about both robots' poses in <W>, the most probable first."""
     poses: tuple[Pose, ...] = ()
-    """The robot's pose in <W> under each hypothesis in `pair`."""
+    """The robot's pose in <W> under each hypothesis in `pair`, at the latest estimate of both poses."""
+    odometry: Pose = ORIGIN
+    """Noisy sensors: the pose by dead reckoning at that estimate, in the frame of the pose at tick 0."""
     covariance: Covariance | None = None
     """The covariance of the first pose in `poses`."""
     blocking_reason: str | None = None
@@ -106,6 +108,14 @@ class Knowledge(msgspec.Struct, frozen=True):
         if self.config.role == "a":
             turn += placement.phi
         return compose(Pose(own.x, own.y, turn), self.local_pose)
+
+    @property
+    def poses(self) -> tuple[Pose, ...]:
+        """Return `belief.poses`, moved by the odometry since the latest estimate."""
+        if self.belief.odometry == self.odometry:
+            return self.belief.poses
+        moved = compose(inverse(self.belief.odometry), self.odometry)
+        return tuple([compose(pose, moved) for pose in self.belief.poses])
 
     def seen(self) -> list[tuple[Pose, float | None]]:
         """Return the odometry pose of each tick of phase 1, and the anchor range or None.

@@ -158,7 +158,7 @@ def estimate(state: RobotState) -> Estimate:
     elif not branches_left and isinstance(state.mode, ThirdPoint):
         branches_left = state.mode.branches
     if belief.poses:
-        world: tuple[Pose, ...] = belief.poses
+        world: tuple[Pose, ...] = state.poses
     elif isinstance(verdict, Localised):
         world = (verdict.pose,)
     else:

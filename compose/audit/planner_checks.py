@@ -18,7 +18,7 @@ from compose.recording import run as recorded
 from compose.recording.recording_files import WORLD_JOURNAL
 from compose.recording.run import Run
 from compose.scenario.kills import Kill, parse
-from compose.scenario.scenario_file import run_name
+from compose.scenario.run_settings import run_name
 from protocol.journal.journal_file import MemoryJournal, packed
 from protocol.messages import RobotConfig
 from protocol.network.inbox import Inbox

@@ -10,7 +10,7 @@ from compose.errors import CLEAN, VIOLATED
 from compose.hardware.conformance import check_results
 from compose.hardware.exercise import Broken, ExerciseRun
 from compose.launch.driver_loader import config_of, driver_class, made, mission, options_of
-from compose.scenario.scenario_file import check_rate
+from compose.scenario.run_settings import check_rate
 from compose.terminal import text_width
 from protocol.output import one_line, say
 

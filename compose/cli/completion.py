@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from compose.cli.arguments import add_closing
 from compose.cli.main import COMMANDS, command_parser
 from compose.errors import ENDED
-from compose.scenario.scenario_file import shipped
+from compose.scenario.shipped_files import shipped
 from protocol.output import say
 
 SHELLS = ("bash", "zsh")

@@ -11,7 +11,7 @@ from pathlib import Path
 from compose.cli.arguments import add_closing, folder
 from compose.errors import ENDED, UserError
 from compose.scenario.json_schema import json_schema
-from compose.scenario.scenario_file import ScenarioFile
+from compose.scenario.scenario_tables import ScenarioFile
 from compose.sweep.spec import SpecFile
 from protocol import files
 from protocol.output import say

@@ -19,7 +19,7 @@ from compose.launch.supervisor import STOP_S, ChildFailed, Supervisor
 from compose.network import reach
 from compose.recording.recording_files import folder_for
 from compose.recording.run import ended
-from compose.scenario.scenario_file import check_rate
+from compose.scenario.run_settings import check_rate
 from protocol.messages import Localised, MissionEnd
 from protocol.motion import wrap
 from protocol.network import access_control, session

@@ -19,7 +19,8 @@ from compose.launch.viewers import Viewer, foxglove_server, page, stay, viewing
 from compose.recording.recording_files import folder_for
 from compose.recording.run import Run, read
 from compose.scenario.kills import Kill
-from compose.scenario.scenario_file import check_rate, run_name, setting
+from compose.scenario.run_settings import check_rate, run_name
+from compose.scenario.scenario_file import setting
 from compose.terminal.outcome import break_off, conclude, shown_live, shows_live
 from protocol.journal.journal_file import CannotRecord
 from protocol.network.inbox import Inbox, Interrupted

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from compose.cli.arguments import add_closing
 from compose.errors import ENDED
-from compose.scenario.scenario_file import ScenarioFile, shipped
+from compose.scenario.scenario_tables import ScenarioFile
+from compose.scenario.shipped_files import shipped
 from compose.terminal import text_width
 from protocol.output import say
 

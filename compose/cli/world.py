@@ -22,7 +22,8 @@ from compose.launch.processes import scenario_from_launcher
 from compose.recording.recording_files import WORLD_JOURNAL, folder_for
 from compose.recording.run import read
 from compose.scenario import kills
-from compose.scenario.scenario_file import check_rate, run_name, setting
+from compose.scenario.run_settings import check_rate, run_name
+from compose.scenario.scenario_file import setting
 from compose.terminal.outcome import break_off, conclude, reopened, shown_live
 from protocol import limits
 from protocol.journal.journal_file import Journal

@@ -2,34 +2,28 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
-import platform
 import random
-import secrets
-import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import msgspec
-from msgspec import Meta
 from msgspec.structs import asdict
 
 from compose.errors import BadFault, BadKill, BadScenario, Unworkable, UserError
 from compose.launch import model_loader, planner_loader
 from compose.scenario.fault_syntax import FaultTable, added, table_of
-from compose.scenario.kills import WORLD, Kill, KillTable, drawn
+from compose.scenario.kills import WORLD, Kill, drawn
+from compose.scenario.scenario_tables import MAX_TICKS, PlannerTable, RobotTable, ScenarioFile
+from compose.scenario.shipped_files import misplaced, shipped, unknown
 from compose.scenario.toml_file import field_first, read_text, table_in
-from protocol.attack import OF_THE_START, Attack
+from protocol.attack import OF_THE_START
 from protocol.messages import AnyRobotConfig
 from protocol.mission import (
     Anchor,
     Mission,
-    Options,
-    PlannerName,
     Role,
     infeasibility,
     noise_infeasibility,
@@ -40,7 +34,6 @@ from protocol.noise import with_profile
 from protocol.orbits import Rendezvous, tick_budget
 from protocol.rounding import TOLERANCE
 from protocol.spelling import did_you_mean
-from protocol.units import NAME, RobotId
 from protocol.wire import MalformedFrame, decode, encode
 from world.faults import Fault, delivery_time_bound
 from world.scenario import (
@@ -50,84 +43,14 @@ from world.scenario import (
     ScenarioWithOptions,
     ScenarioWithWorldNoise,
 )
-from world.world_models import ModelSpec
-from world.world_noise import WorldNoise, world_noise_infeasibility, world_noise_mistake
+from world.world_noise import world_noise_infeasibility, world_noise_mistake
 
-MAX_TICKS = 10**9
-MAX_ROBOTS = 200
-"""The largest number of robots, so that a GroundTruth message of all of them fits a frame."""
-Place = Annotated[float, Meta(ge=-1e6, le=1e6)]
-"""A coordinate in m. No robot can drive so far from it that it leaves the range of `units.Coordinate`."""
 EXCHANGES = 20
 """The number of reports for each of which `max_ticks` allows the full `delivery_time_bound`."""
 NEAREST_ANCHORS = TOLERANCE
 """The minimum distance in m of two anchors: nearer ones coincide at the accuracy of exact claims."""
-TICK_S = (5e-4, 3600.0)
-"""The bounds in s of the wall time of a tick in real time."""
 WITHIN = 1.0 - 1e-9
 """The part of R within which starts are drawn, so that rounding cannot move one outside."""
-
-
-class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A table of the file. Unknown fields are errors, because they are typing mistakes."""
-
-
-class PlannerTable(_Table, frozen=True):
-    """The `[planner]` table."""
-
-    name: PlannerName = "assured"
-    """The planner of all robots: `assured`, `paper`, an installed one, or MODULE:CLASS."""
-    options: Options = {}
-    """The options of a planner of your own: the keyword arguments of its class."""
-
-
-class WorldTable(_Table, frozen=True):
-    """The `[world]` table: what the simulator does and the robots are not told."""
-
-    noise: WorldNoise = WorldNoise()
-    """The `[world.noise]` table: the noise that the sensors have."""
-    range: ModelSpec | None = None
-    """The `[world.range]` table: the model of detection and ranges."""
-    radio: ModelSpec | None = None
-    """The `[world.radio]` table: the model of the delivery of reports."""
-
-
-class RobotTable(_Table, frozen=True):
-    """A `[[robot]]` table."""
-
-    id: RobotId
-    """The robot's name."""
-    anchor: tuple[Place, Place]
-    """x, y of the robot's anchor, in m."""
-    start: tuple[Place, Place, Annotated[float, Meta(ge=-1e6, le=1e6)]] | None = None
-    """Start pose x, y in m and heading in rad; None: drawn from the seed, within range of the anchor."""
-    peer: RobotId | None = None
-    """Id of the peer; required with more than two robots."""
-    attack: Attack | None = None
-    """False data injection: the falsification of the reports that this robot sends to its peer."""
-
-
-class ScenarioFile(_Table, frozen=True):
-    """The content of a scenario file."""
-
-    name: Annotated[str, Meta(pattern=NAME, max_length=48)]
-    """The name of the scenario, and the beginning of the names of its runs."""
-    mission: Mission
-    """The `[mission]` table."""
-    robot: Annotated[list[RobotTable], Meta(min_length=2, max_length=MAX_ROBOTS)]
-    """One `[[robot]]` for each robot."""
-    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
-    """The seed of all random draws, starts included."""
-    max_ticks: Annotated[int, Meta(ge=1, le=MAX_TICKS)] | None = None
-    """The last tick of an undecided run; computed from the mission by default."""
-    planner: PlannerTable = PlannerTable()
-    """The `[planner]` table."""
-    world: WorldTable = WorldTable()
-    """The `[world]` table."""
-    fault: list[FaultTable] = []
-    """Faults of the radio, applied to each report one after the other."""
-    kill: list[KillTable] = []
-    """Kills of processes. They are not part of the Scenario and do not appear in the recording."""
 
 
 class ScenarioTemplate(msgspec.Struct, frozen=True):
@@ -165,67 +88,6 @@ class ScenarioTemplate(msgspec.Struct, frozen=True):
                 near = f"{', '.join(anyone)}{did_you_mean(kill.who, anyone)}"
                 raise BadKill(f"--kill: {kill.text}: there is no '{kill.who}'; there are {near}")
         return (*drawn(self.file.kill, seed, ids), *options)
-
-
-def shipped(package: str = "scenario") -> dict[str, Path]:
-    """Return the shipped scenario files by name; for the package `sweep`, the shipped sweep files."""
-    path = Path(str(resources.files("compose") / package / "shipped"))
-    return {file.stem: file for file in sorted(path.glob("*.toml"))}
-
-
-SHIPPED = {"scenario": ("scenario", "run"), "sweep": ("sweep", "sweep")}
-"""The kind of file in each package, and the command that runs it."""
-MARKS = {"scenario": {"mission", "robot"}, "sweep": {"scenario", "trials"}}
-"""The required fields of the files in each package that files of the other kind cannot have."""
-
-
-def unknown(source: str, folder: str) -> str:
-    """Return an error message: `source` is neither a file nor a shipped file of the package `folder`."""
-    names = {one: shipped(one) for one in SHIPPED}
-    for other, (kind, command) in SHIPPED.items():
-        if other != folder and source in names[other]:
-            return _other_kind(source, kind, command)
-    near = did_you_mean(source, [name for found in names.values() for name in found])
-    ships = ", ".join(names[folder])
-    return f"{source}: neither a file nor a shipped {SHIPPED[folder][0]} ({ships}){near}"
-
-
-def misplaced(source: str, table: Mapping[str, Any], folder: str) -> str | None:
-    """Return an error message if the file `source`, whose content is `table`, is not of the kind in `folder`.
-
-    Return None if `table` has a field that marks the kind of file in `folder`, or no mark at all.
-    """
-    if MARKS[folder].isdisjoint(table):
-        for other, (kind, command) in SHIPPED.items():
-            if not MARKS[other].isdisjoint(table):
-                return _other_kind(source, kind, command)
-    return None
-
-
-def _other_kind(source: str, kind: str, command: str) -> str:
-    return f"{source} is a {kind}; run it with `tandem {command} {shlex.quote(source)}`"
-
-
-def run_name(scenario: Scenario, out: Path | None = None) -> str:
-    """Return a unique name for a run of `scenario`.
-
-    With `out`, the name follows from the host and that folder, so that a resumed run has its name again.
-    """
-    mark = secrets.token_hex(3)
-    if out is not None:
-        mark = hashlib.blake2s(f"{platform.node()}:{out.resolve()}".encode(), digest_size=3).hexdigest()
-    return f"{scenario.name}-{mark}"
-
-
-def check_rate(scenario: Scenario, rate: float | None) -> None:
-    """Raise UserError if a tick at `rate` would last less or more than TICK_S permits."""
-    shortest, longest = TICK_S
-    if rate is not None and not shortest <= scenario.mission.period / rate <= longest:
-        period = scenario.mission.period
-        raise UserError(
-            f"--rate: {rate:g} makes a tick of {period:g} s last {period / rate:g} s, "
-            f"outside {shortest:g} to {longest:g} s"
-        )
 
 
 def load(source: str, *, seed: int | None = None, faults: Sequence[str] = ()) -> Scenario:

@@ -12,7 +12,7 @@ import msgspec
 from msgspec import inspect
 
 from compose.errors import NoSuchField
-from compose.scenario.scenario_file import ScenarioFile
+from compose.scenario.scenario_tables import ScenarioFile
 from protocol.spelling import did_you_mean
 
 Steps = tuple[str | int, ...]

@@ -15,7 +15,7 @@ import msgspec
 from msgspec import Meta
 
 from compose.errors import BadSpec, NoSuchField, NotToml
-from compose.scenario import scenario_file
+from compose.scenario import scenario_tables, shipped_files
 from compose.scenario.toml_file import field_first, read_text, table_in
 from compose.sweep.draws import Draw, Draws, DrawTable, StartsTable
 from compose.sweep.field_paths import Steps, canonical, jsonable, steps, value_at, with_value
@@ -139,7 +139,7 @@ class Sweep(msgspec.Struct, frozen=True):
 
 def shipped() -> dict[str, Path]:
     """Return the paths of the shipped sweep files, by name."""
-    return scenario_file.shipped("sweep")
+    return shipped_files.shipped("sweep")
 
 
 def load(source: str, *, trials: int | None = None, seed: int | None = None) -> Sweep:
@@ -152,10 +152,10 @@ def load(source: str, *, trials: int | None = None, seed: int | None = None) -> 
     try:
         table = table_in(read_text(path), source)
     except FileNotFoundError:
-        raise BadSpec(scenario_file.unknown(source, "sweep")) from None
+        raise BadSpec(shipped_files.unknown(source, "sweep")) from None
     except ValueError as error:
         raise BadSpec(f"{source}: {error}") from None
-    if (why := scenario_file.misplaced(source, table, "sweep")) is not None:
+    if (why := shipped_files.misplaced(source, table, "sweep")) is not None:
         raise BadSpec(why)
     return validated(table, source, path.parent, trials=trials, seed=seed)
 
@@ -196,11 +196,11 @@ def validated(
 
 def _base(spec: SpecFile, folder: Path, source: str) -> dict[str, Any]:
     """Return the table of the base scenario of `spec`. Raises BadSpec if it cannot be read."""
-    file = scenario_file.shipped().get(spec.scenario, folder / spec.scenario)
+    file = shipped_files.shipped().get(spec.scenario, folder / spec.scenario)
     try:
         return _with_fields(table_in(read_text(file), spec.scenario), spec.set, f"{source}: set")
     except FileNotFoundError:
-        names = scenario_file.shipped()
+        names = shipped_files.shipped()
         raise BadSpec(
             f"{source}: scenario: '{spec.scenario}' is neither a file in the folder of the sweep file nor a "
             f"shipped scenario ({', '.join(names)}){did_you_mean(spec.scenario, names)}"
@@ -355,7 +355,7 @@ def _draws(spec: SpecFile, axes: Sequence[Axis], base: dict[str, Any], source: s
 def _check_takes_float(field: str, way: Steps, value: float, base: dict[str, Any], where: str) -> None:
     """Raise BadSpec if the field at `way` is not a float. Its bounds are checked for each trial."""
     try:
-        msgspec.convert(with_value(base, way, value + 0.5), scenario_file.ScenarioFile)
+        msgspec.convert(with_value(base, way, value + 0.5), scenario_tables.ScenarioFile)
     except msgspec.ValidationError as error:
         if "got `float`" in str(error):
             raise BadSpec(f"{where}: '{field}' is not a floating-point field and cannot be drawn") from None

@@ -15,7 +15,7 @@ from compose.launch import in_process
 from compose.recording.run import Run, of_frames, read
 from compose.recording.ticks_csv import ticks_csv
 from compose.scenario.kills import Kill
-from compose.scenario.scenario_file import run_name
+from compose.scenario.run_settings import run_name
 from protocol.journal.journal_file import MemoryJournal, packed
 from protocol.network.inbox import Inbox
 from world.scenario import Scenario

@@ -258,8 +258,11 @@ def _distance_score(fitted: Fit, pair: PairRanges) -> float:
     explained = system.jacobian.T @ weighted
     information = float(by_distance @ weighted - explained @ system.of_guess @ explained)
     score = float(by_distance @ system.multipliers)
-    level = min(fitted.level, HIGHEST_LEVEL)
-    return score / math.sqrt(information * max(level, 1.0)) if information > LEAST else 0.0
+    level = max(min(fitted.level, HIGHEST_LEVEL), 1.0)
+    surveyed = 2.0 * pair.noise.priors.survey_error**2  # the variance of the known distance
+    if information <= LEAST:
+        return 0.0
+    return score / math.sqrt(information * (level + surveyed * information))
 
 
 LEAST = 1e-3

@@ -380,6 +380,7 @@ def with_pair(
         knowledge.belief,
         pair=tuple(one.hypothesis for one in scored),
         poses=tuple(Pose(m1.x + pose.x, m1.y + pose.y, pose.heading) for pose, _ in claims),
+        odometry=knowledge.odometry,
         covariance=claims[0][1] if claims else None,
         candidates=(first, len(scored)),
         inconsistency=inconsistency,

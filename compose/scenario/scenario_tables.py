@@ -1,0 +1,85 @@
+"""The tables of a scenario file: their fields, types, bounds and defaults."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+from compose.scenario.fault_syntax import FaultTable
+from compose.scenario.kills import KillTable
+from protocol.attack import Attack
+from protocol.mission import Mission, Options, PlannerName
+from protocol.units import NAME, RobotId
+from world.world_models import ModelSpec
+from world.world_noise import WorldNoise
+
+MAX_TICKS = 10**9
+"""The largest number of ticks of a run."""
+MAX_ROBOTS = 200
+"""The largest number of robots, so that a GroundTruth message of all of them fits a frame."""
+Place = Annotated[float, Meta(ge=-1e6, le=1e6)]
+"""A coordinate in m. No robot can drive so far from it that it leaves the range of `units.Coordinate`."""
+
+
+class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A table of the file. Unknown fields are errors, because they are typing mistakes."""
+
+
+class PlannerTable(_Table, frozen=True):
+    """The `[planner]` table."""
+
+    name: PlannerName = "assured"
+    """The planner of all robots: `assured`, `paper`, an installed one, or MODULE:CLASS."""
+    options: Options = {}
+    """The options of a planner of your own: the keyword arguments of its class."""
+
+
+class WorldTable(_Table, frozen=True):
+    """The `[world]` table: what the simulator does and the robots are not told."""
+
+    noise: WorldNoise = WorldNoise()
+    """The `[world.noise]` table: the noise that the sensors have."""
+    range: ModelSpec | None = None
+    """The `[world.range]` table: the model of detection and ranges."""
+    radio: ModelSpec | None = None
+    """The `[world.radio]` table: the model of the delivery of reports."""
+
+
+class RobotTable(_Table, frozen=True):
+    """A `[[robot]]` table."""
+
+    id: RobotId
+    """The robot's name."""
+    anchor: tuple[Place, Place]
+    """x, y of the robot's anchor, in m."""
+    start: tuple[Place, Place, Annotated[float, Meta(ge=-1e6, le=1e6)]] | None = None
+    """Start pose x, y in m and heading in rad; None: drawn from the seed, within range of the anchor."""
+    peer: RobotId | None = None
+    """Id of the peer; required with more than two robots."""
+    attack: Attack | None = None
+    """False data injection: the falsification of the reports that this robot sends to its peer."""
+
+
+class ScenarioFile(_Table, frozen=True):
+    """The content of a scenario file."""
+
+    name: Annotated[str, Meta(pattern=NAME, max_length=48)]
+    """The name of the scenario, and the beginning of the names of its runs."""
+    mission: Mission
+    """The `[mission]` table."""
+    robot: Annotated[list[RobotTable], Meta(min_length=2, max_length=MAX_ROBOTS)]
+    """One `[[robot]]` for each robot."""
+    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
+    """The seed of all random draws, starts included."""
+    max_ticks: Annotated[int, Meta(ge=1, le=MAX_TICKS)] | None = None
+    """The last tick of an undecided run; computed from the mission by default."""
+    planner: PlannerTable = PlannerTable()
+    """The `[planner]` table."""
+    world: WorldTable = WorldTable()
+    """The `[world]` table."""
+    fault: list[FaultTable] = []
+    """Faults of the radio, applied to each report one after the other."""
+    kill: list[KillTable] = []
+    """Kills of processes. They are not part of the Scenario and do not appear in the recording."""

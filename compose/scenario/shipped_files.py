@@ -1,0 +1,50 @@
+"""The scenarios and sweeps that ship with Tandem, and files of one kind in place of the other."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from protocol.spelling import did_you_mean
+
+
+def shipped(package: str = "scenario") -> dict[str, Path]:
+    """Return the shipped scenario files by name; for the package `sweep`, the shipped sweep files."""
+    path = Path(str(resources.files("compose") / package / "shipped"))
+    return {file.stem: file for file in sorted(path.glob("*.toml"))}
+
+
+SHIPPED = {"scenario": ("scenario", "run"), "sweep": ("sweep", "sweep")}
+"""The kind of file in each package, and the command that runs it."""
+MARKS = {"scenario": {"mission", "robot"}, "sweep": {"scenario", "trials"}}
+"""The required fields of the files in each package that files of the other kind cannot have."""
+
+
+def unknown(source: str, folder: str) -> str:
+    """Return an error message: `source` is neither a file nor a shipped file of the package `folder`."""
+    names = {one: shipped(one) for one in SHIPPED}
+    for other, (kind, command) in SHIPPED.items():
+        if other != folder and source in names[other]:
+            return _other_kind(source, kind, command)
+    near = did_you_mean(source, [name for found in names.values() for name in found])
+    ships = ", ".join(names[folder])
+    return f"{source}: neither a file nor a shipped {SHIPPED[folder][0]} ({ships}){near}"
+
+
+def misplaced(source: str, table: Mapping[str, Any], folder: str) -> str | None:
+    """Return an error message if the file `source`, whose content is `table`, is not of the kind in `folder`.
+
+    Return None if `table` has a field that marks the kind of file in `folder`, or no mark at all.
+    """
+    if MARKS[folder].isdisjoint(table):
+        for other, (kind, command) in SHIPPED.items():
+            if not MARKS[other].isdisjoint(table):
+                return _other_kind(source, kind, command)
+    return None
+
+
+def _other_kind(source: str, kind: str, command: str) -> str:
+    return f"{source} is a {kind}; run it with `tandem {command} {shlex.quote(source)}`"
