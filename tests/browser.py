@@ -24,7 +24,10 @@ from playwright.sync_api import Browser, Page, Route, expect, sync_playwright
 from tests.commands import BOUND_S, TandemProcess
 
 BOUND_MS = 1000 * BOUND_S
-SERVER_GONE = "ERR_(CONNECTION_(REFUSED|RESET|CLOSED)|EMPTY_RESPONSE|INCOMPLETE_CHUNKED_ENCODING)"
+SERVER_GONE = (
+    "ERR_(CONNECTION_(REFUSED|RESET|CLOSED)|EMPTY_RESPONSE|INCOMPLETE_CHUNKED_ENCODING)"
+    "|was interrupted while the page was loading"
+)
 """The errors that a browser logs after a test has stopped the server.
 
 The error depends on whether the browser was connecting, waiting for an answer, or reading one.
@@ -33,6 +36,11 @@ DOCUMENT = re.compile(r"^http://127\.0\.0\.1:\d+/(#.*)?$")
 """The addresses of the page, in which other addresses of the server do not match."""
 SCRUB = "(scrub, tick) => { scrub.value = tick; scrub.dispatchEvent(new Event('input')); }"
 Open = Callable[..., Page]
+chromium_only = pytest.mark.skipif(
+    os.environ.get("TANDEM_BROWSER") == "firefox",
+    reason="Firefox 140 cannot be told the system's theme or its motion, nor run scripts on a file's page",
+)
+"""The mark of tests that Playwright cannot run in Firefox."""
 
 expect.set_options(timeout=BOUND_MS)
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from axe_playwright_python.sync_playwright import Axe  # it ships axe-core
 from playwright.sync_api import Browser, Page, expect
 
 from compose.launch import in_process
 from compose.scenario.scenario_file import load
-from tests.browser import BOUND_MS, SCRUB, Open, picture, until_shown, watching
+from tests.browser import BOUND_MS, SCRUB, Open, chromium_only, picture, until_shown, watching
 from tests.commands import tandem
 from tests.series import series
 
+axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe-core is not installed")
 SAMPLE = Path(__file__).parent / "data" / "uwb" / "tiers-a-b-30-s.pyfg"
 NARROW = 390
 """The width of a telephone in pixels."""
@@ -21,7 +21,7 @@ NARROW = 390
 
 def violations(page: Page) -> dict[str, list[str]]:
     """Return the elements that break each rule."""
-    found = Axe().run(page).response["violations"]
+    found = axe.Axe().run(page).response["violations"]
     return {one["id"]: [str(node["target"]) for node in one["nodes"]] for one in found}
 
 
@@ -61,6 +61,7 @@ def test_the_other_pages_break_no_rule(opened: Open, tmp_path: Path, dark: bool)
             assert not violations(page), folder
 
 
+@chromium_only
 @pytest.mark.long
 @pytest.mark.parametrize("dark", [False, True])
 def test_the_page_in_one_file_breaks_no_rule(

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.browser import INKS, Open, picture, stop_clock, until_shown
+from tests.browser import INKS, Open, chromium_only, picture, stop_clock, until_shown
 
 STEP_MS = 250
 """The time in ms between two frames of the page."""
@@ -226,6 +226,7 @@ def test_captions_are_announced_while_the_story_is_played_and_events_otherwise(
     expect(live).to_contain_text("Tick 46. a and b are in range of each other")
 
 
+@chromium_only
 @pytest.mark.long
 def test_with_reduced_motion_nothing_moves_between_two_ticks(opened: Open, address: str) -> None:
     page = started(opened, address, 44, reduced=True)

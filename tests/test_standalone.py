@@ -12,7 +12,7 @@ from playwright.sync_api import Browser, expect
 from compose.launch import in_process
 from compose.scenario.scenario_file import load
 from compose.view.web.standalone import standalone_page
-from tests.browser import BOUND_MS, Open, picture, shot, until_shown
+from tests.browser import BOUND_MS, Open, chromium_only, picture, shot, until_shown
 from tests.commands import tandem
 
 MOST_BYTES = 2_000_000
@@ -28,6 +28,7 @@ def file(paper_1: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out / "run.html"
 
 
+@chromium_only
 def test_it_plays_from_disk_to_its_end_without_a_network(browser: Browser, file: Path) -> None:
     with browser.new_context(offline=True, viewport={"width": 1280, "height": 800}) as context:
         requests: list[str] = []
@@ -51,6 +52,7 @@ def test_it_plays_from_disk_to_its_end_without_a_network(browser: Browser, file:
         assert not complaints
 
 
+@chromium_only
 def test_it_shows_what_the_page_of_the_server_shows(
     browser: Browser, opened: Open, file: Path, address: str
 ) -> None:

@@ -30,7 +30,7 @@ from compose.view.web.site import of_folder
 from protocol.journal import journal_file
 from protocol.messages import Message, Observation, OfRobot
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
-from tests.browser import SCRUB, Open, address_of, inks, picture, shot, until_shown, watching
+from tests.browser import SCRUB, Open, address_of, chromium_only, inks, picture, shot, until_shown, watching
 from tests.commands import (
     BOUND_S,
     ENDLESS,
@@ -228,6 +228,7 @@ def test_the_page_is_legible_at_360_pixels(opened: Open, address: str) -> None:
     expect(page.locator("#log")).to_contain_text("The mission ends: localised")
 
 
+@chromium_only
 @pytest.mark.long
 def test_the_page_is_dark_if_the_system_is(opened: Open, address: str) -> None:
     page = opened(f"{address}#tick=47", dark=True)
@@ -432,7 +433,7 @@ def test_every_test_that_opens_a_page_skips_where_there_is_no_browser(tmp_path: 
         [sys.executable, "-m", "pytest", "-n0", "-p", "no:cacheprovider", "-rs", "tests/test_watch.py"]
         + ["-k", "run_watch_serves or by_keyboard_alone"],
         cwd=Path(__file__).parents[1],
-        env=os.environ | {"PATH": str(tmp_path)},
+        env=os.environ | {"PATH": str(tmp_path), "TANDEM_BROWSER": "chromium"},
         capture_output=True,
         text=True,
         timeout=BOUND_S,
