@@ -42,7 +42,7 @@ COUNTS = (
 )
 """Small numbers as words."""
 MOST_LINKS = 2
-"""With more links, a sentence has their number."""
+"""The largest number of links that a sentence names."""
 
 
 class Caption(msgspec.Struct, frozen=True, omit_defaults=True):

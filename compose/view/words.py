@@ -43,7 +43,7 @@ WAITING = "{robot} waits beside its anchor until {peer} comes into range"
 TIME_IS_UP = re.compile(r"max_ticks: (.+) not localised by then")
 """The reason of a mission that ends at its largest number of ticks, as the world writes it."""
 MOST_NAMES = 4
-"""With more robots, a sentence has their number."""
+"""The largest number of robots that a sentence names."""
 
 
 def end_reason(reason: str) -> str:

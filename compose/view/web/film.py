@@ -38,7 +38,7 @@ STYLE = """
 header, aside, #transport button, #pace { display: none !important; }
 #mission { grid-template-columns: 1fr; }
 """
-"""What the picture leaves out of the page: whatever is not the story, or is for the mouse."""
+"""The style that hides the parts of the page which are not the story, or are for the mouse."""
 SHARES = (1.0, 0.72, 0.45, 0.2)
 """The shares of a colour of the page on its background that are colours of the picture."""
 SAME = 255
