@@ -67,7 +67,7 @@ class Priors(NamedTuple):
         return self.wheel_scale > 0.0 or self.gyro_bias > 0.0
 
 
-UNTOLD = Priors(0.02, 0.01, 0.005, 0.0, 2.0, 0.005, 0.003, 0.01)
+UNTOLD = Priors(0.02, 0.01, 0.005, 0.0, 2.0, 0.005, 0.003, 0.0)
 """The priors of whoever tells none, for ranges with a sigma of UNTOLD_SIGMA or more.
 
 They are as wide as costs at most 5 % more ticks if the noise is as told: see docs/assumptions.md.
@@ -121,7 +121,7 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
     """The prior of the bias of omega, in rad/s, while the robot moves."""
     sigma_degrees: Degrees = 4.0
     """The degrees of freedom of the prior of the factor of all sigmas; 0: the sigmas are exactly as told."""
-    survey_error: Sigma | None = None
+    survey_error: Sigma = 0.0
     """The prior of the difference of each anchor from its surveyed position along each axis, in m."""
     strays: Probability = 1e-3
     """The probability that a range has an error of any size and sign; without noise, there are none."""
@@ -147,7 +147,7 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
             self.slow_time,
             share * UNTOLD.wheel_scale if self.wheel_scale is None else self.wheel_scale,
             share * UNTOLD.gyro_bias if self.gyro_bias is None else self.gyro_bias,
-            share * UNTOLD.survey_error if self.survey_error is None else self.survey_error,
+            self.survey_error,
         )
 
     @cached_property

@@ -20,7 +20,7 @@ from agent.estimation.gaussian.range_model import PairRanges, Ranges
 from compose.errors import NOT_LOCALISED, USER_ERROR, UserError
 from compose.recording.estimating.estimate_epoch import ClaimRule
 from compose.recording.estimating.estimate_files import COLUMNS, estimate_csv
-from compose.recording.estimating.estimate_rows import PoseEstimate
+from compose.recording.estimating.estimate_rows import PoseEstimate, true_pose
 from compose.recording.estimating.estimate_run import RecordingEstimate, estimated, measurements
 from compose.recording.estimating.noise_files import RangeCorrection, told_noise
 from compose.recording.estimating.pair_measurements import EPOCH_S
@@ -127,6 +127,17 @@ def test_both_robots_of_the_sample_claim_poses_that_contain_the_truth(of_sample:
     claimed = [row for row in of_sample.rows if row.claim]
     assert len(claimed) > 10
     assert all(row.nees is not None and row.nees < NEES_99_9 for row in claimed)
+
+
+def test_no_estimate_is_compared_with_a_truth_of_another_time(sample: RangeRecording) -> None:
+    robot = sample.robots[0]
+    assert robot.truth is not None
+    first, last = float(robot.truth.t[0]), float(robot.truth.t[-1])
+    assert true_pose(robot, first - 0.5) is None
+    assert true_pose(robot, last + 0.5) is None
+    found = true_pose(robot, last)
+    assert found is not None
+    assert found[:2] == pytest.approx(robot.truth.poses[-1, :2])
 
 
 def test_equal_inputs_give_equal_bytes(sample: RangeRecording, of_sample: RecordingEstimate) -> None:

@@ -103,10 +103,10 @@ def test_summary_has_every_documented_value_of_a_run(played: tuple[str, Path]) -
                     "range_scale",
                     "wheel_scale",
                     "gyro_bias",
-                    "survey_error",
                 )
             ),
             "slow_sigma": 0.0,
+            "survey_error": 0.0,
             "slow_time": 2.0,
             "sigma_degrees": 4.0,
             "strays": 0.001,

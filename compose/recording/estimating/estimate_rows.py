@@ -134,7 +134,7 @@ class EstimateSummary(msgspec.Struct, frozen=True):
 def true_pose(robot: RecordedRobot, t: float) -> Numbers | None:
     """Return the true pose at `t` s, interpolated; None without truth around that time; shape (3,)."""
     truth = robot.truth
-    if truth is None or not truth.t[0] - TRUTH_GAP_S <= t <= truth.t[-1] + TRUTH_GAP_S:
+    if truth is None or not truth.t[0] - TRUTH_END_S <= t <= truth.t[-1] + TRUTH_END_S:
         return None
     after = min(max(int(np.searchsorted(truth.t, t)), 1), len(truth.t) - 1)
     before = max(after - 1, 0)
@@ -151,6 +151,8 @@ def true_pose(robot: RecordedRobot, t: float) -> Numbers | None:
 
 TRUTH_GAP_S = 1.0
 """The longest time in s between true poses within which they are interpolated."""
+TRUTH_END_S = 0.02
+"""The time in s before the first and after the last true pose for which that pose counts."""
 
 
 def rows_of(epoch: EstimateEpoch, robots: Sequence[RecordedRobot]) -> list[PoseEstimateRow]:
