@@ -13,6 +13,7 @@ import { list_missions, state_of } from "./missions.js";
 import { Plane } from "./plane.js";
 import { activities, Announcer, described } from "./spoken.js";
 import { Predictions } from "./predictions.js";
+import { Sequence } from "./sequence.js";
 import { Store } from "./store.js";
 import { Timeline } from "./timeline.js";
 import { plural } from "./words.js";
@@ -43,6 +44,7 @@ const announcer = new Announcer();
 const plane = new Plane($("canvas"), () => draw());
 const predictions = new Predictions($("predictions"), plane);
 const timeline = new Timeline($("line"), $("bands"), $("scrub"), (tick) => go(tick));
+const sequence = new Sequence($("exchange"), $("sequence"), (tick) => go(tick));
 const cards = new Cards($("robots"), $("roster"), (robot) => focus(view.focus === robot ? null : robot));
 const log = new Log($("log"), $("states"), $("radio"), (tick) => go(tick));
 log.onchange = () => draw();
@@ -239,6 +241,7 @@ function draw() {
     cards.draw(view);
     log.draw(view);
     timeline.draw(view, activities(store, view));
+    sequence.draw(store, view);
     controls();
     text($("caption"), guide.text(view));
     const news = view.playing && view.guided ? null : announcer.text(store, view, now);
@@ -342,6 +345,7 @@ function pressed(event) {
     "+": () => plane.zoom(1.25), "=": () => plane.zoom(1.25), "-": () => plane.zoom(0.8),
     w: () => plane.shift(event.shiftKey ? 60 : 0, event.shiftKey ? 0 : 60),
     s: () => plane.shift(event.shiftKey ? -60 : 0, event.shiftKey ? 0 : -60),
+    d: () => { $("exchange").open = !$("exchange").open; },
     "?": () => $("keys").showModal(),
   };
   const action = actions[event.key.length === 1 ? event.key.toLowerCase() : event.key];
@@ -365,6 +369,7 @@ $("guide").addEventListener("click", () => guided(!view.guided));
 $("camera").addEventListener("click", () => follow_story());
 $("fit").addEventListener("click", fit);
 $("near").addEventListener("click", () => plane.near(store, view));
+$("exchange").addEventListener("toggle", () => draw());
 $("help").addEventListener("click", () => $("keys").showModal());
 $("view").addEventListener("submit", (event) => event.preventDefault());
 $("speed").append(...SPEEDS.map((speed) => make("option", { value: speed, textContent: speed })));

@@ -62,6 +62,7 @@ export const KEYS = [
   ["W S", "pan up or down; with Shift, left or right; also by dragging"],
   ["N", "zoom to the robots and to where they may be"],
   ["F", "zoom to the whole scenario"],
+  ["D", "show or hide the sequence diagram of the reports"],
   ["?", "this help"],
 ];
 
