@@ -49,6 +49,9 @@ export class Sequence {
       for (let k = this.from; k <= to; k++) if (!store.player(k, id)?.down) line(pen, x(k) - TICK / 2, y, x(k) + TICK / 2, y);
     }
     pen.textAlign = "center";
+    pen.beginPath();
+    pen.rect(this.inset, 0, wide - this.inset, tall); // an arrow may begin before the first tick that is shown
+    pen.clip();
     const told = [];
     for (let k = this.from; k <= to; k++) {
       const scene = store.scene(k);
@@ -58,7 +61,7 @@ export class Sequence {
         const fate = fate_of(passage, k), start = rows.get(passage.sender), end = rows.get(passage.receiver);
         if (!fate || start === undefined || end === undefined) continue;
         if (k === tick) told.push(`${passage.sender}'s report of tick ${passage.tick} to ${passage.receiver}: ${fate}`);
-        arrow(pen, x(Math.max(passage.tick, this.from)) - 7, start, x(fate === "lost" ? passage.tick : k) + 7, end, fate, of);
+        arrow(pen, x(passage.tick) - 7, start, x(fate === "lost" ? passage.tick : k) + 7, end, fate, of);
       }
       for (const { kind, robot } of scene?.events ?? []) {
         const sign = { late: "◔", down: "⊘", back: "●" }[kind], y = rows.get(robot);
