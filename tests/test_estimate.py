@@ -408,6 +408,24 @@ def test_known_errors_of_ranges_are_removed(sample: RangeRecording, tmp_path: Pa
     np.testing.assert_allclose(shorter[pairs["A", "LC0"]], 0.1)
 
 
+def test_ranges_that_are_all_zero_give_no_claim_and_no_warning(sample: RangeRecording) -> None:
+    one = sample._replace(robots=sample.robots[:1])
+    known = np.flatnonzero((sample.ranges.first == 0) | (sample.ranges.second == 0))
+    third = FixedAnchor("L9", 3.0, 4.0)
+    ranges = RangeSeries(
+        sample.ranges.t[known],
+        np.zeros(len(known), np.intp),
+        1 + np.arange(len(known)) % 2,
+        np.zeros(len(known)),
+        sample.ranges.sigma[known],
+    )
+    recording = one._replace(anchors=(sample.anchors[0], third), ranges=ranges)
+    problem = measurements(recording, None, "uwb-calibrated", (0.0, 12.0))
+    assert not any(
+        claim for epoch in estimated(problem, ClaimRule(0.3, 0.9999)).epochs for claim in epoch.claims
+    )
+
+
 def test_robots_with_ranges_to_one_anchor_only_are_refused(sample: RangeRecording) -> None:
     first = with_ranges(sample, sample.ranges.range)
     ranges = first.ranges.rows(first.ranges.second != first.radios.index("LC1"))

@@ -178,7 +178,7 @@ def _lines(summary: EstimateSummary) -> list[str]:
     if summary.blocking_reason:
         found.append(f"no claim at the end: {summary.blocking_reason}")
     for why, count in summary.unused_ranges.items():
-        found.append(f"{count} ranges not used: {why}")
+        found.append(f"{count} {'range' if count == 1 else 'ranges'} not used: {why}")
     return found
 
 

@@ -361,7 +361,7 @@ def draw_hypotheses(axes: Axes, pair: PairRecord, role: Role) -> None:
     if robot.placed:
         first = robot.placed[0][0].tick
         axes.axvline(first, color="0.3", lw=0.8, ls=":", gid="placed")
-        axes.text(1.0, 1.04, f"from tick {first}: placements of the pair", ha="right", **words)
+        axes.text(1.0, 1.04, f"from tick {first}: configurations of the pair", ha="right", **words)
 
 
 def _probabilities(axes: Axes, pair: PairRecord, role: Role) -> None:

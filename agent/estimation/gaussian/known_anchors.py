@@ -25,7 +25,7 @@ from agent.estimation.gaussian.inference import MUTUAL_RANGES, MUTUAL_RANGES_WIT
 from agent.estimation.gaussian.least_squares import STEPS, fits
 from agent.estimation.gaussian.linear_model import Start
 from agent.estimation.gaussian.odometry_noise import Array, Places, Track
-from agent.estimation.gaussian.range_model import Ranges, mixture, predicted
+from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges, mixture, predicted
 from protocol.mission import HEADING_ACCURACY
 from protocol.noise import Noise
 
@@ -114,7 +114,7 @@ def _refined(guesses: Array, robot: AnchoredRobot) -> list[Array]:
     ranges, path = robot.ranges, robot.path
     at = np.stack((path.x[ranges.tick], path.y[ranges.tick]))[None]
     sigma = np.sqrt(np.square(ranges.sigma) + ranges.loosened(robot.noise.priors))
-    longest = float(np.max(ranges.rho))
+    longest = max(float(np.max(ranges.rho)), SIGMA_FLOOR)
     for step in range(REFINEMENTS):
         s = np.hypot(sigma, COARSE * longest * FINER**step)
         model = predicted(guesses, np.broadcast_to(at, (len(guesses), *at.shape)), ranges, (0.0, 0.0))
