@@ -1,4 +1,4 @@
-"""What belongs to a run and not to its scenario: its name, and its speed in real time."""
+"""The settings of a run that are not part of its scenario: its name, and its speed in real time."""
 
 from __future__ import annotations
 
