@@ -496,6 +496,7 @@ def test_a_terminal_shows_how_far_it_is_and_each_file_on_a_line_of_its_own(
     assert (percentages[0], percentages[-1]) == (0, 100)
 
 
+@pytest.mark.long
 def test_with_its_output_in_a_file_the_progress_bar_stays_on_the_terminal(
     recordings: Path, tmp_path: Path
 ) -> None:

@@ -364,6 +364,7 @@ def known(recording: Run, robot: str) -> int:
 
 
 @pytest.mark.parametrize("reach", series([1.0, 3.0, 5.0]))
+@pytest.mark.long
 def test_driving_back_is_never_slower_than_circling_for_a_slow_turner(
     reach: float,
 ) -> None:

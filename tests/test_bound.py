@@ -85,6 +85,7 @@ def test_the_bound_is_that_of_the_fisher_information_of_all_ranges() -> None:
         assert bounds(recording) == pytest.approx(by_differences(recording, 0.1), rel=1e-3)
 
 
+@pytest.mark.long
 def test_the_bound_shrinks_as_sigma_does() -> None:
     for seed in SEEDS:
         recording = survey(SIGMA, seed)

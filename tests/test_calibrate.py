@@ -69,6 +69,7 @@ def test_slow_errors_are_told_from_white_ones(sample: RangeRecording) -> None:
     assert slow(sample.ranges.range + white) < 0.05
 
 
+@pytest.mark.long
 def test_the_profile_makes_raw_ranges_as_good_as_calibrated_ones(raw: RangeRecording, tmp_path: Path) -> None:
     found = calibrated(raw, None, None)
     anchors = frozenset(one.id for one in raw.anchors)

@@ -126,6 +126,7 @@ def test_more_than_last_bits_is_a_difference_whatever_the_versions(command: str,
 
 
 @pytest.mark.parametrize("command", ["replay", "audit", "figures", "export"])
+@pytest.mark.long
 def test_older_recordings_that_name_no_versions_are_read(command: str, recording: Path) -> None:
     def read() -> Ended:
         return tandem(command, recording, *(["--only", "ranges"] if command == "figures" else []))

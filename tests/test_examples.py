@@ -48,6 +48,7 @@ def test_an_example_without_a_figure_runs(name: str) -> None:
     import_module(f"docs.examples.{name}").main()
 
 
+@pytest.mark.long
 def test_the_notebook_runs_from_its_first_cell_to_its_last() -> None:
     notebook = json.loads((EXAMPLES / "tandem.ipynb").read_text())
     cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]

@@ -492,6 +492,7 @@ def test_a_run_that_cannot_export_has_failed(tmp_path: Path) -> None:
         assert ended.err.startswith("tandem run: not exported: ") == (status == 3)
 
 
+@pytest.mark.long
 def test_where_there_is_no_room_nothing_half_written_is_left(paper_1: Path, tmp_path: Path) -> None:
     sizes = {name: (paper_1 / name).stat().st_size for name in FILES}
     for name in FILES:

@@ -338,6 +338,7 @@ def test_a_folder_without_a_recording_is_refused(tmp_path: Path) -> None:
     assert [path.name for path in empty.iterdir()] == ["world.journal"]
 
 
+@pytest.mark.long
 def test_where_nothing_can_be_written_is_refused(noisy: Path, tmp_path: Path) -> None:
     folder = copied(noisy, tmp_path)
     (folder / "figures").write_text("")

@@ -118,6 +118,7 @@ def test_a_stream_that_breaks_off_gives_the_estimates_before_that(messages: Mess
     assert rows(written(early, whole=False)[:-20]) == whole
 
 
+@pytest.mark.long
 def test_estimates_are_printed_while_the_stream_is_open(messages: Messages, tmp_path: Path) -> None:
     words = [
         sys.executable,
@@ -156,6 +157,7 @@ def test_estimates_are_printed_while_the_stream_is_open(messages: Messages, tmp_
     assert (tmp_path / "found" / "estimate.json").exists()
 
 
+@pytest.mark.long
 def test_ctrl_c_ends_a_stream_and_the_files_are_written(messages: Messages, tmp_path: Path) -> None:
     words = [sys.executable, "-m", "tandem", "estimate", "-", "--follow", "--out", "found"]
     words += ["--noise", PROFILE]

@@ -77,6 +77,7 @@ LONG = """async ([encounter, last, captions]) => {
 }"""
 
 
+@pytest.mark.long
 def test_guided_play_of_thousands_of_ticks_takes_about_a_minute(opened: Open, address: str) -> None:
     """There is a caption in every third tick of the encounter."""
     page = opened(address)
@@ -173,6 +174,7 @@ def test_once_its_pair_has_finished_the_camera_shows_all_pairs(opened: Open, add
     assert page.evaluate(FINISHED, ["a0", "b0"]) == [0, 10, 20, 30]
 
 
+@pytest.mark.long
 def test_the_camera_recovers_from_a_window_too_low_for_a_picture(opened: Open, address: str) -> None:
     page = started(opened, address, 46)
     for height in (170, 800):

@@ -31,6 +31,7 @@ def test_the_paper_planner_mostly_localises_with_fine_ranges() -> None:
     assert outcomes.count("localised") > 0.7 * len(SEEDS)
 
 
+@pytest.mark.long
 def test_the_paper_planner_is_undecided_with_coarse_ranges_and_names_the_reason() -> None:
     reasons = []
     for seed in SEEDS:

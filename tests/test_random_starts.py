@@ -43,6 +43,7 @@ def test_assured_localises_every_random_start_to_a_micrometre(number: int) -> No
 
 
 @pytest.mark.parametrize("number", series(range(SHARES)))
+@pytest.mark.long
 def test_the_paper_planner_localises_most_random_starts_and_makes_no_wrong_claim(number: int) -> None:
     outcomes = Counter[str]()
     for seed in share(number):

@@ -139,6 +139,7 @@ def test_a_range_lies_at_its_time_and_at_the_pose_of_that_time(
 
 
 @given(odometries(st.just(0.0)), st.floats(0.1, 1.0), stamps)
+@pytest.mark.long
 def test_thinned_ranges_of_a_pair_are_apart_and_none_is_left_out_without_one_before(
     odometry: RobotOdometry, spacing_s: float, ranges: list[tuple[float, int, int]]
 ) -> None:

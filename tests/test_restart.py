@@ -605,6 +605,7 @@ def test_an_empty_journal_is_begun(tmp_path: Path) -> None:
     assert (tmp_path / "world.journal").read_bytes() == (tmp_path / "new").read_bytes()
 
 
+@pytest.mark.long
 def test_a_mission_under_noise_is_folded_to_the_bit(tmp_path: Path) -> None:
     scenario = load("noisy")
     run_mission(scenario, tmp_path)

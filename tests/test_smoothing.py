@@ -601,6 +601,7 @@ def test_exact_ranges_and_strides_of_a_kilometre_leave_a_covariance_that_can_be_
 
 @few
 @given(seeds, st.sampled_from([VelocityNoise(), VelocityNoise(2e-4, 2e-4, 1e-4, 2e-4)]))
+@pytest.mark.long
 def test_the_covariance_has_the_surveying_errors_of_both_anchors(seed: int, odometry: VelocityNoise) -> None:
     noise = Noise(1e-4, 3e-4, odometry=odometry).as_told  # small errors: curvature is left out
     one = told(seed, noise)

@@ -112,6 +112,7 @@ def given_up(bystander: Inbox) -> bool:
 # --- lockstep -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_run_continues_after_each_process_is_suspended_for_a_moment(
     undisturbed: Path, tmp_path: Path
 ) -> None:

@@ -36,6 +36,7 @@ from compose.sweep.worker import PLAY
 from protocol.network.inbox import Inbox
 from protocol.noise import Noise, VelocityNoise
 from tests.commands import PAPER_1, Ended, TandemProcess, tandem, temporary_in, until
+from tests.series import series
 from world.world_noise import WorldNoise
 
 HOUSE = Path(__file__).parents[1]
@@ -260,6 +261,7 @@ def misbehaving(function: str, source: str, folder: Path) -> subprocess.Popen[st
     )
 
 
+@pytest.mark.long
 def test_trials_that_raise_die_or_hang_are_rows_and_the_others_go_on(folder: Path) -> None:
     played(folder, "astray.toml", "well")
     with misbehaving("astray", "hasty.toml", folder) as process:
@@ -620,7 +622,7 @@ def test_a_figure_distinguishes_the_values_of_the_other_axes_while_they_are_few(
     assert told_apart("meeting") == both
 
 
-@pytest.mark.parametrize("name", sorted(spec.shipped()))
+@pytest.mark.parametrize("name", series(sorted(spec.shipped()), 6))
 def test_every_shipped_sweep_runs(name: str) -> None:
     sweep = spec.load(name)
     execution.check_columns(sweep, schema_of(sweep, list(cells(sweep))))

@@ -263,6 +263,7 @@ def test_a_third_range_distinguishes_the_branches_unless_omega_1_makes_full_turn
 
 @settings(max_examples=300)
 @given(st.tuples(points, points, points), st.floats(1.0, 10.0), points, angles)
+@pytest.mark.long
 def test_3_plus_1_leaves_two_trajectories(
     odometry: tuple[complex, complex, complex], distance: float, start: complex, heading: float
 ) -> None:

@@ -190,6 +190,7 @@ def test_the_page_can_be_used_by_keyboard_alone(opened: Open, address: str) -> N
     assert focused in {"A", "INPUT", "BUTTON", "SELECT"}
 
 
+@pytest.mark.long
 def test_robots_in_hardware_mode_are_shown_by_their_estimates(
     opened: Open, paper_1: Path, tmp_path: Path
 ) -> None:
