@@ -35,6 +35,7 @@ The error depends on whether the browser was connecting, waiting for an answer, 
 DOCUMENT = re.compile(r"^http://127\.0\.0\.1:\d+/(#.*)?$")
 """The addresses of the page, in which other addresses of the server do not match."""
 SCRUB = "(scrub, tick) => { scrub.value = tick; scrub.dispatchEvent(new Event('input')); }"
+"""Moves the slider of ticks, as a user does who drags it."""
 Open = Callable[..., Page]
 chromium_only = pytest.mark.skipif(
     os.environ.get("TANDEM_BROWSER") == "firefox",
@@ -141,6 +142,18 @@ def address_of(command: TandemProcess) -> str:
 def until_shown(page: Page, tick: int) -> None:
     """Wait until the page shows `tick`."""
     expect(page.locator("body")).to_have_attribute("data-shown", str(tick))
+
+
+def until_loaded(page: Page) -> None:
+    """Wait until the page shows any tick; before that, it ignores the slider and most keys."""
+    expect(page.locator("body")).to_have_attribute("data-shown", re.compile(r"\d"))
+
+
+def scrub_to(page: Page, tick: int) -> None:
+    """Move the slider of a loaded page to `tick`, and wait until the page shows it."""
+    until_loaded(page)
+    page.locator("#scrub").evaluate(SCRUB, tick)
+    until_shown(page, tick)
 
 
 def shot(page: Page, name: str) -> None:

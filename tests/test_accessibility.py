@@ -9,7 +9,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from compose.launch import in_process
 from compose.scenario.scenario_file import load
-from tests.browser import BOUND_MS, SCRUB, Open, chromium_only, picture, until_shown, watching
+from tests.browser import BOUND_MS, Open, chromium_only, picture, scrub_to, until_shown, watching
 from tests.commands import tandem
 from tests.series import series
 
@@ -30,8 +30,7 @@ def test_no_beat_of_a_recording_breaks_a_rule(opened: Open, address: str, look: 
     dark, width = look
     page = opened(address, dark=dark, width=width)
     for tick in (0, 47, 48):
-        page.locator("#scrub").evaluate(SCRUB, tick)
-        until_shown(page, tick)
+        scrub_to(page, tick)
         picture(page)
         assert not violations(page), tick
     page.keyboard.press("?")

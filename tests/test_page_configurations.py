@@ -13,7 +13,7 @@ from playwright.sync_api import Page, expect
 from compose.launch import in_process
 from compose.scenario.scenario_file import load
 from compose.view.web.standalone import PAGE
-from tests.browser import INKS, SCRUB, Open, inks, picture, stop_clock, until_shown, watching
+from tests.browser import INKS, Open, inks, picture, scrub_to, stop_clock, until_shown, watching
 from tests.series import series
 
 STEP_MS = 250
@@ -59,8 +59,7 @@ SIZES = [(1280, 720), (390, 844), (800, 600), (1600, 1000)]
 def test_no_label_of_paper_1_overlaps_another(size: tuple[int, int], opened: Open, address: str) -> None:
     page = opened(address, width=size[0], height=size[1])
     for tick in (0, 5, 20, 46, 47, 48):
-        page.locator("#scrub").evaluate(SCRUB, tick)
-        until_shown(page, tick)
+        scrub_to(page, tick)
         for near in ("f", "n"):
             page.keyboard.press(near)
             picture(page)
@@ -75,8 +74,7 @@ def test_no_label_of_paper_1_overlaps_another(size: tuple[int, int], opened: Ope
 def test_no_label_under_noise_overlaps_another(size: tuple[int, int], opened: Open, noisy: str) -> None:
     page = opened(noisy, width=size[0], height=size[1])
     for tick in (3, 15, 16, 20):
-        page.locator("#scrub").evaluate(SCRUB, tick)
-        until_shown(page, tick)
+        scrub_to(page, tick)
         for key in ("n", "t"):
             page.keyboard.press(key)
             picture(page)
@@ -127,8 +125,7 @@ def test_each_configuration_of_paper_1_has_its_tint_and_the_last_one_keeps_it(
     page = opened(f"{address}#tick=46")
     shown = {}
     for tick in (46, 47, 48):
-        page.locator("#scrub").evaluate(SCRUB, tick)
-        until_shown(page, tick)
+        scrub_to(page, tick)
         drawn = inks(page)
         shown[tick] = [drawn[f"tint-{i}"] > 60 for i in range(1, 5)]
     assert shown == {46: [False] * 4, 47: [True] * 4, 48: [True, False, False, False]}

@@ -30,7 +30,17 @@ from compose.view.web.site import of_folder
 from protocol.journal import journal_file
 from protocol.messages import Message, Observation, OfRobot
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
-from tests.browser import SCRUB, Open, address_of, chromium_only, inks, picture, shot, until_shown, watching
+from tests.browser import (
+    Open,
+    address_of,
+    chromium_only,
+    inks,
+    picture,
+    scrub_to,
+    shot,
+    until_shown,
+    watching,
+)
 from tests.commands import (
     BOUND_S,
     ENDLESS,
@@ -77,12 +87,21 @@ def test_a_recording_at_tick_46_shows_the_first_contact(opened: Open, address: s
 
 
 @pytest.mark.long
+def test_the_slider_reaches_the_last_tick_as_soon_as_it_is_visible(opened: Open, address: str) -> None:
+    page = opened(address)
+    page.add_init_script("window.requestAnimationFrame = () => 0")  # nothing is ever drawn
+    page.reload()
+    scrub = page.locator("#scrub")
+    scrub.wait_for()
+    assert scrub.get_attribute("max") == "48"
+
+
+@pytest.mark.long
 def test_the_plane_is_drawn_in_the_colours_of_what_happens(opened: Open, address: str) -> None:
     page = opened(address)
     seen = {}
     for tick in (0, 20, 45, 46, 47, 48):
-        page.locator("#scrub").evaluate(SCRUB, tick)
-        until_shown(page, tick)
+        scrub_to(page, tick)
         seen[tick] = inks(page)
     assert seen[0]["range"] > 3 * seen[20]["range"]  # both are in range of their anchors; neither is
     assert seen[45]["link"] == 0 < seen[46]["link"]  # phase 3 begins
@@ -95,13 +114,11 @@ def test_the_plane_is_drawn_in_the_colours_of_what_happens(opened: Open, address
         assert 0 < seen[0][robot] < seen[20][robot] < seen[45][robot] < seen[48][robot]  # trails
     page.locator("#truth").uncheck()
     page.locator("#robot").select_option("b")
-    page.locator("#scrub").evaluate(SCRUB, 46)
-    until_shown(page, 46)
+    scrub_to(page, 46)
     alone = inks(page)
     assert alone["ring"] < 0.6 * seen[46]["ring"]  # its own anchor's range
     assert alone["link"] > 100  # the circle of range on which a is
-    page.locator("#scrub").evaluate(SCRUB, 47)
-    until_shown(page, 47)
+    scrub_to(page, 47)
     assert inks(page)["robot-a"] < 50 < seen[47]["robot-a"]  # nothing is drawn at its true position
 
 
@@ -386,8 +403,7 @@ def test_a_mission_is_followed_to_its_end_from_its_journals_and_from_the_network
             shot(heard, "live-network")
             for page in (files, heard):  # skipped frames are present afterwards
                 for tick in (0, 5, 46):
-                    page.locator("#scrub").evaluate(SCRUB, tick)
-                    until_shown(page, tick)
+                    scrub_to(page, tick)
                     expect(page.locator(".card[data-robot=a] dd").first).to_contain_text("anchor")
             assert b.ended().status == 0
 

@@ -35,6 +35,8 @@ export class Timeline {
 
   stage(store) {
     this.store = store;
+    this.last = Math.max(store.last, 0);
+    this.#limit();
     this.read = 0;
     this.spans = new Map(store.stage.robots.map((robot) => [robot.id, []]));
     this.contacts = new Map(store.stage.robots.map((robot) => [robot.id, []]));
@@ -139,9 +141,14 @@ export class Timeline {
     pen.beginPath();
     pen.moveTo(now - 5, 0); pen.lineTo(now + 5, 0); pen.lineTo(now, 7); pen.closePath();
     pen.fill();
-    if (this.scrub.max !== String(this.last)) this.scrub.max = String(this.last);
+    this.#limit();
     if (this.scrub.value !== String(tick)) this.scrub.value = String(tick);
     this.scrub.setAttribute("aria-valuetext", `tick ${tick} of ${this.last}. ${activities}`);
+  }
+
+  /** Lets the slider move up to the last tick. */
+  #limit() {
+    if (this.scrub.max !== String(this.last)) this.scrub.max = String(this.last);
   }
 
   #ticks(pen, x, y, colour, wide) {
