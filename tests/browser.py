@@ -32,7 +32,7 @@ SERVER_GONE = (
 
 The error depends on whether the browser was connecting, waiting for an answer, or reading one.
 """
-DOCUMENT = re.compile(r"^http://127\.0\.0\.1:\d+/(#.*)?$")
+DOCUMENT = re.compile(r"^http://127\.0\.0\.1:\d+/(one)?(#.*)?$")
 """The addresses of the page, in which other addresses of the server do not match."""
 SCRUB = "(scrub, tick) => { scrub.value = tick; scrub.dispatchEvent(new Event('input')); }"
 """Moves the slider of ticks, as a user does who drags it."""

@@ -7,7 +7,8 @@ import errno
 import ipaddress
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from compose.cli.arguments import (
@@ -36,10 +37,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "recording",
         type=folder,
-        nargs="?",
+        nargs="*",
         metavar="DIR",
-        help="folder of a recording, of several recordings, of a sweep or of an estimate "
-        "[default: live missions]",
+        help="folder of a recording, of several recordings, of a sweep or of an estimate; two recordings are "
+        "shown side by side with one clock [default: live missions]",
     )
     add_models(parser)
     add_connection(parser)
@@ -53,7 +54,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_port(parser)
     add_launched(parser)
-    add_closing(parser, "tandem watch recording --port 8080", "docs/recordings.md")
+    add_closing(
+        parser, "tandem watch recording --port 8080\n  tandem watch paper assured", "docs/recordings.md"
+    )
 
 
 def main(options: argparse.Namespace) -> int:
@@ -61,7 +64,7 @@ def main(options: argparse.Namespace) -> int:
     need("starlette", "uvicorn")
     from compose.view.web import server, site  # noqa: PLC0415  # the libraries are optional
 
-    if options.recording is None:
+    if not options.recording:
         from compose.network import places  # noqa: PLC0415  # a recording needs no network
 
         shown = site.of_network(places(options))
@@ -69,7 +72,7 @@ def main(options: argparse.Namespace) -> int:
         flag = "--connect" if options.connect else "--config" if options.config else "--keys"
         raise UserError(f"{flag}: a recording needs no network; give either DIR or {flag}")
     else:
-        shown = site.of_record(options.recording) if options.launched else site.of_folder(options.recording)
+        shown = _recorded(options.recording, options.launched)
     for note in shown.notes:
         say(f"tandem watch: {note}", error=True)
     try:
@@ -95,6 +98,18 @@ def main(options: argparse.Namespace) -> int:
     finally:
         shown.stop()
     return ENDED
+
+
+def _recorded(folders: Sequence[Path], launched: bool) -> Site:
+    """Return the content for one folder, or for two recordings side by side. Raises UserError."""
+    from compose.view.web import site  # noqa: PLC0415  # the libraries are optional
+
+    match folders:
+        case [one]:
+            return site.of_record(one) if launched else site.of_folder(one)
+        case [_, _]:
+            return site.of_two(folders)
+    raise UserError(f"{folders[2]}: at most two recordings can be shown side by side")
 
 
 def _follow_launcher(shown: Site, stop: Callable[[], None]) -> None:

@@ -50,6 +50,8 @@ HEADERS = {
     b"cache-control": b"no-store",
 }
 """The headers of every answer. The page loads nothing from elsewhere, and no other page may embed it."""
+EMBEDDED = "/one"
+"""The path of the page of one recording, which only the page of two recordings embeds."""
 
 
 class CannotServe(OSError):
@@ -68,7 +70,20 @@ class _Answers:
         """Held while a trial is run: one at a time."""
 
     async def index(self, _request: Request) -> Response:
-        return FileResponse(PAGE / "index.html")
+        return FileResponse(PAGE / ("compare.html" if self._site.compared else "index.html"))
+
+    async def one(self, _request: Request) -> Response:
+        if not self._site.compared:
+            return _json({"error": "this server does not show two recordings side by side"}, 404)
+        policy = HEADERS[b"content-security-policy"].decode().replace("'none'", "'self'")
+        return FileResponse(PAGE / "index.html", headers={"content-security-policy": policy})
+
+    async def comparison(self, _request: Request) -> Response:
+        try:
+            found = await asyncio.to_thread(self._site.comparison)
+        except UserError as error:
+            return _json({"error": str(error)}, 404)
+        return _json(found)
 
     async def sweep(self, _request: Request) -> Response:
         return _results(self._site.folder, sweep_page.contents, "sweep")
@@ -137,6 +152,8 @@ def application(site: Site) -> Starlette:
     return Starlette(
         routes=[
             Route("/", answers.index),
+            Route(EMBEDDED, answers.one),
+            Route("/api/comparison", answers.comparison),
             Route("/api/sweep", answers.sweep),
             Route("/api/estimate", answers.estimate),
             Route("/api/figures/{name}", answers.figure),
@@ -170,7 +187,7 @@ class _Own:
 
 
 class _Sealed:
-    """Middleware that adds HEADERS to every answer."""
+    """Middleware that adds HEADERS to every answer, except those that the answer has already."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -178,7 +195,9 @@ class _Sealed:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         async def sealed(message: Message) -> None:
             if message["type"] == "http.response.start":
-                message["headers"] = [*message["headers"], *HEADERS.items()]
+                given = {name for name, _ in message["headers"]}
+                added = [(name, value) for name, value in HEADERS.items() if name not in given]
+                message["headers"] = [*message["headers"], *added]
             await send(message)
 
         await self._app(scope, receive, sealed)

@@ -7,12 +7,17 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from compose.errors import UserError
+from compose.recording.comparison import comparison
 from compose.recording.recording_files import journals_in
+from compose.recording.run import read
 from compose.view.web import estimate_page, sweep_page
 from compose.view.web.live import Listener
 from compose.view.web.sources import Recorded, WatchedRun
 from compose.view.web.trials import Trials
+from protocol.journal.journal_file import CorruptJournal
 from protocol.network.endpoints import Endpoints
 
 
@@ -25,11 +30,14 @@ class Site:
         listeners: list[Listener] | None = None,
         folder: Path | None = None,
         estimate: Path | None = None,
+        compared: bool = False,
     ) -> None:
         """Create the content of a server.
 
-        `folder` is the folder of a sweep, and `estimate` that of an estimate; None if there is none.
+        `folder` is the folder of a sweep, and `estimate` that of an estimate; None if there is none. If
+        `compared`, the two `shows` are shown side by side.
         """
+        self.compared = compared
         self.folder = folder
         self.estimate = estimate
         self.trials = Trials(folder) if folder is not None else None
@@ -65,6 +73,17 @@ class Site:
         if self.estimate is not None and name in estimate_page.figures(self.estimate):
             return self.estimate / name
         return None
+
+    def comparison(self) -> dict[str, Any]:
+        """Return how the two recordings compare, as its value in JSON. Raises UserError."""
+        if not self.compared:
+            raise UserError("this server does not show two recordings side by side")
+        folders = [show.folder for show in self.recorded]
+        try:
+            found = comparison(*[read(folder) for folder in folders])
+        except (OSError, CorruptJournal) as error:
+            raise UserError(f"the recordings cannot be compared: {error}") from None
+        return {**msgspec.structs.asdict(found), "names": [str(folder) for folder in folders]}
 
     def start(self) -> None:
         """Start listening on the network."""
@@ -120,6 +139,18 @@ def of_record(folder: Path) -> Site:
 def of_network(places: Sequence[Endpoints]) -> Site:
     """Return the content for the missions found at the given endpoints."""
     return Site(listeners=[Listener(endpoints) for endpoints in places])
+
+
+def of_two(folders: Sequence[Path]) -> Site:
+    """Return the content for two recordings side by side. Raises UserError if one of them is no recording."""
+    shows: list[Recorded] = []
+    for side, folder in zip(("left", "right"), folders, strict=True):
+        found = of_folder(folder).recorded
+        if not any(journals_in(folder)):
+            raise UserError(f"{folder} is not one recording: side by side, each folder must be a recording")
+        found[0].name = side
+        shows += found
+    return Site(shows, compared=True)
 
 
 def of_folder(folder: Path) -> Site:

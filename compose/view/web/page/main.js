@@ -5,6 +5,7 @@ import { estimate } from "./estimate.js";
 import { sweep } from "./sweep.js";
 import { Cards, make } from "./cards.js";
 import * as data from "./data.js";
+import { embedded, on_clock, pass_on, tell, tell_state } from "./embedding.js";
 import { needed, release_focus } from "./focus.js";
 import { Guide } from "./guide.js";
 import { fill_help } from "./help.js";
@@ -14,12 +15,10 @@ import { Plane } from "./plane.js";
 import { activities, Announcer, described } from "./spoken.js";
 import { Predictions } from "./predictions.js";
 import { Sequence } from "./sequence.js";
+import { SPEEDS, USUAL } from "./speeds.js";
 import { Store } from "./store.js";
 import { Timeline } from "./timeline.js";
 import { plural } from "./words.js";
-
-const SPEEDS = [0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000];
-const USUAL = 5;
 
 const $ = (id) => document.getElementById(id);
 const still = matchMedia("(prefers-reduced-motion: reduce)");
@@ -27,6 +26,8 @@ let store = null;
 const view = {
   tick: 0, share: 0, playing: false, follow: true, focus: null, moving: false, speed: USUAL,
   wanted: true,
+  /** True while the clock of compare.html runs. */
+  driven: false,
   /** True for guided play; false for a plain speed. */
   guided: true,
   /** In guided play: the place of the current caption among those of the tick, and for how many seconds it is shown. */
@@ -52,7 +53,7 @@ log.onchange = () => draw();
 // --- the address ---
 
 function update_address() {
-  if (!store) return;
+  if (!store || embedded) return;
   const fields = new URLSearchParams();
   if (listed && (listed.sweep || listed.shows.length > 1)) fields.set("show", store.name);
   if (!(view.follow && store.live)) fields.set("tick", view.tick);
@@ -165,11 +166,23 @@ function show_list() {
 
 function go(tick, { keep_playing = false } = {}) {
   if (!store) return;
+  if (embedded) return void tell({ tick });
   view.tick = Math.min(Math.max(tick, store.first), Math.max(store.last, 0));
   view.share = 0;
   view.beat = null;
   if (!keep_playing) view.playing = false;
   view.follow = store.live && view.tick >= store.last;
+  store.want(view.tick);
+  draw();
+}
+
+/** Shows the tick of the clock of compare.html, or the last tick if that is earlier. */
+function follow_clock({ tick, share, playing }) {
+  if (!store) return;
+  view.follow = false;
+  view.tick = Math.max(Math.min(tick, store.last), store.first, 0);
+  view.share = tick < store.last ? share : 0;
+  view.driven = playing && tick < store.last;
   store.want(view.tick);
   draw();
 }
@@ -231,11 +244,12 @@ function draw() {
     if (!store) return;
     advance(now);
     store.want(view.tick);
-    view.moving = view.playing && !still.matches && (view.guided || view.speed <= 60);
+    view.moving = (view.playing || view.driven) && !still.matches && (view.guided || view.speed <= 60);
     view.eliminated = guide.eliminated(view);
     if (plane.following) plane.follow(view, store, guide.pair(view.focus), still.matches ? null : now);
     document.body.dataset.tick = view.tick;
     document.body.dataset.shown = store.scene(view.tick) ? view.tick : "";
+    tell_state({ shown: store.scene(view.tick) ? view.tick : null, first: store.first, last: store.last });
     predictions.draw(view, store, guide.pair(view.focus));
     plane.draw(store, view);
     cards.draw(view);
@@ -333,7 +347,7 @@ function fit() {
 
 function pressed(event) {
   if (!store || event.ctrlKey || event.metaKey || event.altKey || $("keys").open) return;
-  if (needed(event)) return;
+  if (needed(event) || pass_on(event)) return;
   const far = event.shiftKey ? 10 : 1;
   const actions = {
     " ": () => play(), ArrowLeft: () => go(view.tick - far), ArrowRight: () => go(view.tick + far),
@@ -356,6 +370,7 @@ function pressed(event) {
 
 release_focus();
 document.addEventListener("keydown", pressed);
+on_clock(follow_clock);
 $("play").addEventListener("click", () => play());
 $("back").addEventListener("click", () => go(view.tick - 1));
 $("on").addEventListener("click", () => go(view.tick + 1));
