@@ -10,10 +10,12 @@ import pytest
 from msgspec.structs import replace
 from playwright.sync_api import FrameLocator, Page, expect
 
+from compose.errors import UserError
 from compose.launch import in_process
 from compose.recording.comparison import comparison
 from compose.recording.run import read
 from compose.scenario.scenario_file import load
+from compose.view.web.site import of_two
 from tests.browser import SCRUB, Open, shot, watching
 from tests.commands import tandem
 
@@ -62,7 +64,7 @@ def test_both_recordings_show_the_tick_of_one_clock(
     page.keyboard.press("ArrowRight")
     until_both_show(page, 21, 21)
     expect(page).to_have_url(re.compile("#tick=21$"))
-    frames(page)[1].locator("#title").click()
+    frames(page)[1].locator("#tick").click()
     page.keyboard.press("ArrowRight")  # a key in a frame is one of both
     until_both_show(page, 22, 22)
     page.keyboard.press("End")
@@ -90,7 +92,7 @@ def test_the_same_recording_twice_is_identical(opened: Open, paper_1: Path) -> N
 @pytest.mark.long
 def test_a_run_with_killed_processes_is_identical_to_one_without(paper_1: Path, tmp_path: Path) -> None:
     out = tmp_path / "killed"
-    killed = tandem("run", "paper-1", "--processes", "--kill", "a@20", "--kill", "world@30", "--out", out)
+    killed = tandem("run", "paper-1", "--kill", "a@20", "--kill", "world@30", "--out", out)
     assert killed.status == 0, killed.err
     assert comparison(read(paper_1), read(out)).identical
 
@@ -101,9 +103,10 @@ def test_two_folders_must_be_two_recordings(paper_1: Path, tmp_path: Path) -> No
         ((paper_1, tmp_path / "none"), "none is not a folder"),
         ((tmp_path / "empty", paper_1), "contains no recording"),
         ((paper_1, paper_1.parent), "is not one recording: side by side, each folder must be a recording"),
-        ((paper_1, paper_1, paper_1), "at most two recordings can be shown side by side"),
     ):
-        refused = tandem("watch", *folders)
-        assert refused.status == 2
-        assert named in refused.err
-        assert refused.err.count("\n") == 1
+        with pytest.raises(UserError, match=named):
+            of_two(folders)
+    refused = tandem("watch", paper_1, paper_1, paper_1)
+    assert refused.status == 2
+    assert refused.err.endswith("at most two recordings can be shown side by side\n")
+    assert refused.err.count("\n") == 1
