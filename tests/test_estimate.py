@@ -165,6 +165,7 @@ def test_a_claim_waits_for_the_accuracy_that_is_asked_for(sample: RangeRecording
     assert re.match(r"the sigma of [AB]'s position is .* m, required 0.01", strict.summary.blocking_reason)
 
 
+@pytest.mark.long
 def test_a_bias_of_all_ranges_is_learned_with_the_profile_of_raw_radios(sample: RangeRecording) -> None:
     found = sample_estimates(with_ranges(sample, sample.ranges.range + 0.35), "uwb")
     assert found.summary.calibration is not None
@@ -254,6 +255,7 @@ def test_a_gross_increment_is_found_and_replaced(
     assert all(row.nees is not None and row.nees < NEES_99_9 for row in claimed)
 
 
+@pytest.mark.long
 def test_the_motion_in_a_gap_is_unknown(sample: RangeRecording) -> None:
     odometry = sample.robot("B").odometry
     kept = np.r_[0:200, 240:600]
