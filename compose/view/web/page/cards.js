@@ -2,6 +2,7 @@
 
 import { distance, wrap } from "./geometry.js";
 import { leads } from "./held.js";
+import { LEAST_GAP_M } from "./plane.js";
 import { metres, probability, PHASES, place, plural, rad, speed, turning } from "./words.js";
 
 const MOST_PROBABILITIES = 5;
@@ -70,9 +71,10 @@ class Card {
     this.phase = make("span", { className: "phase" });
     this.error = make("span", { className: "error" });
     this.doing = make("p", { className: "doing" });
+    this.attack = make("p", { className: "attack", hidden: true });
     this.rows = make("dl", {});
     this.probability = make("ol", { className: "probability" });
-    this.root.append(make("div", { className: "line" }, this.name, this.phase, this.error), this.doing, this.rows, this.probability);
+    this.root.append(make("div", { className: "line" }, this.name, this.phase, this.error), this.doing, this.attack, this.rows, this.probability);
     this.fields = new Map();
   }
 
@@ -98,6 +100,9 @@ class Card {
     this.root.classList.toggle("down", Boolean(player.down));
     this.phase.textContent = `phase ${phase}: ${PHASES[phase]}${player.down ? "; down" : ""}`;
     if (this.doing.textContent !== player.activity) this.doing.textContent = player.activity;
+    const attack = truth && player.reported ? attacked(store, tick, this.robot, player.reported) : "";
+    if (this.attack.textContent !== attack) this.attack.textContent = attack;
+    this.attack.hidden = !attack;
     const [off, range] = truth && player.pose && held?.world.length ? error(held, player.pose) : ["", ""];
     this.error.textContent = off;
     this.error.title = range;
@@ -134,6 +139,16 @@ function error(held, pose) {
   const off = held.world.map((one) => distance(one, pose)), least = metres(Math.min(...off)), most = metres(Math.max(...off));
   if (leads(held)) return [`error ${metres(off[0])}`, ""];
   return [`error up to ${most}`, `${least} to ${most}: ${off.length} poses are possible, and none has a probability above 50 %`];
+}
+
+/** Returns what the false data of an attacker contradict: its true pose, and what its peer has measured. */
+function attacked(store, tick, { id, peer }, { gap }) {
+  const off = gap < LEAST_GAP_M ? "has reported its true position so far" : `reports a position ${metres(gap)} from its true one`;
+  const verdict_at = (k) => store.player(k, peer)?.command?.verdict;
+  if (verdict_at(tick)?.[0] !== "inconsistent") return `${id} ${off}.`;
+  let first = tick;
+  while (verdict_at(first - 1)) first -= 1;
+  return `${id} ${off}. ${peer} rejects ${id} in tick ${first}: ${verdict_at(tick)[1]}.`;
 }
 
 function measured(player, robot) {

@@ -2,13 +2,13 @@
 
 import { Beliefs } from "./beliefs.js";
 import { Configurations } from "./configurations.js";
-import { scenario_discs, story_discs } from "./camera.js";
-import { between, distance, TAU } from "./geometry.js";
+import { scenario_discs, story_discs, true_and_reported } from "./camera.js";
+import { distance, TAU } from "./geometry.js";
 import { Labels } from "./labels.js";
 import { cross, Look, shape, unit } from "./pen.js";
 import { Signals } from "./signals.js";
 import { Tints } from "./tints.js";
-import { Trails } from "./trails.js";
+import { pose_now, REPORTED, Trails, TRUE } from "./trails.js";
 import { metres } from "./words.js";
 
 /** The time in s in which the camera covers most of the way to where it is needed. */
@@ -16,6 +16,8 @@ const EASE_S = 0.45;
 /** The distance in pixels from which on the camera is where it is needed. */
 const NEAR_PX = 0.5;
 const LIST_PX = 42;
+/** The least distance in m between a reported and a true position that counts as a difference. */
+export const LEAST_GAP_M = 1e-6;
 /** The least width and height in pixels of a picture: a lower window shows a part of it. */
 const LEAST_PX = 40;
 
@@ -105,7 +107,7 @@ export class Plane {
     for (const robot of store.stage.robots) {
       if (focus && robot.id !== focus && (robot.peer !== focus || !truth)) continue;
       const player = store.player(tick, robot.id);
-      const poses = [...(truth && player?.pose ? [player.pose] : []), ...(player?.held?.world ?? [])];
+      const poses = [...(truth ? true_and_reported(player) : []), ...(player?.held?.world ?? [])];
       discs.push(...(poses.length ? poses.map((pose) => [pose, 0.3 * reach]) : [[robot.anchor, reach]]));
     }
     this.#frame(discs);
@@ -180,8 +182,10 @@ export class Plane {
     const shown = (robot) => truth || !focus || robot.id === focus;
     const robots = store.stage.robots.filter(shown);
     for (const robot of robots) this.#anchor(view, robot);
-    if (truth) for (const robot of robots) this.#trails.trail(view, robot);
-    else for (const robot of robots) this.#trails.believed_trail(view, robot);
+    if (truth) {
+      for (const robot of robots) this.#trails.trail(view, robot);
+      for (const robot of robots) if (robot.attack) this.#trails.trail(view, robot, REPORTED);
+    } else for (const robot of robots) this.#trails.believed_trail(view, robot);
     if (view.scene) this.#scene(view, robots);
     this.labels.draw();
     this.canvas.labels = this.labels.drawn;
@@ -191,13 +195,40 @@ export class Plane {
     const { store, truth, focus } = view;
     const size = Math.max(4.5, Math.min(11, 0.18 * store.stage.mission.sensing_range * this.scale));
     view.size = size;
-    view.places = new Map(store.stage.robots.map((robot) => [robot.id, this.#place(view, robot)]));
+    view.places = new Map(store.stage.robots.map((robot) => [robot.id, pose_now(view, robot, TRUE)]));
     for (const robot of robots) if (robot.role === "a") this.#configurations.draw(view, robot);
     for (const robot of robots) if (!focus || robot.id === focus) this.#beliefs.belief(view, robot);
     for (const robot of robots) this.#signals.anchor_range(view, robot);
     if (truth) for (const robot of robots) if (robot.role === "a") this.#signals.contact(view, robot);
     if (!truth) for (const robot of robots) this.#signals.mutual_ring(view, robot);
+    if (truth) for (const robot of robots) this.#reported(view, robot);
     if (truth) for (const robot of robots) this.#robot(view, robot, view.places.get(robot.id));
+  }
+
+  /** Draws the pose that an attacker reports, and how far it is from the true one. */
+  #reported(view, robot) {
+    const { look, size, focus } = view, pen = this.context;
+    const pose = pose_now(view, robot, REPORTED), true_pose = view.places.get(robot.id);
+    if (!pose || !true_pose || distance(pose, true_pose) < LEAST_GAP_M) return;
+    const [x, y] = this.at(pose), [to_x, to_y] = this.at(true_pose);
+    pen.globalAlpha = focus && robot.id !== focus && robot.peer !== focus ? 0.45 : 1;
+    pen.strokeStyle = look.fault;
+    pen.lineWidth = 1;
+    pen.beginPath();
+    pen.moveTo(x, y); pen.lineTo(to_x, to_y);
+    pen.stroke();
+    shape(pen, robot.role, x, y, pose[2], size);
+    pen.fillStyle = look.paper;
+    pen.fill();
+    pen.strokeStyle = look.robot[robot.role];
+    pen.lineWidth = 1.5;
+    pen.setLineDash([3, 2]);
+    pen.stroke();
+    pen.setLineDash([]);
+    const text = `${robot.id} reported, ${metres(distance(pose, true_pose))} off`;
+    this.labels.put(text, (x + to_x) / 2, (y + to_y) / 2 - 12, look.fault, "center");
+    if (size > 6) this.labels.placed.push([x - size, y - size, x + size, y + size]);
+    pen.globalAlpha = 1;
   }
 
   /** Returns the boxes of the texts over the plane, as [left, top, right, bottom]. */
@@ -269,14 +300,6 @@ export class Plane {
   }
 
   // --- robots ---
-
-  #place({ store, scene, tick, share, moving }, robot) {
-    const player = scene.players[store.places.get(robot.id)];
-    if (!player?.pose) return null;
-    const next = store.player(tick + 1, robot.id);
-    if (!moving || !next?.pose) return player.pose;
-    return between(player.pose, next.pose, next.executed, share, store.stage.mission.period);
-  }
 
   #robot({ look, size, focus, scene, store }, robot, pose) {
     if (!pose) return;

@@ -78,5 +78,6 @@ export const MEANINGS = [
   ["line to an anchor", "range measured in this tick"],
   ["double line", "contact; dots are reports: filled received, with a tail late, hollow lost, crossed out damaged"],
   ["trail", "in the colour of the robot, as in the figures; dotted in phase 1, dashed in phase 2, solid in phase 3"],
+  ["dashed robot and thin dashed trail", "the path that an attacker reports; a line joins it to the true one"],
   ["circle around an anchor", "solid: its sensing range; dashed: the orbit"],
 ];
