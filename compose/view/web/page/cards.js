@@ -7,6 +7,7 @@ import { metres, probability, PHASES, place, plural, rad, speed, turning } from 
 
 const MOST_PROBABILITIES = 5;
 const MANY = 4;
+const OUTCOMES = ["inconsistent", "undecided", "running", "localised"]; // the worst first
 
 export class Cards {
   constructor(root, roster, choose) {
@@ -23,7 +24,9 @@ export class Cards {
     this.roster.hidden = !this.many;
     this.roster.replaceChildren();
     this.entries = new Map();
+    this.order = "";
     if (!this.many) return;
+    this.counts = this.roster.appendChild(make("p", { id: "counts" }));
     for (const robot of store.stage.robots) {
       const entry = make("button", { type: "button", className: "entry" });
       entry.addEventListener("click", () => this.choose(robot.id));
@@ -48,6 +51,7 @@ export class Cards {
       if (this.root.children[shown.indexOf(robot)] !== card.root) this.root.append(card.root);
       card.draw(store, tick, truth, focus === robot.id);
     }
+    if (this.many) this.#rank(tick);
     for (const [id, entry] of this.entries ?? []) {
       const player = store.player(tick, id), phase = player ? store.phase(tick, id) : 0;
       const text = `${id} ${player?.down ? "is down" : player?.command?.state ?? "–"}`;
@@ -56,6 +60,20 @@ export class Cards {
       entry.setAttribute("aria-pressed", String(id === focus));
       entry.setAttribute("aria-label", player?.activity ?? id);
     }
+  }
+
+  /** Counts the robots by outcome in `tick`, and sorts their buttons: the worst first. */
+  #rank(tick) {
+    const groups = new Map(OUTCOMES.map((outcome) => [outcome, []]));
+    for (const id of this.entries.keys()) groups.get(this.store.player(tick, id)?.command?.verdict?.[0] ?? "running").push(id);
+    const counts = OUTCOMES.filter((outcome) => groups.get(outcome).length).map((outcome) => `${groups.get(outcome).length} ${outcome}`);
+    if (this.counts.textContent !== counts.join(", ")) this.counts.textContent = counts.join(", ");
+    const sorted = [...groups.values()].flat(), order = sorted.join();
+    if (order === this.order) return;
+    this.order = order;
+    const focused = document.activeElement;
+    this.roster.append(...sorted.map((id) => this.entries.get(id)));
+    if (this.roster.contains(focused)) focused.focus({ preventScroll: true });
   }
 }
 

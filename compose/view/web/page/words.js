@@ -58,6 +58,7 @@ export const KEYS = [
   ["T", "show or hide the ground truth"],
   ["R", "next robot; with Shift, previous robot"],
   ["A", "all robots"],
+  ["Esc", "all robots, and nothing selected; a click on a robot, an anchor or a hypothesis selects it"],
   ["+ −", "zoom in or out; also the mouse wheel"],
   ["W S", "pan up or down; with Shift, left or right; also by dragging"],
   ["N", "zoom to the robots and to where they may be"],
