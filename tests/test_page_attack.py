@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -146,3 +147,21 @@ def test_no_label_of_an_attack_overlaps_another(
             picture(page)
             assert not overlapping(page), (tick, near)
             assert [text for text in page.evaluate(LABELS) if text.startswith("a reported, ")]
+
+
+@pytest.mark.long
+def test_the_card_says_that_an_attack_which_no_robot_can_detect_has_not_been_found(
+    opened: Open, tmp_path: Path
+) -> None:
+    shown = scenes_with(tmp_path, Attack("reframe", 1.0), "paper-1")
+    last = shown[-1].player("a").reported
+    assert last
+    with watching(tmp_path) as (_, where):
+        page = opened(where)
+        scrub_to(page, len(shown) - 1)
+        expect(page.locator(".card[data-robot=a] .attack")).to_have_text(
+            re.compile(
+                rf"^a reports a position {last.gap:.2f} m from its true one\. "
+                r"b claims its pose in tick \d+, and has not found a contradiction\.$"
+            )
+        )

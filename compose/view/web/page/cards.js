@@ -162,11 +162,13 @@ function error(held, pose) {
 /** Returns what the false data of an attacker contradict: its true pose, and what its peer has measured. */
 function attacked(store, tick, { id, peer }, { gap }) {
   const off = gap < LEAST_GAP_M ? "has reported its true position so far" : `reports a position ${metres(gap)} from its true one`;
-  const verdict_at = (k) => store.player(k, peer)?.command?.verdict;
-  if (verdict_at(tick)?.[0] !== "inconsistent") return `${id} ${off}.`;
+  const verdict_at = (k) => store.player(k, peer)?.command?.verdict, verdict = verdict_at(tick);
+  if (!verdict) return `${id} ${off}.`;
   let first = tick;
   while (verdict_at(first - 1)) first -= 1;
-  return `${id} ${off}. ${peer} rejects ${id} in tick ${first}: ${verdict_at(tick)[1]}.`;
+  const [kind, reason] = verdict, at = `in tick ${first}`;
+  if (kind === "localised") return `${id} ${off}. ${peer} claims its pose ${at}, and has not found a contradiction.`;
+  return `${id} ${off}. ${peer} ${kind === "undecided" ? "ends undecided" : `rejects ${id}`} ${at}: ${reason}.`;
 }
 
 function measured(player, robot) {

@@ -4,6 +4,7 @@ import { distance, wrap } from "./geometry.js";
 import { metres, place, probability, rad } from "./words.js";
 
 const REACH = 6; // pixels around the outline of a drawing
+const NARROW_PX = 600; // below this width of the plane, the label is in its corner
 const KINDS = ["robot", "hypothesis", "anchor"]; // the first one that is under the pointer is selected
 
 /** True if two targets name the same thing. */
@@ -59,6 +60,7 @@ export class Tip {
     const lines = numbers(view, target).join("\n");
     if (element.textContent !== lines) element.textContent = lines;
     const [x, y] = target.at.map((one) => one * unit), away = (target.radius + REACH) * unit;
+    if (width < NARROW_PX) return void Object.assign(element.style, { left: "0.5rem", top: `${height - element.offsetHeight - 8}px` });
     const fits = x + away + element.offsetWidth < width;
     element.style.left = `${Math.max(0, fits ? x + away : x - away - element.offsetWidth)}px`;
     element.style.top = `${Math.max(0, Math.min(y + away, height - element.offsetHeight))}px`;
