@@ -98,6 +98,7 @@ def test_a_profile_of_other_radios_has_their_mean_bias_and_its_spread(raw: Range
     )
 
 
+@pytest.mark.long
 def test_without_truth_the_fit_is_the_reference(sample: RangeRecording) -> None:
     blind = sample._replace(robots=tuple([one._replace(truth=None) for one in sample.robots]))
     found = calibrated(blind, None, None)

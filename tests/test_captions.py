@@ -72,6 +72,7 @@ def test_the_story_of_paper_1_has_a_caption_for_each_of_its_beats(paper_1: Run) 
     assert scenes_of(paper_1)[-1].captions[-1].truth == "The largest error of a claim is less than 1 µm."
 
 
+@pytest.mark.long
 def test_under_noise_captions_speak_of_estimates_and_probabilities(recorded: Record) -> None:
     text = " ".join(text for _, text in told(recorded(load("noisy"))))
     assert "Each robot has an estimate of its path" in text

@@ -95,6 +95,7 @@ def test_a_late_robot_begins_its_last_manoeuvre_once(tmp_path: Path) -> None:
     assert begun == [[True], [False], [True]]
 
 
+@pytest.mark.long
 def test_under_noise_configurations_have_no_last_manoeuvre(tmp_path: Path) -> None:
     found = shown(recorded(load("noisy", seed=18), tmp_path))
     assert found[67].count == 4
@@ -112,6 +113,7 @@ def test_what_only_one_robot_holds_joins_nothing(tmp_path: Path) -> None:
     assert {tick: one.count for tick, one in shown(run).items()} == {54: 2, 55: 2, 57: 1}
 
 
+@pytest.mark.long
 def test_an_attacker_and_its_victim_hold_no_configurations_in_common(tmp_path: Path) -> None:
     text = (
         shipped()["random"].read_text().replace("[mission]\n", "[mission]\nnoise = {mutual_sigma = 0.05}\n")

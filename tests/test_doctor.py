@@ -220,6 +220,7 @@ def test_a_certificate_is_not_valid_before_its_time(mine: Path) -> None:
 # --- the network ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_an_endpoint_without_a_listener_is_reported_with_a_remedy() -> None:
     nowhere = free_endpoint()
     with world("paper-1", "--run", "mine") as (_, endpoint):
@@ -242,6 +243,7 @@ def test_a_refusal_by_the_router_is_explained(keys: Path, mine: Path) -> None:
 
 
 @pytest.mark.parametrize("command", series(["doctor", "ps"]))
+@pytest.mark.long
 def test_the_wait_for_a_listener_that_sends_nothing_is_bounded_and_can_be_interrupted(
     command: str,
 ) -> None:

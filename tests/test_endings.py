@@ -225,6 +225,7 @@ def test_a_robot_that_stops_sending_fails_the_run_within_the_timeout(endless: Pa
     assert not processes_of(out)
 
 
+@pytest.mark.long
 def test_an_agent_whose_world_dies_ends_within_its_timeout(tmp_path: Path) -> None:
     with world("paper-1", "--run", "mine") as (clock, endpoint):
         timeout = ("--timeout", TIMEOUT, "--out", tmp_path)
@@ -264,6 +265,7 @@ def test_a_world_whose_robot_never_connects_fails_and_names_it(comes: str, tmp_p
 # --- a port in use ----------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_world_whose_port_another_world_has_is_one_clear_line() -> None:
     with world("paper-1") as (_, endpoint):
         assert tandem("world", "paper-1", "--listen", endpoint) == (

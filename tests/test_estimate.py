@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import re
 import warnings
 from collections.abc import Sequence
 from functools import partial
@@ -152,7 +153,7 @@ def test_an_estimate_uses_nothing_that_was_measured_later(
     begin = sample.span[0]
     problem = measurements(sample, ("A", "B"), "uwb-calibrated", (0.0, 15.2))
     early = estimated(problem, ClaimRule()).rows
-    assert problem.measured.ticks_per_epoch == 13  # that of the whole sample: the robots are as fast
+    assert problem.measured.ticks_per_epoch == 7  # that of the whole sample: the robots are as fast
     assert early
     assert max(row.t_s for row in early) <= begin + 15.2
     assert estimate_csv(early) == estimate_csv(of_sample.rows[: len(early)])
@@ -161,9 +162,10 @@ def test_an_estimate_uses_nothing_that_was_measured_later(
 def test_a_claim_waits_for_the_accuracy_that_is_asked_for(sample: RangeRecording) -> None:
     strict = sample_estimates(sample, accuracy=0.01)
     assert not any(row.claim for row in strict.rows)
-    assert "required 0.01" in strict.summary.blocking_reason
+    assert re.match(r"the sigma of [AB]'s position is .* m, required 0.01", strict.summary.blocking_reason)
 
 
+@pytest.mark.long
 def test_a_bias_of_all_ranges_is_learned_with_the_profile_of_raw_radios(sample: RangeRecording) -> None:
     found = sample_estimates(with_ranges(sample, sample.ranges.range + 0.35), "uwb")
     assert found.summary.calibration is not None
@@ -253,6 +255,7 @@ def test_a_gross_increment_is_found_and_replaced(
     assert all(row.nees is not None and row.nees < NEES_99_9 for row in claimed)
 
 
+@pytest.mark.long
 def test_the_motion_in_a_gap_is_unknown(sample: RangeRecording) -> None:
     odometry = sample.robot("B").odometry
     kept = np.r_[0:200, 240:600]

@@ -260,6 +260,7 @@ def test_probabilities_are_shown_with_their_significant_digits(probability: floa
 
 @pytest.mark.parametrize("noise", series(["", NOISE]))
 @pytest.mark.parametrize("planner_name", series(["assured", "paper"]))
+@pytest.mark.long
 def test_a_mission_that_ends_undecided_is_drawn(noise: str, planner_name: str, tmp_path: Path) -> None:
     text = BRIEF.replace("assured", planner_name).replace("[planner]", f"{noise}[planner]")
     recording = run_mission(parse(text, "brief"), tmp_path)

@@ -86,6 +86,7 @@ def messages() -> Messages:
     return messages_of(read_ranges(SAMPLE))
 
 
+@pytest.mark.long
 def test_a_stream_gives_what_its_file_gives(messages: Messages) -> None:
     recording = read_ranges(SAMPLE)
     followed = StreamEstimate("it", ("A", "B"), (told_noise(PROFILE), PROFILE), ClaimRule())

@@ -105,6 +105,7 @@ def gone(pid: int) -> bool:
 # --- separate processes ---------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_each_has_its_own_session_and_group_and_is_named_in_ps(endless: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with TandemProcess("run", endless, "--out", out, "-q") as run:

@@ -45,6 +45,7 @@ def test_the_paper_planner_is_undecided_with_coarse_ranges_and_names_the_reason(
 
 
 @pytest.mark.parametrize("noise", [FINE, SIGMA], ids=["fine", "coarse"])
+@pytest.mark.long
 def test_the_paper_planner_makes_no_wrong_claim(noise: str) -> None:
     claims = 0
     for seed in SEEDS:

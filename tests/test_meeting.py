@@ -102,6 +102,7 @@ def test_they_meet_within_the_bound_from_all_phases_and_no_sooner_from_some(sett
 
 
 @given(drawn(0.1, 1.5))
+@pytest.mark.long
 def test_the_bound_holds_in_every_setting(setting: Setting) -> None:
     plan = rendezvous(mission_of(setting), setting[0], "assured")
     assume(plan.bound > 0.0)

@@ -75,6 +75,7 @@ def tracked(tree: Path, *folders: str) -> set[str]:
     return {name for name in names if name not in FOREIGN}
 
 
+@pytest.mark.long
 def test_an_sdist_has_the_sources_and_nothing_else(tree: Path, tmp_path: Path) -> None:
     with tarfile.open(built(tree, "sdist", tmp_path)) as packed:
         names = {name.partition("/")[2] for name in packed.getnames()}
@@ -83,6 +84,7 @@ def test_an_sdist_has_the_sources_and_nothing_else(tree: Path, tmp_path: Path) -
     assert names == wanted | PROJECT_FILES | {"PKG-INFO"}
 
 
+@pytest.mark.long
 def test_a_wheel_has_the_packages_with_their_data_and_types_and_nothing_else(
     tree: Path, tmp_path: Path
 ) -> None:

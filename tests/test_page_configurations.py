@@ -172,6 +172,7 @@ def test_the_predicted_distances_and_j_of_the_last_manoeuvre_are_listed(opened: 
     expect(page.locator("#predictions")).to_be_hidden()
 
 
+@pytest.mark.long
 def test_the_measured_range_rules_configurations_out_one_by_one_the_worst_first(
     opened: Open, address: str
 ) -> None:

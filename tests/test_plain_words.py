@@ -76,6 +76,7 @@ def private_words(text: str) -> set[str]:
     return {word for word in PRIVATE_WORDS if re.search(rf"\b{word}s?\b", text, re.IGNORECASE)}
 
 
+@pytest.mark.long
 def test_a_docstring_begins_with_what_the_thing_is() -> None:
     found = [
         f"{path}:{line}: {text.splitlines()[0]}"
@@ -99,6 +100,7 @@ def test_the_help_of_a_command_has_no_private_words(command: CommandEntry) -> No
     assert private_words(command_parser(command).format_help()) == set()
 
 
+@pytest.mark.long
 def test_messages_and_docstrings_have_no_private_words() -> None:
     found = [
         f"{path}:{node.lineno}: {sorted(words)}: {node.value[:80]}"
@@ -110,6 +112,7 @@ def test_messages_and_docstrings_have_no_private_words() -> None:
     assert found == []
 
 
+@pytest.mark.long
 def test_no_class_has_the_name_of_another() -> None:
     names = Counter(
         node.name for tree in trees().values() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)
@@ -117,6 +120,7 @@ def test_no_class_has_the_name_of_another() -> None:
     assert {name for name, count in names.items() if count > 1} == PUBLIC_NAMES
 
 
+@pytest.mark.long
 def test_no_module_has_the_name_of_another() -> None:
     """Except those of compose/cli: each has the name of its command."""
     names = Counter(Path(path).stem for path in trees() if not path.startswith("compose/cli/"))

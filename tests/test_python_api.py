@@ -21,8 +21,9 @@ from compose.recording.summary_json import summary
 from compose.recording.ticks_csv import rows
 from tandem.columns import Table
 from tests.commands import tandem as command
+from tests.series import series
 
-MODULES = ("", ".clash", ".columns", ".estimates", ".missions", ".results", ".rows", ".scenarios", ".sweeps")
+MODULES = ("", ".clash", ".columns", ".missions", ".results", ".rows", ".scenarios", ".sweeps", ".estimates")
 SAMPLE = Path(__file__).parent / "data" / "uwb" / "tiers-a-b-30-s.pyfg"
 TABLES = ("truth", "observations", "commands", "estimates", "messages", "claims")
 
@@ -47,7 +48,7 @@ def same(one: Table, other: Table) -> bool:
     )
 
 
-@pytest.mark.parametrize("module", MODULES)
+@pytest.mark.parametrize("module", series(MODULES, len(MODULES) - 1))  # estimates take longest
 def test_the_examples_in_docstrings_give_what_they_show(module: str) -> None:
     found = doctest.testmod(import_module(f"tandem{module}"), optionflags=doctest.ELLIPSIS)
     assert found.failed == 0
@@ -108,6 +109,7 @@ def test_the_tables_hold_what_the_files_hold(run: tandem.Run) -> None:
     assert run.summary["outcome"] == run.outcome == "localised"
 
 
+@pytest.mark.long
 def test_estimates_have_errors_only_where_a_pose_is_known_and_probabilities_that_sum_to_one() -> None:
     found = tandem.run("noisy", seed=7).estimates
     local = found["frame"] == "local"
@@ -355,6 +357,7 @@ def test_estimates_are_those_of_the_command(tmp_path: Path) -> None:
     assert "<td>A</td>" in found._repr_html_()
 
 
+@pytest.mark.long
 def test_a_run_and_its_recording_have_the_same_estimates(tmp_path: Path) -> None:
     run = tandem.run("noisy")
     found, again = tandem.estimate(run), tandem.estimate(run.save(tmp_path / "recording"))

@@ -428,6 +428,7 @@ def end_of(path: Track, guess: Array) -> Array:
 
 @few
 @given(seeds, noises)
+@pytest.mark.long
 def test_a_fit_ends_where_no_pose_and_no_error_of_the_odometry_is_likelier(seed: int, noise: Noise) -> None:
     one = told(seed, noise)
     assume(clear(one))

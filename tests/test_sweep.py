@@ -149,6 +149,7 @@ def parts(out: Path) -> int:
 # --- workers -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_rows_are_the_same_on_one_worker_and_on_two(folder: Path) -> None:
     played(folder, "both.toml", "one", workers=1)
     played(folder, "both.toml", "two", workers=2)

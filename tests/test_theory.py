@@ -214,6 +214,7 @@ def test_three_points_or_more_that_are_not_collinear_leave_rotations_only(
         st.lists(straights, max_size=4),
     ),
 )
+@pytest.mark.long
 def test_two_points_or_collinear_ones_leave_the_mirror_image_too_and_nothing_else(
     rho0: float, heading: float, controls: list[Controls]
 ) -> None:

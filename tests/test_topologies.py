@@ -141,6 +141,7 @@ def test_a_mission_through_routers_has_the_recording_of_one_without_a_network(
 @pytest.mark.parametrize(
     "topology", series(["a router between", "a router on each robot, by the robot's keys"])
 )
+@pytest.mark.long
 def test_a_mission_through_routers_with_access_rules_has_the_same_recording(
     topology: str, tmp_path: Path
 ) -> None:

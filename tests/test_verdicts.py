@@ -155,6 +155,7 @@ def honest_claims(
 
 
 @pytest.mark.parametrize("planner_name", series(["assured", "paper"]))
+@pytest.mark.long
 def test_every_claim_of_an_honest_robot_has_the_required_accuracy(planner_name: str) -> None:
     assert honest_claims(planner_name, [0.001, 0.05], range(3)) > 0
 

@@ -160,6 +160,7 @@ def test_with_the_truth_hidden_the_page_shows_only_estimates(opened: Open, addre
     shot(page, "truth-shown")
 
 
+@pytest.mark.long
 def test_the_page_can_be_used_by_keyboard_alone(opened: Open, address: str) -> None:
     page = opened(f"{address}#tick=0")
     until_shown(page, 0)
@@ -426,6 +427,7 @@ def test_a_page_keeps_up_with_a_mission_as_fast_as_it_goes(opened: Open, tmp_pat
         assert run.ended().status == 130
 
 
+@pytest.mark.long
 def test_run_watch_serves_until_ctrl_c_and_writes_the_usual_recording(
     opened: Open, paper_1: Path, tmp_path: Path
 ) -> None:
@@ -445,6 +447,7 @@ def test_run_watch_serves_until_ctrl_c_and_writes_the_usual_recording(
     assert journals(tmp_path / "record") == journals(paper_1)
 
 
+@pytest.mark.long
 def test_every_test_that_opens_a_page_skips_where_there_is_no_browser(tmp_path: Path) -> None:
     ran = subprocess.run(
         [sys.executable, "-m", "pytest", "-n0", "-p", "no:cacheprovider", "-rs", "tests/test_watch.py"]

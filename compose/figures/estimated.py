@@ -26,7 +26,7 @@ ROLES: tuple[Role, Role] = ("a", "b")
 SIGMAS = 3.0
 """The sigmas of the drawn ellipses and bounds."""
 ELLIPSES = 12
-"""The number of ellipses along a path."""
+"""The largest number of ellipses along a path."""
 NEES_BOUND = 11.34
 """The NEES that 99 % of right covariances do not exceed: chi-square of three degrees of freedom."""
 MARGIN = 0.03
@@ -119,7 +119,7 @@ def _path(drawn: Drawn, medium: Medium) -> Figure:
             [row.x for row in rows], [row.y for row in rows], color=colour, lw=1.0, label=f"{name}, {since}"
         )
         points += [(row.x, row.y) for row in rows]
-        for row in rows[:: max(1, len(rows) // ELLIPSES)]:
+        for row in rows[:: math.ceil(len(rows) / ELLIPSES)]:
             if math.sqrt(row.xx + row.yy) <= TOO_WIDE:
                 axes.add_patch(_ellipse(row, colour))
                 reach = [SIGMAS * math.sqrt(max(variance, 0.0)) for variance in (row.xx, row.yy)]

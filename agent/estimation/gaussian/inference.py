@@ -27,6 +27,7 @@ from agent.estimation.gaussian.placement_guesses import STARTS
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Ranges
 from agent.estimation.knowledge import Belief, Knowledge
 from agent.peer.motion_log import MotionLog
+from protocol.messages import RobotConfig
 from protocol.mission import HEADING_ACCURACY, Mission
 from protocol.motion import Covariance, Pose, Segment, compose, inverse, wrap
 
@@ -272,9 +273,10 @@ def blocking_reason_for(
     hypotheses: Sequence[PlanningHypothesis],
     inconsistency: Inconsistency | None,
     pair: PairRanges,
-    mission: Mission,
+    config: RobotConfig,
 ) -> str | None:
     """Return the first condition for a claim that is not met, or None; there are enough mutual ranges."""
+    mission = config.mission
     if inconsistency is None:
         return "no hypothesis explains the ranges"
     probability = scored[0].hypothesis.probability
@@ -286,7 +288,8 @@ def blocking_reason_for(
     if not inconsistency.p_value >= CLAIM_P_VALUE:
         return f"the most probable hypothesis fails the consistency test: {inconsistency.what}"
     _, covariance = to_second_order(hypotheses[0], pair.apart)
-    for i, robot in ((0, "a"), (3, "b")):
+    ids = (config.robot, config.peer) if config.role == "a" else (config.peer, config.robot)
+    for i, robot in zip((0, 3), ids, strict=True):
         position = deviation(covariance[i, i] + covariance[i + 1, i + 1])
         if not position <= mission.accuracy:
             return f"the sigma of {robot}'s position is {position:.3g} m, required {mission.accuracy:g}"
@@ -373,7 +376,7 @@ def with_pair(
     robot, m1 = (0, config.anchor) if config.role == "a" else (1, config.peer_anchor)
     enough = len(pair.places) >= mutual
     inconsistency = consistency_test(scored[0].fit, pair, robot) if enough and scored else None
-    blocking_reason = blocking_reason_for(scored, hypotheses, inconsistency, pair, config.mission)
+    blocking_reason = blocking_reason_for(scored, hypotheses, inconsistency, pair, config)
     claims = [claim(one, robot, pair) for one in hypotheses]
     first, _ = knowledge.belief.candidates or (len(scored), 0)
     return replace(

@@ -16,6 +16,7 @@ from compose.recording.estimating.estimate_epoch import ClaimRule, EstimateEpoch
 from compose.recording.estimating.pair_measurements import (
     EPOCH_S,
     HALF,
+    RANGE_SPACING_S,
     OneRobot,
     horizon,
     levelled,
@@ -106,7 +107,7 @@ def anchored_measurements(
     first, last = recording.span
     part = recording.part([robot], first, last)._replace(robots=(moved,))
     ticks = ticks or ticks_per_epoch(part, noise)
-    steps = steps_of(part, [robot], StepOptions(period_s=EPOCH_S / ticks, range_spacing_s=EPOCH_S))
+    steps = steps_of(part, [robot], StepOptions(period_s=EPOCH_S / ticks, range_spacing_s=RANGE_SPACING_S))
     ranges = steps.ranges
     counts = [int(np.count_nonzero(ranges.second == 1 + k)) for k in range(len(part.anchors))]
     order = sorted([k for k, count in enumerate(counts) if count], key=lambda k: -counts[k])

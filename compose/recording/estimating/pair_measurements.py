@@ -27,8 +27,11 @@ from compose.recording.ranging.range_recording import (
 from compose.recording.ranging.range_steps import NEARLY_ALL, StepOptions, speeds, steps_of
 from protocol.noise import Noise
 
-EPOCH_S = 1.0
-"""The time in s between two estimates; also the least time between two ranges of the same radios.
+EPOCH_S = 0.5
+"""The time in s between two estimates."""
+
+RANGE_SPACING_S = 1.0
+"""The least time in s between two ranges of the same radios.
 
 The errors of a radio's ranges within a second are correlated: more of them would count for more than they
 tell. With less, claims are too confident.
@@ -189,7 +192,7 @@ def pair_measurements(
     )
     part = _of_robots(recording, whole, robots)
     ticks = ticks or ticks_per_epoch(part, noise)
-    steps = steps_of(part, robots, StepOptions(period_s=EPOCH_S / ticks, range_spacing_s=EPOCH_S))
+    steps = steps_of(part, robots, StepOptions(period_s=EPOCH_S / ticks, range_spacing_s=RANGE_SPACING_S))
     radios, ranges = part.radios, steps.ranges
     if anchors is None:
         of_anchor = _own_anchors(part, ranges.first, ranges.second, robots)
