@@ -277,7 +277,8 @@ export class Plane {
     pen.stroke();
     pen.setLineDash([]);
     const text = `${robot.id} reported, ${metres(distance(pose, true_pose))} off`;
-    this.labels.put(text, (x + to_x) / 2, (y + to_y) / 2 - 12, look.fault, "center");
+    const half = pen.measureText(text).width / 2, middle = Math.min(Math.max((x + to_x) / 2, half), this.width - half);
+    this.labels.put(text, middle, (y + to_y) / 2 - 12, look.fault, "center");
     if (size > 6) this.labels.placed.push([x - size, y - size, x + size, y + size]);
     pen.globalAlpha = 1;
   }
