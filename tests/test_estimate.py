@@ -159,6 +159,12 @@ def test_an_estimate_uses_nothing_that_was_measured_later(
     assert estimate_csv(early) == estimate_csv(of_sample.rows[: len(early)])
 
 
+def test_only_the_last_estimate_keeps_its_fit(of_sample: RecordingEstimate) -> None:
+    *earlier, last = of_sample.epochs
+    assert last.fitted is not None
+    assert all(epoch.fitted is None for epoch in earlier)
+
+
 def test_a_claim_waits_for_the_accuracy_that_is_asked_for(sample: RangeRecording) -> None:
     strict = sample_estimates(sample, accuracy=0.01)
     assert not any(row.claim for row in strict.rows)

@@ -177,9 +177,9 @@ def window(request: pytest.FixtureRequest) -> Compared:
     problem = measurements(read_ranges(SAMPLE), None, PROFILE, (begin_s, begin_s + LENGTH_S))
     assert isinstance(problem.measured, PairMeasurements)
     last = estimated(problem, ClaimRule()).epochs[-1]
-    assert isinstance(last.used, PairRanges)
-    assert last.fit is not None
-    pair, ours = last.used, last.fit
+    assert last.fitted is not None
+    ours, pair = last.fitted
+    assert isinstance(pair, PairRanges)
     starts = nudged(ours, (np.zeros(2), np.array(pair.apart)), np.random.default_rng(request.param))
     ends = [pose_of(robot, len(path.v)) for robot, path in enumerate(pair.paths)]
     return Compared(pair, ours, optimum(graph_of(pair, ours), begun(pair, starts), ends))

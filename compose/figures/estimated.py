@@ -230,12 +230,13 @@ def _hypotheses(axes: Axes, drawn: Drawn) -> None:
 
 def _residuals(axes: Axes, drawn: Drawn, which: int, name: str) -> None:
     """Draw the residuals of one pair of radios by the last fit; outliers are crosses."""
-    last = drawn.estimates.epochs[-1]
-    if last.fit is None:
+    fitted = drawn.estimates.epochs[-1].fitted
+    if fitted is None:
         return
-    rows = last.used.ranges.pairs[which]
-    times = last.fit.ticks[rows] * drawn.problem.measured.period
-    residuals, good = last.fit.residuals[rows], last.fit.weights[rows] > OUTLIER
+    fit, used = fitted
+    rows = used.ranges.pairs[which]
+    times = fit.ticks[rows] * drawn.problem.measured.period
+    residuals, good = fit.residuals[rows], fit.weights[rows] > OUTLIER
     axes.axhline(0.0, color=PALE, lw=0.6)
     axes.plot(times[good], residuals[good], ls="", marker="o", ms=2.5, color=INK)
     axes.plot(times[~good], residuals[~good], ls="", marker="x", ms=4, color=COLOURS["b"])

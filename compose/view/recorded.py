@@ -12,6 +12,7 @@ from compose.recording.recording_files import WORLD_JOURNAL, agent_journal, jour
 from compose.recording.run import Run
 from compose.recording.run_setup import RunSetup, of_configs, of_scenario
 from compose.recording.summary_json import SUMMARY
+from compose.view.reported import reported_paths
 from compose.view.run_data import RunData
 from compose.view.scene import Scene, scene
 from protocol import files
@@ -49,12 +50,14 @@ def scenes_of(run: Run) -> tuple[Scene, ...]:
 def scenes(setup: RunSetup, known: RunData, first: int = 0, last: int | None = None) -> tuple[Scene, ...]:
     """Return the scenes of the known ticks from `first` to `last`, inclusive."""
     last = known.last if last is None else min(last, known.last)
+    paths = reported_paths(setup, known, last)
     before = known.ticks.get(first - 1)
     shown = []
     for tick in range(first, last + 1):
         now = known.ticks.get(tick)
         if now is not None:
-            shown.append(scene(setup, before, now, known.end))
+            reported = {robot: path[tick] for robot, path in paths.items() if tick < len(path)}
+            shown.append(scene(setup, before, now, known.end, reported))
         before = now
     return tuple(shown)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -23,6 +24,9 @@ from protocol.messages import (
 from protocol.motion import Pose
 from world.tick import World, observations
 from world.world_journal import Tick
+
+if TYPE_CHECKING:
+    from agent.peer.motion_log import MotionLog
 
 Link = tuple[str, str]
 """A directed link: sender and receiver."""
@@ -64,6 +68,8 @@ class RunData:
     def __init__(self) -> None:
         self.ticks: dict[int, TickData] = {}
         self.configs: dict[str, RobotConfig] = {}
+        self.reported_logs: dict[str, MotionLog] = {}
+        """The manoeuvres that each robot with an attack has reported so far."""
         self.final_reports: dict[str, FinalReport] = {}
         self.end: MissionEnd | None = None
         self.last = -1
@@ -157,6 +163,7 @@ class RunData:
                 self.at(tick).estimates.setdefault(robot, message)
             case Report(tick, robot) | PlannerReport(tick, robot):
                 self.at(tick).reports.setdefault(robot, SizedReport(message, size))
+                self._add_reported(message)
             case GroundTruth(tick, poses):
                 self.at(tick).truth.update(poses)
                 self.has_truth = True
@@ -165,6 +172,19 @@ class RunData:
                 (data.late if journal_owner is None else data.without).add(journal_owner or robot)
             case _:
                 self._add_once(message)
+
+    def _add_reported(self, report: PeerReport) -> None:
+        """Extend the reported log of an attacker; a report may change earlier ticks than its own."""
+        config = self.configs.get(report.robot)
+        if config is None or config.attack is None or not isinstance(report, Report):
+            return
+        from agent.peer.motion_log import MotionLog  # noqa: PLC0415  # the agent's code, for attackers only
+
+        log = self.reported_logs.get(report.robot, MotionLog())
+        self.reported_logs[report.robot] = log.extended(
+            report.since, 0, MotionLog(report.through, report.runs)
+        )
+        self._touch(min(report.tick, log.through + 1))
 
     def _add_once(self, message: Message) -> None:
         match message:

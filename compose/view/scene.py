@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import msgspec
 
 from compose.recording.run_setup import RobotSetup, RunSetup
@@ -21,7 +23,7 @@ from protocol.messages import (
     Verdict,
     Word,
 )
-from protocol.motion import Controls, Covariance, Pose, wrap
+from protocol.motion import Controls, Covariance, Pose, travelled, wrap
 
 
 class Sent(msgspec.Struct, frozen=True):
@@ -65,6 +67,15 @@ class HeldPoses(msgspec.Struct, frozen=True):
     localised: bool
 
 
+class FalsePose(msgspec.Struct, frozen=True):
+    """The pose that follows from the reports of an attacker."""
+
+    pose: Pose
+    """The pose in <W>, in the attacker's true anchor frame; its heading is not wrapped."""
+    gap: float
+    """Its distance in m from the true position."""
+
+
 class Player(msgspec.Struct, frozen=True, omit_defaults=True):
     """One robot in one tick. A field is None if it did not occur or is unknown."""
 
@@ -84,6 +95,8 @@ class Player(msgspec.Struct, frozen=True, omit_defaults=True):
     sent: Sent | None = None
     command: Decision | None = None
     held: HeldPoses | None = None
+    reported: FalsePose | None = None
+    """What the robot reports about itself, if the scenario has an attack of it and its true pose is known."""
 
 
 class Scene(msgspec.Struct, frozen=True):
@@ -106,9 +119,19 @@ class Scene(msgspec.Struct, frozen=True):
         raise KeyError(robot)
 
 
-def scene(setup: RunSetup, before: TickData | None, now: TickData, end: MissionEnd | None = None) -> Scene:
-    """Return the scene of the tick of `now`; `before` is the previous tick, if it is known."""
-    players = tuple([_player(robot_setup, now) for robot_setup in setup.robots])
+def scene(
+    setup: RunSetup,
+    before: TickData | None,
+    now: TickData,
+    end: MissionEnd | None = None,
+    reported: Mapping[str, Pose] | None = None,
+) -> Scene:
+    """Return the scene of the tick of `now`; `before` is the previous tick, if it is known.
+
+    `reported` has the poses in <W> that attackers report of this tick.
+    """
+    false_poses = reported or {}
+    players = tuple([_player(one, now, false_poses.get(one.id)) for one in setup.robots])
     deliveries = tuple(passages(setup, before, now))
     return Scene(
         now.tick,
@@ -128,7 +151,7 @@ def _sent(report: PeerReport, size: int) -> Sent:
             return Sent(size)
 
 
-def _player(robot_setup: RobotSetup, now: TickData) -> Player:
+def _player(robot_setup: RobotSetup, now: TickData, reported: Pose | None) -> Player:
     robot = robot_setup.id
     pose, observation, sent = now.truth.get(robot), now.observations.get(robot), now.reports.get(robot)
     command, estimate = now.commands.get(robot), now.estimates.get(robot)
@@ -164,6 +187,11 @@ def _player(robot_setup: RobotSetup, now: TickData) -> Player:
                 estimate.localised,
             )
             if estimate is not None
+            else None
+        ),
+        reported=(
+            FalsePose(reported, travelled(pose, reported))
+            if reported is not None and pose is not None
             else None
         ),
     )

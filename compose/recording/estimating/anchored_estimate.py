@@ -12,7 +12,7 @@ from agent.estimation.gaussian.hypotheses import Hypothesis, ScoredHypothesis
 from agent.estimation.gaussian.known_anchors import FEWEST, AnchoredRobot, blocking_reason, follow, search
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges
 from compose.errors import UserError
-from compose.recording.estimating.estimate_epoch import ClaimRule, EstimateEpoch, of_centres
+from compose.recording.estimating.estimate_epoch import ClaimRule, EpochFit, EstimateEpoch, of_centres
 from compose.recording.estimating.pair_measurements import (
     EPOCH_S,
     HALF,
@@ -176,12 +176,12 @@ class AnchoredEstimator:
             reason = self._reason(robot, scored) if scored else ""
         if not scored:
             what = "no hypothesis explains the ranges" if count >= FEWEST else "too few ranges"
-            return EstimateEpoch(t, counts, (), (False,), what, None, robot)
+            return EstimateEpoch(t, counts, (), (False,), what, None)
         self._known = tuple([one.hypothesis for one in scored])
         self._claimed = self._claimed or not reason
         found = [(one.hypothesis.probability, *poses(one.fit, (0.0, 0.0))) for one in scored]
         hypotheses = tuple([of_centres(*one, measured.sides) for one in found])
-        return EstimateEpoch(t, counts, hypotheses, (not reason,), reason, scored[0].fit, robot)
+        return EstimateEpoch(t, counts, hypotheses, (not reason,), reason, EpochFit(scored[0].fit, robot))
 
     def _reason(self, robot: AnchoredRobot, scored: tuple[ScoredHypothesis, ...]) -> str:
         covariance = poses(scored[0].fit, (0.0, 0.0))[1]

@@ -59,23 +59,24 @@ def _by_fit(
     problem = measurements(recording, robots, ASSUMED, window)
     estimate = estimated(problem, RULE)
     last = estimate.epochs[-1] if estimate.epochs else None
-    if last is None or last.fit is None or not all(last.claims):
+    if last is None or last.fitted is None or not all(last.claims):
         why = last.blocking_reason if last is not None else "there is no odometry of both"
         raise UserError(
             f"{recording.source}: without true poses, an estimate of {' and '.join(robots)} is needed, "
             f"and there is none: {why or 'too few ranges'}"
         )
-    errors, ranges = {}, last.used.ranges
+    fit, used = last.fitted
+    errors, ranges = {}, used.ranges
     ranged = [pair for pair, count in zip(problem.measured.pairs, last.ranges, strict=True) if count]
     for pair, rows in zip(ranged, ranges.pairs, strict=True):
         t: Numbers = problem.measured.t0 + problem.measured.period * ranges.tick[rows].astype(float)
         if len(t) >= FEWEST:
-            errors[pair] = PairErrors(t, ranges.rho[rows], last.fit.residuals[rows])
+            errors[pair] = PairErrors(t, ranges.rho[rows], fit.residuals[rows])
     if not errors:
         raise UserError(f"{recording.source}: no pair of radios has {FEWEST} ranges")
     found = range_calibration(errors, "the fit")
     names = [side.id for side in problem.measured.sides]
-    learned = learned_errors(last.fit, names, ["-".join(pair) for pair in ranged])
+    learned = learned_errors(fit, names, ["-".join(pair) for pair in ranged])
     bias, scale = learned.range_bias_m, learned.range_scale
     return found._replace(
         bias_sigma=bias.sigma if bias is not None else 0.0,

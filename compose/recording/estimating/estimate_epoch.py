@@ -24,6 +24,14 @@ class PosesHypothesis(NamedTuple):
     """The covariance of all poses; shape (3 R, 3 R)."""
 
 
+class EpochFit(NamedTuple):
+    """The fit of the first hypothesis, and what it was fitted to."""
+
+    fit: Fit
+    used: PairRanges | AnchoredRobot
+    """The measurements up to the end of the epoch."""
+
+
 class EstimateEpoch(NamedTuple):
     """The estimate at the end of one epoch."""
 
@@ -37,10 +45,15 @@ class EstimateEpoch(NamedTuple):
     """True if a robot may claim the pose of the first hypothesis."""
     blocking_reason: str
     """The condition for a claim that is not met; empty if all are."""
-    fit: Fit | None
-    """The fit of the first hypothesis."""
-    used: PairRanges | AnchoredRobot
-    """The measurements up to now."""
+    fitted: EpochFit | None
+    """The fit of the first hypothesis; None without one, and if there is a later epoch."""
+
+
+def add_epoch(epochs: list[EstimateEpoch], epoch: EstimateEpoch) -> None:
+    """Append `epoch` to `epochs`, and drop the fit of the one before: fits grow with the number of ranges."""
+    if epochs:
+        epochs[-1] = epochs[-1]._replace(fitted=None)
+    epochs.append(epoch)
 
 
 class ClaimRule(NamedTuple):

@@ -223,9 +223,9 @@ def summary_of(
         )
     pairs = ["-".join(pair) for pair in measured.pairs]
     calibration = None
-    if last is not None and last.fit is not None:
+    if last is not None and last.fitted is not None:
         ranged = [name for name, count in zip(pairs, last.ranges, strict=True) if count]
-        calibration = learned_errors(last.fit, [side.id for side in sides], ranged)
+        calibration = learned_errors(last.fitted.fit, [side.id for side in sides], ranged)
     hypotheses = [
         FinalHypothesis(
             one.probability,

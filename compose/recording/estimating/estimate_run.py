@@ -11,7 +11,7 @@ from compose.recording.estimating.anchored_estimate import (
     AnchoredMeasurements,
     anchored_measurements,
 )
-from compose.recording.estimating.estimate_epoch import ClaimRule, EstimateEpoch
+from compose.recording.estimating.estimate_epoch import ClaimRule, EstimateEpoch, add_epoch
 from compose.recording.estimating.estimate_rows import EstimateSummary, PoseEstimateRow, rows_of, summary_of
 from compose.recording.estimating.noise_files import ToldNoise, told_noise
 from compose.recording.estimating.pair_estimate import PairEstimator
@@ -132,7 +132,7 @@ def estimated(
     for number in range(1, problem.measured.epochs + 1):
         epoch = estimator.epoch(problem.measured, number)
         rows += rows_of(epoch, problem.robots)
-        epochs.append(epoch)
+        add_epoch(epochs, epoch)
         done()
     return with_summary(problem, rows, epochs, rule)
 

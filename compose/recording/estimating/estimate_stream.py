@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 
 from compose.errors import UserError
-from compose.recording.estimating.estimate_epoch import ClaimRule, EstimateEpoch
+from compose.recording.estimating.estimate_epoch import ClaimRule, EstimateEpoch, add_epoch
 from compose.recording.estimating.estimate_rows import PoseEstimateRow, rows_of
 from compose.recording.estimating.estimate_run import (
     EstimationProblem,
@@ -104,7 +104,7 @@ class StreamEstimate:
             self._next += 1
             found = rows_of(epoch, self._problem.robots)
             self._rows += found
-            self._epochs.append(epoch)
+            add_epoch(self._epochs, epoch)
             yield from found
 
     def result(self) -> tuple[EstimationProblem, RecordingEstimate]:

@@ -16,7 +16,7 @@ from agent.planning.accuracy_seeking import (
     may_claim,
     weighed,
 )
-from compose.recording.estimating.estimate_epoch import ClaimRule, EstimateEpoch, of_centres
+from compose.recording.estimating.estimate_epoch import ClaimRule, EpochFit, EstimateEpoch, of_centres
 from compose.recording.estimating.pair_measurements import EPOCH_S, OneRobot, PairMeasurements
 from compose.recording.ranging.range_recording import Numbers
 from protocol.messages import RobotConfig
@@ -53,7 +53,7 @@ class PairEstimator:
         found, beliefs = _inferred(known, pair, follow_only=self._claimed)
         if found is None or not found.scored:
             reason = "no hypothesis explains the ranges" if found is not None else "too few mutual ranges"
-            return EstimateEpoch(t, measured.counts(pair.ranges), (), (False, False), reason, None, pair)
+            return EstimateEpoch(t, measured.counts(pair.ranges), (), (False, False), reason, None)
         self._belief = beliefs[0]
         claims = [may_claim(one, pair) for one in beliefs]
         self._claimed = self._claimed or all(claims)
@@ -64,8 +64,7 @@ class PairEstimator:
             tuple([of_centres(*one, measured.sides) for one in _second_order(found, pair)]),
             (claims[0], claims[1]),
             reasons[0] if reasons else "" if all(claims) else "few ranges, and a small p-value",
-            found.scored[0].fit,
-            pair,
+            EpochFit(found.scored[0].fit, pair),
         )
 
 

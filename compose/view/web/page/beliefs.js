@@ -30,6 +30,7 @@ export class Beliefs {
       if (place === 0 && covariance && held.world.length) this.#ellipse(pose, covariance, look);
       const grown = truth ? size * 1.45 : size * 1.15;
       shape(pen, robot.role, x, y, pose[2], grown);
+      this.plane.targets.push({ kind: "hypothesis", robot: robot.id, place, at: [x, y], radius: grown });
       if (!truth && poses.length === 1) {
         pen.fillStyle = player.down ? look.paper : look.robot[robot.role];
         pen.fill();

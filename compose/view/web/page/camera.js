@@ -4,6 +4,9 @@ import { compose, frame_of } from "./geometry.js";
 
 const AROUND = 0.25; // of the sensing range, around each pose
 
+/** Returns the true pose of a player and the one that it reports, as far as there are such. */
+export const true_and_reported = (player) => [player?.pose, player?.reported?.pose].filter(Boolean);
+
 /** Returns the discs [position, radius] of the scenario: the anchors of `robots` with their ranges and orbits. */
 export function scenario_discs(robots, sensing_range) {
   return robots.map((robot) => [robot.anchor, Math.max(sensing_range, robot.orbit[0])]);
@@ -26,7 +29,7 @@ export function story_discs({ store, tick, focus, truth, eliminated }, pair) {
   for (const robot of shown) {
     const ticks = [tick, tick + 1, ...(eliminated < 1 ? [tick - 1] : [])];
     const players = ticks.map((k) => store.player(k, robot.id));
-    if (truth) poses.push(...players.map((player) => player?.pose).filter(Boolean));
+    if (truth) poses.push(...players.flatMap(true_and_reported));
     for (const player of players) poses.push(...(player?.held?.world ?? []));
     const held = store.player(tick, robot.id)?.held;
     if (!truth && held && !held.world.length) poses.push(...held.local.map((local) => compose(frame_of(robot, truth), local)));

@@ -2,10 +2,12 @@
 
 import { distance, wrap } from "./geometry.js";
 import { leads } from "./held.js";
+import { LEAST_GAP_M } from "./plane.js";
 import { metres, probability, PHASES, place, plural, rad, speed, turning } from "./words.js";
 
 const MOST_PROBABILITIES = 5;
 const MANY = 4;
+const OUTCOMES = ["inconsistent", "undecided", "running", "localised"]; // the worst first
 
 export class Cards {
   constructor(root, roster, choose) {
@@ -22,7 +24,9 @@ export class Cards {
     this.roster.hidden = !this.many;
     this.roster.replaceChildren();
     this.entries = new Map();
+    this.order = "";
     if (!this.many) return;
+    this.counts = this.roster.appendChild(make("p", { id: "counts" }));
     for (const robot of store.stage.robots) {
       const entry = make("button", { type: "button", className: "entry" });
       entry.addEventListener("click", () => this.choose(robot.id));
@@ -47,6 +51,7 @@ export class Cards {
       if (this.root.children[shown.indexOf(robot)] !== card.root) this.root.append(card.root);
       card.draw(store, tick, truth, focus === robot.id);
     }
+    if (this.many) this.#rank(tick);
     for (const [id, entry] of this.entries ?? []) {
       const player = store.player(tick, id), phase = player ? store.phase(tick, id) : 0;
       const text = `${id} ${player?.down ? "is down" : player?.command?.state ?? "–"}`;
@@ -55,6 +60,20 @@ export class Cards {
       entry.setAttribute("aria-pressed", String(id === focus));
       entry.setAttribute("aria-label", player?.activity ?? id);
     }
+  }
+
+  /** Counts the robots by outcome in `tick`, and sorts their buttons: the worst first. */
+  #rank(tick) {
+    const groups = new Map(OUTCOMES.map((outcome) => [outcome, []]));
+    for (const id of this.entries.keys()) groups.get(this.store.player(tick, id)?.command?.verdict?.[0] ?? "running").push(id);
+    const counts = OUTCOMES.filter((outcome) => groups.get(outcome).length).map((outcome) => `${groups.get(outcome).length} ${outcome}`);
+    if (this.counts.textContent !== counts.join(", ")) this.counts.textContent = counts.join(", ");
+    const sorted = [...groups.values()].flat(), order = sorted.join();
+    if (order === this.order) return;
+    this.order = order;
+    const focused = document.activeElement;
+    this.roster.append(...sorted.map((id) => this.entries.get(id)));
+    if (this.roster.contains(focused)) focused.focus({ preventScroll: true });
   }
 }
 
@@ -70,9 +89,10 @@ class Card {
     this.phase = make("span", { className: "phase" });
     this.error = make("span", { className: "error" });
     this.doing = make("p", { className: "doing" });
+    this.attack = make("p", { className: "attack", hidden: true });
     this.rows = make("dl", {});
     this.probability = make("ol", { className: "probability" });
-    this.root.append(make("div", { className: "line" }, this.name, this.phase, this.error), this.doing, this.rows, this.probability);
+    this.root.append(make("div", { className: "line" }, this.name, this.phase, this.error), this.doing, this.attack, this.rows, this.probability);
     this.fields = new Map();
   }
 
@@ -98,6 +118,9 @@ class Card {
     this.root.classList.toggle("down", Boolean(player.down));
     this.phase.textContent = `phase ${phase}: ${PHASES[phase]}${player.down ? "; down" : ""}`;
     if (this.doing.textContent !== player.activity) this.doing.textContent = player.activity;
+    const attack = truth && player.reported ? attacked(store, tick, this.robot, player.reported) : "";
+    if (this.attack.textContent !== attack) this.attack.textContent = attack;
+    this.attack.hidden = !attack;
     const [off, range] = truth && player.pose && held?.world.length ? error(held, player.pose) : ["", ""];
     this.error.textContent = off;
     this.error.title = range;
@@ -134,6 +157,18 @@ function error(held, pose) {
   const off = held.world.map((one) => distance(one, pose)), least = metres(Math.min(...off)), most = metres(Math.max(...off));
   if (leads(held)) return [`error ${metres(off[0])}`, ""];
   return [`error up to ${most}`, `${least} to ${most}: ${off.length} poses are possible, and none has a probability above 50 %`];
+}
+
+/** Returns what the false data of an attacker contradict: its true pose, and what its peer has measured. */
+function attacked(store, tick, { id, peer }, { gap }) {
+  const off = gap < LEAST_GAP_M ? "has reported its true position so far" : `reports a position ${metres(gap)} from its true one`;
+  const verdict_at = (k) => store.player(k, peer)?.command?.verdict, verdict = verdict_at(tick);
+  if (!verdict) return `${id} ${off}.`;
+  let first = tick;
+  while (verdict_at(first - 1)) first -= 1;
+  const [kind, reason] = verdict, at = `in tick ${first}`;
+  if (kind === "localised") return `${id} ${off}. ${peer} claims its pose ${at}, and has not found a contradiction.`;
+  return `${id} ${off}. ${peer} ${kind === "undecided" ? "ends undecided" : `rejects ${id}`} ${at}: ${reason}.`;
 }
 
 function measured(player, robot) {

@@ -9,6 +9,13 @@ export function step([x, y, heading], v, omega, s) {
   return [x + length * Math.cos(heading + half), y + length * Math.sin(heading + half), heading + omega * s];
 }
 
+/** Returns the controls (v, omega) with which a robot drives from one pose to another in `s` seconds. */
+export function controls(from, to, s) {
+  const half = (to[2] - from[2]) / 2, course = from[2] + half;
+  const length = (to[0] - from[0]) * Math.cos(course) + (to[1] - from[1]) * Math.sin(course);
+  return [(half === 0 ? length : (length * half) / Math.sin(half)) / s, (2 * half) / s];
+}
+
 /** Returns the pose `local`, given in `frame`, in the parent frame of `frame`. */
 export function compose(frame, local) {
   const c = Math.cos(frame[2]), s = Math.sin(frame[2]);

@@ -1,4 +1,4 @@
-// The entry point of the page: view state, playback, keys, and the address (#show=…&tick=46&robot=a&truth=0).
+// The entry point of the page: view state, playback, keys, and the address (see address.js).
 
 import { address_state } from "./address.js";
 import { estimate } from "./estimate.js";
@@ -12,6 +12,7 @@ import { fill_help } from "./help.js";
 import { Log } from "./log.js";
 import { list_missions, state_of } from "./missions.js";
 import { Plane } from "./plane.js";
+import { same, Tip, written } from "./selection.js";
 import { activities, Announcer, described } from "./spoken.js";
 import { Predictions } from "./predictions.js";
 import { Sequence } from "./sequence.js";
@@ -20,11 +21,13 @@ import { Store } from "./store.js";
 import { Timeline } from "./timeline.js";
 import { plural } from "./words.js";
 
+const SETTLED_MS = 200; // after the last movement of the camera
+
 const $ = (id) => document.getElementById(id);
 const still = matchMedia("(prefers-reduced-motion: reduce)");
 let store = null;
 const view = {
-  tick: 0, share: 0, playing: false, follow: true, focus: null, moving: false, speed: USUAL,
+  tick: 0, share: 0, playing: false, follow: true, focus: null, selected: null, moving: false, speed: USUAL,
   wanted: true,
   /** True while the clock of compare.html runs. */
   driven: false,
@@ -42,11 +45,12 @@ let before = null;
 
 const guide = new Guide();
 const announcer = new Announcer();
-const plane = new Plane($("canvas"), () => draw());
+const plane = new Plane($("canvas"), () => draw(), select);
+const tip = new Tip($("tip"));
 const predictions = new Predictions($("predictions"), plane);
 const timeline = new Timeline($("line"), $("bands"), $("scrub"), (tick) => go(tick));
 const sequence = new Sequence($("exchange"), $("sequence"), (tick) => go(tick));
-const cards = new Cards($("robots"), $("roster"), (robot) => focus(view.focus === robot ? null : robot));
+const cards = new Cards($("robots"), $("roster"), toggle);
 const log = new Log($("log"), $("states"), $("radio"), (tick) => go(tick));
 log.onchange = () => draw();
 
@@ -58,9 +62,21 @@ function update_address() {
   if (listed && (listed.sweep || listed.shows.length > 1)) fields.set("show", store.name);
   if (!(view.follow && store.live)) fields.set("tick", view.tick);
   if (view.focus) fields.set("robot", view.focus);
+  if (view.selected) fields.set("select", written(view.selected));
+  if (plane.chosen_view) fields.set("view", plane.chosen_view.map((one) => Number(one.toPrecision(6))).join("_"));
   if (!view.wanted) fields.set("truth", "0");
   const hash = `#${fields}`;
   if (location.hash !== hash && (location.hash || String(fields))) history.replaceState(null, "", hash);
+}
+
+let addressing = 0, looked = "";
+/** Updates the address, but not with each movement of the camera: browsers refuse too many updates. */
+function keep_address() {
+  const look = String(plane.chosen_view), moved = look !== looked;
+  looked = look;
+  clearTimeout(addressing);
+  if (moved) addressing = setTimeout(update_address, SETTLED_MS);
+  else update_address();
 }
 
 // --- the mission shown ---
@@ -117,7 +133,7 @@ async function open(name) {
     store = new Store(name, mission, draw);
     store.onstage = staged;
     store.onforget = (tick) => { timeline.forget(tick); log.forget(tick); guide.forget(tick); };
-    const { tick, robot, truth } = address_state();
+    const { tick, robot, selected, view: look, truth } = address_state();
     view.follow = tick === null;
     const start = store.live ? store.last : store.first;
     view.tick = Math.max(Math.min(tick ?? start, store.last), store.first, 0);
@@ -126,7 +142,9 @@ async function open(name) {
     view.beat = null;
     plane.following = plane.freed = false;
     view.focus = store.places.has(robot) ? robot : null;
+    view.selected = selected;
     staged();
+    if (look) plane.look_at(look);
     listen();
     if (listed?.sweep) play(true);
   } finally {
@@ -193,6 +211,21 @@ function focus(robot) {
   draw();
 }
 
+function toggle(robot) { focus(view.focus === robot ? null : robot); }
+
+/** Selects what the user has clicked on the plane: a robot as its card does, or an anchor or a hypothesis. */
+function select(target) {
+  if (!store) return;
+  if (target?.kind === "robot") return void toggle(target.robot);
+  view.selected = target && !same(target, view.selected) ? { kind: target.kind, robot: target.robot, place: target.place } : null;
+  draw();
+}
+
+function deselect() {
+  view.selected = null;
+  focus(null);
+}
+
 function play(on = !view.playing) {
   if (!store) return;
   if (on && view.tick >= store.last && !store.live) view.tick = store.first;
@@ -252,6 +285,8 @@ function draw() {
     tell_state({ shown: store.scene(view.tick) ? view.tick : null, first: store.first, last: store.last });
     predictions.draw(view, store, guide.pair(view.focus));
     plane.draw(store, view);
+    const size = [$("canvas").clientWidth, $("canvas").clientHeight];
+    tip.draw({ ...view, store }, plane.hovered ?? plane.targets.find((one) => same(one, view.selected)), size, plane.unit);
     cards.draw(view);
     log.draw(view);
     timeline.draw(view, activities(store, view));
@@ -261,7 +296,7 @@ function draw() {
     const news = view.playing && view.guided ? null : announcer.text(store, view, now);
     if (news !== null) text($("live"), news);
     if (view.playing || plane.easing) draw();
-    if (!view.playing) update_address();
+    if (!view.playing) keep_address();
   });
 }
 
@@ -354,7 +389,7 @@ function pressed(event) {
     PageDown: () => go(view.tick - 10), PageUp: () => go(view.tick + 10),
     Home: () => go(store.first), End: () => go(store.last), ",": () => to_event(-1), ".": () => to_event(1),
     "[": () => pace(-1), "]": () => pace(1), l: () => go(store.last), t: () => show_truth(!view.truth),
-    r: () => next_robot(event.shiftKey ? -1 : 1), a: () => focus(null), f: fit, n: () => plane.near(store, view),
+    r: () => next_robot(event.shiftKey ? -1 : 1), a: () => focus(null), Escape: deselect, f: fit, n: () => plane.near(store, view),
     g: () => guided(!view.guided), c: () => follow_story(),
     "+": () => plane.zoom(1.25), "=": () => plane.zoom(1.25), "-": () => plane.zoom(0.8),
     w: () => plane.shift(event.shiftKey ? 60 : 0, event.shiftKey ? 0 : 60),
@@ -391,9 +426,11 @@ $("speed").append(...SPEEDS.map((speed) => make("option", { value: speed, textCo
 fill_help($("key-list"), $("signs"), $("legend"));
 
 window.addEventListener("hashchange", () => {
-  const { show, tick, robot, truth } = address_state();
+  const { show, tick, robot, selected, view: look, truth } = address_state();
   if (!store || (show || store.name) !== store.name || (!show && (listed?.sweep || listed?.shows.length > 1))) return void (listed && on_list(listed));
   view.focus = store.places.has(robot) ? robot : null;
+  view.selected = selected;
+  if (look) plane.look_at(look);
   view.wanted = truth;
   if (tick !== null) go(tick);
   else draw();

@@ -2,13 +2,14 @@
 
 import { Beliefs } from "./beliefs.js";
 import { Configurations } from "./configurations.js";
-import { scenario_discs, story_discs } from "./camera.js";
-import { between, distance, TAU } from "./geometry.js";
+import { scenario_discs, story_discs, true_and_reported } from "./camera.js";
+import { distance, TAU } from "./geometry.js";
 import { Labels } from "./labels.js";
 import { cross, Look, shape, unit } from "./pen.js";
+import { same, under } from "./selection.js";
 import { Signals } from "./signals.js";
 import { Tints } from "./tints.js";
-import { Trails } from "./trails.js";
+import { pose_now, REPORTED, Trails, TRUE } from "./trails.js";
 import { metres } from "./words.js";
 
 /** The time in s in which the camera covers most of the way to where it is needed. */
@@ -16,12 +17,17 @@ const EASE_S = 0.45;
 /** The distance in pixels from which on the camera is where it is needed. */
 const NEAR_PX = 0.5;
 const LIST_PX = 42;
+/** The distance in pixels that a pointer moves before it drags the plane instead of selecting what is there. */
+const DRAG_PX = 4;
+/** The least distance in m between a reported and a true position that counts as a difference. */
+export const LEAST_GAP_M = 1e-6;
 /** The least width and height in pixels of a picture: a lower window shows a part of it. */
 const LEAST_PX = 40;
 
 /** The map from the world to the canvas, with pan and zoom, and the order in which things are drawn. */
 export class Plane {
-  constructor(canvas, redraw) {
+  /** `choose` is called with the target of each click that is no drag, or undefined if there is none. */
+  constructor(canvas, redraw, choose = () => {}) {
     this.canvas = canvas;
     this.context = canvas.getContext("2d");
     this.centre = [0, 0];
@@ -32,6 +38,8 @@ export class Plane {
     /** True if the user has moved the camera, which then does not follow the story by itself. */
     this.freed = false;
     this.easing = false;
+    /** The drawn robots, anchors and hypotheses as { kind, robot, place, at, radius }, in pixels. */
+    this.targets = [];
     this.#redraw = redraw;
     this.#trails = new Trails(this);
     this.#beliefs = new Beliefs(this);
@@ -42,16 +50,26 @@ export class Plane {
       event.preventDefault();
       this.zoom(Math.exp(-event.deltaY * 0.0015), [event.offsetX / unit(), event.offsetY / unit()]);
     }, { passive: false });
-    let held = null;
+    let held = null, dragged = false;
+    const there = (event) => [event.offsetX / unit(), event.offsetY / unit()];
     canvas.addEventListener("pointerdown", (event) => {
       held = [event.clientX, event.clientY];
+      dragged = false;
       canvas.setPointerCapture(event.pointerId);
     });
     canvas.addEventListener("pointermove", (event) => {
-      if (!held) return;
-      this.shift((event.clientX - held[0]) / unit(), (event.clientY - held[1]) / unit());
+      if (!held) return void this.#point(event.pointerType === "mouse" ? there(event) : null);
+      const moved = [event.clientX - held[0], event.clientY - held[1]];
+      if (!dragged && Math.hypot(...moved) < DRAG_PX) return;
+      dragged = true;
+      this.#point(null);
+      this.shift(moved[0] / unit(), moved[1] / unit());
       held = [event.clientX, event.clientY];
     });
+    canvas.addEventListener("pointerup", (event) => {
+      if (held && !dragged) choose(under(this.targets, there(event)));
+    });
+    canvas.addEventListener("pointerleave", () => this.#point(null));
     for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, () => { held = null; });
   }
 
@@ -61,8 +79,28 @@ export class Plane {
   #signals;
   #configurations;
   #revision = -1;
+  #pointer = null;
+
+  /** The target under the pointer; undefined if there is none. */
+  get hovered() { return this.#pointer ? under(this.targets, this.#pointer) : undefined; }
+
+  #point(at) {
+    const before = this.hovered;
+    this.#pointer = at;
+    if (this.hovered !== before) this.#redraw();
+  }
+
+  /** The view that the user has chosen, as [x, y, scale] in m and pixels per m; null if the page chooses it. */
+  get chosen_view() { return this.freed && !this.fitted && !this.following ? [...this.centre, this.scale] : null; }
+
+  /** Shows the view [x, y, scale]. */
+  look_at([x, y, scale]) {
+    this.#free();
+    Object.assign(this, { centre: [x, y], scale });
+  }
 
   get width() { return this.canvas.clientWidth / unit(); }
+  get unit() { return unit(); }
   get height() { return this.canvas.clientHeight / unit(); }
 
   #free() {
@@ -105,7 +143,7 @@ export class Plane {
     for (const robot of store.stage.robots) {
       if (focus && robot.id !== focus && (robot.peer !== focus || !truth)) continue;
       const player = store.player(tick, robot.id);
-      const poses = [...(truth && player?.pose ? [player.pose] : []), ...(player?.held?.world ?? [])];
+      const poses = [...(truth ? true_and_reported(player) : []), ...(player?.held?.world ?? [])];
       discs.push(...(poses.length ? poses.map((pose) => [pose, 0.3 * reach]) : [[robot.anchor, reach]]));
     }
     this.#frame(discs);
@@ -155,7 +193,7 @@ export class Plane {
     ];
   }
 
-  draw(store, { tick, share, focus, truth, moving, eliminated }) {
+  draw(store, { tick, share, focus, truth, moving, eliminated, selected }) {
     const ratio = (window.devicePixelRatio || 1) * unit();
     const width = Math.round(this.width * ratio), height = Math.round(this.height * ratio);
     if (this.canvas.width !== width || this.canvas.height !== height) {
@@ -163,6 +201,7 @@ export class Plane {
       this.canvas.height = height;
     }
     if (this.fitted) this.fit(store, focus, truth);
+    this.targets = [];
     if (this.#revision !== store.revision) {
       this.#trails.forget();
       this.tints.forget();
@@ -180,24 +219,68 @@ export class Plane {
     const shown = (robot) => truth || !focus || robot.id === focus;
     const robots = store.stage.robots.filter(shown);
     for (const robot of robots) this.#anchor(view, robot);
-    if (truth) for (const robot of robots) this.#trails.trail(view, robot);
-    else for (const robot of robots) this.#trails.believed_trail(view, robot);
+    if (truth) {
+      for (const robot of robots) this.#trails.trail(view, robot);
+      for (const robot of robots) if (robot.attack) this.#trails.trail(view, robot, REPORTED);
+    } else for (const robot of robots) this.#trails.believed_trail(view, robot);
     if (view.scene) this.#scene(view, robots);
+    this.#ring(this.targets.find((one) => same(one, selected)), look);
+    this.canvas.style.cursor = this.hovered ? "pointer" : "";
     this.labels.draw();
     this.canvas.labels = this.labels.drawn;
+    this.canvas.targets = this.targets;
+  }
+
+  /** Draws a ring around the selected target. */
+  #ring(target, look) {
+    if (!target) return;
+    const pen = this.context;
+    pen.beginPath();
+    pen.arc(...target.at, target.radius + 5, 0, TAU);
+    pen.strokeStyle = look.ink;
+    pen.lineWidth = 1.5;
+    pen.stroke();
   }
 
   #scene(view, robots) {
     const { store, truth, focus } = view;
     const size = Math.max(4.5, Math.min(11, 0.18 * store.stage.mission.sensing_range * this.scale));
     view.size = size;
-    view.places = new Map(store.stage.robots.map((robot) => [robot.id, this.#place(view, robot)]));
+    view.places = new Map(store.stage.robots.map((robot) => [robot.id, pose_now(view, robot, TRUE)]));
     for (const robot of robots) if (robot.role === "a") this.#configurations.draw(view, robot);
     for (const robot of robots) if (!focus || robot.id === focus) this.#beliefs.belief(view, robot);
     for (const robot of robots) this.#signals.anchor_range(view, robot);
     if (truth) for (const robot of robots) if (robot.role === "a") this.#signals.contact(view, robot);
     if (!truth) for (const robot of robots) this.#signals.mutual_ring(view, robot);
+    if (truth) for (const robot of robots) this.#reported(view, robot);
     if (truth) for (const robot of robots) this.#robot(view, robot, view.places.get(robot.id));
+  }
+
+  /** Draws the pose that an attacker reports, and how far it is from the true one. */
+  #reported(view, robot) {
+    const { look, size, focus } = view, pen = this.context;
+    const pose = pose_now(view, robot, REPORTED), true_pose = view.places.get(robot.id);
+    if (!pose || !true_pose || distance(pose, true_pose) < LEAST_GAP_M) return;
+    const [x, y] = this.at(pose), [to_x, to_y] = this.at(true_pose);
+    pen.globalAlpha = focus && robot.id !== focus && robot.peer !== focus ? 0.45 : 1;
+    pen.strokeStyle = look.fault;
+    pen.lineWidth = 1;
+    pen.beginPath();
+    pen.moveTo(x, y); pen.lineTo(to_x, to_y);
+    pen.stroke();
+    shape(pen, robot.role, x, y, pose[2], size);
+    pen.fillStyle = look.paper;
+    pen.fill();
+    pen.strokeStyle = look.robot[robot.role];
+    pen.lineWidth = 1.5;
+    pen.setLineDash([3, 2]);
+    pen.stroke();
+    pen.setLineDash([]);
+    const text = `${robot.id} reported, ${metres(distance(pose, true_pose))} off`;
+    const half = pen.measureText(text).width / 2, middle = Math.min(Math.max((x + to_x) / 2, half), this.width - half);
+    this.labels.put(text, middle, (y + to_y) / 2 - 12, look.fault, "center");
+    if (size > 6) this.labels.placed.push([x - size, y - size, x + size, y + size]);
+    pen.globalAlpha = 1;
   }
 
   /** Returns the boxes of the texts over the plane, as [left, top, right, bottom]. */
@@ -260,6 +343,7 @@ export class Plane {
     pen.stroke();
     pen.setLineDash([]);
     const r = reach > 40 ? 6 : 4;
+    this.targets.push({ kind: "anchor", robot: robot.id, at: [x, y], radius: r });
     pen.beginPath();
     pen.moveTo(x, y - r); pen.lineTo(x + r, y + r * 0.75); pen.lineTo(x - r, y + r * 0.75); pen.closePath();
     pen.fillStyle = look.ink;
@@ -269,14 +353,6 @@ export class Plane {
   }
 
   // --- robots ---
-
-  #place({ store, scene, tick, share, moving }, robot) {
-    const player = scene.players[store.places.get(robot.id)];
-    if (!player?.pose) return null;
-    const next = store.player(tick + 1, robot.id);
-    if (!moving || !next?.pose) return player.pose;
-    return between(player.pose, next.pose, next.executed, share, store.stage.mission.period);
-  }
 
   #robot({ look, size, focus, scene, store }, robot, pose) {
     if (!pose) return;
@@ -293,6 +369,7 @@ export class Plane {
     pen.strokeStyle = down ? look.robot[robot.role] : look.ink;
     pen.stroke();
     if (down) cross(pen, x, y, size, look);
+    this.targets.push({ kind: "robot", robot: robot.id, at: [x, y], radius: size });
     if (size > 6) this.labels.placed.push([x - size, y - size, x + size, y + size]);
     if (size > 6 || down || robot.id === focus) {
       const name = down ? `${robot.id} is down` : robot.id;

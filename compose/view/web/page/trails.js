@@ -1,14 +1,30 @@
-// The trails of the robots: true, or as implied by their most probable current pose. As in the figures, the hue is the
-// robot, and the line style the phase: dotted, dashed, solid.
+// The trails of the robots: true, as an attacker reports it, or as implied by their most probable current pose. As in the
+// figures, the hue is the robot, and the line style of all but reported ones the phase: dotted, dashed, solid.
 
-import { between, compose, inverse } from "./geometry.js";
+import { between, compose, controls, inverse } from "./geometry.js";
 import { held_now, leads } from "./held.js";
 import { unit } from "./pen.js";
 
 const TRAIL = { 1: { dash: [1.5, 4.5], width: 2.4 }, 2: { dash: [8, 5.5], width: 2 }, 3: { dash: [], width: 2.6 } };
+const REPORTED_STYLE = { dash: [4, 4], width: 1.3 };
 const CHUNK = 64;
 const BENDS = 6;
 const MOST_TRAILS = 6;
+
+/** The poses of a trail, and the controls between two of them. */
+export const TRUE = { name: "true", pose: (player) => player?.pose, driven: (here, next) => next.executed };
+export const REPORTED = {
+  name: "reported", pose: (player) => player?.reported?.pose,
+  driven: (here, next, period) => controls(here.reported.pose, next.reported.pose, period),
+};
+
+/** Returns the pose of `robot` on a trail; between two ticks while time passes. */
+export function pose_now({ store, tick, share, moving }, robot, kind) {
+  const here = store.player(tick, robot.id), next = store.player(tick + 1, robot.id), pose = kind.pose(here) ?? null;
+  if (!pose || !moving || !kind.pose(next)) return pose;
+  const { period } = store.stage.mission;
+  return between(pose, kind.pose(next), kind.driven(here, next, period), share, period);
+}
 
 export class Trails {
   constructor(plane) { this.plane = plane; }
@@ -18,7 +34,8 @@ export class Trails {
   /** Discards the cached paths, because the scenes have changed. */
   forget() { this.#chunks.clear(); }
 
-  trail({ store, tick, share, look, focus, moving }, robot) {
+  /** Draws the trail of `robot` up to now: the true one, or the reported one. */
+  trail({ store, tick, share, look, focus, moving }, robot, kind = TRUE) {
     const pen = this.plane.context, last = Math.min(tick, store.last);
     const faint = focus && robot.id !== focus;
     pen.save();
@@ -29,7 +46,7 @@ export class Trails {
       ratio * (this.plane.width / 2 - this.plane.centre[0] * s), ratio * (this.plane.height / 2 + this.plane.centre[1] * s),
     );
     const stroke = (path, phase) => {
-      const { dash, width } = TRAIL[phase] ?? TRAIL[2];
+      const { dash, width } = kind === REPORTED ? REPORTED_STYLE : TRAIL[phase] ?? TRAIL[2];
       pen.lineWidth = (faint ? 0.7 * width : width) / s;
       pen.setLineDash(dash.map((length) => length / s));
       pen.strokeStyle = look.robot[robot.role];
@@ -38,16 +55,16 @@ export class Trails {
     map();
     for (let from = store.first; from < last; from += CHUNK) {
       const to = Math.min(from + CHUNK, last);
-      for (const [phase, path] of this.#pieces(store, robot, from, to, to === from + CHUNK)) stroke(path, phase);
+      for (const [phase, path] of this.#pieces(store, robot, kind, from, to, to === from + CHUNK)) stroke(path, phase);
     }
     if (moving && share > 0) {
       const player = store.player(tick, robot.id), next = store.player(tick + 1, robot.id);
-      if (player?.pose && next?.pose) {
-        const path = new Path2D(), bends = bends_of(next.executed, store.stage.mission.period);
-        path.moveTo(player.pose[0], player.pose[1]);
+      const start = kind.pose(player), end = kind.pose(next), { period } = store.stage.mission;
+      if (start && end) {
+        const driven = kind.driven(player, next, period), path = new Path2D(), bends = bends_of(driven, period);
+        path.moveTo(start[0], start[1]);
         for (let k = 1; k <= bends; k++) {
-          const way = (share * k) / bends;
-          const pose = between(player.pose, next.pose, next.executed, way, store.stage.mission.period);
+          const pose = between(start, end, driven, (share * k) / bends, period);
           path.lineTo(pose[0], pose[1]);
         }
         stroke(path, store.phase(tick, robot.id));
@@ -58,14 +75,15 @@ export class Trails {
   }
 
   /** Returns the trail from tick `from` to `to`, one path per phase; cached once it is complete. */
-  #pieces(store, robot, from, to, whole) {
-    const key = `${robot.id}/${from}`, cached = this.#chunks.get(key);
+  #pieces(store, robot, kind, from, to, whole) {
+    const key = `${kind.name}/${robot.id}/${from}`, cached = this.#chunks.get(key);
     if (cached && whole) return cached;
     const pieces = [], period = store.stage.mission.period;
     let path = null, phase = null, complete = true;
     for (let k = from; k < to; k++) {
       const here = store.player(k, robot.id), next = store.player(k + 1, robot.id);
-      if (!here?.pose || !next?.pose) {
+      const start = kind.pose(here), end = kind.pose(next);
+      if (!start || !end) {
         path = null; phase = null;
         complete = complete && Boolean(here && next);
         continue;
@@ -73,16 +91,16 @@ export class Trails {
       const now = here.command?.phase ?? phase ?? store.phase(k, robot.id);
       if (now !== phase || !path) {
         path = new Path2D();
-        path.moveTo(here.pose[0], here.pose[1]);
+        path.moveTo(start[0], start[1]);
         pieces.push([now, path]);
         phase = now;
       }
-      const bends = bends_of(next.executed, period);
+      const driven = kind.driven(here, next, period), bends = bends_of(driven, period);
       for (let bend = 1; bend < bends; bend++) {
-        const pose = between(here.pose, next.pose, next.executed, bend / bends, period);
+        const pose = between(start, end, driven, bend / bends, period);
         path.lineTo(pose[0], pose[1]);
       }
-      path.lineTo(next.pose[0], next.pose[1]);
+      path.lineTo(end[0], end[1]);
     }
     if (whole && complete) this.#chunks.set(key, pieces);
     return pieces;

@@ -58,6 +58,7 @@ export const KEYS = [
   ["T", "show or hide the ground truth"],
   ["R", "next robot; with Shift, previous robot"],
   ["A", "all robots"],
+  ["Esc", "all robots, and nothing selected; a click on a robot, an anchor or a hypothesis selects it"],
   ["+ −", "zoom in or out; also the mouse wheel"],
   ["W S", "pan up or down; with Shift, left or right; also by dragging"],
   ["N", "zoom to the robots and to where they may be"],
@@ -78,5 +79,6 @@ export const MEANINGS = [
   ["line to an anchor", "range measured in this tick"],
   ["double line", "contact; dots are reports: filled received, with a tail late, hollow lost, crossed out damaged"],
   ["trail", "in the colour of the robot, as in the figures; dotted in phase 1, dashed in phase 2, solid in phase 3"],
+  ["dashed robot and thin dashed trail", "the path that an attacker reports; a line joins it to the true one"],
   ["circle around an anchor", "solid: its sensing range; dashed: the orbit"],
 ];

@@ -1,0 +1,167 @@
+"""The attack view: the path that an attacker reports, beside the true one, and what contradicts it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import msgspec
+import pytest
+from msgspec.structs import replace
+from playwright.sync_api import expect
+
+from compose.launch import in_process
+from compose.recording.run import read
+from compose.scenario.scenario_file import load
+from compose.view.recorded import Journals, scenes, scenes_of
+from compose.view.scene import Scene
+from protocol.attack import Attack
+from protocol.messages import Inconsistent
+from protocol.motion import travelled
+from tests.browser import Open, picture, scrub_to, watching
+from tests.series import series
+from tests.test_page_configurations import SIZES, overlapping
+
+HALVED = Attack("scale", 0.5, "orbit")
+LABELS = "document.getElementById('canvas').labels.map((one) => one.text)"
+
+
+def scenes_with(folder: Path, attack: Attack | None, name: str) -> tuple[Scene, ...]:
+    """Return the scenes of a mission whose robot a has `attack`, recorded in `folder`."""
+    scenario = load(name)
+    a, *others = scenario.robots
+    in_process.run_mission(replace(scenario, robots=(replace(a, attack=attack), *others)), folder)
+    return scenes_of(read(folder))
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("attacked")
+    scenes_with(folder, HALVED, "random")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def attacked_address(recording: Path) -> Iterator[str]:
+    with watching(recording) as (_, found):
+        yield found
+
+
+# --- scenes -------------------------------------------------------------------------------------------
+
+
+def test_the_reported_path_has_half_the_speed_in_orbit_and_its_gap_is_the_distance_to_the_true_one(
+    recording: Path,
+) -> None:
+    shown = scenes_of(read(recording))
+    players = [scene.player("a") for scene in shown]
+    assert all(one.reported is not None for one in players)
+    assert max(one.reported.gap for one in players if one.reported) > 1.0
+    for earlier, now in pairwise(players):
+        assert earlier.pose
+        assert earlier.reported
+        assert now.pose
+        assert now.reported
+        assert now.reported.gap == travelled(now.pose, now.reported.pose)
+        factor = 0.5 if earlier.command and earlier.command.phase == 2 else 1.0
+        driven = travelled(earlier.pose, now.pose)
+        assert travelled(earlier.reported.pose, now.reported.pose) == pytest.approx(factor * driven, abs=1e-9)
+    assert all(scene.player("b").reported is None for scene in shown)
+
+
+@pytest.mark.parametrize("attack", [Attack("radius", 0.3), Attack("heading", 0.2)], ids=lambda one: one.kind)
+def test_the_reported_path_begins_at_the_start_that_the_attacker_reports(
+    attack: Attack, tmp_path: Path
+) -> None:
+    first = scenes_with(tmp_path, attack, "paper-1")[0].player("a")
+    assert first.pose
+    assert first.reported
+    assert first.reported.gap == pytest.approx(0.3 if attack.kind == "radius" else 0.0, abs=1e-9)
+    turned = first.reported.pose.heading - first.pose.heading
+    assert (turned % 6.283185307179586) == pytest.approx(0.0 if attack.kind == "radius" else 0.2, abs=1e-9)
+
+
+def test_an_honest_scene_has_no_reported_pose_on_the_wire(paper_1: Path, recording: Path) -> None:
+    honest, false = (msgspec.json.encode(scenes_of(read(folder))) for folder in (paper_1, recording))
+    assert b'"reported":' in false
+    assert b'"reported":' not in honest
+
+
+def test_without_the_ground_truth_nothing_is_known_to_be_false(recording: Path, tmp_path: Path) -> None:
+    for path in recording.glob("agent-*.journal"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    journals = Journals(tmp_path)
+    journals.read()
+    assert journals.setup is not None
+    assert journals.known.reported_logs["a"].through > 0
+    shown = scenes(journals.setup, journals.known)
+    assert all(player.reported is None for scene in shown for player in scene.players)
+
+
+# --- the page -----------------------------------------------------------------------------------------
+
+
+def test_the_card_names_the_gap_and_then_the_verdict_and_only_with_the_truth(
+    opened: Open, recording: Path, attacked_address: str
+) -> None:
+    shown = scenes_of(read(recording))
+    commands = [scene.player("b").command for scene in shown]
+    verdicts = [command.verdict if command else None for command in commands]
+    rejected = next(tick for tick, one in enumerate(verdicts) if isinstance(one, Inconsistent))
+    verdict = verdicts[rejected]
+    assert isinstance(verdict, Inconsistent)
+    page = opened(attacked_address)
+    sentence = page.locator(".card[data-robot=a] .attack")
+    scrub_to(page, 0)
+    expect(sentence).to_have_text("a has reported its true position so far.")
+    for tick in (rejected - 1, rejected):
+        scrub_to(page, tick)
+        reported = shown[tick].player("a").reported
+        assert reported
+        gap = f"{reported.gap:.2f} m"
+        says = f"a reports a position {gap} from its true one."
+        if tick == rejected:
+            says += f" b rejects a in tick {tick}: {verdict.claim}."
+        expect(sentence).to_have_text(says)
+        picture(page)
+        assert f"a reported, {gap} off" in page.evaluate(LABELS)
+    expect(page.locator(".card[data-robot=b] .attack")).to_be_hidden()
+    page.keyboard.press("t")
+    expect(sentence).to_be_hidden()
+    picture(page)
+    assert not [text for text in page.evaluate(LABELS) if "reported" in text]
+
+
+@pytest.mark.parametrize("size", series(SIZES, 1), ids=str)
+def test_no_label_of_an_attack_overlaps_another(
+    size: tuple[int, int], opened: Open, recording: Path, attacked_address: str
+) -> None:
+    page = opened(attacked_address, width=size[0], height=size[1])
+    last = len(scenes_of(read(recording))) - 1
+    for tick in (last // 2, last):
+        scrub_to(page, tick)
+        for near in ("f", "n"):
+            page.keyboard.press(near)
+            picture(page)
+            assert not overlapping(page), (tick, near)
+            assert [text for text in page.evaluate(LABELS) if text.startswith("a reported, ")]
+
+
+@pytest.mark.long
+def test_the_card_says_that_an_attack_which_no_robot_can_detect_has_not_been_found(
+    opened: Open, tmp_path: Path
+) -> None:
+    shown = scenes_with(tmp_path, Attack("reframe", 1.0), "paper-1")
+    last = shown[-1].player("a").reported
+    assert last
+    with watching(tmp_path) as (_, where):
+        page = opened(where)
+        scrub_to(page, len(shown) - 1)
+        expect(page.locator(".card[data-robot=a] .attack")).to_have_text(
+            re.compile(
+                rf"^a reports a position {last.gap:.2f} m from its true one\. "
+                r"b claims its pose in tick \d+, and has not found a contradiction\.$"
+            )
+        )
