@@ -451,7 +451,7 @@ def test_run_watch_serves_until_ctrl_c_and_writes_the_usual_recording(
 def test_every_test_that_opens_a_page_skips_where_there_is_no_browser(tmp_path: Path) -> None:
     ran = subprocess.run(
         [sys.executable, "-m", "pytest", "-n0", "-p", "no:cacheprovider", "-rs", "tests/test_watch.py"]
-        + ["-k", "run_watch_serves or by_keyboard_alone"],
+        + ["-m", "long", "-k", "run_watch_serves or by_keyboard_alone"],
         cwd=Path(__file__).parents[1],
         env=os.environ | {"PATH": str(tmp_path), "TANDEM_BROWSER": "chromium"},
         capture_output=True,
