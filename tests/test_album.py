@@ -316,6 +316,7 @@ def test_the_last_error_is_that_of_the_claim(name: str, recordings: Path) -> Non
     assert bool(found(figure, "position-sigma-a")) == (name == "noisy")
 
 
+@pytest.mark.long
 def test_all_error_lines_differ_in_grey(
     recordings: Path,
 ) -> None:

@@ -73,6 +73,7 @@ def estimate_of(recording: RangeRecording, noise: str = "uwb-calibrated") -> Rec
 
 
 @pytest.mark.parametrize("count", [2, 4])
+@pytest.mark.long
 def test_a_robot_claims_its_pose_by_ranges_to_several_anchors(count: int) -> None:
     found = estimate_of(driven(ANCHORS[:count], sigma=0.05))
     (robot,) = found.summary.robots.values()
@@ -95,6 +96,7 @@ def test_covariances_of_many_recordings_are_right() -> None:
     assert 0.5 < np.mean(nees) < 5.0
 
 
+@pytest.mark.long
 def test_a_scale_of_all_ranges_is_learned() -> None:
     found = estimate_of(driven(scale=0.07, sigma=0.03), "uwb")
     assert found.summary.calibration is not None

@@ -34,6 +34,7 @@ def played(trial: int) -> str:
     return end.outcome if end.reason is None else f"trial {trial}: {end.outcome}: {end.reason}"
 
 
+@pytest.mark.long
 def test_missions_in_any_setting_from_any_start_localise_or_are_refused() -> None:
     outcomes = Counter(played(trial) for trial in range(100))
     assert set(outcomes) <= {"localised", "refused"}, outcomes

@@ -147,6 +147,7 @@ def attack(link: zenoh.Session) -> list[zenoh.LivelinessToken]:
     return shown
 
 
+@pytest.mark.long
 def test_wildcards_odd_keys_and_deletions_end_no_process_and_change_nothing(tmp_path: Path) -> None:
     """Robot d is absent, so the tick does not advance while every process listens."""
     scenario, out, alone = tmp_path / "pairs.toml", tmp_path / "out", tmp_path / "alone"

@@ -96,6 +96,7 @@ def test_without_a_fault_every_report_is_received_in_its_tick(contact: list[bool
 
 @settings(max_examples=150)
 @given(plans, meetings, seeds)
+@pytest.mark.long
 def test_no_report_is_sent_or_received_out_of_contact(
     plan: list[Fault], contact: list[bool], seed: int
 ) -> None:
@@ -106,6 +107,7 @@ def test_no_report_is_sent_or_received_out_of_contact(
 
 @settings(max_examples=150)
 @given(plans, meetings, seeds)
+@pytest.mark.long
 def test_a_report_comes_at_most_once_unless_a_fault_doubles_it(
     plan: list[Fault], contact: list[bool], seed: int
 ) -> None:
@@ -116,6 +118,7 @@ def test_a_report_comes_at_most_once_unless_a_fault_doubles_it(
 
 @settings(max_examples=150)
 @given(plans, meetings, seeds)
+@pytest.mark.long
 def test_a_report_comes_within_the_delays_of_the_faults_that_were_there_when_it_was_sent(
     plan: list[Fault], contact: list[bool], seed: int
 ) -> None:
@@ -248,6 +251,7 @@ def test_bandwidth_that_is_enough_loses_nothing() -> None:
 
 
 @given(windows, windows, meetings)
+@pytest.mark.long
 def test_a_fault_is_there_in_its_windows_and_at_no_other_time(
     ticks: Window | None, contact_ticks: Window | None, contact: list[bool]
 ) -> None:
@@ -306,6 +310,7 @@ def arrivals(airs: Sequence[LinkState]) -> dict[int, Counter[tuple[int, bool]]]:
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.2, 0.5, 0.9])
+@pytest.mark.long
 def test_more_or_less_loss_shifts_no_other_draw(loss: float) -> None:
     """A higher loss loses a superset of the reports; the others arrive unchanged."""
     contact = [True] * 2000
@@ -348,6 +353,7 @@ def test_what_is_not_in_contact_shifts_no_draw() -> None:
         Fault(reports_per_tick=3.0),
     ],
 )
+@pytest.mark.long
 def test_the_delivery_ratio_is_that_of_the_deliveries(fault: Fault) -> None:
     heard = heard_at_once([fault], ticks=2 * N)
     assert abs(sum(heard) / len(heard) - fault.let_through) < 0.03

@@ -41,6 +41,7 @@ def test_the_example_fulfils_the_driver_contract() -> None:
         ("WaitsForItsWheels", "of a manoeuvre, expected at most 0.05: it must not wait"),
     ],
 )
+@pytest.mark.long
 def test_a_broken_driver_is_reported_with_what_it_violates(
     broken: str, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -153,6 +153,7 @@ def test_kills_are_not_part_of_the_worlds_scenario() -> None:
     assert parse(PAPER_1 + DRAWN, "mine") == parse(PAPER_1, "mine")
 
 
+@pytest.mark.long
 def test_a_run_takes_the_kills_of_its_file_and_those_of_the_command_line(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(PAPER_1 + '[[kill]]\nwho = "world"\ntick = 5\npoint = "report"\n')
     ended = tandem("run", "mine.toml", "-q", "--kill", "b@900", cwd=tmp_path)

@@ -7,6 +7,7 @@ import pytest
 from docs import rendezvous
 
 
+@pytest.mark.long
 def test_the_figures_of_the_rendezvous_are_printed_a_line_a_setting(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -241,6 +241,7 @@ def test_an_agent_whose_world_dies_ends_within_its_timeout(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("comes", series(["nobody", "a"]))
+@pytest.mark.long
 def test_a_world_whose_robot_never_connects_fails_and_names_it(comes: str, tmp_path: Path) -> None:
     missing = {"nobody": "a (not connected), b (not connected)", "a": "b (not connected)"}[comes]
     reason = f"no answer from {missing} at tick 0 for {TIMEOUT} s"
@@ -274,6 +275,7 @@ def test_a_world_whose_port_another_world_has_is_one_clear_line() -> None:
         )
 
 
+@pytest.mark.long
 def test_an_agent_at_a_port_that_does_not_speak_zenoh_gives_up() -> None:
     with socket.create_server(("127.0.0.1", 0)) as mute:
         endpoint = f"tcp/127.0.0.1:{mute.getsockname()[1]}"

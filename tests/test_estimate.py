@@ -183,6 +183,7 @@ def test_a_bias_of_all_ranges_is_learned_with_the_profile_of_raw_radios(sample: 
     assert all(row.nees is not None and row.nees < NEES_99_9 for row in last)
 
 
+@pytest.mark.long
 def test_a_recording_of_tandem_is_estimated_with_the_noise_that_its_robots_assume(tmp_path: Path) -> None:
     assert tandem("run", "noisy", "--seed", "3", "--out", "run", cwd=tmp_path).status == 0
     found = estimated(measurements(read_ranges(tmp_path / "run"), None, None, None), ClaimRule())
@@ -247,6 +248,7 @@ def test_measurements_that_differ_in_slip_variance_or_sigma_are_not_the_same(sam
     assert pair.content != pair._replace(ranges=ranges._replace(sigma=2.0 * ranges.sigma)).content
 
 
+@pytest.mark.long
 def test_a_gross_increment_is_found_and_replaced(
     sample: RangeRecording, of_sample: RecordingEstimate
 ) -> None:

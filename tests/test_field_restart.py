@@ -204,6 +204,7 @@ def test_a_motion_during_a_crash_is_reported_and_within_its_command(pair: Pair, 
         assert abs(step.observation.executed.omega) <= abs(before.command.omega) + 1e-12
 
 
+@pytest.mark.long
 def test_a_recording_of_another_mission_is_refused(pair: Pair, tmp_path: Path) -> None:
     pair.robots["a"].until_written(pair.path("a"), 1500)
     pair.kill("a", "b")

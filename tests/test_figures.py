@@ -171,6 +171,7 @@ def test_each_part_of_a_noisy_mission_is_in_its_picture(noisy: Path, drawn: Path
     assert ellipses <= {one.tick for one in held}
 
 
+@pytest.mark.long
 def test_the_error_over_time_is_that_of_the_estimates_against_the_truth(noisy: Path) -> None:
     pair, held = pair_of(noisy), read(noisy).estimates("a")
     truth = [moment.truth.poses[0] for moment in read(noisy).ticks]
@@ -194,6 +195,7 @@ def test_the_error_over_time_is_that_of_the_estimates_against_the_truth(noisy: P
     assert not held[claimed - 1].localised
 
 
+@pytest.mark.long
 def test_an_ellipse_holds_what_is_within_3_sigma(noisy: Path) -> None:
     axes = Figure().subplots()
     one_robot.draw_estimates(axes, pair_of(noisy), "a")
@@ -295,6 +297,7 @@ def test_an_agent_killed_before_its_configuration_has_a_figure_without_estimates
     assert "nothing-near" in ids(picture(folder, "a"))
 
 
+@pytest.mark.long
 def test_a_robot_with_an_empty_journal_is_drawn_without_a_warning(tmp_path: Path) -> None:
     run_mission(load("paper-1"), tmp_path)
     (tmp_path / "agent-a.journal").write_bytes(b"")

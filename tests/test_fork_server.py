@@ -301,6 +301,7 @@ def test_a_process_that_was_stopped_before_it_began_does_not_begin_later() -> No
         server.close()
 
 
+@pytest.mark.long
 def test_no_fork_server_outlasts_a_run() -> None:
     with TandemProcess("run", "paper-1", "-q") as run:
         run.until(lambda: fork_servers_of(run.pid), "it has a fork server")

@@ -312,6 +312,7 @@ def test_a_robot_without_access_rules_is_advised_to_check_them(keys: Path, tmp_p
     )
 
 
+@pytest.mark.long
 def test_a_process_without_tls_is_advised_to_use_it(keys: Path) -> None:
     with world_of(keys) as endpoint:
         plain = endpoint.replace("tls/", "tcp/")

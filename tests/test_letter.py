@@ -20,6 +20,7 @@ ITS_OWN = {
 
 
 @pytest.mark.parametrize("noise", series([FINE, SIGMA]), ids=["fine", "coarse"])
+@pytest.mark.long
 def test_the_paper_planner_drives_only_the_papers_manoeuvres(noise: str) -> None:
     for seed in SEEDS:
         recording = survey(noise, seed, "paper")

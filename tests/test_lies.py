@@ -116,6 +116,7 @@ def test_an_attacker_gives_up_when_its_peer_is_inconsistent() -> None:
     ),
     ids=lambda attack: f"{attack.kind}-{attack.part}",
 )
+@pytest.mark.long
 def test_an_attack_larger_than_the_noise_is_inconsistent(attack: Attack) -> None:
     """Robot a is the attacker: no anchor range depends on its path from the anchor to the encounter."""
     for seed in range(3):
@@ -137,6 +138,7 @@ def test_a_robot_misled_by_false_data_finds_other_places_to_range_from(seed: int
     assert outcome(mission(seed, {"a": Attack("scale", 0.5, "phase-1")}, FINE)) == "inconsistent"
 
 
+@pytest.mark.long
 def test_honest_robots_are_consistent_under_noise() -> None:
     for seed in range(8):
         assert outcome(mission(seed, {}, FINE)) == "localised", seed

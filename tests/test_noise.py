@@ -267,6 +267,7 @@ def test_outliers_have_their_probability_and_a_uniform_positive_bias(share: floa
         assert is_white(bias)
 
 
+@pytest.mark.long
 def test_biases_are_drawn_for_each_sensor_and_robot() -> None:
     told = all_ranges(near("outliers = 0.25"))
     biases = [known(ranges) - rho for ranges, rho in zip(told, (RHO_A, RHO_B, APART), strict=True)]

@@ -174,6 +174,7 @@ def test_an_agent_runs_only_planners_that_its_command_line_names(tmp_path: Path)
     assert "add --planner hostile:Wrapping" in agent.err
 
 
+@pytest.mark.long
 def test_a_planner_of_an_installed_package_has_a_name(tmp_path: Path) -> None:
     (tmp_path / "gleaner.py").write_text("from tests.own_planners import Wrapping as Gleaner\n")
     info = tmp_path / "gleaner-1.0.dist-info"

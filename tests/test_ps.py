@@ -52,6 +52,7 @@ def test_a_mission_is_a_line_and_so_is_each_robot_there_or_not(tmp_path: Path) -
         ]
 
 
+@pytest.mark.long
 def test_a_running_mission_is_listed_as_json_with_all_known_values(tmp_path: Path) -> None:
     (tmp_path / "endless.toml").write_text(ENDLESS)
     with world(tmp_path / "endless.toml", "--run", "mine") as (_, endpoint), ExitStack() as stack:
@@ -83,12 +84,14 @@ def test_robots_of_all_pairs_are_named_though_none_is_there(tmp_path: Path) -> N
     assert mission["missing"] == list("abcdef")
 
 
+@pytest.mark.long
 def test_missions_of_several_endpoints_are_listed() -> None:
     with world("paper-1", "--run", "one") as (_, here), world("paper-1", "--run", "other") as (_, there):
         missions = told(here, "--connect", there)
     assert [(mission["run"], mission["at"]) for mission in missions] == [("one", here), ("other", there)]
 
 
+@pytest.mark.long
 def test_robots_whose_world_has_gone_are_listed_and_it_is_missing(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     with routing(Router(endpoint), tmp_path), ExitStack() as stack:

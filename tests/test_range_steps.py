@@ -116,6 +116,7 @@ def test_the_steps_compose_to_the_same_pose_as_the_recorded_increments(
 
 
 @given(odometries(), odometries(), stamps, st.floats(0.1, 1.0))
+@pytest.mark.long
 def test_a_range_lies_at_its_time_and_at_the_pose_of_that_time(
     a: RobotOdometry, b: RobotOdometry, ranges: list[tuple[float, int, int]], period_s: float
 ) -> None:

@@ -537,6 +537,7 @@ def test_an_agents_journal_of_another_configuration_is_refused(recording: Path, 
         refuses(recording, "agent", "a", "--connect", endpoint, says=says)
 
 
+@pytest.mark.long
 def test_an_agents_journal_with_another_observation_is_refused(recording: Path, paper_2: str) -> None:
     path = recording / "agent-a.journal"
     path.write_bytes(journal_file.packed(list(journal_file.read(path))[:4]))

@@ -149,6 +149,7 @@ MANY_OUTLIERS = "anchor_sigma = 0.05\nmutual_sigma = 0.05\noutliers = 0.2\ndrop_
         (MANY_OUTLIERS, 0.1, 6293238656222347062),
     ],
 )
+@pytest.mark.long
 def test_a_mission_whose_search_once_missed_the_truth_is_not_wrong(
     noise: str, accuracy: float, seed: int
 ) -> None:

@@ -483,6 +483,7 @@ def test_of_more_cells_than_fit_a_screen_those_in_which_all_is_well_are_counted(
 # --- audits -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_trial_that_breaks_a_rule_fails_the_sweep_and_is_named(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -306,6 +306,7 @@ def test_2_plus_1_leaves_two_trajectories_for_each_distance_of_q_2_from_m_1(
 
 @settings(max_examples=300)
 @given(st.floats(0.5, 12.0), points, st.tuples(points, points), angles, angles)
+@pytest.mark.long
 def test_eq_7_has_exactly_the_placements_that_brute_force_finds(
     distance: float, p1b: complex, ways: tuple[complex, complex], phi: float, psi: float
 ) -> None:
@@ -398,6 +399,7 @@ def counted(draw: Callable[..., Setting], *, same: bool, draws: int = DRAWS) -> 
     ],
     ids=["2+1 anywhere", "1+1+1 anywhere", "2+1 of the pair", "1+1+1 of the pair"],
 )
+@pytest.mark.long
 def test_both_bounds_are_reached(draw: Callable[..., Setting], same: bool, numbers: set[int]) -> None:
     """At least 99.6 % of the scans of 100 000 draws each were complete, and none had a seventh solution:
 

@@ -82,6 +82,7 @@ def test_any_order_of_starting_gives_the_same_recording(
     assert not processes_of(endpoint)
 
 
+@pytest.mark.long
 def test_each_shell_may_write_its_journal_to_its_own_folder(paper_1: Path, tmp_path: Path) -> None:
     with world("paper-1", "--out", tmp_path / "world") as (clock, endpoint), ExitStack() as shells:
         for robot in ("a", "b"):
@@ -125,6 +126,7 @@ def test_an_agent_without_a_world_reports_it_and_gives_up(tmp_path: Path) -> Non
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.long
 def test_an_agent_finds_no_world_where_its_run_is_not_alive() -> None:
     with world("paper-1", "--run", "mine") as (_, endpoint):
         ended = tandem("agent", "a", "--connect", endpoint, "--run", "yours", "--connect-timeout", "1")

@@ -104,6 +104,7 @@ TOPOLOGIES = (
 
 
 @pytest.mark.parametrize("topology", series(TOPOLOGIES, 2))
+@pytest.mark.long
 def test_a_mission_through_routers_has_the_recording_of_one_without_a_network(
     topology: str, tmp_path: Path
 ) -> None:
