@@ -328,6 +328,7 @@ def test_all_error_lines_differ_in_grey(
     assert len(set(dashes.values())) == len(dashes) == 6
 
 
+@pytest.mark.long
 def test_a_panel_has_each_hypothesis_of_the_journal_under_noise(recordings: Path) -> None:
     folder = recorded("noisy", recordings)
     told = pair(folder)

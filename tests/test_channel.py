@@ -155,6 +155,7 @@ def test_reports_are_lost_independently_with_the_given_probability(loss: float) 
 
 
 @pytest.mark.parametrize("contact", [[True] * 2 * N, [True, False] * 2 * N], ids=["always", "every other"])
+@pytest.mark.long
 def test_bursts_have_the_length_and_frequency_of_the_gilbert_elliott_model(contact: list[bool]) -> None:
     start, end = 0.02, 0.1
     airs = flown([Fault(burst_start=start, burst_end=end)], contact)

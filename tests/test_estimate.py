@@ -141,6 +141,7 @@ def test_no_estimate_is_compared_with_a_truth_of_another_time(sample: RangeRecor
     assert found[:2] == pytest.approx(robot.truth.poses[-1, :2])
 
 
+@pytest.mark.long
 def test_equal_inputs_give_equal_bytes(sample: RangeRecording, of_sample: RecordingEstimate) -> None:
     again = sample_estimates(sample)
     assert estimate_csv(again.rows) == estimate_csv(of_sample.rows)

@@ -115,6 +115,7 @@ def on_disk(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("recording", ["paper_1", "faulty"])
+@pytest.mark.long
 def test_every_journaled_frame_is_there_and_the_journals_can_be_made_anew(
     recording: str, request: pytest.FixtureRequest
 ) -> None:

@@ -53,6 +53,7 @@ def test_every_flag_is_explained_with_its_default(command: CommandEntry) -> None
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
+@pytest.mark.long
 def test_a_command_imports_only_its_own_module(command: CommandEntry) -> None:
     code = (
         "import sys\nfrom compose.cli import main\n"

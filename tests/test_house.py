@@ -331,5 +331,6 @@ def loaded_by(module: str) -> set[str]:
         ("compose.cli.sweep", {"zenoh", "rich", "distributed", "dask", "pyarrow", "matplotlib"}),
     ],
 )
+@pytest.mark.long
 def test_a_process_does_not_import_what_it_does_not_use(module: str, absent: set[str]) -> None:
     assert loaded_by(module) & absent == set()

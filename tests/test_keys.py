@@ -291,6 +291,7 @@ def test_a_world_with_an_expired_certificate_is_refused(keys: Path, mine: Path, 
     assert "its certificate is not valid here: certificate has expired" in ended.err
 
 
+@pytest.mark.long
 def test_a_world_whose_name_is_not_in_its_certificate_is_refused(keys: Path, mine: Path) -> None:
     with world_of(keys) as endpoint:
         elsewhere = endpoint.replace("127.0.0.1", "127.0.0.2")

@@ -27,6 +27,7 @@ def test_the_paper_planner_drives_only_the_papers_manoeuvres(noise: str) -> None
         assert {*states(recording, "a"), *states(recording, "b")} <= ITS_OWN
 
 
+@pytest.mark.long
 def test_the_paper_planner_mostly_localises_with_fine_ranges() -> None:
     outcomes = [summary(survey(FINE, seed, "paper"), "in-process", None)["outcome"] for seed in SEEDS]
     assert outcomes.count("localised") > 0.7 * len(SEEDS)

@@ -134,6 +134,7 @@ def test_an_attack_larger_than_the_noise_is_inconsistent(attack: Attack) -> None
 
 
 @pytest.mark.parametrize("seed", series([30, 49, 109]))
+@pytest.mark.long
 def test_a_robot_misled_by_false_data_finds_other_places_to_range_from(seed: int) -> None:
     assert outcome(mission(seed, {"a": Attack("scale", 0.5, "phase-1")}, FINE)) == "inconsistent"
 

@@ -78,6 +78,7 @@ def test_both_recordings_show_the_tick_of_one_clock(
     expect(page.locator("#outcome-left")).to_have_text(f"localised after {lasts[0]} ticks")
 
 
+@pytest.mark.long
 def test_the_same_recording_twice_is_identical(opened: Open, paper_1: Path) -> None:
     with watching(paper_1, paper_1) as (_, address):
         page = opened(address)

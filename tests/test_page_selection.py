@@ -57,6 +57,7 @@ def test_hovering_shows_the_numbers_and_a_click_selects_until_escape(opened: Ope
     assert not re.search("select|robot", page.url)
 
 
+@pytest.mark.long
 def test_the_address_holds_the_view_once_the_user_has_moved_the_camera_and_the_selection(
     opened: Open, address: str
 ) -> None:
@@ -100,6 +101,7 @@ def many_address(many: Path) -> Iterator[str]:
         yield found
 
 
+@pytest.mark.long
 def test_the_roster_counts_outcomes_and_names_the_worst_robots_first(
     opened: Open, many: Path, many_address: str
 ) -> None:

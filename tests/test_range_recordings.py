@@ -321,6 +321,7 @@ def test_the_covariance_of_an_increment_is_that_of_its_derivatives(omega: float)
 
 
 @pytest.mark.parametrize("name", ["paper-1", "noisy"])
+@pytest.mark.long
 def test_an_exported_run_is_read_back_without_loss(name: str, tmp_path: Path) -> None:
     recording = tmp_path / "recording"
     recording.mkdir()

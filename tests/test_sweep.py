@@ -509,6 +509,7 @@ def test_a_trial_that_breaks_a_rule_fails_the_sweep_and_is_named(
     assert line[heading.index("clean")] == "3"
 
 
+@pytest.mark.long
 def test_the_command_that_runs_a_trial_again_records_to_a_new_folder(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -702,6 +703,7 @@ rows = [
 """
 
 
+@pytest.mark.long
 def test_rows_differ_from_the_base_in_the_fields_that_they_set(folder: Path) -> None:
     (folder / "rows.toml").write_text(ROWS)
     results = played(folder, "rows.toml", "out")
