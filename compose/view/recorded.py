@@ -19,6 +19,7 @@ from protocol import files
 from protocol.journal.journal_file import CorruptJournal, OtherVersion, Tail
 from protocol.messages import OfRobot
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
+from world.scenario import Scenario
 from world.world_journal import WorldJournalReading
 
 
@@ -93,6 +94,11 @@ class Journals:
         """One line per damaged journal. Its frames after the damage are ignored."""
         self._tails: dict[str, Tail] = {}
         self._world = WorldJournalReading()
+
+    @property
+    def scenario(self) -> Scenario | None:
+        """The scenario in the world's journal; None until it has been read, or if there is none."""
+        return self._world.world.scenario if self._world.world is not None else None
 
     def read(self) -> None:
         """Read the frames appended since the last call. Raises OSError."""

@@ -1,6 +1,6 @@
 """The page's web server. It listens on the loopback interface by default.
 
-It only reads data, and it refuses requests of foreign web pages.
+It refuses requests of foreign web pages, and runs missions for browsers on this machine only.
 """
 
 from __future__ import annotations
@@ -27,10 +27,14 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from compose.errors import UserError
+from compose.scenario.scenario_change import ScenarioChange
+from compose.scenario.toml_file import field_first
 from compose.view.recorded import scenes
 from compose.view.web import estimate_page, sweep_page
+from compose.view.web.changed_missions import changed_text
 from compose.view.web.origin import refusal
 from compose.view.web.site import Site
+from compose.view.web.sources import WatchedRun
 from compose.view.web.standalone import PAGE
 from compose.view.web.thumbnail import thumbnail
 
@@ -50,6 +54,8 @@ HEADERS = {
     b"cache-control": b"no-store",
 }
 """The headers of every answer. The page loads nothing from elsewhere, and no other page may embed it."""
+MAX_CHANGE_BYTES = 8192
+"""The maximum size of a request to change a mission."""
 EMBEDDED = "/one"
 """The path of the page of one recording, which only the page of two recordings embeds."""
 
@@ -67,7 +73,7 @@ class _Answers:
     def __init__(self, site: Site) -> None:
         self._site = site
         self._running = asyncio.Lock()
-        """Held while a trial is run: one at a time."""
+        """Held while a mission is run: one at a time."""
 
     async def index(self, _request: Request) -> Response:
         return FileResponse(PAGE / ("compare.html" if self._site.compared else "index.html"))
@@ -109,6 +115,35 @@ class _Answers:
             return _json({"error": str(error)}, 409)
         return _json({"show": worst.show.name, "outcome": worst.outcome, "trial": worst.trial})
 
+    async def values(self, request: Request) -> Response:
+        """Return the values of a mission that can be changed."""
+        return _json(await asyncio.to_thread(self._site.changed.values, self._changeable(request)))
+
+    async def changed_file(self, request: Request) -> Response:
+        """Return the scenario file of a mission with other values."""
+        show, change = self._changeable(request), await _change_in(request)
+        text = await asyncio.to_thread(changed_text, show, change)
+        return PlainTextResponse(text, media_type="application/toml")
+
+    async def run_changed(self, request: Request) -> Response:
+        """Run a mission with other values, and return the name of its recording."""
+        site, show, change = self._site, self._changeable(request), await _change_in(request)
+        if self._running.locked():
+            raise _Refused(409, "another mission is being run; try again in a moment")
+        async with self._running:
+            found = await asyncio.to_thread(site.changed.run, show, change, lambda: site.over)
+        site.changed.add(found, site.shows)
+        return _json({"show": found.name})
+
+    def _changeable(self, request: Request) -> WatchedRun:
+        """Return the mission that a request is about. Raises _Refused if its values cannot be changed."""
+        show = self._site.shows.get(request.path_params["name"])
+        if show is None or self._site.compared:
+            raise _Refused(404, "there is no such mission, or it is shown side by side with another")
+        if request.client is None or not ipaddress.ip_address(request.client.host).is_loopback:
+            raise _Refused(403, "missions are run again for browsers on the server's machine only")
+        return show
+
     async def show(self, request: Request) -> Response:
         show = self._site.shows.get(request.path_params["name"])
         if show is None:
@@ -136,6 +171,37 @@ class _Answers:
         return StreamingResponse(stream, media_type="text/event-stream")
 
 
+class _Refused(Exception):
+    """A request that is refused; the text says why."""
+
+    def __init__(self, status: int, why: str) -> None:
+        super().__init__(why)
+        self.status = status
+        """The status of the answer."""
+
+
+async def _refusal(_request: Request, error: Exception) -> Response:
+    """Return the answer to a request that is refused, or whose values are."""
+    return _json({"error": str(error)}, error.status if isinstance(error, _Refused) else 422)
+
+
+async def _change_in(request: Request) -> ScenarioChange:
+    """Return the values in the body of a POST of the page. Raises _Refused."""
+    if len(request.headers.getlist("origin")) != 1:  # `_Own` has refused foreign ones
+        raise _Refused(403, "only the page of this server may change a mission (Origin header)")
+    if request.headers.get("content-type") != "application/json":
+        raise _Refused(415, "the values must be JSON (Content-Type header)")
+    body = b""
+    async for part in request.stream():
+        body += part
+        if len(body) > MAX_CHANGE_BYTES:
+            raise _Refused(413, f"too many robots are changed: more than {MAX_CHANGE_BYTES} bytes")
+    try:
+        return msgspec.json.decode(body, type=ScenarioChange)
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        raise _Refused(400, field_first(str(error), ScenarioChange)) from None
+
+
 def _results(folder: Path | None, contents: Callable[[Path], dict[str, Any]], what: str) -> Response:
     """Return the `contents` of a folder of results; an error if the server shows none."""
     if folder is None:
@@ -160,10 +226,14 @@ def application(site: Site) -> Starlette:
             Route("/api/cells/{cell:int}/worst", answers.worst, methods=["POST"]),
             Route("/api/shows/{name}", answers.show),
             Route("/api/shows/{name}/scenes", answers.scenes),
+            Route("/api/shows/{name}/values", answers.values),
+            Route("/api/shows/{name}/changed", answers.run_changed, methods=["POST"]),
+            Route("/api/shows/{name}/changed.toml", answers.changed_file, methods=["POST"]),
             Route("/api/shows/{name}/thumbnail", answers.thumbnail),
             Route("/api/news", answers.news),
             Mount("/page", StaticFiles(directory=PAGE)),
         ],
+        exception_handlers={_Refused: _refusal, UserError: _refusal},
         middleware=[
             Middleware(_Sealed),
             Middleware(_Own),

@@ -14,6 +14,7 @@ from compose.recording.comparison import comparison
 from compose.recording.recording_files import journals_in
 from compose.recording.run import read
 from compose.view.web import estimate_page, sweep_page
+from compose.view.web.changed_missions import ChangedMissions
 from compose.view.web.live import Listener
 from compose.view.web.sources import Recorded, WatchedRun
 from compose.view.web.trials import Trials
@@ -41,6 +42,7 @@ class Site:
         self.folder = folder
         self.estimate = estimate
         self.trials = Trials(folder) if folder is not None else None
+        self.changed = ChangedMissions()
         self.recorded = shows or []
         self.listeners = listeners or []
         self.over = False
@@ -50,7 +52,9 @@ class Site:
     def shows(self) -> dict[str, WatchedRun]:
         """The runs whose static data is known, by name."""
         trials = self.trials.shows if self.trials is not None else []
-        found: dict[str, WatchedRun] = {show.name: show for show in [*self.recorded, *trials]}
+        found: dict[str, WatchedRun] = {
+            show.name: show for show in [*self.recorded, *trials, *self.changed.shows]
+        }
         for i, listener in enumerate(self.listeners):
             for run, show in listener.shows.items():
                 found[run if run not in found else f"{run}.{i}"] = show
@@ -91,11 +95,12 @@ class Site:
             listener.start()
 
     def stop(self) -> None:
-        """Stop listening on the network, and delete the recordings of trials."""
+        """Stop listening on the network, and delete the recordings of trials and of changed missions."""
         for listener in self.listeners:
             listener.stop()
         if self.trials is not None:
             self.trials.close()
+        self.changed.close()
 
     def poll(self) -> None:
         """Read new data."""

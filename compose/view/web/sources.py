@@ -13,6 +13,7 @@ from compose.recording.recording_files import WORLD_JOURNAL, agent_journal, jour
 from compose.recording.run_setup import RunSetup
 from compose.view.recorded import Journals
 from compose.view.run_data import RunData
+from world.scenario import Scenario
 
 REVISIONS_KEPT = 1000
 """The number of stored revisions. A page that has missed more reloads all scenes."""
@@ -107,6 +108,11 @@ class Recorded(WatchedRun):
         self._over = False
         self._writers: dict[str, int] = {}
         """The id of the process that last held the lock of each journal, by the journal's name."""
+
+    @property
+    def scenario(self) -> Scenario | None:
+        """The scenario in the world's journal; None if there is none."""
+        return self._journals.scenario
 
     def poll(self) -> None:
         """Read new frames of the journals. Raises OSError."""

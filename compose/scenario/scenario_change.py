@@ -1,0 +1,204 @@
+"""A recorded scenario as the content of a scenario file again, with another geometry, R, noise or loss."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+from msgspec.structs import fields, replace
+
+from compose.errors import BadScenario, UserError
+from compose.launch import planner_loader
+from compose.scenario.scenario_file import validate
+from protocol.noise import Noise
+from protocol.spelling import did_you_mean
+from protocol.units import Finite, RobotId
+from world.faults import Fault
+from world.radio_models import RADIO_MODELS
+from world.range_models import RANGE_MODELS
+from world.scenario import Scenario
+from world.world_noise import WorldNoise
+
+SOURCE = "the changed scenario"
+"""The name of the changed scenario in error messages, which `refusal_text` removes."""
+SUFFIX = "-changed"
+"""The end of the name of a changed scenario."""
+LONGEST_NAME = 48
+"""The maximum number of characters of the name of a scenario."""
+
+
+class RobotChange(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The start and the anchor of one robot."""
+
+    x: Finite
+    """The x coordinate of the start in <W>, in m."""
+    y: Finite
+    """The y coordinate of the start in <W>, in m."""
+    heading: Finite
+    """The heading at the start, in rad."""
+    anchor_x: Finite
+    """The x coordinate of the anchor in <W>, in m."""
+    anchor_y: Finite
+    """The y coordinate of the anchor in <W>, in m."""
+
+
+class ScenarioChange(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The values of a scenario that can be changed."""
+
+    robots: dict[RobotId, RobotChange]
+    """The starts and anchors by robot. A robot that is left out keeps its own."""
+    sensing_range: Finite
+    """The sensing range R, in m."""
+    sigma: Finite
+    """The standard deviation of all ranges, in m; 0 for a mission without any noise."""
+    loss: Finite
+    """The probability that a report is lost, on all links."""
+
+
+def values_of(scenario: Scenario) -> ScenarioChange:
+    """Return the values that `scenario` has. Sigma is the larger one of ranges to anchors and to robots."""
+    noise = scenario.mission.noise
+    place = _place_of_loss(scenario.faults)
+    return ScenarioChange(
+        robots={
+            one.id: RobotChange(one.start.x, one.start.y, one.start.heading, one.anchor.x, one.anchor.y)
+            for one in scenario.robots
+        },
+        sensing_range=scenario.mission.sensing_range,
+        sigma=max(noise.anchor_sigma, noise.mutual_sigma),
+        loss=0.0 if place is None else scenario.faults[place].loss,
+    )
+
+
+def require_shipped(scenario: Scenario) -> None:
+    """Raise UserError if a mission of `scenario` runs code that is not shipped with Tandem.
+
+    The name of a planner or a model in a recording must not choose the code that this process loads.
+    """
+    models = [spec.model for spec in (scenario.range_model, scenario.radio_model) if spec is not None]
+    foreign = [name for name in models if name not in {*RANGE_MODELS, *RADIO_MODELS}]
+    if not planner_loader.is_shipped(scenario.planner_name):
+        foreign.insert(0, scenario.planner_name)
+    if foreign:
+        raise UserError(f"it uses {foreign[0]}, and only planners and models of Tandem are run again here")
+
+
+def changed_table(scenario: Scenario, change: ScenarioChange, most_ticks: int) -> dict[str, Any]:
+    """Return the content of the scenario file of `scenario` with the values of `change`.
+
+    Its last tick is computed again if that of `scenario` follows from the mission, and is at most
+    `most_ticks`. Raises UserError if a value is refused, as one of a file is, and like `require_shipped`.
+    """
+    require_shipped(scenario)
+    before = values_of(scenario)
+    unknown = next((one for one in change.robots if one not in before.robots), None)
+    if unknown is not None:
+        near = did_you_mean(unknown, before.robots)
+        raise UserError(f"robots: there is no '{unknown}'; there are {', '.join(before.robots)}{near}")
+    table = file_table(_with_values(scenario, before, change))
+    for robot in table["robot"]:
+        if (one := change.robots.get(robot["id"])) is not None:
+            robot["anchor"] = [one.anchor_x, one.anchor_y]
+            robot["start"] = [one.x, one.y, one.heading]
+    if _has_default_ticks(scenario):
+        del table["max_ticks"]
+    try:
+        found = validate(table, SOURCE).scenario
+    except BadScenario as error:
+        raise UserError(str(error).removeprefix(f"{SOURCE}: ")) from None
+    if found.max_ticks > most_ticks:
+        table["max_ticks"] = most_ticks
+    return table
+
+
+def _with_values(scenario: Scenario, before: ScenarioChange, change: ScenarioChange) -> Scenario:
+    """Return `scenario` with R, sigma and loss of `change`, not validated."""
+    mission = replace(scenario.mission, sensing_range=change.sensing_range)
+    given: dict[str, Any] = {}
+    if change.sigma != before.sigma:
+        sigma = change.sigma
+        noise = replace(mission.noise, anchor_sigma=sigma, mutual_sigma=sigma) if sigma else Noise()
+        mission = replace(mission, noise=noise)
+        if scenario.world_noise != WorldNoise():
+            own = replace(scenario.world_noise, anchor_sigma=None, mutual_sigma=None)
+            given["world_noise"] = own if sigma else WorldNoise()
+    faults = list(scenario.faults)
+    if change.loss != before.loss:
+        place = _place_of_loss(scenario.faults)
+        if place is not None:
+            del faults[place]
+        if change.loss:
+            faults.insert(place or 0, Fault(loss=change.loss))
+    name = scenario.name.removesuffix(SUFFIX)[: LONGEST_NAME - len(SUFFIX)] + SUFFIX
+    return replace(scenario, name=name, mission=mission, faults=tuple(faults), **given)
+
+
+def _place_of_loss(faults: tuple[Fault, ...]) -> int | None:
+    """Return the index of the fault that is only a loss on all links in all ticks; None if there is none."""
+    return next((i for i, one in enumerate(faults) if replace(one, loss=0.0) == Fault()), None)
+
+
+def _has_default_ticks(scenario: Scenario) -> bool:
+    """Return whether the last tick of `scenario` is the one that is computed from its mission."""
+    table = file_table(scenario)
+    del table["max_ticks"]
+    try:
+        return validate(table, SOURCE).scenario.max_ticks == scenario.max_ticks
+    except BadScenario:
+        return False
+
+
+# --- the file of a scenario -----------------------------------------------------------------------------
+
+
+def file_table(scenario: Scenario) -> dict[str, Any]:
+    """Return the content of a scenario file that describes `scenario`, with all starts and the last tick."""
+    mission = _given(scenario.mission)
+    if scenario.mission.noise.profile is not None:  # a default would have the value of the profile
+        noise = msgspec.to_builtins(scenario.mission.noise)
+        mission["noise"] = {name: value for name, value in noise.items() if value is not None}
+    world = {
+        "noise": _given(scenario.world_noise),
+        "range": msgspec.to_builtins(scenario.range_model),
+        "radio": msgspec.to_builtins(scenario.radio_model),
+    }
+    planner = {"name": scenario.planner_name, "options": msgspec.to_builtins(scenario.planner_options)}
+    table = {
+        "name": scenario.name,
+        "seed": scenario.seed,
+        "max_ticks": scenario.max_ticks,
+        "mission": mission,
+        "planner": {name: value for name, value in planner.items() if value},
+        "world": {name: value for name, value in world.items() if value},
+        "robot": [
+            {
+                "id": one.id,
+                "peer": one.peer,
+                "anchor": [one.anchor.x, one.anchor.y],
+                "start": [one.start.x, one.start.y, one.start.heading],
+                **({"attack": _given(one.attack)} if one.attack is not None else {}),
+            }
+            for one in scenario.robots
+        ],
+        "fault": [_fault_table(one) for one in scenario.faults],
+    }
+    return {name: value for name, value in table.items() if value or name == "seed"}
+
+
+def _fault_table(fault: Fault) -> dict[str, Any]:
+    """Return the `[[fault]]` table of `fault`."""
+    table = _given(fault)
+    if fault.link is not None:
+        arrow = "<->" if fault.link.both else "->"
+        table["link"] = f"{fault.link.sender}{arrow}{fault.link.receiver}"
+    return table
+
+
+def _given(struct: msgspec.Struct) -> dict[str, Any]:
+    """Return the fields of `struct` that do not have their default, as values of TOML."""
+    found: dict[str, Any] = {}
+    for field in fields(type(struct)):
+        value = getattr(struct, field.name)
+        if value is not None and value != field.default:
+            found[field.name] = _given(value) if isinstance(value, msgspec.Struct) else value
+    return msgspec.to_builtins(found)  # type: ignore[no-any-return]

@@ -1,0 +1,157 @@
+"""A recording is changed on the page and run again: through HTTP, and in a browser."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
+
+import pytest
+from msgspec.structs import asdict, replace
+from playwright.sync_api import Page, Route, expect
+
+from compose.errors import UserError
+from compose.launch import in_process
+from compose.recording.run import read
+from compose.scenario.scenario_change import ScenarioChange, changed_table, values_of
+from compose.scenario.scenario_file import load, parse
+from compose.view.web.changed_missions import MOST_CHANGED, MOST_TICKS, ChangedMissions, changed_text
+from compose.view.web.sources import Recorded
+from tests.browser import Open, shot, until_shown
+from world.scenario import Scenario
+
+PAPER_1 = load("paper-1")
+
+
+def posted(address: str, change: object, what: str = "changed", origin: str | None = None) -> Any:
+    """Return the answer to the request that the page sends; its text if it is no JSON."""
+    body = change if isinstance(change, bytes) else json.dumps(change).encode()
+    heads = {"Origin": origin or address.rstrip("/"), "Content-Type": "application/json"}
+    request = Request(f"{address}api/shows/paper-1/{what}", body, heads)  # noqa: S310  # loopback
+    with urlopen(request, timeout=60) as answer:  # noqa: S310  # loopback
+        text = answer.read().decode()
+    return text if what.endswith("toml") else json.loads(text)
+
+
+def values(**changed: object) -> dict[str, Any]:
+    """Return the values of paper-1 for a request, with others for those in `changed`."""
+    return {"robots": {}, "sensing_range": 3.0, "sigma": 0.0, "loss": 0.0, **changed}
+
+
+def moved_a(x: float, y: float) -> dict[str, Any]:
+    """Return the values of robot a in paper-1 with another start."""
+    return {"a": {"x": x, "y": y, "heading": 1.0, "anchor_x": 0.0, "anchor_y": 0.5}}
+
+
+def fetched(address: str, path: str) -> Any:
+    with urlopen(f"{address}api/{path}", timeout=60) as answer:  # noqa: S310  # loopback
+        return json.load(answer)
+
+
+def test_a_changed_mission_is_that_of_its_scenario_file_run_in_one_process(address: str) -> None:
+    change = values(robots=moved_a(1.0, 2.0), sensing_range=3.5, loss=0.05)
+    name = posted(address, change)["show"].replace(" ", "%20")
+    scenario = parse(posted(address, change, "changed.toml"), "saved")
+    run = in_process.run_mission(scenario)
+    mission = fetched(address, f"shows/{name}")
+    assert run.end is not None
+    assert mission["end"][1:3] == [run.end.tick, run.end.outcome]
+    assert mission["stage"]["mission"]["sensing_range"] == 3.5
+    assert mission["stage"]["faults"][0][1] == 0.05
+    for tick in (0, run.end.tick):
+        [scene] = fetched(address, f"shows/{name}/scenes?from={tick}&to={tick}")["scenes"]
+        assert run.world is not None
+        poses = [[pose.x, pose.y, pose.heading] for pose in run.world.ticks[tick].truth.poses]
+        assert [player["pose"] for player in scene["players"]] == poses
+
+
+REFUSED: dict[str, tuple[object, int, str]] = {
+    "no number": (values(sigma=float("nan")), 400, "SON is malformed"),
+    "infinite": (json.dumps(values()).replace("3.0", "1e999").encode(), 400, "sensing_range"),
+    "too large": (b" " * 10_000, 413, "more than 8192 bytes"),
+    "a code": (values(planner="os:system"), 400, "unknown field 'planner'"),
+    "unknown robot": (
+        values(robots={"z": moved_a(0.0, 1.0)["a"]}),
+        422,
+        "robots: there is no 'z'; there are a, b",
+    ),
+    "R = 0": (values(sensing_range=0.0), 422, "mission.sensing_range: expected 'float' >= 0.001"),
+    "out of range": (values(robots=moved_a(5.0, 0.0)), 422, "robot[0].start: 'a' is 5.02493781 m from its"),
+    "loss": (values(loss=1.5), 422, "fault[0].loss: expected 'float' <= 1.0"),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_a_file_may_not_have_is_one_line(address: str, what: str) -> None:
+    change, status, why = REFUSED[what]
+    with pytest.raises(HTTPError) as refused:
+        posted(address, change)
+    line = json.loads(refused.value.read())["error"]
+    assert (refused.value.code, "\n" in line) == (status, False)
+    assert why in line
+
+
+def test_only_the_page_of_the_server_changes_a_mission(address: str) -> None:
+    for origin in ("http://elsewhere.example", "null", "http://127.0.0.1:1"):
+        with pytest.raises(HTTPError, match="403"):
+            posted(address, values(), origin=origin)
+    for heads in ({"Content-Type": "application/json"}, {"Origin": address.rstrip("/")}):
+        request = Request(f"{address}api/shows/paper-1/changed", b"{}", heads)  # noqa: S310  # loopback
+        with pytest.raises(HTTPError, match="403|415"):
+            urlopen(request, timeout=60)  # noqa: S310  # loopback
+
+
+FAULTS = ("a->b: loss=0.3, delay=0..3", "loss=0.1", "delay=2, ticks=3..9")
+EVERYTHING = """
+name = "everything"
+seed = 3
+max_ticks = 77
+mission = {sensing_range = 3.0, period = 1.0, max_speed = 1.0, max_turn_rate = 3.1, accuracy = 0.3, noise = {profile = "uwb", slow_sigma = 0.0}}
+[world.noise]
+anchor_sigma = 0.07
+anchor_bias = {a = 0.1}
+[world.range]
+model = "fading"
+options = {full = 0.7}
+[[robot]]
+id = "a"
+anchor = [0.0, 0.0]
+attack = {kind = "scale", size = 0.5, part = "orbit"}
+[[robot]]
+id = "b"
+anchor = [10.0, 0.0]
+start = [11.0, 0.0, 100.0]
+"""  # noqa: E501
+
+
+@pytest.mark.parametrize(
+    "scenario", [load("paper-1", faults=FAULTS), load("noisy"), parse(EVERYTHING, "everything")]
+)
+def test_without_a_change_the_file_describes_the_same_scenario(scenario: Scenario) -> None:
+    table = changed_table(scenario, values_of(scenario), MOST_TICKS)
+    again = parse(json_as_toml(table), "saved")
+    assert replace(again, name=scenario.name) == scenario
+
+
+def json_as_toml(table: dict[str, Any]) -> str:
+    return pytest.importorskip("tomli_w").dumps(table)  # type: ignore[no-any-return]
+
+
+def test_sigma_is_that_of_all_ranges_and_zero_is_exact() -> None:
+    noisy = load("noisy")
+    found = [
+        parse(json_as_toml(changed_table(noisy, replace(values_of(noisy), sigma=sigma), MOST_TICKS)), "saved")
+        for sigma in (0.02, 0.0)
+    ]
+    noise = found[0].mission.noise
+    assert (noise.anchor_sigma, noise.mutual_sigma, noise.outliers) == (0.02, 0.02, 0.05)
+    assert found[1].mission.noise.exact
+
+
+def test_a_planner_that_is_not_shipped_is_not_run_again() -> None:
+    scenario = replace(PAPER_1, planner_name="os:system")
+    with pytest.raises(UserError, match=r"^it uses os:system, and only planners and models of Tandem are run"):
+        changed_table(scenario, values_of(scenario), MOST_TICKS)
