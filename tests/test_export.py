@@ -646,9 +646,19 @@ def test_a_crowd_of_viewers_is_turned_away_and_leaves_room_for_those_that_come_a
         assert {connection.getresponse().status for connection in crowd} == {101}
         crowd += [asking(port, {}) for _ in range(files)]
         assert crowd[GUESTS].getresponse().status == 503
+        assert server_at(port).num_fds() <= GUESTS_FILES
         for connection in crowd:
             connection.close()
         until(lambda: asked(port, heads) == 101, "there is room again")
+
+
+def test_a_viewer_that_ends_before_ctrl_c_is_named() -> None:
+    port = int(free_endpoint().rsplit(":", 1)[1])
+    with TandemProcess("run", "paper-1", "-q", "--foxglove", str(port)) as played:
+        played.until_prints("until Ctrl-C")
+        server_at(port).kill()
+        ended = played.ended()
+    assert (ended.status, ended.err) == (3, "tandem run: the Foxglove server was killed by signal 9\n")
 
 
 def asked(port: int, heads: dict[str, str]) -> int:
@@ -671,6 +681,17 @@ def asking(port: int, heads: dict[str, str]) -> http.client.HTTPConnection:
     }
     connection.request("GET", "/", headers=usual | heads)
     return connection
+
+
+def server_at(port: int) -> psutil.Process:
+    """Return the process that listens on an IPv4 `port`."""
+    [pid] = {
+        link.pid
+        for link in psutil.net_connections("tcp4")
+        if link.status == psutil.CONN_LISTEN and link.laddr.port == port
+    }
+    assert pid is not None
+    return psutil.Process(pid)
 
 
 def listened_by(pids: Iterable[int]) -> set[tuple[str, int]]:

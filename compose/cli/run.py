@@ -228,8 +228,8 @@ def _after_outcome(
     except Interrupted as signal_name:
         inbox.say(f"stopped by {signal_name} before the export was complete")
         return STOPPED
-    stay(viewers, inbox)
-    return FAILED if options.export and not exported else status
+    served = stay(viewers, inbox)
+    return FAILED if not served or (options.export and not exported) else status
 
 
 def _export(options: argparse.Namespace, folder: Path, inbox: Inbox, run: Run | None) -> bool:

@@ -55,22 +55,37 @@ class Viewer:
         """Print the address."""
         say(f"{self._what} at {self.address}")
 
+    @property
+    def failure(self) -> str | None:
+        """A line about its failure; None if it is running, or has ended as it should."""
+        if self.running or self._child.status == 0:
+            return None
+        return f"{self._what} {self._child.how_ended().splitlines()[-1]}"
+
     def conclude(self) -> None:
         """Tell the viewer that the mission has ended, and print that it keeps running."""
         self._child.send(OVER)
         say(f"{self._what} remains at {self.address} until Ctrl-C")
 
 
-def stay(viewers: Sequence[Viewer], inbox: Inbox) -> None:
+def stay(viewers: Sequence[Viewer], inbox: Inbox) -> bool:
     """Wait, after the mission, for Ctrl-C or for the end of all `viewers`, which `inbox` receives.
 
-    Processes of the mission that end later are ignored.
+    Return whether none has failed; a failure is printed. Processes of the mission that end later are ignored.
     """
     for viewer in viewers:
         viewer.conclude()
+    failed: dict[Viewer, str] = {}
     with suppress(Interrupted):
-        while any(viewer.running for viewer in viewers):
+        while True:
+            for viewer in viewers:
+                if viewer not in failed and (failure := viewer.failure) is not None:
+                    failed[viewer] = failure
+                    inbox.say(failure)
+            if not any(viewer.running for viewer in viewers):
+                break
             inbox.next(None)
+    return not failed
 
 
 @contextmanager

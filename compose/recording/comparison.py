@@ -10,7 +10,7 @@ from compose.recording.run import Run, broken_off, ended
 
 
 class Comparison(msgspec.Struct, frozen=True):
-    """How two runs compare."""
+    """The comparison of two runs."""
 
     line: str
     """The result in one line."""

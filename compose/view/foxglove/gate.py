@@ -26,12 +26,18 @@ HEAD_S = 10.0
 PIECE_BYTES = 1 << 16
 """The maximum size in bytes of a forwarded piece."""
 GUESTS = 64
-"""The maximum number of connections; more are refused.
+"""The maximum number of forwarded connections; more are refused.
 
 Without a limit, the SDK's server would run out of descriptors, and accept no more.
 """
-GUESTS_FILES = 3 * GUESTS + 120
-"""The file descriptors for GUESTS: three for each, and some for refused connections."""
+REFUSED = 32
+"""The maximum number of connections that are being refused. Further ones wait until they are accepted."""
+REFUSED_S = 1.0
+"""The time in s for the head of a refused request to arrive, and for the end of an answer to be read."""
+RETRY_S = 0.1
+"""The time in s until a connection is accepted after one could not be."""
+GUESTS_FILES = 3 * GUESTS + REFUSED + 88
+"""The file descriptors for GUESTS, three for each, for REFUSED, and for the rest of the process."""
 
 Place = tuple[str, int]
 """A host and a port."""
@@ -54,28 +60,48 @@ class Gate:
         self._behind = behind
         self._origins = (*FOXGLOVE, *origins)
         self._guests = 0
+        self._room = asyncio.Semaphore(GUESTS + REFUSED)
+        """The number of connections that may still be opened, so that descriptors never run out."""
+        self._admitted: set[asyncio.Task[None]] = set()
 
     def open(self) -> None:
         """Start the thread, which ends with the process."""
         threading.Thread(target=lambda: asyncio.run(self._serve()), daemon=True).start()
 
     async def _serve(self) -> None:
-        server = await asyncio.start_server(self._admit, sock=self._taken, limit=HEAD_BYTES)
-        await server.serve_forever()
-
-    async def _admit(self, reader: StreamReader, writer: StreamWriter) -> None:
-        with closing(writer), suppress(OSError, EOFError, LimitOverrunError):
-            if self._guests >= GUESTS:
-                await _refuse(writer, "503 Service Unavailable", "too many connections")
-                return
-            self._guests += 1
+        self._taken.setblocking(False)
+        while True:
+            await self._room.acquire()
             try:
-                await self._look_at(reader, writer)
-            finally:
-                self._guests -= 1
+                accepted, _ = await asyncio.get_running_loop().sock_accept(self._taken)
+            except OSError:  # the connection has been reset, or the system has no descriptor left
+                self._room.release()
+                await asyncio.sleep(RETRY_S)
+                continue
+            task = asyncio.create_task(self._admit(accepted))
+            self._admitted.add(task)
+            task.add_done_callback(self._admitted.discard)
 
-    async def _look_at(self, reader: StreamReader, writer: StreamWriter) -> None:
-        head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), HEAD_S)
+    async def _admit(self, accepted: socket.socket) -> None:
+        guest = self._guests < GUESTS
+        self._guests += guest
+        try:
+            reader, writer = await asyncio.open_connection(sock=accepted, limit=HEAD_BYTES)
+            with suppress(OSError, EOFError, LimitOverrunError):
+                await self._answer(guest, reader, writer)
+            writer.close()
+            with suppress(OSError):
+                await asyncio.wait_for(writer.wait_closed(), REFUSED_S)
+            writer.transport.abort()  # it may hold data that nobody reads
+        finally:
+            self._guests -= guest
+            self._room.release()
+
+    async def _answer(self, guest: bool, reader: StreamReader, writer: StreamWriter) -> None:
+        head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), HEAD_S if guest else REFUSED_S)
+        if not guest:
+            await _refuse(writer, "503 Service Unavailable", "too many connections")
+            return
         why = self._refusal(head)
         if why is not None:
             await _refuse(writer, "403 Forbidden", why)
