@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import json
 import re
-from pathlib import Path
+from math import remainder, tau
 from typing import Any
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
 import pytest
-from msgspec.structs import asdict, replace
+from msgspec.structs import replace
 from playwright.sync_api import Page, Route, expect
 
 from compose.errors import UserError
 from compose.launch import in_process
-from compose.recording.run import read
-from compose.scenario.scenario_change import ScenarioChange, changed_table, values_of
+from compose.scenario.scenario_change import changed_table, values_of
 from compose.scenario.scenario_file import load, parse
-from compose.view.web.changed_missions import MOST_CHANGED, MOST_TICKS, ChangedMissions, changed_text
-from compose.view.web.sources import Recorded
-from tests.browser import Open, shot, until_shown
+from compose.view.web.changed_missions import MOST_TICKS
+from tests.browser import Open, shot, until_loaded
 from world.scenario import Scenario
 
 PAPER_1 = load("paper-1")
@@ -30,8 +28,8 @@ def posted(address: str, change: object, what: str = "changed", origin: str | No
     """Return the answer to the request that the page sends; its text if it is no JSON."""
     body = change if isinstance(change, bytes) else json.dumps(change).encode()
     heads = {"Origin": origin or address.rstrip("/"), "Content-Type": "application/json"}
-    request = Request(f"{address}api/shows/paper-1/{what}", body, heads)  # noqa: S310  # loopback
-    with urlopen(request, timeout=60) as answer:  # noqa: S310  # loopback
+    request = Request(f"{address}api/shows/paper-1/{what}", body, heads)  # loopback
+    with urlopen(request, timeout=60) as answer:  # loopback
         text = answer.read().decode()
     return text if what.endswith("toml") else json.loads(text)
 
@@ -47,7 +45,7 @@ def moved_a(x: float, y: float) -> dict[str, Any]:
 
 
 def fetched(address: str, path: str) -> Any:
-    with urlopen(f"{address}api/{path}", timeout=60) as answer:  # noqa: S310  # loopback
+    with urlopen(f"{address}api/{path}", timeout=60) as answer:  # loopback
         return json.load(answer)
 
 
@@ -64,8 +62,9 @@ def test_a_changed_mission_is_that_of_its_scenario_file_run_in_one_process(addre
     for tick in (0, run.end.tick):
         [scene] = fetched(address, f"shows/{name}/scenes?from={tick}&to={tick}")["scenes"]
         assert run.world is not None
-        poses = [[pose.x, pose.y, pose.heading] for pose in run.world.ticks[tick].truth.poses]
-        assert [player["pose"] for player in scene["players"]] == poses
+        poses = [(pose.x, pose.y, remainder(pose.heading, tau)) for pose in run.world.ticks[tick].truth.poses]
+        shown = [(x, y, remainder(turn, tau)) for x, y, turn in (one["pose"] for one in scene["players"])]
+        assert shown == [pytest.approx(pose, abs=1e-12) for pose in poses]
 
 
 REFUSED: dict[str, tuple[object, int, str]] = {
@@ -99,9 +98,9 @@ def test_only_the_page_of_the_server_changes_a_mission(address: str) -> None:
         with pytest.raises(HTTPError, match="403"):
             posted(address, values(), origin=origin)
     for heads in ({"Content-Type": "application/json"}, {"Origin": address.rstrip("/")}):
-        request = Request(f"{address}api/shows/paper-1/changed", b"{}", heads)  # noqa: S310  # loopback
-        with pytest.raises(HTTPError, match="403|415"):
-            urlopen(request, timeout=60)  # noqa: S310  # loopback
+        request = Request(f"{address}api/shows/paper-1/changed", b"{}", heads)  # loopback
+        with pytest.raises(HTTPError, match=r"403|415"):
+            urlopen(request, timeout=60)  # loopback
 
 
 FAULTS = ("a->b: loss=0.3, delay=0..3", "loss=0.1", "delay=2, ticks=3..9")
@@ -153,5 +152,107 @@ def test_sigma_is_that_of_all_ranges_and_zero_is_exact() -> None:
 
 def test_a_planner_that_is_not_shipped_is_not_run_again() -> None:
     scenario = replace(PAPER_1, planner_name="os:system")
-    with pytest.raises(UserError, match=r"^it uses os:system, and only planners and models of Tandem are run"):
+    with pytest.raises(
+        UserError, match=r"^it uses os:system, and only planners and models of Tandem are run"
+    ):
         changed_table(scenario, values_of(scenario), MOST_TICKS)
+
+
+# --- in a browser ---------------------------------------------------------------------------------------
+
+
+def opened_form(opened: Open, address: str, **window: Any) -> Page:
+    """Return the page of paper-1 with the form open, and its values in it."""
+    page = opened(f"{address}#show=paper-1&tick=0", **window)
+    until_loaded(page)
+    page.keyboard.press("e")
+    expect(page.get_by_label("start x", exact=True)).to_have_value(str(PAPER_1.robots[0].start.x))
+    return page
+
+
+def pixel(page: Page, x: float, y: float) -> tuple[float, float]:
+    """Return the place in the window of a position in <W>, by the anchors of paper-1 that are drawn."""
+    drawn = page.evaluate("document.getElementById('canvas').targets")
+    a, b = (
+        next(one["at"] for one in drawn if one["kind"] == "anchor" and one["robot"] == robot)
+        for robot in "ab"
+    )
+    box = page.locator("#canvas").bounding_box()
+    assert box is not None
+    scale = (b[0] - a[0]) / (PAPER_1.robots[1].anchor.x - PAPER_1.robots[0].anchor.x)
+    return box["x"] + a[0] + scale * x, box["y"] + a[1] - scale * y
+
+
+def drag(page: Page, before: tuple[float, float], after: tuple[float, float]) -> None:
+    page.mouse.move(*pixel(page, *before))
+    page.mouse.down()
+    page.mouse.move(*pixel(page, 0.5 * (before[0] + after[0]), 0.5 * (before[1] + after[1])))
+    page.mouse.move(*pixel(page, *after))
+    page.mouse.up()
+
+
+def test_a_start_that_is_dragged_is_where_the_mission_begins_again(opened: Open, address: str) -> None:
+    page = opened_form(opened, address)
+    start = PAPER_1.robots[0].start
+    drag(page, (start.x, start.y), (1.0, 2.0))
+    x, y = (float(page.get_by_label(f"start {axis}", exact=True).input_value()) for axis in "xy")
+    assert (x, y) == pytest.approx((1.0, 2.0), abs=0.05)
+    page.get_by_role("button", name="run", exact=True).click()
+    expect(page.locator("#title")).to_have_text("paper-1-changed")
+    expect(page).to_have_url(re.compile("show=changed"))
+    expect(page.locator("#status")).to_contain_text("localised")
+    name = re.search(r"show=(changed)[+%20]+(\d+)", page.url)
+    assert name is not None
+    [scene] = fetched(address, f"shows/changed%20{name[2]}/scenes?from=0&to=0")["scenes"]
+    assert scene["players"][0]["pose"][:2] == [x, y]
+    expect(page.get_by_label("start x", exact=True)).to_have_value(f"{x:g}")  # ready for the next change
+
+
+def test_the_form_works_from_the_keyboard_and_saves_the_scenario(opened: Open, address: str) -> None:
+    page = opened_form(opened, address)
+    page.get_by_label("sensing range R in m", exact=True).nth(1).focus()
+    page.keyboard.press("Control+a")
+    page.keyboard.type("3.5")
+    page.get_by_label("reports lost").first.focus()
+    page.keyboard.press("ArrowRight")
+    loss = float(page.get_by_label("reports lost").nth(1).input_value())
+    assert loss > 0.0
+    page.get_by_role("button", name="save as a scenario").focus()
+    with page.expect_download() as saved:
+        page.keyboard.press("Enter")
+    assert saved.value.suggested_filename == "paper-1-changed.toml"
+    found = load(str(saved.value.path()))
+    assert (found.mission.sensing_range, found.faults[0].loss) == (3.5, loss)
+    page.get_by_role("button", name="reset").focus()
+    page.keyboard.press("Space")
+    expect(page.get_by_label("sensing range R in m", exact=True).nth(1)).to_have_value("3")
+    page.get_by_role("button", name="close").press("e")
+    expect(page.locator("#changes")).to_be_hidden()
+
+
+def test_what_the_server_refuses_is_said_beside_the_buttons(opened: Open, address: str) -> None:
+    page = opened_form(opened, address)
+
+    def refuse(route: Route) -> None:
+        """Answer as the server does, but with a status that browsers do not log."""
+        with pytest.raises(HTTPError) as refused:
+            posted(address, json.loads(route.request.post_data or ""))
+        route.fulfill(status=200, content_type="application/json", body=refused.value.read())
+
+    page.route(re.compile("/changed$"), refuse)
+    page.get_by_label("start x", exact=True).fill("5")
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("alert")).to_contain_text("robot[0].start: 'a' is")
+    expect(page.locator("#title")).to_have_text("paper-1")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize(("width", "height"), [(1280, 720), (800, 600), (390, 844)])
+def test_the_form_is_legible(opened: Open, address: str, width: int, height: int, dark: bool) -> None:
+    page = opened_form(opened, address, width=width, height=height, dark=dark)
+    shot(page, f"rerun-{width}-{'dark' if dark else 'light'}")
+    assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+    for box in page.locator("#changes input, #changes button").all():
+        box.scroll_into_view_if_needed()
+        expect(box).to_be_in_viewport()

@@ -12,8 +12,15 @@ from itertools import count
 from pathlib import Path
 
 from compose.errors import UserError
-from compose.scenario.scenario_change import ScenarioChange, changed_table, require_shipped, values_of
-from compose.scenario.scenario_file import parse
+from compose.extras import need
+from compose.scenario.scenario_change import (
+    SOURCE,
+    ScenarioChange,
+    changed_table,
+    require_shipped,
+    values_of,
+)
+from compose.scenario.scenario_file import validate
 from compose.view.web.sources import Recorded, WatchedRun
 from protocol.journal.journal_file import Journal, Sink
 from world.scenario import Scenario
@@ -52,7 +59,8 @@ class ChangedMissions:
         """
         from compose.launch.in_process import journals, played  # noqa: PLC0415  # imports numpy
 
-        scenario = parse(changed_text(show, change), "the changed scenario")
+        table = changed_table(scenario_of(show), change, MOST_TICKS)
+        scenario = validate(table, SOURCE).seeded(None)
         if self._folder is None:
             self._folder = tempfile.TemporaryDirectory(prefix="tandem-")
         out = Path(tempfile.mkdtemp(dir=self._folder.name))
@@ -124,6 +132,7 @@ def scenario_of(show: WatchedRun) -> Scenario:
 
 def changed_text(show: WatchedRun, change: ScenarioChange) -> str:
     """Return the scenario file of the mission of `show` with the values of `change`. Raises UserError."""
+    need("tomli_w")
     import tomli_w  # noqa: PLC0415  # the library is optional
 
     scenario = scenario_of(show)

@@ -19,6 +19,27 @@ export async function scenes(name, from, to) {
   return asked(`/api/shows/${encodeURIComponent(name)}/scenes?from=${from}&to=${to}`);
 }
 
+/** Returns the values of a mission that can be changed, or { error }. */
+export const values = async (name) => answered(await fetch(`${of(name)}/values`));
+
+/** Runs a mission with other values, and returns the name of its recording as { show }, or { error }. */
+export const run_changed = async (name, changed) => answered(await posted(`${of(name)}/changed`, changed));
+
+/** Returns the scenario file of a mission with other values as { text }, or { error }. */
+export async function changed_file(name, changed) {
+  const answer = await posted(`${of(name)}/changed.toml`, changed);
+  return answer.ok ? { text: await answer.text() } : answered(answer);
+}
+
+const of = (name) => `/api/shows/${encodeURIComponent(name)}`;
+
+const posted = (path, value) => fetch(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(value) });
+
+const answered = (answer) => answer.json().catch(() => ({ error: `the server refuses: ${answer.status} ${answer.statusText}` }));
+
+/** True if the page has a server. */
+export const served = !recording;
+
 /** Calls `on_news` with the list of missions and the updates of `store`, and `on_lost` without a server. */
 export function listen(store, on_news, on_lost) {
   if (recording) {

@@ -4,6 +4,7 @@
 export function needed({ target, key }) {
   const { tagName, type } = target;
   if (target.closest("dialog")) return false; // the dialog has just closed and still has the focus
+  if (["INPUT", "SELECT"].includes(tagName) && target.form?.id === "changes") return true;
   if (tagName === "SELECT") {
     return ["ArrowUp", "ArrowDown", "Enter"].includes(key) || (target.id === "robot" ? /^[\w-]$/ : /^\d$/).test(key);
   }

@@ -4,6 +4,7 @@ import { address_state } from "./address.js";
 import { estimate } from "./estimate.js";
 import { sweep } from "./sweep.js";
 import { Cards, make } from "./cards.js";
+import { Changes } from "./changes.js";
 import * as data from "./data.js";
 import { embedded, on_clock, pass_on, tell, tell_state } from "./embedding.js";
 import { needed, release_focus } from "./focus.js";
@@ -53,13 +54,15 @@ const sequence = new Sequence($("exchange"), $("sequence"), (tick) => go(tick));
 const cards = new Cards($("robots"), $("roster"), toggle);
 const log = new Log($("log"), $("states"), $("radio"), (tick) => go(tick));
 log.onchange = () => draw();
+const changes = new Changes($("changes"), { redraw: () => draw(), shown: (name) => open(name) });
+plane.handles = changes;
 
 // --- the address ---
 
 function update_address() {
   if (!store || embedded) return;
   const fields = new URLSearchParams();
-  if (listed && (listed.sweep || listed.shows.length > 1)) fields.set("show", store.name);
+  if (listed && (listed.sweep || listed.shows.length > 1 || listed.shows[0]?.name !== store.name)) fields.set("show", store.name);
   if (!(view.follow && store.live)) fields.set("tick", view.tick);
   if (view.focus) fields.set("robot", view.focus);
   if (view.selected) fields.set("select", written(view.selected));
@@ -100,7 +103,9 @@ function listen() {
 }
 
 async function on_list(list) {
+  const alone = listed?.shows.length === 1;
   listed = list;
+  if (alone && list.shows.length > 1) update_address(); // it has not named the only mission
   if (list.estimate) {
     if (!$("sweep").hidden) return;
     text($("title"), await estimate($("sweep")));
@@ -166,6 +171,7 @@ function staged() {
   log.stage(store);
   guide.stage(store);
   plane.fitted = true;
+  if (changes.open) change();
   draw();
 }
 
@@ -313,6 +319,8 @@ function controls() {
   $("caption").setAttribute("aria-live", view.guided && view.playing ? "polite" : "off");
   $("camera").setAttribute("aria-pressed", String(plane.following));
   $("follow").hidden = !store.live;
+  $("change").hidden = !changeable();
+  $("change").setAttribute("aria-expanded", String(changes.open));
   $("follow").setAttribute("aria-pressed", String(view.follow));
   $("truth").checked = view.truth;
   $("truth").disabled = !store.has_truth;
@@ -374,6 +382,16 @@ function show_truth(on) {
   draw();
 }
 
+/** Opens the form that changes the scenario. */
+function change() {
+  if (!changeable()) return changes.close();
+  view.playing = false;
+  changes.stage(store);
+}
+
+/** True if the scenario can be changed and run again. */
+const changeable = () => data.served && !embedded && !store.live;
+
 function fit() {
   plane.fit(store, view.focus, view.truth);
   plane.freed = true;
@@ -395,6 +413,7 @@ function pressed(event) {
     w: () => plane.shift(event.shiftKey ? 60 : 0, event.shiftKey ? 0 : 60),
     s: () => plane.shift(event.shiftKey ? -60 : 0, event.shiftKey ? 0 : -60),
     d: () => { $("exchange").open = !$("exchange").open; },
+    e: () => (changes.open ? changes.close() : change()),
     "?": () => $("keys").showModal(),
   };
   const action = actions[event.key.length === 1 ? event.key.toLowerCase() : event.key];
@@ -418,6 +437,7 @@ $("speed").addEventListener("change", () => guided(false, Number($("speed").valu
 $("guide").addEventListener("click", () => guided(!view.guided));
 $("camera").addEventListener("click", () => follow_story());
 $("fit").addEventListener("click", fit);
+$("change").addEventListener("click", () => (changes.open ? changes.close() : change()));
 $("near").addEventListener("click", () => plane.near(store, view));
 $("exchange").addEventListener("toggle", () => draw());
 $("help").addEventListener("click", () => $("keys").showModal());

@@ -46,15 +46,18 @@ export class Plane {
     this.#signals = new Signals(this);
     this.#configurations = new Configurations(this);
     this.tints = new Tints();
+    /** What is drawn above all else and can be dragged; see Changes. */
+    this.handles = null;
     canvas.addEventListener("wheel", (event) => {
       event.preventDefault();
       this.zoom(Math.exp(-event.deltaY * 0.0015), [event.offsetX / unit(), event.offsetY / unit()]);
     }, { passive: false });
-    let held = null, dragged = false;
+    let held = null, dragged = false, handle = null;
     const there = (event) => [event.offsetX / unit(), event.offsetY / unit()];
     canvas.addEventListener("pointerdown", (event) => {
       held = [event.clientX, event.clientY];
       dragged = false;
+      handle = this.handles?.taken(there(event), this);
       canvas.setPointerCapture(event.pointerId);
     });
     canvas.addEventListener("pointermove", (event) => {
@@ -63,11 +66,12 @@ export class Plane {
       if (!dragged && Math.hypot(...moved) < DRAG_PX) return;
       dragged = true;
       this.#point(null);
+      if (handle) return void handle(this.world(there(event)));
       this.shift(moved[0] / unit(), moved[1] / unit());
       held = [event.clientX, event.clientY];
     });
     canvas.addEventListener("pointerup", (event) => {
-      if (held && !dragged) choose(under(this.targets, there(event)));
+      if (held && !dragged && !handle) choose(under(this.targets, there(event)));
     });
     canvas.addEventListener("pointerleave", () => this.#point(null));
     for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, () => { held = null; });
@@ -193,6 +197,11 @@ export class Plane {
     ];
   }
 
+  /** Returns the position in m of a pixel. */
+  world([x, y]) {
+    return [this.centre[0] + (x - this.width / 2) / this.scale, this.centre[1] - (y - this.height / 2) / this.scale];
+  }
+
   draw(store, { tick, share, focus, truth, moving, eliminated, selected }) {
     const ratio = (window.devicePixelRatio || 1) * unit();
     const width = Math.round(this.width * ratio), height = Math.round(this.height * ratio);
@@ -227,6 +236,7 @@ export class Plane {
     this.#ring(this.targets.find((one) => same(one, selected)), look);
     this.canvas.style.cursor = this.hovered ? "pointer" : "";
     this.labels.draw();
+    this.handles?.draw(this, look, store.stage.robots);
     this.canvas.labels = this.labels.drawn;
     this.canvas.targets = this.targets;
   }

@@ -64,6 +64,7 @@ export const KEYS = [
   ["N", "zoom to the robots and to where they may be"],
   ["F", "zoom to the whole scenario"],
   ["D", "show or hide the sequence diagram of the reports"],
+  ["E", "change the scenario, and run it again"],
   ["?", "this help"],
 ];
 
