@@ -64,6 +64,7 @@ export const KEYS = [
   ["N", "zoom to the robots and to where they may be"],
   ["F", "zoom to the whole scenario"],
   ["D", "show or hide the sequence diagram of the reports"],
+  ["V", "show or hide the charts; in them, + − zoom in time and 0 shows all ticks"],
   ["?", "this help"],
 ];
 
