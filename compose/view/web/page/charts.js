@@ -17,6 +17,7 @@ const TWO_COLUMNS = 760;
 /** The smallest visible number of ticks. */
 const FEWEST = 8;
 const LEAST_M = 1e-4;
+/** The shortest time between two readings while a mission runs, and the time after which a failed one is repeated. */
 const REFRESH_MS = 1000;
 const RETRY_MS = 2000;
 /** The dashes of a line by role, so that two robots differ without colour. */
@@ -88,6 +89,7 @@ export class Charts {
   #reading = false;
   #failed = false;
   #read_ms = -Infinity;
+  #pause_ms = REFRESH_MS;
   #drawn = "";
   #at = null;
   #later = null;
@@ -178,19 +180,20 @@ export class Charts {
     return pen;
   }
 
-  /** Reads the series of the visible ticks if they have changed; while a mission runs, once a second at most. */
+  /** Reads the series of the visible ticks if they have changed; while a mission runs, at most once in #pause_ms. */
   #want(store, robots) {
     const [from, to] = this.span ? [Math.max(Math.floor(this.span[0]) - 1, store.first), Math.ceil(this.span[1]) + 1] : [store.first, store.last];
     const ids = robots.map((robot) => robot.id), where = [store.name, ...ids, from, this.span ? to : "last"].join("/");
     const key = `${where}/${store.last}/${store.revision}/${store.live}`;
-    const recent = store.live && this.#wanted?.where === where && performance.now() - this.#read_ms < REFRESH_MS;
-    if (recent) this.#again(REFRESH_MS);
+    const recent = store.live && this.#wanted?.where === where && performance.now() - this.#read_ms < this.#pause_ms;
+    if (recent) this.#again(this.#pause_ms);
     if (this.#reading || recent || key === this.#wanted?.key || store.last < 0) return;
     this.#wanted = { key, where };
     this.#reading = true;
     this.#read_ms = performance.now();
     data.series(store.name, ids, from, Math.min(to, store.last)).catch(() => null).then((series) => {
       this.#reading = false;
+      this.#pause_ms = Math.max(REFRESH_MS, 10 * (performance.now() - this.#read_ms)); // a long mission takes the server longer
       this.#failed = !series;
       if (series && this.store === store) [this.#series, this.#key] = [series, key];
       if (this.#failed) this.#again(RETRY_MS);
