@@ -6,29 +6,41 @@ import json
 import math
 import re
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from compose.launch import in_process
+from compose.recording.recording_files import WORLD_JOURNAL
 from compose.recording.run import Run, read
 from compose.scenario.scenario_file import load
 from compose.view import series as series_module
 from compose.view.recorded import run_data
 from compose.view.series import MOST_BINS, Curve, Series, series
-from protocol.messages import Estimate
-from tests.browser import BOUND_MS, Open, chromium_only, scrub_to, shot, until_shown, watching
-from tests.commands import PAPER_1, TandemProcess, tandem, world
+from protocol.journal import journal_file
+from protocol.journal.journal_file import Journal
+from protocol.messages import Command, Estimate, Observation
+from tests.browser import (
+    BOUND_MS,
+    Open,
+    chromium_only,
+    scrub_to,
+    shot,
+    until_loaded,
+    until_shown,
+    watching,
+)
+from tests.commands import tandem
 from tests.series import series as cases
 from tests.test_accessibility import violations
+from tests.test_page import frames_to
 
 CHARTS = "#strips canvas + canvas"
 """The canvas with the cursor, which takes the pointer and has the values as its label."""
 INSET = (46, 8)
 """The space left and right of the curves in their column, in pixels."""
-WITH_TIMEOUT = ("--timeout", "600")
-"""The options of a mission that waits while browsers start."""
 DRAWN = """(canvas) => {
   const style = getComputedStyle(document.documentElement);
   const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
@@ -234,25 +246,28 @@ def test_a_mission_with_exact_sensors_says_that_it_has_no_sigma(opened: Open, ad
 
 
 @pytest.mark.long
-def test_the_charts_follow_a_mission_while_it_runs(opened: Open, tmp_path: Path) -> None:
-    scenario, recording = tmp_path / "paper-1.toml", tmp_path / "record"
-    scenario.write_text(PAPER_1)
-    with (
-        world(scenario, "--out", recording, *WITH_TIMEOUT) as (_, endpoint),
-        TandemProcess("agent", "a", "--connect", endpoint, "--out", recording, *WITH_TIMEOUT) as a,
-        watching(recording) as (_, of_journals),
-        watching("--connect", endpoint) as (_, of_network),
-    ):
-        a.until_answered("a", recording)
-        pages = [opened(of_journals), opened(of_network)]
-        for page in pages:
-            until_shown(page, 0)
-            page.keyboard.press("v")
-            expect(page.locator(CHARTS)).to_have_attribute("aria-label", re.compile(r"^Tick 0\."))
-        with TandemProcess("agent", "b", "--connect", endpoint, "--out", recording):
-            for page in pages:
-                expect(page.locator("#status")).to_have_text("localised after 48 ticks")
-                until_read(page, 48)
-                expect(page.locator(CHARTS)).to_have_attribute(
-                    "aria-label", re.compile("hypotheses: a 1, b 1")
-                )
+def test_the_charts_follow_a_mission_while_it_runs(opened: Open, noisy: Path, tmp_path: Path) -> None:
+    whole = {path.name: list(journal_file.read(path)) for path in noisy.glob("*.journal")}
+    written = dict.fromkeys(whole, 0)
+    with ExitStack() as stack:
+        growing = {name: stack.enter_context(Journal(tmp_path / name)) for name in whole}
+
+        def grow(tick: int) -> None:
+            """Write the journals up to the Commands of tick `tick`."""
+            for name in whole:
+                first = Command if name == WORLD_JOURNAL else Observation
+                goal = frames_to(noisy / name, tick + 1, first)
+                growing[name].write(*whole[name][written[name] : goal])
+                written[name] = goal
+
+        grow(16)
+        _, where = stack.enter_context(watching(tmp_path))
+        page = opened(where)
+        until_loaded(page)
+        page.keyboard.press("v")
+        for tick in (16, 19, 21):
+            grow(tick)
+            held = estimates(read(noisy), "a")[tick]
+            label = re.compile(f"^Tick {tick}. hypotheses: a {len(held.world)}, ")
+            expect(page.locator(CHARTS)).to_have_attribute("aria-label", label)
+            expect(page.locator("#status")).to_contain_text("running")

@@ -17,8 +17,8 @@ const TWO_COLUMNS = 760;
 /** The smallest visible number of ticks. */
 const FEWEST = 8;
 const LEAST_M = 1e-4;
-/** The shortest time between two readings while a mission runs, and the time after which a failed one is repeated. */
-const REFRESH_MS = 1000;
+/** The shortest time between two readings while a mission runs, and, next, the time after which a failed one is repeated. */
+const REFRESH_MS = 250;
 const RETRY_MS = 2000;
 /** The dashes of a line by role, so that two robots differ without colour. */
 const DASHES = { a: [], b: [5, 3] };
