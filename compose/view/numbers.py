@@ -18,9 +18,12 @@ class Numbers(msgspec.Struct, frozen=True):
     probability: float | UnsetType = UNSET
     """The probability of the first of them."""
     position_error_m: float | UnsetType = UNSET
-    """The distance of the first pose in the world frame from the true position."""
+    """The distance of the leading pose in the world frame from the true position.
+
+    If no pose is more probable than all others together, it is that of the farthest possible pose.
+    """
     position_bound_m: float | UnsetType = UNSET
-    """SIGMAS times the robot's standard deviation of that position."""
+    """SIGMAS times the robot's standard deviation of the first pose's position."""
     anchor_range_m: float | UnsetType = UNSET
     mutual_range_m: float | UnsetType = UNSET
 
@@ -29,16 +32,18 @@ class Numbers(msgspec.Struct, frozen=True):
         """Return the numbers of a robot's scene."""
         held = player.held
         hypotheses = held.world or held.local if held is not None else ()
-        first = held.world[0] if held is not None and held.world else None
-        covariance = held.covariance if first is not None and held is not None else None
+        world = held.world if held is not None else ()
+        covariance = held.covariance if world and held is not None else None
         ranges = [contact.range for contact in player.contacts if contact.range is not None]
         probability: float | UnsetType = UNSET
         if held is not None and hypotheses:
             probability = held.probability[0] if held.probability else 1.0 / len(hypotheses)
+        leads = probability is not UNSET and probability > 0.5
+        distances = [errors(pose, player.pose)[0] for pose in world] if player.pose is not None else []
         return Numbers(
             hypotheses=len(hypotheses) if held is not None else UNSET,
             probability=probability,
-            position_error_m=errors(first, player.pose)[0] if first and player.pose else UNSET,
+            position_error_m=(distances[0] if leads else max(distances)) if distances else UNSET,
             position_bound_m=SIGMAS * covariance.position_sigma if covariance is not None else UNSET,
             anchor_range_m=player.anchor_range if player.anchor_range is not None else UNSET,
             mutual_range_m=ranges[0] if ranges else UNSET,

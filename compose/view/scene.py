@@ -131,7 +131,7 @@ def scene(
     `reported` has the poses in <W> that attackers report of this tick.
     """
     false_poses = reported or {}
-    players = tuple([_player(one, now, false_poses.get(one.id)) for one in setup.robots])
+    players = tuple([player_of(one, now, false_poses.get(one.id)) for one in setup.robots])
     deliveries = tuple(passages(setup, before, now))
     return Scene(
         now.tick,
@@ -151,7 +151,8 @@ def _sent(report: PeerReport, size: int) -> Sent:
             return Sent(size)
 
 
-def _player(robot_setup: RobotSetup, now: TickData, reported: Pose | None) -> Player:
+def player_of(robot_setup: RobotSetup, now: TickData, reported: Pose | None = None) -> Player:
+    """Return the entry of one robot in the scene of the tick of `now`; `reported` as in `scene`."""
     robot = robot_setup.id
     pose, observation, sent = now.truth.get(robot), now.observations.get(robot), now.reports.get(robot)
     command, estimate = now.commands.get(robot), now.estimates.get(robot)

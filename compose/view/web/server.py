@@ -30,6 +30,7 @@ from compose.errors import UserError
 from compose.scenario.scenario_change import ScenarioChange
 from compose.scenario.toml_file import field_first
 from compose.view.recorded import scenes
+from compose.view.series import series
 from compose.view.web import estimate_page, sweep_page
 from compose.view.web.changed_missions import changed_text
 from compose.view.web.origin import refusal
@@ -166,6 +167,17 @@ class _Answers:
         shown = scenes(show.setup, show.known, first, last)
         return _json({"from": first, "to": last, "version": show.version, "scenes": shown})
 
+    async def series(self, request: Request) -> Response:
+        """Return the numbers of the robots named `robot`, of all without a name, over time."""
+        show = self._site.shows.get(request.path_params["name"])
+        if show is None or show.setup is None:
+            return _json({"error": "there is no such mission"}, 404)
+        first = min(_number(request, "from", 0), max(show.known.last, 0))
+        last = _number(request, "to", show.known.last)
+        robots = request.query_params.getlist("robot") or None
+        # A thread, because thousands of ticks take longer than the interval of the news.
+        return _json(await asyncio.to_thread(series, show.setup, show.known, first, last, robots))
+
     async def news(self, request: Request) -> Response:
         stream = _news(self._site, request.query_params.get("show"), _number(request, "since", 0))
         return StreamingResponse(stream, media_type="text/event-stream")
@@ -229,6 +241,7 @@ def application(site: Site) -> Starlette:
             Route("/api/shows/{name}/values", answers.values),
             Route("/api/shows/{name}/changed", answers.run_changed, methods=["POST"]),
             Route("/api/shows/{name}/changed.toml", answers.changed_file, methods=["POST"]),
+            Route("/api/shows/{name}/series", answers.series),
             Route("/api/shows/{name}/thumbnail", answers.thumbnail),
             Route("/api/news", answers.news),
             Mount("/page", StaticFiles(directory=PAGE)),

@@ -12,6 +12,7 @@ import msgspec
 
 from compose.errors import UserError
 from compose.view.recorded import scenes
+from compose.view.series import series
 from compose.view.web.site import of_folder
 
 PAGE = Path(__file__).parent / "page"
@@ -43,6 +44,7 @@ def standalone_page(folder: Path) -> StandalonePage:
         "list": site.listed(),
         "mission": show.mission,
         "scenes": scenes(show.setup, show.known),
+        "series": series(show.setup, show.known, show.mission["first"], show.mission["last"]),
     }
     return StandalonePage(_page(show.setup.name, msgspec.json.encode(recording).decode()), site.notes)
 

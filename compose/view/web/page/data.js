@@ -40,6 +40,13 @@ const answered = (answer) => answer.json().catch(() => ({ error: `the server ref
 /** True if the page has a server. */
 export const served = !recording;
 
+/** Returns the numbers of `robots` over time from tick `from` to `to`; a file has those of the whole mission. */
+export async function series(name, robots, from, to) {
+  if (recording) return { ...recording.series, robots: recording.series.robots.filter((one) => robots.includes(one.robot)) };
+  const fields = new URLSearchParams([["from", from], ["to", to], ...robots.map((robot) => ["robot", robot])]);
+  return asked(`/api/shows/${encodeURIComponent(name)}/series?${fields}`);
+}
+
 /** Calls `on_news` with the list of missions and the updates of `store`, and `on_lost` without a server. */
 export function listen(store, on_news, on_lost) {
   if (recording) {

@@ -5,6 +5,7 @@ import { estimate } from "./estimate.js";
 import { sweep } from "./sweep.js";
 import { Cards, make } from "./cards.js";
 import { Changes } from "./changes.js";
+import { Charts } from "./charts.js";
 import * as data from "./data.js";
 import { embedded, on_clock, pass_on, tell, tell_state } from "./embedding.js";
 import { needed, release_focus } from "./focus.js";
@@ -51,6 +52,7 @@ const tip = new Tip($("tip"));
 const predictions = new Predictions($("predictions"), plane);
 const timeline = new Timeline($("line"), $("bands"), $("scrub"), (tick) => go(tick));
 const sequence = new Sequence($("exchange"), $("sequence"), (tick) => go(tick));
+const charts = new Charts($("charts"), $("strips"), (tick) => go(tick), () => draw());
 const cards = new Cards($("robots"), $("roster"), toggle);
 const log = new Log($("log"), $("states"), $("radio"), (tick) => go(tick));
 log.onchange = () => draw();
@@ -170,6 +172,7 @@ function staged() {
   timeline.stage(store);
   log.stage(store);
   guide.stage(store);
+  charts.stage(store);
   plane.fitted = true;
   if (changes.open) change();
   draw();
@@ -297,6 +300,7 @@ function draw() {
     log.draw(view);
     timeline.draw(view, activities(store, view));
     sequence.draw(store, view);
+    charts.draw(store, view, guide.pair(view.focus));
     controls();
     text($("caption"), guide.text(view));
     const news = view.playing && view.guided ? null : announcer.text(store, view, now);
@@ -414,6 +418,7 @@ function pressed(event) {
     s: () => plane.shift(event.shiftKey ? -60 : 0, event.shiftKey ? 0 : -60),
     d: () => { $("exchange").open = !$("exchange").open; },
     e: () => (changes.open ? changes.close() : change()),
+    v: () => { $("charts").open = !$("charts").open; },
     "?": () => $("keys").showModal(),
   };
   const action = actions[event.key.length === 1 ? event.key.toLowerCase() : event.key];

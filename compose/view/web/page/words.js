@@ -65,6 +65,7 @@ export const KEYS = [
   ["F", "zoom to the whole scenario"],
   ["D", "show or hide the sequence diagram of the reports"],
   ["E", "change the scenario, and run it again"],
+  ["V", "show or hide the charts; in them, + − zoom in time and 0 shows all ticks"],
   ["?", "this help"],
 ];
 

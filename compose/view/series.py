@@ -1,0 +1,81 @@
+"""Series: the numbers of robots over time, with few enough points for a chart of a mission of any length."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+
+import msgspec
+from msgspec import UNSET
+
+from compose.recording.run_setup import RunSetup
+from compose.view.numbers import Numbers
+from compose.view.run_data import RunData
+from compose.view.scene import player_of
+
+MOST_BINS = 500
+"""The maximum number of bins of a series: with the minimum and the maximum of each, 1000 points."""
+
+
+class Curve(msgspec.Struct, frozen=True):
+    """One number of one robot in each bin of consecutive ticks; None where it is unknown in all of them."""
+
+    low: tuple[float | None, ...]
+    """The minimum in each bin."""
+    high: tuple[float | None, ...]
+    """The maximum in each bin."""
+
+
+class RobotSeries(msgspec.Struct, frozen=True):
+    """The numbers of one robot over time."""
+
+    robot: str
+    curves: dict[str, Curve]
+    """The curves by the names of the fields of `Numbers`; those that are unknown in all ticks are absent."""
+
+
+class Series(msgspec.Struct, frozen=True):
+    """The numbers of robots over time."""
+
+    first: int
+    """The first tick."""
+    last: int
+    """The last tick."""
+    step: int
+    """The number of ticks in a bin; the last bin may have fewer."""
+    exact: bool
+    """True if the sensors are exact; then there is no `position_bound_m`."""
+    robots: tuple[RobotSeries, ...]
+
+
+def series(
+    setup: RunSetup, known: RunData, first: int, last: int, robots: Collection[str] | None = None
+) -> Series:
+    """Return the series of `robots`, or of all if None, from tick `first` to tick `last`, inclusive."""
+    last = max(min(last, known.last), first)
+    step = -(-(last - first + 1) // MOST_BINS)
+    found = []
+    for one in setup.robots:
+        if robots is not None and one.id not in robots:
+            continue
+        bins: list[list[Numbers]] = []
+        for begin in range(first, last + 1, step):
+            data = [known.ticks.get(tick) for tick in range(begin, min(begin + step, last + 1))]
+            bins.append([Numbers.of(player_of(one, now)) for now in data if now is not None])
+        curves = {name: _curve(name, bins) for name in Numbers.__struct_fields__}
+        found.append(
+            RobotSeries(
+                one.id,
+                {name: curve for name, curve in curves.items() if any(low is not None for low in curve.low)},
+            )
+        )
+    return Series(first, last, step, setup.mission.noise.exact, tuple(found))
+
+
+def _curve(name: str, bins: Iterable[Sequence[Numbers]]) -> Curve:
+    low: list[float | None] = []
+    high: list[float | None] = []
+    for numbers in bins:
+        values = [value for one in numbers if (value := getattr(one, name)) is not UNSET]
+        low.append(min(values, default=None))
+        high.append(max(values, default=None))
+    return Curve(tuple(low), tuple(high))

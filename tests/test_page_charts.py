@@ -1,0 +1,273 @@
+"""The charts of the page, and the series that they draw."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from compose.launch import in_process
+from compose.recording.recording_files import WORLD_JOURNAL
+from compose.recording.run import Run, read
+from compose.scenario.scenario_file import load
+from compose.view import series as series_module
+from compose.view.recorded import run_data
+from compose.view.series import MOST_BINS, Curve, Series, series
+from protocol.journal import journal_file
+from protocol.journal.journal_file import Journal
+from protocol.messages import Command, Estimate, Observation
+from tests.browser import (
+    BOUND_MS,
+    Open,
+    chromium_only,
+    scrub_to,
+    shot,
+    until_loaded,
+    until_shown,
+    watching,
+)
+from tests.commands import tandem
+from tests.series import series as cases
+from tests.test_accessibility import violations
+from tests.test_page import frames_to
+
+CHARTS = "#strips canvas + canvas"
+"""The canvas with the cursor, which takes the pointer and has the values as its label."""
+INSET = (46, 8)
+"""The space left and right of the curves in their column, in pixels."""
+DRAWN = """(canvas) => {
+  const style = getComputedStyle(document.documentElement);
+  const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
+  return ['robot-a', 'robot-b', 'link'].map((name) => {
+    const hex = style.getPropertyValue('--' + name).trim();
+    const hue = [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16));
+    let count = 0;
+    for (let i = 0; i < data.length; i += 4) {
+      if (hue.every((part, k) => Math.abs(data[i + k] - part) < 12)) count += 1;
+    }
+    return count;
+  });
+}"""
+"""Returns the number of pixels in the hues of a and b, and of ranges between them."""
+
+
+@pytest.fixture(scope="module")
+def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the recording of noisy, which tests must not change."""
+    folder = tmp_path_factory.mktemp("recorded") / "noisy"
+    folder.mkdir()
+    in_process.run_mission(load("noisy"), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def served(noisy: Path) -> Iterator[str]:
+    """Yield the address of the page on the recording of noisy."""
+    with watching(noisy) as (_, found):
+        yield found
+
+
+def series_of(run: Run) -> Series:
+    """Return the series of all ticks and robots of a run."""
+    assert run.setup is not None
+    return series(run.setup, run_data(run), 0, run.length - 1)
+
+
+def estimates(run: Run, robot: str) -> dict[int, Estimate]:
+    """Return the estimates in the journal of `robot`, by tick."""
+    messages = run.journals[f"agent-{robot}.journal"].messages
+    return {one.tick: one for one in messages if isinstance(one, Estimate)}
+
+
+# --- the series -------------------------------------------------------------------------------------
+
+
+def test_the_values_of_a_series_are_those_of_the_run(noisy: Path) -> None:
+    run = read(noisy)
+    found = series_of(run)
+    assert (found.first, found.last, found.step, found.exact) == (0, run.length - 1, 1, False)
+    assert tuple([one.robot for one in found.robots]) == run.robots
+    for of_robot in found.robots:
+        held, truth, curves = estimates(run, of_robot.robot), run.truth(of_robot.robot), of_robot.curves
+        for tick in range(run.length):
+            at = {name: curve.low[tick] for name, curve in curves.items()}
+            assert at == {name: curve.high[tick] for name, curve in curves.items()}
+            observation, contact = run.observations[tick][of_robot.robot], run.contact(of_robot.robot, tick)
+            assert at["anchor_range_m"] == observation.anchor_range
+            assert at["mutual_range_m"] == (contact.range if contact is not None else None)
+            one = held[tick]
+            assert at["hypotheses"] == len(one.world or one.local)
+            if one.world:
+                assert one.covariance is not None
+                off = [math.hypot(pose.x - truth[tick].x, pose.y - truth[tick].y) for pose in one.world]
+                error = off[0] if one.probabilities[0] > 0.5 else max(off)
+                assert at["position_error_m"] == pytest.approx(error, abs=1e-12)
+                assert at["position_bound_m"] == 3.0 * one.covariance.position_sigma
+                assert at["probability"] == one.probabilities[0]
+            else:
+                assert at["position_error_m"] is at["position_bound_m"] is None
+
+
+def test_no_peak_is_lost_in_a_series_of_few_bins(noisy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = series_of(read(noisy))
+    monkeypatch.setattr(series_module, "MOST_BINS", 5)
+    coarse = series_of(read(noisy))
+    assert coarse.step == math.ceil((whole.last + 1) / 5)
+    for fine, of_robot in zip(whole.robots, coarse.robots, strict=True):
+        assert fine.curves.keys() == of_robot.curves.keys()
+        for name, curve in of_robot.curves.items():
+            assert len(curve.low) <= 5
+            for i, (low, high) in enumerate(zip(curve.low, curve.high, strict=True)):
+                values = known(fine.curves[name], i * coarse.step, coarse.step)
+                assert (low, high) == (min(values, default=None), max(values, default=None))
+
+
+def known(curve: Curve, first: int, count: int) -> list[float]:
+    """Return the known values of a curve with one tick in each bin."""
+    return [value for value in curve.low[first : first + count] if value is not None]
+
+
+def test_a_series_has_at_most_1000_points_and_keeps_within_the_run(paper_1: Path) -> None:
+    run = read(paper_1)
+    assert run.setup is not None
+    assert MOST_BINS <= 500
+    beyond = series(run.setup, run_data(run), 40, 10**9, ["b"])
+    assert (beyond.first, beyond.last, beyond.exact) == (40, run.length - 1, True)
+    assert [one.robot for one in beyond.robots] == ["b"]
+    assert "position_bound_m" not in beyond.robots[0].curves
+    errors = beyond.robots[0].curves["position_error_m"].high
+    largest = max(error for error in errors if error is not None)
+    assert largest > 1.0, "of equally probable poses, the error is that of the farthest"
+    assert errors[-1] == pytest.approx(0.0, abs=1e-6)
+
+
+# --- the page ---------------------------------------------------------------------------------------
+
+
+def at_tick(page: Page, tick: int, first: float, last: float) -> tuple[float, float]:
+    """Return the place of `tick` in the first strip, which shows the ticks `first` to `last`."""
+    box = page.locator(CHARTS).bounding_box()
+    assert box is not None
+    width = box["width"] / 2 - sum(INSET)
+    return INSET[0] + width * (tick - first) / (last - first), 40.0
+
+
+def until_read(page: Page, tick: int) -> None:
+    """Wait until the charts have the numbers of `tick`."""
+    expect(page.locator(CHARTS)).to_have_attribute("aria-label", re.compile(f"^Tick {tick}. hypotheses"))
+
+
+def test_a_click_in_the_charts_goes_to_the_tick_whose_values_it_shows(
+    opened: Open, served: str, noisy: Path
+) -> None:
+    run = read(noisy)
+    last = run.length - 1
+    page = opened(f"{served}#tick=3")
+    until_shown(page, 3)
+    charts = page.locator(CHARTS)
+    expect(charts).to_be_hidden()
+    page.keyboard.press("v")
+    until_read(page, 3)
+    assert min(page.locator("#strips canvas").first.evaluate(DRAWN)) > 100
+    x, y = at_tick(page, 20, 0, last)
+    charts.click(position={"x": x, "y": y})
+    until_shown(page, 20)
+    one, truth = estimates(run, "a")[20], run.truth("a")[20]
+    error = math.hypot(one.world[0].x - truth.x, one.world[0].y - truth.y)
+    assert one.covariance is not None
+    expect(charts).to_have_attribute(
+        "aria-label",
+        re.compile(f"a {error:.2f} m, a 3 sigma {3.0 * one.covariance.position_sigma:.2f} m"),
+    )
+    page.locator("#truth").uncheck()
+    expect(charts).to_have_attribute(
+        "aria-label", re.compile(r"error / 3 sigma: a 3 sigma \d\S+ m, b 3 sigma")
+    )
+    charts.focus()
+    for _ in range(3):
+        page.keyboard.press("+")  # to 8 ticks, the fewest; tick 20 stays where it is
+    first = 20.0 - 8.0 * 20.0 / last
+    x, y = at_tick(page, 16, first, first + 8.0)
+    charts.click(position={"x": x, "y": y})
+    until_shown(page, 16)
+    page.get_by_role("button", name="Show all ticks in the charts").click()
+    x, y = at_tick(page, 5, 0, last)
+    charts.click(position={"x": x, "y": y})
+    until_shown(page, 5)
+    shot(page, "charts")
+
+
+@pytest.mark.parametrize("look", cases([(False, 1280, 720), (True, 800, 600), (False, 390, 844)]), ids=str)
+def test_open_charts_break_no_rule_of_accessibility(
+    opened: Open, served: str, look: tuple[bool, int, int]
+) -> None:
+    dark, width, height = look
+    page = opened(served, dark=dark, width=width, height=height)
+    scrub_to(page, 20)
+    page.locator("#charts summary").click()
+    until_read(page, 20)
+    assert not violations(page)
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    shot(page, f"charts-{width}")
+
+
+@chromium_only
+@pytest.mark.long
+def test_the_page_in_one_file_has_the_charts(browser: Browser, noisy: Path, tmp_path: Path) -> None:
+    assert tandem("export", noisy, "--html", "--out", tmp_path).status == 0
+    kept = (tmp_path / "run.html").read_text("utf-8").split('id="recording">')[1].split("</script>")[0]
+    curves = json.loads(kept)["series"]["robots"][0]["curves"]
+    assert curves["hypotheses"]["low"][20] == len(estimates(read(noisy), "a")[20].world)
+    page = browser.new_page()
+    page.set_default_timeout(BOUND_MS)
+    page.goto(f"{(tmp_path / 'run.html').as_uri()}#tick=20")
+    until_shown(page, 20)
+    page.keyboard.press("v")
+    until_read(page, 20)
+    page.close()
+
+
+@pytest.mark.long
+def test_a_mission_with_exact_sensors_says_that_it_has_no_sigma(opened: Open, address: str) -> None:
+    page = opened(f"{address}#tick=47")
+    until_shown(page, 47)
+    page.keyboard.press("v")
+    until_read(page, 47)
+    expect(page.locator(CHARTS)).to_have_attribute(
+        "aria-label", re.compile(r"a 25 %, b 25 %\. error / 3 sigma: a 9\.03 m")
+    )
+    expect(page.locator(CHARTS)).not_to_have_attribute("aria-label", re.compile(r"sigma \d"))
+
+
+@pytest.mark.long
+def test_the_charts_follow_a_mission_while_it_runs(opened: Open, noisy: Path, tmp_path: Path) -> None:
+    whole = {path.name: list(journal_file.read(path)) for path in noisy.glob("*.journal")}
+    written = dict.fromkeys(whole, 0)
+    with ExitStack() as stack:
+        growing = {name: stack.enter_context(Journal(tmp_path / name)) for name in whole}
+
+        def grow(tick: int) -> None:
+            """Write the journals up to the Commands of tick `tick`."""
+            for name in whole:
+                first = Command if name == WORLD_JOURNAL else Observation
+                goal = frames_to(noisy / name, tick + 1, first)
+                growing[name].write(*whole[name][written[name] : goal])
+                written[name] = goal
+
+        grow(16)
+        _, where = stack.enter_context(watching(tmp_path))
+        page = opened(where)
+        until_loaded(page)
+        page.keyboard.press("v")
+        for tick in (16, 19, 21):
+            grow(tick)
+            held = estimates(read(noisy), "a")[tick]
+            label = re.compile(f"^Tick {tick}. hypotheses: a {len(held.world)}, ")
+            expect(page.locator(CHARTS)).to_have_attribute("aria-label", label)
+            expect(page.locator("#status")).to_contain_text("running")
