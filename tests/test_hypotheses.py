@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from agent.estimation import closed_forms
 from agent.estimation.closed_forms import Placement, same_placement
 from agent.estimation.gaussian import hypotheses, inference
+from agent.estimation.gaussian.evidence import anchor_evidence
 from agent.estimation.gaussian.fitted_poses import poses
 from agent.estimation.gaussian.hypotheses import (
     ScoredHypothesis,
     _alone,
-    anchor_evidence,
     follow,
     missing,
     no_detection_log_likelihood,

@@ -65,6 +65,14 @@ class Fit(NamedTuple):
         """The paths of the linear model."""
         return self.problem.paths(self.linear, self.row)
 
+    @property
+    def log_volume(self) -> float:
+        """Twice the logarithm of the posterior's volume in the unknowns, up to a constant.
+
+        It counts how many guesses share the likelihood of the best one.
+        """
+        return -float(np.linalg.slogdet(self.information)[1])
+
     def __hash__(self) -> int:
         """Return the hash of this object."""
         return id(self)

@@ -12,15 +12,10 @@ from msgspec.structs import replace
 
 from agent.estimation.exact import Branch
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, Inconsistency, consistency_test
+from agent.estimation.gaussian.evidence import anchor_evidence, mutual_evidence
 from agent.estimation.gaussian.fitted import Fit
 from agent.estimation.gaussian.fitted_poses import deviation, poses
-from agent.estimation.gaussian.hypotheses import (
-    ScoredHypothesis,
-    anchor_evidence,
-    missing,
-    mutual_evidence,
-    of_anchor,
-)
+from agent.estimation.gaussian.hypotheses import ScoredHypothesis, missing, of_anchor
 from agent.estimation.gaussian.odometry_noise import Array, Track, track
 from agent.estimation.gaussian.own_sensors import DOUBTFUL_CLAIMS, Doubt, claim_doubt, doubt
 from agent.estimation.gaussian.placement_guesses import STARTS

@@ -35,11 +35,12 @@ def expected_rate(weights: Array, noise: Noise) -> Array:
 def log_likelihood(strays: int, inliers: int, noise: Noise) -> float:
     """Return the log-likelihood of which ranges are strays, with their rate integrated out."""
     told = (WORTH * noise.strays, WORTH * (1.0 - noise.strays))
-    return _log_beta(told[0] + strays, told[1] + inliers) - _log_beta(*told)
+    return log_beta(told[0] + strays, told[1] + inliers) - log_beta(*told)
 
 
-def _log_beta(a: float, b: float) -> float:
-    return math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)
+def log_beta(a: float, b: float) -> float:
+    """Return the logarithm of the beta function."""
+    return -(math.lgamma(a + b) - math.lgamma(a) - math.lgamma(b))
 
 
 def log_gain(strays: int, inliers: int, noise: Noise) -> float:
