@@ -55,10 +55,21 @@ def opened(browser: Browser) -> Iterator[Open]:
 @pytest.fixture(scope="module")
 def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the recording of paper-1, which tests must not change."""
-    folder = tmp_path_factory.mktemp("recorded") / "paper-1"
-    folder.mkdir()
-    in_process.run_mission(load("paper-1"), folder)
-    return folder
+    return recorded("paper-1", tmp_path_factory.mktemp("recorded"))
+
+
+@pytest.fixture(scope="module")
+def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the recording of noisy, which tests must not change."""
+    return recorded("noisy", tmp_path_factory.mktemp("recorded"))
+
+
+def recorded(name: str, folder: Path) -> Path:
+    """Return the recording of the shipped scenario `name`, in a new folder in `folder`."""
+    out = folder / name
+    out.mkdir()
+    in_process.run_mission(load(name), out)
+    return out
 
 
 @pytest.fixture(scope="module")

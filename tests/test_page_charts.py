@@ -12,10 +12,8 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from compose.launch import in_process
 from compose.recording.recording_files import WORLD_JOURNAL
 from compose.recording.run import Run, read
-from compose.scenario.scenario_file import load
 from compose.view import series as series_module
 from compose.view.recorded import run_data
 from compose.view.series import MOST_BINS, Curve, Series, series
@@ -55,15 +53,6 @@ DRAWN = """(canvas) => {
   });
 }"""
 """Returns the number of pixels in the hues of a and b, and of ranges between them."""
-
-
-@pytest.fixture(scope="module")
-def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the recording of noisy, which tests must not change."""
-    folder = tmp_path_factory.mktemp("recorded") / "noisy"
-    folder.mkdir()
-    in_process.run_mission(load("noisy"), folder)
-    return folder
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from playwright.sync_api import Page, Route, expect
 
 from compose.errors import UserError
 from compose.launch import in_process
-from compose.scenario.scenario_change import changed_table, values_of
+from compose.scenario.scenario_change import changed, values_of
 from compose.scenario.scenario_file import load, parse
 from compose.view.web.changed_missions import MOST_TICKS
 from tests.browser import Open, shot, until_loaded
@@ -28,8 +28,8 @@ def posted(address: str, change: object, what: str = "changed", origin: str | No
     """Return the answer to the request that the page sends; its text if it is no JSON."""
     body = change if isinstance(change, bytes) else json.dumps(change).encode()
     heads = {"Origin": origin or address.rstrip("/"), "Content-Type": "application/json"}
-    request = Request(f"{address}api/shows/paper-1/{what}", body, heads)  # loopback
-    with urlopen(request, timeout=60) as answer:  # loopback
+    request = Request(f"{address}api/shows/paper-1/{what}", body, heads)
+    with urlopen(request, timeout=60) as answer:
         text = answer.read().decode()
     return text if what.endswith("toml") else json.loads(text)
 
@@ -45,7 +45,8 @@ def moved_a(x: float, y: float) -> dict[str, Any]:
 
 
 def fetched(address: str, path: str) -> Any:
-    with urlopen(f"{address}api/{path}", timeout=60) as answer:  # loopback
+    """Return the server's answer at `path`."""
+    with urlopen(f"{address}api/{path}", timeout=60) as answer:
         return json.load(answer)
 
 
@@ -98,9 +99,9 @@ def test_only_the_page_of_the_server_changes_a_mission(address: str) -> None:
         with pytest.raises(HTTPError, match="403"):
             posted(address, values(), origin=origin)
     for heads in ({"Content-Type": "application/json"}, {"Origin": address.rstrip("/")}):
-        request = Request(f"{address}api/shows/paper-1/changed", b"{}", heads)  # loopback
+        request = Request(f"{address}api/shows/paper-1/changed", b"{}", heads)
         with pytest.raises(HTTPError, match=r"403|415"):
-            urlopen(request, timeout=60)  # loopback
+            urlopen(request, timeout=60)
 
 
 FAULTS = ("a->b: loss=0.3, delay=0..3", "loss=0.1", "delay=2, ticks=3..9")
@@ -130,7 +131,7 @@ start = [11.0, 0.0, 100.0]
     "scenario", [load("paper-1", faults=FAULTS), load("noisy"), parse(EVERYTHING, "everything")]
 )
 def test_without_a_change_the_file_describes_the_same_scenario(scenario: Scenario) -> None:
-    table = changed_table(scenario, values_of(scenario), MOST_TICKS)
+    table = changed(scenario, values_of(scenario), MOST_TICKS).table
     again = parse(json_as_toml(table), "saved")
     assert replace(again, name=scenario.name) == scenario
 
@@ -142,7 +143,7 @@ def json_as_toml(table: dict[str, Any]) -> str:
 def test_sigma_is_that_of_all_ranges_and_zero_is_exact() -> None:
     noisy = load("noisy")
     found = [
-        parse(json_as_toml(changed_table(noisy, replace(values_of(noisy), sigma=sigma), MOST_TICKS)), "saved")
+        parse(json_as_toml(changed(noisy, replace(values_of(noisy), sigma=sigma), MOST_TICKS).table), "saved")
         for sigma in (0.02, 0.0)
     ]
     noise = found[0].mission.noise
@@ -155,7 +156,7 @@ def test_a_planner_that_is_not_shipped_is_not_run_again() -> None:
     with pytest.raises(
         UserError, match=r"^it uses os:system, and only planners and models of Tandem are run"
     ):
-        changed_table(scenario, values_of(scenario), MOST_TICKS)
+        changed(scenario, values_of(scenario), MOST_TICKS)
 
 
 # --- in a browser ---------------------------------------------------------------------------------------
@@ -230,20 +231,25 @@ def test_the_form_works_from_the_keyboard_and_saves_the_scenario(opened: Open, a
     expect(page.locator("#changes")).to_be_hidden()
 
 
-def test_what_the_server_refuses_is_said_beside_the_buttons(opened: Open, address: str) -> None:
+def test_an_empty_field_and_what_the_server_refuses_run_nothing(opened: Open, address: str) -> None:
     page = opened_form(opened, address)
+    sent = []
 
     def refuse(route: Route) -> None:
         """Answer as the server does, but with a status that browsers do not log."""
+        sent.append(json.loads(route.request.post_data or ""))
         with pytest.raises(HTTPError) as refused:
-            posted(address, json.loads(route.request.post_data or ""))
+            posted(address, sent[-1])
         route.fulfill(status=200, content_type="application/json", body=refused.value.read())
 
     page.route(re.compile("/changed$"), refuse)
-    page.get_by_label("start x", exact=True).fill("5")
-    page.keyboard.press("Enter")
+    field = page.get_by_label("start x", exact=True)
+    for empty_or_not in ("", "5"):
+        field.fill(empty_or_not)
+        field.press("Enter")
     expect(page.get_by_role("alert")).to_contain_text("robot[0].start: 'a' is")
     expect(page.locator("#title")).to_have_text("paper-1")
+    assert [one["robots"]["a"]["x"] for one in sent] == [5.0]
 
 
 @pytest.mark.long

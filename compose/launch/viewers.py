@@ -75,12 +75,12 @@ def stay(viewers: Sequence[Viewer], inbox: Inbox) -> bool:
     """
     for viewer in viewers:
         viewer.conclude()
-    failed: dict[Viewer, str] = {}
+    failed: set[Viewer] = set()
     with suppress(Interrupted):
         while True:
             for viewer in viewers:
                 if viewer not in failed and (failure := viewer.failure) is not None:
-                    failed[viewer] = failure
+                    failed.add(viewer)
                     inbox.say(failure)
             if not any(viewer.running for viewer in viewers):
                 break

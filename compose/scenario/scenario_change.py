@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 from msgspec.structs import fields, replace
@@ -10,6 +10,7 @@ from msgspec.structs import fields, replace
 from compose.errors import BadScenario, UserError
 from compose.launch import planner_loader
 from compose.scenario.scenario_file import validate
+from compose.scenario.scenario_tables import LONGEST_NAME
 from protocol.noise import Noise
 from protocol.spelling import did_you_mean
 from protocol.units import Finite, RobotId
@@ -20,11 +21,9 @@ from world.scenario import Scenario
 from world.world_noise import WorldNoise
 
 SOURCE = "the changed scenario"
-"""The name of the changed scenario in error messages, which `refusal_text` removes."""
+"""The name of the changed scenario in error messages; those of `changed` leave it out."""
 SUFFIX = "-changed"
 """The end of the name of a changed scenario."""
-LONGEST_NAME = 48
-"""The maximum number of characters of the name of a scenario."""
 
 
 class RobotChange(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -55,6 +54,14 @@ class ScenarioChange(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The probability that a report is lost, on all links."""
 
 
+class ChangedScenario(NamedTuple):
+    """A scenario with other values."""
+
+    table: dict[str, Any]
+    """The content of its scenario file."""
+    scenario: Scenario
+
+
 def values_of(scenario: Scenario) -> ScenarioChange:
     """Return the values that `scenario` has. Sigma is the larger one of ranges to anchors and to robots."""
     noise = scenario.mission.noise
@@ -83,8 +90,8 @@ def require_shipped(scenario: Scenario) -> None:
         raise UserError(f"it uses {foreign[0]}, and only planners and models of Tandem are run again here")
 
 
-def changed_table(scenario: Scenario, change: ScenarioChange, most_ticks: int) -> dict[str, Any]:
-    """Return the content of the scenario file of `scenario` with the values of `change`.
+def changed(scenario: Scenario, change: ScenarioChange, most_ticks: int) -> ChangedScenario:
+    """Return `scenario` with the values of `change`.
 
     Its last tick is computed again if that of `scenario` follows from the mission, and is at most
     `most_ticks`. Raises UserError if a value is refused, as one of a file is, and like `require_shipped`.
@@ -108,7 +115,8 @@ def changed_table(scenario: Scenario, change: ScenarioChange, most_ticks: int) -
         raise UserError(str(error).removeprefix(f"{SOURCE}: ")) from None
     if found.max_ticks > most_ticks:
         table["max_ticks"] = most_ticks
-    return table
+        found = replace(found, max_ticks=most_ticks)
+    return ChangedScenario(table, found)
 
 
 def _with_values(scenario: Scenario, before: ScenarioChange, change: ScenarioChange) -> Scenario:

@@ -62,10 +62,14 @@ class RobotTable(_Table, frozen=True):
     """False data injection: the falsification of the reports that this robot sends to its peer."""
 
 
+LONGEST_NAME = 48
+"""The maximum number of characters of the name of a scenario."""
+
+
 class ScenarioFile(_Table, frozen=True):
     """The content of a scenario file."""
 
-    name: Annotated[str, Meta(pattern=NAME, max_length=48)]
+    name: Annotated[str, Meta(pattern=NAME, max_length=LONGEST_NAME)]
     """The name of the scenario, and the beginning of the names of its runs."""
     mission: Mission
     """The `[mission]` table."""

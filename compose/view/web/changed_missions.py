@@ -13,14 +13,7 @@ from pathlib import Path
 
 from compose.errors import UserError
 from compose.extras import need
-from compose.scenario.scenario_change import (
-    SOURCE,
-    ScenarioChange,
-    changed_table,
-    require_shipped,
-    values_of,
-)
-from compose.scenario.scenario_file import validate
+from compose.scenario.scenario_change import ScenarioChange, changed, require_shipped, values_of
 from compose.view.web.sources import Recorded, WatchedRun
 from protocol.journal.journal_file import Journal, Sink
 from world.scenario import Scenario
@@ -59,8 +52,7 @@ class ChangedMissions:
         """
         from compose.launch.in_process import journals, played  # noqa: PLC0415  # imports numpy
 
-        table = changed_table(scenario_of(show), change, MOST_TICKS)
-        scenario = validate(table, SOURCE).seeded(None)
+        scenario = changed(scenario_of(show), change, MOST_TICKS).scenario
         if self._folder is None:
             self._folder = tempfile.TemporaryDirectory(prefix="tandem-")
         out = Path(tempfile.mkdtemp(dir=self._folder.name))
@@ -136,6 +128,6 @@ def changed_text(show: WatchedRun, change: ScenarioChange) -> str:
     import tomli_w  # noqa: PLC0415  # the library is optional
 
     scenario = scenario_of(show)
-    text = tomli_w.dumps(changed_table(scenario, change, MOST_TICKS))
+    text = tomli_w.dumps(changed(scenario, change, MOST_TICKS).table)
     text = _ARRAY.sub(lambda found: f"[{', '.join(found[1].replace(',', ' ').split())}]", text)
     return f"# {scenario.name}, changed on the page of `tandem watch`.\n{text}"

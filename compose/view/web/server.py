@@ -27,6 +27,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from compose.errors import UserError
+from compose.recording.run_setup import RunSetup
 from compose.scenario.scenario_change import ScenarioChange
 from compose.scenario.toml_file import field_first
 from compose.view.recorded import scenes
@@ -136,47 +137,45 @@ class _Answers:
         site.changed.add(found, site.shows)
         return _json({"show": found.name})
 
+    def _show(self, request: Request) -> tuple[WatchedRun, RunSetup]:
+        """Return the run that a request is about, and its static data. Raises _Refused."""
+        show = self._site.shows.get(request.path_params["name"])
+        if show is None or show.setup is None:
+            raise _Refused(404, "there is no such mission")
+        return show, show.setup
+
     def _changeable(self, request: Request) -> WatchedRun:
         """Return the mission that a request is about. Raises _Refused if its values cannot be changed."""
-        show = self._site.shows.get(request.path_params["name"])
-        if show is None or self._site.compared:
-            raise _Refused(404, "there is no such mission, or it is shown side by side with another")
+        show, _ = self._show(request)
+        if self._site.compared:
+            raise _Refused(404, "the mission is shown side by side with another")
         if request.client is None or not ipaddress.ip_address(request.client.host).is_loopback:
             raise _Refused(403, "missions are run again for browsers on the server's machine only")
         return show
 
     async def show(self, request: Request) -> Response:
-        show = self._site.shows.get(request.path_params["name"])
-        if show is None:
-            return _json({"error": "there is no such mission"}, 404)
-        return _json(show.mission)
+        return _json(self._show(request)[0].mission)
 
     async def thumbnail(self, request: Request) -> Response:
-        show = self._site.shows.get(request.path_params["name"])
-        if show is None or show.setup is None:
-            return _json({"error": "there is no such mission"}, 404)
-        return Response(thumbnail(show.setup, show.known), media_type="image/svg+xml")
+        show, setup = self._show(request)
+        return Response(thumbnail(setup, show.known), media_type="image/svg+xml")
 
     async def scenes(self, request: Request) -> Response:
-        show = self._site.shows.get(request.path_params["name"])
-        if show is None or show.setup is None:
-            return _json({"error": "there is no such mission"}, 404)
+        show, setup = self._show(request)
         first = _number(request, "from", 0)
-        most = max(1, PLAYERS_AT_ONCE // len(show.setup.robots))
+        most = max(1, PLAYERS_AT_ONCE // len(setup.robots))
         last = min(_number(request, "to", show.known.last), first + most - 1, show.known.last)
-        shown = scenes(show.setup, show.known, first, last)
+        shown = scenes(setup, show.known, first, last)
         return _json({"from": first, "to": last, "version": show.version, "scenes": shown})
 
     async def series(self, request: Request) -> Response:
         """Return the numbers of the robots named `robot`, of all without a name, over time."""
-        show = self._site.shows.get(request.path_params["name"])
-        if show is None or show.setup is None:
-            return _json({"error": "there is no such mission"}, 404)
+        show, setup = self._show(request)
         first = min(_number(request, "from", 0), max(show.known.last, 0))
         last = _number(request, "to", show.known.last)
         robots = request.query_params.getlist("robot") or None
         # A thread, because thousands of ticks take longer than the interval of the news.
-        return _json(await asyncio.to_thread(series, show.setup, show.known, first, last, robots))
+        return _json(await asyncio.to_thread(series, setup, show.known, first, last, robots))
 
     async def news(self, request: Request) -> Response:
         stream = _news(self._site, request.query_params.get("show"), _number(request, "since", 0))

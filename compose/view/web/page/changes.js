@@ -28,9 +28,8 @@ export class Changes {
     this.common = COMMON.map(([name, label]) => slider(numbers[0], name, label, (value) => this.#set(name, value)));
     this.own = OWN.map(([name, label]) => number(numbers[1], label, (value) => this.#set_own(name, value)));
     this.robot.addEventListener("change", () => this.#fill());
-    const actions = { run: () => {}, save: () => this.#save(), reset: () => this.#reset(), close: () => this.close() };
-    for (const button of section.querySelectorAll("button")) button.addEventListener("click", actions[button.name]);
-    section.noValidate = true; // the server says what is wrong, in one line
+    const actions = { save: () => this.#save(), reset: () => this.#reset(), close: () => this.close() };
+    for (const button of section.querySelectorAll("button[type=button]")) button.addEventListener("click", actions[button.name]);
     section.addEventListener("submit", (event) => {
       event.preventDefault();
       this.#run();
@@ -50,7 +49,7 @@ export class Changes {
   async stage(store) {
     this.section.hidden = false;
     this.section.scrollIntoView({ block: "nearest" });
-    Object.assign(this, { values: null });
+    this.values = null;
     this.#name = store.name;
     this.#title = store.stage.name;
     this.#say("");
@@ -107,6 +106,7 @@ export class Changes {
   // --- running and saving ---
 
   async #asked(what) {
+    if (!this.section.reportValidity()) return null; // a field is empty
     const name = this.#name;
     this.#running = true;
     this.#say("");
@@ -192,12 +192,11 @@ export class Changes {
   }
 }
 
-/** Adds a labelled number field to `list`, and returns a function that shows a value in it. */
+/** Adds a labelled number field to `list`; returns the field, and a function that shows a value in it. */
 function number(list, label, changed) {
   const input = make("input", { type: "number", step: "any", required: true });
-  list.append(make("dt", {}, make("label", {}, label)), make("dd", {}, input));
   input.id = `change-${label.replaceAll(" ", "-")}`;
-  list.lastChild.previousSibling.firstChild.htmlFor = input.id;
+  list.append(make("dt", {}, make("label", { htmlFor: input.id }, label)), make("dd", {}, input));
   input.addEventListener("input", () => { if (input.checkValidity()) changed(input.valueAsNumber); });
   const show = (value) => { if (input.valueAsNumber !== value && document.activeElement !== input) input.value = value; };
   return { input, show };

@@ -3,6 +3,8 @@
 const kept = document.getElementById("recording");
 const recording = kept && JSON.parse(kept.textContent);
 
+const of = (name) => `/api/shows/${encodeURIComponent(name)}`;
+
 async function asked(path) {
   const answer = await fetch(path);
   return answer.ok ? answer.json() : null;
@@ -10,13 +12,13 @@ async function asked(path) {
 
 /** Returns the static data and the state of a mission; null if there is none of that name. */
 export async function mission(name) {
-  return recording ? recording.mission : asked(`/api/shows/${encodeURIComponent(name)}`);
+  return recording ? recording.mission : asked(of(name));
 }
 
 /** Returns the scenes of the ticks from `from` to `to`, or of those of them that fit in one answer. */
 export async function scenes(name, from, to) {
   if (recording) return { from: 0, to: recording.mission.last, scenes: recording.scenes };
-  return asked(`/api/shows/${encodeURIComponent(name)}/scenes?from=${from}&to=${to}`);
+  return asked(`${of(name)}/scenes?from=${from}&to=${to}`);
 }
 
 /** Returns the values of a mission that can be changed, or { error }. */
@@ -31,8 +33,6 @@ export async function changed_file(name, changed) {
   return answer.ok ? { text: await answer.text() } : answered(answer);
 }
 
-const of = (name) => `/api/shows/${encodeURIComponent(name)}`;
-
 const posted = (path, value) => fetch(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(value) });
 
 const answered = (answer) => answer.json().catch(() => ({ error: `the server refuses: ${answer.status} ${answer.statusText}` }));
@@ -44,7 +44,7 @@ export const served = !recording;
 export async function series(name, robots, from, to) {
   if (recording) return { ...recording.series, robots: recording.series.robots.filter((one) => robots.includes(one.robot)) };
   const fields = new URLSearchParams([["from", from], ["to", to], ...robots.map((robot) => ["robot", robot])]);
-  return asked(`/api/shows/${encodeURIComponent(name)}/series?${fields}`);
+  return asked(`${of(name)}/series?${fields}`);
 }
 
 /** Calls `on_news` with the list of missions and the updates of `store`, and `on_lost` without a server. */

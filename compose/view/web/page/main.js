@@ -174,7 +174,7 @@ function staged() {
   guide.stage(store);
   charts.stage(store);
   plane.fitted = true;
-  if (changes.open) change();
+  if (changes.open) change(true);
   draw();
 }
 
@@ -386,9 +386,9 @@ function show_truth(on) {
   draw();
 }
 
-/** Opens the form that changes the scenario. */
-function change() {
-  if (!changeable()) return changes.close();
+/** Opens the form that changes the scenario, or closes it. */
+function change(on = !changes.open) {
+  if (!on || !changeable()) return void changes.close();
   view.playing = false;
   changes.stage(store);
 }
@@ -417,7 +417,7 @@ function pressed(event) {
     w: () => plane.shift(event.shiftKey ? 60 : 0, event.shiftKey ? 0 : 60),
     s: () => plane.shift(event.shiftKey ? -60 : 0, event.shiftKey ? 0 : -60),
     d: () => { $("exchange").open = !$("exchange").open; },
-    e: () => (changes.open ? changes.close() : change()),
+    e: () => change(),
     v: () => { $("charts").open = !$("charts").open; },
     "?": () => $("keys").showModal(),
   };
@@ -442,7 +442,7 @@ $("speed").addEventListener("change", () => guided(false, Number($("speed").valu
 $("guide").addEventListener("click", () => guided(!view.guided));
 $("camera").addEventListener("click", () => follow_story());
 $("fit").addEventListener("click", fit);
-$("change").addEventListener("click", () => (changes.open ? changes.close() : change()));
+$("change").addEventListener("click", () => change());
 $("near").addEventListener("click", () => plane.near(store, view));
 $("exchange").addEventListener("toggle", () => draw());
 $("help").addEventListener("click", () => $("keys").showModal());
