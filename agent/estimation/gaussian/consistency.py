@@ -12,7 +12,6 @@ from agent.estimation.gaussian.fitted import Fit
 from agent.estimation.gaussian.least_squares import fit
 from agent.estimation.gaussian.noise_level import INLIER
 from agent.estimation.gaussian.range_model import PairRanges
-from agent.estimation.gaussian.stray_rate import log_beta
 from protocol.messages import Inconsistent
 from protocol.noise import Noise
 
@@ -186,7 +185,7 @@ def beta_binomial_tail(least: int, count: int, alpha: float, beta: float) -> flo
     """
     if least <= 0:
         return 1.0
-    log_norm = -log_beta(alpha, beta)
+    log_norm = math.lgamma(alpha + beta) - math.lgamma(alpha) - math.lgamma(beta)
     log_norm += math.lgamma(count + 1.0) - math.lgamma(alpha + beta + count)
     total = 0.0
     for k in range(least, count + 1):
@@ -203,7 +202,9 @@ def f_tail(ratio: float, over: float, under: float) -> float:
     if ratio <= 0.0:
         return 1.0
     x, a, b = under / (under + over * ratio), 0.5 * under, 0.5 * over
-    front = math.exp(-log_beta(a, b) + a * math.log(x) + b * math.log1p(-x))
+    front = math.exp(
+        math.lgamma(a + b) - math.lgamma(a) - math.lgamma(b) + a * math.log(x) + b * math.log1p(-x)
+    )
     if x < (a + 1.0) / (a + b + 2.0):
         return front * _beta_fraction(x, a, b) / a
     return 1.0 - front * _beta_fraction(1.0 - x, b, a) / b

@@ -1,7 +1,4 @@
-"""The evidence for a fit: the Bayes factor against ranges that have nothing to do with each other.
-
-Ranges that are explained by chance, or by strays, are none.
-"""
+"""The evidence for a fit: the Bayes factor against ranges that have nothing to do with each other."""
 
 from __future__ import annotations
 
@@ -15,7 +12,6 @@ from agent.estimation.gaussian.fitted import Fit
 from agent.estimation.gaussian.least_squares import fit
 from agent.estimation.gaussian.odometry_noise import Track
 from agent.estimation.gaussian.range_model import PairRanges, Ranges
-from agent.estimation.gaussian.stray_rate import log_gain
 
 
 def anchor_evidence(one: Fit, path: Track, ranges: Ranges, sensing_range: float) -> float:
@@ -27,7 +23,7 @@ def anchor_evidence(one: Fit, path: Track, ranges: Ranges, sensing_range: float)
     """
     prior = math.log(math.pi * sensing_range**2)
     volume = math.log(2.0 * math.pi) + 0.5 * one.log_volume
-    return _told_log_likelihood(one) + volume - prior + _log_widths((path,), ranges, sensing_range)
+    return one.log_likelihood + volume - prior + _log_widths((path,), ranges, sensing_range)
 
 
 @lru_cache(maxsize=2)
@@ -36,23 +32,15 @@ def mutual_evidence(one: Fit, pair: PairRanges) -> float:
 
     It is that of `anchor_evidence`, given the ranges to the anchors. All headings are equally probable.
     """
-    weight = _told_log_likelihood(one) + 0.5 * one.log_volume - math.log(2.0 * math.pi)
+    weight = one.log_likelihood + 0.5 * one.log_volume - math.log(2.0 * math.pi)
     for robot in (0, 1):
         guess = np.array([*one.guess[3 * robot : 3 * robot + 2], 0.0])
         begun = one.errors[robot : robot + 1]
         own = fit(guess, [pair.paths[robot]], pair.ranges.only(robot), pair.noise, begun=begun)
-        weight -= _told_log_likelihood(own) + 0.5 * own.log_volume
+        weight -= own.log_likelihood + 0.5 * own.log_volume
         for others in pair.ranges.to_others(robot):
             weight += _log_widths((pair.paths[robot],), others, pair.sensing_range)
     return weight + _log_widths(pair.paths, pair.ranges.only(2), pair.sensing_range)
-
-
-def _told_log_likelihood(one: Fit) -> float:
-    """Return the log-likelihood of a fit at the told rate of strays.
-
-    At a learned rate, a fit to two ranges of which all others are strays would be evidence.
-    """
-    return one.log_likelihood - log_gain(len(one.weights) - one.inliers, one.inliers, one.problem.noise)
 
 
 def _log_widths(paths: Sequence[Track], ranges: Ranges, sensing_range: float) -> float:

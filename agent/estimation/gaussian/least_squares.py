@@ -18,7 +18,6 @@ from typing import NamedTuple, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian import stray_rate
 from agent.estimation.gaussian.fitted import Fit, NormalEquations
 from agent.estimation.gaussian.linear_model import ErrorSizes, LinearModel, Point, Problem, Start, product
 from agent.estimation.gaussian.noise_level import (
@@ -34,7 +33,7 @@ from agent.estimation.gaussian.odometry_noise import (
     Track,
 )
 from agent.estimation.gaussian.range_covariance import RangeCovariance, inverse_of, range_covariance
-from agent.estimation.gaussian.range_model import STRAY_WIDTH, Ranges, inlier_probability, outliers
+from agent.estimation.gaussian.range_model import Ranges, inlier_probability, outliers
 from protocol.noise import Noise
 
 STEPS = 8
@@ -318,14 +317,11 @@ def _inlier_probabilities(system: NormalEquations, weights: Array, sigma: Array,
     precision = np.maximum(alone - explained, BLIND * alone)
     error = system.multipliers / precision
     variance = np.maximum(1.0 / precision - _variance(sigma, weights), 0.0) + np.square(sigma)
-    strays = stray_rate.expected_rate(weights, noise) if stray_rate.is_learned(noise) else None
-    return _weights(error, np.sqrt(variance), noise, strays)
+    return _weights(error, np.sqrt(variance), noise)
 
 
-def _weights(errors: Array, sigma: Array, noise: Noise, strays: Array | None = None) -> Array:
+def _weights(errors: Array, sigma: Array, noise: Noise) -> Array:
     """Return the probability that each range is an inlier, if `errors` (m) have the scale of their median.
-
-    `strays` is the rate of strays; None for the told one.
 
     Far from the minimum, all errors are large, and no range is an outlier because of that. At least about
     half of the ranges are therefore inliers.
@@ -335,7 +331,7 @@ def _weights(errors: Array, sigma: Array, noise: Noise, strays: Array | None = N
         middle = ratios.shape[-1] // 2
         median = np.partition(ratios, middle, -1)[..., middle, None]
         sigma = sigma * np.maximum(1.0, median / MEDIAN)
-    return inlier_probability(errors, sigma, noise, strays)
+    return inlier_probability(errors, sigma, noise)
 
 
 MEDIAN = 0.6745
@@ -359,20 +355,13 @@ def _log_likelihood(
     log_likelihood = -0.5 * (volume + math.log(2.0 * math.pi) * count)
     log_likelihood += misfit_log_likelihood(chi2, count - len(system.change), noise)
     log_likelihood -= 0.5 * len(system.change) * math.log(level)  # of the covariance of the guess
-    return log_likelihood + _outliers_log_likelihood(residuals, good, sigma, noise)
-
-
-def _outliers_log_likelihood(residuals: Array, good: NDArray[np.bool], sigma: Array, noise: Noise) -> float:
-    """Return the log-likelihood of which ranges are `good`, and of the residuals (m) of all others."""
-    bad, count = ~good, int(np.count_nonzero(good))
-    if stray_rate.is_learned(noise):
-        width = float(np.sum(np.log(STRAY_WIDTH * sigma[bad])))
-        return stray_rate.log_likelihood(len(good) - count, count, noise) - width
-    found = count * math.log1p(-noise.outliers - noise.strays)
-    if count < len(good):
-        smoothed = np.maximum(sigma[bad], SOFT * noise.outlier_bias[0])
-        found += float(np.sum(outliers(residuals[bad], smoothed, noise)))
-    return found
+    if count == len(good):
+        return log_likelihood + count * math.log1p(-noise.outliers - noise.strays)
+    if noise.outliers or noise.strays:
+        log_likelihood += count * math.log1p(-noise.outliers - noise.strays)
+        soft = SOFT * noise.outlier_bias[0] if noise.outliers else 0.0
+        log_likelihood += float(np.sum(outliers(residuals[~good], np.maximum(sigma[~good], soft), noise)))
+    return log_likelihood
 
 
 SOFT = 0.1

@@ -323,19 +323,13 @@ def placed(guess: Array, path: Track, ticks: Places) -> tuple[Array, Array]:
     return c * x - s * y, s * x + c * y
 
 
-def inlier_probability(residuals: Array, sigma: Array, noise: Noise, strays: Array | None = None) -> Array:
-    """Return the probability that the range of each residual (m) is an inlier.
-
-    `strays` is the rate of strays, in a shape that broadcasts with `residuals`; None for the told one.
-    """
+def inlier_probability(residuals: Array, sigma: Array, noise: Noise) -> Array:
+    """Return the probability that the range of each residual (m) is an inlier."""
     if not (noise.outliers or noise.strays):
         return np.ones_like(residuals)
     # the log-density of outliers and strays, less that of inliers
     misfit, told = 0.5 * np.square(residuals / sigma), _log_inlier(noise)
-    ratio = None
-    if noise.strays:
-        rate = math.log(noise.strays) if strays is None else np.log(strays)
-        ratio = misfit + (rate - (math.log(STRAY_WIDTH) + told))
+    ratio = misfit + (math.log(noise.strays / STRAY_WIDTH) - told) if noise.strays else None
     if noise.outliers:
         least, most = noise.outlier_bias
         beyond = residuals - np.minimum(np.maximum(residuals, least), most)
