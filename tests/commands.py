@@ -158,7 +158,7 @@ class TandemProcess:
             holds = bool(condition())
             return holds or not self.running
 
-        until(check, f"{what}\n{self.err}")
+        until(check, lambda: f"{what}\n{self.out}{self.err}")
         assert holds or condition(), f"ended before {what}: {self.out}{self.err}"
 
     def until_prints(self, words: str) -> None:
@@ -251,11 +251,12 @@ def world(scenario: str | Path, *arguments: str | Path) -> Iterator[tuple[Tandem
         yield command, endpoint
 
 
-def until(condition: Callable[[], object], what: str, bound: float = BOUND_S) -> None:
-    """Wait until `condition` holds."""
+def until(condition: Callable[[], object], what: str | Callable[[], str], bound: float = BOUND_S) -> None:
+    """Wait until `condition` holds; `what` is the message if it does not, or returns it then."""
     give_up = time.monotonic() + bound
     while not condition():
-        assert time.monotonic() < give_up, f"not within {bound:g} s: {what}"
+        if time.monotonic() >= give_up:
+            raise AssertionError(f"not within {bound:g} s: {what if isinstance(what, str) else what()}")
         time.sleep(POLL_S)
 
 

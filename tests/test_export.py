@@ -507,6 +507,11 @@ def test_where_there_is_no_room_nothing_half_written_is_left(paper_1: Path, tmp_
         assert name not in {path.name for path in out.iterdir()}
 
 
+def stopped_unless(some: Iterator[bool]) -> None:
+    """Raise an AssertionError unless `some` has another item."""
+    assert next(some, False), "stopped"
+
+
 def test_ctrl_c_ends_an_export_and_leaves_nothing_half_written(paper_1: Path, tmp_path: Path) -> None:
     with TandemProcess("export", paper_1, "--out", tmp_path / "out") as command:
         command.until(lambda: command.catches(Signals.SIGTERM), "it catches signals")
@@ -521,9 +526,9 @@ def test_ctrl_c_ends_an_export_and_leaves_nothing_half_written(paper_1: Path, tm
         (60, {"run.mcap", "run.foxglove.json"}),
         (next(all_checks) - 1, {*FILES} - {"ticks.parquet"}),
     ):
-        some = iter(range(checks))
-        with pytest.raises(StopIteration):
-            export(read(paper_1), tmp_path / "out", check=functools.partial(next, some))
+        some = iter([True] * checks)
+        with pytest.raises(AssertionError, match="stopped"):
+            export(read(paper_1), tmp_path / "out", check=functools.partial(stopped_unless, some))
         assert {path.name for path in (tmp_path / "out").iterdir()} == left
 
 

@@ -71,6 +71,15 @@ class Pair:
         for name in names:
             self.robots[name] = self._started(name)
 
+    def said(self) -> str:
+        """Return what both robots have printed, and the sizes of their journals in bytes."""
+        return "\n".join(
+            [
+                f"{name}: {size(self.path(name))} bytes\n{one.out}{one.err}"
+                for name, one in self.robots.items()
+            ]
+        )
+
     def nobody_is_left(self, name: str) -> None:
         until(lambda: not processes_of((self._out / name).resolve()), f"{name}'s agent has ended")
 
@@ -257,7 +266,7 @@ def test_a_robot_that_is_killed_at_any_moment_goes_on(
 ) -> None:
     for name in killed:
         path, robot = pair.path(name), pair.robots[name]
-        until(lambda path=path, robot=robot: size(path) >= amount or not robot.running, "it is far on")  # type: ignore[misc]
+        until(lambda path=path, robot=robot: size(path) >= amount or not robot.running, pair.said)  # type: ignore[misc]
     pair.kill(*killed)
     pair.again(*killed)
     all_is_well(tmp_path, pair)

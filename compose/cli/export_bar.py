@@ -28,7 +28,9 @@ def exported(
     """
     from compose.view.export.folder import FILES, export  # noqa: PLC0415  # slow to import, and optional
 
+    # a process with a run of its own may have sessions and threads, with which a fork is not safe
+    alone = run is not None
     with user_errors(folder), counting("tandem export", 0 if quiet else len(FILES)) as done:
         run = run or read(folder)
         gc.freeze()  # else each garbage collection goes through all messages again
-        return export(run, out, done=done, check=lambda: inbox.next(0.0))
+        return export(run, out, done=done, check=lambda: inbox.next(0.0), alone=alone)

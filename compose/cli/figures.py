@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,7 @@ from compose.errors import ENDED, FAILED, UserError
 from compose.extras import need
 from compose.figures import FORMATS, PICTURES
 from compose.launch.planner_loader import trust
+from compose.launch.second_process import Line, Task, share
 from compose.recording.recording_files import agent_journal, user_errors
 from compose.recording.run import Run, read
 from compose.terminal.outcome import counting
@@ -85,7 +87,8 @@ def main(options: argparse.Namespace) -> int:
                 status = FAILED
                 continue
             try:
-                draw(pair, kinds, formats, folder, done, torn=bool(torn), paper=options.paper)
+                tasks = drawing(pair, kinds, formats, folder, torn=bool(torn), paper=options.paper)
+                share(tasks, partial(_printed, done))
             except BrokenPipeError:
                 raise
             except OSError as error:
@@ -93,35 +96,40 @@ def main(options: argparse.Namespace) -> int:
     return status
 
 
-def draw(
-    pair: PairRecord,
-    kinds: Sequence[str],
-    formats: Sequence[str],
-    folder: Path,
-    done: Callable[[], None],
-    *,
-    torn: bool,
-    paper: bool = False,
-) -> None:
-    """Draw the figures of `kinds`; print a line for each file, and for each figure that does not apply.
+def drawing(
+    pair: PairRecord, kinds: Sequence[str], formats: Sequence[str], folder: Path, *, torn: bool, paper: bool
+) -> list[Task]:
+    """Return the tasks of drawing the figures of `kinds`, one for each kind.
 
-    `done` is called after each kind. `torn` states that the recording is incomplete, so that an event that it
-    lacks may have happened; `paper` is the flag. Raises OSError.
+    A task returns a line for each file, and for each figure that does not apply. `torn` states that the
+    recording is incomplete, so that an event that it lacks may have happened; `paper` is the flag.
+    Raises OSError, as do the tasks.
     """
     from compose.figures import catalogue, style  # noqa: PLC0415
     from compose.figures.sheet import Absent  # noqa: PLC0415
 
     medium = style.PAPER if paper else style.SCREEN
     folder.mkdir(exist_ok=True)
-    for kind in kinds:
+
+    def draw(kind: str) -> Sequence[Line]:
+        lines = []
         with style.look(medium):
             for name, figure in catalogue.pictures(pair, kind, medium):
                 if isinstance(figure, Absent):
-                    _say(f"no {name}: {figure.why}{' (in the incomplete recording)' if torn else ''}")
-                    continue
-                for path in style.save(figure, folder / name, formats, medium.dpi):
-                    say(str(path))
-        done()
+                    why = f"{figure.why}{' (in the incomplete recording)' if torn else ''}"
+                    lines.append(Line(f"tandem figures: no {name}: {why}", error=True))
+                else:
+                    paths = style.save(figure, folder / name, formats, medium.dpi)
+                    lines += [Line(str(path)) for path in paths]
+        return lines
+
+    return [partial(draw, kind) for kind in kinds]
+
+
+def _printed(done: Callable[[], None], lines: Sequence[Line]) -> None:
+    for line in lines:
+        say(line.text, error=line.error)
+    done()
 
 
 def _replay(run: Run, robot: str) -> AgentReplay | None:
