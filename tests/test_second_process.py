@@ -47,8 +47,13 @@ def two_processors(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def second_begins(folder: Path) -> Path:
-    """Return the path of a file that appears when the second process has begun a task."""
+    """Return the path of a file that appears when the second process has begun a task, with its pid."""
     return folder / "second"
+
+
+def begin(folder: Path) -> None:
+    """Let the file of `second_begins` appear."""
+    files.write(second_begins(folder), str(os.getpid()))
 
 
 def by_second(folder: Path, here: Callable[[], object], there: Callable[[], object]) -> Task:
@@ -57,7 +62,7 @@ def by_second(folder: Path, here: Callable[[], object], there: Callable[[], obje
 
     def task() -> Sequence[Line]:
         if os.getpid() != first:
-            second_begins(folder).write_text(str(os.getpid()))
+            begin(folder)
             there()
         else:
             until(lambda: second_begins(folder).exists(), "the second process has begun a task")
@@ -130,10 +135,11 @@ def test_an_error_ends_the_second_process_and_leaves_no_unfinished_file(stage: s
     def write(name: str) -> Sequence[Line]:
         with files.draft(tmp_path / name) as place:
             place.write_text("begun")
-            if os.getpid() != first:
-                second_begins(tmp_path).write_text(str(os.getpid()))
+            if os.getpid() == first:
+                until(lambda: second_begins(tmp_path).exists(), "the second process has begun a task")
+            elif name != "a":  # `done` is called for a first
+                begin(tmp_path)
                 time.sleep(BOUND_S)
-            until(lambda: second_begins(tmp_path).exists(), "the second process has begun a task")
         return ()
 
     def stop(*_: object) -> None:

@@ -100,15 +100,12 @@ class _SecondProcess:
         if self._ended:
             return
         self._ended = True
-        os.kill(self._pid, signal.SIGTERM)
-        os.kill(self._pid, signal.SIGCONT)
         give_up = time.monotonic() + END_S
         while os.waitpid(self._pid, os.WNOHANG) == (0, 0):
-            if time.monotonic() > give_up:
-                os.kill(self._pid, signal.SIGKILL)
-                os.waitpid(self._pid, 0)
-                return
-            time.sleep(0.002)
+            # again and again: a signal that arrives just before a system call does not interrupt it
+            os.kill(self._pid, signal.SIGTERM if time.monotonic() < give_up else signal.SIGKILL)
+            os.kill(self._pid, signal.SIGCONT)
+            time.sleep(LOOK_S / 10)
 
 
 def _finished(
@@ -191,16 +188,25 @@ def _work(tasks: Sequence[Task], waiting: int, reported: int, parent: int) -> No
         os.setsid()
         for stopping in STOPPING:
             signal.signal(stopping, _leave)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)
         end_with_parent(parent, signal.SIGTERM)
-        with Path(os.devnull).open("w", encoding="utf-8") as nowhere:
-            sys.stdout = sys.stderr = nowhere
-            for number in _taken(waiting):
-                result = _Result(number, tuple(tasks[number]()))
-                os.write(reported, msgspec.json.encode(result) + b"\n")
+        try:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)
+            with Path(os.devnull).open("w", encoding="utf-8") as nowhere:
+                sys.stdout = sys.stderr = nowhere
+                for number in _taken(waiting):
+                    result = _Result(number, tuple(tasks[number]()))
+                    os.write(reported, msgspec.json.encode(result) + b"\n")
+        finally:
+            _ignore_signals()  # the exception of a signal after this block would reach the first one's code
     os._exit(0)
 
 
 def _leave(number: int, _frame: object) -> NoReturn:
     """End the process by an exception, so that it removes the files that it is writing."""
+    _ignore_signals()
     raise SystemExit(128 + number)
+
+
+def _ignore_signals() -> None:
+    for stopping in STOPPING:
+        signal.signal(stopping, signal.SIG_IGN)
