@@ -15,7 +15,7 @@ from compose.figures.style import SCREEN, look, save
 from compose.launch import in_process
 from compose.recording.run import read
 from compose.scenario import scenario_file
-from compose.view.web.film import film
+from compose.view.web import film
 
 DOCS = Path(__file__).parent
 SHOWN: dict[str, dict[str, str]] = {
@@ -45,7 +45,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             draw(name, shown, Path(folder))
             if name == FILMED:
-                (DOCS / "page.gif").write_bytes(film(Path(folder)))
+                (DOCS / "page.gif").write_bytes(film.gif(Path(folder)))
 
 
 def draw(name: str, shown: Mapping[str, str], folder: Path) -> None:

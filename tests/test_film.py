@@ -1,19 +1,27 @@
-"""`tandem export --gif`: the guided play of a recording as an animated picture."""
+"""`tandem export --gif` and `--mp4`: the guided play of a recording as an animated picture and as a video."""
 
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
+import av
+import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
 from compose.errors import UserError
 from compose.view.web import film
-from tests.commands import tandem
+from tests.commands import TandemProcess, tandem
 
 MOST_BYTES = 600_000
 """The largest size of the picture of paper-1."""
+MOST_FRAMES = 500
+"""The largest number of frames of the video of paper-1."""
+FRAME_S = 1.0
+"""The time in s in which the browser draws a frame on any machine."""
 
 
 @pytest.mark.long
@@ -30,7 +38,29 @@ def test_the_picture_lasts_as_long_as_guided_play_and_is_small(paper_1: Path, tm
     assert len(durations) > 30
 
 
-def test_without_a_browser_there_is_one_line(paper_1: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.long
+def test_the_video_lasts_as_long_as_guided_play_and_is_small(paper_1: Path, tmp_path: Path) -> None:
+    if not any(map(shutil.which, film.BROWSERS)):
+        pytest.skip("there is no chromium: apt-get install chromium")
+    with TandemProcess("export", paper_1, "--mp4", "--out", tmp_path) as export:
+        ended = export.ended(MOST_FRAMES * FRAME_S)
+    assert (ended.status, ended.out, ended.err) == (0, f"{tmp_path / 'run.mp4'}\n", "")
+    assert (tmp_path / "run.mp4").stat().st_size < 2 * MOST_BYTES
+    with av.open(tmp_path / "run.mp4") as video:
+        (stream,) = video.streams.video
+        assert (stream.width, stream.height) == (film.WIDTH, film.HEIGHT)
+        frames = [frame.to_ndarray(format="gray") for frame in video.decode(stream)]
+    assert 30_000 < len(frames) * film.VIDEO_FRAME_MS < 50_000
+    assert len(frames) < MOST_FRAMES
+    changes = sum([bool(np.abs(now.astype(int) - was).max() > 64) for was, now in pairwise(frames)])
+    assert changes > 100
+
+
+@pytest.mark.parametrize("kind", [film.gif, film.mp4])
+def test_without_a_browser_there_is_one_line(
+    kind: Callable[[Path], bytes], paper_1: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(film, "BROWSERS", ("no-such-browser",))
-    with pytest.raises(UserError, match=r"^--gif needs chromium: apt-get install chromium$"):
-        film.film(paper_1)
+    message = f"^--{kind.__name__} needs chromium: apt-get install chromium$"
+    with pytest.raises(UserError, match=message):
+        kind(paper_1)

@@ -32,8 +32,8 @@ from compose.launch.second_process import share
 def task(name):
     with files.draft(Path(name)) as place:
         place.write_text(str(os.getpid()))
-        time.sleep(600)
-    return ()
+        while True:  # a signal just before a sleep does not end it
+            time.sleep(0.01)
 
 share([lambda: task("one"), lambda: task("two")], lambda lines: None)
 """

@@ -47,6 +47,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="write only run.gif: the guided play as an animated picture (extra film, and Chromium)",
     )
+    kinds.add_argument(
+        "--mp4",
+        action="store_true",
+        help="write only run.mp4: the guided play as a video (extra film, and Chromium)",
+    )
     add_closing(parser, "tandem export recording --out exported", "docs/recordings.md")
 
 
@@ -62,6 +67,8 @@ def main(options: argparse.Namespace) -> int:
         return _html(options.recording, out)
     if options.gif:
         return _gif(options.recording, out)
+    if options.mp4:
+        return _mp4(options.recording, out)
     if options.rerun:
         return _rerun(options.recording, out)
     need(*MODULES)
@@ -107,9 +114,18 @@ def _html(recording: Path, out: Path) -> int:
 def _gif(recording: Path, out: Path) -> int:
     """Write run.gif to `out`, and print its path."""
     need("PIL", "playwright", extra="film")
-    from compose.view.web.film import film  # noqa: PLC0415  # it imports Zenoh
+    from compose.view.web import film  # noqa: PLC0415  # it imports Zenoh
 
-    say(str(_written(out, "run.gif", film(recording))))
+    say(str(_written(out, "run.gif", film.gif(recording))))
+    return ENDED
+
+
+def _mp4(recording: Path, out: Path) -> int:
+    """Write run.mp4 to `out`, and print its path."""
+    need("av", "PIL", "playwright", extra="film")
+    from compose.view.web import film  # noqa: PLC0415  # it imports Zenoh
+
+    say(str(_written(out, "run.mp4", film.mp4(recording))))
     return ENDED
 
 

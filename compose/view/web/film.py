@@ -1,4 +1,4 @@
-"""The guided play of a recording as an animated picture, taken from the page in headless Chromium.
+"""The guided play of a recording as an animated picture or a video, taken from the page in headless Chromium.
 
 The clock of the page stands still between two frames, so that the frames do not depend on the
 speed of the machine.
@@ -29,13 +29,17 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 WIDTH, HEIGHT = 900, 560
 """The size of the picture in pixels."""
 FRAME_MS = 250
-"""The time between two frames in ms; the page lets no more pass between two of its drawings."""
+"""The time between two frames of a picture in ms; the page lets no more pass between two of its drawings."""
+VIDEO_FRAME_MS = 100
+"""The time between two frames of a video in ms."""
 LAST_MS = 3000
-"""The time in ms for which the last frame is shown before the picture begins again."""
-MOST_FRAMES = 1500
-"""The largest number of frames: five minutes. Guided play takes about one."""
+"""The time in ms for which the last frame is shown."""
+MOST_MS = 300_000
+"""The longest time in ms that is shown. Guided play takes about a minute."""
+QUALITY = "20"
+"""The constant rate factor of a video; text is sharp with it, and a smaller one makes larger files."""
 STYLE = """
-header, aside, #transport button, #pace { display: none !important; }
+header, aside, details, #transport button, #pace { display: none !important; }
 #mission { grid-template-columns: 1fr; }
 """
 """The style that hides the parts of the page which are not the story, or are for the mouse."""
@@ -45,14 +49,24 @@ SAME = 255
 """The colour of pixels that are as in the frame before."""
 
 
-def film(folder: Path) -> bytes:
+def gif(folder: Path) -> bytes:
     """Return the guided play of the recording in `folder` as an animated GIF.
 
     Raises UserError if there is not exactly one recording, or if Chromium is not installed.
     """
+    return _gif(_frames(folder, "--gif", FRAME_MS))
+
+
+def mp4(folder: Path) -> bytes:
+    """Return the guided play of the recording in `folder` as a video: MP4 with H.264. Raises like `gif`."""
+    return _mp4(_frames(folder, "--mp4", VIDEO_FRAME_MS))
+
+
+def _frames(folder: Path, flag: str, frame_ms: int) -> list[bytes]:
+    """Return the frames of guided play as PNG files, one for each `frame_ms`. Raises like `gif`."""
     found = next(filter(None, map(shutil.which, BROWSERS)), None)
     if found is None:
-        raise UserError("--gif needs chromium: apt-get install chromium")
+        raise UserError(f"{flag} needs chromium: apt-get install chromium")
     html = standalone_page(folder).html
     from playwright.sync_api import sync_playwright  # noqa: PLC0415  # slow, and optional
 
@@ -65,18 +79,18 @@ def film(folder: Path) -> bytes:
         page.goto(file.as_uri())
         page.add_style_tag(content=STYLE)
         page.clock.pause_at(1000)
-        frames = list(_frames(page))
+        frames = list(_played(page, frame_ms))
         browser.close()
-    return _gif(frames)
+    return frames
 
 
-def _frames(page: Page) -> Iterator[bytes]:
-    """Yield the frames of guided play as PNG files."""
+def _played(page: Page, frame_ms: int) -> Iterator[bytes]:
+    """Play the page, and yield a PNG file for each `frame_ms`."""
     page.wait_for_selector("body[data-shown='0']", state="attached")
     page.keyboard.press("f")  # a camera at rest: most of the picture stays the same
     page.locator("#play").evaluate("(button) => button.click()")
-    for _ in range(MOST_FRAMES):
-        page.clock.fast_forward(FRAME_MS)
+    for _ in range(MOST_MS // frame_ms):
+        page.clock.fast_forward(frame_ms)
         yield page.screenshot()
         if page.locator("#play").get_attribute("aria-label") == "Play":
             return
@@ -109,6 +123,22 @@ def _gif(frames: list[bytes]) -> bytes:
         file, "GIF", save_all=True, append_images=rest, duration=durations, loop=0,
         transparency=SAME, disposal=1, optimize=False,
     )  # fmt: skip
+    return file.getvalue()
+
+
+def _mp4(frames: list[bytes]) -> bytes:
+    """Return PNG files as a video; the last one stays for LAST_MS."""
+    import av  # noqa: PLC0415  # optional
+    from PIL import Image  # noqa: PLC0415
+
+    file = BytesIO()
+    with av.open(file, "w", format="mp4") as video:
+        stream = video.add_stream("libx264", rate=1000 // VIDEO_FRAME_MS, options={"crf": QUALITY})
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        for frame in frames + frames[-1:] * (LAST_MS // VIDEO_FRAME_MS):
+            pixels = np.asarray(Image.open(BytesIO(frame)).convert("RGB"))
+            video.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+        video.mux(stream.encode())
     return file.getvalue()
 
 
