@@ -15,7 +15,7 @@ import psutil
 import pytest
 
 from compose.launch import second_process
-from compose.launch.second_process import Line, Task, share
+from compose.launch.second_process import OutputLine, Task, share
 from compose.recording.run import read
 from compose.view.export.folder import export
 from protocol import files
@@ -60,14 +60,14 @@ def by_second(folder: Path, here: Callable[[], object], there: Callable[[], obje
     """Return a task: `there` in the second process and, once that has begun one, `here` in this one."""
     first = os.getpid()
 
-    def task() -> Sequence[Line]:
+    def task() -> Sequence[OutputLine]:
         if os.getpid() != first:
             begin(folder)
             there()
         else:
             until(lambda: second_begins(folder).exists(), "the second process has begun a task")
             here()
-        return [Line(str(os.getpid()))]
+        return [OutputLine(str(os.getpid()))]
 
     return task
 
@@ -92,14 +92,17 @@ def assert_no_child() -> None:
 def test_both_processes_do_tasks_and_their_lines_come_in_order(tmp_path: Path) -> None:
     meet = by_second(tmp_path, nothing, nothing)
     tasks: list[Task] = [meet, *[partial(_numbered, meet, number) for number in range(1, 40)]]
-    lines: list[Sequence[Line]] = []
+    lines: list[Sequence[OutputLine]] = []
     share(tasks, lines.append)
-    assert [tuple(some[1:]) for some in lines] == [(), *[(Line(str(n), error=True),) for n in range(1, 40)]]
+    assert [tuple(some[1:]) for some in lines] == [
+        (),
+        *[(OutputLine(str(n), error=True),) for n in range(1, 40)],
+    ]
     assert {some[0].text for some in lines} == {str(os.getpid()), second_begins(tmp_path).read_text()}
 
 
-def _numbered(task: Task, number: int) -> Sequence[Line]:
-    return [*task(), Line(str(number), error=True)]
+def _numbered(task: Task, number: int) -> Sequence[OutputLine]:
+    return [*task(), OutputLine(str(number), error=True)]
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
@@ -132,7 +135,7 @@ def test_the_error_of_a_task_is_raised_by_the_first_process(tmp_path: Path) -> N
 def test_an_error_ends_the_second_process_and_leaves_no_unfinished_file(stage: str, tmp_path: Path) -> None:
     first = os.getpid()
 
-    def write(name: str) -> Sequence[Line]:
+    def write(name: str) -> Sequence[OutputLine]:
         with files.draft(tmp_path / name) as place:
             place.write_text("begun")
             if os.getpid() == first:
@@ -182,9 +185,9 @@ def test_one_process_does_all_tasks_where_there_can_be_no_second(
         monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0})
     elif why == "no memory":
         monkeypatch.setattr(os, "fork", no_memory)
-    lines: list[Line] = []
-    share([lambda: [Line(str(os.getpid()))]] * 9, lines.extend, alone=why == "alone")
-    assert lines == [Line(str(os.getpid()))] * 9
+    lines: list[OutputLine] = []
+    share([lambda: [OutputLine(str(os.getpid()))]] * 9, lines.extend, alone=why == "alone")
+    assert lines == [OutputLine(str(os.getpid()))] * 9
 
 
 def test_an_export_has_the_same_bytes_with_one_and_with_two_processes(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from compose.errors import ENDED, FAILED, UserError
 from compose.extras import need
 from compose.figures import FORMATS, PICTURES
 from compose.launch.planner_loader import trust
-from compose.launch.second_process import Line, Task, share
+from compose.launch.second_process import OutputLine, Task, share
 from compose.recording.recording_files import agent_journal, user_errors
 from compose.recording.run import Run, read
 from compose.terminal.outcome import counting
@@ -111,22 +111,22 @@ def drawing(
     medium = style.PAPER if paper else style.SCREEN
     folder.mkdir(exist_ok=True)
 
-    def draw(kind: str) -> Sequence[Line]:
+    def draw(kind: str) -> Sequence[OutputLine]:
         lines = []
         with style.look(medium):
             for name, figure in catalogue.pictures(pair, kind, medium):
                 if isinstance(figure, Absent):
                     why = f"{figure.why}{' (in the incomplete recording)' if torn else ''}"
-                    lines.append(Line(f"tandem figures: no {name}: {why}", error=True))
+                    lines.append(OutputLine(f"tandem figures: no {name}: {why}", error=True))
                 else:
                     paths = style.save(figure, folder / name, formats, medium.dpi)
-                    lines += [Line(str(path)) for path in paths]
+                    lines += [OutputLine(str(path)) for path in paths]
         return lines
 
     return [partial(draw, kind) for kind in kinds]
 
 
-def _printed(done: Callable[[], None], lines: Sequence[Line]) -> None:
+def _printed(done: Callable[[], None], lines: Sequence[OutputLine]) -> None:
     for line in lines:
         say(line.text, error=line.error)
     done()

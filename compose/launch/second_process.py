@@ -31,7 +31,7 @@ END_S = 2.0
 """The time in s that the second process has to remove the files that it is writing; then it is killed."""
 
 
-class Line(NamedTuple):
+class OutputLine(NamedTuple):
     """A line for the terminal."""
 
     text: str
@@ -39,13 +39,13 @@ class Line(NamedTuple):
     """Whether it belongs on standard error."""
 
 
-Task = Callable[[], Sequence[Line]]
+Task = Callable[[], Sequence[OutputLine]]
 """A task: it writes files, and returns the lines to print about them."""
 
 
 def share(
     tasks: Sequence[Task],
-    done: Callable[[Sequence[Line]], object],
+    done: Callable[[Sequence[OutputLine]], object],
     check: Callable[[], object] = lambda: None,
     *,
     alone: bool = False,
@@ -57,7 +57,7 @@ def share(
     called between tasks and while this process waits. It may raise, and so may `done`; that ends the second
     process.
     """
-    early: dict[int, Sequence[Line]] = {}
+    early: dict[int, Sequence[OutputLine]] = {}
     reported = 0
     with _numbered(tasks) as waiting, _second_process(tasks, waiting, alone=alone) as second:
         for number, lines in _finished(tasks, waiting, second, check):
@@ -71,7 +71,7 @@ class _Result(NamedTuple):
     """A task that the second process has finished."""
 
     number: int
-    lines: tuple[Line, ...]
+    lines: tuple[OutputLine, ...]
 
 
 class _SecondProcess:
@@ -110,11 +110,11 @@ class _SecondProcess:
 
 def _finished(
     tasks: Sequence[Task], waiting: int, second: _SecondProcess | None, check: Callable[[], object]
-) -> Iterator[tuple[int, Sequence[Line]]]:
+) -> Iterator[tuple[int, Sequence[OutputLine]]]:
     """Yield the number and the lines of each task, when it is finished."""
     missing = dict(enumerate(tasks))
 
-    def from_second(timeout: float) -> Iterator[tuple[int, Sequence[Line]]]:
+    def from_second(timeout: float) -> Iterator[tuple[int, Sequence[OutputLine]]]:
         for number, lines in second.results(timeout) if second is not None else ():
             del missing[number]
             yield number, lines

@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 
 from compose.errors import UserError
-from compose.launch.second_process import Line, Task, share
+from compose.launch.second_process import OutputLine, Task, share
 from compose.recording.frames import in_time
 from compose.recording.recording_files import agent_journal, cannot_write, make_folder
 from compose.recording.run import Run
@@ -80,7 +80,7 @@ def export(
 def _task(write: Callable[[Path], object], path: Path) -> Task:
     """Return the task of writing the file at `path` by `write`."""
 
-    def written() -> Sequence[Line]:
+    def written() -> Sequence[OutputLine]:
         with files.draft(path) as place:
             write(place)
         return ()
