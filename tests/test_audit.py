@@ -22,8 +22,7 @@ from compose.audit.findings import Findings, Violation
 from compose.audit.rules import RULES, audit, audit_run
 from compose.launch import in_process
 from compose.launch.planner_loader import planner_of
-from compose.recording.frames import KINDS
-from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
+from compose.recording.recording_files import KINDS, WORLD_JOURNAL, agent_journal
 from compose.recording.run import of_frames, read
 from compose.scenario.scenario_file import load, parse
 from compose.scenario.shipped_files import shipped

@@ -13,8 +13,7 @@ from msgspec.structs import replace
 
 from compose.audit.replay import replayed
 from compose.launch import in_process
-from compose.recording.frames import KINDS
-from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
+from compose.recording.recording_files import KINDS, WORLD_JOURNAL, agent_journal
 from compose.recording.run import of_frames
 from compose.scenario.scenario_file import load, parse
 from protocol.journal import journal_file

@@ -14,6 +14,7 @@ from compose.errors import ENDED
 from compose.launch.model_loader import trust_all
 from compose.launch.planner_loader import is_shipped
 from compose.launch.supervisor import ChildFailed, Supervisor
+from compose.recording.kills_file import KILLS, add_kill
 from compose.scenario.kills import WORLD, Kill, taken
 from protocol import limits
 from protocol.network.inbox import Inbox
@@ -95,7 +96,7 @@ def run_mission(
     """
     limits.need_files(CHILD_FILES * (1 + len(scenario.robots)) + SPARE_FILES, "a run as processes")
     arguments = _arguments(scenario, out, run, rate, timeout, keys, agents_journal=agents_journal)
-    mission = _Mission(scenario, arguments, kills, inbox)
+    mission = _Mission(scenario, arguments, kills, inbox, out if agents_journal else None)
     try:
         mission.run()
     finally:
@@ -142,12 +143,18 @@ class _Mission:
     """The world and the agents of one run, restarted when they were killed."""
 
     def __init__(
-        self, scenario: Scenario, arguments: Mapping[str, list[str]], kills: Sequence[Kill], inbox: Inbox
+        self,
+        scenario: Scenario,
+        arguments: Mapping[str, list[str]],
+        kills: Sequence[Kill],
+        inbox: Inbox,
+        recording: Path | None,
     ) -> None:
-        """`arguments` are the command lines, by process name."""
+        """`arguments` are the command lines, by process name; `recording` is the folder of all journals."""
         self._scenario = encode(scenario)
         self._arguments = arguments
         self._inbox = inbox
+        self._recording = recording
         self.children = Supervisor(inbox)
         self.kills = {name: [kill for kill in kills if kill.process == name] for name in arguments}
         """Kills that have not happened yet, by process name."""
@@ -186,9 +193,18 @@ class _Mission:
         kill = taken(self.kills[name], child.stderr_text()) if child.status == -signal.SIGKILL else None
         if kill is None:
             raise self.children.failure(name)
+        self._note(kill)
         if kill.after is None:
             raise ChildFailed(f"{name} was killed at tick {kill.tick} (--kill {kill.text})")
         self.kills[name].remove(kill)
         when = f" in {kill.after:g} s" if kill.after else ""
         self._inbox.say(f"{name} was killed at tick {kill.tick}, and is restarted{when}")
         self.children.start_later(kill.after, lambda: self._start(name))
+
+    def _note(self, kill: Kill) -> None:
+        """Write `kill` to the recording; say why if that fails, which does not end the mission."""
+        if self._recording is not None:
+            try:
+                add_kill(self._recording, kill)
+            except (OSError, ValueError) as error:
+                self._inbox.say(f"{KILLS} lacks --kill {kill.text}: {error}")

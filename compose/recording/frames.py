@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 from msgspec.structs import astuple
 
+from compose.recording.recording_files import KINDS
 from compose.recording.run import Run
 from protocol.journal.journal_file import CorruptJournal
 from protocol.messages import (
@@ -20,15 +21,12 @@ from protocol.messages import (
     Message,
     MissionEnd,
     Observation,
-    OfRobot,
 )
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, body, decode
 from world.scenario import RecordedScenario
 
 OfWorld = Environment | RecordedScenario | Command | DeadlineMissed | MissionEnd | FinalReport
 """The kinds of messages in the world's journal."""
-KINDS = RecordedScenario | OfRobot
-"""The kinds of messages in any journal."""
 
 
 class Journaled(msgspec.Struct, frozen=True):

@@ -14,8 +14,12 @@ import msgspec
 from compose.errors import UserError
 from protocol.journal import journal_file
 from protocol.journal.journal_file import CorruptJournal
+from protocol.messages import OfRobot
+from world.scenario import RecordedScenario
 
 WORLD_JOURNAL = "world.journal"
+KINDS = RecordedScenario | OfRobot
+"""The kinds of messages in any journal."""
 
 
 def agent_journal(robot: str) -> str:

@@ -11,6 +11,7 @@ import msgspec
 from msgspec.structs import replace
 
 from compose.recording.claim import Claim, claim, truth_held
+from compose.recording.kills_file import Killed, kills_in
 from compose.recording.recording_files import (
     WORLD_JOURNAL,
     JournalFile,
@@ -61,6 +62,8 @@ class Run(msgspec.Struct, frozen=True, dict=True):
     """The journals, by file name, the world's first; empty for a run without journals."""
     source: object = "the recording"
     """The folder of the journals, for errors."""
+    kills: tuple[Killed, ...] = ()
+    """The processes that were killed in the run."""
     claim_estimates: dict[str, Estimate] = {}
     """The Estimate of each robot at its first claim, if the run took place in this process."""
 
@@ -301,15 +304,16 @@ def ended(outcome: Outcome, ticks: int, reason: str | None) -> str:
 def read(folder: Path, *, audited: bool = False) -> Run:
     """Return the run recorded in `folder`.
 
-    Raises OSError if there is no recording or the world's journal cannot be read, and CorruptJournal if that
-    is damaged before its end or, unless the run is to be `audited`, has a frame out of order. Raises
-    CorruptJournal also if there is no such journal and two peers' journals are of different runs.
+    Raises OSError if there is no recording, or the world's journal or the list of killed processes cannot be
+    read. Raises CorruptJournal if one of these is damaged before its end or, unless the run is to be
+    `audited`, the journal has a frame out of order. Raises CorruptJournal also if there is no world's journal
+    and two peers' journals are of different runs.
     """
     paths = journals_in(folder) or [folder / WORLD_JOURNAL]
     run = of_journals({path.name: opened(path) for path in paths}, folder)
     if not audited and run.world is not None and run.world.unexpected is not None:
         raise CorruptJournal(f"{folder / WORLD_JOURNAL}: {run.world.unexpected.what}")
-    return run
+    return replace(run, kills=kills_in(folder))
 
 
 def of_frames(journals: Mapping[str, Iterable[bytes]], source: object = "the recording") -> Run:

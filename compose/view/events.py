@@ -62,7 +62,13 @@ def _presence(robot: str | None, before: TickData | None, now: TickData) -> Iter
     if robot in now.down and (before is None or robot not in before.down - before.back):
         yield Event(now.tick, "down", robot, f"{name} is down: its process is gone")
     if robot in now.back:
-        yield Event(now.tick, "back", robot, f"{name} is back: its process runs again")
+        ticks = now.replayed.get(robot)
+        what = (
+            f"replayed {ticks} tick{'' if ticks == 1 else 's'}, identical"
+            if ticks is not None
+            else "runs again"
+        )
+        yield Event(now.tick, "back", robot, f"{name} is back: its process {what}")
 
 
 def _radio(tick: int, passages: Sequence[Passage]) -> Iterator[Event]:

@@ -8,6 +8,7 @@ from pathlib import Path
 import msgspec
 
 from compose.errors import UserError
+from compose.recording.kills_file import kills_in
 from compose.recording.recording_files import WORLD_JOURNAL, agent_journal, journals_in, robot_of
 from compose.recording.run import Run
 from compose.recording.run_setup import RunSetup, of_configs, of_scenario
@@ -26,6 +27,7 @@ from world.world_journal import WorldJournalReading
 def run_data(run: Run) -> RunData:
     """Return the data of a recording. The world's journal takes precedence over those of the agents."""
     known = RunData()
+    known.add_kills(run.kills)
     if run.world is not None:
         for tick in run.world.ticks:
             known.add_tick(tick)
@@ -39,7 +41,7 @@ def run_data(run: Run) -> RunData:
         known.add_observations(run.world.worlds)
     if run.end is not None:
         known.conclude(run.end)
-    known.final_reports = dict(run.final_reports)
+    known.add_final_reports(run.final_reports)
     return known
 
 
@@ -94,6 +96,8 @@ class Journals:
         """One line per damaged journal. Its frames after the damage are ignored."""
         self._tails: dict[str, Tail] = {}
         self._world = WorldJournalReading()
+        self._kills = 0
+        """The number of killed processes that have been read."""
 
     @property
     def scenario(self) -> Scenario | None:
@@ -102,6 +106,7 @@ class Journals:
 
     def read(self) -> None:
         """Read the frames appended since the last call. Raises OSError."""
+        self._read_kills()
         for path in journals_in(self.folder):
             tail = self._tails.setdefault(path.name, Tail(path))
             try:
@@ -124,6 +129,15 @@ class Journals:
                 self._note(f"{path}: belongs to another run: its configuration does not match the world's")
         if world is None and len(configs) > (len(self.setup.robots) if self.setup is not None else 0):
             self.setup = of_configs(self.folder.name, configs)
+
+    def _read_kills(self) -> None:
+        try:
+            kills = kills_in(self.folder)
+        except CorruptJournal as error:
+            self._note(str(error))
+        else:
+            self.known.add_kills(kills[self._kills :])
+            self._kills = len(kills)
 
     def fill(self) -> None:
         """Compute missing observations from the world's journal. Call once the journals are complete."""
@@ -159,7 +173,7 @@ class Journals:
             self.known.add_world(reading.world)
         if reading.end is not None:
             self.known.conclude(reading.end)
-        self.known.final_reports.update(reading.final_reports)
+        self.known.add_final_reports(reading.final_reports)
 
     def _mode(self) -> str | None:
         try:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 import msgspec
 
+from compose.recording.kills_file import Killed
+from compose.scenario.kills import WORLD
 from protocol.messages import (
     Command,
     DeadlineMissed,
@@ -60,6 +62,8 @@ class TickData(msgspec.Struct, frozen=True):
     """Robots whose process ended in this tick; None is the world. Observed by viewers, never journaled."""
     back: set[str | None] = msgspec.field(default_factory=set)
     """Robots in `down` whose process was seen again in the same tick."""
+    replayed: dict[str | None, int] = msgspec.field(default_factory=dict)
+    """The number of ticks that the process of a robot in `back` replayed, if it was killed on purpose."""
 
 
 class RunData:
@@ -79,6 +83,10 @@ class RunData:
         self._seen: set[str | None] = set()
         self.gone: set[str | None] = set()
         """Robots whose process was seen and has ended; None is the world."""
+        self._complete = -1
+        """The latest tick that the world's journal has completely."""
+        self._kills: list[Killed] = []
+        """The processes that were killed and are not known to be back."""
         self.touched: int | None = None
         """The earliest tick that has changed since the user of this object last set this to None."""
 
@@ -120,6 +128,38 @@ class RunData:
         for robot, command in tick.commands.items():
             data.commands.setdefault(robot, command)
         data.late.update({robot.id for robot in tick.world.scenario.robots} - tick.commands.keys())
+        self._complete = tick.truth.tick
+        self._add_absences()
+
+    def add_kills(self, kills: Iterable[Killed]) -> None:
+        """Add processes that were killed."""
+        self._kills += kills
+        self._add_absences()
+
+    def add_final_reports(self, reports: Mapping[str, FinalReport]) -> None:
+        """Add the FinalReports of the world's journal, after all of its ticks."""
+        self.final_reports.update(reports)
+        self._add_absences()
+
+    def _add_absences(self) -> None:
+        """Add the ticks of killed processes: that of the kill, and those after it with a missed deadline.
+
+        A process that is started again is back when a tick after it is complete, or its FinalReport is known:
+        it goes on only if what it replayed is identical to its journal.
+        """
+        for killed in [killed for killed in self._kills if killed.tick <= self._complete]:
+            robot = None if killed.who == WORLD else killed.who
+            last = killed.tick
+            while last < self._complete and robot in self.ticks[last + 1].late:
+                last += 1
+            for tick in range(killed.tick, last + 1):
+                if robot not in self.ticks[tick].down:
+                    self.at(tick).down.add(robot)
+            reported = self.end is not None and (robot is None or robot in self.final_reports)
+            if killed.after is not None and (last < self._complete or reported):
+                self.at(last).back.add(robot)
+                self.ticks[last].replayed[robot] = killed.replayed_ticks
+                self._kills.remove(killed)
 
     def add_observations(self, worlds: Iterable[World]) -> None:
         """Add the Observations that are still missing in the ticks of `worlds`."""

@@ -1,7 +1,7 @@
-// The timeline: one band of phases per robot, contact shaded, and marks above for faults, claims and the end.
+// The timeline: one band of phases per robot, contact shaded, and marks above for contacts, verdicts, and processes that end and return.
 
 import { unit } from "./pen.js";
-import { FAULTS, SIGNS } from "./words.js";
+import { SIGNS } from "./words.js";
 
 const MARKED = Object.fromEntries(["contact", "claim", "inconsistent", "undecided", "down", "back"].map((kind) => [kind, SIGNS[kind]]));
 const MOST_BANDS = 6;
@@ -57,8 +57,7 @@ export class Timeline {
         if (player.contacts?.length) lengthen(this.contacts.get(player.robot), this.read, 1);
       }
       for (const event of scene.events) {
-        if (FAULTS.has(event.kind)) this.marks.push([this.read, "fault", event.robot]);
-        else if (event.kind in MARKED) this.marks.push([this.read, event.kind, event.robot]);
+        if (event.kind in MARKED) this.marks.push([this.read, event.kind, event.robot]);
       }
     }
   }
@@ -132,7 +131,7 @@ export class Timeline {
       if (robot !== null && !ids.has(robot)) continue;
       pen.textAlign = "center";
       pen.fillStyle = ["contact", "claim", "back"].includes(kind) ? of("ink") : of("fault");
-      pen.fillText(kind === "fault" ? "×" : MARKED[kind], x(k), 11);
+      pen.fillText(MARKED[kind], x(k), 11);
     }
     this.#ticks(pen, x, MARKS + shown.length * (band + 3) + 11, of("faint"), wide);
     const now = x(Math.min(tick + (moving ? share : 0), this.last));

@@ -44,8 +44,6 @@ export const KIND_NAMES = {
   "report-late": "report late", "report-doubled": "report duplicated",
 };
 
-export const FAULTS = new Set(["report-lost", "report-damaged", "report-late", "report-doubled", "late"]);
-
 export const KEYS = [
   ["space", "play or pause"],
   ["← →", "previous or next tick; with Shift, 10 ticks"],
@@ -63,7 +61,7 @@ export const KEYS = [
   ["W S", "pan up or down; with Shift, left or right; also by dragging"],
   ["N", "zoom to the robots and to where they may be"],
   ["F", "zoom to the whole scenario"],
-  ["D", "show or hide the sequence diagram of the reports"],
+  ["D", "show or hide the sequence diagram of the reports; in it, + − zoom in time and 0 shows all ticks"],
   ["E", "change the scenario, and run it again"],
   ["V", "show or hide the charts; in them, + − zoom in time and 0 shows all ticks"],
   ["?", "this help"],
