@@ -23,13 +23,14 @@ from agent.estimation.gaussian.consistency import (
 )
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis, follow, search
 from agent.estimation.gaussian.inference import PlanningHypothesis
+from agent.estimation.gaussian.odometry_noise import Track
 from agent.estimation.gaussian.range_model import PairRanges
 from agent.estimation.knowledge import Belief, Knowledge
-from agent.planning import active_sensing, exchange, phase2_orbit, range_seeking, transitions
+from agent.planning import active_sensing, exchange, phase2_orbit, range_seeking, stalls, transitions
 from agent.planning.active_sensing import Listening, Retreating, Surveying
 from agent.planning.assured import AssuredExact
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent
-from agent.planning.range_seeking import Backing, Circling, Homing, Straight, Turning
+from agent.planning.range_seeking import Backing, Beacon, Circling, Homing, Straight, Turning
 from agent.planning.state import Asleep, Done, RobotState
 from protocol.messages import BranchKind, Localised, Observation, Report
 from protocol.mission import Mission
@@ -207,8 +208,20 @@ def _continue_phase1(state: RobotState) -> RobotState:
             state, belief=replace(state.belief, branch_kind=kind, phase1_done_tick=phase1_done_tick)
         )
         return _start_phase2(state)
-    command = active_sensing.plan_alone(inference.anchor_planning_hypotheses(state), mission)
-    return replace(state, mode=Surveying("anchor", command))
+    since, stalled = _stalled(state, "anchor", (inference.own_path(state),))
+    hypotheses = inference.anchor_planning_hypotheses(state)
+    command = active_sensing.plan_alone(hypotheses, mission, stalled=stalled)
+    return replace(state, mode=Surveying("anchor", command, since))
+
+
+def _stalled(state: RobotState, beacon: Beacon, paths: Sequence[Track]) -> tuple[int, bool]:
+    """Return the tick of the first of consecutive plans, and whether they lead nowhere (see `stalls`)."""
+    match state.mode:
+        case Surveying(before, _, since) if before == beacon:
+            stride = active_sensing.stride(state.config.mission)
+            return since, stalls.is_stalled(paths, since, stride, state.config.mission)
+        case _:
+            return state.tick, False
 
 
 def _are_misleading(state: RobotState, best: ScoredHypothesis) -> bool:
@@ -294,7 +307,9 @@ def _continue_phase3(state: RobotState) -> RobotState:
         case Retreating(_, since) if state.tick - since < 2 * stride:
             return state
         case Retreating():
-            return replace(state, mode=Surveying("peer")) if state.in_contact else _start_phase2(state)
+            if not state.in_contact:
+                return _start_phase2(state)
+            return replace(state, mode=Surveying("peer", since=state.tick))
         case _ if state.config.role == "b" and _ticks_without_range(state) >= LOST_AFTER_IN_PHASE_3 * stride:
             return _return_to_anchor(state)
         case Surveying(_, command) | Listening(command) if not state.in_contact:
@@ -354,8 +369,13 @@ def _decide_phase3(state: RobotState, planned: JointManoeuvres) -> RobotState:
         return _return_to_anchor(tested)
     if not scored:
         return _drive_without_hypotheses(tested)
-    a, b = planned(hypotheses, pair.apart, state.mutual[-1].range, mission)
-    return replace(tested, mode=Surveying("peer", a if role == "a" else b))
+    since, stalled = _stalled(state, "peer", pair.paths)
+    rho = state.mutual[-1].range
+    if stalled:
+        a, b = active_sensing.plan_together(hypotheses, pair.apart, rho, mission, stalled=True)
+    else:
+        a, b = planned(hypotheses, pair.apart, rho, mission)
+    return replace(tested, mode=Surveying("peer", a if role == "a" else b, since))
 
 
 def may_claim(belief: Belief, pair: PairRanges) -> bool:
@@ -452,6 +472,6 @@ def _drive_without_hypotheses(state: RobotState) -> RobotState:
     """Drive without hypotheses about the poses: b stands, a drives straight on (Section III.C.a)."""
     mission = state.config.mission
     if state.config.role == "b" or not state.mutual:
-        return replace(state, mode=Surveying("peer"))
+        return replace(state, mode=Surveying("peer", since=state.tick))
     step = range_seeking.step_length("peer", state.mutual[-1].range, mission)
-    return replace(state, mode=Surveying("peer", Controls(step / mission.period, 0.0)))
+    return replace(state, mode=Surveying("peer", Controls(step / mission.period, 0.0), state.tick))
