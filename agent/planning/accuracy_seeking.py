@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 from msgspec.structs import replace
 
 from agent.estimation.gaussian import inference
+from agent.estimation.gaussian.claim_rivals import with_rival_check
 from agent.estimation.gaussian.consistency import (
     CLAIM_P_VALUE,
     EARLY_CLAIM_P_VALUE,
@@ -97,6 +99,9 @@ JointManoeuvres = Callable[
     [Sequence[PlanningHypothesis], tuple[float, float], float, Mission], tuple[Controls, Controls]
 ]
 """The type of `AccuracySeeking.joint_manoeuvres`."""
+
+STALLED_MANOEUVRES: JointManoeuvres = partial(active_sensing.plan_together, stalled=True)
+"""The joint manoeuvres of robots that measure at the same places for ever (see `stalls`)."""
 
 
 class AccuracySeeking(AssuredExact):
@@ -359,10 +364,8 @@ def _decide_phase3(state: RobotState, planned: JointManoeuvres) -> RobotState:
     tested = replace(state, belief=inference.with_convergence_check(belief, scored))
     if searched and len(pair.places) >= inference.sufficient_mutual_ranges(mission):
         tested = _with_consistency_test(tested)
-    if tested.verdict is not None:
-        return tested
-    if may_claim(tested.belief, pair):
-        tested = _with_claim(tested, scored, pair)
+    if tested.verdict is None and may_claim(tested.belief, pair):
+        tested = _with_claim(tested, scored, hypotheses, pair)
     if tested.verdict is not None:
         return tested
     if role == "a" and len(pair.places) >= MANY_MUTUAL_RANGES * (1 + state.belief.returns):
@@ -370,11 +373,8 @@ def _decide_phase3(state: RobotState, planned: JointManoeuvres) -> RobotState:
     if not scored:
         return _drive_without_hypotheses(tested)
     since, stalled = _stalled(state, "peer", pair.paths)
-    rho = state.mutual[-1].range
-    if stalled:
-        a, b = active_sensing.plan_together(hypotheses, pair.apart, rho, mission, stalled=True)
-    else:
-        a, b = planned(hypotheses, pair.apart, rho, mission)
+    manoeuvres = STALLED_MANOEUVRES if stalled else planned
+    a, b = manoeuvres(hypotheses, pair.apart, state.mutual[-1].range, mission)
     return replace(tested, mode=Surveying("peer", a if role == "a" else b, since))
 
 
@@ -384,9 +384,16 @@ def may_claim(belief: Belief, pair: PairRanges) -> bool:
     return belief.blocking_reason is None and not (few_ranges and _p_value_below(belief, EARLY_CLAIM_P_VALUE))
 
 
-def _with_claim(state: RobotState, scored: Sequence[ScoredHypothesis], pair: PairRanges) -> RobotState:
+def _with_claim(
+    state: RobotState,
+    scored: Sequence[ScoredHypothesis],
+    hypotheses: Sequence[PlanningHypothesis],
+    pair: PairRanges,
+) -> RobotState:
     """Return `state` with the claim if nothing blocks it, or Undecided if profiles contradict all claims."""
-    state = replace(state, belief=inference.with_doubt_check(state.belief, scored, pair))
+    belief = inference.with_doubt_check(state.belief, scored, pair)
+    belief = with_rival_check(belief, scored, hypotheses[0], pair, state.config.mission)
+    state = replace(state, belief=belief)
     reason = state.belief.blocking_reason
     if reason is None:
         belief = replace(state.belief, p_value=_least_p_value(state.belief))

@@ -19,8 +19,8 @@ from protocol.mission import Mission
 PLANS = 6
 """The number of consecutive plans whose places are compared.
 
-Set on 1500 missions with R = 1.5 m, of which 4 stalled for more than 60 plans. With fewer, robots that measure
-on purpose for a while where they are would leave; with more, a stall lasts longer.
+Set on missions with R = 1.5 m, of which 4 of 1500 stalled for more than 60 plans. With fewer, robots that
+measure on purpose for a while where they are would leave; with more, a stall lasts longer.
 """
 
 FEWEST_PLACES = 3

@@ -366,3 +366,31 @@ def _log_likelihood(
 
 SOFT = 0.1
 """The least smoothing of the ends of the outlier density, as a fraction of the least bias."""
+
+
+def held_log_likelihood(problem: Problem, begun: Fit, row: int, steps: int) -> float:
+    """Return the log-likelihood of the ranges of `problem` after `steps` steps from the fit `begun`.
+
+    The problem has the ranges of that fit and one more, at `row`, which holds a coordinate: it is no outlier.
+    """
+    noise, sigma = problem.noise, problem.ranges.sigma
+    point = problem.begin([Start(begun.guess, begun.errors)])
+    weights = np.insert(begun.weights, row, 1.0)[None]
+    for step in range(steps + 1):
+        linear = problem.linearised(point)
+        covariance = range_covariance(_variance(sigma, weights), linear.columns, linear.dense)
+        system = _solved(point.predicted.jacobian[..., problem.free], linear.innovation, covariance)
+        if step == steps:
+            break
+        change = system.change * min(1.0, LEAP / max(float(np.abs(system.change).max()), LEAP))
+        left_over = system.weighted[..., -1] - product(system.weighted[..., :-1], change)
+        point = problem.point(point.guess + change, problem.sizes(point, linear, left_over))
+        if problem.robust:
+            if step == 0:
+                loosened = np.square(sigma) + np.add.reduce(np.square(problem.common), 1)
+                weights = _weights(point.residuals, np.sqrt(loosened), noise)
+            else:
+                weights = _inlier_probabilities(system, weights, sigma, noise)
+            weights[:, row] = 1.0
+    chi2, level = float(_quality(system, weights, noise).chi2[0]), begun.level
+    return _log_likelihood(system.one(0), chi2, point.residuals[0], weights[0], sigma, level, noise)

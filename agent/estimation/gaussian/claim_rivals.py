@@ -1,0 +1,119 @@
+"""The rivals of a claim: the likeliest poses that are so far from it that it would be wrong.
+
+The covariance of a fit describes the likelihood near its maximum. Where the possible poses lie along a bent
+valley, or where an outlier passes as an inlier because the fit has moved towards it, poses many sigmas away
+may be nearly as likely as the claimed ones. They are found by fits in which one coordinate of a robot is held
+there and everything else is free, the weights of the ranges included (a profile likelihood).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from msgspec.structs import replace
+
+from agent.estimation.gaussian.fitted import Fit
+from agent.estimation.gaussian.hypotheses import ScoredHypothesis
+from agent.estimation.gaussian.inference import PlanningHypothesis, to_second_order
+from agent.estimation.gaussian.least_squares import held_log_likelihood
+from agent.estimation.gaussian.linear_model import Problem
+from agent.estimation.gaussian.odometry_noise import Array
+from agent.estimation.gaussian.range_model import PairRanges, Ranges
+from agent.estimation.knowledge import Belief
+from protocol.mission import Mission
+
+WRONG_SIGMAS = 5.0
+"""The number of claimed sigmas from which on the referee calls a claim wrong."""
+
+HELD_STEPS = 5
+"""The Gauss-Newton steps of a fit with a held coordinate.
+
+The first one leads to the held place, and the weights of the ranges follow within two or three.
+"""
+
+FAR_ANCHOR = 1e4
+"""The distance (m) of an anchor to which a range holds a coordinate: it measures along one direction."""
+
+HOLDING_SIGMA = 1e-4
+"""The sigma (m) of that range, which is small beside that of any claim that is checked."""
+
+
+class Rival(NamedTuple):
+    """The likeliest poses that would make a claim wrong."""
+
+    robot: int
+    log_likelihood_ratio: float
+    """The log-likelihood of all ranges under these poses, less that under the claimed ones."""
+
+
+@lru_cache(maxsize=2)
+def likeliest_rival(fitted: Fit, pair: PairRanges, claimed: PlanningHypothesis) -> Rival:
+    """Return the likeliest rival of the claims of `fitted`.
+
+    `claimed` contains the poses and the covariance of both robots. The coordinate that is held is that along
+    the longest axis of the ellipse of a robot's position.
+    """
+    _, covariance = to_second_order(claimed, pair.apart)
+    rivals = []
+    for robot in (0, 1):
+        i = 3 * robot
+        variances, axes = np.linalg.eigh(covariance[i : i + 2, i : i + 2])
+        along, far = axes[:, 1], WRONG_SIGMAS * math.sqrt(float(np.sum(variances)))
+        place = float(along @ (claimed.poses[i : i + 2] - robot * np.array(pair.apart)))
+        here = _held(fitted, pair, robot, along, place, 0)
+        there = [_held(fitted, pair, robot, along, place + off, HELD_STEPS) for off in (far, -far)]
+        rivals.append(Rival(robot, max(there) - here))
+    return max(rivals, key=lambda one: one.log_likelihood_ratio)
+
+
+def _held(fitted: Fit, pair: PairRanges, robot: int, along: Array, place: float, steps: int) -> float:
+    """Return the log-likelihood of all ranges if the last coordinate `along` of a robot is `place` (m).
+
+    A range of the last tick to an anchor far away holds it. No error that ranges have in common affects it.
+    """
+    ranges, noise = pair.ranges, pair.noise
+    row = sum(ranges.counts[: robot + 1])
+    counts = [count + (kind == robot) for kind, count in enumerate(ranges.counts)]
+    anchors = np.zeros((len(ranges.rho) + 1, 2))
+    anchors[row] = -FAR_ANCHOR * along
+    held = Ranges(
+        np.insert(ranges.rho, row, FAR_ANCHOR + place),
+        np.insert(ranges.tick, row, len(pair.paths[robot].v)),
+        np.insert(ranges.sigma, row, HOLDING_SIGMA),
+        (counts[0], counts[1], counts[2]),
+        anchors,
+        np.insert(np.repeat(np.arange(3), ranges.counts), row, 3),
+    )
+    problem = Problem.of(pair.paths, held, noise, pair.apart)
+    common, slow = np.insert(ranges.common_errors(noise.priors), row, 0.0, 0), problem.slow
+    if slow is not None:
+        slow = slow.copy()
+        slow[row] = slow[:, row] = 0.0
+    return held_log_likelihood(problem._replace(common=common, slow=slow), fitted, row, steps)
+
+
+def with_rival_check(
+    belief: Belief,
+    scored: Sequence[ScoredHypothesis],
+    claimed: PlanningHypothesis,
+    pair: PairRanges,
+    mission: Mission,
+) -> Belief:
+    """Return `belief` with a blocking reason if poses that would make the claim wrong are too likely.
+
+    They may be as likely as other hypotheses may be probable: 1 - confidence.
+    """
+    if belief.blocking_reason is not None:
+        return belief
+    rival, most = likeliest_rival(scored[0].fit, pair, claimed), math.log1p(-mission.confidence)
+    if rival.log_likelihood_ratio <= most:
+        return belief
+    reason = (
+        f"poses {WRONG_SIGMAS:g} sigmas away explain the ranges nearly as well: "
+        f"their log-likelihood ratio is {rival.log_likelihood_ratio:.3g}, allowed {most:.3g}"
+    )
+    return replace(belief, blocking_reason=reason)
