@@ -35,11 +35,11 @@ HELD_STEPS = 5
 The first one leads to the held place, and the weights of the ranges follow within two or three.
 """
 
-FAR_ANCHOR = 1e4
-"""The distance (m) of an anchor to which a range holds a coordinate: it measures along one direction."""
+FAR_ANCHOR = 1e3
+"""The distance of an anchor to which a range holds a coordinate, in R: it measures along one direction."""
 
-HOLDING_SIGMA = 1e-4
-"""The sigma (m) of that range, which is small beside that of any claim that is checked."""
+HOLDING_SIGMA = 1e-3
+"""The sigma of that range, as a fraction of the distance from the claim at which it holds a coordinate."""
 
 
 class Rival(NamedTuple):
@@ -63,37 +63,50 @@ def likeliest_rival(fitted: Fit, pair: PairRanges, claimed: PlanningHypothesis) 
         i = 3 * robot
         variances, axes = np.linalg.eigh(covariance[i : i + 2, i : i + 2])
         along, far = axes[:, 1], WRONG_SIGMAS * math.sqrt(float(np.sum(variances)))
-        place = float(along @ (claimed.poses[i : i + 2] - robot * np.array(pair.apart)))
-        here = _held(fitted, pair, robot, along, place, 0)
-        there = [_held(fitted, pair, robot, along, place + off, HELD_STEPS) for off in (far, -far)]
-        rivals.append(Rival(robot, max(there) - here))
+        place = claimed.poses[i : i + 2] - robot * np.array(pair.apart)
+        anchor = place - FAR_ANCHOR * pair.sensing_range * along
+        hold = _Held(fitted, pair, robot, anchor, math.hypot(*(place - anchor)), HOLDING_SIGMA * far)
+        there = max(hold.log_likelihood(off, HELD_STEPS) for off in (far, -far))
+        rivals.append(Rival(robot, there - hold.log_likelihood(0.0, 0)))
     return max(rivals, key=lambda one: one.log_likelihood_ratio)
 
 
-def _held(fitted: Fit, pair: PairRanges, robot: int, along: Array, place: float, steps: int) -> float:
-    """Return the log-likelihood of all ranges if the last coordinate `along` of a robot is `place` (m).
+class _Held(NamedTuple):
+    """A fit and one more range, which holds a coordinate of a robot at the last tick."""
 
-    A range of the last tick to an anchor far away holds it. No error that ranges have in common affects it.
-    """
-    ranges, noise = pair.ranges, pair.noise
-    row = sum(ranges.counts[: robot + 1])
-    counts = [count + (kind == robot) for kind, count in enumerate(ranges.counts)]
-    anchors = np.zeros((len(ranges.rho) + 1, 2))
-    anchors[row] = -FAR_ANCHOR * along
-    held = Ranges(
-        np.insert(ranges.rho, row, FAR_ANCHOR + place),
-        np.insert(ranges.tick, row, len(pair.paths[robot].v)),
-        np.insert(ranges.sigma, row, HOLDING_SIGMA),
-        (counts[0], counts[1], counts[2]),
-        anchors,
-        np.insert(np.repeat(np.arange(3), ranges.counts), row, 3),
-    )
-    problem = Problem.of(pair.paths, held, noise, pair.apart)
-    common, slow = np.insert(ranges.common_errors(noise.priors), row, 0.0, 0), problem.slow
-    if slow is not None:
-        slow = slow.copy()
-        slow[row] = slow[:, row] = 0.0
-    return held_log_likelihood(problem._replace(common=common, slow=slow), fitted, row, steps)
+    fitted: Fit
+    pair: PairRanges
+    robot: int
+    anchor: Array
+    """The position (m) of the far anchor to which the range is, relative to the robot's own anchor."""
+    rho: float
+    """The range (m) at the claimed position."""
+    sigma: float
+
+    def log_likelihood(self, off: float, steps: int) -> float:
+        """Return the log-likelihood of all ranges if the coordinate is `off` (m) from the claim.
+
+        No error that ranges have in common affects the range that holds it.
+        """
+        ranges, noise = self.pair.ranges, self.pair.noise
+        row = sum(ranges.counts[: self.robot + 1])
+        first, second, mutual = [count + (kind == self.robot) for kind, count in enumerate(ranges.counts)]
+        anchors = np.zeros((len(ranges.rho) + 1, 2))
+        anchors[row] = self.anchor
+        held = Ranges(
+            np.insert(ranges.rho, row, self.rho + off),
+            np.insert(ranges.tick, row, len(self.pair.paths[self.robot].v)),
+            np.insert(ranges.sigma, row, self.sigma),
+            (first, second, mutual),
+            anchors,
+            np.insert(np.repeat(np.arange(3), ranges.counts), row, 3),
+        )
+        problem = Problem.of(self.pair.paths, held, noise, self.pair.apart)
+        common, slow = np.insert(ranges.common_errors(noise.priors), row, 0.0, 0), problem.slow
+        if slow is not None:
+            slow = slow.copy()
+            slow[row] = slow[:, row] = 0.0
+        return held_log_likelihood(problem._replace(common=common, slow=slow), self.fitted, row, steps)
 
 
 def with_rival_check(
