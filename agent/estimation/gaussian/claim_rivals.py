@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from agent.estimation.gaussian.fitted import Fit
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis
 from agent.estimation.gaussian.inference import PlanningHypothesis, to_second_order
-from agent.estimation.gaussian.least_squares import held_log_likelihood
+from agent.estimation.gaussian.least_squares import held_log_likelihoods
 from agent.estimation.gaussian.linear_model import Problem
 from agent.estimation.gaussian.odometry_noise import Array
 from agent.estimation.gaussian.range_model import PairRanges, Ranges
@@ -65,48 +65,38 @@ def likeliest_rival(fitted: Fit, pair: PairRanges, claimed: PlanningHypothesis) 
         along, far = axes[:, 1], WRONG_SIGMAS * math.sqrt(float(np.sum(variances)))
         place = claimed.poses[i : i + 2] - robot * np.array(pair.apart)
         anchor = place - FAR_ANCHOR * pair.sensing_range * along
-        hold = _Held(fitted, pair, robot, anchor, math.hypot(*(place - anchor)), HOLDING_SIGMA * far)
-        there = max(hold.log_likelihood(off, HELD_STEPS) for off in (far, -far))
-        rivals.append(Rival(robot, there - hold.log_likelihood(0.0, 0)))
+        held, row = _holding(pair, robot, anchor, math.hypot(*(place - anchor)), HOLDING_SIGMA * far)
+        (here,) = held_log_likelihoods(held, fitted, row, np.zeros(1), 0)
+        there = held_log_likelihoods(held, fitted, row, np.array((far, -far)), HELD_STEPS)
+        rivals.append(Rival(robot, max(there) - here))
     return max(rivals, key=lambda one: one.log_likelihood_ratio)
 
 
-class _Held(NamedTuple):
-    """A fit and one more range, which holds a coordinate of a robot at the last tick."""
+def _holding(pair: PairRanges, robot: int, anchor: Array, rho: float, sigma: float) -> tuple[Problem, int]:
+    """Return the problem of `pair` with one more range, which holds a coordinate of a robot, and its row.
 
-    fitted: Fit
-    pair: PairRanges
-    robot: int
-    anchor: Array
-    """The position (m) of the far anchor to which the range is, relative to the robot's own anchor."""
-    rho: float
-    """The range (m) at the claimed position."""
-    sigma: float
-
-    def log_likelihood(self, off: float, steps: int) -> float:
-        """Return the log-likelihood of all ranges if the coordinate is `off` (m) from the claim.
-
-        No error that ranges have in common affects the range that holds it.
-        """
-        ranges, noise = self.pair.ranges, self.pair.noise
-        row = sum(ranges.counts[: self.robot + 1])
-        first, second, mutual = [count + (kind == self.robot) for kind, count in enumerate(ranges.counts)]
-        anchors = np.zeros((len(ranges.rho) + 1, 2))
-        anchors[row] = self.anchor
-        held = Ranges(
-            np.insert(ranges.rho, row, self.rho + off),
-            np.insert(ranges.tick, row, len(self.pair.paths[self.robot].v)),
-            np.insert(ranges.sigma, row, self.sigma),
-            (first, second, mutual),
-            anchors,
-            np.insert(np.repeat(np.arange(3), ranges.counts), row, 3),
-        )
-        problem = Problem.of(self.pair.paths, held, noise, self.pair.apart)
-        common, slow = np.insert(ranges.common_errors(noise.priors), row, 0.0, 0), problem.slow
-        if slow is not None:
-            slow = slow.copy()
-            slow[row] = slow[:, row] = 0.0
-        return held_log_likelihood(problem._replace(common=common, slow=slow), self.fitted, row, steps)
+    It is one of the last tick to an `anchor` far away, whose position (m) is relative to the robot's own. No
+    error that ranges have in common affects it.
+    """
+    ranges, noise = pair.ranges, pair.noise
+    row = sum(ranges.counts[: robot + 1])
+    first, second, mutual = [count + (kind == robot) for kind, count in enumerate(ranges.counts)]
+    anchors = np.zeros((len(ranges.rho) + 1, 2))
+    anchors[row] = anchor
+    held = Ranges(
+        np.insert(ranges.rho, row, rho),
+        np.insert(ranges.tick, row, len(pair.paths[robot].v)),
+        np.insert(ranges.sigma, row, sigma),
+        (first, second, mutual),
+        anchors,
+        np.insert(np.repeat(np.arange(3), ranges.counts), row, 3),
+    )
+    problem = Problem.of(pair.paths, held, noise, pair.apart)
+    common, slow = np.insert(ranges.common_errors(noise.priors), row, 0.0, 0), problem.slow
+    if slow is not None:
+        slow = slow.copy()
+        slow[row] = slow[:, row] = 0.0
+    return problem._replace(common=common, slow=slow), row
 
 
 def with_rival_check(
