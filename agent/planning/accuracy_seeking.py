@@ -35,7 +35,7 @@ from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent
 from agent.planning.range_seeking import Backing, Beacon, Circling, Homing, Straight, Turning
 from agent.planning.state import Asleep, Done, RobotState
 from protocol.messages import BranchKind, Localised, Observation, Report
-from protocol.mission import Mission
+from protocol.mission import Mission, Role
 from protocol.motion import ORIGIN, REST, Controls
 
 MANOEUVRES = AssuredExact.MANOEUVRES
@@ -99,9 +99,6 @@ JointManoeuvres = Callable[
     [Sequence[PlanningHypothesis], tuple[float, float], float, Mission], tuple[Controls, Controls]
 ]
 """The type of `AccuracySeeking.joint_manoeuvres`."""
-
-STALLED_MANOEUVRES: JointManoeuvres = partial(active_sensing.plan_together, stalled=True)
-"""The joint manoeuvres of robots that measure at the same places for ever (see `stalls`)."""
 
 
 class AccuracySeeking(AssuredExact):
@@ -373,9 +370,18 @@ def _decide_phase3(state: RobotState, planned: JointManoeuvres) -> RobotState:
     if not scored:
         return _drive_without_hypotheses(tested)
     since, stalled = _stalled(state, "peer", pair.paths)
-    manoeuvres = STALLED_MANOEUVRES if stalled else planned
+    manoeuvres = _manoeuvres(state, stalled) or planned
     a, b = manoeuvres(hypotheses, pair.apart, state.mutual[-1].range, mission)
     return replace(tested, mode=Surveying("peer", a if role == "a" else b, since))
+
+
+def _manoeuvres(state: RobotState, stalled: bool) -> JointManoeuvres | None:
+    """Return how robots plan that are stalled, or of which one has claimed its pose; None: as always."""
+    claimed = isinstance(state.peer_state.verdict, Localised)
+    if not (stalled or claimed):
+        return None
+    peer: Role = "b" if state.config.role == "a" else "a"
+    return partial(active_sensing.plan_together, stalled=stalled, resting=peer if claimed else None)
 
 
 def may_claim(belief: Belief, pair: PairRanges) -> bool:
@@ -392,7 +398,9 @@ def _with_claim(
 ) -> RobotState:
     """Return `state` with the claim if nothing blocks it, or Undecided if profiles contradict all claims."""
     belief = inference.with_doubt_check(state.belief, scored, pair)
-    belief = with_rival_check(belief, scored, hypotheses[0], pair, state.config.mission)
+    own = 0 if state.config.role == "a" else 1
+    robots = (own,) if isinstance(state.peer_state.verdict, Localised) else (0, 1)
+    belief = with_rival_check(belief, scored, hypotheses[0], pair, state.config.mission, robots)
     state = replace(state, belief=belief)
     reason = state.belief.blocking_reason
     if reason is None:

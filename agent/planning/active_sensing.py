@@ -21,7 +21,7 @@ from agent.estimation.gaussian.odometry_noise import Array, Places
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
 from agent.planning import separation
 from agent.planning.range_seeking import Beacon
-from protocol.mission import Mission
+from protocol.mission import Mission, Role
 from protocol.motion import REST, Controls
 
 STRIDE_LENGTH = 0.25
@@ -189,6 +189,7 @@ def plan_together(
     mission: Mission,
     *,
     stalled: bool = False,
+    resting: Role | None = None,
 ) -> tuple[Controls, Controls]:
     """Return the manoeuvres of a and b after which both poses are expected to be known best.
 
@@ -196,9 +197,10 @@ def plan_together(
     manoeuvre is selected as if a stood still, then a's, given b's. Neither robot comes nearer to the other
     than the safety distance under any hypothesis; `rho` is the latest range between them in m. If no
     manoeuvre meets this condition, both stand still. Of `stalled` robots, b moves, one stride alone counts,
-    and to leave the range costs little.
+    and to leave the range costs little. A robot that is `resting` has claimed its pose, and stands still; the
+    other one moves.
     """
-    return _planned_together(tuple(hypotheses), m2, rho, mission, stalled)
+    return _planned_together(tuple(hypotheses), m2, rho, mission, stalled, resting)
 
 
 @lru_cache(maxsize=2)
@@ -208,14 +210,19 @@ def _planned_together(
     rho: float,
     mission: Mission,
     stalled: bool,
+    resting: Role | None,
 ) -> tuple[Controls, Controls]:
     """Return the manoeuvres of `plan_together`, which both robots of one process ask for."""
     ways = _choice(mission, stalled)
     stand = len(ways.v) - 1
-    still, outside = np.array([stand]), OUTSIDE_COST_ALONE if stalled else OUTSIDE_COST
-    standing = STALLED_COST if stalled else 0.0
-    _, b = _best_of(ways, hypotheses, m2, rho, mission, still, np.arange(stand + 1), outside, standing)
-    a, _ = _best_of(ways, hypotheses, m2, rho, mission, np.arange(stand + 1), np.array([b]), outside)
+    still, every = np.array([stand]), np.arange(stand + 1)
+    outside, standing = (OUTSIDE_COST_ALONE, STALLED_COST) if stalled else (OUTSIDE_COST, 0.0)
+    a = b = stand
+    if resting != "b":
+        _, b = _best_of(ways, hypotheses, m2, rho, mission, still, every, outside, standing)
+    if resting != "a":
+        of_a = standing if resting == "b" else 0.0
+        a, _ = _best_of(ways, hypotheses, m2, rho, mission, every, np.array([b]), outside, of_a)
     return (
         Controls(float(ways.v[a]), float(ways.omega[a])),
         Controls(float(ways.v[b]), float(ways.omega[b])),

@@ -51,15 +51,17 @@ class Rival(NamedTuple):
 
 
 @lru_cache(maxsize=2)
-def likeliest_rival(fitted: Fit, pair: PairRanges, claimed: PlanningHypothesis) -> Rival:
-    """Return the likeliest rival of the claims of `fitted`.
+def likeliest_rival(
+    fitted: Fit, pair: PairRanges, claimed: PlanningHypothesis, robots: tuple[int, ...]
+) -> Rival:
+    """Return the likeliest rival of the claims of `robots` (0 and 1), which follow from `fitted`.
 
     `claimed` contains the poses and the covariance of both robots. The coordinate that is held is that along
     the longest axis of the ellipse of a robot's position.
     """
     _, covariance = to_second_order(claimed, pair.apart)
     rivals = []
-    for robot in (0, 1):
+    for robot in robots:
         i = 3 * robot
         variances, axes = np.linalg.eigh(covariance[i : i + 2, i : i + 2])
         along, far = axes[:, 1], WRONG_SIGMAS * math.sqrt(float(np.sum(variances)))
@@ -105,14 +107,15 @@ def with_rival_check(
     claimed: PlanningHypothesis,
     pair: PairRanges,
     mission: Mission,
+    robots: tuple[int, ...],
 ) -> Belief:
-    """Return `belief` with a blocking reason if poses that would make the claim wrong are too likely.
+    """Return `belief` with a blocking reason if poses that would make a claim of `robots` wrong are likely.
 
     They may be as likely as other hypotheses may be probable: 1 - confidence.
     """
     if belief.blocking_reason is not None:
         return belief
-    rival, most = likeliest_rival(scored[0].fit, pair, claimed), math.log1p(-mission.confidence)
+    rival, most = likeliest_rival(scored[0].fit, pair, claimed, robots), math.log1p(-mission.confidence)
     if rival.log_likelihood_ratio <= most:
         return belief
     reason = (
