@@ -7,12 +7,13 @@ import math
 import numpy as np
 import pytest
 
+import tandem
 from agent.estimation.gaussian.inference import PlanningHypothesis
 from agent.estimation.gaussian.odometry_noise import Array, Track, track
 from agent.planning.active_sensing import choice, plan_alone, plan_together, stride
 from agent.planning.stalls import PLANS, is_stalled
 from compose.launch.in_process import run_mission
-from protocol.mission import Mission
+from protocol.mission import Mission, Role
 from protocol.motion import REST
 from protocol.noise import Noise
 from tests.series import series
@@ -77,6 +78,24 @@ def test_a_stalled_pair_does_not_stand_still() -> None:
     assert plan_together(mirrored, (10.0, 0.0), 1.3, MISSION) == (REST, REST)
     _, b = plan_together(mirrored, (10.0, 0.0), 1.3, MISSION, stalled=True)
     assert b != REST
+
+
+@pytest.mark.parametrize("resting", ["a", "b"])
+def test_beside_a_peer_that_has_claimed_only_the_other_robot_moves(resting: Role) -> None:
+    known = np.diag([0.05**2, 0.05**2, 0.05**2] * 2)
+    hypotheses = [held(1.0, [9.6, -1.0, 0.0, 10.0, -0.3, 2.0], known)]
+    plan = plan_together(hypotheses, (10.0, 0.0), 1.0, MISSION, stalled=True, resting=resting)
+    at_rest, mover = (plan[0], plan[1]) if resting == "a" else (plan[1], plan[0])
+    assert at_rest == REST
+    assert mover != REST
+
+
+@pytest.mark.parametrize("seed", series([8091567773304338074, 3571630859253287996, 6725030068727122292], 0))
+def test_a_robot_whose_peer_has_claimed_first_localises_too(seed: int) -> None:
+    """It waited for manoeuvres of its peer, which stood still; in the last one, for a better claim of it."""
+    fields = {"mission.noise.anchor_sigma": 0.05, "mission.noise.mutual_sigma": 0.05, "mission.accuracy": 0.1}
+    scenario = tandem.Scenario.load("random").with_({**fields, "world.noise.outliers": 0.1}, seed=seed)
+    assert tandem.run(scenario).outcome == "localised"
 
 
 @pytest.mark.parametrize("seed", series([455, 694, 1102, 1198]))
