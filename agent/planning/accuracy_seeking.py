@@ -126,7 +126,8 @@ class AccuracySeeking(AssuredExact):
 
         `hypotheses` are about the poses of both robots relative to M1, the most probable first. M2 is at
         `m2` in m, and `rho` is the latest range between the robots in m. A subclass may plan others; both
-        robots compute both from the same measurements.
+        robots compute both from the same measurements. It is not asked while they are stalled (see `stalls`),
+        nor when one of them has claimed its pose.
         """
         return active_sensing.plan_together(hypotheses, m2, rho, mission)
 
