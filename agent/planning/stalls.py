@@ -20,7 +20,7 @@ PLANS = 6
 """The number of consecutive plans whose places are compared.
 
 Set on missions with R = 1.5 m, of which 4 of 1500 stalled for more than 60 plans. With fewer, robots that
-measure on purpose for a while where they are would leave; with more, a stall lasts longer. With 6, robots were
+measure on purpose for a while where they are would leave; with more, a stall lasts longer. With 6, robots
 stalled for a while in 5 % of these missions, and in none of 300 of the row `as told` of the sweep `mismatch`.
 """
 
