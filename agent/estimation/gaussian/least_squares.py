@@ -53,10 +53,22 @@ No claim does: each search fits all ranges again. With STILL, such a fit takes t
 """
 
 WARM_DECREASE = 0.1
-"""The expected decrease of the first step of a fit that begins at the last one, which has one range less."""
+"""The expected decrease of the first step of a fit that begins near its end.
 
-SETTLED = 1e-2
-"""The change of a weight below which the weights have converged."""
+It begins at the last fit, which has one range less, or at a guess that is refined on all ranges.
+"""
+
+SETTLED = 3.0
+"""The change of a weight below which the weights have converged, in units of the shortest step."""
+
+NEAR_END = 1.0
+"""The length in sigmas of the next step below which a fit tells where it will end."""
+
+ALIKE = 0.3
+"""The largest difference of the weights of two fits that come to the same end.
+
+With other outliers, two fits from one guess may come to different ends.
+"""
 
 LEAP = 1.0
 """The largest change of an unknown, in m and rad, in one step."""
@@ -106,10 +118,11 @@ def fits(
     *,
     shortest: float = STILL,
     decrease: float = 1.0,
+    same: float = 0.0,
 ) -> list[Fit]:
     """Return the Gauss-Newton fits that begin at `starts`, in this order.
 
-    A step is the last if the next one is expected to be shorter than `shortest`. The second step is expected
+    Of fits that come within `same` sigmas of each other, one continues, and the others are left out. A step is the last if the next one is expected to be shorter than `shortest`. The second step is expected
     to be shorter than the first by the factor `decrease`, which is less than 1 for starts that are fits. A
     step that does not descend is shortened, because Gauss-Newton with full steps may alternate between two
     guesses. The weights of outliers decrease during the iteration. `apart` is M2 - M1 (m) in <W>.
@@ -120,7 +133,7 @@ def fits(
     point = problem.begin(starts)
     weights = np.ones(point.residuals.shape)
     ended: dict[int, Fit] = {}  # by the index of the start
-    left, before = list(range(len(starts))), np.zeros(len(starts))
+    left, before = list(range(len(starts))), np.zeros(len(starts))  # the index of the start of each row
     for step in range(steps + 1):
         linear = problem.linearised(point)
         if problem.robust and step == 0:
@@ -133,11 +146,11 @@ def fits(
         if step == 0:
             before = quality.last_step / decrease
         expected = np.square(quality.last_step) / np.maximum(np.maximum(quality.last_step, before), STILL)
-        still = (expected < shortest) & (np.maximum.reduce(np.abs(updated - weights), -1) < SETTLED)
+        still = (expected < shortest) & (np.maximum.reduce(np.abs(updated - weights), -1) < SETTLED * shortest)
         still &= step > 0 or decrease < 1.0 or not problem.noisy  # the path is corrected at least once
         if step == steps:
-            for i in left:
-                ended[i] = _fit(problem, i, point, point, weights, system, quality)
+            for row, i in enumerate(left):
+                ended[i] = _fit(problem, row, point, point, weights, system, quality)
             break
         change = system.change
         change = change * np.minimum(1.0, LEAP / np.maximum(np.abs(change).max(-1, keepdims=True), LEAP))
@@ -146,16 +159,33 @@ def fits(
         left_over = system.weighted[..., -1] - product(system.weighted[..., :-1], change)
         sizes = problem.sizes(point, linear, left_over)
         begun, point = point, _descended(problem, point, following, sizes, variance)
-        # fits that have ended go on with the others: to leave them out takes longer
-        done, at_end = still.tolist(), quality._replace(last_step=expected)
-        for i in left:
-            if done[i]:
-                ended[i] = _fit(problem, i, point, begun, weights, system, at_end)
-        left = [i for i in left if not done[i]]
+        at_end = quality._replace(last_step=expected)
+        for row in np.flatnonzero(still).tolist():
+            ended[left[row]] = _fit(problem, row, point, begun, weights, system, at_end)
+        weights, before, onward = updated, quality.last_step, ~still
+        if same and len(left) > 1:
+            onward &= ~_copies(following[:, problem.free], system, quality, weights, same)
+        if not onward.all():
+            left = [i for i, one in zip(left, onward.tolist(), strict=True) if one]
+            point, weights, before = _of(point, onward), weights[onward], before[onward]
         if not left:
             break
-        weights, before = updated, quality.last_step
-    return [ended[i] for i in range(len(starts))]
+    return [ended[i] for i in sorted(ended)]
+
+
+def _copies(
+    guess: Array, system: NormalEquations, quality: _Quality, weights: Array, same: float
+) -> NDArray[np.bool]:
+    """Return which fits come to the same guess and weights as one that is nearer to its end; shape (fits,)."""
+    apart = guess[:, None] - guess
+    apart[..., 2::3] = np.remainder(apart[..., 2::3] + math.pi, math.tau) - math.pi
+    distance = np.add.reduce((apart @ system.information) * apart, -1) / quality.level
+    near = (distance < same**2) & (np.abs(weights[:, None] - weights).max(-1) < ALIKE)
+    length = quality.last_step
+    near &= np.maximum(length[:, None], length) < NEAR_END
+    sooner = length < length[:, None]
+    sooner |= (length == length[:, None]) & np.tri(len(length), k=-1, dtype=bool)
+    return np.asarray(np.any(near & sooner, 1), np.bool)
 
 
 def _first_weights(problem: Problem, starts: Sequence[Start], point: Point, linear: LinearModel) -> Array:
