@@ -108,6 +108,17 @@ def fit(
     return fits([Start(guess, tuple(begun))], measured, ranges, noise, apart, steps)[0]
 
 
+def own_fit(joint: Fit, robot: int, measured: Sequence[Track], ranges: Ranges, noise: Noise) -> Fit:
+    """Return the fit of one robot (0 or 1) to its own anchor alone, which begins at that of both robots.
+
+    Its evidence and its chi-square are enough for tests, which do not depend on the last digits.
+    """
+    start = Start(np.array([*joint.guess[3 * robot : 3 * robot + 2], 0.0]), joint.errors[robot : robot + 1])
+    own = ranges.only(robot)
+    (one,) = fits([start], [measured[robot]], own, noise, shortest=COARSE_STILL, decrease=WARM_DECREASE)
+    return one
+
+
 def fits(
     starts: Sequence[Start],
     measured: Sequence[Track],
@@ -146,7 +157,9 @@ def fits(
         if step == 0:
             before = quality.last_step / decrease
         expected = np.square(quality.last_step) / np.maximum(np.maximum(quality.last_step, before), STILL)
-        still = (expected < shortest) & (np.maximum.reduce(np.abs(updated - weights), -1) < SETTLED * shortest)
+        still = (expected < shortest) & (
+            np.maximum.reduce(np.abs(updated - weights), -1) < SETTLED * shortest
+        )
         still &= step > 0 or decrease < 1.0 or not problem.noisy  # the path is corrected at least once
         if step == steps:
             for row, i in enumerate(left):
@@ -163,6 +176,8 @@ def fits(
         for row in np.flatnonzero(still).tolist():
             ended[left[row]] = _fit(problem, row, point, begun, weights, system, at_end)
         weights, before, onward = updated, quality.last_step, ~still
+        if not onward.any():
+            break
         if same and len(left) > 1:
             onward &= ~_copies(following[:, problem.free], system, quality, weights, same)
         if not onward.all():

@@ -146,7 +146,8 @@ class Ranges(NamedTuple):
 
     def loosened(self, priors: Priors) -> Array:
         """Return the variance (m^2) that constant and slow errors add to each range; shape (N,)."""
-        variance: Array = np.sum(np.square(self.common_errors(priors)), 1) + priors.slow_sigma**2
+        of_biases = priors.range_bias**2 + priors.pair_bias**2 + priors.slow_sigma**2
+        variance: Array = np.square(priors.range_scale * self.rho) + of_biases
         return variance
 
     def within(self, sensing_range: float, priors: Priors) -> Ranges:
