@@ -133,10 +133,10 @@ def fits(
 ) -> list[Fit]:
     """Return the Gauss-Newton fits that begin at `starts`, in this order.
 
-    Of fits that come within `same` sigmas of each other, one continues, and the others are left out. A step is the last if the next one is expected to be shorter than `shortest`. The second step is expected
-    to be shorter than the first by the factor `decrease`, which is less than 1 for starts that are fits. A
-    step that does not descend is shortened, because Gauss-Newton with full steps may alternate between two
-    guesses. The weights of outliers decrease during the iteration. `apart` is M2 - M1 (m) in <W>.
+    A step is the last if the next one is expected to be shorter than `shortest`. The second step is expected
+    to be shorter than the first by the factor `decrease`, which is less than 1 for starts that are fits. Of
+    fits that come within `same` sigmas of each other, one goes on, and the others are left out. The weights
+    of outliers decrease during the iteration. `apart` is M2 - M1 (m) in <W>.
     """
     if not starts:
         return []
@@ -191,7 +191,7 @@ def fits(
 def _copies(
     guess: Array, system: NormalEquations, quality: _Quality, weights: Array, same: float
 ) -> NDArray[np.bool]:
-    """Return which fits come to the same guess and weights as one that is nearer to its end; shape (fits,)."""
+    """Return which fits come to the same guess and weights as one that is nearer to its end."""
     apart = guess[:, None] - guess
     apart[..., 2::3] = np.remainder(apart[..., 2::3] + math.pi, math.tau) - math.pi
     distance = np.add.reduce((apart @ system.information) * apart, -1) / quality.level
@@ -240,10 +240,12 @@ T = TypeVar("T")
 
 def _of(values: T, some: NDArray[np.bool] | Places) -> T:
     """Return the part of `values`, a tuple of arrays or of such tuples, that belongs to some of the fits."""
-    if isinstance(values, tuple):
-        parts = [_of(value, some) for value in values]
-        return cast("T", type(values)(*parts) if hasattr(values, "_fields") else tuple(parts))
-    return cast("T", values[some]) if isinstance(values, np.ndarray) else values
+    if isinstance(values, np.ndarray):
+        return cast("T", values[some])
+    if not isinstance(values, tuple):
+        return values
+    parts = [_of(value, some) for value in values]
+    return cast("T", type(values)(*parts) if hasattr(values, "_fields") else tuple(parts))
 
 
 def _put(values: object, some: NDArray[np.bool] | Places, others: object) -> None:
