@@ -13,13 +13,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, TypeVar, cast
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.estimation.gaussian.descent import rows_of, stepped
 from agent.estimation.gaussian.fitted import Fit, NormalEquations
-from agent.estimation.gaussian.linear_model import ErrorSizes, LinearModel, Point, Problem, Start, product
+from agent.estimation.gaussian.linear_model import LinearModel, Point, Problem, Start, product
 from agent.estimation.gaussian.noise_level import (
     INLIER,
     misfit_log_likelihood,
@@ -29,7 +30,6 @@ from agent.estimation.gaussian.noise_level import (
 from agent.estimation.gaussian.odometry_noise import (
     Array,
     Errors,
-    Places,
     Track,
 )
 from agent.estimation.gaussian.range_covariance import RangeCovariance, inverse_of, range_covariance
@@ -69,18 +69,6 @@ ALIKE = 0.3
 
 With other outliers, two fits from one guess may come to different ends.
 """
-
-LEAP = 1.0
-"""The largest change of an unknown, in m and rad, in one step."""
-
-SHORTER_STEPS = (0.5, 0.25, 0.0625)
-"""The fractions of a step that are tried in turn if it does not descend.
-
-Gauss-Newton with full steps may alternate between two guesses for ever.
-"""
-
-DESCENT = 1e-6
-"""The increase of the cost, in units of chi-square, that is due to rounding."""
 
 RIDGE = 1e-12
 """The fraction of the information that is added to its diagonal, and an absolute part of the same size.
@@ -157,34 +145,25 @@ def fits(
         if step == 0:
             before = quality.last_step / decrease
         expected = np.square(quality.last_step) / np.maximum(np.maximum(quality.last_step, before), STILL)
-        still = (expected < shortest) & (
-            np.maximum.reduce(np.abs(updated - weights), -1) < SETTLED * shortest
-        )
+        settled = np.maximum.reduce(np.abs(updated - weights), -1) < SETTLED * shortest
+        still = settled & (expected < shortest)
         still &= step > 0 or decrease < 1.0 or not problem.noisy  # the path is corrected at least once
         if step == steps:
             for row, i in enumerate(left):
                 ended[i] = _fit(problem, row, point, point, weights, system, quality)
             break
-        change = system.change
-        change = change * np.minimum(1.0, LEAP / np.maximum(np.abs(change).max(-1, keepdims=True), LEAP))
-        following = point.guess.copy()
-        following[:, problem.free] += change
-        left_over = system.weighted[..., -1] - product(system.weighted[..., :-1], change)
-        sizes = problem.sizes(point, linear, left_over)
-        begun, point = point, _descended(problem, point, following, sizes, variance)
+        begun, point = point, stepped(problem, point, linear, system, variance)
         at_end = quality._replace(last_step=expected)
         for row in np.flatnonzero(still).tolist():
             ended[left[row]] = _fit(problem, row, point, begun, weights, system, at_end)
-        weights, before, onward = updated, quality.last_step, ~still
+        copies = _copies(point.guess[:, problem.free], system, quality, weights, same)
+        onward = ~(still | copies)
         if not onward.any():
             break
-        if same and len(left) > 1:
-            onward &= ~_copies(following[:, problem.free], system, quality, weights, same)
-        if not onward.all():
-            left = [i for i, one in zip(left, onward.tolist(), strict=True) if one]
-            point, weights, before = _of(point, onward), weights[onward], before[onward]
-        if not left:
-            break
+        left = [i for i, one in zip(left, onward.tolist(), strict=True) if one]
+        weights, before = updated, quality.last_step
+        if len(left) < len(onward):
+            point, weights, before = rows_of((point, weights, before), onward)
     return [ended[i] for i in sorted(ended)]
 
 
@@ -192,6 +171,8 @@ def _copies(
     guess: Array, system: NormalEquations, quality: _Quality, weights: Array, same: float
 ) -> NDArray[np.bool]:
     """Return which fits come to the same guess and weights as one that is nearer to its end."""
+    if not same or len(guess) == 1:
+        return np.zeros(len(guess), np.bool)
     apart = guess[:, None] - guess
     apart[..., 2::3] = np.remainder(apart[..., 2::3] + math.pi, math.tau) - math.pi
     distance = np.add.reduce((apart @ system.information) * apart, -1) / quality.level
@@ -233,28 +214,6 @@ def without_outliers(
     return [
         start._replace(weights=own) for start, own in zip(starts, weights, strict=True) if own.min() < INLIER
     ]
-
-
-T = TypeVar("T")
-
-
-def _of(values: T, some: NDArray[np.bool] | Places) -> T:
-    """Return the part of `values`, a tuple of arrays or of such tuples, that belongs to some of the fits."""
-    if isinstance(values, np.ndarray):
-        return cast("T", values[some])
-    if not isinstance(values, tuple):
-        return values
-    parts = [_of(value, some) for value in values]
-    return cast("T", type(values)(*parts) if hasattr(values, "_fields") else tuple(parts))
-
-
-def _put(values: object, some: NDArray[np.bool] | Places, others: object) -> None:
-    """Replace the part of `values` that belongs to some of the fits by `others`."""
-    if isinstance(values, tuple) and isinstance(others, tuple):
-        for value, other in zip(values, others, strict=True):
-            _put(value, some, other)
-    elif isinstance(values, np.ndarray):
-        values[some] = others
 
 
 def _fit(
@@ -300,29 +259,6 @@ class _Quality(NamedTuple):
     inliers: Array
     level: Array
     last_step: Array
-
-
-def _descended(problem: Problem, point: Point, guess: Array, sizes: ErrorSizes, variance: Array) -> Point:
-    """Return the point after a step to `guess` and `sizes`, or after that fraction of it that descends.
-
-    If none does, the point stays.
-    """
-    most = point.cost(variance) + DESCENT
-    following = problem.point(guess, sizes)
-    descends = following.cost(variance) <= most
-    if descends.all():
-        return following
-    climbing = np.flatnonzero(~descends)
-    for fraction in SHORTER_STEPS:
-        begin, end, ends = _of((point, guess, sizes), climbing)
-        shorter = [one + fraction * (other - one) for one, other in zip(begin.sizes, ends, strict=True)]
-        nearer = problem.point(begin.guess + fraction * (end - begin.guess), ErrorSizes(*shorter))
-        _put(following, climbing, nearer)
-        climbing = climbing[~(nearer.cost(variance[climbing]) <= most[climbing])]
-        if not len(climbing):
-            return following
-    _put(following, climbing, _of(point, climbing))
-    return following
 
 
 def _quality(system: NormalEquations, weights: Array, noise: Noise) -> _Quality:

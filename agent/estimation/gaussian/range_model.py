@@ -133,7 +133,7 @@ class Ranges(NamedTuple):
         if priors.range_scale:
             columns.append(priors.range_scale * rho)
         if priors.pair_bias:
-            columns += [priors.pair_bias * own for own in self.pairs]
+            columns += [np.where(own, priors.pair_bias, 0.0) for own in self.pairs]
         return np.array(columns).T if columns else np.zeros((len(rho), 0))
 
     def slow_errors(self, priors: Priors, period: float) -> Array | None:
