@@ -53,18 +53,6 @@ WARM_STEPS = 4
 Where the best fit has not converged by then, it may be on its way to another mode, and the plane is searched.
 With one step, that is every third tick; with more, each tick takes longer."""
 
-POLISHED_STEPS = 2
-"""The Gauss-Newton steps from a guess that is refined on a few ranges to an anchor.
-
-So few ranges leave directions in which a fit moves on for long, and nothing but the robot's way follows."""
-
-SEARCH_STEPS = 5
-"""The Gauss-Newton steps from each guess of a search.
-
-What a search finds is followed, so that it converges in the next ticks if not in this one. Three of four
-searches take no more than these steps; the others do not converge with 8 either, mostly because three mutual
-ranges leave a direction undetermined."""
-
 
 class Hypothesis(NamedTuple):
     """One possible explanation of all measurements."""
@@ -201,20 +189,20 @@ def of_anchor(
         places = [one.guess[:2] for one in known]
         points = anchors(path, ranges, sensing_range, noise, places)
         starts = [Start(np.array([*point, 0.0])) for point in points]
-    found = _coarse_fits(starts, path, ranges, noise, WARM_STEPS if warm else POLISHED_STEPS)
+    found = _coarse_fits(starts, path, ranges, noise)
     return with_probability(
         [(one, _anchor_log_likelihood(one, 0, silent, ranges.tick, sensing_range, noise)) for one in found]
     )
 
 
-def _coarse_fits(starts: Sequence[Start], path: Track, ranges: Ranges, noise: Noise, steps: int) -> list[Fit]:
+def _coarse_fits(starts: Sequence[Start], path: Track, ranges: Ranges, noise: Noise) -> list[Fit]:
     """Return the fits of one robot, which begin near their ends and are as accurate as planning needs."""
     return fits(
         starts,
         [path],
         ranges,
         noise,
-        steps=steps,
+        steps=WARM_STEPS,
         shortest=COARSE_STILL,
         decrease=WARM_DECREASE,
         same=COPY_SIGMAS,
@@ -284,7 +272,7 @@ def search(pair: PairRanges, known: tuple[Hypothesis, ...] = ()) -> tuple[Scored
     )
     starts = [*[one.start for one in known], *starts]
     measured = (pair.paths, pair.ranges, pair.noise, pair.apart)
-    return _scored(fits(starts, *measured, SEARCH_STEPS, same=COPY_SIGMAS), pair)
+    return _scored(fits(starts, *measured, same=COPY_SIGMAS), pair)
 
 
 STARTS_WITHOUT_OUTLIERS = 4
@@ -329,7 +317,7 @@ def _up_to_last_range(own: _OwnRanges) -> tuple[ScoredHypothesis, ...]:
     """
     points = anchors(own.path, own.ranges, own.sensing_range, own.noise)
     starts = [Start(np.array([*point, 0.0])) for point in points]
-    found = _coarse_fits(starts, own.path, own.ranges, own.noise, WARM_STEPS)
+    found = _coarse_fits(starts, own.path, own.ranges, own.noise)
     return with_probability([(one, 0.0) for one in found])
 
 
