@@ -51,8 +51,8 @@ WARM_STEPS = 4
 """The Gauss-Newton steps from the fit of the previous tick.
 
 Where the best fit has not converged by then, it may be on its way to another mode, and the plane is searched.
-With two steps, that is every third tick of the scenario `noisy`, whose outliers make fits converge slowly; with
-four, every twentieth. With more, each tick takes longer."""
+With two steps, that is every third tick of the scenario `noisy`, whose outliers make fits converge slowly;
+with four, every twentieth. With more, each tick takes longer."""
 
 
 class Hypothesis(NamedTuple):
