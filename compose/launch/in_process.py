@@ -8,6 +8,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from agent.planning.planner import Planner
 from agent.process.agent_journal import FramedReport
 from agent.process.robot import Robot
@@ -24,6 +26,7 @@ from protocol.messages import (
     MissionEnd,
     RobotConfig,
 )
+from protocol.wire import encode
 from world.faults import LATEST
 from world.referee import MissionOutcome
 from world.scenario import Scenario
@@ -57,17 +60,18 @@ def played(
     scenario: Scenario,
     sinks: Mapping[str, Sink],
     planner_of: Callable[[RobotConfig], Planner[Any, Any]] = planner_of,
+    encode: Callable[[msgspec.Struct], bytes] = encode,
 ) -> Run:
     """Run `scenario`, and write its journals to `sinks`, by file name; without sinks, write none.
 
-    `planner_of` returns the planner of a robot.
+    `planner_of` returns the planner of a robot, and `encode` the frame of a message.
     """
     _keep_freed_memory()
     ids = [robot.id for robot in scenario.robots]
-    simulation = Simulation(scenario, sinks.get(WORLD_JOURNAL))
+    simulation = Simulation(scenario, sinks.get(WORLD_JOURNAL), encode)
     configs = {robot: scenario.config(robot) for robot in ids}
     robots = {
-        robot: Robot(config, planner_of(config), sinks.get(agent_journal(robot)))
+        robot: Robot(config, planner_of(config), sinks.get(agent_journal(robot)), encode)
         for robot, config in configs.items()
     }
     ticks: list[Tick] = []
