@@ -110,7 +110,7 @@ class PreparedSteps(NamedTuple):
     part: RangeRecording
     """The recording of these robots alone, with the odometry of their antennas."""
     sound: tuple[SoundOdometry, ...]
-    """How the odometry of each robot was prepared."""
+    """The prepared odometry of each robot."""
     assumed: RecordedNoise
     """The noise that is assumed."""
     ticks_per_epoch: int
