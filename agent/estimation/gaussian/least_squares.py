@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian.descent import rows_of, stepped
+from agent.estimation.gaussian.descent import LEAP, rows_of, stepped
 from agent.estimation.gaussian.fitted import Fit, NormalEquations
 from agent.estimation.gaussian.linear_model import LinearModel, Point, Problem, Start, product
 from agent.estimation.gaussian.noise_level import (
