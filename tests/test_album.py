@@ -23,9 +23,9 @@ from matplotlib.patches import Circle
 from matplotlib.text import Annotation
 from msgspec.structs import replace
 
-from agent.planning.active_sensing import stride
 from agent.planning.assured import AssuredExact
 from agent.planning.phase3_last_manoeuvre import compared
+from agent.planning.strides import stride
 from compose.cli.figures import drawing
 from compose.figures import PICTURES, catalogue, decisions, manoeuvre, over_time, phase_one, steps, trajectory
 from compose.figures.agent_replay import agent_replay

@@ -10,8 +10,9 @@ import pytest
 import tandem
 from agent.estimation.gaussian.inference import PlanningHypothesis
 from agent.estimation.gaussian.odometry_noise import Array, Track, track
-from agent.planning.active_sensing import choice, plan_alone, plan_together, stride
+from agent.planning.active_sensing import STALLED, plan_alone, plan_together
 from agent.planning.stalls import PLANS, is_stalled
+from agent.planning.strides import choice, stride
 from compose.launch.in_process import run_mission
 from protocol.mission import Mission, Role
 from protocol.motion import REST
@@ -54,7 +55,7 @@ def test_a_stalled_robot_moves_to_where_its_next_range_differs() -> None:
     """Continued, each manoeuvre would leave the range under one of the two hypotheses."""
     known = np.eye(2) * 0.05**2
     hypotheses = [held(0.9, [1.24, 0.48, -1.19], known), held(0.1, [1.18, -0.38, 0.83], known)]
-    command = plan_alone(hypotheses, MISSION, stalled=True)
+    command = plan_alone(hypotheses, MISSION, objective=STALLED)
     assert command != REST
     ranges = []
     for x, y, heading in (one.poses for one in hypotheses):
@@ -76,7 +77,7 @@ def test_a_stalled_pair_does_not_stand_still() -> None:
         held(0.24, [9.65, 1.18, 0.13, 9.98, -0.07, -1.88], known),
     ]
     assert plan_together(mirrored, (10.0, 0.0), 1.3, MISSION) == (REST, REST)
-    _, b = plan_together(mirrored, (10.0, 0.0), 1.3, MISSION, stalled=True)
+    _, b = plan_together(mirrored, (10.0, 0.0), 1.3, MISSION, objective=STALLED)
     assert b != REST
 
 
@@ -84,7 +85,7 @@ def test_a_stalled_pair_does_not_stand_still() -> None:
 def test_beside_a_peer_that_has_claimed_only_the_other_robot_moves(resting: Role) -> None:
     known = np.diag([0.05**2, 0.05**2, 0.05**2] * 2)
     hypotheses = [held(1.0, [9.6, -1.0, 0.0, 10.0, -0.3, 2.0], known)]
-    plan = plan_together(hypotheses, (10.0, 0.0), 1.0, MISSION, stalled=True, resting=resting)
+    plan = plan_together(hypotheses, (10.0, 0.0), 1.0, MISSION, objective=STALLED, resting=resting)
     at_rest, mover = (plan[0], plan[1]) if resting == "a" else (plan[1], plan[0])
     assert at_rest == REST
     assert mover != REST

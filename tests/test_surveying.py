@@ -12,10 +12,11 @@ from msgspec.structs import replace
 
 from agent.estimation.gaussian.inference import PlanningHypothesis
 from agent.estimation.gaussian.odometry_noise import Array
-from agent.planning.active_sensing import AHEAD, choice, plan_alone, plan_together, stride
+from agent.planning.active_sensing import plan_alone, plan_together
 from agent.planning.phase2_orbit import pursuit
 from agent.planning.range_seeking import Homing, homing_controls
 from agent.planning.state import estimator_for
+from agent.planning.strides import AHEAD, choice, stride
 from protocol.mission import Mission
 from protocol.motion import REST, Controls, Pose, step
 from protocol.noise import Noise, VelocityNoise

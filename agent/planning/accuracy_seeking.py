@@ -28,12 +28,14 @@ from agent.estimation.gaussian.inference import PlanningHypothesis
 from agent.estimation.gaussian.odometry_noise import Track
 from agent.estimation.gaussian.range_model import PairRanges
 from agent.estimation.knowledge import Belief, Knowledge
-from agent.planning import active_sensing, exchange, phase2_orbit, range_seeking, stalls, transitions
-from agent.planning.active_sensing import Listening, Retreating, Surveying
+from agent.planning import active_sensing, exchange, phase2_orbit, range_seeking, transitions
+from agent.planning.active_sensing import CONTINUED, STALLED, Listening, Objective, Retreating, Surveying
 from agent.planning.assured import AssuredExact
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent
 from agent.planning.range_seeking import Backing, Beacon, Circling, Homing, Straight, Turning
+from agent.planning.stalls import is_stalled
 from agent.planning.state import Asleep, Done, RobotState
+from agent.planning.strides import stride
 from protocol.messages import BranchKind, Localised, Observation, Report
 from protocol.mission import Mission, Role
 from protocol.motion import ORIGIN, REST, Controls
@@ -122,7 +124,7 @@ class AccuracySeeking(AssuredExact):
         rho: float,
         mission: Mission,
     ) -> tuple[Controls, Controls]:
-        """Return the manoeuvres of a and b in phase 3, for `active_sensing.stride` ticks.
+        """Return the manoeuvres of a and b in phase 3, for `stride` ticks.
 
         `hypotheses` are about the poses of both robots relative to M1, the most probable first. M2 is at
         `m2` in m, and `rho` is the latest range between the robots in m. A subclass may plan others; both
@@ -182,7 +184,7 @@ UNLIKELY_DROP_OUTS = 1e-3
 
 def is_planning_tick(state: RobotState) -> bool:
     """Return whether the robot plans a manoeuvre in this tick. Both robots plan in the same ticks."""
-    return state.tick % active_sensing.stride(state.config.mission) == 0
+    return state.tick % stride(state.config.mission) == 0
 
 
 def _continue_phase1(state: RobotState) -> RobotState:
@@ -195,7 +197,7 @@ def _continue_phase1(state: RobotState) -> RobotState:
     scored = inference.own_anchor(state)
     if scored:
         state = replace(state, belief=inference.with_own(state, scored))
-    if _ticks_without_range(state) >= LOST_AFTER * active_sensing.stride(state.config.mission):
+    if _ticks_without_range(state) >= LOST_AFTER * stride(state.config.mission):
         return _return_to_anchor(state)
     if not scored or _are_misleading(state, scored[0]):
         if not ranged:
@@ -211,20 +213,20 @@ def _continue_phase1(state: RobotState) -> RobotState:
             state, belief=replace(state.belief, branch_kind=kind, phase1_done_tick=phase1_done_tick)
         )
         return _start_phase2(state)
-    since, stalled = _stalled(state, "anchor", (inference.own_path(state),))
+    since, objective = _objective(state, "anchor", (inference.own_path(state),))
     hypotheses = inference.anchor_planning_hypotheses(state)
-    command = active_sensing.plan_alone(hypotheses, mission, stalled=stalled)
+    command = active_sensing.plan_alone(hypotheses, mission, objective=objective)
     return replace(state, mode=Surveying("anchor", command, since))
 
 
-def _stalled(state: RobotState, beacon: Beacon, paths: Sequence[Track]) -> tuple[int, bool]:
-    """Return the tick of the first of consecutive plans, and whether they lead nowhere (see `stalls`)."""
+def _objective(state: RobotState, beacon: Beacon, paths: Sequence[Track]) -> tuple[int, Objective]:
+    """Return the tick of the first of the consecutive plans, and the objective of the next one."""
     match state.mode:
         case Surveying(before, _, since) if before == beacon:
-            stride = active_sensing.stride(state.config.mission)
-            return since, stalls.is_stalled(paths, since, stride, state.config.mission)
+            mission = state.config.mission
+            return since, STALLED if is_stalled(paths, since, stride(mission), mission) else CONTINUED
         case _:
-            return state.tick, False
+            return state.tick, CONTINUED
 
 
 def _are_misleading(state: RobotState, best: ScoredHypothesis) -> bool:
@@ -276,7 +278,7 @@ def _continue_phase2(state: RobotState, ranged: bool) -> RobotState:
     assert isinstance(state.mode, Aligning | Radial | Tangent | Orbiting)
     tolerance = state.estimator.pose_tolerance
     mode = phase2_orbit.onward(state.mode, state.odometry, state.start, state.orbit, mission, tolerance)
-    timeout: float = LOST_AFTER * active_sensing.stride(mission)
+    timeout: float = LOST_AFTER * stride(mission)
     if (
         state.orbit.v == 0.0
         and isinstance(mode, Radial | Orbiting)
@@ -305,15 +307,15 @@ def _continue_phase2(state: RobotState, ranged: bool) -> RobotState:
 
 def _continue_phase3(state: RobotState) -> RobotState:
     """Continue phase 3 depending on whether the peer, and for b also its anchor, are in range."""
-    stride = active_sensing.stride(state.config.mission)
+    ticks = stride(state.config.mission)
     match state.mode:
-        case Retreating(_, since) if state.tick - since < 2 * stride:
+        case Retreating(_, since) if state.tick - since < 2 * ticks:
             return state
         case Retreating():
             if not state.in_contact:
                 return _start_phase2(state)
             return replace(state, mode=Surveying("peer", since=state.tick))
-        case _ if state.config.role == "b" and _ticks_without_range(state) >= LOST_AFTER_IN_PHASE_3 * stride:
+        case _ if state.config.role == "b" and _ticks_without_range(state) >= LOST_AFTER_IN_PHASE_3 * ticks:
             return _return_to_anchor(state)
         case Surveying(_, command) | Listening(command) if not state.in_contact:
             return replace(state, mode=Retreating(Controls(0.0 - command.v, 0.0 - command.omega), state.tick))
@@ -370,19 +372,20 @@ def _decide_phase3(state: RobotState, planned: JointManoeuvres) -> RobotState:
         return _return_to_anchor(tested)
     if not scored:
         return _drive_without_hypotheses(tested)
-    since, stalled = _stalled(state, "peer", pair.paths)
-    manoeuvres = _manoeuvres(state, stalled) or planned
+    since, objective = _objective(state, "peer", pair.paths)
+    manoeuvres = _manoeuvres(state, objective) or planned
     a, b = manoeuvres(hypotheses, pair.apart, state.mutual[-1].range, mission)
     return replace(tested, mode=Surveying("peer", a if role == "a" else b, since))
 
 
-def _manoeuvres(state: RobotState, stalled: bool) -> JointManoeuvres | None:
-    """Return how robots plan that are stalled, or of which one has claimed its pose; None: as always."""
-    claimed = isinstance(state.peer_state.verdict, Localised)
-    if not (stalled or claimed):
+def _manoeuvres(state: RobotState, objective: Objective) -> JointManoeuvres | None:
+    """Return how to plan if the robots are stalled or one of them has claimed its pose; None: as always."""
+    resting: Role | None = None
+    if isinstance(state.peer_state.verdict, Localised):
+        resting = "b" if state.config.role == "a" else "a"
+    if objective == CONTINUED and resting is None:
         return None
-    peer: Role = "b" if state.config.role == "a" else "a"
-    return partial(active_sensing.plan_together, stalled=stalled, resting=peer if claimed else None)
+    return partial(active_sensing.plan_together, objective=objective, resting=resting)
 
 
 def may_claim(belief: Belief, pair: PairRanges) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import NamedTuple
 
 import msgspec
@@ -21,23 +21,9 @@ from agent.estimation.gaussian.odometry_noise import Array, Places
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
 from agent.planning import separation
 from agent.planning.range_seeking import Beacon
+from agent.planning.strides import AHEAD, Choice, choice, stride
 from protocol.mission import Mission, Role
 from protocol.motion import REST, Controls
-
-STRIDE_LENGTH = 0.25
-"""The minimum length of a manoeuvre, as a fraction of R. A manoeuvre lasts as many ticks as that takes."""
-
-AHEAD = 3
-"""The number of strides over which a manoeuvre is evaluated, as if it were continued."""
-
-TURNS = 17
-"""The number of values of omega that are compared, from -omega_max to omega_max."""
-
-SPEEDS = (1.0, -1.0, 0.5, -0.5)
-"""The values of v that are compared, in units of A_0 / T_s."""
-
-SLOW = (0.1, -0.1)
-"""Additional values of v in the same units, for small gaps when there is a safety distance."""
 
 NEGLIGIBLE = 0.03
 """The standard deviation below which a further improvement has no value, as a fraction of the accuracy."""
@@ -51,11 +37,29 @@ OUTSIDE_COST = 1e3
 OUTSIDE_COST_ALONE = 10.0
 """The OUTSIDE_COST of a robot that plans for its anchor alone; each tick improves its position estimate.
 
-It also is that of stalled robots, to which a missing range tells which hypothesis is false.
+It is also that of stalled robots, to which a missing range tells which hypothesis is false.
 """
 
 STALLED_COST = 1e9
 """The cost of standing still for a stalled robot (see `stalls`)."""
+
+
+class Objective(NamedTuple):
+    """The values by which manoeuvres are compared, apart from what their ranges tell."""
+
+    strides: int
+    """The number of strides over which a manoeuvre is evaluated, as if it were continued."""
+    outside_cost: float
+    """The cost per m out of range of the peer, or of b out of range of its anchor; see OUTSIDE_COST."""
+    standing_cost: float
+    """The cost of standing still."""
+
+
+CONTINUED = Objective(AHEAD, OUTSIDE_COST, 0.0)
+"""The objective of robots that get further with each plan."""
+
+STALLED = Objective(1, OUTSIDE_COST_ALONE, STALLED_COST)
+"""The objective of stalled robots: the next stride counts alone, and they move (see `stalls`)."""
 
 
 class Surveying(msgspec.Struct, frozen=True):
@@ -84,81 +88,24 @@ class Retreating(msgspec.Struct, frozen=True):
     """The tick in which the peer was out of range for the first time."""
 
 
-def stride(mission: Mission) -> int:
-    """Return the number of ticks of a manoeuvre. Ranges from nearer points are hardly more informative."""
-    return max(1, round(STRIDE_LENGTH * mission.sensing_range / mission.first_straight))
-
-
-class Choice(NamedTuple):
-    """The C manoeuvres that are compared, with end points relative to the starting pose."""
-
-    v: Array
-    omega: Array
-    along: Array
-    """The distance in m along the initial heading after each stride; (C, AHEAD)."""
-    across: Array
-    """The distance in m to the left of it; (C, AHEAD)."""
-    way_along: Array
-    """The distance in m along the initial heading at CHORDS times during the first stride; (C, CHORDS)."""
-    way_across: Array
-
-
-@cache
-def choice(mission: Mission) -> Choice:
-    """Return all manoeuvres of a robot. The last one is to stand still."""
-    period = stride(mission) * mission.period
-    fastest = min(mission.max_turn_rate, math.pi / period)
-    speeds = SPEEDS + SLOW if mission.safety_distance else SPEEDS
-    omega, speed = np.meshgrid(
-        np.linspace(-fastest, fastest, TURNS), mission.first_straight / mission.period * np.array(speeds)
-    )
-    v = np.append(speed.ravel(), 0.0)
-    turn = np.append(omega.ravel(), 0.0)
-    half = 0.5 * period * turn
-    chord = period * v * np.sinc(half / math.pi)
-    course = half[:, None] * (2.0 * np.arange(AHEAD) + 1.0)
-    share = half[:, None] * np.arange(1, separation.CHORDS + 1) / separation.CHORDS
-    way = (
-        period
-        * v[:, None]
-        * np.arange(1, separation.CHORDS + 1)
-        / separation.CHORDS
-        * np.sinc(share / math.pi)
-    )
-    return Choice(
-        v,
-        turn,
-        np.cumsum(chord[:, None] * np.cos(course), 1),
-        np.cumsum(chord[:, None] * np.sin(course), 1),
-        way * np.cos(share),
-        way * np.sin(share),
-    )
-
-
-def _choice(mission: Mission, stalled: bool) -> Choice:
-    """Return the manoeuvres to compare; for stalled robots with the first stride alone."""
-    ways = choice(mission)
-    return ways._replace(along=ways.along[:, :1], across=ways.across[:, :1]) if stalled else ways
-
-
 def plan_alone(
     hypotheses: Sequence[PlanningHypothesis],
     mission: Mission,
     within: float | None = None,
-    *,
-    stalled: bool = False,
+    objective: Objective = CONTINUED,
 ) -> Controls:
     """Return the manoeuvre whose ranges to the anchor are expected to be most informative.
 
     The anchor is the origin, and the covariance of each hypothesis is that of the anchor's position. `within`
-    is the largest allowed distance from the anchor in m. A `stalled` robot moves, and counts one stride only.
+    is the largest allowed distance from the anchor in m. The `outside_cost` of the objective does not count:
+    that of a robot alone is OUTSIDE_COST_ALONE, or OUTSIDE_COST beyond `within`.
     """
-    ways = _choice(mission, stalled)
+    ways = choice(mission, objective.strides)
     best = hypotheses[0]
     reach = mission.sensing_range
     distances = []
     for one in hypotheses:
-        x, y = _ends(ways, one.poses)
+        x, y = ways.ends(one.poses)
         distances.append(np.maximum(np.hypot(x, y), SIGMA_FLOOR))
         if one is best:
             ux, uy = x / distances[0], y / distances[0]
@@ -170,8 +117,7 @@ def plan_alone(
     yy = information[1, 1] + np.sum(weight * uy * uy, 1)
     cost = (xx + yy) / np.maximum(xx * yy - xy * xy, 1e-300) / mission.accuracy**2
     cost += _confusion(hypotheses, distances, sigma, reach)
-    if stalled:
-        cost[-1] += STALLED_COST
+    cost[-1] += objective.standing_cost
     limit = within if within is not None else reach
     for one, distance in zip(hypotheses, distances, strict=True):
         cost += one.probability * OUTSIDE_COST * np.maximum(0.0, NEAREST_TO_ANCHOR * reach - distance[:, 0])
@@ -188,7 +134,7 @@ def plan_together(
     rho: float,
     mission: Mission,
     *,
-    stalled: bool = False,
+    objective: Objective = CONTINUED,
     resting: Role | None = None,
 ) -> tuple[Controls, Controls]:
     """Return the manoeuvres of a and b after which both poses are expected to be known best.
@@ -196,11 +142,11 @@ def plan_together(
     The covariance of each hypothesis is that of both poses, (6, 6), relative to M1. M2 is at `m2`. First, b's
     manoeuvre is selected as if a stood still, then a's, given b's. Neither robot comes nearer to the other
     than the safety distance under any hypothesis; `rho` is the latest range between them in m. If no
-    manoeuvre meets this condition, both stand still. Of `stalled` robots, b moves, one stride alone counts,
-    and to leave the range costs little. A robot that is `resting` has claimed its pose, and stands still; the
-    other one moves.
+    manoeuvre meets this condition, both stand still. The robot in the role `resting` has claimed its pose and
+    stands still: only the manoeuvre of the other one is selected. The `standing_cost` of the objective counts
+    for b; for a only if b is resting.
     """
-    return _planned_together(tuple(hypotheses), m2, rho, mission, stalled, resting)
+    return _planned_together(tuple(hypotheses), m2, rho, mission, objective, resting)
 
 
 @lru_cache(maxsize=2)
@@ -209,20 +155,19 @@ def _planned_together(
     m2: tuple[float, float],
     rho: float,
     mission: Mission,
-    stalled: bool,
+    objective: Objective,
     resting: Role | None,
 ) -> tuple[Controls, Controls]:
     """Return the manoeuvres of `plan_together`, which both robots of one process ask for."""
-    ways = _choice(mission, stalled)
+    ways = choice(mission, objective.strides)
     stand = len(ways.v) - 1
     still, every = np.array([stand]), np.arange(stand + 1)
-    outside, standing = (OUTSIDE_COST_ALONE, STALLED_COST) if stalled else (OUTSIDE_COST, 0.0)
     a = b = stand
     if resting != "b":
-        _, b = _best_of(ways, hypotheses, m2, rho, mission, still, every, outside, standing)
+        _, b = _best_of(ways, hypotheses, m2, rho, mission, still, every, objective)
     if resting != "a":
-        of_a = standing if resting == "b" else 0.0
-        a, _ = _best_of(ways, hypotheses, m2, rho, mission, every, np.array([b]), outside, of_a)
+        of_a = objective if resting == "b" else objective._replace(standing_cost=0.0)
+        a, _ = _best_of(ways, hypotheses, m2, rho, mission, every, np.array([b]), of_a)
     return (
         Controls(float(ways.v[a]), float(ways.omega[a])),
         Controls(float(ways.v[b]), float(ways.omega[b])),
@@ -237,12 +182,11 @@ def _best_of(
     mission: Mission,
     of_a: Places,
     of_b: Places,
-    outside: float,
-    standing: float = 0.0,
+    objective: Objective,
 ) -> tuple[int, int]:
     """Return the best pair of manoeuvres from `of_a` and `of_b`, one of which contains a single manoeuvre.
 
-    `outside` is the cost per m out of range, and `standing` that of the last pair, in which both stand still.
+    In the last pair, the robot that has several manoeuvres stands still.
     """
     reach = mission.sensing_range
     own_sigma = max(mission.noise.anchor_sigma, NEGLIGIBLE * mission.accuracy)
@@ -252,15 +196,15 @@ def _best_of(
     distances = []
     cost = np.zeros(count)
     for one in hypotheses:
-        ax, ay = _ends(ways, one.poses[:3], of_a)
-        bx, by = _ends(ways, one.poses[3:], of_b)
+        ax, ay = ways.ends(one.poses[:3], of_a)
+        bx, by = ways.ends(one.poses[3:], of_b)
         dx, dy = ax - bx, ay - by
         distance = np.maximum(np.hypot(dx, dy), SIGMA_FLOOR)
         distances.append(distance)
         off_anchor = np.hypot(bx[:, 0] - m2[0], by[:, 0] - m2[1])
         for beyond, loss in (
-            (distance[:, 0] - FARTHEST * reach, outside),
-            (off_anchor - FARTHEST * reach, outside),
+            (distance[:, 0] - FARTHEST * reach, objective.outside_cost),
+            (off_anchor - FARTHEST * reach, objective.outside_cost),
             (NEAREST * reach - np.min(distance, 1), OUTSIDE_COST),
             (NEAREST_TO_ANCHOR * reach - off_anchor, OUTSIDE_COST),
         ):
@@ -297,7 +241,7 @@ def _best_of(
             variance += 2.0 * (dx * covariance_after[:, i + 1, i + 2] - dy * covariance_after[:, i, i + 2])
             cost += variance / mission.accuracy**2
     cost += _confusion(hypotheses, distances, sigma, reach)
-    cost[-1] += standing
+    cost[-1] += objective.standing_cost
     if mission.safety_distance:
         cost[~_keep_apart(ways, hypotheses, latest, mission, of_a, of_b)] = np.inf
         cost[-1] = min(cost[-1], STANDING_COST)
@@ -321,7 +265,7 @@ def _keep_apart(
     lengths_of_both = lengths[of_a] + lengths[of_b]
     allowed = np.ones(len(lengths_of_both), dtype=np.bool)
     for one in hypotheses:
-        (ax, ay), (bx, by) = _way(ways, one.poses[:3], of_a), _way(ways, one.poses[3:], of_b)
+        (ax, ay), (bx, by) = ways.way(one.poses[:3], of_a), ways.way(one.poses[3:], of_b)
         relative = one.covariance[:2, :2] + one.covariance[3:5, 3:5] - 2.0 * one.covariance[:2, 3:5]
         uncertainty = separation.SIGMAS * math.sqrt(max(0.0, float(np.trace(relative))))
         least = (
@@ -382,17 +326,3 @@ SIGMA_FACTOR = 1.5
 
 LARGEST_GAP = 400.0
 """The largest squared difference of predictions in sigmas^2. Larger ones do not distinguish better."""
-
-
-def _way(ways: Choice, pose: Array, some: Places) -> tuple[Array, Array]:
-    """Return the positions in m along the first stride of the manoeuvres `some` from `pose`; (C, CHORDS)."""
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    along, across = ways.way_along[some], ways.way_across[some]
-    return pose[0] + c * along - s * across, pose[1] + s * along + c * across
-
-
-def _ends(ways: Choice, pose: Array, some: Places | slice = slice(None)) -> tuple[Array, Array]:
-    """Return the positions in m after each stride of the manoeuvres `some` from `pose`; (C, AHEAD)."""
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    along, across = ways.along[some], ways.across[some]
-    return pose[0] + c * along - s * across, pose[1] + s * along + c * across

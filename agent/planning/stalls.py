@@ -43,5 +43,5 @@ def is_stalled(paths: Sequence[Track], since: int, stride: int, mission: Mission
     ticks = now - stride * np.arange(PLANS + 1)
     where = np.stack([one for path in paths for one in (path.x[ticks], path.y[ticks])])
     apart = np.abs(where[:, :, None] - where[:, None, :]).max(0) > ELSEWHERE * mission.sensing_range
-    places = [all(apart[i, :i].tolist()) for i in range(len(ticks))]
-    return sum(places) <= STALLED_PLACES
+    is_new = [all(apart[i, :i].tolist()) for i in range(len(ticks))]
+    return sum(is_new) <= STALLED_PLACES

@@ -8,8 +8,9 @@ from typing import NamedTuple
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from agent.planning.active_sensing import Surveying, stride
+from agent.planning.active_sensing import Surveying
 from agent.planning.state import RobotState
+from agent.planning.strides import stride
 from compose.figures.pair import ROLES, PairRecord
 from compose.figures.sheet import NO_ENCOUNTER, Absent, Sheet, Window, circle, some, square
 from compose.figures.style import INK, MARKS, PALE, PALER, SCREEN, Medium
