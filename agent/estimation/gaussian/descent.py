@@ -1,4 +1,4 @@
-"""The steps of fits, which are shortened until they descend."""
+"""The steps of fits. A step that does not descend is shortened."""
 
 from __future__ import annotations
 
@@ -31,12 +31,19 @@ def stepped(
 
     `variance` is that of each range (m^2) for known constant and slow errors.
     """
+    return _descended(problem, point, *full_step(problem, point, linear, system), variance)
+
+
+def full_step(
+    problem: Problem, point: Point, linear: LinearModel, system: NormalEquations
+) -> tuple[Array, ErrorSizes]:
+    """Return the guesses and errors after a step by `system`, whose unknowns change by at most LEAP."""
     change = system.change
     change = change * np.minimum(1.0, LEAP / np.maximum(np.abs(change).max(-1, keepdims=True), LEAP))
     guess = point.guess.copy()
     guess[:, problem.free] += change
     left_over = system.weighted[..., -1] - product(system.weighted[..., :-1], change)
-    return _descended(problem, point, guess, problem.sizes(point, linear, left_over), variance)
+    return guess, problem.sizes(point, linear, left_over)
 
 
 def _descended(problem: Problem, point: Point, guess: Array, sizes: ErrorSizes, variance: Array) -> Point:

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian.descent import LEAP, rows_of, stepped
+from agent.estimation.gaussian.descent import full_step, rows_of, stepped
 from agent.estimation.gaussian.fitted import Fit, NormalEquations
 from agent.estimation.gaussian.linear_model import LinearModel, Point, Problem, Start, product
 from agent.estimation.gaussian.noise_level import (
@@ -27,13 +27,10 @@ from agent.estimation.gaussian.noise_level import (
     noise_level,
     residual_correlation,
 )
-from agent.estimation.gaussian.odometry_noise import (
-    Array,
-    Errors,
-    Track,
-)
+from agent.estimation.gaussian.odometry_noise import Array, Errors, Track
 from agent.estimation.gaussian.range_covariance import RangeCovariance, inverse_of, range_covariance
-from agent.estimation.gaussian.range_model import Ranges, inlier_probability, outliers
+from agent.estimation.gaussian.range_model import Ranges, outliers
+from agent.estimation.gaussian.range_weights import inlier_probabilities, weighted_variance, weights_by_errors
 from protocol.noise import Noise
 
 STEPS = 8
@@ -62,12 +59,12 @@ SETTLED = 3.0
 """The change of a weight below which the weights have converged, in units of the shortest step."""
 
 NEAR_END = 1.0
-"""The length in sigmas of the next step below which a fit tells where it will end."""
+"""The length in sigmas of the next step below which a fit is compared with others: it is near its end."""
 
 ALIKE = 0.3
-"""The largest difference of the weights of two fits that come to the same end.
+"""The largest difference of the weights of two fits that continue as one.
 
-With other outliers, two fits from one guess may come to different ends.
+With different outliers, two fits may come from the same guess to different ends.
 """
 
 RIDGE = 1e-12
@@ -75,12 +72,6 @@ RIDGE = 1e-12
 
 With it, the variance of an unknown that the ranges leave undetermined is large but finite.
 """
-
-FAR = 100.0
-"""The standard deviation (m) of a range with the weight 0."""
-
-BLIND = 1e-9
-"""The least precision of a range's prediction, as a fraction of that with a known guess."""
 
 
 def fit(
@@ -123,8 +114,8 @@ def fits(
 
     A step is the last if the next one is expected to be shorter than `shortest`. The second step is expected
     to be shorter than the first by the factor `decrease`, which is less than 1 for starts that are fits. Of
-    fits that come within `same` sigmas of each other, one goes on, and the others are left out. The weights
-    of outliers decrease during the iteration. `apart` is M2 - M1 (m) in <W>.
+    fits that come within `same` sigmas of each other, one continues, and the others are not returned. The
+    weights of outliers decrease during the iteration. `apart` is M2 - M1 (m) in <W>.
     """
     if not starts:
         return []
@@ -132,15 +123,16 @@ def fits(
     point = problem.begin(starts)
     weights = np.ones(point.residuals.shape)
     ended: dict[int, Fit] = {}  # by the index of the start
-    left, before = list(range(len(starts))), np.zeros(len(starts))  # the index of the start of each row
+    left = list(range(len(starts)))  # the index of the start of each row
+    before = np.zeros(len(starts))
     for step in range(steps + 1):
         linear = problem.linearised(point)
         if problem.robust and step == 0:
             weights = _first_weights(problem, starts, point, linear)
-        variance = _variance(ranges.sigma, weights)
+        variance = weighted_variance(ranges.sigma, weights)
         covariance = range_covariance(variance, linear.columns, linear.dense)
         system = _solved(point.predicted.jacobian[..., problem.free], linear.innovation, covariance)
-        updated = _inlier_probabilities(system, weights, ranges.sigma, noise) if problem.robust else weights
+        updated = inlier_probabilities(system, weights, ranges.sigma, noise) if problem.robust else weights
         quality = _quality(system, weights, noise)
         if step == 0:
             before = quality.last_step / decrease
@@ -186,7 +178,7 @@ def _copies(
 
 def _first_weights(problem: Problem, starts: Sequence[Start], point: Point, linear: LinearModel) -> Array:
     """Return the weights with which fits begin: those of their starts, or by their residuals."""
-    weights = _weights(point.residuals, np.sqrt(problem.loosened(linear)), problem.noise)
+    weights = weights_by_errors(point.residuals, np.sqrt(problem.loosened(linear)), problem.noise)
     for i, start in enumerate(starts):
         if start.weights is not None:
             weights[i] = start.weights
@@ -210,7 +202,7 @@ def without_outliers(
     if not (starts and problem.robust):
         return []
     sigma = np.sqrt(np.square(ranges.sigma) + ranges.loosened(noise.priors))
-    weights = _weights(problem.begin(starts).residuals, sigma, noise)
+    weights = weights_by_errors(problem.begin(starts).residuals, sigma, noise)
     return [
         start._replace(weights=own) for start, own in zip(starts, weights, strict=True) if own.min() < INLIER
     ]
@@ -218,23 +210,24 @@ def without_outliers(
 
 def _fit(
     problem: Problem,
-    i: int,
+    row: int,
     points: Point,
     linear_points: Point,
     all_weights: Array,
     systems: NormalEquations,
     qualities: _Quality,
 ) -> Fit:
-    """Return the fit with index `i`, which has ended at its point, with the linear model of another."""
-    residuals, weights, system = points.residuals[i], all_weights[i], systems.one(i)
-    chi2, inliers, level = float(qualities.chi2[i]), int(qualities.inliers[i]), float(qualities.level[i])
+    """Return the fit in `row`, which has ended at `points`, with the linear model of `linear_points`."""
+    residuals, weights, system = points.residuals[row], all_weights[row], systems.one(row)
+    chi2, level = float(qualities.chi2[row]), float(qualities.level[row])
+    inliers = int(qualities.inliers[row])
     if problem.noise.sigma_degrees:
-        correlation = residual_correlation(points.own[i], weights, problem.ranges)
+        correlation = residual_correlation(points.own[row], weights, problem.ranges)
         level = noise_level(chi2, inliers - len(system.change), problem.noise, correlation)
     return Fit(
-        points.guess[i],
-        problem.paths(points, i),
-        problem.errors(points.sizes.constant[i], points.sizes.white[i]),
+        points.guess[row],
+        problem.paths(points, row),
+        problem.errors(points.sizes.constant[row], points.sizes.white[row]),
         _log_likelihood(system, chi2, residuals, weights, problem.ranges.sigma, level, problem.noise),
         residuals,
         weights,
@@ -242,12 +235,12 @@ def _fit(
         system.information / level,
         chi2,
         inliers,
-        float(qualities.last_step[i]),
+        float(qualities.last_step[row]),
         problem.ranges.tick,
         problem,
         system,
         linear_points,
-        i,
+        row,
         level,
     )
 
@@ -272,12 +265,6 @@ def _quality(system: NormalEquations, weights: Array, noise: Noise) -> _Quality:
     return _Quality(chi2, inliers, level, np.sqrt(length / level))
 
 
-def _variance(sigma: Array, weights: Array) -> Array:
-    """Return the variance (m^2) of each range, which is large for a small weight."""
-    variance: Array = np.square(sigma) / np.maximum(weights, np.square(sigma / FAR))
-    return variance
-
-
 def _solved(jacobian: Array, innovation: Array, covariance: RangeCovariance) -> NormalEquations:
     weighted = covariance.solve(np.concatenate((jacobian, innovation[..., None]), -1))
     products = np.swapaxes(jacobian, -1, -2) @ weighted
@@ -290,35 +277,6 @@ def _solved(jacobian: Array, innovation: Array, covariance: RangeCovariance) -> 
     return NormalEquations(
         jacobian, innovation, covariance, weighted, information, of_guess, change, multipliers
     )
-
-
-def _inlier_probabilities(system: NormalEquations, weights: Array, sigma: Array, noise: Noise) -> Array:
-    """Return the probability that each range is an inlier, given the prediction from all other ranges."""
-    alone = system.covariance.precisions
-    weighted = system.weighted[..., :-1]
-    explained = np.add.reduce((weighted @ system.of_guess) * weighted, -1)
-    precision = np.maximum(alone - explained, BLIND * alone)
-    error = system.multipliers / precision
-    variance = np.maximum(1.0 / precision - _variance(sigma, weights), 0.0) + np.square(sigma)
-    return _weights(error, np.sqrt(variance), noise)
-
-
-def _weights(errors: Array, sigma: Array, noise: Noise) -> Array:
-    """Return the probability that each range is an inlier, if `errors` (m) have the scale of their median.
-
-    Far from the minimum, all errors are large, and no range is an outlier because of that. At least about
-    half of the ranges are therefore inliers.
-    """
-    if noise.sigma_degrees:
-        ratios = np.abs(errors / sigma)
-        middle = ratios.shape[-1] // 2
-        median = np.partition(ratios, middle, -1)[..., middle, None]
-        sigma = sigma * np.maximum(1.0, median / MEDIAN)
-    return inlier_probability(errors, sigma, noise)
-
-
-MEDIAN = 0.6745
-"""The median of the absolute value of a standard normal variable."""
 
 
 def _log_likelihood(
@@ -334,7 +292,7 @@ def _log_likelihood(
     good = weights > INLIER
     volume, count = float(system.covariance.log_determinant), int(np.count_nonzero(good))
     if count < len(good):
-        volume -= float(np.sum(np.log(_variance(sigma, weights)[~good])))
+        volume -= float(np.sum(np.log(weighted_variance(sigma, weights)[~good])))
     log_likelihood = -0.5 * (volume + math.log(2.0 * math.pi) * count)
     log_likelihood += misfit_log_likelihood(chi2, count - len(system.change), noise)
     log_likelihood -= 0.5 * len(system.change) * math.log(level)  # of the covariance of the guess
@@ -351,43 +309,39 @@ SOFT = 0.1
 """The least smoothing of the ends of the outlier density, as a fraction of the least bias."""
 
 
-def held_log_likelihoods(problem: Problem, begun: Fit, row: int, offs: Array, steps: int) -> list[float]:
-    """Return the log-likelihoods of the ranges of `problem` after `steps` steps from the fit `begun`.
+def held_log_likelihoods(problem: Problem, begun: Fit, row: int, offsets: Array, steps: int) -> list[float]:
+    """Return the log-likelihood of the ranges of `problem` after `steps` steps from the fit `begun`.
 
     The problem has the ranges of that fit and one more, at `row`, which holds a coordinate: it is no outlier.
-    Each of `offs` (m) is added to this range in turn.
+    There is one fit for each of `offsets` (m), by which this range is longer.
     """
     noise, sigma = problem.noise, problem.ranges.sigma
     start = Start(begun.guess, begun.errors)
-    point = _longer(problem.begin([start] * len(offs)), row, offs)
-    weights = np.repeat(np.insert(begun.weights, row, 1.0)[None], len(offs), 0)
+    point = _longer(problem.begin([start] * len(offsets)), row, offsets)
+    weights = np.repeat(np.insert(begun.weights, row, 1.0)[None], len(offsets), 0)
     for step in range(steps + 1):
         linear = problem.linearised(point)
-        covariance = range_covariance(_variance(sigma, weights), linear.columns, linear.dense)
+        covariance = range_covariance(weighted_variance(sigma, weights), linear.columns, linear.dense)
         system = _solved(point.predicted.jacobian[..., problem.free], linear.innovation, covariance)
         if step == steps:
             break
-        longest = np.abs(system.change).max(-1, keepdims=True)
-        change = system.change * np.minimum(1.0, LEAP / np.maximum(longest, LEAP))
-        left_over = system.weighted[..., -1] - product(system.weighted[..., :-1], change)
-        sizes = problem.sizes(point, linear, left_over)
-        point = _longer(problem.point(point.guess + change, sizes), row, offs)
+        point = _longer(problem.point(*full_step(problem, point, linear, system)), row, offsets)
         if problem.robust and step == 0:
             loosened = np.square(sigma) + np.add.reduce(np.square(problem.common), 1)
-            weights = _weights(point.residuals, np.sqrt(loosened), noise)
+            weights = weights_by_errors(point.residuals, np.sqrt(loosened), noise)
         elif problem.robust:
-            weights = _inlier_probabilities(system, weights, sigma, noise)
+            weights = inlier_probabilities(system, weights, sigma, noise)
         weights[:, row] = 1.0
     chi2, level = _quality(system, weights, noise).chi2.tolist(), begun.level
     return [
         _log_likelihood(system.one(i), chi2[i], point.residuals[i], weights[i], sigma, level, noise)
-        for i in range(len(offs))
+        for i in range(len(offsets))
     ]
 
 
-def _longer(point: Point, row: int, offs: Array) -> Point:
-    """Return `point` with `offs` (m) added to the range at `row`, one for each fit."""
+def _longer(point: Point, row: int, offsets: Array) -> Point:
+    """Return `point` with `offsets` (m) added to the range at `row`, one for each fit."""
     residuals, own = point.residuals.copy(), point.own.copy()
-    residuals[:, row] += offs
-    own[:, row] += offs
+    residuals[:, row] += offsets
+    own[:, row] += offsets
     return point._replace(residuals=residuals, own=own)

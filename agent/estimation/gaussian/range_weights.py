@@ -1,0 +1,51 @@
+"""The weights of ranges in a fit: the probability that each range is an inlier."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from agent.estimation.gaussian.fitted import NormalEquations
+from agent.estimation.gaussian.odometry_noise import Array
+from agent.estimation.gaussian.range_model import inlier_probability
+from protocol.noise import Noise
+
+FAR = 100.0
+"""The standard deviation (m) of a range with the weight 0."""
+
+BLIND = 1e-9
+"""The least precision of a range's prediction, as a fraction of that with a known guess."""
+
+
+def weighted_variance(sigma: Array, weights: Array) -> Array:
+    """Return the variance (m^2) of each range, which is large for a small weight."""
+    variance: Array = np.square(sigma) / np.maximum(weights, np.square(sigma / FAR))
+    return variance
+
+
+def inlier_probabilities(system: NormalEquations, weights: Array, sigma: Array, noise: Noise) -> Array:
+    """Return the probability that each range is an inlier, given the prediction from all other ranges."""
+    alone = system.covariance.precisions
+    weighted = system.weighted[..., :-1]
+    explained = np.add.reduce((weighted @ system.of_guess) * weighted, -1)
+    precision = np.maximum(alone - explained, BLIND * alone)
+    error = system.multipliers / precision
+    variance = np.maximum(1.0 / precision - weighted_variance(sigma, weights), 0.0) + np.square(sigma)
+    return weights_by_errors(error, np.sqrt(variance), noise)
+
+
+def weights_by_errors(errors: Array, sigma: Array, noise: Noise) -> Array:
+    """Return the probability that each range is an inlier, if `errors` (m) have the scale of their median.
+
+    Far from the minimum, all errors are large, and no range is an outlier because of that. At least about
+    half of the ranges are therefore inliers.
+    """
+    if noise.sigma_degrees:
+        ratios = np.abs(errors / sigma)
+        middle = ratios.shape[-1] // 2
+        median = np.partition(ratios, middle, -1)[..., middle, None]
+        sigma = sigma * np.maximum(1.0, median / MEDIAN)
+    return inlier_probability(errors, sigma, noise)
+
+
+MEDIAN = 0.6745
+"""The median of the absolute value of a standard normal variable."""
