@@ -23,7 +23,7 @@ def anchor_ranges(truth: Truth, scenario: Scenario) -> list[float | None]:
     sensors, model, radios = scenario.sensors, scenario.ranging, None
     if sensors.exact and model is None:
         return [
-            _on_disc(pose.x - (robot.anchor.x - at.x), pose.y - (robot.anchor.y - at.y), sensors.reach)
+            _exact_range(pose.x - (robot.anchor.x - at.x), pose.y - (robot.anchor.y - at.y), sensors.reach)
             for pose, at, robot in zip(truth.local, truth.origins, scenario.robots, strict=True)
         ]
     lobed = sensors.world.lobe_depth
@@ -61,7 +61,7 @@ def mutual_ranges(truth: Truth, scenario: Scenario, pairs: Sequence[tuple[int, i
     if sensors.exact and model is None:
         for i, j in pairs:
             one, other = truth.local[i], truth.local[j]
-            exact = _on_disc(one.x - other.x, one.y - other.y, sensors.reach)
+            exact = _exact_range(one.x - other.x, one.y - other.y, sensors.reach)
             ranges.append(None if exact is None else Mutual(exact))
         return ranges
     lobed = sensors.world.lobe_depth
@@ -93,8 +93,8 @@ def mutual_ranges(truth: Truth, scenario: Scenario, pairs: Sequence[tuple[int, i
     return ranges
 
 
-def _on_disc(x: float, y: float, reach: float) -> float | None:
-    """Return the length of (x, y) in m, which exact sensors measure; None beyond `reach`."""
+def _exact_range(x: float, y: float, reach: float) -> float | None:
+    """Return the range that exact sensors measure along (x, y) in m; None beyond `reach`."""
     rho = math.hypot(x, y)
     return rho if rho <= reach else None
 

@@ -34,8 +34,7 @@ from world.simulation import Simulation
 from world.world_journal import Tick, WorldHistory
 
 MAPPED_BYTES = 8 << 20
-"""The size of the block from which the C library learns to keep freed memory: larger than all of a mission's
-arrays together."""
+"""The size of a block. Once it has been freed, the C library keeps the memory of smaller ones, all arrays."""
 
 
 def run_mission(scenario: Scenario, out: Path | None = None) -> Run:

@@ -22,7 +22,7 @@ from compose.launch.signals import STOPPING
 NUMBER = struct.Struct("<H")
 """The number of a task in the pipe from which both processes take the next one."""
 MAX_TASKS = select.PIPE_BUF // NUMBER.size
-"""The number of tasks whose numbers any pipe takes at once."""
+"""The largest number of tasks: all their numbers are written to the pipe before one is read."""
 LOOK_S = 0.05
 """The time in s between two looks for a signal while this process waits for the second one."""
 WAIT_S = 60.0
@@ -50,12 +50,12 @@ def share(
     *,
     alone: bool = False,
 ) -> None:
-    """Do all `tasks`, which begin in their order, and call `done` with the lines of each in the same order.
+    """Do all `tasks`, begun in their order, and call `done` with the lines of each in the same order.
 
-    A second process takes over tasks, unless this one is `alone`, has one processor or too little memory.
-    What the second one does not finish is done here, so that the error of a task is raised here. `check` is
-    called between tasks and while this process waits. It may raise, and so may `done`; that ends the second
-    process.
+    A second process takes over some of them, unless `alone` is set, there is one processor, or the fork
+    fails. This process does what the second one does not finish, so that it raises the error of a task.
+    `check` is called between tasks and while this process waits. If `check` or `done` raises, the second
+    process is ended.
     """
     early: dict[int, Sequence[OutputLine]] = {}
     reported = 0
@@ -197,7 +197,7 @@ def _work(tasks: Sequence[Task], waiting: int, reported: int, parent: int) -> No
                     result = _Result(number, tuple(tasks[number]()))
                     os.write(reported, msgspec.json.encode(result) + b"\n")
         finally:
-            _ignore_signals()  # the exception of a signal after this block would reach the first one's code
+            _ignore_signals()  # the exception of a later signal would reach the code of the first process
     os._exit(0)
 
 

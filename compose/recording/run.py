@@ -304,10 +304,10 @@ def ended(outcome: Outcome, ticks: int, reason: str | None) -> str:
 def read(folder: Path, *, audited: bool = False) -> Run:
     """Return the run recorded in `folder`.
 
-    Raises OSError if there is no recording, or the world's journal or the list of killed processes cannot be
-    read. Raises CorruptJournal if one of these is damaged before its end or, unless the run is to be
-    `audited`, the journal has a frame out of order. Raises CorruptJournal also if there is no world's journal
-    and two peers' journals are of different runs.
+    Raises OSError if there is no recording, or if the world's journal or the list of killed processes cannot
+    be read. Raises CorruptJournal if one of these two is damaged before its end; if the world's journal has a
+    frame out of order, unless the run is to be `audited`; or if there is no world's journal and two peers'
+    journals are of different runs.
     """
     paths = journals_in(folder) or [folder / WORLD_JOURNAL]
     run = of_journals({path.name: opened(path) for path in paths}, folder)
@@ -323,7 +323,7 @@ def of_frames(
 ) -> Run:
     """Return the run with the frames of `journals`, by file name; `source` appears in errors.
 
-    `messages` are those, by frame, that this process has encoded itself: they are not decoded. Raises
+    `messages` are those that this process has encoded itself, by frame: their frames are not decoded. Raises
     CorruptJournal like `read`, but not for a frame out of order.
     """
     return of_journals(
@@ -334,11 +334,14 @@ def of_frames(
 def of_journals(
     journals: Mapping[str, JournalFile], source: object, messages: dict[bytes, Any] | None = None
 ) -> Run:
-    """Return the run in `journals`, without the `messages` not decoded yet. Raises like `of_frames`."""
+    """Return the run in `journals`, which need not be decoded; see `of_frames`. Raises like it.
+
+    Messages that are decoded here and shared by two journals are added to `messages`.
+    """
     decoded: dict[str, JournalFile] = {}
     world: WorldHistory | None = None
     agents: dict[str, AgentHistory] = {}
-    shared = messages or {}  # also the Reports and Commands: each is in two journals, and decoded once
+    shared = messages or {}  # Reports and Commands are added: each is in two journals, and decoded once
     for name, one in journals.items():
         if name == WORLD_JOURNAL:
             decoded[name], world = _world(one, f"{source}/{name}", shared)

@@ -1,4 +1,4 @@
-"""The recorded steps and ranges of robots, prepared for the estimator: what one robot and two have in common.
+"""The recorded steps and ranges of robots, prepared for the estimates of one robot and of two.
 
 The estimator counts in ticks. A tick is so short that no robot moves further in half of it than a small part
 of a range's sigma, and each range counts at the nearest tick.
@@ -46,7 +46,6 @@ HORIZON = 1.25
 A missing range of a recording says nothing, so that this only scales the tolerances of the search. With 1,
 the estimator would take it for information that no range is longer.
 """
-
 
 SHORTEST_RANGE_M = 1e-3
 """The least length in m of the longest range. A recording whose ranges are all 0 says nothing."""
@@ -112,7 +111,6 @@ class PreparedSteps(NamedTuple):
     sound: tuple[SoundOdometry, ...]
     """The prepared odometry of each robot."""
     assumed: RecordedNoise
-    """The noise that is assumed."""
     ticks_per_epoch: int
     steps: RangeSteps
 
@@ -128,7 +126,7 @@ class PreparedSteps(NamedTuple):
         return OneRobot(robot.id, anchors, path, self.sound[place], robot.antenna)
 
     def sigmas(self, told: Numbers, stated: Numbers) -> Numbers:
-        """Return the sigmas (m) of ranges: those `told`, or `stated` by the recording where they are used."""
+        """Return the sigmas (m) of ranges: those `told`, or `stated` by the recording if these are used."""
         if self.assumed.stated:
             told = np.where(np.isfinite(stated), stated, told)
         return np.maximum(told, SIGMA_FLOOR)

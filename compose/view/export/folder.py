@@ -80,9 +80,9 @@ def export(
 def _task(write: Callable[[Path], object], path: Path) -> Task:
     """Return the task of writing the file at `path` by `write`."""
 
-    def written() -> Sequence[OutputLine]:
+    def task() -> Sequence[OutputLine]:
         with files.draft(path) as place:
             write(place)
         return ()
 
-    return written
+    return task
