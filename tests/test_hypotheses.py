@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from agent.estimation import closed_forms
 from agent.estimation.closed_forms import Placement, same_placement
 from agent.estimation.gaussian import hypotheses, inference
+from agent.estimation.gaussian.detections import no_detection_log_likelihood
 from agent.estimation.gaussian.evidence import anchor_evidence
 from agent.estimation.gaussian.fitted_poses import poses
 from agent.estimation.gaussian.hypotheses import (
@@ -21,7 +22,6 @@ from agent.estimation.gaussian.hypotheses import (
     _alone,
     follow,
     missing,
-    no_detection_log_likelihood,
     of_anchor,
     search,
 )

@@ -15,18 +15,13 @@ from typing import NamedTuple
 import numpy as np
 
 from agent.estimation.gaussian.anchor_guesses import MOST, SEED_RANGES, UNLIKELY, anchors
+from agent.estimation.gaussian.detections import anchor_log_likelihood, detection_log_likelihood
 from agent.estimation.gaussian.fitted import Fit
-from agent.estimation.gaussian.fitted_poses import deviation
-from agent.estimation.gaussian.least_squares import (
-    COARSE_STILL,
-    WARM_DECREASE,
-    fits,
-    without_outliers,
-)
+from agent.estimation.gaussian.least_squares import COARSE_STILL, WARM_DECREASE, fits, without_outliers
 from agent.estimation.gaussian.linear_model import Start
-from agent.estimation.gaussian.odometry_noise import Array, Errors, Places, Track
+from agent.estimation.gaussian.odometry_noise import Errors, Places, Track
 from agent.estimation.gaussian.placement_guesses import STARTS, placements
-from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Ranges, placed
+from agent.estimation.gaussian.range_model import PairRanges, Ranges
 from protocol.noise import Noise
 
 NEGLIGIBLE_PROBABILITY = 1e-7
@@ -134,37 +129,6 @@ def _same(one: Fit, other: Fit) -> bool:
     return float(change @ one.information @ change) < SAME_SIGMAS**2
 
 
-def no_detection_log_likelihood(beyond: Array, sigma: float, drop_outs: float) -> float:
-    """Return the log-likelihood of no detection at several ticks.
-
-    `beyond` is the predicted distance (m) beyond R at each of these ticks. The prediction has an error of
-    standard deviation `sigma` (m), which is common to all ticks because they lie on one path. A tick within R
-    has no detection with the probability `drop_outs`.
-    """
-    if not len(beyond):
-        return 0.0
-    margins = np.sort(beyond)[:SILENT] / max(sigma, SIGMA_FLOOR)
-    if not drop_outs:
-        return _log_cdf(float(margins[0]))
-    likelihood, below = 0.0, 0.0
-    for n, margin in enumerate([*margins.tolist(), math.inf]):
-        up_to = 0.5 * math.erfc(-margin / math.sqrt(2.0))
-        likelihood += drop_outs**n * (up_to - below)
-        below = up_to
-    return math.log(max(likelihood, 1e-300))
-
-
-SILENT = 12
-"""The maximum number of ticks without a detection that are evaluated, those closest to the beacon."""
-
-
-def _log_cdf(x: float) -> float:
-    """Return the logarithm of the standard normal distribution function."""
-    if x > -30.0:
-        return math.log(0.5 * math.erfc(-x / math.sqrt(2.0)))
-    return -0.5 * x * x - math.log(-x * math.sqrt(2.0 * math.pi))
-
-
 # --- one robot and its anchor -------------------------------------------------------------------------
 
 
@@ -192,12 +156,12 @@ def of_anchor(
         starts = [Start(np.array([*point, 0.0])) for point in points]
     found = _coarse_fits(starts, path, ranges, noise)
     return with_probability(
-        [(one, _anchor_log_likelihood(one, 0, silent, ranges.tick, sensing_range, noise)) for one in found]
+        [(one, anchor_log_likelihood(one, 0, silent, ranges.tick, sensing_range, noise)) for one in found]
     )
 
 
 def _coarse_fits(starts: Sequence[Start], path: Track, ranges: Ranges, noise: Noise) -> list[Fit]:
-    """Return the fits of one robot, which begin near their ends and are as accurate as planning needs."""
+    """Return fits of one robot that begin near their ends and are as accurate as planning needs."""
     return fits(
         starts,
         [path],
@@ -208,38 +172,6 @@ def _coarse_fits(starts: Sequence[Start], path: Track, ranges: Ranges, noise: No
         decrease=WARM_DECREASE,
         same=COPY_SIGMAS,
     )
-
-
-def _anchor_log_likelihood(
-    one: Fit, robot: int, silent: Places, ranged: Places, sensing_range: float, noise: Noise
-) -> float:
-    """Return the log-likelihood of detections by the anchor at `ranged`, and of none at `silent` (ticks)."""
-    columns = slice(3 * robot, 3 * robot + 2)
-    place = one.covariance[columns, columns]
-    mx, my = one.guess[columns]
-    path, weight = one.paths[robot], 0.0
-    for ticks, sign in ((silent, 1.0), (ranged, -1.0)):
-        if not len(ticks):
-            continue
-        x, y = path.x[ticks] - mx, path.y[ticks] - my
-        beyond = sign * (np.hypot(x, y) - sensing_range)
-        worst = int(np.argmin(beyond))
-        if beyond[worst] > CLEAR * sensing_range:
-            continue
-        u = np.array((x[worst], y[worst])) / max(math.hypot(x[worst], y[worst]), SIGMA_FLOOR)
-        sigma = math.hypot(deviation(float(u @ place @ u)), EDGE * sensing_range)
-        if sign > 0.0:
-            weight += no_detection_log_likelihood(beyond, sigma, noise.drop_outs)
-        else:
-            weight += _log_cdf(float(beyond[worst]) / sigma)
-    return weight
-
-
-EDGE = 0.005
-"""The assumed uncertainty of R, as a fraction of R, which is added to the uncertainty of the pose."""
-
-CLEAR = 0.5
-"""The fraction of R beyond R from which a tick without a detection contains no information."""
 
 
 def missing(ticks: Places, end: int) -> Places:
@@ -332,41 +264,4 @@ def follow(before: tuple[Hypothesis, ...], pair: PairRanges) -> tuple[ScoredHypo
 
 
 def _scored(found: Sequence[Fit], pair: PairRanges) -> tuple[ScoredHypothesis, ...]:
-    return with_probability([(one, _detection_log_likelihood(one, pair)) for one in found])
-
-
-def _detection_log_likelihood(one: Fit, pair: PairRanges) -> float:
-    """Return the log-likelihood of all detections and ticks without one, given the fit."""
-    weight = 0.0
-    for robot in (0, 1):
-        ranged = pair.ranges.only(robot).tick
-        weight += _anchor_log_likelihood(
-            one, robot, pair.silent[robot], ranged, pair.sensing_range, pair.noise
-        )
-    return weight + _mutual_log_likelihood(one, pair)
-
-
-def _mutual_log_likelihood(one: Fit, pair: PairRanges) -> float:
-    """Return the log-likelihood of no mutual detection at the ticks without a mutual range."""
-    silent = pair.silent[2]
-    if not len(silent):
-        return 0.0
-    (wx, wy), (vx, vy) = (placed(one.guess[3 * r : 3 * r + 3], one.paths[r], silent) for r in (0, 1))
-    dx, dy = wx - vx - pair.apart[0], wy - vy - pair.apart[1]
-    distance = np.hypot(dx, dy)
-    k = int(np.argmin(distance))
-    beyond = distance - pair.sensing_range
-    if beyond[k] > CLEAR * pair.sensing_range:
-        return 0.0
-    nx, ny = dx[k] / max(distance[k], SIGMA_FLOOR), dy[k] / max(distance[k], SIGMA_FLOOR)
-    gradient = np.empty(6)
-    for robot, (x, y), sign in ((0, (wx[k], wy[k]), 1.0), (1, (vx[k], vy[k]), -1.0)):
-        theta = one.guess[3 * robot + 2]
-        c, s = math.cos(theta), math.sin(theta)
-        gradient[3 * robot : 3 * robot + 3] = (
-            -sign * (c * nx + s * ny),
-            -sign * (c * ny - s * nx),
-            sign * (ny * x - nx * y),
-        )
-    sigma = math.hypot(deviation(float(gradient @ one.covariance @ gradient)), EDGE * pair.sensing_range)
-    return no_detection_log_likelihood(beyond, sigma, pair.noise.drop_outs)
+    return with_probability([(one, detection_log_likelihood(one, pair)) for one in found])
