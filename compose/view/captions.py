@@ -313,12 +313,18 @@ def _end(setup: RunSetup, now: TickData, end: MissionEnd) -> Caption:
                 truth=" ".join(filter(None, [silent, largest])) or None,
             )
         case "inconsistent":
-            text = f"The mission ends, because measurements and reports contradict each other{why}"
-            return Caption("end", text, truth=largest)
+            text = "The mission ends, because measurements and reports contradict each other"
+            return Caption("end", _stopped(text) if _just_told(setup, now) else f"{text}{why}", truth=largest)
         case "wrong":
             return Caption("end", f"The mission ends with a wrong claim{why}", truth=largest)
         case _:
             return Caption("end", f"The mission fails{why}", truth=largest)
+
+
+def _just_told(setup: RunSetup, now: TickData) -> bool:
+    """Return whether a robot of the only pair has found the contradiction: its caption has the reason."""
+    verdicts = [now.commands[robot].verdict for robot in setup.ids if robot in now.commands]
+    return len(setup.robots) == 2 and any(isinstance(verdict, Inconsistent) for verdict in verdicts)
 
 
 def _silent_links(setup: RunSetup) -> str | None:

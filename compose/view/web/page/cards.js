@@ -98,8 +98,9 @@ class Card {
 
   #row(name, text) {
     if (!this.fields.has(name)) {
-      const value = make("dd", {});
-      this.rows.append(make("dt", { textContent: name }), value);
+      const value = make("dd", {}), title = make("dt", { textContent: name });
+      value.dataset.row = title.dataset.row = name;
+      this.rows.append(title, value);
       this.fields.set(name, value);
     }
     const value = this.fields.get(name);

@@ -292,6 +292,8 @@ function draw() {
     document.body.dataset.tick = view.tick;
     document.body.dataset.shown = store.scene(view.tick) ? view.tick : "";
     tell_state({ shown: store.scene(view.tick) ? view.tick : null, first: store.first, last: store.last });
+    controls(); // and other texts, of which the labels of the plane keep clear
+    text($("caption"), guide.text(view));
     predictions.draw(view, store, guide.pair(view.focus));
     plane.draw(store, view);
     const size = [$("canvas").clientWidth, $("canvas").clientHeight];
@@ -301,8 +303,6 @@ function draw() {
     timeline.draw(view, activities(store, view));
     sequence.draw(store, view);
     charts.draw(store, view, guide.pair(view.focus));
-    controls();
-    text($("caption"), guide.text(view));
     const news = view.playing && view.guided ? null : announcer.text(store, view, now);
     if (news !== null) text($("live"), news);
     if (view.playing || plane.easing) draw();

@@ -4,7 +4,7 @@ import { Beliefs } from "./beliefs.js";
 import { Configurations } from "./configurations.js";
 import { scenario_discs, story_discs, true_and_reported } from "./camera.js";
 import { distance, TAU } from "./geometry.js";
-import { Labels } from "./labels.js";
+import { Labels, NAME } from "./labels.js";
 import { cross, Look, shape, unit } from "./pen.js";
 import { same, under } from "./selection.js";
 import { Signals } from "./signals.js";
@@ -287,8 +287,9 @@ export class Plane {
     pen.stroke();
     pen.setLineDash([]);
     const text = `${robot.id} reported, ${metres(distance(pose, true_pose))} off`;
-    const half = pen.measureText(text).width / 2, middle = Math.min(Math.max((x + to_x) / 2, half), this.width - half);
-    this.labels.put(text, middle, (y + to_y) / 2 - 12, look.fault, "center");
+    const half = pen.measureText(text).width / 2;
+    const along = (part) => [Math.min(Math.max(x + part * (to_x - x), half), this.width - half), y + part * (to_y - y) - 12];
+    this.labels.put(text, ...along(0.5), look.fault, "center", { rank: 1, others: [along(0), along(1)] });
     if (size > 6) this.labels.placed.push([x - size, y - size, x + size, y + size]);
     pen.globalAlpha = 1;
   }
@@ -383,7 +384,7 @@ export class Plane {
     if (size > 6) this.labels.placed.push([x - size, y - size, x + size, y + size]);
     if (size > 6 || down || robot.id === focus) {
       const name = down ? `${robot.id} is down` : robot.id;
-      this.labels.put(name, x + size + 4, y - size - 2, look.ink, "left", { font: look.bold, name: true, around: size + 4 });
+      this.labels.put(name, x + size + 4, y - size - 2, look.ink, "left", { font: look.bold, rank: NAME, around: size + 4 });
     }
     pen.globalAlpha = 1;
   }
