@@ -98,7 +98,14 @@ def test_the_predicted_distances_and_j_of_the_last_manoeuvre_are_listed(opened: 
     until_shown(page, 47)
     listed = page.locator("#predictions li")
     expect(listed).to_have_text(
-        ["predicted distances", "1: 2.39 m", "2: 2.75 m", "3: 1.14 m", "4: 3.06 m", "J = 1.80 m²"]
+        [
+            "predicted distances",
+            "1: 2.39 m",
+            "2: 2.75 m",
+            "3: 1.14 m",
+            "4: 3.06 m",
+            "least difference J = 1.80 m²",
+        ]
     )
     page.keyboard.press("ArrowLeft")
     expect(page.locator("#predictions")).to_be_hidden()

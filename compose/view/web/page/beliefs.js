@@ -39,7 +39,7 @@ export class Beliefs {
       const colour = tints.length ? look.tint(tints[place]) : look.ghost;
       pen.strokeStyle = colour;
       pen.lineWidth = tints.length ? 2.6 : 2;
-      pen.setLineDash(held.world.length || !truth ? [] : [3, 3]);
+      pen.setLineDash(held.world.length || !truth || size <= 6 ? [] : [3, 3]);
       pen.stroke();
       pen.setLineDash([]);
       const many = held.probability.length > 1 && chance > 0.01;

@@ -288,13 +288,14 @@ function draw() {
     store.want(view.tick);
     view.moving = (view.playing || view.driven) && !still.matches && (view.guided || view.speed <= 60);
     view.eliminated = guide.eliminated(view);
+    // First the texts: they decide the size of the plane, and its camera and its labels keep clear of them.
+    controls();
+    text($("caption"), guide.text(view));
+    predictions.draw(view, store, guide.pair(view.focus));
     if (plane.following) plane.follow(view, store, guide.pair(view.focus), still.matches ? null : now);
     document.body.dataset.tick = view.tick;
     document.body.dataset.shown = store.scene(view.tick) ? view.tick : "";
     tell_state({ shown: store.scene(view.tick) ? view.tick : null, first: store.first, last: store.last });
-    controls(); // and other texts, of which the labels of the plane keep clear
-    text($("caption"), guide.text(view));
-    predictions.draw(view, store, guide.pair(view.focus));
     plane.draw(store, view);
     const size = [$("canvas").clientWidth, $("canvas").clientHeight];
     tip.draw({ ...view, store }, plane.hovered ?? plane.targets.find((one) => same(one, view.selected)), size, plane.unit);

@@ -1,5 +1,6 @@
 // The plane in one tick: anchors, trails, robots, ranges, reports and beliefs.
 
+import { Backdrop } from "./backdrop.js";
 import { Beliefs } from "./beliefs.js";
 import { Configurations } from "./configurations.js";
 import { scenario_discs, story_discs, true_and_reported } from "./camera.js";
@@ -9,7 +10,7 @@ import { cross, Look, shape, unit } from "./pen.js";
 import { same, under } from "./selection.js";
 import { Signals } from "./signals.js";
 import { Tints } from "./tints.js";
-import { pose_now, REPORTED, Trails, TRUE } from "./trails.js";
+import { kinds_of, pose_now, REPORTED, Trails, TRUE } from "./trails.js";
 import { metres } from "./words.js";
 
 /** The time in s in which the camera covers most of the way to where it is needed. */
@@ -42,6 +43,7 @@ export class Plane {
     this.targets = [];
     this.#redraw = redraw;
     this.#trails = new Trails(this);
+    this.#backdrop = new Backdrop(this, this.#trails);
     this.#beliefs = new Beliefs(this);
     this.#signals = new Signals(this);
     this.#configurations = new Configurations(this);
@@ -79,6 +81,8 @@ export class Plane {
 
   #redraw;
   #trails;
+  #backdrop;
+  #size = [0, 0];
   #beliefs;
   #signals;
   #configurations;
@@ -103,9 +107,12 @@ export class Plane {
     Object.assign(this, { centre: [x, y], scale });
   }
 
-  get width() { return this.canvas.clientWidth / unit(); }
+  get width() { return this.#size[0]; }
   get unit() { return unit(); }
-  get height() { return this.canvas.clientHeight / unit(); }
+  get height() { return this.#size[1]; }
+
+  /** Reads the size of the canvas, which the browser may have to compute. */
+  #measure() { this.#size = [this.canvas.clientWidth / unit(), this.canvas.clientHeight / unit()]; }
 
   #free() {
     this.fitted = this.following = this.easing = false;
@@ -158,6 +165,7 @@ export class Plane {
   /** Eases the camera to what the story needs in view; without delay if `now`, in ms, is null. */
   follow(view, store, pair, now) {
     this.fitted = false;
+    this.#measure();
     const { scale, centre } = this.#framed(story_discs({ ...view, truth: view.truth, store }, pair), this.#list_height());
     const s = now === null ? Infinity : Math.min(now - (this.easing || now - 16), 250) / 1000;
     const part = 1 - Math.exp(-s / EASE_S);
@@ -203,6 +211,7 @@ export class Plane {
   }
 
   draw(store, { tick, share, focus, truth, moving, eliminated, selected }) {
+    this.#measure();
     const ratio = (window.devicePixelRatio || 1) * unit();
     const width = Math.round(this.width * ratio), height = Math.round(this.height * ratio);
     if (this.canvas.width !== width || this.canvas.height !== height) {
@@ -224,14 +233,13 @@ export class Plane {
     pen.font = look.font;
     const view = { store, tick, share, focus, truth, moving, eliminated, look, scene: store.scene(tick) };
     this.labels = new Labels(pen, look, this.width, this.height, this.#overlays());
-    this.#grid(view);
     const shown = (robot) => truth || !focus || robot.id === focus;
     const robots = store.stage.robots.filter(shown);
-    for (const robot of robots) this.#anchor(view, robot);
-    if (truth) {
-      for (const robot of robots) this.#trails.trail(view, robot);
-      for (const robot of robots) if (robot.attack) this.#trails.trail(view, robot, REPORTED);
-    } else for (const robot of robots) this.#trails.believed_trail(view, robot);
+    this.#backdrop.draw(view, robots, ratio);
+    for (const robot of robots) {
+      if (!truth) this.#trails.believed_trail(view, robot);
+      else for (const kind of kinds_of(robot)) this.#trails.newest(pen, view, robot, kind);
+    }
     if (view.scene) this.#scene(view, robots);
     this.#ring(this.targets.find((one) => same(one, selected)), look);
     this.canvas.style.cursor = this.hovered ? "pointer" : "";
@@ -301,66 +309,6 @@ export class Plane {
       const box = one.getBoundingClientRect();
       return [(box.left - left) / scale, (box.top - top) / scale, (box.right - left) / scale, (box.bottom - top) / scale];
     });
-  }
-
-  // --- grid and anchors ---
-
-  #grid({ look }) {
-    const pen = this.context, raw = Math.min(80, this.width / 9) / this.scale, power = 10 ** Math.floor(Math.log10(raw));
-    const unit = [1, 2, 5, 10].find((factor) => factor * power >= raw) * power;
-    pen.strokeStyle = look.grid;
-    pen.lineWidth = 1;
-    pen.beginPath();
-    const left = this.centre[0] - this.width / 2 / this.scale, right = left + this.width / this.scale;
-    const low = this.centre[1] - this.height / 2 / this.scale, high = low + this.height / this.scale;
-    for (let x = Math.ceil(left / unit) * unit; x <= right; x += unit) {
-      const px = Math.round(this.at([x, 0])[0]) + 0.5;
-      pen.moveTo(px, 0); pen.lineTo(px, this.height);
-    }
-    for (let y = Math.ceil(low / unit) * unit; y <= high; y += unit) {
-      const py = Math.round(this.at([0, y])[1]) + 0.5;
-      pen.moveTo(0, py); pen.lineTo(this.width, py);
-    }
-    pen.stroke();
-    const bar = unit * this.scale, x = this.width - 14, y = this.height - 14;
-    pen.strokeStyle = pen.fillStyle = look.faint;
-    pen.lineWidth = 2;
-    pen.beginPath();
-    pen.moveTo(x - bar, y - 4); pen.lineTo(x - bar, y); pen.lineTo(x, y); pen.lineTo(x, y - 4);
-    pen.stroke();
-    pen.textAlign = "right";
-    pen.fillText(unit >= 1 ? `${unit} m` : metres(unit), x - 5, y - 5);
-    this.labels.placed.push([x - Math.max(bar, 60), y - 18, x, y + 4]);
-  }
-
-  #anchor(view, robot) {
-    const { look, store, focus } = view, pen = this.context;
-    const [x, y] = this.at(robot.anchor), reach = store.stage.mission.sensing_range * this.scale;
-    const mine = !focus || robot.id === focus || robot.peer === focus;
-    pen.globalAlpha = mine ? 1 : 0.45;
-    pen.beginPath();
-    pen.arc(x, y, reach, 0, TAU);
-    pen.fillStyle = look.disc;
-    pen.fill();
-    pen.setLineDash([]);
-    pen.lineWidth = 1.2;
-    pen.strokeStyle = look.ring;
-    pen.stroke();
-    pen.beginPath();
-    pen.arc(x, y, robot.orbit[0] * this.scale, 0, TAU);
-    pen.setLineDash([7, 4, 1.5, 4]);
-    pen.lineWidth = 1;
-    pen.strokeStyle = look.orbit;
-    pen.stroke();
-    pen.setLineDash([]);
-    const r = reach > 40 ? 6 : 4;
-    this.targets.push({ kind: "anchor", robot: robot.id, at: [x, y], radius: r });
-    pen.beginPath();
-    pen.moveTo(x, y - r); pen.lineTo(x + r, y + r * 0.75); pen.lineTo(x - r, y + r * 0.75); pen.closePath();
-    pen.fillStyle = look.ink;
-    pen.fill();
-    if (reach > 26) this.labels.put(`anchor of ${robot.id}`, x, y + r + 12, look.faint, "center");
-    pen.globalAlpha = 1;
   }
 
   // --- robots ---
