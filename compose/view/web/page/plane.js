@@ -157,7 +157,7 @@ export class Plane {
       const poses = [...(truth ? true_and_reported(player) : []), ...(player?.held?.world ?? [])];
       discs.push(...(poses.length ? poses.map((pose) => [pose, 0.3 * reach]) : [[robot.anchor, reach]]));
     }
-    this.#frame(discs);
+    this.#frame(discs, this.#list_height());
     this.#free();
     this.#redraw();
   }
@@ -182,7 +182,7 @@ export class Plane {
     return Math.max(over.offsetTop + over.offsetHeight, LIST_PX) / unit() - 12;
   }
 
-  #frame(discs) { Object.assign(this, this.#framed(discs)); }
+  #frame(discs, top) { Object.assign(this, this.#framed(discs, top)); }
 
   /** Returns the scale and the centre with which `discs` are in view, below the uppermost `top` pixels. */
   #framed(discs, top = 0) {

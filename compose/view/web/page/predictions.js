@@ -29,7 +29,7 @@ export class Predictions {
       return item;
     });
     const measured = found.measured ? [make("li", { className: "measured", textContent: `measured ${found.measured}` })] : [];
-    const value = found.value ? [make("li", { className: "value", textContent: found.value })] : [];
+    const value = found.value ? [make("li", { className: "value" }, make("span", { textContent: "least difference " }), found.value)] : [];
     this.root.replaceChildren(make("li", { className: "title", textContent: found.title }), ...items, ...measured, ...value);
   }
 
@@ -43,7 +43,7 @@ export class Predictions {
     }
     if (!now || now.count < 2) return null;
     const all = predicted(store, tick, robot, tints);
-    const value = now.manoeuvre && `least difference J = ${now.manoeuvre.separation_m2.toPrecision(3)} m²`;
+    const value = now.manoeuvre && `J = ${now.manoeuvre.separation_m2.toPrecision(3)} m²`;
     return all.length ? { title: "predicted distances", all: listed(all), value } : null;
   }
 }

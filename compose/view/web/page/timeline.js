@@ -142,22 +142,22 @@ export class Timeline {
     this.scrub.setAttribute("aria-valuetext", `tick ${tick} of ${this.last}. ${activities}`);
   }
 
-  /** Draws the signs of each tick side by side; those that have no room near their tick are left out. */
+  /** Draws the signs of each tick side by side, the last first; those that have no room near their tick are left out. */
   #signs(pen, x, of, ids, wide) {
     const ticks = new Map();
     for (const [k, kind, robot] of this.marks) {
       if (robot === null || ids.has(robot)) ticks.set(k, (ticks.get(k) ?? new Set()).add(kind));
     }
     pen.textAlign = "left";
-    let free = 0;
-    for (const [k, kinds] of ticks) {
-      const room = SIGN * kinds.size, wanted = Math.min(x(k) - room / 2, wide - room), left = Math.max(wanted, free);
-      if (left > wanted + SIGN) continue;
+    let free = wide;
+    for (const [k, kinds] of [...ticks].reverse()) {
+      const room = SIGN * kinds.size, wanted = Math.min(x(k) - room / 2, wide - room), left = Math.min(wanted, free - room);
+      if (left < wanted - SIGN) continue;
       [...kinds].forEach((kind, i) => {
         pen.fillStyle = ["contact", "claim", "back"].includes(kind) ? of("ink") : of("fault");
         pen.fillText(MARKED[kind], left + SIGN * i, 10);
       });
-      free = left + room;
+      free = left;
     }
   }
 
