@@ -191,16 +191,21 @@ def test_a_hypothesis_that_goes_on_moves_to_where_it_is_next_and_others_as_drive
 
 def test_a_view_is_the_same_picture_however_it_was_reached(opened: Open, address: str) -> None:
     """What stays the same between two ticks is drawn once, and again when anything in it changes."""
-    page = opened(f"{address}#tick=30")
-    until_shown(page, 30)
-    page.keyboard.press("f")
-    expected = picture(page)
-    for away, back in (("End", "Home"), ("n", "f"), ("t", "t"), ("r", "a"), ("w", "f")):
+    pages = {tick: opened(f"{address}#tick={tick}") for tick in (30, 40)}
+    expected = {}
+    for tick, page in pages.items():
+        until_shown(page, tick)
+        expected[tick] = inks(page)
+    page = pages[30]
+    first = picture(page)
+    for away, back in (("n", "f"), ("t", "t"), ("r", "a"), ("w", "f")):
         page.keyboard.press(away)
-        assert picture(page) != expected
+        assert picture(page) != first
         page.keyboard.press(back)
-        scrub_to(page, 30)
-        assert picture(page) == expected
+        for tick, inked in reversed(expected.items()):
+            scrub_to(page, tick)
+            assert inks(page) == inked
+        assert picture(page) == first
 
 
 JOINED = """async () => {
