@@ -17,7 +17,9 @@ import { metres } from "./words.js";
 const EASE_S = 0.45;
 /** The distance in pixels from which on the camera is where it is needed. */
 const NEAR_PX = 0.5;
+/** The height in pixels of a list of predicted distances in one line, and the part of it that is in the margin of a picture. */
 const LIST_PX = 42;
+const CLEAR_PX = 12;
 /** The distance in pixels that a pointer moves before it drags the plane instead of selecting what is there. */
 const DRAG_PX = 4;
 /** The least distance in m between a reported and a true position that counts as a difference. */
@@ -142,10 +144,10 @@ export class Plane {
     const { robots, mission } = store.stage, reach = mission.sensing_range;
     if (!truth && focus) {
       const { anchor, orbit } = robots.find((robot) => robot.id === focus);
-      return this.#frame([[anchor, Math.max(reach, orbit[0]) + reach]]);
+      return this.#frame([[anchor, Math.max(reach, orbit[0]) + reach]], LIST_PX - CLEAR_PX);
     }
     const chosen = focus && robots.length > 2 ? robots.filter((r) => r.id === focus || r.peer === focus) : robots;
-    return this.#frame(scenario_discs(chosen, reach));
+    return this.#frame(scenario_discs(chosen, reach), LIST_PX - CLEAR_PX);
   }
 
   /** Zooms to the robots and to all poses that they consider possible, or to those of the selected robot's pair. */
@@ -179,7 +181,7 @@ export class Plane {
   /** Returns the height in pixels of the list of predicted distances, of which the camera keeps clear. */
   #list_height() {
     const over = this.canvas.parentElement.querySelector("#over");
-    return Math.max(over.offsetTop + over.offsetHeight, LIST_PX) / unit() - 12;
+    return Math.max(over.offsetTop + over.offsetHeight, LIST_PX) / unit() - CLEAR_PX;
   }
 
   #frame(discs, top) { Object.assign(this, this.#framed(discs, top)); }
