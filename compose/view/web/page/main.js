@@ -123,8 +123,8 @@ async function on_list(list) {
     }
     return;
   }
-  const { show } = address_state();
-  const chosen = list.shows.find((one) => one.name === show) ?? (list.shows.length === 1 ? list.shows[0] : null);
+  const { show, tick } = address_state(); // an address with a tick and no mission is that of the only one at that time
+  const chosen = list.shows.find((one) => one.name === show) ?? (list.shows.length === 1 || (!show && tick !== null) ? list.shows[0] : null);
   if (chosen && chosen.name !== store?.name) await open(chosen.name);
   else if (!chosen && !(store && list.shows.some((one) => one.name === store.name) && show)) show_list();
 }
