@@ -285,7 +285,7 @@ msgpack_values = st.recursive(
 )
 
 
-@settings(max_examples=500)
+@settings(max_examples=150)
 @given(st.binary(max_size=60) | msgpack_values.map(packed))
 def test_any_body_is_a_message_or_refused(body: bytes) -> None:
     assert isinstance(_understood(framed(body)), Message | None)
