@@ -18,7 +18,7 @@ from compose.launch import in_process
 from compose.scenario.scenario_change import changed, values_of
 from compose.scenario.scenario_file import load, parse
 from compose.view.web.changed_missions import MOST_TICKS
-from tests.browser import Open, shot, until_loaded, until_shown
+from tests.browser import Open, chromium_only, shot, until_loaded, until_shown
 from world.scenario import Scenario
 
 PAPER_1 = load("paper-1")
@@ -212,6 +212,7 @@ def test_a_start_that_is_dragged_is_where_the_mission_begins_again(opened: Open,
     until_shown(older, 7)
 
 
+@chromium_only
 def test_the_form_works_from_the_keyboard_and_saves_the_scenario(opened: Open, address: str) -> None:
     page = opened_form(opened, address)
     page.get_by_label("sensing range R in m", exact=True).nth(1).focus()
@@ -234,6 +235,7 @@ def test_the_form_works_from_the_keyboard_and_saves_the_scenario(opened: Open, a
     expect(page.locator("#changes")).to_be_hidden()
 
 
+@chromium_only
 def test_an_empty_field_and_what_the_server_refuses_run_nothing(opened: Open, address: str) -> None:
     page = opened_form(opened, address)
     sent = []
