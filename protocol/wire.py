@@ -39,6 +39,16 @@ def encode(message: msgspec.Struct) -> bytes:
     return _HEAD.pack(VERSION, zlib.crc32(payload)) + payload
 
 
+class EncodedMessages(dict[bytes, Any]):
+    """The messages that this process has encoded, by frame. A reader need not decode these frames."""
+
+    def encode(self, message: msgspec.Struct) -> bytes:
+        """Return the frame of `message`, and store both."""
+        frame = encode(message)
+        self[frame] = message
+        return frame
+
+
 def body(frame: bytes) -> bytes:
     """Return the body of `frame`, in msgpack."""
     return frame[_HEAD.size :]

@@ -17,6 +17,7 @@ from msgspec.structs import replace
 
 from agent.planning.paper import Paper
 from agent.planning.state import RobotState
+from agent.process import agent_journal as reader_of_agent
 from agent.process.robot import Robot
 from compose.audit.findings import Findings, Violation
 from compose.audit.rules import RULES, audit, audit_run
@@ -44,7 +45,7 @@ from protocol.messages import (
 )
 from protocol.mission import Anchor
 from protocol.motion import Covariance, Segment
-from protocol.wire import MAX_FRAME_BYTES, decode, encode
+from protocol.wire import MAX_FRAME_BYTES, EncodedMessages, decode, encode
 from tests.commands import (
     OVER,
     REAL_TIME,
@@ -57,6 +58,7 @@ from tests.commands import (
 )
 from tests.series import series
 from tests.test_real_time import missed
+from world import world_journal as reader_of_world
 from world.referee import MissionOutcome
 from world.scenario import Scenario
 from world.simulation import Simulation
@@ -142,6 +144,30 @@ def test_journals_in_memory_are_those_on_disk(tmp_path: Path) -> None:
     journals = kept(scenario)
     assert {path.name: list(journal_file.read(path)) for path in tmp_path.iterdir()} == journals
     assert audit(tmp_path) == audit_run(of_frames(journals))
+
+
+@pytest.mark.parametrize("scenario", [load("paper-1"), parse(several_pairs(2), "pairs")])
+def test_an_audit_of_a_run_in_this_process_decodes_none_of_its_ticks(
+    scenario: Scenario, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It finds the same as with decoded journals, and still decodes a frame that is not the run's own."""
+    books, messages = {name: MemoryJournal() for name in in_process.journals(scenario)}, EncodedMessages()
+    in_process.played(scenario, books, encode=messages.encode)
+    journals = {name: book.frames for name, book in books.items()}
+    expected = audit_run(of_frames(journals))
+    decoded: list[bytes] = []
+
+    def counted(frame: bytes, *kind: Any) -> Any:
+        decoded.append(frame)
+        return decode(frame, *kind)
+
+    for module in (reader_of_agent, reader_of_world):
+        monkeypatch.setattr(module, "decode", counted)
+    assert audit_run(of_frames(journals, messages=EncodedMessages(messages))) == expected
+    assert len(decoded) == 1 + len(scenario.robots)  # the world's MissionEnd and FinalReports
+    journals[A][2] = journals[A][2][:-1] + b"\xff"
+    with pytest.raises(CorruptJournal, match="the CRC does not match"):
+        audit_run(of_frames(journals, messages=messages))
 
 
 def test_a_run_as_processes_violates_no_rule_and_the_command_reports_it(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from compose.recording.estimating.estimate_files import COLUMNS, estimate_csv
 from compose.recording.estimating.estimate_rows import PoseEstimate, true_pose
 from compose.recording.estimating.estimate_run import RecordingEstimate, estimated, measurements
 from compose.recording.estimating.noise_files import RangeCorrection, told_noise
-from compose.recording.estimating.pair_measurements import EPOCH_S
+from compose.recording.estimating.prepared_steps import EPOCH_S
 from compose.recording.estimating.sound_odometry import GAP_MOTION_S, sound
 from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.range_recording import (

@@ -119,29 +119,23 @@ def test_a_stream_that_breaks_off_gives_the_estimates_before_that(messages: Mess
     assert rows(written(early, whole=False)[:-20]) == whole
 
 
-@pytest.mark.long
-def test_estimates_are_printed_while_the_stream_is_open(messages: Messages, tmp_path: Path) -> None:
-    words = [
-        sys.executable,
-        "-m",
-        "tandem",
-        "estimate",
-        "-",
-        "--follow",
-        "--noise",
-        PROFILE,
-        "--out",
-        "found",
-    ]
-    early = [one for one in messages if one[0] <= 12.0]
-    with subprocess.Popen(
-        words,
-        cwd=tmp_path,
+def following(folder: Path) -> subprocess.Popen[bytes]:
+    """Return a process in `folder` that estimates the stream on its standard input, and writes to `found`."""
+    words = ["-m", "tandem", "estimate", "-", "--follow", "--noise", PROFILE, "--out", "found"]
+    return subprocess.Popen(
+        [sys.executable, *words],
+        cwd=folder,
         env={"PYTHONPATH": str(HOUSE), "PATH": "/usr/bin:/bin"},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
-    ) as process:
+    )
+
+
+@pytest.mark.long
+def test_estimates_are_printed_while_the_stream_is_open(messages: Messages, tmp_path: Path) -> None:
+    early = [one for one in messages if one[0] <= 12.0]
+    with following(tmp_path) as process:
         assert process.stdin is not None
         assert process.stdout is not None
         first = written(early, whole=False)
@@ -160,16 +154,7 @@ def test_estimates_are_printed_while_the_stream_is_open(messages: Messages, tmp_
 
 @pytest.mark.long
 def test_ctrl_c_ends_a_stream_and_the_files_are_written(messages: Messages, tmp_path: Path) -> None:
-    words = [sys.executable, "-m", "tandem", "estimate", "-", "--follow", "--out", "found"]
-    words += ["--noise", PROFILE]
-    with subprocess.Popen(
-        words,
-        cwd=tmp_path,
-        env={"PYTHONPATH": str(HOUSE), "PATH": "/usr/bin:/bin"},
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    ) as process:
+    with following(tmp_path) as process:
         assert process.stdin is not None
         assert process.stdout is not None
         process.stdin.write(written([one for one in messages if one[0] <= 9.0], whole=False))

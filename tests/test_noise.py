@@ -46,15 +46,19 @@ RHO_A, RHO_B, APART = 1.5, 2.0, 2.5
 """The distances in m of the robots of `near` from their anchors, and from each other."""
 
 
-def near(noise: str = "", *, seed: int = 1, max_ticks: int = 500) -> Scenario:
-    """Return a scenario in which all ranges are within R from the start."""
-    text = f"""
+def near_text(noise: str, world: str = "", *, seed: int = 1, max_ticks: int = 500) -> str:
+    """Return a scenario file in which all ranges are within R from the start.
+
+    `noise` is what the robots are told, and `world` a table of the world's noise, if it is another.
+    """
+    return f"""
         name = "near"
         seed = {seed}
         max_ticks = {max_ticks}
         {SECTION_IV}
         [mission.noise]
         {noise}
+        {world}
         [[robot]]
         id = "a"
         anchor = [0.0, 0.0]
@@ -64,7 +68,11 @@ def near(noise: str = "", *, seed: int = 1, max_ticks: int = 500) -> Scenario:
         anchor = [6.0, 0.0]
         start = [{RHO_A + APART}, 0.0, 4.0]
         """
-    return parse(text, "near")
+
+
+def near(noise: str = "", *, seed: int = 1, max_ticks: int = 500) -> Scenario:
+    """Return the scenario of `near_text`."""
+    return parse(near_text(noise, seed=seed, max_ticks=max_ticks), "near")
 
 
 def at_tick(scenario: Scenario, tick: int) -> Truth:

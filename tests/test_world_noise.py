@@ -26,7 +26,7 @@ from protocol.messages import Command
 from protocol.motion import REST, Controls, Pose
 from protocol.noise import Noise, VelocityNoise
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
-from tests.commands import SECTION_IV, journals, tandem
+from tests.commands import journals, tandem
 from tests.series import series
 from tests.test_noise import (
     APART,
@@ -40,6 +40,7 @@ from tests.test_noise import (
     is_white,
     known,
     mutual,
+    near_text,
     to_anchors,
 )
 from world import random_streams
@@ -61,24 +62,7 @@ TOLD = "anchor_sigma = 0.05\nmutual_sigma = 0.05"
 
 def text(world: str, *, told: str = TOLD, seed: int = 1, max_ticks: int = 500) -> str:
     """Return a scenario file in which all ranges are within R from the start."""
-    return f"""
-        name = "near"
-        seed = {seed}
-        max_ticks = {max_ticks}
-        {SECTION_IV}
-        [mission.noise]
-        {told}
-        [world.noise]
-        {world}
-        [[robot]]
-        id = "a"
-        anchor = [0.0, 0.0]
-        start = [{RHO_A}, 0.0, 1.0]
-        [[robot]]
-        id = "b"
-        anchor = [6.0, 0.0]
-        start = [{RHO_A + APART}, 0.0, 4.0]
-        """
+    return near_text(told, f"[world.noise]\n{world}", seed=seed, max_ticks=max_ticks)
 
 
 def near(world: str, *, told: str = TOLD, seed: int = 1, max_ticks: int = 500) -> Scenario:

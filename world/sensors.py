@@ -20,8 +20,13 @@ from world.world_models import Radios, RangeModel
 
 def anchor_ranges(truth: Truth, scenario: Scenario) -> list[float | None]:
     """Return the measured range of each robot to its own anchor (eq. (1b)), in m; None if there is none."""
-    sensors, lobed = scenario.sensors, scenario.sensors.world.lobe_depth
-    model, radios = scenario.ranging, None
+    sensors, model, radios = scenario.sensors, scenario.ranging, None
+    if sensors.exact and model is None:
+        return [
+            _on_disc(pose.x - (robot.anchor.x - at.x), pose.y - (robot.anchor.y - at.y), sensors.reach)
+            for pose, at, robot in zip(truth.local, truth.origins, scenario.robots, strict=True)
+        ]
+    lobed = sensors.world.lobe_depth
     ranges: list[float | None] = []
     for i, (pose, origin, robot) in enumerate(zip(truth.local, truth.origins, scenario.robots, strict=True)):
         anchor, (off_x, off_y) = robot.anchor, sensors.survey[i]
@@ -51,9 +56,15 @@ class Mutual(NamedTuple):
 
 def mutual_ranges(truth: Truth, scenario: Scenario, pairs: Sequence[tuple[int, int]]) -> list[Mutual | None]:
     """Return the measurement of each pair; None if its robots are out of range of each other."""
-    sensors, lobed = scenario.sensors, scenario.sensors.world.lobe_depth
-    model, radios = scenario.ranging, None
+    sensors, model, radios = scenario.sensors, scenario.ranging, None
     ranges: list[Mutual | None] = []
+    if sensors.exact and model is None:
+        for i, j in pairs:
+            one, other = truth.local[i], truth.local[j]
+            exact = _on_disc(one.x - other.x, one.y - other.y, sensors.reach)
+            ranges.append(None if exact is None else Mutual(exact))
+        return ranges
+    lobed = sensors.world.lobe_depth
     for i, j in pairs:
         one, other, robot = truth.local[i], truth.local[j], scenario.robots[i].id
         x, y = one.x - other.x, one.y - other.y
@@ -80,6 +91,12 @@ def mutual_ranges(truth: Truth, scenario: Scenario, pairs: Sequence[tuple[int, i
             measured = sensors.measured(sensors.mutual[i], rho, truth.tick)
             ranges.append(Mutual(_modelled(measured, model, radios)))
     return ranges
+
+
+def _on_disc(x: float, y: float, reach: float) -> float | None:
+    """Return the length of (x, y) in m, which exact sensors measure; None beyond `reach`."""
+    rho = math.hypot(x, y)
+    return rho if rho <= reach else None
 
 
 def _modelled(rho: float | None, model: RangeModel | None, radios: Radios | None) -> float | None:

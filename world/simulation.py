@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+
+import msgspec
 
 from protocol.journal import environment
 from protocol.journal.journal_file import CorruptJournal, Sink
@@ -22,7 +24,14 @@ class Simulation:
     MissionEnd and the FinalReports.
     """
 
-    def __init__(self, scenario: Scenario, journal: Sink | None = None) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        journal: Sink | None = None,
+        encode: Callable[[msgspec.Struct], bytes] = encode,
+    ) -> None:
+        """`encode` returns the frame of a message."""
+        self._encode = encode
         self.world = release(scenario)
         self.mission_end: MissionEnd | None = None
         """The end of the run; None while it is running."""
@@ -62,7 +71,7 @@ class Simulation:
         if self._journal is not None:
             self._journal.write(
                 *[
-                    encode(
+                    self._encode(
                         commands[robot.id] if robot.id in commands else DeadlineMissed(self.tick, robot.id)
                     )
                     for robot in self.world.scenario.robots
@@ -91,7 +100,7 @@ class Simulation:
         """End the run with this outcome, and journal and return the MissionEnd. Raises CannotRecord."""
         self.mission_end = MissionEnd(self.tick, mission_outcome.outcome, mission_outcome.reason)
         if self._journal is not None:
-            self._journal.write(encode(self.mission_end))
+            self._journal.write(self._encode(self.mission_end))
         return self.mission_end
 
     def journal_final_reports(self, final_reports: Iterable[FinalReport]) -> None:
@@ -106,7 +115,7 @@ class Simulation:
         new = [received[robot] for robot in ids[latest + 1 :] if robot in received]
         self.final_reports |= {final_report.robot: final_report for final_report in new}
         if self._journal is not None and new:
-            self._journal.write(*[encode(final_report) for final_report in new])
+            self._journal.write(*[self._encode(final_report) for final_report in new])
 
 
 def resumed(scenario: Scenario, recording: Retrace) -> Simulation:

@@ -60,7 +60,7 @@ def observations(world: World) -> list[Observation]:
     """Return the Observation of each robot at the current tick, in the order of the scenario."""
     scenario, truth, driven = world.scenario, world.truth, world.executed
     tick, robots = truth.tick, scenario.robots
-    measured: Sequence[Controls | None] = driven or [None] * len(robots)
+    measured: Sequence[Controls | None] = driven or (None,) * len(robots)
     if driven is not None and not scenario.sensors.exact:
         before = world.executed_before or (REST,) * len(robots)
         measured = [

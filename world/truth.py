@@ -51,12 +51,15 @@ class Truth(msgspec.Struct, frozen=True):
 
     def moved(self, controls: Sequence[Controls], period: float) -> Truth:
         """Return the truth one tick later, after all robots have driven `controls` for `period` s."""
-        before = self.legs or [Leg(pose, 0, c) for pose, c in zip(self.local, controls, strict=True)]
-        legs = [
-            Leg(leg.begin, leg.ticks + 1, c) if leg.controls == c else Leg(pose, 1, c)
-            for leg, pose, c in zip(before, self.local, controls, strict=True)
-        ]
-        local = [step(leg.begin, leg.controls.v, leg.controls.omega, leg.ticks * period) for leg in legs]
+        legs: list[Leg] = []
+        local: list[Pose] = []
+        before = self.legs or (None,) * len(self.local)
+        for leg, pose, driven in zip(before, self.local, controls, strict=True):
+            begin, ticks = pose, 1
+            if leg is not None and leg.controls == driven:
+                begin, ticks = leg.begin, leg.ticks + 1
+            legs.append(Leg(begin, ticks, driven))
+            local.append(step(begin, driven.v, driven.omega, ticks * period))
         return Truth(self.tick + 1, tuple(local), self.origins, tuple(legs))
 
 

@@ -116,11 +116,13 @@ class WorldJournalReading:
             message = decode(frame, _AFTER_THE_SCENARIO)
             if isinstance(message, Command):
                 self._shared[frame] = message
-        is_running = self.end is None and self.mission_outcome is None
         tick = self.world.truth.tick
         match message:
             case Command() | DeadlineMissed() if (
-                is_running and message.tick == tick and message.robot == self._ids[len(self._answers)]
+                self.end is None
+                and self.mission_outcome is None
+                and message.tick == tick
+                and message.robot == self._ids[len(self._answers)]
             ):
                 self._answers[message.robot] = message
                 if len(self._answers) == len(self._ids):
@@ -144,7 +146,9 @@ class WorldJournalReading:
             self.environment = named
             self.messages.append(named)
             return
-        scenario: Scenario = decode(frame, RecordedScenario, MAX_FRAME_BYTES)
+        scenario = self._shared.get(frame)
+        if not isinstance(scenario, Scenario):
+            scenario = decode(frame, RecordedScenario, MAX_FRAME_BYTES)
         problem = _unpaired(scenario)
         if problem is not None:
             raise MalformedFrame(problem)

@@ -13,7 +13,7 @@ from agent.planning.active_sensing import Listening, Retreating, Surveying
 from agent.planning.phase1_anchor import ThirdPoint
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent
 from agent.planning.phase3_last_manoeuvre import LastManoeuvre, Plan, Returning, Standing, Waiting
-from agent.planning.range_seeking import Backing, Circling, Homing, Straight, Turning
+from agent.planning.range_seeking import Backing, Circling, Homing, Seeking, Straight, Turning
 from protocol import messages
 from protocol.messages import Inconsistent, Localised, Undecided
 from protocol.mission import Mission
@@ -65,6 +65,24 @@ MODE_NAMES: dict[type, str] = {
 }
 
 
+PHASES: dict[type, int] = {
+    Asleep: 1,
+    ThirdPoint: 1,
+    Homing: 1,
+    Aligning: 2,
+    Radial: 2,
+    Tangent: 2,
+    Orbiting: 2,
+    Standing: 3,
+    Waiting: 3,
+    LastManoeuvre: 3,
+    Returning: 3,
+    Listening: 3,
+    Retreating: 3,
+}
+"""The phase of each mode that belongs to one phase alone. That of the others depends on their beacon."""
+
+
 class RobotState(Knowledge, frozen=True):
     """Everything that a robot knows, and what it is doing (`mode`). The planner maps it to the next one."""
 
@@ -89,19 +107,14 @@ class RobotState(Knowledge, frozen=True):
     @property
     def phase(self) -> int:
         """Return the phase of the paper: 1, 2 or 3."""
-        match self.mode:
-            case Orbiting() | Aligning() | Radial() | Tangent():
-                return 2
-            case Asleep() | ThirdPoint():
-                return 1
-            case Straight("anchor") | Backing("anchor") | Turning("anchor") | Circling("anchor"):
-                return 1
-            case Surveying("anchor") | Homing():
-                return 1
-            case Done(phase, _):
-                return phase
-            case _:
-                return 3
+        mode = self.mode
+        phase = PHASES.get(type(mode))
+        if phase is not None:
+            return phase
+        if isinstance(mode, Done):
+            return mode.phase
+        assert isinstance(mode, Seeking | Surveying)
+        return 1 if mode.beacon == "anchor" else 3
 
     @property
     def mode_name(self) -> str:

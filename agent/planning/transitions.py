@@ -48,21 +48,24 @@ def after_observation(
 
     `after_range` continues phase 1 once a second or a further anchor range is measured.
     """
-    match state.mode:
-        case Orbiting(None) | Standing() | Waiting() | Done():
+    mode = state.mode
+    match mode:
+        case Orbiting() if mode.command is None:  # most ticks
             return state
-        case Aligning() | Radial() | Tangent() | Orbiting():
-            return continue_phase2(state, state.mode)
+        case Orbiting() | Aligning() | Radial() | Tangent():
+            return continue_phase2(state, mode)
+        case Standing() | Waiting() | Done():
+            return state
         case Straight(beacon) | Backing(beacon) | Turning(beacon) | Circling(beacon):
             measured = state.in_contact if beacon == "peer" else anchor_range is not None
-            seeking = sought(state, state.mode, measured, manoeuvres)
+            seeking = sought(state, mode, measured, manoeuvres)
             if seeking is not None:
                 return seeking
             return replace(state, mode=Waiting()) if beacon == "peer" else after_range(state)
         case ThirdPoint(_, origin) if moved(origin, state.odometry):
             return after_range(state)
         case LastManoeuvre(_, origin) | Returning(_, origin) if moved(origin, state.odometry):
-            return after_last_manoeuvre(state, state.mode)
+            return after_last_manoeuvre(state, mode)
         case Asleep():
             return start_phase1(state, anchor_range)
         case _:
@@ -245,15 +248,14 @@ def homing_controls(state: RobotState) -> Controls | None:
 
 def controls(state: RobotState) -> Controls:
     """Return the controls of the current mode."""
-    match state.mode:
-        case Orbiting(command):
-            return command or state.config.orbit.controls
+    mode = state.mode
+    match mode:
+        case Orbiting():
+            return mode.command or state.orbit.controls
         case Aligning() | Radial() | Tangent():
-            return phase2_orbit.controls(
-                state.mode, state.odometry, state.start, state.orbit, state.config.mission
-            )
+            return phase2_orbit.controls(mode, state.odometry, state.start, state.orbit, state.config.mission)
         case Straight() | Backing() | Turning() | Circling():
-            return range_seeking.controls(state.mode, state.odometry, state.config.mission)
+            return range_seeking.controls(mode, state.odometry, state.config.mission)
         case ThirdPoint(command=planned) | LastManoeuvre(planned) | Returning(planned):
             return planned
         case Surveying(command=planned) | Retreating(planned):

@@ -143,19 +143,20 @@ class AgentJournalReading:
         """Add `message`, and return True if it may be next."""
         if self.config is None:
             return self._begins(message)
+        step = self._step
         match message:
             case _ if self._end is not None:
                 if not isinstance(message, FinalReport) or self._final_report is not None:
                     return False
                 self._final_report = message
-            case Command() | Estimate() | Report() | PlannerReport() | DeadlineMissed():
-                return bool(self._step) and self._answers(message, frame, self._step)
-            case Observation(tick) if tick == len(self._steps) + bool(self._step):
-                if self._step:
-                    if "command" not in self._step:
+            case Observation() if message.tick == len(self._steps) + bool(step):
+                if step:
+                    if "command" not in step:
                         return False
-                    self._steps.append(Step(**self._step))
+                    self._steps.append(Step(**step))
                 self._step = {"observation": message, "frame": frame}
+            case Command() | Estimate() | Report() | PlannerReport() | DeadlineMissed():
+                return bool(step) and self._answers(message, frame, step)
             case MissionEnd():
                 self._end = message
             case _:
@@ -167,21 +168,19 @@ class AgentJournalReading:
     ) -> bool:
         """Add `message` to `step`, and return True if it may be next."""
         assert self.config is not None
-        is_open = "command" not in step
-        if isinstance(message, PeerReport) and message.robot != self.config.robot:
-            if is_open:
-                step["received"] = (*step.get("received", ()), FramedReport(message, frame))
-            return is_open
+        is_open, is_now = "command" not in step, message.tick == step["observation"].tick
         match message:
-            case _ if message.tick != step["observation"].tick:
-                return False
-            case Command() if is_open:
+            case Command() if is_open and is_now:
                 step["command"], step["command_frame"] = message, frame
-            case Estimate() if not is_open and "estimate" not in step:
+            case Estimate() if not is_open and is_now and "estimate" not in step:
                 step["estimate"], step["estimate_frame"] = message, frame
-            case Report() | PlannerReport() if "report" not in step:
+            case Report() | PlannerReport() if message.robot != self.config.robot and is_open:
+                step["received"] = (*step.get("received", ()), FramedReport(message, frame))
+            case Report() | PlannerReport() if (
+                message.robot == self.config.robot and is_now and "report" not in step
+            ):
                 step["report"] = FramedReport(message, frame)
-            case DeadlineMissed() if is_open:
+            case DeadlineMissed() if is_open and is_now:
                 step["missed"] = (*step.get("missed", ()), message.robot)
             case _:
                 return False

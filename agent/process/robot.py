@@ -5,7 +5,7 @@ The agent process over Zenoh and the run in one process use the same `Robot`, so
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from agent.planning.planner import Planner
@@ -17,6 +17,7 @@ from protocol.messages import (
     Command,
     DeadlineMissed,
     FinalReport,
+    Message,
     MissionEnd,
     Observation,
     Report,
@@ -29,8 +30,18 @@ from protocol.wire import encode
 class Robot:
     """The state of one robot, and the journal of its inputs and outputs."""
 
-    def __init__(self, config: RobotConfig, planner: Planner[Any, Any], journal: Sink | None = None) -> None:
-        """`planner` is the one that `config` names, with its options, for the noise of the mission."""
+    def __init__(
+        self,
+        config: RobotConfig,
+        planner: Planner[Any, Any],
+        journal: Sink | None = None,
+        encode: Callable[[Message], bytes] = encode,
+    ) -> None:
+        """`planner` is the one that `config` names, with its options, for the noise of the mission.
+
+        `encode` returns the frame of a message.
+        """
+        self._encode = encode
         self.config = config
         self.planner = planner
         self._logs = planner.BODY is Report
@@ -75,7 +86,7 @@ class Robot:
         """Return the frame of this tick's Command, which must have been decided."""
         if self._command_frame is None:
             assert self.command is not None
-            self._command_frame = encode(self.command)
+            self._command_frame = self._encode(self.command)
         return self._command_frame
 
     def observation(self, observation: Observation, frame: bytes | None = None) -> FramedReport | None:
@@ -96,13 +107,13 @@ class Robot:
             report = report_of(
                 self.planner.report(self.state), self.tick, self.config.robot, self._heard, self._verdict
             )
-            self.report = FramedReport(report, encode(report))
+            self.report = FramedReport(report, self._encode(report))
             self.reports_sent += 1
             self.bytes_sent += len(self.report.frame)
             if self._journal is not None:
-                self._journal.write(frame or encode(observation), self.report.frame)
+                self._journal.write(frame or self._encode(observation), self.report.frame)
         elif self._journal is not None:
-            self._unwritten = frame or encode(observation)
+            self._unwritten = frame or self._encode(observation)
         return self.report
 
     def decide(self, received: Sequence[FramedReport] = (), missed: Sequence[str] = ()) -> Command:
@@ -124,7 +135,7 @@ class Robot:
         self._verdict = self.command.verdict
         if self._journal is not None:
             frames = [framed.frame for framed in received]
-            frames += [encode(DeadlineMissed(self.tick, peer)) for peer in missed]
+            frames += [self._encode(DeadlineMissed(self.tick, peer)) for peer in missed]
             if self._unwritten is not None:
                 frames.insert(0, self._unwritten)
                 self._unwritten = None
@@ -136,7 +147,7 @@ class Robot:
 
         No process waits for an Estimate, so it is computed and journaled after the Command has been sent.
         """
-        frame = encode(self.planner.estimate(self.state))
+        frame = self._encode(self.planner.estimate(self.state))
         if self._journal is not None:
             self._journal.write(frame)
         return frame
@@ -171,7 +182,7 @@ class Robot:
             bytes_sent=self.bytes_sent,
         )
         if self._journal is not None:
-            self._journal.write(encode(end), encode(final_report))
+            self._journal.write(self._encode(end), self._encode(final_report))
         return final_report
 
 

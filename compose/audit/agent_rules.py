@@ -13,7 +13,7 @@ from agent.process.robot import Robot
 from compose.audit.findings import Checks, Violation, between, difference
 from compose.launch.planner_loader import planner_of
 from compose.recording.run import Run
-from protocol.messages import FinalReport, Message, MissionEnd, Observation, PeerReport
+from protocol.messages import Command, FinalReport, Message, MissionEnd, Observation, PeerReport
 from protocol.mission import Mission
 from protocol.motion import Controls
 from protocol.wire import MalformedFrame, decode, encode
@@ -89,24 +89,26 @@ def limits(run: Run) -> Checks:
     Observation contains measurements of them.
     """
     for robot, agent in run.agents.items():
-        mission = agent.config.mission
+        mission, exact = agent.config.mission, agent.config.mission.noise.exact
         for step in agent.steps:
             tick, command, driven = step.observation.tick, step.command, step.observation.executed
             if command is not None:
-                yield _within(tick, robot, "commanded", Controls(command.v, command.omega), mission)
-            if driven is not None and mission.noise.exact:
+                yield _within(tick, robot, "commanded", command, mission)
+            if driven is not None and exact:
                 yield _within(tick, robot, "drove", driven, mission)
 
 
-def _within(tick: int, robot: str, how: str, controls: Controls, mission: Mission) -> Violation | None:
-    for name, value, most in (
-        ("v", controls.v, mission.max_speed),
-        ("omega", controls.omega, mission.max_turn_rate),
-    ):
-        if abs(value) > most * (1.0 + ROUNDING):
-            what = f"it {how} {name} = {value:g}, expected at most {most:g}"
-            return Violation("limits", tick, robot, what)
-    return None
+def _within(
+    tick: int, robot: str, how: str, controls: Command | Controls, mission: Mission
+) -> Violation | None:
+    speed, turn_rate = mission.max_speed, mission.max_turn_rate
+    if abs(controls.v) > speed * (1.0 + ROUNDING):
+        what = f"it {how} v = {controls.v:g}, expected at most {speed:g}"
+    elif abs(controls.omega) > turn_rate * (1.0 + ROUNDING):
+        what = f"it {how} omega = {controls.omega:g}, expected at most {turn_rate:g}"
+    else:
+        return None
+    return Violation("limits", tick, robot, what)
 
 
 def log(run: Run) -> Checks:

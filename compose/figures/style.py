@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,6 +37,8 @@ COLUMN, PAGE = 3.5, 7.16
 PLACES = 6
 """The number of decimal places of panel positions, which are fractions of the figure's size."""
 
+LAYOUT_TABLES = ["GSUB", "GPOS", "GDEF", "BASE", "JSTF", "MATH", "kern"]
+"""The tables of a font with which text is laid out. A PDF file states the place of each glyph."""
 _DATES: dict[str, dict[str, None]] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {}}
 
 # Matplotlib has no setting for the size of subscripts, which its 0.7 would make 5.6 points.
@@ -101,11 +104,21 @@ def save(
     Raises OSError.
     """
     _settle(figure)
+    if "pdf" in formats:
+        _leave_out_layout_tables()
     written = [path.with_name(f"{path.name}.{ending}") for ending in formats]
     for ending, place in zip(formats, written, strict=True):
         with files.draft(place) as drawn:
             figure.savefig(drawn, format=ending, dpi=dpi, metadata=_DATES[ending])
     return tuple(written)
+
+
+@cache
+def _leave_out_layout_tables() -> None:
+    """Embed fonts in PDF files without LAYOUT_TABLES, which take most of the time of an embedding."""
+    from fontTools.subset import Options  # type: ignore[import-untyped]  # noqa: PLC0415  # only for PDF
+
+    Options._drop_tables_default = [*Options._drop_tables_default, *LAYOUT_TABLES]
 
 
 def _settle(figure: Figure) -> None:

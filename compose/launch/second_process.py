@@ -36,7 +36,7 @@ class OutputLine(NamedTuple):
 
     text: str
     error: bool = False
-    """Whether it belongs on standard error."""
+    """True if it belongs on standard error."""
 
 
 Task = Callable[[], Sequence[OutputLine]]
@@ -80,7 +80,7 @@ class _SecondProcess:
     def __init__(self, pid: int, results: int) -> None:
         """`results` is the end of the pipe from which its results are read."""
         self.running = True
-        """Whether results may still arrive."""
+        """True as long as results may still arrive."""
         self._pid = pid
         self._results = results
         self._received = b""

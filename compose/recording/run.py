@@ -316,20 +316,29 @@ def read(folder: Path, *, audited: bool = False) -> Run:
     return replace(run, kills=kills_in(folder))
 
 
-def of_frames(journals: Mapping[str, Iterable[bytes]], source: object = "the recording") -> Run:
+def of_frames(
+    journals: Mapping[str, Iterable[bytes]],
+    source: object = "the recording",
+    messages: dict[bytes, Any] | None = None,
+) -> Run:
     """Return the run with the frames of `journals`, by file name; `source` appears in errors.
 
-    Raises CorruptJournal like `read`, but not for a frame out of order.
+    `messages` are those, by frame, that this process has encoded itself: they are not decoded. Raises
+    CorruptJournal like `read`, but not for a frame out of order.
     """
-    return of_journals({name: JournalFile(list(frames)) for name, frames in journals.items()}, source)
+    return of_journals(
+        {name: JournalFile(list(frames)) for name, frames in journals.items()}, source, messages
+    )
 
 
-def of_journals(journals: Mapping[str, JournalFile], source: object) -> Run:
-    """Return the run in `journals`, whose frames have not been decoded yet. Raises like `of_frames`."""
+def of_journals(
+    journals: Mapping[str, JournalFile], source: object, messages: dict[bytes, Any] | None = None
+) -> Run:
+    """Return the run in `journals`, without the `messages` not decoded yet. Raises like `of_frames`."""
     decoded: dict[str, JournalFile] = {}
     world: WorldHistory | None = None
     agents: dict[str, AgentHistory] = {}
-    shared: dict[bytes, Any] = {}  # the Reports and Commands: each is in two journals, and decoded once
+    shared = messages or {}  # also the Reports and Commands: each is in two journals, and decoded once
     for name, one in journals.items():
         if name == WORLD_JOURNAL:
             decoded[name], world = _world(one, f"{source}/{name}", shared)

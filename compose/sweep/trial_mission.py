@@ -18,6 +18,7 @@ from compose.scenario.kills import Kill
 from compose.scenario.run_settings import run_name
 from protocol.journal.journal_file import MemoryJournal, packed
 from protocol.network.inbox import Inbox
+from protocol.wire import EncodedMessages
 from world.scenario import Scenario
 
 TIMEOUT_S = 30.0
@@ -44,8 +45,9 @@ def run_in_process(scenario: Scenario, *, audit: bool) -> Played:
     if not audit:
         return Played(in_process.run_mission(scenario), None, time.perf_counter() - began)
     journals = {name: MemoryJournal() for name in in_process.journals(scenario)}
-    run = in_process.played(scenario, journals)
-    recorded = of_frames({name: journal.frames for name, journal in journals.items()})
+    messages = EncodedMessages()
+    run = in_process.played(scenario, journals, encode=messages.encode)
+    recorded = of_frames({name: journal.frames for name, journal in journals.items()}, messages=messages)
     return Played(run, rules.audit_run(recorded), time.perf_counter() - began)
 
 

@@ -2,59 +2,32 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from agent.estimation.gaussian.consistency import FINISHED
 from agent.estimation.gaussian.fitted_poses import poses
 from agent.estimation.gaussian.hypotheses import Hypothesis, ScoredHypothesis
 from agent.estimation.gaussian.known_anchors import FEWEST, AnchoredRobot, blocking_reason, follow, search
-from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges
+from agent.estimation.gaussian.range_model import Ranges
 from compose.errors import UserError
 from compose.recording.estimating.estimate_epoch import ClaimRule, EpochFit, EstimateEpoch, of_centres
-from compose.recording.estimating.pair_measurements import (
+from compose.recording.estimating.pair_measurements import listed
+from compose.recording.estimating.prepared_steps import (
     EPOCH_S,
-    HALF,
-    RANGE_SPACING_S,
+    Measurements,
     OneRobot,
     horizon,
     levelled,
-    listed,
-    path_of_steps,
-    ticks_per_epoch,
+    prepared_steps,
 )
 from compose.recording.estimating.recorded_noise import RecordedNoise
-from compose.recording.estimating.sound_odometry import at_antenna, sound
-from compose.recording.ranging.range_recording import FixedAnchor, Numbers, RangeRecording, locked
-from compose.recording.ranging.range_steps import StepOptions, steps_of
-from protocol.noise import Noise
+from compose.recording.ranging.range_recording import FixedAnchor, RangeRecording, locked
 
 
-class AnchoredMeasurements(NamedTuple):
+class AnchoredMeasurements(Measurements, frozen=True, kw_only=True):
     """All measurements of one robot."""
 
     robot: OneRobot
-    t0: float
-    """The time in s of tick 0."""
-    ticks_per_epoch: int
-    ranges: Ranges
-    """The ranges; `radio` is the index in the robot's anchors."""
-    t: Numbers
-    """The time in s of each range; shape (N,)."""
-    noise: Noise
-    unused: dict[str, int]
-    """The number of ranges that are not used, by the reason."""
-
-    @property
-    def period(self) -> float:
-        """The length of a tick in s."""
-        return EPOCH_S / self.ticks_per_epoch
-
-    @property
-    def epochs(self) -> int:
-        """The number of epochs with odometry."""
-        return len(self.robot.path.v) // self.ticks_per_epoch
 
     @property
     def sides(self) -> tuple[OneRobot, ...]:
@@ -101,13 +74,8 @@ def anchored_measurements(
     `ticks` is the number of them in an epoch; None: by the speed of the robot. Raises UserError unless it has
     ranges to two anchors at different places.
     """
-    noise, recorded = assumed.noise, recording.robot(robot)
-    prepared = sound(recorded.odometry, assumed.odometry)
-    moved = recorded._replace(odometry=at_antenna(prepared.odometry, *recorded.antenna[:2]))
-    first, last = recording.span
-    part = recording.part([robot], first, last)._replace(robots=(moved,))
-    ticks = ticks or ticks_per_epoch(part, noise)
-    steps = steps_of(part, [robot], StepOptions(period_s=EPOCH_S / ticks, range_spacing_s=RANGE_SPACING_S))
+    prepared = prepared_steps(recording, [robot], assumed, ticks)
+    part, steps = prepared.part, prepared.steps
     ranges = steps.ranges
     counts = [int(np.count_nonzero(ranges.second == 1 + k)) for k in range(len(part.anchors))]
     order = sorted([k for k, count in enumerate(counts) if count], key=lambda k: -counts[k])
@@ -121,28 +89,19 @@ def anchored_measurements(
     radio = np.argsort(order)[np.searchsorted(np.sort(order), ranges.second - 1)]
     places = np.array([(one.x - anchors[0].x, one.y - anchors[0].y) for one in anchors])
     heights = np.array([one.height for one in anchors])
-    rho, ratio = levelled(ranges.range, recorded.antenna[2] - heights[radio])
-    told = np.full(len(rho), noise.anchor_sigma)
-    if assumed.stated:
-        told = np.where(np.isfinite(ranges.sigma), ranges.sigma, told)
-    tick = steps.step + (steps.fraction >= HALF)
+    rho, ratio = levelled(ranges.range, part.robots[0].antenna[2] - heights[radio])
+    sigma = prepared.sigmas(np.full(len(rho), assumed.noise.anchor_sigma), ranges.sigma) * ratio
     unused = {"within a second after another": steps.thinned, "without odometry": steps.outside}
-    path = path_of_steps(steps.increments[0], steps.covariance[0], EPOCH_S / ticks)
     return AnchoredMeasurements(
-        OneRobot(robot, anchors, path, prepared, recorded.antenna),
-        float(steps.t[0]),
-        ticks,
-        Ranges(
-            locked(rho),
-            locked(tick),
-            locked(np.maximum(told, SIGMA_FLOOR) * ratio),
-            (len(rho), 0, 0),
-            places[radio],
-            radio,
+        robot=prepared.robot(0, anchors),
+        t0=float(steps.t[0]),
+        ticks_per_epoch=prepared.ticks_per_epoch,
+        ranges=Ranges(
+            locked(rho), locked(prepared.ticks), locked(sigma), (len(rho), 0, 0), places[radio], radio
         ),
-        ranges.t,
-        noise,
-        {why: count for why, count in unused.items() if count},
+        t=ranges.t,
+        noise=assumed.noise,
+        unused={why: count for why, count in unused.items() if count},
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from agent.estimation.gaussian.fitted import Fit
 from agent.estimation.gaussian.known_anchors import AnchoredRobot
 from agent.estimation.gaussian.range_model import PairRanges
-from compose.recording.estimating.pair_measurements import OneRobot
+from compose.recording.estimating.prepared_steps import OneRobot
 from compose.recording.ranging.range_recording import Numbers
 from protocol.motion import wrap
 

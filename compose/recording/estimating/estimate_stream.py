@@ -20,7 +20,8 @@ from compose.recording.estimating.estimate_run import (
     with_summary,
 )
 from compose.recording.estimating.noise_files import ToldNoise
-from compose.recording.estimating.pair_measurements import EPOCH_S, NoAnchors, PairMeasurements
+from compose.recording.estimating.pair_measurements import NoAnchors, PairMeasurements
+from compose.recording.estimating.prepared_steps import EPOCH_S
 from compose.recording.ranging.range_recording import SAME_TIME_S
 from compose.recording.ranging.recording_rows import (
     AnyRow,

@@ -17,7 +17,8 @@ from agent.planning.accuracy_seeking import (
     weighed,
 )
 from compose.recording.estimating.estimate_epoch import ClaimRule, EpochFit, EstimateEpoch, of_centres
-from compose.recording.estimating.pair_measurements import EPOCH_S, OneRobot, PairMeasurements
+from compose.recording.estimating.pair_measurements import PairMeasurements
+from compose.recording.estimating.prepared_steps import EPOCH_S, OneRobot
 from compose.recording.ranging.range_recording import Numbers
 from protocol.messages import RobotConfig
 from protocol.mission import Anchor, Mission, Role

@@ -1,22 +1,22 @@
-"""The measurements of two recorded robots as the estimator takes them: paths in short steps, and ranges.
-
-The estimator counts in ticks. A tick is so short that no robot moves further in half of it than a small part
-of a range's sigma, and each range counts at the nearest tick.
-"""
+"""The measurements of two recorded robots as the estimator takes them: paths in short steps, and ranges."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.gaussian.odometry_noise import Track, track
-from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Ranges
+from agent.estimation.gaussian.range_model import PairRanges, Ranges
 from compose.errors import UserError
+from compose.recording.estimating.prepared_steps import (
+    EPOCH_S,
+    Measurements,
+    OneRobot,
+    horizon,
+    levelled,
+    prepared_steps,
+)
 from compose.recording.estimating.recorded_noise import RecordedNoise
-from compose.recording.estimating.sound_odometry import SoundOdometry, at_antenna, sound
 from compose.recording.ranging.range_recording import (
     FixedAnchor,
     Numbers,
@@ -24,90 +24,17 @@ from compose.recording.ranging.range_recording import (
     RangeRecording,
     locked,
 )
-from compose.recording.ranging.range_steps import NEARLY_ALL, StepOptions, speeds, steps_of
-from protocol.noise import Noise
-
-EPOCH_S = 0.5
-"""The time in s between two estimates."""
-
-RANGE_SPACING_S = 1.0
-"""The least time in s between two ranges of the same radios.
-
-The errors of a radio's ranges within a second are correlated: more of them would count for more than they
-tell. With less, claims are too confident.
-"""
-
-MOST_TICKS = 50
-"""The largest number of ticks in an epoch."""
-
-SHARE = 0.25
-"""The largest part of a range's sigma that a robot moves in half a tick.
-
-With it, rounding the times of ranges adds at most 1 % to their sigma.
-"""
-
-HORIZON = 1.25
-"""The assumed sensing range, as a multiple of the longest range so far.
-
-A missing range of a recording says nothing, so that this only scales the tolerances of the search. With 1,
-the estimator would take it for information that no range is longer.
-"""
-
-
-SHORTEST_RANGE_M = 1e-3
-"""The least length in m of the longest range. A recording whose ranges are all 0 says nothing."""
-
-
-def horizon(ranges: Ranges) -> float:
-    """Return the assumed sensing range (m), for which `ranges` are those so far."""
-    return HORIZON * max(float(np.max(ranges.rho, initial=0.0)), SHORTEST_RANGE_M)
 
 
 class NoAnchors(UserError):
     """The robots have no ranges to two anchors at different places."""
 
 
-class OneRobot(NamedTuple):
-    """One robot: its path in ticks, and how it was prepared."""
-
-    id: str
-    anchors: tuple[FixedAnchor, ...]
-    """The anchors to which it has ranges. Poses are relative to the first, which has the most."""
-    path: Track
-    """The path of the antenna, in the frame of its first pose."""
-    sound: SoundOdometry
-    antenna: tuple[float, float, float]
-
-    @property
-    def anchor(self) -> FixedAnchor:
-        """The first of its anchors."""
-        return self.anchors[0]
-
-
-class PairMeasurements(NamedTuple):
+class PairMeasurements(Measurements, frozen=True, kw_only=True):
     """All measurements of two robots."""
 
     a: OneRobot
     b: OneRobot
-    t0: float
-    """The time in s of tick 0."""
-    ticks_per_epoch: int
-    ranges: Ranges
-    t: Numbers
-    """The time in s of each range; shape (N,)."""
-    noise: Noise
-    unused: dict[str, int]
-    """The number of ranges that are not used, by the reason."""
-
-    @property
-    def period(self) -> float:
-        """The length of a tick in s."""
-        return EPOCH_S / self.ticks_per_epoch
-
-    @property
-    def epochs(self) -> int:
-        """The number of epochs with odometry of all robots."""
-        return len(self.a.path.v) // self.ticks_per_epoch
 
     @property
     def sides(self) -> tuple[OneRobot, ...]:
@@ -179,27 +106,14 @@ def pair_measurements(
     set. Raises UserError if there are no two such anchors.
     """
     noise = assumed.noise
-    prepared = [sound(recording.robot(name).odometry, assumed.odometry) for name in robots]
-    whole = recording._replace(
-        robots=tuple(
-            [
-                recording.robot(name)._replace(
-                    odometry=at_antenna(one.odometry, *recording.robot(name).antenna[:2])
-                )
-                for name, one in zip(robots, prepared, strict=True)
-            ]
-        ),
-    )
-    part = _of_robots(recording, whole, robots)
-    ticks = ticks or ticks_per_epoch(part, noise)
-    steps = steps_of(part, robots, StepOptions(period_s=EPOCH_S / ticks, range_spacing_s=RANGE_SPACING_S))
+    prepared = prepared_steps(recording, robots, assumed, ticks)
+    part, steps = prepared.part, prepared.steps
     radios, ranges = part.radios, steps.ranges
     if anchors is None:
         of_anchor = _own_anchors(part, ranges.first, ranges.second, robots)
     else:
         first, second = anchors
         of_anchor = _anchor(part, first), _anchor(part, second)
-    tick = steps.step + (steps.fraction >= HALF)
     mutual = (ranges.first < len(robots)) & (ranges.second < len(robots))
     lists = [
         np.flatnonzero(
@@ -214,13 +128,8 @@ def pair_measurements(
     rho, ratio = levelled(ranges.range[used], heights[ranges.first[used]] - heights[ranges.second[used]])
     counts = (len(lists[0]), len(lists[1]), len(lists[2]))
     told = np.repeat([noise.anchor_sigma, noise.anchor_sigma, noise.mutual_sigma], counts)
-    if assumed.stated:
-        told = np.where(np.isfinite(ranges.sigma[used]), ranges.sigma[used], told)
-    sigma = np.maximum(told, SIGMA_FLOOR) * ratio
-    sides = []
-    for i, (name, own) in enumerate(zip(robots, of_robot, strict=True)):
-        path = path_of_steps(steps.increments[i], steps.covariance[i], EPOCH_S / ticks)
-        sides.append(OneRobot(name, own, path, prepared[i], part.robots[i].antenna))
+    sigma = prepared.sigmas(told, ranges.sigma[used]) * ratio
+    a, b = [prepared.robot(i, own) for i, own in enumerate(of_robot)]
     place, radio = _several(of_robot, [[radios[k] for k in ranges.second[rows]] for rows in lists])
     unused = {
         "to other anchors": len(ranges.t) - len(used),
@@ -228,18 +137,15 @@ def pair_measurements(
         "without odometry of both robots": steps.outside,
     }
     return PairMeasurements(
-        sides[0],
-        sides[1],
-        float(steps.t[0]),
-        ticks,
-        Ranges(locked(rho), locked(tick[used]), locked(sigma), counts, place, radio),
-        locked(ranges.t[used].copy()),
-        noise,
-        {why: count for why, count in unused.items() if count},
+        a=a,
+        b=b,
+        t0=float(steps.t[0]),
+        ticks_per_epoch=prepared.ticks_per_epoch,
+        ranges=Ranges(locked(rho), locked(prepared.ticks[used]), locked(sigma), counts, place, radio),
+        t=locked(ranges.t[used].copy()),
+        noise=noise,
+        unused={why: count for why, count in unused.items() if count},
     )
-
-
-HALF = 0.5
 
 
 def _anchors_of(recording: RangeRecording, ranged: Places, first: FixedAnchor) -> tuple[FixedAnchor, ...]:
@@ -270,27 +176,6 @@ def _several(
 
 def _anchor(recording: RangeRecording, name: str) -> FixedAnchor:
     return next(one for one in recording.anchors if one.id == name)
-
-
-def _of_robots(recording: RangeRecording, whole: RangeRecording, robots: Sequence[str]) -> RangeRecording:
-    """Return the recording of these `robots` alone, with the odometry that `whole` has for them."""
-    first, last = recording.span
-    part = recording.part(robots, first, last)
-    return part._replace(
-        robots=tuple(
-            [
-                one._replace(odometry=other.odometry)
-                for one, other in zip(part.robots, whole.robots, strict=True)
-            ]
-        )
-    )
-
-
-def ticks_per_epoch(recording: RangeRecording, noise: Noise) -> int:
-    """Return the number of ticks in an epoch, by the speed of the fastest robot (see SHARE)."""
-    least = min(noise.anchor_sigma, noise.mutual_sigma)
-    fastest = max(float(np.percentile(speeds(one.odometry)[0], NEARLY_ALL)) for one in recording.robots)
-    return min(max(math.ceil(0.5 * EPOCH_S * fastest / (SHARE * max(least, 1e-3))), 1), MOST_TICKS)
 
 
 def _own_anchors(
@@ -341,39 +226,3 @@ def listed(names: Sequence[str]) -> str:
     """Return `names` in one line: the first MOST_LISTED, and the number of the others."""
     more = len(names) - MOST_LISTED
     return ", ".join(names[:MOST_LISTED]) + (f" and {more} more" if more > 0 else "")
-
-
-def levelled(measured: Numbers, higher: Numbers) -> tuple[Numbers, Numbers]:
-    """Return the ranges (m) in the plane of antennas that differ in height, and the factors of the sigmas."""
-    level = np.sqrt(np.maximum(np.square(measured) - np.square(higher), 0.0))
-    steep = np.where(higher == 0.0, 1.0, measured / np.maximum(level, LEVEL * np.maximum(measured, 1e-3)))
-    return level, steep
-
-
-LEVEL = 0.1
-"""The least ratio of a range in the plane to the range itself: steeper ranges tell hardly anything."""
-
-
-def path_of_steps(increments: Numbers, covariance: Numbers, period: float) -> Track:
-    """Return the path over steps of `period` s; its `extra` variances are those of the increments.
-
-    The error sideways is not used: a path has none but that of its heading.
-    """
-    dx, dy, turn = increments.T
-    half = 0.5 * turn
-    course = np.arctan2(dy, dx)
-    slip = np.remainder(course - half + math.pi, math.tau) - math.pi
-    backwards = np.abs(slip) > 0.5 * math.pi
-    slip = np.where(backwards, np.remainder(slip, math.tau) - math.pi, slip)
-    unit = period * np.sinc(half / math.pi)
-    moved = np.hypot(dx, dy)
-    slip = np.where(moved > 0.0, slip, 0.0)
-    v = np.where(backwards, -moved, moved) / unit
-    along = np.stack((np.cos(half + slip), np.sin(half + slip)), 1)
-    extra = np.stack(
-        (
-            np.einsum("ki,kij,kj->k", along, covariance[:, :2, :2], along) / np.square(unit),
-            covariance[:, 2, 2] / period**2,
-        )
-    )
-    return track(v, turn / period, period, slip)._replace(extra=extra)
