@@ -60,6 +60,8 @@ NOISY_SIGMA = 0.1
 """The standard deviation of all ranges in the noisy missions (m)."""
 NOISY_MISSIONS = 20
 """The number of random missions with such ranges per round, in one process."""
+RANGES = 322
+"""The number of ranges of each kind in the measured search."""
 ROBOTS = 200
 """The number of robots in the scenario of many pairs."""
 STARTED = 20
@@ -272,18 +274,53 @@ def _noisy(rounds: int, done: Callable[[], None]) -> Table:
     scenarios = [
         _with_noise(scenario_file.load("random", seed=SEED + i), noise) for i in range(NOISY_MISSIONS)
     ]
+    exact = [scenario_file.load("random", seed=SEED + i) for i in range(NOISY_MISSIONS)]
     parts: list[tuple[float, float, float]] = []
-    for _ in range(rounds):
+    baseline: list[float] = []
+    searches: list[float] = []
+    for draw in range(rounds):
+        baseline.append(sum(_parts(exact)))
         parts.append(_parts(scenarios))
+        searches.append(_search_s(draw))
         done()
     table = _table(f"In-process, one core, ranges of sigma {NOISY_SIGMA:g} m")
     scale = 1e3 / NOISY_MISSIONS
-    _row(table, "one mission, both robots (at most 150)", [scale * sum(part) for part in parts], "ms")
+    _row(table, "one mission, both robots (at most 30)", [scale * sum(part) for part in parts], "ms")
     for k, what in enumerate(
         ("observations (phases 1 and 2)", "decisions in contact (phase 3)", "the world")
     ):
         _row(table, f"of that, {what}", [scale * part[k] for part in parts], "ms")
+    ratios = [sum(part) / s for part, s in zip(parts, baseline, strict=True)]
+    _row(table, "the same with exact ranges (baseline)", [scale * s for s in baseline], "ms")
+    _row(table, "noisy / exact", ratios, "")
+    _row(table, f"a search over {3 * RANGES} ranges (at most 200)", [1e3 * s for s in searches], "ms")
     return table
+
+
+def _search_s(draw: int) -> float:
+    """Return the time (s) of a search with RANGES ranges of each kind, between robots that circle.
+
+    Ranges that were searched before are not searched again, so each `draw` has others.
+    """
+    import numpy as np  # noqa: PLC0415  # the command line starts without it
+
+    from agent.estimation.gaussian.hypotheses import search  # noqa: PLC0415  # likewise
+    from agent.estimation.gaussian.odometry_noise import track  # noqa: PLC0415  # likewise
+    from agent.estimation.gaussian.range_model import PairRanges, Ranges, predict  # noqa: PLC0415  # likewise
+
+    noise = Noise(anchor_sigma=NOISY_SIGMA, mutual_sigma=NOISY_SIGMA)
+    every, ticks = [(tick, 0.0) for tick in range(RANGES)], np.arange(RANGES - 1)
+    paths = [track(np.full(RANGES - 1, 0.5), turn + 0.2 * np.sin(ticks), 1.0) for turn in (0.5, -0.35)]
+    ranges = Ranges.of_lists(every, every, every, noise)
+    apart, none = (1.5, 0.0), np.empty(0, np.intp)
+    true = predict(np.array((0.4, 0.9, 0.3, -0.2, 1.0, -0.8)), paths, ranges, apart).distance
+    errors = NOISY_SIGMA * np.random.default_rng(draw).normal(size=3 * RANGES)
+    pair = PairRanges(
+        (paths[0], paths[1]), ranges._replace(rho=true + errors), (none, none, none), apart, 10.0, noise
+    )
+    began = time.perf_counter()
+    search(pair)
+    return time.perf_counter() - began
 
 
 def _with_noise(exact: Scenario, noise: Noise) -> Scenario:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from agent.estimation.gaussian.fitted import Fit
-from agent.estimation.gaussian.least_squares import fit
+from agent.estimation.gaussian.least_squares import own_fit
 from agent.estimation.gaussian.noise_level import INLIER
 from agent.estimation.gaussian.range_model import PairRanges
 from protocol.messages import Inconsistent
@@ -83,7 +83,9 @@ def consistency_test(fitted: Fit, pair: PairRanges, robot: int) -> Inconsistency
     misfit = _normal(fitted.chi2, free)
     p_value = 0.5 * math.erfc(misfit / math.sqrt(2.0))
     learned = pair.noise.sigma_degrees > 0.0 and p_value < LEARNED_P_VALUE
-    own = _own_fit(fitted, pair, robot) if learned or fitted.inliers < count else None
+    own = None
+    if learned or fitted.inliers < count:  # the own ranges, without the peer's reports
+        own = own_fit(fitted, robot, pair.paths, pair.ranges, pair.noise)
     if learned and own is not None:
         p_value, misfit = _against_own(fitted, own, pair.noise)
     what = (
@@ -109,13 +111,6 @@ def fisher(p_values: Sequence[float]) -> float:
         term *= -log_product / k
         total += term
     return math.exp(log_product) * total
-
-
-def _own_fit(fitted: Fit, pair: PairRanges, robot: int) -> Fit:
-    """Return the fit of the ranges of `robot` to its anchor, without the peer's reports."""
-    guess = np.array([*fitted.guess[3 * robot : 3 * robot + 2], 0.0])
-    begun = fitted.errors[robot : robot + 1]
-    return fit(guess, [pair.paths[robot]], pair.ranges.only(robot), pair.noise, begun=begun)
 
 
 def _against_own(fitted: Fit, own: Fit, noise: Noise) -> tuple[float, float]:

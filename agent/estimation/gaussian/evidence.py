@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 
 from agent.estimation.gaussian.fitted import Fit
-from agent.estimation.gaussian.least_squares import fit
+from agent.estimation.gaussian.least_squares import own_fit
 from agent.estimation.gaussian.odometry_noise import Track
 from agent.estimation.gaussian.range_model import PairRanges, Ranges
 
@@ -34,9 +34,7 @@ def mutual_evidence(one: Fit, pair: PairRanges) -> float:
     """
     weight = one.log_likelihood + 0.5 * one.log_volume - math.log(2.0 * math.pi)
     for robot in (0, 1):
-        guess = np.array([*one.guess[3 * robot : 3 * robot + 2], 0.0])
-        begun = one.errors[robot : robot + 1]
-        own = fit(guess, [pair.paths[robot]], pair.ranges.only(robot), pair.noise, begun=begun)
+        own = own_fit(one, robot, pair.paths, pair.ranges, pair.noise)
         weight -= own.log_likelihood + 0.5 * own.log_volume
         for others in pair.ranges.to_others(robot):
             weight += _log_widths((pair.paths[robot],), others, pair.sensing_range)

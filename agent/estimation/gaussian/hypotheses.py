@@ -19,7 +19,6 @@ from agent.estimation.gaussian.fitted import Fit
 from agent.estimation.gaussian.fitted_poses import deviation
 from agent.estimation.gaussian.least_squares import (
     COARSE_STILL,
-    STEPS,
     WARM_DECREASE,
     fits,
     without_outliers,
@@ -36,17 +35,24 @@ NEGLIGIBLE_PROBABILITY = 1e-7
 SAME_SIGMAS = 1.0
 """The distance in sigmas below which two fits are the same hypothesis."""
 
+COPY_SIGMAS = 0.3
+"""The distance in sigmas below which two fits of a search continue as one.
+
+It is less than SAME_SIGMAS, because such fits still move.
+"""
+
 FOLLOWED_RANGES = 6
 """The number of ranges to an anchor from which on its hypotheses are followed only, without outliers.
 
 Two circles have two intersections, so a few ranges from different places leave nothing that a search would
 find. With outliers it takes SEED_RANGES."""
 
-WARM_STEPS = 2
+WARM_STEPS = 4
 """The Gauss-Newton steps from the fit of the previous tick.
 
 Where the best fit has not converged by then, it may be on its way to another mode, and the plane is searched.
-With one step, that is every third tick; with more, each tick takes longer."""
+With two steps, that is every third tick of the scenario `noisy`, whose outliers make fits converge slowly;
+with four, every twentieth. With more, each tick takes longer."""
 
 
 class Hypothesis(NamedTuple):
@@ -184,10 +190,23 @@ def of_anchor(
         places = [one.guess[:2] for one in known]
         points = anchors(path, ranges, sensing_range, noise, places)
         starts = [Start(np.array([*point, 0.0])) for point in points]
-    steps, decrease = (WARM_STEPS, WARM_DECREASE) if warm else (STEPS, 1.0)
-    found = fits(starts, [path], ranges, noise, steps=steps, shortest=COARSE_STILL, decrease=decrease)
+    found = _coarse_fits(starts, path, ranges, noise)
     return with_probability(
         [(one, _anchor_log_likelihood(one, 0, silent, ranges.tick, sensing_range, noise)) for one in found]
+    )
+
+
+def _coarse_fits(starts: Sequence[Start], path: Track, ranges: Ranges, noise: Noise) -> list[Fit]:
+    """Return the fits of one robot, which begin near their ends and are as accurate as planning needs."""
+    return fits(
+        starts,
+        [path],
+        ranges,
+        noise,
+        steps=WARM_STEPS,
+        shortest=COARSE_STILL,
+        decrease=WARM_DECREASE,
+        same=COPY_SIGMAS,
     )
 
 
@@ -252,7 +271,9 @@ def search(pair: PairRanges, known: tuple[Hypothesis, ...] = ()) -> tuple[Scored
     starts += without_outliers(
         starts[:STARTS_WITHOUT_OUTLIERS], pair.paths, pair.ranges, pair.noise, pair.apart
     )
-    return _fitted([*[one.start for one in known], *starts], pair, STEPS)
+    starts = [*[one.start for one in known], *starts]
+    measured = (pair.paths, pair.ranges, pair.noise, pair.apart)
+    return _scored(fits(starts, *measured, same=COPY_SIGMAS), pair)
 
 
 STARTS_WITHOUT_OUTLIERS = 4
@@ -296,18 +317,21 @@ def _up_to_last_range(own: _OwnRanges) -> tuple[ScoredHypothesis, ...]:
     A robot that has left its anchor has the same in each tick.
     """
     points = anchors(own.path, own.ranges, own.sensing_range, own.noise)
-    found = fits([Start(np.array([*point, 0.0])) for point in points], [own.path], own.ranges, own.noise)
+    starts = [Start(np.array([*point, 0.0])) for point in points]
+    found = _coarse_fits(starts, own.path, own.ranges, own.noise)
     return with_probability([(one, 0.0) for one in found])
 
 
 @lru_cache(maxsize=2)
 def follow(before: tuple[Hypothesis, ...], pair: PairRanges) -> tuple[ScoredHypothesis, ...]:
     """Return the hypotheses that follow from those of the previous tick, `before`."""
-    return _fitted([one.start for one in before], pair, WARM_STEPS)
+    starts = [one.start for one in before]
+    measured = (pair.paths, pair.ranges, pair.noise, pair.apart)
+    found = fits(starts, *measured, WARM_STEPS, shortest=COARSE_STILL, decrease=WARM_DECREASE)
+    return _scored(found, pair)
 
 
-def _fitted(starts: Sequence[Start], pair: PairRanges, steps: int) -> tuple[ScoredHypothesis, ...]:
-    found = fits(starts, pair.paths, pair.ranges, pair.noise, pair.apart, steps)
+def _scored(found: Sequence[Fit], pair: PairRanges) -> tuple[ScoredHypothesis, ...]:
     return with_probability([(one, _detection_log_likelihood(one, pair)) for one in found])
 
 

@@ -13,13 +13,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, TypeVar, cast
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.estimation.gaussian.descent import rows_of, stepped
 from agent.estimation.gaussian.fitted import Fit, NormalEquations
-from agent.estimation.gaussian.linear_model import ErrorSizes, LinearModel, Point, Problem, Start, product
+from agent.estimation.gaussian.linear_model import LinearModel, Point, Problem, Start, product
 from agent.estimation.gaussian.noise_level import (
     INLIER,
     misfit_log_likelihood,
@@ -29,7 +30,6 @@ from agent.estimation.gaussian.noise_level import (
 from agent.estimation.gaussian.odometry_noise import (
     Array,
     Errors,
-    Places,
     Track,
 )
 from agent.estimation.gaussian.range_covariance import RangeCovariance, inverse_of, range_covariance
@@ -53,22 +53,22 @@ No claim does: each search fits all ranges again. With STILL, such a fit takes t
 """
 
 WARM_DECREASE = 0.1
-"""The expected decrease of the first step of a fit that begins at the last one, which has one range less."""
+"""The expected decrease of the first step of a fit that begins near its end.
 
-SETTLED = 1e-2
-"""The change of a weight below which the weights have converged."""
-
-LEAP = 1.0
-"""The largest change of an unknown, in m and rad, in one step."""
-
-SHORTER_STEPS = (0.5, 0.25, 0.0625)
-"""The fractions of a step that are tried in turn if it does not descend.
-
-Gauss-Newton with full steps may alternate between two guesses for ever.
+It begins at the last fit, which has one range less, or at a guess that is refined on all ranges.
 """
 
-DESCENT = 1e-6
-"""The increase of the cost, in units of chi-square, that is due to rounding."""
+SETTLED = 3.0
+"""The change of a weight below which the weights have converged, in units of the shortest step."""
+
+NEAR_END = 1.0
+"""The length in sigmas of the next step below which a fit tells where it will end."""
+
+ALIKE = 0.3
+"""The largest difference of the weights of two fits that come to the same end.
+
+With other outliers, two fits from one guess may come to different ends.
+"""
 
 RIDGE = 1e-12
 """The fraction of the information that is added to its diagonal, and an absolute part of the same size.
@@ -96,6 +96,17 @@ def fit(
     return fits([Start(guess, tuple(begun))], measured, ranges, noise, apart, steps)[0]
 
 
+def own_fit(joint: Fit, robot: int, measured: Sequence[Track], ranges: Ranges, noise: Noise) -> Fit:
+    """Return the fit of one robot (0 or 1) to its own anchor alone, which begins at that of both robots.
+
+    Its evidence and its chi-square are enough for tests, which do not depend on the last digits.
+    """
+    start = Start(np.array([*joint.guess[3 * robot : 3 * robot + 2], 0.0]), joint.errors[robot : robot + 1])
+    own = ranges.only(robot)
+    (one,) = fits([start], [measured[robot]], own, noise, shortest=COARSE_STILL, decrease=WARM_DECREASE)
+    return one
+
+
 def fits(
     starts: Sequence[Start],
     measured: Sequence[Track],
@@ -106,13 +117,14 @@ def fits(
     *,
     shortest: float = STILL,
     decrease: float = 1.0,
+    same: float = 0.0,
 ) -> list[Fit]:
     """Return the Gauss-Newton fits that begin at `starts`, in this order.
 
     A step is the last if the next one is expected to be shorter than `shortest`. The second step is expected
-    to be shorter than the first by the factor `decrease`, which is less than 1 for starts that are fits. A
-    step that does not descend is shortened, because Gauss-Newton with full steps may alternate between two
-    guesses. The weights of outliers decrease during the iteration. `apart` is M2 - M1 (m) in <W>.
+    to be shorter than the first by the factor `decrease`, which is less than 1 for starts that are fits. Of
+    fits that come within `same` sigmas of each other, one goes on, and the others are left out. The weights
+    of outliers decrease during the iteration. `apart` is M2 - M1 (m) in <W>.
     """
     if not starts:
         return []
@@ -120,7 +132,7 @@ def fits(
     point = problem.begin(starts)
     weights = np.ones(point.residuals.shape)
     ended: dict[int, Fit] = {}  # by the index of the start
-    left, before = list(range(len(starts))), np.zeros(len(starts))
+    left, before = list(range(len(starts))), np.zeros(len(starts))  # the index of the start of each row
     for step in range(steps + 1):
         linear = problem.linearised(point)
         if problem.robust and step == 0:
@@ -133,29 +145,43 @@ def fits(
         if step == 0:
             before = quality.last_step / decrease
         expected = np.square(quality.last_step) / np.maximum(np.maximum(quality.last_step, before), STILL)
-        still = (expected < shortest) & (np.maximum.reduce(np.abs(updated - weights), -1) < SETTLED)
+        settled = np.maximum.reduce(np.abs(updated - weights), -1) < SETTLED * shortest
+        still = settled & (expected < shortest)
         still &= step > 0 or decrease < 1.0 or not problem.noisy  # the path is corrected at least once
         if step == steps:
-            for i in left:
-                ended[i] = _fit(problem, i, point, point, weights, system, quality)
+            for row, i in enumerate(left):
+                ended[i] = _fit(problem, row, point, point, weights, system, quality)
             break
-        change = system.change
-        change = change * np.minimum(1.0, LEAP / np.maximum(np.abs(change).max(-1, keepdims=True), LEAP))
-        following = point.guess.copy()
-        following[:, problem.free] += change
-        left_over = system.weighted[..., -1] - product(system.weighted[..., :-1], change)
-        sizes = problem.sizes(point, linear, left_over)
-        begun, point = point, _descended(problem, point, following, sizes, variance)
-        # fits that have ended go on with the others: to leave them out takes longer
-        done, at_end = still.tolist(), quality._replace(last_step=expected)
-        for i in left:
-            if done[i]:
-                ended[i] = _fit(problem, i, point, begun, weights, system, at_end)
-        left = [i for i in left if not done[i]]
-        if not left:
+        begun, point = point, stepped(problem, point, linear, system, variance)
+        at_end = quality._replace(last_step=expected)
+        for row in np.flatnonzero(still).tolist():
+            ended[left[row]] = _fit(problem, row, point, begun, weights, system, at_end)
+        copies = _copies(point.guess[:, problem.free], system, quality, weights, same)
+        onward = ~(still | copies)
+        if not onward.any():
             break
+        left = [i for i, one in zip(left, onward.tolist(), strict=True) if one]
         weights, before = updated, quality.last_step
-    return [ended[i] for i in range(len(starts))]
+        if len(left) < len(onward):
+            point, weights, before = rows_of((point, weights, before), onward)
+    return [ended[i] for i in sorted(ended)]
+
+
+def _copies(
+    guess: Array, system: NormalEquations, quality: _Quality, weights: Array, same: float
+) -> NDArray[np.bool]:
+    """Return which fits come to the same guess and weights as one that is nearer to its end."""
+    if not same or len(guess) == 1:
+        return np.zeros(len(guess), np.bool)
+    apart = guess[:, None] - guess
+    apart[..., 2::3] = np.remainder(apart[..., 2::3] + math.pi, math.tau) - math.pi
+    distance = np.add.reduce((apart @ system.information) * apart, -1) / quality.level
+    near = (distance < same**2) & (np.abs(weights[:, None] - weights).max(-1) < ALIKE)
+    length = quality.last_step
+    near &= np.maximum(length[:, None], length) < NEAR_END
+    sooner = length < length[:, None]
+    sooner |= (length == length[:, None]) & np.tri(len(length), k=-1, dtype=bool)
+    return np.asarray(np.any(near & sooner, 1), np.bool)
 
 
 def _first_weights(problem: Problem, starts: Sequence[Start], point: Point, linear: LinearModel) -> Array:
@@ -188,26 +214,6 @@ def without_outliers(
     return [
         start._replace(weights=own) for start, own in zip(starts, weights, strict=True) if own.min() < INLIER
     ]
-
-
-T = TypeVar("T")
-
-
-def _of(values: T, some: NDArray[np.bool] | Places) -> T:
-    """Return the part of `values`, a tuple of arrays or of such tuples, that belongs to some of the fits."""
-    if isinstance(values, tuple):
-        parts = [_of(value, some) for value in values]
-        return cast("T", type(values)(*parts) if hasattr(values, "_fields") else tuple(parts))
-    return cast("T", values[some]) if isinstance(values, np.ndarray) else values
-
-
-def _put(values: object, some: NDArray[np.bool] | Places, others: object) -> None:
-    """Replace the part of `values` that belongs to some of the fits by `others`."""
-    if isinstance(values, tuple) and isinstance(others, tuple):
-        for value, other in zip(values, others, strict=True):
-            _put(value, some, other)
-    elif isinstance(values, np.ndarray):
-        values[some] = others
 
 
 def _fit(
@@ -253,29 +259,6 @@ class _Quality(NamedTuple):
     inliers: Array
     level: Array
     last_step: Array
-
-
-def _descended(problem: Problem, point: Point, guess: Array, sizes: ErrorSizes, variance: Array) -> Point:
-    """Return the point after a step to `guess` and `sizes`, or after that fraction of it that descends.
-
-    If none does, the point stays.
-    """
-    most = point.cost(variance) + DESCENT
-    following = problem.point(guess, sizes)
-    descends = following.cost(variance) <= most
-    if descends.all():
-        return following
-    climbing = np.flatnonzero(~descends)
-    for fraction in SHORTER_STEPS:
-        begin, end, ends = _of((point, guess, sizes), climbing)
-        shorter = [one + fraction * (other - one) for one, other in zip(begin.sizes, ends, strict=True)]
-        nearer = problem.point(begin.guess + fraction * (end - begin.guess), ErrorSizes(*shorter))
-        _put(following, climbing, nearer)
-        climbing = climbing[~(nearer.cost(variance[climbing]) <= most[climbing])]
-        if not len(climbing):
-            return following
-    _put(following, climbing, _of(point, climbing))
-    return following
 
 
 def _quality(system: NormalEquations, weights: Array, noise: Noise) -> _Quality:

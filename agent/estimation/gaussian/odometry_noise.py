@@ -216,17 +216,21 @@ class Ticks(NamedTuple):
     tick: Places
     k: int
     """The number of ticks of the path."""
+    latest_first: Places
+    """The rows in the order of their ticks, the latest first; shape (N,)."""
+    later: Places
+    """The number of rows after each tick of the path; shape (k,)."""
 
     @staticmethod
     def of(tick: Places, k: int) -> Ticks:
         """Return the ticks of rows along a path of `k` ticks. Those beyond it are taken as its last one."""
-        return Ticks(np.minimum(tick, k), k)
+        tick = np.minimum(tick, k)
+        order = np.argsort(-tick, kind="stable")
+        return Ticks(tick, k, order, np.searchsorted(-tick[order], -np.arange(k)))
 
     def sum_after(self, values: Array) -> Array:
         """Return the sums over the rows after each tick; (..., N) -> (..., k)."""
-        order = np.argsort(-self.tick, kind="stable")
-        after = np.searchsorted(-self.tick[order], -np.arange(self.k))
-        return np.asarray(_summed(values[..., order])[..., after], np.float64)
+        return np.asarray(_summed(values[..., self.latest_first])[..., self.later], np.float64)
 
 
 class Projection(NamedTuple):

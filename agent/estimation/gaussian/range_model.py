@@ -86,9 +86,11 @@ class Ranges(NamedTuple):
     @property
     def pairs(self) -> list[NDArray[np.bool]]:
         """Return the ranges of each pair of radios that has some; shapes (N,)."""
-        which = self.radio if self.radio is not None else np.repeat(np.arange(3), self.counts)
+        if self.radio is None:
+            kinds = np.repeat(np.arange(3), self.counts)
+            return [kinds == kind for kind in range(3) if self.counts[kind]]
         # numpy.unique would import numpy.ma in the first search of a mission
-        return [which == one for one in sorted(set(which.tolist()))]
+        return [self.radio == one for one in sorted(set(self.radio.tolist()))]
 
     def rows(self, kind: int) -> slice:
         """Return the rows of a kind: 0 and 1 are the ranges of that robot to its anchor, 2 is mutual."""
@@ -124,14 +126,15 @@ class Ranges(NamedTuple):
         The errors are a bias of all ranges, one of each pair of radios, and a scale. The scale multiplies the
         measured ranges: then the effects are the same under each guess.
         """
-        columns = []
+        rho = self.rho
+        columns: list[Array] = []
         if priors.range_bias:
-            columns.append(np.full(len(self.rho), priors.range_bias))
+            columns.append(np.full(len(rho), priors.range_bias))
         if priors.range_scale:
-            columns.append(priors.range_scale * self.rho)
+            columns.append(priors.range_scale * rho)
         if priors.pair_bias:
-            columns += [priors.pair_bias * own for own in self.pairs]
-        return np.stack(columns, 1) if columns else np.zeros((len(self.rho), 0))
+            columns += [np.where(own, priors.pair_bias, 0.0) for own in self.pairs]
+        return np.array(columns).T if columns else np.zeros((len(rho), 0))
 
     def slow_errors(self, priors: Priors, period: float) -> Array | None:
         """Return the covariance (m^2) of slowly varying errors, within each pair of radios; None without."""
@@ -146,7 +149,8 @@ class Ranges(NamedTuple):
 
     def loosened(self, priors: Priors) -> Array:
         """Return the variance (m^2) that constant and slow errors add to each range; shape (N,)."""
-        variance: Array = np.sum(np.square(self.common_errors(priors)), 1) + priors.slow_sigma**2
+        of_biases = priors.range_bias**2 + priors.pair_bias**2 + priors.slow_sigma**2
+        variance: Array = np.square(priors.range_scale * self.rho) + of_biases
         return variance
 
     def within(self, sensing_range: float, priors: Priors) -> Ranges:

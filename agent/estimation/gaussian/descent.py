@@ -1,0 +1,84 @@
+"""The steps of fits, which are shortened until they descend."""
+
+from __future__ import annotations
+
+from typing import TypeVar, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.estimation.gaussian.fitted import NormalEquations
+from agent.estimation.gaussian.linear_model import ErrorSizes, LinearModel, Point, Problem, product
+from agent.estimation.gaussian.odometry_noise import Array, Places
+
+LEAP = 1.0
+"""The largest change of an unknown, in m and rad, in one step."""
+
+SHORTER_STEPS = (0.5, 0.25, 0.0625)
+"""The fractions of a step that are tried in turn if it does not descend.
+
+Gauss-Newton with full steps may alternate between two guesses for ever.
+"""
+
+DESCENT = 1e-6
+"""The increase of the cost, in units of chi-square, that is due to rounding."""
+
+
+def stepped(
+    problem: Problem, point: Point, linear: LinearModel, system: NormalEquations, variance: Array
+) -> Point:
+    """Return the points after a step by `system`, or after that fraction of it that descends.
+
+    `variance` is that of each range (m^2) for known constant and slow errors.
+    """
+    change = system.change
+    change = change * np.minimum(1.0, LEAP / np.maximum(np.abs(change).max(-1, keepdims=True), LEAP))
+    guess = point.guess.copy()
+    guess[:, problem.free] += change
+    left_over = system.weighted[..., -1] - product(system.weighted[..., :-1], change)
+    return _descended(problem, point, guess, problem.sizes(point, linear, left_over), variance)
+
+
+def _descended(problem: Problem, point: Point, guess: Array, sizes: ErrorSizes, variance: Array) -> Point:
+    """Return the point after a step to `guess` and `sizes`, or after that fraction of it that descends.
+
+    If none does, the point stays.
+    """
+    most = point.cost(variance) + DESCENT
+    following = problem.point(guess, sizes)
+    descends = following.cost(variance) <= most
+    if descends.all():
+        return following
+    climbing = np.flatnonzero(~descends)
+    for fraction in SHORTER_STEPS:
+        begin, end, ends = rows_of((point, guess, sizes), climbing)
+        shorter = [one + fraction * (other - one) for one, other in zip(begin.sizes, ends, strict=True)]
+        nearer = problem.point(begin.guess + fraction * (end - begin.guess), ErrorSizes(*shorter))
+        _put_rows(following, climbing, nearer)
+        climbing = climbing[~(nearer.cost(variance[climbing]) <= most[climbing])]
+        if not len(climbing):
+            return following
+    _put_rows(following, climbing, rows_of(point, climbing))
+    return following
+
+
+T = TypeVar("T")
+
+
+def rows_of(values: T, some: NDArray[np.bool] | Places) -> T:
+    """Return the part of `values`, a tuple of arrays or of such tuples, that belongs to some of the fits."""
+    if isinstance(values, np.ndarray):
+        return cast("T", values[some])
+    if not isinstance(values, tuple):
+        return values
+    parts = [rows_of(value, some) for value in values]
+    return cast("T", type(values)(*parts) if hasattr(values, "_fields") else tuple(parts))
+
+
+def _put_rows(values: object, some: NDArray[np.bool] | Places, others: object) -> None:
+    """Replace the part of `values` that belongs to some of the fits by `others`."""
+    if isinstance(values, tuple) and isinstance(others, tuple):
+        for value, other in zip(values, others, strict=True):
+            _put_rows(value, some, other)
+    elif isinstance(values, np.ndarray):
+        values[some] = others
