@@ -170,10 +170,11 @@ def test_a_click_in_the_charts_goes_to_the_tick_whose_values_it_shows(
     one, truth = estimates(run, "a")[20], run.truth("a")[20]
     error = math.hypot(one.world[0].x - truth.x, one.world[0].y - truth.y)
     assert one.covariance is not None
-    expect(charts).to_have_attribute(
-        "aria-label",
-        re.compile(f"a {error:.2f} m, a 3 sigma {3.0 * one.covariance.position_sigma:.2f} m"),
+    off, sigma = (
+        f"{length:.2f} m" if length >= 0.095 else f"{1000.0 * length:.1f} mm"
+        for length in (error, 3.0 * one.covariance.position_sigma)
     )
+    expect(charts).to_have_attribute("aria-label", re.compile(f"a {off}, a 3 sigma {sigma}"))
     page.locator("#truth").uncheck()
     expect(charts).to_have_attribute(
         "aria-label", re.compile(r"error / 3 sigma: a 3 sigma \d\S+ m, b 3 sigma")
