@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 from msgspec.structs import replace
 
 from agent.estimation.gaussian import inference
+from agent.estimation.gaussian.claim_rivals import with_rival_check
 from agent.estimation.gaussian.consistency import (
     CLAIM_P_VALUE,
     EARLY_CLAIM_P_VALUE,
@@ -23,16 +25,17 @@ from agent.estimation.gaussian.consistency import (
 )
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis, follow, search
 from agent.estimation.gaussian.inference import PlanningHypothesis
+from agent.estimation.gaussian.odometry_noise import Track
 from agent.estimation.gaussian.range_model import PairRanges
 from agent.estimation.knowledge import Belief, Knowledge
-from agent.planning import active_sensing, exchange, phase2_orbit, range_seeking, transitions
+from agent.planning import active_sensing, exchange, phase2_orbit, range_seeking, stalls, transitions
 from agent.planning.active_sensing import Listening, Retreating, Surveying
 from agent.planning.assured import AssuredExact
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent
-from agent.planning.range_seeking import Backing, Circling, Homing, Straight, Turning
+from agent.planning.range_seeking import Backing, Beacon, Circling, Homing, Straight, Turning
 from agent.planning.state import Asleep, Done, RobotState
 from protocol.messages import BranchKind, Localised, Observation, Report
-from protocol.mission import Mission
+from protocol.mission import Mission, Role
 from protocol.motion import ORIGIN, REST, Controls
 
 MANOEUVRES = AssuredExact.MANOEUVRES
@@ -123,7 +126,8 @@ class AccuracySeeking(AssuredExact):
 
         `hypotheses` are about the poses of both robots relative to M1, the most probable first. M2 is at
         `m2` in m, and `rho` is the latest range between the robots in m. A subclass may plan others; both
-        robots compute both from the same measurements.
+        robots compute both from the same measurements. It is not asked while they are stalled (see `stalls`),
+        nor when one of them has claimed its pose.
         """
         return active_sensing.plan_together(hypotheses, m2, rho, mission)
 
@@ -207,8 +211,20 @@ def _continue_phase1(state: RobotState) -> RobotState:
             state, belief=replace(state.belief, branch_kind=kind, phase1_done_tick=phase1_done_tick)
         )
         return _start_phase2(state)
-    command = active_sensing.plan_alone(inference.anchor_planning_hypotheses(state), mission)
-    return replace(state, mode=Surveying("anchor", command))
+    since, stalled = _stalled(state, "anchor", (inference.own_path(state),))
+    hypotheses = inference.anchor_planning_hypotheses(state)
+    command = active_sensing.plan_alone(hypotheses, mission, stalled=stalled)
+    return replace(state, mode=Surveying("anchor", command, since))
+
+
+def _stalled(state: RobotState, beacon: Beacon, paths: Sequence[Track]) -> tuple[int, bool]:
+    """Return the tick of the first of consecutive plans, and whether they lead nowhere (see `stalls`)."""
+    match state.mode:
+        case Surveying(before, _, since) if before == beacon:
+            stride = active_sensing.stride(state.config.mission)
+            return since, stalls.is_stalled(paths, since, stride, state.config.mission)
+        case _:
+            return state.tick, False
 
 
 def _are_misleading(state: RobotState, best: ScoredHypothesis) -> bool:
@@ -294,7 +310,9 @@ def _continue_phase3(state: RobotState) -> RobotState:
         case Retreating(_, since) if state.tick - since < 2 * stride:
             return state
         case Retreating():
-            return replace(state, mode=Surveying("peer")) if state.in_contact else _start_phase2(state)
+            if not state.in_contact:
+                return _start_phase2(state)
+            return replace(state, mode=Surveying("peer", since=state.tick))
         case _ if state.config.role == "b" and _ticks_without_range(state) >= LOST_AFTER_IN_PHASE_3 * stride:
             return _return_to_anchor(state)
         case Surveying(_, command) | Listening(command) if not state.in_contact:
@@ -344,18 +362,27 @@ def _decide_phase3(state: RobotState, planned: JointManoeuvres) -> RobotState:
     tested = replace(state, belief=inference.with_convergence_check(belief, scored))
     if searched and len(pair.places) >= inference.sufficient_mutual_ranges(mission):
         tested = _with_consistency_test(tested)
-    if tested.verdict is not None:
-        return tested
-    if may_claim(tested.belief, pair):
-        tested = _with_claim(tested, scored, pair)
+    if tested.verdict is None and may_claim(tested.belief, pair):
+        tested = _with_claim(tested, scored, hypotheses, pair)
     if tested.verdict is not None:
         return tested
     if role == "a" and len(pair.places) >= MANY_MUTUAL_RANGES * (1 + state.belief.returns):
         return _return_to_anchor(tested)
     if not scored:
         return _drive_without_hypotheses(tested)
-    a, b = planned(hypotheses, pair.apart, state.mutual[-1].range, mission)
-    return replace(tested, mode=Surveying("peer", a if role == "a" else b))
+    since, stalled = _stalled(state, "peer", pair.paths)
+    manoeuvres = _manoeuvres(state, stalled) or planned
+    a, b = manoeuvres(hypotheses, pair.apart, state.mutual[-1].range, mission)
+    return replace(tested, mode=Surveying("peer", a if role == "a" else b, since))
+
+
+def _manoeuvres(state: RobotState, stalled: bool) -> JointManoeuvres | None:
+    """Return how robots plan that are stalled, or of which one has claimed its pose; None: as always."""
+    claimed = isinstance(state.peer_state.verdict, Localised)
+    if not (stalled or claimed):
+        return None
+    peer: Role = "b" if state.config.role == "a" else "a"
+    return partial(active_sensing.plan_together, stalled=stalled, resting=peer if claimed else None)
 
 
 def may_claim(belief: Belief, pair: PairRanges) -> bool:
@@ -364,9 +391,18 @@ def may_claim(belief: Belief, pair: PairRanges) -> bool:
     return belief.blocking_reason is None and not (few_ranges and _p_value_below(belief, EARLY_CLAIM_P_VALUE))
 
 
-def _with_claim(state: RobotState, scored: Sequence[ScoredHypothesis], pair: PairRanges) -> RobotState:
+def _with_claim(
+    state: RobotState,
+    scored: Sequence[ScoredHypothesis],
+    hypotheses: Sequence[PlanningHypothesis],
+    pair: PairRanges,
+) -> RobotState:
     """Return `state` with the claim if nothing blocks it, or Undecided if profiles contradict all claims."""
-    state = replace(state, belief=inference.with_doubt_check(state.belief, scored, pair))
+    belief = inference.with_doubt_check(state.belief, scored, pair)
+    own = 0 if state.config.role == "a" else 1
+    robots = (own,) if isinstance(state.peer_state.verdict, Localised) else (0, 1)
+    belief = with_rival_check(belief, scored, hypotheses[0], pair, state.config.mission, robots)
+    state = replace(state, belief=belief)
     reason = state.belief.blocking_reason
     if reason is None:
         belief = replace(state.belief, p_value=_least_p_value(state.belief))
@@ -452,6 +488,6 @@ def _drive_without_hypotheses(state: RobotState) -> RobotState:
     """Drive without hypotheses about the poses: b stands, a drives straight on (Section III.C.a)."""
     mission = state.config.mission
     if state.config.role == "b" or not state.mutual:
-        return replace(state, mode=Surveying("peer"))
+        return replace(state, mode=Surveying("peer", since=state.tick))
     step = range_seeking.step_length("peer", state.mutual[-1].range, mission)
-    return replace(state, mode=Surveying("peer", Controls(step / mission.period, 0.0)))
+    return replace(state, mode=Surveying("peer", Controls(step / mission.period, 0.0), state.tick))

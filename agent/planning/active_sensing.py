@@ -21,7 +21,7 @@ from agent.estimation.gaussian.odometry_noise import Array, Places
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
 from agent.planning import separation
 from agent.planning.range_seeking import Beacon
-from protocol.mission import Mission
+from protocol.mission import Mission, Role
 from protocol.motion import REST, Controls
 
 STRIDE_LENGTH = 0.25
@@ -49,7 +49,13 @@ OUTSIDE_COST = 1e3
 """The cost per m in a place without informative ranges, in variances as large as the required accuracy."""
 
 OUTSIDE_COST_ALONE = 10.0
-"""The OUTSIDE_COST of a robot that plans for its anchor alone; each tick improves its position estimate."""
+"""The OUTSIDE_COST of a robot that plans for its anchor alone; each tick improves its position estimate.
+
+It also is that of stalled robots, to which a missing range tells which hypothesis is false.
+"""
+
+STALLED_COST = 1e9
+"""The cost of standing still for a stalled robot (see `stalls`)."""
 
 
 class Surveying(msgspec.Struct, frozen=True):
@@ -57,6 +63,8 @@ class Surveying(msgspec.Struct, frozen=True):
 
     beacon: Beacon
     command: Controls = REST
+    since: int = 0
+    """The tick of the first of the consecutive plans of which this is the last."""
 
 
 class Listening(msgspec.Struct, frozen=True):
@@ -127,15 +135,25 @@ def choice(mission: Mission) -> Choice:
     )
 
 
+def _choice(mission: Mission, stalled: bool) -> Choice:
+    """Return the manoeuvres to compare; for stalled robots with the first stride alone."""
+    ways = choice(mission)
+    return ways._replace(along=ways.along[:, :1], across=ways.across[:, :1]) if stalled else ways
+
+
 def plan_alone(
-    hypotheses: Sequence[PlanningHypothesis], mission: Mission, within: float | None = None
+    hypotheses: Sequence[PlanningHypothesis],
+    mission: Mission,
+    within: float | None = None,
+    *,
+    stalled: bool = False,
 ) -> Controls:
     """Return the manoeuvre whose ranges to the anchor are expected to be most informative.
 
     The anchor is the origin, and the covariance of each hypothesis is that of the anchor's position. `within`
-    is the largest allowed distance from the anchor in m.
+    is the largest allowed distance from the anchor in m. A `stalled` robot moves, and counts one stride only.
     """
-    ways = choice(mission)
+    ways = _choice(mission, stalled)
     best = hypotheses[0]
     reach = mission.sensing_range
     distances = []
@@ -152,6 +170,8 @@ def plan_alone(
     yy = information[1, 1] + np.sum(weight * uy * uy, 1)
     cost = (xx + yy) / np.maximum(xx * yy - xy * xy, 1e-300) / mission.accuracy**2
     cost += _confusion(hypotheses, distances, sigma, reach)
+    if stalled:
+        cost[-1] += STALLED_COST
     limit = within if within is not None else reach
     for one, distance in zip(hypotheses, distances, strict=True):
         cost += one.probability * OUTSIDE_COST * np.maximum(0.0, NEAREST_TO_ANCHOR * reach - distance[:, 0])
@@ -163,28 +183,46 @@ def plan_alone(
 
 
 def plan_together(
-    hypotheses: Sequence[PlanningHypothesis], m2: tuple[float, float], rho: float, mission: Mission
+    hypotheses: Sequence[PlanningHypothesis],
+    m2: tuple[float, float],
+    rho: float,
+    mission: Mission,
+    *,
+    stalled: bool = False,
+    resting: Role | None = None,
 ) -> tuple[Controls, Controls]:
     """Return the manoeuvres of a and b after which both poses are expected to be known best.
 
     The covariance of each hypothesis is that of both poses, (6, 6), relative to M1. M2 is at `m2`. First, b's
     manoeuvre is selected as if a stood still, then a's, given b's. Neither robot comes nearer to the other
     than the safety distance under any hypothesis; `rho` is the latest range between them in m. If no
-    manoeuvre meets this condition, both stand still.
+    manoeuvre meets this condition, both stand still. Of `stalled` robots, b moves, one stride alone counts,
+    and to leave the range costs little. A robot that is `resting` has claimed its pose, and stands still; the
+    other one moves.
     """
-    return _planned_together(tuple(hypotheses), m2, rho, mission)
+    return _planned_together(tuple(hypotheses), m2, rho, mission, stalled, resting)
 
 
 @lru_cache(maxsize=2)
 def _planned_together(
-    hypotheses: tuple[PlanningHypothesis, ...], m2: tuple[float, float], rho: float, mission: Mission
+    hypotheses: tuple[PlanningHypothesis, ...],
+    m2: tuple[float, float],
+    rho: float,
+    mission: Mission,
+    stalled: bool,
+    resting: Role | None,
 ) -> tuple[Controls, Controls]:
     """Return the manoeuvres of `plan_together`, which both robots of one process ask for."""
-    ways = choice(mission)
+    ways = _choice(mission, stalled)
     stand = len(ways.v) - 1
-    still = np.array([stand])
-    _, b = _best_of(ways, hypotheses, m2, rho, mission, still, np.arange(stand + 1))
-    a, _ = _best_of(ways, hypotheses, m2, rho, mission, np.arange(stand + 1), np.array([b]))
+    still, every = np.array([stand]), np.arange(stand + 1)
+    outside, standing = (OUTSIDE_COST_ALONE, STALLED_COST) if stalled else (OUTSIDE_COST, 0.0)
+    a = b = stand
+    if resting != "b":
+        _, b = _best_of(ways, hypotheses, m2, rho, mission, still, every, outside, standing)
+    if resting != "a":
+        of_a = standing if resting == "b" else 0.0
+        a, _ = _best_of(ways, hypotheses, m2, rho, mission, every, np.array([b]), outside, of_a)
     return (
         Controls(float(ways.v[a]), float(ways.omega[a])),
         Controls(float(ways.v[b]), float(ways.omega[b])),
@@ -199,8 +237,13 @@ def _best_of(
     mission: Mission,
     of_a: Places,
     of_b: Places,
+    outside: float,
+    standing: float = 0.0,
 ) -> tuple[int, int]:
-    """Return the best pair of manoeuvres from `of_a` and `of_b`, one of which contains a single manoeuvre."""
+    """Return the best pair of manoeuvres from `of_a` and `of_b`, one of which contains a single manoeuvre.
+
+    `outside` is the cost per m out of range, and `standing` that of the last pair, in which both stand still.
+    """
     reach = mission.sensing_range
     own_sigma = max(mission.noise.anchor_sigma, NEGLIGIBLE * mission.accuracy)
     sigma = max(mission.noise.mutual_sigma, NEGLIGIBLE * mission.accuracy)
@@ -215,28 +258,29 @@ def _best_of(
         distance = np.maximum(np.hypot(dx, dy), SIGMA_FLOOR)
         distances.append(distance)
         off_anchor = np.hypot(bx[:, 0] - m2[0], by[:, 0] - m2[1])
-        for beyond in (
-            distance[:, 0] - FARTHEST * reach,
-            off_anchor - FARTHEST * reach,
-            NEAREST * reach - np.min(distance, 1),
-            NEAREST_TO_ANCHOR * reach - off_anchor,
+        for beyond, loss in (
+            (distance[:, 0] - FARTHEST * reach, outside),
+            (off_anchor - FARTHEST * reach, outside),
+            (NEAREST * reach - np.min(distance, 1), OUTSIDE_COST),
+            (NEAREST_TO_ANCHOR * reach - off_anchor, OUTSIDE_COST),
         ):
-            cost += one.probability * OUTSIDE_COST * np.maximum(0.0, beyond)
+            cost += one.probability * loss * np.maximum(0.0, beyond)
         if one is not hypotheses[0]:
             continue
-        rows = np.zeros((count, 3 * AHEAD, 6))
+        ahead = distance.shape[1]
+        rows = np.zeros((count, 3 * ahead, 6))
         nx, ny = dx / distance, dy / distance
         weight = (distance <= reach) / sigma
         for robot, (x, y), sign in ((0, (ax, ay), 1.0), (1, (bx, by), -1.0)):
             px, py = one.poses[3 * robot : 3 * robot + 2]
             i = 3 * robot
-            rows[:, :AHEAD, i] = sign * nx * weight
-            rows[:, :AHEAD, i + 1] = sign * ny * weight
-            rows[:, :AHEAD, i + 2] = sign * (ny * (x - px) - nx * (y - py)) * weight
+            rows[:, :ahead, i] = sign * nx * weight
+            rows[:, :ahead, i + 1] = sign * ny * weight
+            rows[:, :ahead, i + 2] = sign * (ny * (x - px) - nx * (y - py)) * weight
             ox, oy = x - anchors[robot][0], y - anchors[robot][1]
             rho = np.maximum(np.hypot(ox, oy), SIGMA_FLOOR)
             own = (rho <= reach) / rho / own_sigma
-            own_rows = slice((robot + 1) * AHEAD, (robot + 2) * AHEAD)
+            own_rows = slice((robot + 1) * ahead, (robot + 2) * ahead)
             rows[:, own_rows, i] = ox * own
             rows[:, own_rows, i + 1] = oy * own
             rows[:, own_rows, i + 2] = (oy * (x - px) - ox * (y - py)) * own
@@ -253,6 +297,7 @@ def _best_of(
             variance += 2.0 * (dx * covariance_after[:, i + 1, i + 2] - dy * covariance_after[:, i, i + 2])
             cost += variance / mission.accuracy**2
     cost += _confusion(hypotheses, distances, sigma, reach)
+    cost[-1] += standing
     if mission.safety_distance:
         cost[~_keep_apart(ways, hypotheses, latest, mission, of_a, of_b)] = np.inf
         cost[-1] = min(cost[-1], STANDING_COST)

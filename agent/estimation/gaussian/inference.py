@@ -61,6 +61,11 @@ def _path_of(runs: tuple[Segment, ...], through: int, period: float) -> Track:
     return track(v + 0.0, omega + 0.0, period)
 
 
+def own_path(knowledge: Knowledge) -> Track:
+    """Return the odometry of the robot up to now."""
+    return path_of(knowledge.log, knowledge.tick, knowledge.config.mission.period)
+
+
 def own_anchor(knowledge: Knowledge) -> tuple[ScoredHypothesis, ...]:
     """Return the hypotheses about the anchor in the frame of the odometry, the most probable first."""
     mission = knowledge.config.mission

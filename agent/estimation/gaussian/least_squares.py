@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian.descent import rows_of, stepped
+from agent.estimation.gaussian.descent import LEAP, rows_of, stepped
 from agent.estimation.gaussian.fitted import Fit, NormalEquations
 from agent.estimation.gaussian.linear_model import LinearModel, Point, Problem, Start, product
 from agent.estimation.gaussian.noise_level import (
@@ -349,3 +349,45 @@ def _log_likelihood(
 
 SOFT = 0.1
 """The least smoothing of the ends of the outlier density, as a fraction of the least bias."""
+
+
+def held_log_likelihoods(problem: Problem, begun: Fit, row: int, offs: Array, steps: int) -> list[float]:
+    """Return the log-likelihoods of the ranges of `problem` after `steps` steps from the fit `begun`.
+
+    The problem has the ranges of that fit and one more, at `row`, which holds a coordinate: it is no outlier.
+    Each of `offs` (m) is added to this range in turn.
+    """
+    noise, sigma = problem.noise, problem.ranges.sigma
+    start = Start(begun.guess, begun.errors)
+    point = _longer(problem.begin([start] * len(offs)), row, offs)
+    weights = np.repeat(np.insert(begun.weights, row, 1.0)[None], len(offs), 0)
+    for step in range(steps + 1):
+        linear = problem.linearised(point)
+        covariance = range_covariance(_variance(sigma, weights), linear.columns, linear.dense)
+        system = _solved(point.predicted.jacobian[..., problem.free], linear.innovation, covariance)
+        if step == steps:
+            break
+        longest = np.abs(system.change).max(-1, keepdims=True)
+        change = system.change * np.minimum(1.0, LEAP / np.maximum(longest, LEAP))
+        left_over = system.weighted[..., -1] - product(system.weighted[..., :-1], change)
+        sizes = problem.sizes(point, linear, left_over)
+        point = _longer(problem.point(point.guess + change, sizes), row, offs)
+        if problem.robust and step == 0:
+            loosened = np.square(sigma) + np.add.reduce(np.square(problem.common), 1)
+            weights = _weights(point.residuals, np.sqrt(loosened), noise)
+        elif problem.robust:
+            weights = _inlier_probabilities(system, weights, sigma, noise)
+        weights[:, row] = 1.0
+    chi2, level = _quality(system, weights, noise).chi2.tolist(), begun.level
+    return [
+        _log_likelihood(system.one(i), chi2[i], point.residuals[i], weights[i], sigma, level, noise)
+        for i in range(len(offs))
+    ]
+
+
+def _longer(point: Point, row: int, offs: Array) -> Point:
+    """Return `point` with `offs` (m) added to the range at `row`, one for each fit."""
+    residuals, own = point.residuals.copy(), point.own.copy()
+    residuals[:, row] += offs
+    own[:, row] += offs
+    return point._replace(residuals=residuals, own=own)

@@ -1,0 +1,125 @@
+"""The rivals of a claim: the likeliest poses that are so far from it that it would be wrong.
+
+The covariance of a fit describes the likelihood near its maximum. Where the possible poses lie along a bent
+valley, or where an outlier passes as an inlier because the fit has moved towards it, poses many sigmas away
+may be nearly as likely as the claimed ones. They are found by fits in which one coordinate of a robot is held
+there and everything else is free, the weights of the ranges included (a profile likelihood).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from msgspec.structs import replace
+
+from agent.estimation.gaussian.fitted import Fit
+from agent.estimation.gaussian.hypotheses import ScoredHypothesis
+from agent.estimation.gaussian.inference import PlanningHypothesis, to_second_order
+from agent.estimation.gaussian.least_squares import held_log_likelihoods
+from agent.estimation.gaussian.linear_model import Problem
+from agent.estimation.gaussian.odometry_noise import Array
+from agent.estimation.gaussian.range_model import PairRanges, Ranges
+from agent.estimation.knowledge import Belief
+from protocol.mission import Mission
+
+WRONG_SIGMAS = 5.0
+"""The number of claimed sigmas from which on the referee calls a claim wrong."""
+
+HELD_STEPS = 5
+"""The Gauss-Newton steps of a fit with a held coordinate.
+
+The first one leads to the held place, and the weights of the ranges follow within two or three.
+"""
+
+FAR_ANCHOR = 1e3
+"""The distance of an anchor to which a range holds a coordinate, in R: it measures along one direction."""
+
+HOLDING_SIGMA = 1e-3
+"""The sigma of that range, as a fraction of the distance from the claim at which it holds a coordinate."""
+
+
+class Rival(NamedTuple):
+    """The likeliest poses that would make a claim wrong."""
+
+    robot: int
+    log_likelihood_ratio: float
+    """The log-likelihood of all ranges under these poses, less that under the claimed ones."""
+
+
+@lru_cache(maxsize=2)
+def likeliest_rival(
+    fitted: Fit, pair: PairRanges, claimed: PlanningHypothesis, robots: tuple[int, ...]
+) -> Rival:
+    """Return the likeliest rival of the claims of `robots` (0 and 1), which follow from `fitted`.
+
+    `claimed` contains the poses and the covariance of both robots. The coordinate that is held is that along
+    the longest axis of the ellipse of a robot's position.
+    """
+    _, covariance = to_second_order(claimed, pair.apart)
+    rivals = []
+    for robot in robots:
+        i = 3 * robot
+        variances, axes = np.linalg.eigh(covariance[i : i + 2, i : i + 2])
+        along, far = axes[:, 1], WRONG_SIGMAS * math.sqrt(float(np.sum(variances)))
+        place = claimed.poses[i : i + 2] - robot * np.array(pair.apart)
+        anchor = place - FAR_ANCHOR * pair.sensing_range * along
+        held, row = _holding(pair, robot, anchor, math.hypot(*(place - anchor)), HOLDING_SIGMA * far)
+        (here,) = held_log_likelihoods(held, fitted, row, np.zeros(1), 0)
+        there = held_log_likelihoods(held, fitted, row, np.array((far, -far)), HELD_STEPS)
+        rivals.append(Rival(robot, max(there) - here))
+    return max(rivals, key=lambda one: one.log_likelihood_ratio)
+
+
+def _holding(pair: PairRanges, robot: int, anchor: Array, rho: float, sigma: float) -> tuple[Problem, int]:
+    """Return the problem of `pair` with one more range, which holds a coordinate of a robot, and its row.
+
+    It is one of the last tick to an `anchor` far away, whose position (m) is relative to the robot's own. No
+    error that ranges have in common affects it.
+    """
+    ranges, noise = pair.ranges, pair.noise
+    row = sum(ranges.counts[: robot + 1])
+    first, second, mutual = [count + (kind == robot) for kind, count in enumerate(ranges.counts)]
+    anchors = np.zeros((len(ranges.rho) + 1, 2))
+    anchors[row] = anchor
+    held = Ranges(
+        np.insert(ranges.rho, row, rho),
+        np.insert(ranges.tick, row, len(pair.paths[robot].v)),
+        np.insert(ranges.sigma, row, sigma),
+        (first, second, mutual),
+        anchors,
+        np.insert(np.repeat(np.arange(3), ranges.counts), row, 3),
+    )
+    problem = Problem.of(pair.paths, held, noise, pair.apart)
+    common, slow = np.insert(ranges.common_errors(noise.priors), row, 0.0, 0), problem.slow
+    if slow is not None:
+        slow = slow.copy()
+        slow[row] = slow[:, row] = 0.0
+    return problem._replace(common=common, slow=slow), row
+
+
+def with_rival_check(
+    belief: Belief,
+    scored: Sequence[ScoredHypothesis],
+    claimed: PlanningHypothesis,
+    pair: PairRanges,
+    mission: Mission,
+    robots: tuple[int, ...],
+) -> Belief:
+    """Return `belief` with a blocking reason if poses that would make a claim of `robots` wrong are likely.
+
+    They may be as likely as other hypotheses may be probable: 1 - confidence.
+    """
+    if belief.blocking_reason is not None:
+        return belief
+    rival, most = likeliest_rival(scored[0].fit, pair, claimed, robots), math.log1p(-mission.confidence)
+    if rival.log_likelihood_ratio <= most:
+        return belief
+    reason = (
+        f"poses {WRONG_SIGMAS:g} sigmas away explain the ranges nearly as well: "
+        f"their log-likelihood ratio is {rival.log_likelihood_ratio:.3g}, allowed {most:.3g}"
+    )
+    return replace(belief, blocking_reason=reason)

@@ -1,0 +1,45 @@
+"""The rivals of a claim: a pose is not claimed if poses that would make it wrong are nearly as likely."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+import tandem
+from agent.estimation.gaussian import claim_rivals
+from compose.launch.in_process import run_mission
+from compose.recording.summary_json import summary
+from tests.series import series
+from tests.surveys import SIGMA, assert_localised, scenario_of
+
+RANGES = {"mission.noise.anchor_sigma": 0.05, "mission.noise.mutual_sigma": 0.05, "mission.accuracy": 0.1}
+TOLD_OUTLIERS = {**RANGES, "mission.noise.outliers": 0.2, "mission.noise.drop_outs": 0.3}
+UNTOLD_OUTLIERS = {**RANGES, "world.noise.outliers": 0.1}
+
+
+def test_a_claim_along_a_bent_valley_waits_for_further_ranges() -> None:
+    """The chi-square of the truth was 9.8 more than that of the claim, whose covariance made it 35."""
+    assert_localised(run_mission(scenario_of(SIGMA, 384, reach=1.5)))
+
+
+PASSED_AS_INLIERS = [
+    (TOLD_OUTLIERS, 2111298897115261548),  # one outlier of 0.36 m had moved the fit towards it
+    (UNTOLD_OUTLIERS, 1375614881244800650),  # two had
+]
+
+
+@pytest.mark.parametrize("case", series(PASSED_AS_INLIERS, 0), ids=["told", "untold"])
+def test_an_outlier_that_passes_as_an_inlier_delays_the_claim(case: tuple[dict[str, Any], int]) -> None:
+    fields, seed = case
+    run = tandem.run(tandem.Scenario.load("random").with_(fields, seed=seed))
+    assert run.outcome == "localised"
+
+
+def test_the_reason_against_a_claim_is_its_rival(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a claim that is called wrong from a hundredth of a sigma on, rivals are always as likely."""
+    monkeypatch.setattr(claim_rivals, "WRONG_SIGMAS", 0.01)
+    recording = run_mission(scenario_of(SIGMA, 4, max_ticks=60))
+    assert summary(recording, "in-process", None)["outcome"] == "undecided"
+    for final_report in recording.final_reports.values():
+        assert "sigmas away explain the ranges nearly as well" in (final_report.blocking_reason or "")
