@@ -39,7 +39,8 @@ SCRUB = "(scrub, tick) => { scrub.value = tick; scrub.dispatchEvent(new Event('i
 Open = Callable[..., Page]
 chromium_only = pytest.mark.skipif(
     os.environ.get("TANDEM_BROWSER") == "firefox",
-    reason="Firefox 140 cannot be told the system's theme or its motion, nor run scripts on a file's page",
+    reason="Firefox 140 cannot be told the system's theme or its motion, nor run scripts on a file's page, "
+    "and reports neither downloads nor the bodies of requests",
 )
 """The mark of tests that Playwright cannot run in Firefox."""
 

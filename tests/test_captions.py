@@ -56,7 +56,8 @@ def test_the_story_of_paper_1_has_a_caption_for_each_of_its_beats(paper_1: Run) 
         ),
         (
             5,
-            "Each robot knows its path relative to its anchor, but not on which side of it. "
+            "After a short drive, each robot knows its path relative to its anchor, "
+            "but turned around the anchor by an unknown angle. "
             "They drive on circles around their anchors to find each other.",
         ),
         (
@@ -64,8 +65,15 @@ def test_the_story_of_paper_1_has_a_caption_for_each_of_its_beats(paper_1: Run) 
             "a and b meet. They measure the distance between them, 2.95 m. "
             "They exchange reports of their paths.",
         ),
-        (47, "Four configurations of the robots fit what was measured and reported."),
-        (47, "b makes one manoeuvre, chosen so that the four predict distances that differ most."),
+        (
+            47,
+            "Four configurations, each with one pose of a and one of b, fit what was measured and reported.",
+        ),
+        (
+            47,
+            "b makes one manoeuvre, chosen so that the four predict distances that differ most: "
+            "then the next measured distance can tell which one is true.",
+        ),
         (48, "With the distance now measured, 2.39 m, only one of the four configurations is left."),
         (48, "Both are localised."),
     ]
@@ -75,7 +83,7 @@ def test_the_story_of_paper_1_has_a_caption_for_each_of_its_beats(paper_1: Run) 
 @pytest.mark.long
 def test_under_noise_captions_speak_of_estimates_and_probabilities(recorded: Record) -> None:
     text = " ".join(text for _, text in told(recorded(load("noisy"))))
-    assert "Each robot has an estimate of its path" in text
+    assert "After a short drive, each robot has an estimate of its path" in text
     assert "a drives on a circle around its anchor to find b, which waits near its own." in text
     assert re.search(r"the most probable with \d\d %\.", text)
     assert "Both drive to where the next distances are expected to distinguish them" in text
@@ -84,10 +92,10 @@ def test_under_noise_captions_speak_of_estimates_and_probabilities(recorded: Rec
 
 
 def test_robots_that_lose_contact_are_told_to_meet_again(recorded: Record) -> None:
-    text = [text for _, text in told(recorded(load("noisy", seed=18)))]
+    text = [text for _, text in told(recorded(load("noisy", seed=8)))]
     left = text.index("They have left each other's range.")
     assert text[left + 1].startswith("a and b are in range of each other again.")
-    assert text[left + 2].startswith("Four configurations of the robots fit now, instead of one")
+    assert text[left + 2].startswith("Two configurations of the robots fit now, instead of one")
 
 
 def test_a_detected_attack_is_told_as_a_contradiction_and_named_with_the_truth_only(recorded: Record) -> None:
@@ -99,9 +107,7 @@ def test_a_detected_attack_is_told_as_a_contradiction_and_named_with_the_truth_o
     run = recorded(replace(scenario, robots=robots))
     captions = [caption for scene in scenes_of(run) for caption in scene.captions]
     assert captions[-2].text.startswith("b finds that the reports of a contradict what it measured: ")
-    assert captions[-1].text.startswith(
-        "The mission ends, because measurements and reports contradict each other: "
-    )
+    assert captions[-1].text == "The mission ends, because measurements and reports contradict each other."
     assert [one.truth for one in captions if one.truth and "false data" in one.truth] == [
         "a will report false data about itself.",
         "a does report false data about itself.",
@@ -114,8 +120,8 @@ def test_what_each_robot_of_a_pair_finds_at_another_time_is_told_of_it_alone(rec
     text = " ".join(text for _, text in told(run))
     for one in (
         "A report of a is lost.",
-        "For a, two configurations of the robots fit",
-        "For b, two configurations of the robots fit",
+        "For a, two configurations, each with one pose of a and one of b, fit",
+        "For b, two configurations, each with one pose of a and one of b, fit",
         "for b, only one of the two configurations is left.",
         "b claims to know its pose.",
     ):

@@ -49,9 +49,9 @@ def test_guided_play_tells_paper_1_in_forty_seconds_most_of_them_at_the_encounte
     told = list(dict.fromkeys(caption for _, caption in seen))
     assert [re.split(r"[.,]", one)[0] for one in told] == [
         "Each robot measures the distance to one beacon",
-        "Each robot knows its path relative to its anchor",
+        "After a short drive",
         "a and b meet",
-        "Four configurations of the robots fit what was measured and reported",
+        "Four configurations",
         "b makes one manoeuvre",
         "With the distance now measured",
         "Both are localised",

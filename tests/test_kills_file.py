@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from compose.recording.kills_file import KILLS, Killed
+from compose.recording.kills_file import KILLS, MOST_BYTES, Killed
 from compose.recording.recording_files import KINDS, WORLD_JOURNAL
 from compose.recording.run import Run, of_frames, read
 from compose.view.recorded import Journals, scenes, scenes_of
+from compose.view.run_data import RunData
 from protocol.journal import journal_file
 from protocol.journal.journal_file import CorruptJournal
 from protocol.messages import Command, DeadlineMissed
@@ -106,6 +107,15 @@ def test_a_robot_is_gone_until_it_meets_a_deadline_again(paper_1: Path) -> None:
             b'{"who":"a","tick":1,"point":"nowhere","after":0,"replayed_ticks":1}\n',
             "line 1: Invalid enum value",
         ),
+        (
+            b'{"who":"a","tick":-5,"point":"report","after":0,"replayed_ticks":1}\n',
+            "line 1: Expected `int` >= 0",
+        ),
+        (
+            b'{"who":"a","tick":1,"point":"report","after":-1,"replayed_ticks":1}\n',
+            "line 1: Expected `float` >= 0.0",
+        ),
+        (b" " * (MOST_BYTES + 1), f"it is larger than {MOST_BYTES} bytes"),
     ],
 )
 def test_a_damaged_file_is_one_line_and_viewers_show_the_rest(
@@ -124,6 +134,50 @@ def test_a_damaged_file_is_one_line_and_viewers_show_the_rest(
     viewer.read()
     assert len(viewer.notes) == 1
     assert viewer.known.last == 48
+
+
+def test_a_list_that_is_a_folder_hides_no_journal(paper_1: Path, tmp_path: Path) -> None:
+    shutil.copytree(paper_1, tmp_path / "run")
+    (tmp_path / "run" / KILLS).mkdir()
+    ended = tandem("figures", tmp_path / "run", "--only", "ranges")
+    assert (ended.status, ended.err.count("\n")) == (2, 1)
+    viewer = Journals(tmp_path / "run")
+    viewer.read()
+    assert viewer.known.last == 48
+    assert [KILLS in note for note in viewer.notes] == [True]
+
+
+def test_kills_of_no_process_and_of_ticks_that_never_come_are_ignored(paper_1: Path) -> None:
+    killed = [Killed("c", 5, "report", 0.0, 5), Killed("a", 10**30, "report", 0.0, 5)]
+    assert processes_shown(replace(read(paper_1), kills=tuple(killed))) == []
+
+
+def test_thousands_of_kills_are_shown_in_time(paper_1: Path) -> None:
+    """Each is looked at once, not once a tick."""
+    killed = tuple(Killed("a", tick % 49, "report", None, tick) for tick in range(14_000))
+    looked_at = 0
+
+    class Counted(RunData):
+        def _extend_absence(self, robot: str | None) -> None:
+            nonlocal looked_at
+            looked_at += 1
+            super()._extend_absence(robot)
+
+    known = Counted()
+    known.add_kills(killed)
+    world = read(paper_1).world
+    assert world is not None
+    for tick in world.ticks:
+        known.add_tick(tick)
+    assert looked_at < 2 * len(killed)
+    assert all("a" in known.ticks[tick].down for tick in range(48))
+
+
+def test_a_run_does_not_add_to_the_kills_of_another(tmp_path: Path) -> None:
+    (tmp_path / KILLS).touch()
+    ended = tandem("run", "paper-1", "-q", "--out", tmp_path)
+    assert ended.status == 2
+    assert "already contains a recording" in ended.err
 
 
 def test_a_torn_last_line_is_ignored(disturbed: Path, tmp_path: Path) -> None:

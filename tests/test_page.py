@@ -19,7 +19,7 @@ from protocol.journal import journal_file
 from protocol.journal.journal_file import Journal
 from protocol.messages import Command, Observation
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
-from tests.browser import Open, inks, picture, shot, until_shown, watching
+from tests.browser import Open, inks, picture, scrub_to, shot, until_shown, watching
 from tests.commands import ENDLESS, TandemProcess, until, world
 from tests.series import series
 from world.referee import errors
@@ -187,6 +187,25 @@ def test_a_hypothesis_that_goes_on_moves_to_where_it_is_next_and_others_as_drive
     assert found["covariance"] == [3, 0, 0, 3, 0, 0]
     far = {"world": [[1.5, 0, 0]], "executed": [1, 0]}
     assert page.evaluate(HELD, [now, far, 0.5])["poses"][0] == [0.5, 0, 0]  # it jumps at the tick
+
+
+def test_a_view_is_the_same_picture_however_it_was_reached(opened: Open, address: str) -> None:
+    """What stays the same between two ticks is drawn once, and again when anything in it changes."""
+    pages = {tick: opened(f"{address}#tick={tick}") for tick in (30, 40)}
+    expected = {}
+    for tick, page in pages.items():
+        until_shown(page, tick)
+        expected[tick] = inks(page)
+    page = pages[30]
+    first = picture(page)
+    for away, back in (("n", "f"), ("t", "t"), ("r", "a"), ("w", "f")):
+        page.keyboard.press(away)
+        assert picture(page) != first
+        page.keyboard.press(back)
+        for tick, inked in reversed(expected.items()):
+            scrub_to(page, tick)
+            assert inks(page) == inked
+        assert picture(page) == first
 
 
 JOINED = """async () => {

@@ -21,8 +21,6 @@ from protocol.attack import Attack
 from protocol.messages import Inconsistent
 from protocol.motion import travelled
 from tests.browser import Open, picture, scrub_to, watching
-from tests.series import series
-from tests.test_page_configurations import SIZES, overlapping
 
 HALVED = Attack("scale", 0.5, "orbit")
 LABELS = "document.getElementById('canvas').labels.map((one) => one.text)"
@@ -132,21 +130,6 @@ def test_the_card_names_the_gap_and_then_the_verdict_and_only_with_the_truth(
     expect(sentence).to_be_hidden()
     picture(page)
     assert not [text for text in page.evaluate(LABELS) if "reported" in text]
-
-
-@pytest.mark.parametrize("size", series(SIZES, 1), ids=str)
-def test_no_label_of_an_attack_overlaps_another(
-    size: tuple[int, int], opened: Open, recording: Path, attacked_address: str
-) -> None:
-    page = opened(attacked_address, width=size[0], height=size[1])
-    last = len(scenes_of(read(recording))) - 1
-    for tick in (last // 2, last):
-        scrub_to(page, tick)
-        for near in ("f", "n"):
-            page.keyboard.press(near)
-            picture(page)
-            assert not overlapping(page), (tick, near)
-            assert [text for text in page.evaluate(LABELS) if text.startswith("a reported, ")]
 
 
 @pytest.mark.long

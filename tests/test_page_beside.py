@@ -79,6 +79,17 @@ def test_both_recordings_show_the_tick_of_one_clock(
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("size", [(800, 600), (390, 844)], ids=str)
+def test_both_planes_have_room_in_a_small_window(opened: Open, beside: str, size: tuple[int, int]) -> None:
+    page = opened(f"{beside}#tick=3", width=size[0], height=size[1])
+    until_both_show(page, 3, 3)
+    for frame in frames(page):
+        box = frame.locator("#canvas").bounding_box()
+        assert box is not None
+        assert min(box["width"], box["height"]) > 150.0
+
+
+@pytest.mark.long
 def test_the_same_recording_twice_is_identical(opened: Open, paper_1: Path) -> None:
     with watching(paper_1, paper_1) as (_, address):
         page = opened(address)

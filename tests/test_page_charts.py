@@ -20,6 +20,7 @@ from compose.view.series import MOST_BINS, Curve, Series, series
 from protocol.journal import journal_file
 from protocol.journal.journal_file import Journal
 from protocol.messages import Command, Estimate, Observation
+from protocol.mission import Anchor
 from tests.browser import (
     BOUND_MS,
     Open,
@@ -103,6 +104,36 @@ def test_the_values_of_a_series_are_those_of_the_run(noisy: Path) -> None:
                 assert at["position_error_m"] is at["position_bound_m"] is None
 
 
+def test_residuals_are_the_ranges_less_those_of_the_first_poses(noisy: Path) -> None:
+    """Of the leading poses of both, for ranges between robots; then the largest residuals are outliers."""
+    run = read(noisy)
+    assert run.setup is not None
+    held = {robot: estimates(run, robot) for robot in run.robots}
+    known_mutual = 0
+    for of_robot in series_of(run).robots:
+        setup = run.setup.robot_setup(of_robot.robot)
+        for tick in range(run.length):
+            one, peer = held[of_robot.robot][tick], held[setup.peer][tick]
+            measured = run.observations[tick][of_robot.robot].anchor_range
+            residual = of_robot.curves["anchor_residual_m"].low[tick]
+            poses, origin = (one.world, setup.anchor) if one.world else (one.local, Anchor(0.0, 0.0))
+            assert (residual is None) == (measured is None or not poses)
+            if residual is not None and measured is not None:
+                expected = math.hypot(poses[0].x - origin.x, poses[0].y - origin.y)
+                assert residual == pytest.approx(measured - expected, abs=1e-12)
+            contact, mutual = (
+                run.contact(of_robot.robot, tick),
+                of_robot.curves["mutual_residual_m"].low[tick],
+            )
+            lead = all(belief.world and belief.probabilities[0] > 0.5 for belief in (one, peer))
+            assert (mutual is None) == (contact is None or contact.range is None or not lead)
+            if mutual is not None and contact is not None and contact.range is not None:
+                apart = math.hypot(one.world[0].x - peer.world[0].x, one.world[0].y - peer.world[0].y)
+                assert mutual == pytest.approx(contact.range - apart, abs=1e-12)
+                known_mutual += 1
+    assert known_mutual > 4
+
+
 def test_no_peak_is_lost_in_a_series_of_few_bins(noisy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = series_of(read(noisy))
     monkeypatch.setattr(series_module, "MOST_BINS", 5)
@@ -170,10 +201,11 @@ def test_a_click_in_the_charts_goes_to_the_tick_whose_values_it_shows(
     one, truth = estimates(run, "a")[20], run.truth("a")[20]
     error = math.hypot(one.world[0].x - truth.x, one.world[0].y - truth.y)
     assert one.covariance is not None
-    expect(charts).to_have_attribute(
-        "aria-label",
-        re.compile(f"a {error:.2f} m, a 3 sigma {3.0 * one.covariance.position_sigma:.2f} m"),
+    off, sigma = (
+        f"{length:.2f} m" if length >= 0.095 else f"{1000.0 * length:.1f} mm"
+        for length in (error, 3.0 * one.covariance.position_sigma)
     )
+    expect(charts).to_have_attribute("aria-label", re.compile(f"a {off}, a 3 sigma {sigma}"))
     page.locator("#truth").uncheck()
     expect(charts).to_have_attribute(
         "aria-label", re.compile(r"error / 3 sigma: a 3 sigma \d\S+ m, b 3 sigma")

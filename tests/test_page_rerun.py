@@ -18,7 +18,7 @@ from compose.launch import in_process
 from compose.scenario.scenario_change import changed, values_of
 from compose.scenario.scenario_file import load, parse
 from compose.view.web.changed_missions import MOST_TICKS
-from tests.browser import Open, shot, until_loaded
+from tests.browser import Open, chromium_only, shot, until_loaded, until_shown
 from world.scenario import Scenario
 
 PAPER_1 = load("paper-1")
@@ -207,8 +207,12 @@ def test_a_start_that_is_dragged_is_where_the_mission_begins_again(opened: Open,
     [scene] = fetched(address, f"shows/changed%20{name[2]}/scenes?from=0&to=0")["scenes"]
     assert scene["players"][0]["pose"][:2] == [x, y]
     expect(page.get_by_label("start x", exact=True)).to_have_value(f"{x:g}")  # ready for the next change
+    older = opened(f"{address}#tick=7")  # from when there was one mission
+    expect(older.locator("#title")).to_have_text("paper-1")
+    until_shown(older, 7)
 
 
+@chromium_only
 def test_the_form_works_from_the_keyboard_and_saves_the_scenario(opened: Open, address: str) -> None:
     page = opened_form(opened, address)
     page.get_by_label("sensing range R in m", exact=True).nth(1).focus()
@@ -231,6 +235,7 @@ def test_the_form_works_from_the_keyboard_and_saves_the_scenario(opened: Open, a
     expect(page.locator("#changes")).to_be_hidden()
 
 
+@chromium_only
 def test_an_empty_field_and_what_the_server_refuses_run_nothing(opened: Open, address: str) -> None:
     page = opened_form(opened, address)
     sent = []

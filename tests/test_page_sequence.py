@@ -76,7 +76,7 @@ BARS = """() => {
 
 @pytest.mark.long
 def test_a_long_mission_is_shown_as_bars(opened: Open, tmp_path: Path) -> None:
-    """The reports of thousands of ticks are in the last hundred."""
+    """All reports are in the last four of thousands of ticks."""
     in_process.run_mission(load("far", faults=["loss=0.5"]), tmp_path)
     with watching(tmp_path) as (_, address):
         page = opened(f"{address}#tick=3000")

@@ -89,6 +89,7 @@ def test_a_recording_at_tick_46_shows_the_first_contact(opened: Open, address: s
 @pytest.mark.long
 def test_the_slider_reaches_the_last_tick_as_soon_as_it_is_visible(opened: Open, address: str) -> None:
     page = opened(address)
+    until_shown(page, 0)
     page.add_init_script("window.requestAnimationFrame = () => 0")  # nothing is ever drawn
     page.reload()
     scrub = page.locator("#scrub")

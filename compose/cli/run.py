@@ -16,6 +16,7 @@ from compose.extras import need
 from compose.launch import processes, supervisor
 from compose.launch.signals import stop_by_signal
 from compose.launch.viewers import Viewer, foxglove_server, page, stay, viewing
+from compose.recording.kills_file import KILLS
 from compose.recording.recording_files import folder_for
 from compose.recording.run import Run, read
 from compose.scenario.kills import Kill
@@ -92,7 +93,7 @@ def run_one(options: argparse.Namespace) -> int:
     """Run one mission, whose `scenario` and `seed` are single values, and return its exit status."""
     found = setting(options.scenario, options.fault, options.planner, options.planner_option)
     scenario = found.seeded(options.seed)
-    if options.out is not None and any(options.out.glob("*.journal")):
+    if options.out is not None and (any(options.out.glob("*.journal")) or (options.out / KILLS).exists()):
         raise UserError(f"--out: {options.out} already contains a recording; choose another folder")
     _check_viewers(options)
     if options.export:

@@ -6,8 +6,10 @@ The launcher writes the file beside the journals. Those do not show that a proce
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
+from msgspec import Meta
 
 from compose.recording.recording_files import KINDS, WORLD_JOURNAL, agent_journal
 from compose.scenario.kills import WORLD, Kill, Point
@@ -19,6 +21,9 @@ from protocol.wire import MAX_FRAME_BYTES, decode
 
 KILLS = "kills.jsonl"
 """The file's name."""
+MOST_BYTES = 1 << 20
+"""The greatest size of the file that is read, about 14 000 lines."""
+_Count = Annotated[int, Meta(ge=0)]
 
 
 class Killed(msgspec.Struct, frozen=True):
@@ -26,12 +31,12 @@ class Killed(msgspec.Struct, frozen=True):
 
     who: str
     """The id of a robot, or WORLD."""
-    tick: int
+    tick: _Count
     point: Point
     """The point of the tick at which it was killed."""
-    after: float | None
+    after: Annotated[float, Meta(ge=0.0)] | None
     """Time in s until it was started again; None if it was not."""
-    replayed_ticks: int
+    replayed_ticks: _Count
     """The number of ticks in its journal. Started again, it replays them before it goes on."""
 
 
@@ -54,13 +59,17 @@ def add_kill(folder: Path, kill: Kill) -> None:
 def kills_in(folder: Path) -> tuple[Killed, ...]:
     """Return the processes that were killed in the run recorded in `folder`, in the order of the file.
 
-    Raises OSError if the file cannot be read, and CorruptJournal if a line is not that of a process.
+    Raises OSError if the file cannot be read, and CorruptJournal if a line is not that of a process or there
+    are more than MOST_BYTES.
     """
     path = folder / KILLS
     try:
-        content = files.read_bytes(path)
+        with files.open_file(path) as file:
+            content = file.read(MOST_BYTES + 1)
     except FileNotFoundError:
         return ()
+    if len(content) > MOST_BYTES:
+        raise CorruptJournal(f"{path}: it is larger than {MOST_BYTES} bytes")
     found = []
     for number, line in enumerate(content.split(b"\n")[:-1], 1):  # a line without an end is being written
         try:

@@ -118,9 +118,10 @@ def _searching(pair: PairData) -> Iterator[Caption]:
         return
     parts = []
     if all(_knows_path(pair.held(robot)[1]) for robot in pair.ids):
-        subject = "Each robot" if len(pair.ids) > 1 else pair.ids[0]
+        subject = "each robot" if len(pair.ids) > 1 else pair.ids[0]
         what = "knows its path" if pair.exact else "has an estimate of its path"
-        parts.append(f"{subject} {what} relative to its anchor, but not on which side of it.")
+        around = "but turned around the anchor by an unknown angle"
+        parts.append(f"After a short drive, {subject} {what} relative to its anchor, {around}.")
     if max(phases) < 3:
         parts.append(_search(pair.robots))
     if parts:
@@ -197,6 +198,9 @@ def _fitting(pair: PairData) -> Iterator[Caption]:
         else:
             now = f" now, instead of {_count(had)}" if had else " what was measured and reported"
             fit = "configuration of the robots fits" if has == 1 else "configurations of the robots fit"
+            if not had and has > 1:
+                one, other = pair.robots[0].id, pair.robots[0].peer
+                fit = f"configurations, each with one pose of {one} and one of {other}, fit"
             text = f"{for_whom}{_count(has)} {fit}{now}{_most_probable(pair, robots[0])}"
             yield Caption("configurations", _sentence(text), pair.ids)
 
@@ -236,7 +240,8 @@ def _planning(pair: PairData) -> Iterator[Caption]:
         else:
             count = _count(len(held.world))
             text = (
-                f"{robot} makes one manoeuvre, chosen so that the {count} predict distances that differ most."
+                f"{robot} makes one manoeuvre, chosen so that the {count} predict distances that differ "
+                "most: then the next measured distance can tell which one is true."
             )
         yield Caption("manoeuvre", text, pair.ids)
     appeared = [r for r in pair.ids if _appeared(*pair.held(r)) and pair.state(r) == "surveying"]
@@ -313,12 +318,18 @@ def _end(setup: RunSetup, now: TickData, end: MissionEnd) -> Caption:
                 truth=" ".join(filter(None, [silent, largest])) or None,
             )
         case "inconsistent":
-            text = f"The mission ends, because measurements and reports contradict each other{why}"
-            return Caption("end", text, truth=largest)
+            text = "The mission ends, because measurements and reports contradict each other"
+            return Caption("end", _stopped(text) if _just_told(setup, now) else f"{text}{why}", truth=largest)
         case "wrong":
             return Caption("end", f"The mission ends with a wrong claim{why}", truth=largest)
         case _:
             return Caption("end", f"The mission fails{why}", truth=largest)
+
+
+def _just_told(setup: RunSetup, now: TickData) -> bool:
+    """Return whether a robot of the only pair has found the contradiction: its caption has the reason."""
+    verdicts = [now.commands[robot].verdict for robot in setup.ids if robot in now.commands]
+    return len(setup.robots) == 2 and any(isinstance(verdict, Inconsistent) for verdict in verdicts)
 
 
 def _silent_links(setup: RunSetup) -> str | None:

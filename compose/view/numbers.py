@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import msgspec
 from msgspec import UNSET, UnsetType
 
 from compose.view.outlines import SIGMAS
 from compose.view.scene import Player
+from protocol.mission import Anchor
+from protocol.motion import Pose
 from world.referee import errors
 
 
@@ -26,10 +30,14 @@ class Numbers(msgspec.Struct, frozen=True):
     """SIGMAS times the robot's standard deviation of the first pose's position."""
     anchor_range_m: float | UnsetType = UNSET
     mutual_range_m: float | UnsetType = UNSET
+    anchor_residual_m: float | UnsetType = UNSET
+    """The range to the anchor, less that from the first pose."""
+    mutual_residual_m: float | UnsetType = UNSET
+    """The range to the peer, less the distance between the leading poses of both in the world frame."""
 
     @staticmethod
-    def of(player: Player) -> Numbers:
-        """Return the numbers of a robot's scene."""
+    def of(player: Player, anchor: Anchor, peer: Player) -> Numbers:
+        """Return the numbers of a robot's scene, with the place of its anchor and the scene of its peer."""
         held = player.held
         hypotheses = held.world or held.local if held is not None else ()
         world = held.world if held is not None else ()
@@ -39,6 +47,13 @@ class Numbers(msgspec.Struct, frozen=True):
         if held is not None and hypotheses:
             probability = held.probability[0] if held.probability else 1.0 / len(hypotheses)
         leads = probability is not UNSET and probability > 0.5
+        expected = None
+        if world:
+            expected = math.hypot(world[0].x - anchor.x, world[0].y - anchor.y)
+        elif hypotheses:
+            expected = math.hypot(hypotheses[0].x, hypotheses[0].y)
+        own, other = _leading(player), _leading(peer)
+        apart = errors(own, other)[0] if own is not None and other is not None else None
         distances = [errors(pose, player.pose)[0] for pose in world] if player.pose is not None else []
         return Numbers(
             hypotheses=len(hypotheses) if held is not None else UNSET,
@@ -47,11 +62,26 @@ class Numbers(msgspec.Struct, frozen=True):
             position_bound_m=SIGMAS * covariance.position_sigma if covariance is not None else UNSET,
             anchor_range_m=player.anchor_range if player.anchor_range is not None else UNSET,
             mutual_range_m=ranges[0] if ranges else UNSET,
+            anchor_residual_m=_residual(player.anchor_range, expected),
+            mutual_residual_m=_residual(ranges[0] if ranges else None, apart),
         )
 
     def encode(self) -> bytes:
         """Return the numbers as a JSON object."""
         return msgspec.json.encode(self)
+
+
+def _leading(player: Player) -> Pose | None:
+    """Return the pose in the world frame that is more probable than all others together, if there is one."""
+    held = player.held
+    if held is None or not held.world:
+        return None
+    probability = held.probability[0] if held.probability else 1.0 / len(held.world)
+    return held.world[0] if probability > 0.5 else None
+
+
+def _residual(measured: float | None, expected: float | None) -> float | UnsetType:
+    return measured - expected if measured is not None and expected is not None else UNSET
 
 
 HYPOTHESES, RANGES = "Hypotheses", "Ranges, m"

@@ -133,6 +133,8 @@ class Journals:
     def _read_kills(self) -> None:
         try:
             kills = kills_in(self.folder)
+        except OSError as error:
+            self._note(f"{files.error_text(error)}; the processes that were killed are not shown")
         except CorruptJournal as error:
             self._note(str(error))
         else:

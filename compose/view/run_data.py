@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
@@ -66,6 +66,14 @@ class TickData(msgspec.Struct, frozen=True):
     """The number of ticks that the process of a robot in `back` replayed, if it was killed on purpose."""
 
 
+class Absence(NamedTuple):
+    """The ticks in which a killed process was gone."""
+
+    killed: Killed
+    last: int
+    """The latest of these ticks that is known."""
+
+
 class RunData:
     """The data of a run, collected while messages arrive."""
 
@@ -85,8 +93,10 @@ class RunData:
         """Robots whose process was seen and has ended; None is the world."""
         self._complete = -1
         """The latest tick that the world's journal has completely."""
-        self._kills: list[Killed] = []
-        """The processes that were killed and are not known to be back."""
+        self._kills: dict[int, list[Killed]] = {}
+        """The processes that were killed in ticks after `_complete`, by tick."""
+        self._absences: dict[str | None, Absence] = {}
+        """The latest absence of each process that was killed and is not known to be back."""
         self.touched: int | None = None
         """The earliest tick that has changed since the user of this object last set this to None."""
 
@@ -129,37 +139,55 @@ class RunData:
             data.commands.setdefault(robot, command)
         data.late.update({robot.id for robot in tick.world.scenario.robots} - tick.commands.keys())
         self._complete = tick.truth.tick
-        self._add_absences()
+        self._extend_absences()
+        for killed in self._kills.pop(self._complete, ()):
+            self._begin_absence(killed)
 
     def add_kills(self, kills: Iterable[Killed]) -> None:
-        """Add processes that were killed."""
-        self._kills += kills
-        self._add_absences()
+        """Add processes that were killed; those that are no process of the mission are ignored."""
+        for killed in kills:
+            if killed.tick <= self._complete:
+                self._begin_absence(killed)
+            else:
+                self._kills.setdefault(killed.tick, []).append(killed)
 
     def add_final_reports(self, reports: Mapping[str, FinalReport]) -> None:
         """Add the FinalReports of the world's journal, after all of its ticks."""
         self.final_reports.update(reports)
-        self._add_absences()
+        self._extend_absences()
 
-    def _add_absences(self) -> None:
-        """Add the ticks of killed processes: that of the kill, and those after it with a missed deadline.
+    def _begin_absence(self, killed: Killed) -> None:
+        """Add the absence of a process from the tick of its kill, which is complete."""
+        robot = None if killed.who == WORLD else killed.who
+        data = self.ticks[killed.tick]
+        if robot is None or robot in data.truth:
+            if robot not in data.down:
+                self.at(killed.tick).down.add(robot)
+            self._absences[robot] = Absence(killed, killed.tick)
+            self._extend_absence(robot)
+
+    def _extend_absences(self) -> None:
+        for robot in list(self._absences):
+            self._extend_absence(robot)
+
+    def _extend_absence(self, robot: str | None) -> None:
+        """Extend the absence of a process by the complete ticks after it whose deadline the process missed.
 
         A process that is started again is back when a tick after it is complete, or its FinalReport is known:
         it goes on only if what it replayed is identical to its journal.
         """
-        for killed in [killed for killed in self._kills if killed.tick <= self._complete]:
-            robot = None if killed.who == WORLD else killed.who
-            last = killed.tick
-            while last < self._complete and robot in self.ticks[last + 1].late:
-                last += 1
-            for tick in range(killed.tick, last + 1):
-                if robot not in self.ticks[tick].down:
-                    self.at(tick).down.add(robot)
-            reported = self.end is not None and (robot is None or robot in self.final_reports)
-            if killed.after is not None and (last < self._complete or reported):
+        killed, last = self._absences[robot]
+        while last < self._complete and robot in self.ticks[last + 1].late:
+            last += 1
+            if robot not in self.ticks[last].down:
+                self.at(last).down.add(robot)
+        self._absences[robot] = Absence(killed, last)
+        reported = self.end is not None and (robot is None or robot in self.final_reports)
+        if last < self._complete or reported:
+            del self._absences[robot]
+            if killed.after is not None:
                 self.at(last).back.add(robot)
                 self.ticks[last].replayed[robot] = killed.replayed_ticks
-                self._kills.remove(killed)
 
     def add_observations(self, worlds: Iterable[World]) -> None:
         """Add the Observations that are still missing in the ticks of `worlds`."""

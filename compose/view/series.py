@@ -57,10 +57,17 @@ def series(
     for one in setup.robots:
         if robots is not None and one.id not in robots:
             continue
+        peer = setup.robot_setup(one.peer)
         bins: list[list[Numbers]] = []
         for begin in range(first, last + 1, step):
             data = [known.ticks.get(tick) for tick in range(begin, min(begin + step, last + 1))]
-            bins.append([Numbers.of(player_of(one, now)) for now in data if now is not None])
+            bins.append(
+                [
+                    Numbers.of(player_of(one, now), one.anchor, player_of(peer, now))
+                    for now in data
+                    if now is not None
+                ]
+            )
         curves = {name: _curve(name, bins) for name in Numbers.__struct_fields__}
         found.append(
             RobotSeries(

@@ -147,6 +147,9 @@ class Views:
         at = shapes.timestamp(nanoseconds(self.setup, scene.tick))
         yield Shown("/tf", fox.FrameTransforms(transforms=list(self._transforms(scene, at))))
         for player in scene.players:
+            robot_setup = self.setup.robot_setup(player.robot)
+            numbers = Numbers.of(player, robot_setup.anchor, scene.player(robot_setup.peer))
+            yield Shown(f"/{player.robot}/numbers", numbers)
             yield from self._robot(player, at)
         yield Shown("/contact", fox.SceneUpdate(entities=list(self._contacts(scene, at))))
 
@@ -168,7 +171,6 @@ class Views:
 
     def _robot(self, player: Player, at: fox.Timestamp) -> Iterator[Shown]:
         robot, robot_setup = player.robot, self.setup.robot_setup(player.robot)
-        yield Shown(f"/{robot}/numbers", Numbers.of(player))
         if player.pose is not None:
             pose = fox.PoseInFrame(timestamp=at, frame_id=WORLD, pose=shapes.pose(player.pose))
             yield Shown(f"/{robot}/pose", pose)

@@ -154,5 +154,12 @@ def _colours() -> list[int]:
         for colour in named.values()
         for share in SHARES
     ]
+    shades += [
+        [round(0.8 * part + 0.2 * over) for part, over in zip(named[robot], named["ink"], strict=True)]
+        for robot in ("robot-a", "robot-b")
+    ]  # contact on the time line
+    shades.append(
+        [round(0.05 * part + 0.95 * back) for part, back in zip(named["accent"], named["paper"], strict=True)]
+    )  # the range of an anchor
     parts = [part for shade in shades for part in shade]
     return parts + [0] * (3 * 256 - len(parts))

@@ -3,6 +3,7 @@
 import { shown } from "./configurations.js";
 import { between, compose, distance, ellipse, frame_of, step, TAU } from "./geometry.js";
 import { held_now } from "./held.js";
+import { NAME } from "./labels.js";
 import { cross, fading, shape } from "./pen.js";
 import { probability } from "./words.js";
 
@@ -38,7 +39,7 @@ export class Beliefs {
       const colour = tints.length ? look.tint(tints[place]) : look.ghost;
       pen.strokeStyle = colour;
       pen.lineWidth = tints.length ? 2.6 : 2;
-      pen.setLineDash(held.world.length || !truth ? [] : [3, 3]);
+      pen.setLineDash(held.world.length || !truth || size <= 6 ? [] : [3, 3]);
       pen.stroke();
       pen.setLineDash([]);
       const many = held.probability.length > 1 && chance > 0.01;
@@ -49,7 +50,7 @@ export class Beliefs {
       if (!truth && place === 0 && player.down) cross(pen, x, y, grown, look);
       if (!truth && place === 0) {
         const name = player.down ? `${robot.id} is down` : robot.id;
-        labels.put(name, x + grown + 3, y - grown, look.ink, "left", { font: look.bold, name: true, around: grown + 3 });
+        labels.put(name, x + grown + 3, y - grown, look.ink, "left", { font: look.bold, rank: NAME, around: grown + 3 });
       }
     });
     pen.globalAlpha = 1;

@@ -24,7 +24,7 @@ export class Cards {
     this.roster.hidden = !this.many;
     this.roster.replaceChildren();
     this.entries = new Map();
-    this.order = "";
+    this.order = this.ranked = "";
     if (!this.many) return;
     this.counts = this.roster.appendChild(make("p", { id: "counts" }));
     for (const robot of store.stage.robots) {
@@ -51,8 +51,11 @@ export class Cards {
       if (this.root.children[shown.indexOf(robot)] !== card.root) this.root.append(card.root);
       card.draw(store, tick, truth, focus === robot.id);
     }
-    if (this.many) this.#rank(tick);
-    for (const [id, entry] of this.entries ?? []) {
+    const key = [tick, focus, store.revision, Boolean(store.scene(tick))].join();
+    if (!this.many || key === this.ranked) return;
+    this.ranked = key;
+    this.#rank(tick);
+    for (const [id, entry] of this.entries) {
       const player = store.player(tick, id), phase = player ? store.phase(tick, id) : 0;
       const text = `${id} ${player?.down ? "is down" : player?.command?.state ?? "–"}`;
       if (entry.textContent !== text) entry.textContent = text;
@@ -98,8 +101,9 @@ class Card {
 
   #row(name, text) {
     if (!this.fields.has(name)) {
-      const value = make("dd", {});
-      this.rows.append(make("dt", { textContent: name }), value);
+      const value = make("dd", {}), title = make("dt", { textContent: name });
+      value.dataset.row = title.dataset.row = name;
+      this.rows.append(title, value);
       this.fields.set(name, value);
     }
     const value = this.fields.get(name);

@@ -1,4 +1,4 @@
-// The charts: four strips with the numbers of a pair of robots over time. A click or a drag goes to a tick.
+// The charts: six strips with the numbers of a pair of robots over time. A click or a drag goes to a tick.
 
 import * as data from "./data.js";
 import { unit } from "./pen.js";
@@ -8,7 +8,7 @@ const TOP = 17;
 const TALL = 46;
 /** The height of a strip in a window lower than LOW. */
 const FLAT = 34;
-const LOW = 700;
+const LOW = 900;
 const AXIS = 16;
 const GAP = 26;
 const LEFT = 46;
@@ -43,7 +43,17 @@ const STRIPS = [
       return { low: 0, high, marks: [0, high], unit: " m" };
     },
   },
+  {
+    title: "residuals of ranges to anchors", curves: ["anchor_residual_m"], text: metres, none: "no expected ranges in these ticks",
+    scale: both_sides,
+  },
+  {
+    title: "residuals of ranges between robots", curves: ["mutual_residual_m"], text: metres, none: "no expected ranges in these ticks",
+    scale: both_sides,
+  },
 ];
+/** The curves that the two robots have in common. */
+const MUTUAL = new Set(["mutual_range_m", "mutual_residual_m"]);
 
 export class Charts {
   /** `box` is the details element that opens the charts; nothing is read or drawn while it is closed. */
@@ -217,7 +227,7 @@ export class Charts {
       const curves = this.#series?.robots.find((one) => one.robot === robot.id)?.curves ?? {};
       for (const name of strip.curves) {
         if (name === "position_error_m" && !truth) continue;
-        if (name === "mutual_range_m" && found.some((one) => one.name === name)) continue;
+        if (MUTUAL.has(name) && found.some((one) => one.name === name)) continue;
         if (curves[name]) found.push({ robot, name, ...curves[name] });
       }
     }
@@ -283,10 +293,10 @@ export class Charts {
     pen.rect(LEFT, 0, this.#wide, this.tall);
     pen.clip();
     for (const { robot, name, low, high } of curves) {
-      const hue = of(name === "mutual_range_m" ? "link" : `robot-${robot.role}`);
+      const hue = of(MUTUAL.has(name) ? "link" : `robot-${robot.role}`);
       pen.strokeStyle = pen.fillStyle = hue;
       if (name === strip.band) this.#band(pen, high, y);
-      else this.#line(pen, low, high, y, name === "mutual_range_m" ? [] : DASHES[robot.role]);
+      else this.#line(pen, low, high, y, MUTUAL.has(name) ? [] : DASHES[robot.role]);
     }
     pen.restore();
   }
@@ -361,7 +371,7 @@ export class Charts {
       for (const { robot, name, text } of joined(values).toReversed()) {
         const width = pen.measureText(text).width;
         if (end - width < least) break; // a screen reader is told all values
-        pen.fillStyle = of(name === "mutual_range_m" ? "link" : `robot-${robot.role}`);
+        pen.fillStyle = of(MUTUAL.has(name) ? "link" : `robot-${robot.role}`);
         pen.fillText(text, end, top - 5);
         end -= width + 10;
       }
@@ -378,7 +388,7 @@ function valued({ text }, { low, high }, bin) {
   return least === most ? most : `${least} to ${most}`;
 }
 
-const who = (robot, name) => (name === "mutual_range_m" ? `${robot.id} to ${robot.peer}` : name === "position_bound_m" ? `${robot.id} 3 sigma` : robot.id);
+const who = (robot, name) => (MUTUAL.has(name) ? `${robot.id} to ${robot.peer}` : name === "position_bound_m" ? `${robot.id} 3 sigma` : robot.id);
 
 /** Returns the texts above a strip, with the error and 3 sigma of a robot in one, in the same unit if they have the same. */
 function joined(values) {
@@ -392,6 +402,13 @@ function joined(values) {
     } else found.push({ ...one, text: `${one.robot.id} ${one.text}` });
   }
   return found;
+}
+
+/** Returns a scale with 0 in its middle. */
+function both_sides({ least, most }) {
+  const size = Math.max(-least, most, LEAST_M), power = 10 ** Math.floor(Math.log10(size));
+  const high = [1, 2, 3, 5, 10].map((factor) => factor * power).find((one) => one >= size);
+  return { low: -high, high, marks: [-high, 0, high], unit: " m" };
 }
 
 /** Returns a logarithmic scale from a power of ten to another. */

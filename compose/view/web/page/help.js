@@ -17,4 +17,7 @@ export function fill_help(keys, signs, legend) {
     item.dataset.phase = phase;
     legend.append(item);
   }
+  const outlined = make("li", { textContent: "outlined: a possible pose" });
+  outlined.dataset.sign = "outlined";
+  legend.append(outlined);
 }

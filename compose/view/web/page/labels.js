@@ -2,6 +2,8 @@
 
 const GAP = 2;
 const LEAST_ALPHA = 0.9;
+/** The rank of the names of robots. */
+export const NAME = 2;
 
 export class Labels {
   /** Starts a picture of `width` x `height`; labels keep clear of `obstacles`, [left, top, right, bottom]. */
@@ -12,21 +14,23 @@ export class Labels {
   }
 
   /**
-   * Asks for a label at (x, y). Names are placed first; any other label is left out where there is no room for it.
+   * Asks for a label at (x, y). A label is left out where there is no room for it; those of higher `rank` are placed first.
    *
-   * `align` is "left", "right" or "center"; `around` is the distance to what is labelled, for places on its other sides.
+   * `align` is "left", "right" or "center"; `around` is the distance to what is labelled, for places on its other sides;
+   * `others` are further positions [x, y].
    */
-  put(text, x, y, colour, align, { font = this.look.font, name = false, around = 0 } = {}) {
-    this.asked.push({ text, x, y, colour, align, font, name, around, alpha: this.pen.globalAlpha });
+  put(text, x, y, colour, align, { font = this.look.font, rank = 0, around = 0, others = [] } = {}) {
+    this.asked.push({ text, x, y, colour, align, font, rank, around, others, alpha: this.pen.globalAlpha });
   }
 
   draw() {
     const { pen } = this;
-    for (const one of [...this.asked].sort((a, b) => b.name - a.name)) {
+    for (const one of [...this.asked].sort((a, b) => b.rank - a.rank)) {
       pen.font = one.font;
       const wide = pen.measureText(one.text).width, tall = Number(/(\d+(\.\d+)?)px/.exec(one.font)[1]);
-      const spot = this.#spots(one, tall).map(([x, y, align]) => ({ x, y, align, box: box_of(x, y, align, wide, tall) }))
-        .find(({ box }) => this.#free(box, one.name));
+      const spots = [[one.x, one.y], ...one.others].flatMap(([x, y]) => this.#spots({ ...one, x, y }, tall));
+      const spot = spots.map(([x, y, align]) => ({ x, y, align, box: box_of(x, y, align, wide, tall) }))
+        .find(({ box }) => this.#free(box));
       if (!spot) continue;
       this.placed.push(spot.box);
       this.drawn.push({ text: one.text, box: spot.box });
@@ -42,11 +46,11 @@ export class Labels {
   }
 
   /** Returns places for a label: where it is asked for, then mirrored, then farther away. */
-  #spots({ x, y, align, around, name }, tall) {
+  #spots({ x, y, align, around, rank }, tall) {
     const other = { left: "right", right: "left", center: "center" }[align], beside = align === "left" ? -2 * around : 2 * around;
     const mirrored = align === "center" ? [x, y, align] : [x + beside, y, other];
     const spots = [[x, y, align], mirrored];
-    for (let row = 1; row <= (name ? 4 : 2); row++) {
+    for (let row = 1; row <= (rank ? 4 : 2); row++) {
       for (const dy of [row * (tall + GAP), -row * (tall + GAP)]) spots.push([x, y + dy, align], [mirrored[0], y + dy, other]);
     }
     return spots;

@@ -123,8 +123,8 @@ async function on_list(list) {
     }
     return;
   }
-  const { show } = address_state();
-  const chosen = list.shows.find((one) => one.name === show) ?? (list.shows.length === 1 ? list.shows[0] : null);
+  const { show, tick } = address_state(); // an address with a tick and no mission is that of the only one at that time
+  const chosen = list.shows.find((one) => one.name === show) ?? (list.shows.length === 1 || (!show && tick !== null) ? list.shows[0] : null);
   if (chosen && chosen.name !== store?.name) await open(chosen.name);
   else if (!chosen && !(store && list.shows.some((one) => one.name === store.name) && show)) show_list();
 }
@@ -288,11 +288,14 @@ function draw() {
     store.want(view.tick);
     view.moving = (view.playing || view.driven) && !still.matches && (view.guided || view.speed <= 60);
     view.eliminated = guide.eliminated(view);
+    // First the texts: they decide the size of the plane, and its camera and its labels keep clear of them.
+    controls();
+    text($("caption"), guide.text(view));
+    predictions.draw(view, store, guide.pair(view.focus));
     if (plane.following) plane.follow(view, store, guide.pair(view.focus), still.matches ? null : now);
     document.body.dataset.tick = view.tick;
     document.body.dataset.shown = store.scene(view.tick) ? view.tick : "";
     tell_state({ shown: store.scene(view.tick) ? view.tick : null, first: store.first, last: store.last });
-    predictions.draw(view, store, guide.pair(view.focus));
     plane.draw(store, view);
     const size = [$("canvas").clientWidth, $("canvas").clientHeight];
     tip.draw({ ...view, store }, plane.hovered ?? plane.targets.find((one) => same(one, view.selected)), size, plane.unit);
@@ -301,8 +304,6 @@ function draw() {
     timeline.draw(view, activities(store, view));
     sequence.draw(store, view);
     charts.draw(store, view, guide.pair(view.focus));
-    controls();
-    text($("caption"), guide.text(view));
     const news = view.playing && view.guided ? null : announcer.text(store, view, now);
     if (news !== null) text($("live"), news);
     if (view.playing || plane.easing) draw();

@@ -1,22 +1,25 @@
 // The plane in one tick: anchors, trails, robots, ranges, reports and beliefs.
 
+import { Backdrop } from "./backdrop.js";
 import { Beliefs } from "./beliefs.js";
 import { Configurations } from "./configurations.js";
 import { scenario_discs, story_discs, true_and_reported } from "./camera.js";
 import { distance, TAU } from "./geometry.js";
-import { Labels } from "./labels.js";
+import { Labels, NAME } from "./labels.js";
 import { cross, Look, shape, unit } from "./pen.js";
 import { same, under } from "./selection.js";
 import { Signals } from "./signals.js";
 import { Tints } from "./tints.js";
-import { pose_now, REPORTED, Trails, TRUE } from "./trails.js";
+import { kinds_of, pose_now, REPORTED, Trails, TRUE } from "./trails.js";
 import { metres } from "./words.js";
 
 /** The time in s in which the camera covers most of the way to where it is needed. */
 const EASE_S = 0.45;
 /** The distance in pixels from which on the camera is where it is needed. */
 const NEAR_PX = 0.5;
+/** The height in pixels of a list of predicted distances in one line, and the part of it that is in the margin of a picture. */
 const LIST_PX = 42;
+const CLEAR_PX = 12;
 /** The distance in pixels that a pointer moves before it drags the plane instead of selecting what is there. */
 const DRAG_PX = 4;
 /** The least distance in m between a reported and a true position that counts as a difference. */
@@ -42,6 +45,7 @@ export class Plane {
     this.targets = [];
     this.#redraw = redraw;
     this.#trails = new Trails(this);
+    this.#backdrop = new Backdrop(this, this.#trails);
     this.#beliefs = new Beliefs(this);
     this.#signals = new Signals(this);
     this.#configurations = new Configurations(this);
@@ -79,6 +83,8 @@ export class Plane {
 
   #redraw;
   #trails;
+  #backdrop;
+  #size = [0, 0];
   #beliefs;
   #signals;
   #configurations;
@@ -103,9 +109,12 @@ export class Plane {
     Object.assign(this, { centre: [x, y], scale });
   }
 
-  get width() { return this.canvas.clientWidth / unit(); }
+  get width() { return this.#size[0]; }
   get unit() { return unit(); }
-  get height() { return this.canvas.clientHeight / unit(); }
+  get height() { return this.#size[1]; }
+
+  /** Reads the size of the canvas, which the browser may have to compute. */
+  #measure() { this.#size = [this.canvas.clientWidth / unit(), this.canvas.clientHeight / unit()]; }
 
   #free() {
     this.fitted = this.following = this.easing = false;
@@ -135,10 +144,10 @@ export class Plane {
     const { robots, mission } = store.stage, reach = mission.sensing_range;
     if (!truth && focus) {
       const { anchor, orbit } = robots.find((robot) => robot.id === focus);
-      return this.#frame([[anchor, Math.max(reach, orbit[0]) + reach]]);
+      return this.#frame([[anchor, Math.max(reach, orbit[0]) + reach]], LIST_PX - CLEAR_PX);
     }
     const chosen = focus && robots.length > 2 ? robots.filter((r) => r.id === focus || r.peer === focus) : robots;
-    return this.#frame(scenario_discs(chosen, reach));
+    return this.#frame(scenario_discs(chosen, reach), LIST_PX - CLEAR_PX);
   }
 
   /** Zooms to the robots and to all poses that they consider possible, or to those of the selected robot's pair. */
@@ -150,7 +159,7 @@ export class Plane {
       const poses = [...(truth ? true_and_reported(player) : []), ...(player?.held?.world ?? [])];
       discs.push(...(poses.length ? poses.map((pose) => [pose, 0.3 * reach]) : [[robot.anchor, reach]]));
     }
-    this.#frame(discs);
+    this.#frame(discs, this.#list_height());
     this.#free();
     this.#redraw();
   }
@@ -158,6 +167,7 @@ export class Plane {
   /** Eases the camera to what the story needs in view; without delay if `now`, in ms, is null. */
   follow(view, store, pair, now) {
     this.fitted = false;
+    this.#measure();
     const { scale, centre } = this.#framed(story_discs({ ...view, truth: view.truth, store }, pair), this.#list_height());
     const s = now === null ? Infinity : Math.min(now - (this.easing || now - 16), 250) / 1000;
     const part = 1 - Math.exp(-s / EASE_S);
@@ -171,10 +181,10 @@ export class Plane {
   /** Returns the height in pixels of the list of predicted distances, of which the camera keeps clear. */
   #list_height() {
     const over = this.canvas.parentElement.querySelector("#over");
-    return Math.max(over.offsetTop + over.offsetHeight, LIST_PX) / unit() - 12;
+    return Math.max(over.offsetTop + over.offsetHeight, LIST_PX) / unit() - CLEAR_PX;
   }
 
-  #frame(discs) { Object.assign(this, this.#framed(discs)); }
+  #frame(discs, top) { Object.assign(this, this.#framed(discs, top)); }
 
   /** Returns the scale and the centre with which `discs` are in view, below the uppermost `top` pixels. */
   #framed(discs, top = 0) {
@@ -203,6 +213,7 @@ export class Plane {
   }
 
   draw(store, { tick, share, focus, truth, moving, eliminated, selected }) {
+    this.#measure();
     const ratio = (window.devicePixelRatio || 1) * unit();
     const width = Math.round(this.width * ratio), height = Math.round(this.height * ratio);
     if (this.canvas.width !== width || this.canvas.height !== height) {
@@ -224,14 +235,13 @@ export class Plane {
     pen.font = look.font;
     const view = { store, tick, share, focus, truth, moving, eliminated, look, scene: store.scene(tick) };
     this.labels = new Labels(pen, look, this.width, this.height, this.#overlays());
-    this.#grid(view);
     const shown = (robot) => truth || !focus || robot.id === focus;
     const robots = store.stage.robots.filter(shown);
-    for (const robot of robots) this.#anchor(view, robot);
-    if (truth) {
-      for (const robot of robots) this.#trails.trail(view, robot);
-      for (const robot of robots) if (robot.attack) this.#trails.trail(view, robot, REPORTED);
-    } else for (const robot of robots) this.#trails.believed_trail(view, robot);
+    this.#backdrop.draw(view, robots, ratio);
+    for (const robot of robots) {
+      if (!truth) this.#trails.believed_trail(view, robot);
+      else for (const kind of kinds_of(robot)) this.#trails.newest(pen, view, robot, kind);
+    }
     if (view.scene) this.#scene(view, robots);
     this.#ring(this.targets.find((one) => same(one, selected)), look);
     this.canvas.style.cursor = this.hovered ? "pointer" : "";
@@ -287,8 +297,9 @@ export class Plane {
     pen.stroke();
     pen.setLineDash([]);
     const text = `${robot.id} reported, ${metres(distance(pose, true_pose))} off`;
-    const half = pen.measureText(text).width / 2, middle = Math.min(Math.max((x + to_x) / 2, half), this.width - half);
-    this.labels.put(text, middle, (y + to_y) / 2 - 12, look.fault, "center");
+    const half = pen.measureText(text).width / 2;
+    const along = (part) => [Math.min(Math.max(x + part * (to_x - x), half), this.width - half), y + part * (to_y - y) - 12];
+    this.labels.put(text, ...along(0.5), look.fault, "center", { rank: 1, others: [along(0), along(1)] });
     if (size > 6) this.labels.placed.push([x - size, y - size, x + size, y + size]);
     pen.globalAlpha = 1;
   }
@@ -300,66 +311,6 @@ export class Plane {
       const box = one.getBoundingClientRect();
       return [(box.left - left) / scale, (box.top - top) / scale, (box.right - left) / scale, (box.bottom - top) / scale];
     });
-  }
-
-  // --- grid and anchors ---
-
-  #grid({ look }) {
-    const pen = this.context, raw = Math.min(80, this.width / 9) / this.scale, power = 10 ** Math.floor(Math.log10(raw));
-    const unit = [1, 2, 5, 10].find((factor) => factor * power >= raw) * power;
-    pen.strokeStyle = look.grid;
-    pen.lineWidth = 1;
-    pen.beginPath();
-    const left = this.centre[0] - this.width / 2 / this.scale, right = left + this.width / this.scale;
-    const low = this.centre[1] - this.height / 2 / this.scale, high = low + this.height / this.scale;
-    for (let x = Math.ceil(left / unit) * unit; x <= right; x += unit) {
-      const px = Math.round(this.at([x, 0])[0]) + 0.5;
-      pen.moveTo(px, 0); pen.lineTo(px, this.height);
-    }
-    for (let y = Math.ceil(low / unit) * unit; y <= high; y += unit) {
-      const py = Math.round(this.at([0, y])[1]) + 0.5;
-      pen.moveTo(0, py); pen.lineTo(this.width, py);
-    }
-    pen.stroke();
-    const bar = unit * this.scale, x = this.width - 14, y = this.height - 14;
-    pen.strokeStyle = pen.fillStyle = look.faint;
-    pen.lineWidth = 2;
-    pen.beginPath();
-    pen.moveTo(x - bar, y - 4); pen.lineTo(x - bar, y); pen.lineTo(x, y); pen.lineTo(x, y - 4);
-    pen.stroke();
-    pen.textAlign = "right";
-    pen.fillText(unit >= 1 ? `${unit} m` : metres(unit), x - 5, y - 5);
-    this.labels.placed.push([x - Math.max(bar, 60), y - 18, x, y + 4]);
-  }
-
-  #anchor(view, robot) {
-    const { look, store, focus } = view, pen = this.context;
-    const [x, y] = this.at(robot.anchor), reach = store.stage.mission.sensing_range * this.scale;
-    const mine = !focus || robot.id === focus || robot.peer === focus;
-    pen.globalAlpha = mine ? 1 : 0.45;
-    pen.beginPath();
-    pen.arc(x, y, reach, 0, TAU);
-    pen.fillStyle = look.disc;
-    pen.fill();
-    pen.setLineDash([]);
-    pen.lineWidth = 1.2;
-    pen.strokeStyle = look.ring;
-    pen.stroke();
-    pen.beginPath();
-    pen.arc(x, y, robot.orbit[0] * this.scale, 0, TAU);
-    pen.setLineDash([7, 4, 1.5, 4]);
-    pen.lineWidth = 1;
-    pen.strokeStyle = look.orbit;
-    pen.stroke();
-    pen.setLineDash([]);
-    const r = reach > 40 ? 6 : 4;
-    this.targets.push({ kind: "anchor", robot: robot.id, at: [x, y], radius: r });
-    pen.beginPath();
-    pen.moveTo(x, y - r); pen.lineTo(x + r, y + r * 0.75); pen.lineTo(x - r, y + r * 0.75); pen.closePath();
-    pen.fillStyle = look.ink;
-    pen.fill();
-    if (reach > 26) this.labels.put(`anchor of ${robot.id}`, x, y + r + 12, look.faint, "center");
-    pen.globalAlpha = 1;
   }
 
   // --- robots ---
@@ -383,7 +334,7 @@ export class Plane {
     if (size > 6) this.labels.placed.push([x - size, y - size, x + size, y + size]);
     if (size > 6 || down || robot.id === focus) {
       const name = down ? `${robot.id} is down` : robot.id;
-      this.labels.put(name, x + size + 4, y - size - 2, look.ink, "left", { font: look.bold, name: true, around: size + 4 });
+      this.labels.put(name, x + size + 4, y - size - 2, look.ink, "left", { font: look.bold, rank: NAME, around: size + 4 });
     }
     pen.globalAlpha = 1;
   }

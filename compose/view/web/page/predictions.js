@@ -29,7 +29,7 @@ export class Predictions {
       return item;
     });
     const measured = found.measured ? [make("li", { className: "measured", textContent: `measured ${found.measured}` })] : [];
-    const value = found.value ? [make("li", { className: "value", textContent: found.value, title: "Eq. (8): the smallest difference of two predicted distances, in squares" })] : [];
+    const value = found.value ? [make("li", { className: "value" }, make("span", { textContent: "least difference " }), found.value)] : [];
     this.root.replaceChildren(make("li", { className: "title", textContent: found.title }), ...items, ...measured, ...value);
   }
 

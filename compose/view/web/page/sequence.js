@@ -149,7 +149,7 @@ export class Sequence {
   }
 
   /** Draws, on the lane of the receiver, how many reports had each fate; the highest bar has the most reports. */
-  #bars({ pen, store, of, rows, to }) {
+  #bars({ pen, store, of, rows, x, to }) {
     const each = Math.max(Math.ceil(BAR / this.wide), 1), bins = new Map();
     for (let k = this.from; k <= to; k++) {
       for (const passage of store.scene(k)?.passages ?? []) {
@@ -163,12 +163,14 @@ export class Sequence {
       }
     }
     const most = Math.max(...[...bins.values()].map((bin) => bin.sum));
+    const broad = Math.max(each * this.wide - 1, 1), end = x(to) + this.wide / 2;
     for (const bin of bins.values()) {
+      const left = Math.min(this.inset + bin.place * each * this.wide, end - broad); // the last bin may have fewer ticks
       let y = rows.get(bin.receiver) - 2;
       for (const [fate, colour] of Object.entries(FATES)) {
         const high = (HIGH * (bin[fate] ?? 0)) / most;
         pen.fillStyle = of(colour);
-        pen.fillRect(this.inset + bin.place * each * this.wide, y - high, Math.max(each * this.wide - 1, 1), high);
+        pen.fillRect(left, y - high, broad, high);
         y -= high;
       }
     }

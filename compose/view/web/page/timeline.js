@@ -5,7 +5,9 @@ import { SIGNS } from "./words.js";
 
 const MARKED = Object.fromEntries(["contact", "claim", "inconsistent", "undecided", "down", "back"].map((kind) => [kind, SIGNS[kind]]));
 const MOST_BANDS = 6;
-const MARKS = 15;
+/** The height of the signs and of the hand below them, and the width of a sign, in pixels. */
+const MARKS = 18;
+const SIGN = 11;
 
 export class Timeline {
   constructor(box, canvas, scrub, go) {
@@ -127,22 +129,36 @@ export class Timeline {
         pen.fillRect(x(from), y - 2, Math.max(x(Math.min(to + 1, this.last)) - x(from), 2), band + 4);
       }
     });
-    for (const [k, kind, robot] of this.marks) {
-      if (robot !== null && !ids.has(robot)) continue;
-      pen.textAlign = "center";
-      pen.fillStyle = ["contact", "claim", "back"].includes(kind) ? of("ink") : of("fault");
-      pen.fillText(MARKED[kind], x(k), 11);
-    }
+    this.#signs(pen, x, of, ids, wide);
     this.#ticks(pen, x, MARKS + shown.length * (band + 3) + 11, of("faint"), wide);
     const now = x(Math.min(tick + (moving ? share : 0), this.last));
     pen.fillStyle = of("ink");
-    pen.fillRect(now - 1, 2, 2, tall - 15);
+    pen.fillRect(now - 1, MARKS - 6, 2, tall - MARKS - 9);
     pen.beginPath();
-    pen.moveTo(now - 5, 0); pen.lineTo(now + 5, 0); pen.lineTo(now, 7); pen.closePath();
+    pen.moveTo(now - 5, MARKS - 7); pen.lineTo(now + 5, MARKS - 7); pen.lineTo(now, MARKS); pen.closePath();
     pen.fill();
     this.#limit();
     if (this.scrub.value !== String(tick)) this.scrub.value = String(tick);
     this.scrub.setAttribute("aria-valuetext", `tick ${tick} of ${this.last}. ${activities}`);
+  }
+
+  /** Draws the signs of each tick side by side, the last first; those that have no room near their tick are left out. */
+  #signs(pen, x, of, ids, wide) {
+    const ticks = new Map();
+    for (const [k, kind, robot] of this.marks) {
+      if (robot === null || ids.has(robot)) ticks.set(k, (ticks.get(k) ?? new Set()).add(kind));
+    }
+    pen.textAlign = "left";
+    let free = wide;
+    for (const [k, kinds] of [...ticks].reverse()) {
+      const room = SIGN * kinds.size, wanted = Math.min(x(k) - room / 2, wide - room), left = Math.min(wanted, free - room);
+      if (left < wanted - SIGN) continue;
+      [...kinds].forEach((kind, i) => {
+        pen.fillStyle = ["contact", "claim", "back"].includes(kind) ? of("ink") : of("fault");
+        pen.fillText(MARKED[kind], left + SIGN * i, 10);
+      });
+      free = left;
+    }
   }
 
   /** Lets the slider move up to the last tick. */

@@ -26,6 +26,9 @@ export function pose_now({ store, tick, share, moving }, robot, kind) {
   return between(pose, kind.pose(next), kind.driven(here, next, period), share, period);
 }
 
+/** Returns the trails of a robot that are known with the truth. */
+export const kinds_of = (robot) => (robot.attack ? [TRUE, REPORTED] : [TRUE]);
+
 export class Trails {
   constructor(plane) { this.plane = plane; }
 
@@ -34,44 +37,48 @@ export class Trails {
   /** Discards the cached paths, because the scenes have changed. */
   forget() { this.#chunks.clear(); }
 
-  /** Draws the trail of `robot` up to now: the true one, or the reported one. */
-  trail({ store, tick, share, look, focus, moving }, robot, kind = TRUE) {
-    const pen = this.plane.context, last = Math.min(tick, store.last);
+  /** Draws a trail of `robot` up to the tick. */
+  trail(pen, view, robot, kind) {
+    const { store, tick } = view, last = Math.min(tick, store.last);
+    this.#stroked(pen, view, robot, kind, (stroke) => {
+      for (let from = store.first; from < last; from += CHUNK) {
+        const to = Math.min(from + CHUNK, last);
+        for (const [phase, path] of this.#pieces(store, robot, kind, from, to, to === from + CHUNK)) stroke(path, phase);
+      }
+    });
+  }
+
+  /** Draws the part of a trail that `robot` has driven since the tick. */
+  newest(pen, view, robot, kind) {
+    const { store, tick, share, moving } = view;
+    if (!moving || share <= 0) return;
+    const player = store.player(tick, robot.id), next = store.player(tick + 1, robot.id);
+    const start = kind.pose(player), end = kind.pose(next), { period } = store.stage.mission;
+    if (!start || !end) return;
+    const driven = kind.driven(player, next, period), path = new Path2D(), bends = bends_of(driven, period);
+    path.moveTo(start[0], start[1]);
+    for (let k = 1; k <= bends; k++) {
+      const pose = between(start, end, driven, (share * k) / bends, period);
+      path.lineTo(pose[0], pose[1]);
+    }
+    this.#stroked(pen, view, robot, kind, (stroke) => stroke(path, store.phase(tick, robot.id)));
+  }
+
+  /** Calls `draw` with a function that strokes a path in m, in the style of a phase. */
+  #stroked(pen, { look, focus }, robot, kind, draw) {
     const faint = focus && robot.id !== focus;
+    const ratio = (window.devicePixelRatio || 1) * unit(), { scale: s, width: wide, height, centre } = this.plane;
     pen.save();
     pen.globalAlpha = faint ? 0.4 : 0.95;
-    const ratio = (window.devicePixelRatio || 1) * unit(), s = this.plane.scale;
-    const map = () => pen.setTransform(
-      ratio * s, 0, 0, -ratio * s,
-      ratio * (this.plane.width / 2 - this.plane.centre[0] * s), ratio * (this.plane.height / 2 + this.plane.centre[1] * s),
-    );
-    const stroke = (path, phase) => {
+    pen.setTransform(ratio * s, 0, 0, -ratio * s, ratio * (wide / 2 - centre[0] * s), ratio * (height / 2 + centre[1] * s));
+    pen.strokeStyle = look.robot[robot.role];
+    draw((path, phase) => {
       const { dash, width } = kind === REPORTED ? REPORTED_STYLE : TRAIL[phase] ?? TRAIL[2];
       pen.lineWidth = (faint ? 0.7 * width : width) / s;
       pen.setLineDash(dash.map((length) => length / s));
-      pen.strokeStyle = look.robot[robot.role];
       pen.stroke(path);
-    };
-    map();
-    for (let from = store.first; from < last; from += CHUNK) {
-      const to = Math.min(from + CHUNK, last);
-      for (const [phase, path] of this.#pieces(store, robot, kind, from, to, to === from + CHUNK)) stroke(path, phase);
-    }
-    if (moving && share > 0) {
-      const player = store.player(tick, robot.id), next = store.player(tick + 1, robot.id);
-      const start = kind.pose(player), end = kind.pose(next), { period } = store.stage.mission;
-      if (start && end) {
-        const driven = kind.driven(player, next, period), path = new Path2D(), bends = bends_of(driven, period);
-        path.moveTo(start[0], start[1]);
-        for (let k = 1; k <= bends; k++) {
-          const pose = between(start, end, driven, (share * k) / bends, period);
-          path.lineTo(pose[0], pose[1]);
-        }
-        stroke(path, store.phase(tick, robot.id));
-      }
-    }
+    });
     pen.restore();
-    pen.setLineDash([]);
   }
 
   /** Returns the trail from tick `from` to `to`, one path per phase; cached once it is complete. */

@@ -73,6 +73,7 @@ export const MEANINGS = [
   ["colour of outlined robots", "poses of a and b in one colour, joined by a line, belong to one configuration of the pair"],
   ["dashed circles around a driving robot", "the distances that the configurations predict; solid: the measured one"],
   ["arc with a cross", "where the last manoeuvre can end: the thicker, the larger J of eq. (8); the cross is the choice"],
+  ["J", "the least difference between the squares of two distances that the configurations predict"],
   ["dotted circle around an anchor", "where the robot may be by its only range"],
   ["ellipse", "3 sigma of the most probable position"],
   ["hollow robot, crossed out", "its process is gone"],

@@ -1,0 +1,110 @@
+// What stays the same between two ticks: the grid, the anchors with their ranges and orbits, and the trails up to the
+// tick. It is drawn once for many pictures.
+
+import { TAU } from "./geometry.js";
+import { kinds_of } from "./trails.js";
+import { metres } from "./words.js";
+
+const LEGIBLE = 26; // the least radius in pixels of an anchor's range with which the anchor has a label
+
+export class Backdrop {
+  constructor(plane, trails) {
+    Object.assign(this, { plane, trails, canvas: document.createElement("canvas") });
+    this.pen = this.canvas.getContext("2d");
+  }
+
+  #key = "";
+
+  /** Copies the backdrop to the plane, and adds its labels and targets; draws it again if something in it has changed. */
+  draw(view, robots, ratio) {
+    const { plane, canvas } = this, { store, tick, focus, truth, look } = view, { width, height } = plane.canvas;
+    const known = [store.name, store.revision, store.last, Math.min(store.whole, tick + 1), Boolean(view.scene), robots.length];
+    const key = [...known, tick, focus, truth, plane.centre, plane.scale, width, height, ratio, look.paper].join();
+    if (key !== this.#key) {
+      this.#key = key;
+      Object.assign(canvas, { width, height }); // this also clears it
+      this.pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+      this.pen.lineCap = this.pen.lineJoin = "round";
+      this.pen.font = look.font;
+      this.#grid(look);
+      for (const robot of robots) this.#anchor(view, robot);
+      if (truth) for (const robot of robots) for (const kind of kinds_of(robot)) this.trails.trail(this.pen, view, robot, kind);
+    }
+    plane.context.save();
+    plane.context.setTransform(1, 0, 0, 1, 0, 0);
+    plane.context.drawImage(canvas, 0, 0);
+    plane.context.restore();
+    plane.labels.placed.push(this.bar);
+    for (const robot of robots) this.#name(view, robot);
+  }
+
+  /** Draws the grid, and a bar with its unit. */
+  #grid(look) {
+    const { pen, plane } = this, { width, height, scale, centre } = plane;
+    const raw = Math.min(80, width / 9) / scale, power = 10 ** Math.floor(Math.log10(raw));
+    const unit = [1, 2, 5, 10].find((factor) => factor * power >= raw) * power;
+    pen.strokeStyle = look.grid;
+    pen.lineWidth = 1;
+    pen.beginPath();
+    const left = centre[0] - width / 2 / scale, right = left + width / scale;
+    const low = centre[1] - height / 2 / scale, high = low + height / scale;
+    for (let x = Math.ceil(left / unit) * unit; x <= right; x += unit) {
+      const px = Math.round(plane.at([x, 0])[0]) + 0.5;
+      pen.moveTo(px, 0); pen.lineTo(px, height);
+    }
+    for (let y = Math.ceil(low / unit) * unit; y <= high; y += unit) {
+      const py = Math.round(plane.at([0, y])[1]) + 0.5;
+      pen.moveTo(0, py); pen.lineTo(width, py);
+    }
+    pen.stroke();
+    const bar = unit * scale, x = width - 14, y = height - 14;
+    pen.strokeStyle = pen.fillStyle = look.faint;
+    pen.lineWidth = 2;
+    pen.beginPath();
+    pen.moveTo(x - bar, y - 4); pen.lineTo(x - bar, y); pen.lineTo(x, y); pen.lineTo(x, y - 4);
+    pen.stroke();
+    pen.textAlign = "right";
+    pen.fillText(unit >= 1 ? `${unit} m` : metres(unit), x - 5, y - 5);
+    this.bar = [x - Math.max(bar, 60), y - 18, x, y + 4];
+  }
+
+  /** Draws an anchor with its range and its robot's orbit. */
+  #anchor(view, robot) {
+    const { pen, plane } = this, { look } = view, { at: [x, y], reach, radius: r, alpha } = this.#place(view, robot);
+    pen.globalAlpha = alpha;
+    pen.beginPath();
+    pen.arc(x, y, reach, 0, TAU);
+    pen.fillStyle = look.disc;
+    pen.fill();
+    pen.lineWidth = 1.2;
+    pen.strokeStyle = look.ring;
+    pen.stroke();
+    pen.beginPath();
+    pen.arc(x, y, robot.orbit[0] * plane.scale, 0, TAU);
+    pen.setLineDash([7, 4, 1.5, 4]);
+    pen.lineWidth = 1;
+    pen.strokeStyle = look.orbit;
+    pen.stroke();
+    pen.setLineDash([]);
+    pen.beginPath();
+    pen.moveTo(x, y - r); pen.lineTo(x + r, y + r * 0.75); pen.lineTo(x - r, y + r * 0.75); pen.closePath();
+    pen.fillStyle = look.ink;
+    pen.fill();
+    pen.globalAlpha = 1;
+  }
+
+  /** Asks for the label of an anchor, and adds its target. */
+  #name(view, robot) {
+    const { plane } = this, { at, reach, radius, alpha } = this.#place(view, robot);
+    plane.targets.push({ kind: "anchor", robot: robot.id, at, radius });
+    plane.context.globalAlpha = alpha;
+    if (reach > LEGIBLE) plane.labels.put(`anchor of ${robot.id}`, at[0], at[1] + radius + 12, view.look.faint, "center");
+    plane.context.globalAlpha = 1;
+  }
+
+  #place({ store, focus }, robot) {
+    const reach = store.stage.mission.sensing_range * this.plane.scale;
+    const mine = !focus || robot.id === focus || robot.peer === focus;
+    return { at: this.plane.at(robot.anchor), reach, radius: reach > 40 ? 6 : 4, alpha: mine ? 1 : 0.45 };
+  }
+}
