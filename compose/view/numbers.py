@@ -8,7 +8,7 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from compose.view.outlines import SIGMAS
-from compose.view.scene import Player
+from compose.view.scene import HeldPoses, Player
 from protocol.mission import Anchor
 from protocol.motion import Pose
 from world.referee import errors
@@ -43,10 +43,6 @@ class Numbers(msgspec.Struct, frozen=True):
         world = held.world if held is not None else ()
         covariance = held.covariance if world and held is not None else None
         ranges = [contact.range for contact in player.contacts if contact.range is not None]
-        probability: float | UnsetType = UNSET
-        if held is not None and hypotheses:
-            probability = held.probability[0] if held.probability else 1.0 / len(hypotheses)
-        leads = probability is not UNSET and probability > 0.5
         expected = None
         if world:
             expected = math.hypot(world[0].x - anchor.x, world[0].y - anchor.y)
@@ -57,8 +53,8 @@ class Numbers(msgspec.Struct, frozen=True):
         distances = [errors(pose, player.pose)[0] for pose in world] if player.pose is not None else []
         return Numbers(
             hypotheses=len(hypotheses) if held is not None else UNSET,
-            probability=probability,
-            position_error_m=(distances[0] if leads else max(distances)) if distances else UNSET,
+            probability=_probability(held) if held is not None and hypotheses else UNSET,
+            position_error_m=(max(distances) if own is None else distances[0]) if distances else UNSET,
             position_bound_m=SIGMAS * covariance.position_sigma if covariance is not None else UNSET,
             anchor_range_m=player.anchor_range if player.anchor_range is not None else UNSET,
             mutual_range_m=ranges[0] if ranges else UNSET,
@@ -76,8 +72,12 @@ def _leading(player: Player) -> Pose | None:
     held = player.held
     if held is None or not held.world:
         return None
-    probability = held.probability[0] if held.probability else 1.0 / len(held.world)
-    return held.world[0] if probability > 0.5 else None
+    return held.world[0] if _probability(held) > 0.5 else None
+
+
+def _probability(held: HeldPoses) -> float:
+    """Return the probability of the first pose; there must be one."""
+    return held.probability[0] if held.probability else 1.0 / len(held.world or held.local)
 
 
 def _residual(measured: float | None, expected: float | None) -> float | UnsetType:

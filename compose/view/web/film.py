@@ -45,6 +45,11 @@ header, aside, details, #transport button, #pace { display: none !important; }
 """The style that hides the parts of the page which are not the story, or are for the mouse."""
 SHARES = (1.0, 0.72, 0.45, 0.2)
 """The shares of a colour of the page on its background that are colours of the picture."""
+MIXED = (("robot-a", "ink", 0.8), ("robot-b", "ink", 0.8), ("accent", "paper", 0.05))
+"""Further colours of the picture, each a share of one colour on another.
+
+They are those of contact on the time line, and of the range of an anchor.
+"""
 SAME = 255
 """The colour of pixels that are as in the frame before."""
 
@@ -143,23 +148,13 @@ def _mp4(frames: list[bytes]) -> bytes:
 
 
 def _colours() -> list[int]:
-    """Return the red, green and blue of the colours of the page's light theme, and of their shares."""
+    """Return the red, green and blue of all colours of the page's light theme, their shares and MIXED."""
     theme = (PAGE / "style.css").read_text("utf-8").partition("@media")[0]
     named = {name: bytes.fromhex(colour) for name, colour in re.findall(r"--([\w-]+): #([0-9a-f]{6})", theme)}
-    shades = [
-        [
-            round(share * part + (1.0 - share) * back)
-            for part, back in zip(colour, named["paper"], strict=True)
-        ]
-        for colour in named.values()
-        for share in SHARES
+    mixed = [(name, "paper", share) for name in named for share in SHARES] + list(MIXED)
+    parts = [
+        round(share * part + (1.0 - share) * back)
+        for name, under, share in mixed
+        for part, back in zip(named[name], named[under], strict=True)
     ]
-    shades += [
-        [round(0.8 * part + 0.2 * over) for part, over in zip(named[robot], named["ink"], strict=True)]
-        for robot in ("robot-a", "robot-b")
-    ]  # contact on the time line
-    shades.append(
-        [round(0.05 * part + 0.95 * back) for part, back in zip(named["accent"], named["paper"], strict=True)]
-    )  # the range of an anchor
-    parts = [part for shade in shades for part in shade]
     return parts + [0] * (3 * 256 - len(parts))
