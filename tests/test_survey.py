@@ -16,7 +16,7 @@ from agent.estimation.gaussian.hypotheses import Hypothesis, ScoredHypothesis, s
 from agent.estimation.gaussian.range_model import PairRanges
 from agent.estimation.knowledge import Belief
 from agent.peer.motion_log import MotionLog
-from agent.planning import accuracy_seeking
+from agent.planning import pair_claim
 from agent.planning.accuracy_seeking import OFF_RADIUS, AccuracySeeking
 from agent.planning.phase2_orbit import Aligning, Radial, orientation
 from agent.planning.state import RobotState
@@ -412,7 +412,7 @@ def test_nothing_is_claimed_by_a_fit_that_still_moves(monkeypatch: pytest.Monkey
     def searched(pair: PairRanges, known: Sequence[Hypothesis]) -> tuple[ScoredHypothesis, ...]:
         return tuple([one._replace(fit=one.fit._replace(last_step=0.5)) for one in search(pair, known)])
 
-    monkeypatch.setattr(accuracy_seeking, "search", searched)
+    monkeypatch.setattr(pair_claim, "search", searched)
     recording = run_mission(scenario_of(SIGMA, SHORT, max_ticks=ticks + 2))
     assert summary(recording, "in-process", None)["outcome"] == "undecided"
     assert all(

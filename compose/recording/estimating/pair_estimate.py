@@ -9,7 +9,7 @@ from agent.estimation.gaussian.hypotheses import follow, search
 from agent.estimation.gaussian.inference import to_second_order
 from agent.estimation.gaussian.range_model import PairRanges
 from agent.estimation.knowledge import Belief, Knowledge
-from agent.planning.accuracy_seeking import (
+from agent.planning.pair_claim import (
     FEWEST_MUTUAL_RANGES,
     PairInference,
     inferred,
