@@ -24,7 +24,7 @@ from tests.commands import BOUND_S, tandem, until
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="there is a second process only on Linux")
 
 PARENT = """
-import os, sys, time
+import os, signal, sys, time
 from pathlib import Path
 from protocol import files
 from compose.launch.second_process import share
@@ -35,6 +35,7 @@ def task(name):
         while True:  # a signal just before a sleep does not end it
             time.sleep(0.01)
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell lets commands in the background ignore it
 share([lambda: task("one"), lambda: task("two")], lambda lines: None)
 """
 """A process that shares two tasks which last for ever."""
@@ -165,10 +166,14 @@ def test_an_error_ends_the_second_process_and_leaves_no_unfinished_file(stage: s
 def test_the_second_process_ends_with_the_first(number: signal.Signals, tmp_path: Path) -> None:
     parent = subprocess.Popen([sys.executable, "-c", PARENT], cwd=tmp_path, stderr=subprocess.DEVNULL)
     drafts = [tmp_path / f".{name}.0{files.DRAFT}" for name in ("one", "two")]
-    until(lambda: all(path.exists() and path.read_text() for path in drafts), "both tasks have begun")
-    (second,) = {int(path.read_text()) for path in drafts} - {parent.pid}
-    parent.send_signal(number)
-    parent.wait(BOUND_S)
+    try:
+        until(lambda: all(path.exists() and path.read_text() for path in drafts), "both tasks have begun")
+        (second,) = {int(path.read_text()) for path in drafts} - {parent.pid}
+        parent.send_signal(number)
+        parent.wait(BOUND_S)
+    finally:
+        parent.kill()
+        parent.wait()
     until(lambda: not psutil.pid_exists(second), "the second process has ended")
     left = [path for path in drafts if path.exists()]
     assert [int(path.read_text()) for path in left] == ([] if number == signal.SIGINT else [parent.pid])
