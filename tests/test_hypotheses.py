@@ -285,7 +285,7 @@ def test_the_branches_of_a_robot_that_has_left_its_anchor_are_those_of_its_whole
     for branch in _alone(pair, 0):
         (whole,) = fits([branch.hypothesis.start], [path], ranges, pair.noise)
         sigmas = np.sqrt(np.diagonal(whole.covariance))
-        assert np.max(np.abs(branch.fit.guess - whole.guess)[:2] / sigmas) < COARSE_STILL
+        assert np.max(np.abs(branch.fit.guess - whole.guess)[:2] / sigmas) < 0.01
         assert len(branch.fit.paths[0].v) == len(branch.fit.errors[0].v) == len(path.v)
         assert branch.fit.paths[0].x[-1] == pytest.approx(whole.paths[0].x[-1], abs=1e-3)
         assert branch.fit.log_likelihood == pytest.approx(whole.log_likelihood, abs=1e-2)
@@ -324,7 +324,7 @@ def test_a_followed_anchor_ends_after_one_linear_model_near_the_fit_of_all_steps
     sigmas = np.sqrt(np.diagonal(whole.covariance))
     assert followed.fit.linear_guess.tolist() == list(held[0].hypothesis.guess), "no second linear model"
     assert followed.fit.last_step < COARSE_STILL
-    assert np.max(np.abs(followed.fit.guess - whole.guess)[:2] / sigmas) < COARSE_STILL
+    assert np.max(np.abs(followed.fit.guess - whole.guess)[:2] / sigmas) < 0.01
 
 
 @pytest.mark.parametrize(("sigma", "left"), [(1e-9, 2), (1e-3, 1)])
@@ -391,7 +391,7 @@ def test_the_evidence_of_three_ranges_grows_as_they_get_more_accurate() -> None:
         scored = of_anchor((), path, ranges, NONE, REACH, noise)
         found.append(anchor_evidence(scored[0].fit, path, ranges, REACH))
     assert found == sorted(found)
-    assert found[0] < 1.0, "not worth a mention (Jeffreys)"
+    assert found[0] < 0.0
     assert found[-1] > 7.0
 
 

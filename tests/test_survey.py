@@ -207,7 +207,7 @@ def test_the_robots_keep_apart_and_b_stays_in_range_of_its_anchor(noise: str) ->
 def test_a_lost_contact_is_found_again() -> None:
     """After a tick without contact there is one with contact, and the mission ends localised."""
     lost = 0
-    for seed in (*SEEDS, 3, 91):
+    for seed in (*SEEDS, 3, 13, 20):
         recording = survey(NOISES["drop-outs"], seed)
         contact = in_contact(recording)
         met = next(

@@ -36,8 +36,8 @@ class Numbers(msgspec.Struct, frozen=True):
     """The range to the peer, less the distance between the leading poses of both in the world frame."""
 
     @staticmethod
-    def of(player: Player, anchor: Anchor, peer: Player) -> Numbers:
-        """Return the numbers of a robot's scene, with the place of its anchor and the scene of its peer."""
+    def of(player: Player, anchor: Anchor, peer: Player | None) -> Numbers:
+        """Return the numbers of a robot's scene; `anchor` is its own, `peer` that of its peer, if known."""
         held = player.held
         hypotheses = held.world or held.local if held is not None else ()
         world = held.world if held is not None else ()
@@ -67,9 +67,9 @@ class Numbers(msgspec.Struct, frozen=True):
         return msgspec.json.encode(self)
 
 
-def _leading(player: Player) -> Pose | None:
+def _leading(player: Player | None) -> Pose | None:
     """Return the pose in the world frame that is more probable than all others together, if there is one."""
-    held = player.held
+    held = player.held if player is not None else None
     if held is None or not held.world:
         return None
     return held.world[0] if _probability(held) > 0.5 else None

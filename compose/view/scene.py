@@ -118,6 +118,10 @@ class Scene(msgspec.Struct, frozen=True):
                 return player
         raise KeyError(robot)
 
+    def peer_of(self, robot: RobotSetup) -> Player | None:
+        """Return the entry of the peer of `robot`; None if only one robot's journal is known."""
+        return next((player for player in self.players if player.robot == robot.peer), None)
+
 
 def scene(
     setup: RunSetup,

@@ -57,13 +57,13 @@ def series(
     for one in setup.robots:
         if robots is not None and one.id not in robots:
             continue
-        peer = setup.robot_setup(one.peer)
+        peer = next((other for other in setup.robots if other.id == one.peer), None)
         bins: list[list[Numbers]] = []
         for begin in range(first, last + 1, step):
             data = [known.ticks.get(tick) for tick in range(begin, min(begin + step, last + 1))]
             bins.append(
                 [
-                    Numbers.of(player_of(one, now), one.anchor, player_of(peer, now))
+                    Numbers.of(player_of(one, now), one.anchor, player_of(peer, now) if peer else None)
                     for now in data
                     if now is not None
                 ]

@@ -17,7 +17,7 @@ import numpy as np
 from agent.estimation.gaussian.anchor_guesses import MOST, SEED_RANGES, UNLIKELY, anchors
 from agent.estimation.gaussian.detections import anchor_log_likelihood, detection_log_likelihood
 from agent.estimation.gaussian.fitted import Fit
-from agent.estimation.gaussian.least_squares import COARSE_STILL, WARM_DECREASE, fits, without_outliers
+from agent.estimation.gaussian.least_squares import COARSE_STILL, STEPS, WARM_DECREASE, fits, without_outliers
 from agent.estimation.gaussian.linear_model import Start
 from agent.estimation.gaussian.odometry_noise import Errors, Places, Track
 from agent.estimation.gaussian.placement_guesses import STARTS, placements
@@ -30,24 +30,17 @@ NEGLIGIBLE_PROBABILITY = 1e-7
 SAME_SIGMAS = 1.0
 """The distance in sigmas below which two fits are the same hypothesis."""
 
-COPY_SIGMAS = 0.3
-"""The distance in sigmas below which two fits of a search continue as one.
-
-It is less than SAME_SIGMAS, because such fits still move.
-"""
-
 FOLLOWED_RANGES = 6
 """The number of ranges to an anchor from which on its hypotheses are followed only, without outliers.
 
 Two circles have two intersections, so a few ranges from different places leave nothing that a search would
 find. With outliers it takes SEED_RANGES."""
 
-WARM_STEPS = 4
+WARM_STEPS = 2
 """The Gauss-Newton steps from the fit of the previous tick.
 
 Where the best fit has not converged by then, it may be on its way to another mode, and the plane is searched.
-With two steps, that is every third tick of the scenario `noisy`, whose outliers make fits converge slowly;
-with four, every twentieth. With more, each tick takes longer."""
+With one step, that is every third tick; with more, each tick takes longer."""
 
 
 class Hypothesis(NamedTuple):
@@ -154,23 +147,10 @@ def of_anchor(
         places = [one.guess[:2] for one in known]
         points = anchors(path, ranges, sensing_range, noise, places)
         starts = [Start(np.array([*point, 0.0])) for point in points]
-    found = _coarse_fits(starts, path, ranges, noise)
+    steps, decrease = (WARM_STEPS, WARM_DECREASE) if warm else (STEPS, 1.0)
+    found = fits(starts, [path], ranges, noise, steps=steps, shortest=COARSE_STILL, decrease=decrease)
     return with_probability(
         [(one, anchor_log_likelihood(one, 0, silent, ranges.tick, sensing_range, noise)) for one in found]
-    )
-
-
-def _coarse_fits(starts: Sequence[Start], path: Track, ranges: Ranges, noise: Noise) -> list[Fit]:
-    """Return fits of one robot that begin near their ends and are as accurate as planning needs."""
-    return fits(
-        starts,
-        [path],
-        ranges,
-        noise,
-        steps=WARM_STEPS,
-        shortest=COARSE_STILL,
-        decrease=WARM_DECREASE,
-        same=COPY_SIGMAS,
     )
 
 
@@ -205,7 +185,7 @@ def search(pair: PairRanges, known: tuple[Hypothesis, ...] = ()) -> tuple[Scored
     )
     starts = [*[one.start for one in known], *starts]
     measured = (pair.paths, pair.ranges, pair.noise, pair.apart)
-    return _scored(fits(starts, *measured, same=COPY_SIGMAS), pair)
+    return _scored(fits(starts, *measured), pair)
 
 
 STARTS_WITHOUT_OUTLIERS = 4
@@ -250,7 +230,7 @@ def _up_to_last_range(own: _OwnRanges) -> tuple[ScoredHypothesis, ...]:
     """
     points = anchors(own.path, own.ranges, own.sensing_range, own.noise)
     starts = [Start(np.array([*point, 0.0])) for point in points]
-    found = _coarse_fits(starts, own.path, own.ranges, own.noise)
+    found = fits(starts, [own.path], own.ranges, own.noise)
     return with_probability([(one, 0.0) for one in found])
 
 
@@ -259,8 +239,7 @@ def follow(before: tuple[Hypothesis, ...], pair: PairRanges) -> tuple[ScoredHypo
     """Return the hypotheses that follow from those of the previous tick, `before`."""
     starts = [one.start for one in before]
     measured = (pair.paths, pair.ranges, pair.noise, pair.apart)
-    found = fits(starts, *measured, WARM_STEPS, shortest=COARSE_STILL, decrease=WARM_DECREASE)
-    return _scored(found, pair)
+    return _scored(fits(starts, *measured, WARM_STEPS), pair)
 
 
 def _scored(found: Sequence[Fit], pair: PairRanges) -> tuple[ScoredHypothesis, ...]:

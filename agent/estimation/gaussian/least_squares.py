@@ -16,7 +16,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agent.estimation.gaussian.descent import full_step, rows_of, stepped
 from agent.estimation.gaussian.fitted import Fit, NormalEquations
@@ -50,22 +49,10 @@ No claim does: each search fits all ranges again. With STILL, such a fit takes t
 """
 
 WARM_DECREASE = 0.1
-"""The expected decrease of the first step of a fit that begins near its end.
+"""The expected decrease of the first step of a fit that begins at the last one, which has one range less."""
 
-It begins at the last fit, which has one range less, or at a guess that is refined on all ranges.
-"""
-
-SETTLED = 3.0
-"""The change of a weight below which the weights have converged, in units of the shortest step."""
-
-NEAR_END = 1.0
-"""The length in sigmas of the next step below which a fit is compared with others: it is near its end."""
-
-ALIKE = 0.3
-"""The largest difference of the weights of two fits that continue as one.
-
-With different outliers, two fits may come from the same guess to different ends.
-"""
+SETTLED = 1e-2
+"""The change of a weight below which the weights have converged."""
 
 RIDGE = 1e-12
 """The fraction of the information that is added to its diagonal, and an absolute part of the same size.
@@ -88,14 +75,10 @@ def fit(
 
 
 def own_fit(joint: Fit, robot: int, measured: Sequence[Track], ranges: Ranges, noise: Noise) -> Fit:
-    """Return the fit of one robot (0 or 1) to its own anchor alone, which begins at that of both robots.
-
-    Its evidence and its chi-square are enough for tests, which do not depend on the last digits.
-    """
-    start = Start(np.array([*joint.guess[3 * robot : 3 * robot + 2], 0.0]), joint.errors[robot : robot + 1])
-    own = ranges.only(robot)
-    (one,) = fits([start], [measured[robot]], own, noise, shortest=COARSE_STILL, decrease=WARM_DECREASE)
-    return one
+    """Return the fit of one robot (0 or 1) to its own anchor alone, which begins at that of both robots."""
+    guess = np.array([*joint.guess[3 * robot : 3 * robot + 2], 0.0])
+    begun = joint.errors[robot : robot + 1]
+    return fit(guess, [measured[robot]], ranges.only(robot), noise, begun=begun)
 
 
 def fits(
@@ -108,13 +91,11 @@ def fits(
     *,
     shortest: float = STILL,
     decrease: float = 1.0,
-    same: float = 0.0,
 ) -> list[Fit]:
     """Return the Gauss-Newton fits that begin at `starts`, in this order.
 
     A step is the last if the next one is expected to be shorter than `shortest`. The second step is expected
-    to be shorter than the first by the factor `decrease`, which is less than 1 for starts that are fits. Of
-    fits that come within `same` sigmas of each other, one continues, and the others are not returned. The
+    to be shorter than the first by the factor `decrease`, which is less than 1 for starts that are fits. The
     weights of outliers decrease during the iteration. `apart` is M2 - M1 (m) in <W>.
     """
     if not starts:
@@ -137,7 +118,7 @@ def fits(
         if step == 0:
             before = quality.last_step / decrease
         expected = np.square(quality.last_step) / np.maximum(np.maximum(quality.last_step, before), STILL)
-        settled = np.maximum.reduce(np.abs(updated - weights), -1) < SETTLED * shortest
+        settled = np.maximum.reduce(np.abs(updated - weights), -1) < SETTLED
         still = settled & (expected < shortest)
         still &= step > 0 or decrease < 1.0 or not problem.noisy  # the path is corrected at least once
         if step == steps:
@@ -148,32 +129,14 @@ def fits(
         at_end = quality._replace(last_step=expected)
         for row in np.flatnonzero(still).tolist():
             ended[left[row]] = _fit(problem, row, point, begun, weights, system, at_end)
-        copies = _copies(point.guess[:, problem.free], system, quality, weights, same)
-        onward = ~(still | copies)
+        onward = ~still
         if not onward.any():
             break
         left = [i for i, one in zip(left, onward.tolist(), strict=True) if one]
         weights, before = updated, quality.last_step
         if len(left) < len(onward):
             point, weights, before = rows_of((point, weights, before), onward)
-    return [ended[i] for i in sorted(ended)]
-
-
-def _copies(
-    guess: Array, system: NormalEquations, quality: _Quality, weights: Array, same: float
-) -> NDArray[np.bool]:
-    """Return which fits come to the same guess and weights as one that is nearer to its end."""
-    if not same or len(guess) == 1:
-        return np.zeros(len(guess), np.bool)
-    apart = guess[:, None] - guess
-    apart[..., 2::3] = np.remainder(apart[..., 2::3] + math.pi, math.tau) - math.pi
-    distance = np.add.reduce((apart @ system.information) * apart, -1) / quality.level
-    near = (distance < same**2) & (np.abs(weights[:, None] - weights).max(-1) < ALIKE)
-    length = quality.last_step
-    near &= np.maximum(length[:, None], length) < NEAR_END
-    sooner = length < length[:, None]
-    sooner |= (length == length[:, None]) & np.tri(len(length), k=-1, dtype=bool)
-    return np.asarray(np.any(near & sooner, 1), np.bool)
+    return [ended[i] for i in range(len(starts))]
 
 
 def _first_weights(problem: Problem, starts: Sequence[Start], point: Point, linear: LinearModel) -> Array:
