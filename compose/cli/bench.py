@@ -285,7 +285,7 @@ def _noisy(rounds: int, done: Callable[[], None]) -> Table:
         done()
     table = _table(f"In-process, one core, ranges of sigma {NOISY_SIGMA:g} m")
     scale = 1e3 / NOISY_MISSIONS
-    _row(table, "one mission, both robots (at most 30)", [scale * sum(part) for part in parts], "ms")
+    _row(table, "one mission, both robots (at most 150)", [scale * sum(part) for part in parts], "ms")
     for k, what in enumerate(
         ("observations (phases 1 and 2)", "decisions in contact (phase 3)", "the world")
     ):
