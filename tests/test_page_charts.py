@@ -105,7 +105,7 @@ def test_the_values_of_a_series_are_those_of_the_run(noisy: Path) -> None:
 
 
 def test_residuals_are_the_ranges_less_those_of_the_first_poses(noisy: Path) -> None:
-    """Of the leading poses of both, for ranges between robots; then the largest residuals are outliers."""
+    """A range between robots is compared with the distance between the leading poses of both."""
     run = read(noisy)
     assert run.setup is not None
     held = {robot: estimates(run, robot) for robot in run.robots}

@@ -71,7 +71,7 @@ BARS = """() => {
   }
   return Object.values(found).every((columns) => columns.length > 20 && Math.min(...columns) > 0.95);
 }"""
-"""Whether the diagram has bars of received and of lost reports, all of them at its right end."""
+"""Returns true if the diagram has bars of received and of lost reports, all of them at its right end."""
 
 
 @pytest.mark.long

@@ -36,8 +36,8 @@ class Numbers(msgspec.Struct, frozen=True):
     """The range to the peer, less the distance between the leading poses of both in the world frame."""
 
     @staticmethod
-    def of(player: Player, anchor: Anchor, peer: Player | None) -> Numbers:
-        """Return the numbers of a robot's scene; `anchor` is its own, `peer` that of its peer, if known."""
+    def of(player: Player, anchor: Anchor, peer: HeldPoses | None) -> Numbers:
+        """Return the numbers of a robot; `anchor` is its own, and `peer` the poses that its peer holds."""
         held = player.held
         hypotheses = held.world or held.local if held is not None else ()
         world = held.world if held is not None else ()
@@ -48,7 +48,7 @@ class Numbers(msgspec.Struct, frozen=True):
             expected = math.hypot(world[0].x - anchor.x, world[0].y - anchor.y)
         elif hypotheses:
             expected = math.hypot(hypotheses[0].x, hypotheses[0].y)
-        own, other = _leading(player), _leading(peer)
+        own, other = _leading(held), _leading(peer)
         apart = errors(own, other)[0] if own is not None and other is not None else None
         distances = [errors(pose, player.pose)[0] for pose in world] if player.pose is not None else []
         return Numbers(
@@ -67,9 +67,8 @@ class Numbers(msgspec.Struct, frozen=True):
         return msgspec.json.encode(self)
 
 
-def _leading(player: Player | None) -> Pose | None:
+def _leading(held: HeldPoses | None) -> Pose | None:
     """Return the pose in the world frame that is more probable than all others together, if there is one."""
-    held = player.held if player is not None else None
     if held is None or not held.world:
         return None
     return held.world[0] if _probability(held) > 0.5 else None

@@ -118,9 +118,9 @@ class Scene(msgspec.Struct, frozen=True):
                 return player
         raise KeyError(robot)
 
-    def peer_of(self, robot: RobotSetup) -> Player | None:
-        """Return the entry of the peer of `robot`; None if only one robot's journal is known."""
-        return next((player for player in self.players if player.robot == robot.peer), None)
+    def held_by(self, robot: str) -> HeldPoses | None:
+        """Return the poses that `robot` holds; None if they, or the robot, are unknown."""
+        return next((player.held for player in self.players if player.robot == robot), None)
 
 
 def scene(
@@ -155,11 +155,21 @@ def _sent(report: PeerReport, size: int) -> Sent:
             return Sent(size)
 
 
+def held_poses(robot: str, now: TickData) -> HeldPoses | None:
+    """Return the poses that `robot` holds in the tick of `now`; None if its Estimate is unknown."""
+    estimate = now.estimates.get(robot)
+    if estimate is None:
+        return None
+    return HeldPoses(
+        estimate.local, estimate.world, estimate.probabilities, estimate.covariance, estimate.localised
+    )
+
+
 def player_of(robot_setup: RobotSetup, now: TickData, reported: Pose | None = None) -> Player:
     """Return the entry of one robot in the scene of the tick of `now`; `reported` as in `scene`."""
     robot = robot_setup.id
     pose, observation, sent = now.truth.get(robot), now.observations.get(robot), now.reports.get(robot)
-    command, estimate = now.commands.get(robot), now.estimates.get(robot)
+    command = now.commands.get(robot)
     sentence = f"{robot} has not answered"
     down = robot in now.down - now.back
     if down:
@@ -183,17 +193,7 @@ def player_of(robot_setup: RobotSetup, now: TickData, reported: Pose | None = No
             if command is not None
             else None
         ),
-        held=(
-            HeldPoses(
-                estimate.local,
-                estimate.world,
-                estimate.probabilities,
-                estimate.covariance,
-                estimate.localised,
-            )
-            if estimate is not None
-            else None
-        ),
+        held=held_poses(robot, now),
         reported=(
             FalsePose(reported, travelled(pose, reported))
             if reported is not None and pose is not None

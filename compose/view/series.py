@@ -10,7 +10,7 @@ from msgspec import UNSET
 from compose.recording.run_setup import RunSetup
 from compose.view.numbers import Numbers
 from compose.view.run_data import RunData
-from compose.view.scene import player_of
+from compose.view.scene import held_poses, player_of
 
 MOST_BINS = 500
 """The maximum number of bins of a series: with the minimum and the maximum of each, 1000 points."""
@@ -57,13 +57,12 @@ def series(
     for one in setup.robots:
         if robots is not None and one.id not in robots:
             continue
-        peer = next((other for other in setup.robots if other.id == one.peer), None)
         bins: list[list[Numbers]] = []
         for begin in range(first, last + 1, step):
             data = [known.ticks.get(tick) for tick in range(begin, min(begin + step, last + 1))]
             bins.append(
                 [
-                    Numbers.of(player_of(one, now), one.anchor, player_of(peer, now) if peer else None)
+                    Numbers.of(player_of(one, now), one.anchor, held_poses(one.peer, now))
                     for now in data
                     if now is not None
                 ]

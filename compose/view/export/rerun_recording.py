@@ -174,7 +174,7 @@ class _Drawing:
             self._draw_robot(robot, player)
             self._draw_hypotheses(robot, player)
         for robot in self._setup.robots[:PLOTTED]:
-            numbers = Numbers.of(scene.player(robot.id), robot.anchor, scene.peer_of(robot))
+            numbers = Numbers.of(scene.player(robot.id), robot.anchor, scene.held_by(robot.peer))
             for number in numbers.__struct_fields__:
                 value = getattr(numbers, number)
                 if any(number in plotted for plotted in PLOTS.values()):

@@ -148,7 +148,7 @@ class Views:
         yield Shown("/tf", fox.FrameTransforms(transforms=list(self._transforms(scene, at))))
         for player in scene.players:
             robot_setup = self.setup.robot_setup(player.robot)
-            numbers = Numbers.of(player, robot_setup.anchor, scene.peer_of(robot_setup))
+            numbers = Numbers.of(player, robot_setup.anchor, scene.held_by(robot_setup.peer))
             yield Shown(f"/{player.robot}/numbers", numbers)
             yield from self._robot(player, at)
         yield Shown("/contact", fox.SceneUpdate(entities=list(self._contacts(scene, at))))
