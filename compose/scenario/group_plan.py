@@ -1,0 +1,113 @@
+"""The plan of meetings of a group: its seed pairs, the hops of its wake-up trees, and the bounds of both."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from math import sqrt
+
+import msgspec
+
+from compose.scenario.wake_up_search import short_forest
+from compose.scenario.wake_up_tree import MeetingTimes, Rows, WakeUpForest, optimal_forest
+
+MOST_OPTIMAL = 8
+"""The most robots whose plan is optimal. The time that the optimum takes triples with each further robot."""
+
+
+class PlannedMeeting(msgspec.Struct, frozen=True, array_like=True):
+    """A meeting of a plan, at the anchor of the robot that is visited."""
+
+    visitor: int
+    visited: int
+    ends: float
+    """The bound in s of the time at which both are localised."""
+    first: bool = False
+    """The visitor is not localised before: a seed pair."""
+
+
+class GroupPlan(msgspec.Struct, frozen=True):
+    """The meetings that localise a group, each robot's in order."""
+
+    meetings: tuple[PlannedMeeting, ...]
+    """In the order of their ends."""
+    bound: float
+    """The bound in s of the time at which all are localised."""
+    travel_lower_bound: float
+    """A time in s below which no plan of these anchors has its bound: seed pairs and travel alone, meetings free."""
+
+
+def group_plan(
+    anchors: Sequence[tuple[float, float]],
+    seed_time: Callable[[int, int], float],
+    speed: float,
+    meeting: float,
+) -> GroupPlan:
+    """Return the plan of the group whose robots wait beside `anchors`, given in m.
+
+    `seed_time(a, b)` bounds in s how long it takes until a, which searches, and b, which waits, are both localised
+    beside the anchor of b; it is infinite if they cannot meet. A localised robot drives at `speed` in m/s, and a
+    meeting of it lasts at most `meeting` in s. The plan is optimal up to MOST_OPTIMAL robots. Raises ValueError if
+    there are fewer than two.
+
+    Numbering and translation do not change the bound, except for rounding, unless two anchors are at one place.
+    """
+    if len(anchors) < 2:
+        raise ValueError(f"a group has at least two robots, not {len(anchors)}")
+    order = sorted(range(len(anchors)), key=anchors.__getitem__)
+    seed = tuple(tuple(0.0 if a == b else seed_time(a, b) for b in order) for a in order)
+    travel = tuple(tuple(_distance(anchors[a], anchors[b]) / speed for b in order) for a in order)
+    times = MeetingTimes(seed, tuple(tuple(time + meeting for time in row) for row in travel))
+    forest = optimal_forest(times) if len(order) <= MOST_OPTIMAL else short_forest(times)
+    meetings = tuple(
+        msgspec.structs.replace(each, visitor=order[each.visitor], visited=order[each.visited])
+        for each in planned_meetings(forest, times)
+    )
+    return GroupPlan(meetings, meetings[-1].ends, _travel_lower_bound(seed, travel))
+
+
+def planned_meetings(forest: WakeUpForest, times: MeetingTimes) -> list[PlannedMeeting]:
+    """Return the meetings of `forest`, in the order of their ends.
+
+    The robot that was visited makes the hop whose branch ends last, and its visitor the other.
+    """
+    ends = forest.ends(times)
+    last = dict(ends)
+    for place, robot in reversed(forest.hops):
+        last[place] = max(last[place], last[robot])
+    visitors = {b: a for a, b in forest.seeds}
+    meetings = [PlannedMeeting(a, b, ends[b], first=True) for a, b in forest.seeds]
+    for place, robot in forest.hops:
+        branches = [other for start, other in forest.hops if start == place]
+        visitors[robot] = place if robot == max(branches, key=last.__getitem__) else visitors[place]
+        meetings.append(PlannedMeeting(visitors[robot], robot, ends[robot]))
+    return sorted(meetings, key=lambda meeting: meeting.ends)
+
+
+def _travel_lower_bound(seed: Rows, travel: Rows) -> float:
+    """Return the least bound of any plan if meetings took no time, or below 1 + MOST_OPTIMAL, a bound of it."""
+    times = MeetingTimes(seed, travel)
+    if len(seed) <= MOST_OPTIMAL:
+        return max(optimal_forest(times).ends(times).values())
+    return earliest_end(times)
+
+
+def earliest_end(times: MeetingTimes) -> float:
+    """Return a lower bound of the last end of any forest: the end for the robot that is the latest to be reached.
+
+    A robot is reached no earlier than by a seed pair of its own, or by a hop straight from the place of another.
+    """
+    seed, hop, robots = times.seed, times.hop, times.robots
+    as_visitor = [min(seed[a][b] for b in robots if a != b) for a in robots]
+    as_visited = [min(seed[a][b] for a in robots if a != b) for b in robots]
+    return max(
+        min(
+            as_visitor[robot],
+            as_visited[robot],
+            *(as_visited[b] + hop[b][robot] for b in robots if b != robot),
+        )
+        for robot in robots
+    )
+
+
+def _distance(a: tuple[float, float], b: tuple[float, float]) -> float:
+    return sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2)
