@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import sqrt
+from math import inf, sqrt
 
 import msgspec
 
 from compose.scenario.wake_up_search import short_forest
-from compose.scenario.wake_up_tree import MeetingTimes, Rows, WakeUpForest, optimal_forest
+from compose.scenario.wake_up_tree import MeetingTimes, WakeUpForest, optimal_forest
 
 MOST_OPTIMAL = 8
 """The most robots whose plan is optimal. The time that the optimum takes triples with each further robot."""
@@ -33,7 +33,10 @@ class GroupPlan(msgspec.Struct, frozen=True):
     bound: float
     """The bound in s of the time at which all are localised."""
     travel_lower_bound: float
-    """A time in s below which no plan of these anchors has its bound: seed pairs and travel alone, meetings free."""
+    """A lower bound in s of the bound of any plan: of seed pairs and travel alone, with no time for meetings.
+
+    The least bound of such plans up to MOST_OPTIMAL robots; beyond, that of the robot that is reached last.
+    """
 
 
 def group_plan(
@@ -44,17 +47,20 @@ def group_plan(
 ) -> GroupPlan:
     """Return the plan of the group whose robots wait beside `anchors`, given in m.
 
-    `seed_time(a, b)` bounds in s how long it takes until a, which searches, and b, which waits, are both localised
-    beside the anchor of b; it is infinite if they cannot meet. A localised robot drives at `speed` in m/s, and a
-    meeting of it lasts at most `meeting` in s. The plan is optimal up to MOST_OPTIMAL robots. Raises ValueError if
-    there are fewer than two.
+    `seed_time(a, b)` bounds in s how long it takes until a, which searches, and b, which waits, are both
+    localised beside the anchor of b; it is infinite if they cannot meet. Later a localised robot drives at
+    `speed` in m/s to the anchor of one that waits, where their meeting lasts at most `meeting` in s.
 
-    Numbering and translation do not change the bound, except for rounding, unless two anchors are at one place.
+    The plan is optimal up to MOST_OPTIMAL robots; beyond, `short_forest` says what is known. Numbering and
+    translation change the bound by rounding only, unless two anchors are at one place. Raises ValueError for
+    fewer than two robots, or if no two can meet first.
     """
     if len(anchors) < 2:
         raise ValueError(f"a group has at least two robots, not {len(anchors)}")
     order = sorted(range(len(anchors)), key=anchors.__getitem__)
-    seed = tuple(tuple(0.0 if a == b else seed_time(a, b) for b in order) for a in order)
+    seed = tuple(tuple(inf if a == b else seed_time(a, b) for b in order) for a in order)
+    if min(map(min, seed)) == inf:
+        raise ValueError("no two robots of the group can meet first")
     travel = tuple(tuple(_distance(anchors[a], anchors[b]) / speed for b in order) for a in order)
     times = MeetingTimes(seed, tuple(tuple(time + meeting for time in row) for row in travel))
     forest = optimal_forest(times) if len(order) <= MOST_OPTIMAL else short_forest(times)
@@ -62,7 +68,7 @@ def group_plan(
         msgspec.structs.replace(each, visitor=order[each.visitor], visited=order[each.visited])
         for each in planned_meetings(forest, times)
     )
-    return GroupPlan(meetings, meetings[-1].ends, _travel_lower_bound(seed, travel))
+    return GroupPlan(meetings, meetings[-1].ends, _travel_lower_bound(MeetingTimes(seed, travel)))
 
 
 def planned_meetings(forest: WakeUpForest, times: MeetingTimes) -> list[PlannedMeeting]:
@@ -83,30 +89,11 @@ def planned_meetings(forest: WakeUpForest, times: MeetingTimes) -> list[PlannedM
     return sorted(meetings, key=lambda meeting: meeting.ends)
 
 
-def _travel_lower_bound(seed: Rows, travel: Rows) -> float:
-    """Return the least bound of any plan if meetings took no time, or below 1 + MOST_OPTIMAL, a bound of it."""
-    times = MeetingTimes(seed, travel)
-    if len(seed) <= MOST_OPTIMAL:
+def _travel_lower_bound(times: MeetingTimes) -> float:
+    """Return the least last end for `times` up to MOST_OPTIMAL robots, and a lower bound of it beyond."""
+    if len(times.robots) <= MOST_OPTIMAL:
         return max(optimal_forest(times).ends(times).values())
-    return earliest_end(times)
-
-
-def earliest_end(times: MeetingTimes) -> float:
-    """Return a lower bound of the last end of any forest: the end for the robot that is the latest to be reached.
-
-    A robot is reached no earlier than by a seed pair of its own, or by a hop straight from the place of another.
-    """
-    seed, hop, robots = times.seed, times.hop, times.robots
-    as_visitor = [min(seed[a][b] for b in robots if a != b) for a in robots]
-    as_visited = [min(seed[a][b] for a in robots if a != b) for b in robots]
-    return max(
-        min(
-            as_visitor[robot],
-            as_visited[robot],
-            *(as_visited[b] + hop[b][robot] for b in robots if b != robot),
-        )
-        for robot in robots
-    )
+    return times.earliest_end()
 
 
 def _distance(a: tuple[float, float], b: tuple[float, float]) -> float:

@@ -1,8 +1,8 @@
-"""A wake-up forest that a search changes: robots are released from it and put back where they end earliest."""
+"""A wake-up forest that a search changes: it releases robots and inserts them where that delays least."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from math import inf
 from operator import itemgetter
 
@@ -59,7 +59,7 @@ class OpenForest:
         return found
 
     def release(self, robots: Iterable[int]) -> list[int]:
-        """Take `robots` out, seed pairs as a whole, and return the parts: these robots, and the branches below them."""
+        """Take out `robots` and their partners in seed pairs. Return these and the branches below them."""
         out = {each for robot in robots for each in (robot, self._partner[robot]) if each >= 0}
         parts = set(out)
         for robot in out:
@@ -78,19 +78,21 @@ class OpenForest:
             )
         return sorted(parts)
 
-    def insert(self, parts: list[int]) -> None:
-        """Put all of `parts` into the forest, the last first, each where the last end of what it changes is least."""
+    def insert(self, parts: list[int], skip: Callable[[], bool]) -> None:
+        """Put in `parts`, the last first, each where the last end of what it changes is least.
+
+        A place or a seed pair for which `skip` returns True is not considered.
+        """
         places = [robot for root in self._roots() for robot in self._part(root)]
         waiting = parts[:]
         while waiting:
             part = waiting.pop()
-            end, place, under = self._best_hop(part, places)
-            end_of_seed, visitor, root = min(
-                self._seeds_of(part, waiting), key=itemgetter(0), default=(inf, -1, -1)
-            )
-            if place < 0 and visitor < 0:
+            end, place, under = self._best_hop(part, (place for place in places if not skip()))
+            seed_pairs = (pair for pair in self._seed_pairs_of(part, waiting) if not skip())
+            end_of_pair, visitor, root = min(seed_pairs, key=itemgetter(0), default=(inf, -1, -1))
+            if end == end_of_pair == inf:
                 waiting.insert(0, part)
-            elif place < 0 or end_of_seed < end:
+            elif end_of_pair < end:
                 waiting = [each for each in waiting if each not in {visitor, root}]
                 places.extend(self._part(root))
                 self._add_seed(visitor, root)
@@ -98,7 +100,7 @@ class OpenForest:
                 places.extend(self._part(part))
                 self._add_hop(place, part, under)
 
-    def _best_hop(self, part: int, places: list[int]) -> tuple[float, int, int]:
+    def _best_hop(self, part: int, places: Iterable[int]) -> tuple[float, int, int]:
         """Return the last end, the place of departure, and the robot above which `part` is put, or -1."""
         hop, tail = self._times.hop, self._tail
         best = (inf, -1, -1)
@@ -114,7 +116,7 @@ class OpenForest:
                             best = (last, place, under)
         return best
 
-    def _seeds_of(self, part: int, waiting: list[int]) -> Iterator[tuple[float, int, int]]:
+    def _seed_pairs_of(self, part: int, waiting: list[int]) -> Iterator[tuple[float, int, int]]:
         """Yield the last end, the visitor and the visited of each seed pair of `part` with another part."""
         seed, tail = self._times.seed, self._tail
         for other in waiting:

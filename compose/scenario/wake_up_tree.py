@@ -28,6 +28,24 @@ class MeetingTimes(msgspec.Struct, frozen=True):
         """The numbers of the robots."""
         return range(len(self.seed))
 
+    def earliest_end(self) -> float:
+        """Return a lower bound in s of the last end of any forest: that of the robot that is reached last.
+
+        A robot is reached no earlier than by a seed pair of its own, or by one hop from the place of another:
+        more hops take no less time.
+        """
+        seed, hop, robots = self.seed, self.hop, self.robots
+        as_visitor = [min(seed[a][b] for b in robots if a != b) for a in robots]
+        as_visited = [min(seed[a][b] for a in robots if a != b) for b in robots]
+        return max(
+            min(
+                as_visitor[robot],
+                as_visited[robot],
+                *(as_visited[place] + hop[place][robot] for place in robots if place != robot),
+            )
+            for robot in robots
+        )
+
 
 class WakeUpForest(msgspec.Struct, frozen=True):
     """The trees of a group: each starts with a seed pair, each hop localises one robot more."""
@@ -35,7 +53,7 @@ class WakeUpForest(msgspec.Struct, frozen=True):
     seeds: tuple[tuple[int, int], ...]
     """The seed pairs, as (visitor, visited)."""
     hops: tuple[tuple[int, int], ...]
-    """The anchor of departure and the robot that is visited, each after the one that localised its departure."""
+    """The robot at whose anchor each hop starts, and the robot that it visits, in a possible order."""
 
     def ends(self, times: MeetingTimes) -> dict[int, float]:
         """Return the time in s at which each visited robot is localised."""
@@ -48,8 +66,8 @@ class WakeUpForest(msgspec.Struct, frozen=True):
 def optimal_forest(times: MeetingTimes) -> WakeUpForest:
     """Return a forest whose last meeting ends as early as possible.
 
-    Trees do not interact, and after a meeting neither do the two robots, so the optimum follows from the optima of
-    all sets of robots: O(n 3^n) steps. Ties go to the lower numbers.
+    Trees do not interact, and after a meeting neither do its two robots, so the optimum of a set of robots
+    follows from the optima of its subsets, in O(n 3^n) steps for all. Ties go to the lower numbers.
     """
     return _Optimum(times).forest()
 
