@@ -109,7 +109,7 @@ def groups(least: int, most: int) -> st.SearchStrategy[Anchors]:
 
 
 @given(groups(2, 14), st.floats(0.1, 3.0), st.floats(0.0, 60.0))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_a_plan_is_possible_and_ends_at_its_bound(anchors: Anchors, speed: float, meeting: float) -> None:
     seed_time = orbit_time(anchors)
     plan = group_plan(anchors, seed_time, speed, meeting)
@@ -121,7 +121,7 @@ def test_a_plan_is_possible_and_ends_at_its_bound(anchors: Anchors, speed: float
 
 
 @given(groups(2, 5), st.lists(st.floats(1.0, 400.0), min_size=25, max_size=25), st.floats(0.0, 60.0))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_a_small_plan_is_the_best_of_all_plans(anchors: Anchors, drawn: list[float], meeting: float) -> None:
     def seed_time(a: int, b: int) -> float:
         return drawn[5 * a + b]
@@ -138,10 +138,11 @@ def test_a_plan_of_six_robots_is_the_best_of_all_plans(seed: int) -> None:
     assert plan_of(anchors).bound == pytest.approx(least_bound(anchors, orbit_time(anchors), MEETING_S))
 
 
-@given(groups(3, 7))
-@settings(max_examples=30, deadline=None)
-def test_the_optimum_is_between_the_lower_bound_and_any_search(anchors: Anchors) -> None:
-    times = meeting_times(anchors)
+@given(groups(3, 7), st.randoms(use_true_random=False))
+@settings(max_examples=20, deadline=None)
+def test_the_optimum_is_between_the_lower_bound_and_any_search(anchors: Anchors, draw: random.Random) -> None:
+    seed = tuple(tuple(draw.uniform(1.0, 400.0) for _ in anchors) for _ in anchors)
+    times = MeetingTimes(seed, meeting_times(anchors).hop)
     optimum = last_end(optimal_forest(times), times)
     assert times.earliest_end() <= optimum * (1 + 1e-12)
     for steps in (0, 20):
@@ -149,7 +150,7 @@ def test_the_optimum_is_between_the_lower_bound_and_any_search(anchors: Anchors)
 
 
 @given(groups(3, 12), st.integers(-1000, 1000), st.integers(-1000, 1000), st.randoms(use_true_random=False))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_numbers_and_the_origin_do_not_change_the_bound(
     anchors: Anchors, east: int, north: int, draw: random.Random
 ) -> None:
@@ -171,7 +172,7 @@ def test_the_search_is_near_the_optimum(robots: int) -> None:
 def test_the_search_is_near_the_optimum_in_200_groups(robots: int) -> None:
     ratios = [ratio_of_search(drawn_anchors(robots, seed)) for seed in range(200)]
     assert mean(ratios) < 1.001
-    assert max(ratios) < 1.05
+    assert max(ratios) < 1.01
 
 
 @pytest.mark.parametrize("robots", [16, pytest.param(50, marks=pytest.mark.long)])
@@ -189,8 +190,8 @@ def test_the_same_group_has_the_same_plan() -> None:
 
 
 def test_pairs_that_are_far_apart_meet_at_the_same_time() -> None:
-    plan = plan_of([(0.0, 0.0), (5.0, 0.0), (500.0, 0.0), (505.0, 0.0)])
-    assert [each.first for each in plan.meetings] == [True, True]
+    plan = plan_of([(0.0, 0.0), (5.0, 0.0), (35.0, 0.0), (40.0, 0.0), (70.0, 0.0), (75.0, 0.0)])
+    assert [each.first for each in plan.meetings] == [True, True, True]
     assert plan.bound == pytest.approx(10 * math.pi + 20)
 
 

@@ -23,11 +23,11 @@ def short_forest(times: MeetingTimes, steps: int = STEPS) -> WakeUpForest:
     """Return the shortest forest that the search finds.
 
     A step releases robots near one of those on which the last end depends, and inserts them again in another
-    order, until a lower bound is met: ruin and recreate (Schrimpf et al., J. Comput. Phys. 159, 2000) with
-    blinks (Christiaens and Vanden Berghe, Transp. Sci. 54, 2020). All random numbers come from a constant seed.
+    order: ruin and recreate (Schrimpf et al., J. Comput. Phys. 159, 2000) with blinks (Christiaens and
+    Vanden Berghe, Transp. Sci. 54, 2020). The search ends early at a lower bound. Its seed is a constant.
 
-    No bound of its ratio to the optimum is proved. In the plane, with no time for meetings, one robot can have
-    all within a distance r localised within 4.31 r / v, and for some positions no sooner than 3.82 r / v
+    No bound of its ratio to the optimum is proved. In the plane, with no time for meetings, one robot can
+    have all within a distance r localised within 4.31 r / v, and for some positions no sooner than 3.82 r / v
     (arXiv 2507.16269); this search does not guarantee the former.
     """
     draw = random.Random(SEED).random
