@@ -95,6 +95,9 @@ MAX_REPORT_RUNS = 70
 MAX_REPORT_RANGES = 70
 """The maximum number of ranges in a Report, for the same reason."""
 
+MAX_MEETINGS = 1000
+"""The maximum number of meetings of a robot after its first one."""
+
 MAX_BODY_BYTES = 3890
 """The maximum size of the body of a PlannerReport, so that its frame fits in `wire.MAX_REPORT_BYTES`."""
 
@@ -266,8 +269,41 @@ class RobotConfigWithOptions(RobotConfig, frozen=True, dict=True):
     """The options of the planner, by name."""
 
 
-AnyRobotConfig = RobotConfig | RobotConfigWithOptions
-"""The two kinds of configurations."""
+class Meeting(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """A meeting of a robot with another one of its group."""
+
+    peer: RobotId
+    """The other robot."""
+    role: Role
+    """The role of this robot in the pair that they form."""
+    peer_anchor: Anchor
+    """The position of the peer's anchor in <W>, in m."""
+    rendezvous: Rendezvous
+    """The orbits of both robots, on which they meet."""
+
+
+class RobotConfigInGroup(RobotConfigWithOptions, frozen=True, dict=True):
+    """The configuration of a robot in a group, which meets one robot after another.
+
+    `peer`, `role`, `peer_anchor` and `rendezvous` are those of its first meeting.
+    """
+
+    later_meetings: Annotated[tuple[Meeting, ...], Meta(max_length=MAX_MEETINGS)] = ()
+    """The meetings after the first one, in their order."""
+
+    def at(self, meeting: Meeting) -> RobotConfigInGroup:
+        """Return the configuration for `meeting`: the pair that this robot and its peer then form."""
+        return msgspec.structs.replace(
+            self,
+            peer=meeting.peer,
+            role=meeting.role,
+            peer_anchor=meeting.peer_anchor,
+            rendezvous=meeting.rendezvous,
+        )
+
+
+AnyRobotConfig = RobotConfig | RobotConfigWithOptions | RobotConfigInGroup
+"""The kinds of configurations."""
 
 
 class Observation(Message, frozen=True):
@@ -475,6 +511,7 @@ OfRobot = (
     Environment
     | RobotConfig
     | RobotConfigWithOptions
+    | RobotConfigInGroup
     | Observation
     | Report
     | PlannerReport

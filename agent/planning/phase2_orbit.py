@@ -11,6 +11,9 @@ from protocol.mission import Mission
 from protocol.motion import Controls, Pose, compose, wrap
 from protocol.orbits import Orbit
 
+ASIDE = 1e-9
+"""The distance from the place of Travelling at which a straight may end beside it, as a fraction of A_0."""
+
 LOOKAHEAD = 2.0
 """The distance of the pursued point ahead on the orbit, in ticks of the orbit's speed."""
 
@@ -40,6 +43,13 @@ class Orbiting(msgspec.Struct, frozen=True):
     """Noisy sensors: the controls of pure pursuit, or of active sensing while the robot waits."""
     since: int = 0
     """Noisy sensors: the tick in which the robot reached its orbit."""
+
+
+class Travelling(msgspec.Struct, frozen=True):
+    """A localised robot of a group drives to the next one, which waits beside its anchor."""
+
+    place: tuple[float, float]
+    """The place in m, in the frame of the odometry."""
 
 
 Phase2Mode = Aligning | Radial | Tangent | Orbiting
@@ -89,6 +99,22 @@ def controls(
             return turn(odometry, heading, mission)
         case Radial():
             return straight(left_to_orbit(odometry, start, orbit), mission)
+
+
+def travel_controls(mode: Travelling, odometry: Pose, mission: Mission, tolerance: float) -> Controls | None:
+    """Return the controls of `mode` at the pose `odometry`: a turn, then straight on; None on arrival.
+
+    `tolerance` is `Estimator.pose_tolerance`.
+    """
+    dx, dy = mode.place[0] - odometry.x, mode.place[1] - odometry.y
+    distance = math.hypot(dx, dy)
+    if distance <= tolerance * mission.first_straight:
+        return None
+    bearing = wrap(math.atan2(dy, dx) - odometry.heading)
+    # a tick of driving that begins with a small error of the heading ends beside the place by that error
+    if abs(bearing) > max(tolerance, ASIDE * mission.first_straight / distance):
+        return turn(odometry, odometry.heading + bearing, mission)
+    return straight(distance, mission)
 
 
 def pursuit(local: Pose, orbit: Orbit, mission: Mission) -> Controls:
