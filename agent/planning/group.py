@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from agent.estimation.knowledge import Belief
 from agent.planning import exchange
 from agent.planning.log_exchange import LogPlanner
-from agent.planning.phase2_orbit import Travelling
+from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Travelling, next_side, travel_controls
 from agent.planning.planner import Planner, Summary
 from agent.planning.state import Done, RobotState
 from protocol.messages import (
@@ -100,12 +100,16 @@ class GroupPlanner(Planner[GroupState, Report]):
     def observe(self, state: GroupState, observation: Observation) -> GroupState:
         """Return `state` with the sensor data of one tick, ranges to all robots of the group included."""
         pair = self._pair.observe(state.pair, observation)
+        if state.met and isinstance(pair.mode, Aligning | Radial | Orbiting):  # out of range again
+            pair = replace(pair, mode=Travelling(_stop(state.frame, pair)))
         others = state.others
         for contact in observation.contacts:
             if contact.peer != pair.config.peer and contact.range is not None:
                 known = others.get(contact.peer, Earlier())
                 ranges = (*known.mutual, Ranged(observation.tick, contact.range))
                 others = {**others, contact.peer: replace(known, mutual=ranges)}
+        if isinstance(pair.mode, Travelling) and not pair.in_contact:
+            pair = _searching(pair)
         ended = isinstance(pair.mode, Done) and not pair.in_contact
         return replace(state, pair=pair, others=others, unmet=state.unmet + 1 if ended else 0)
 
@@ -172,6 +176,15 @@ class GroupPlanner(Planner[GroupState, Report]):
         return self._pair.required_mutual_ranges(mission)
 
 
+def _searching(pair: RobotState) -> RobotState:
+    """Return `pair`, a visitor out of range; if it has arrived, on the next side of the search."""
+    assert isinstance(pair.mode, Travelling)
+    mission, tolerance = pair.config.mission, pair.estimator.pose_tolerance
+    if travel_controls(pair.mode, pair.odometry, mission, tolerance) is not None:
+        return pair
+    return replace(pair, mode=next_side(pair.mode, mission))
+
+
 def _is_over(state: GroupState) -> bool:
     """Return whether the robot may leave its meeting: the peer has its verdict, or has left before."""
     return state.pair.peer_state.verdict is not None or state.unmet >= PARTED_AFTER
@@ -188,26 +201,26 @@ def _next_meeting(state: GroupState) -> GroupState:
     known = state.others.get(config.peer, Earlier())
     others = {**state.others, config.peer: replace(known, mutual=pair.mutual, verdict=pair.verdict)}
     belief = pair.belief
-    return GroupState(
-        pair=RobotState(
-            config.at(meeting),
-            tick=pair.tick,
-            odometry=pair.odometry,
-            log=pair.log,
-            leg=pair.leg,
-            mutual=others[meeting.peer].mutual if meeting.peer in others else (),
-            belief=Belief(
-                possible=belief.possible,
-                branch=belief.branch,
-                branch_kind=belief.branch_kind,
-                phase1_done_tick=belief.phase1_done_tick,
-                own_anchor=belief.own_anchor,
-                own=belief.own,
-                branches=belief.branches,
-                ranges_at_last_fit=belief.ranges_at_last_fit,
-            ),
-            mode=Travelling(_stop(state.frame, pair, meeting)),
+    visitor = RobotState(
+        config.at(meeting),
+        tick=pair.tick,
+        odometry=pair.odometry,
+        log=pair.log,
+        leg=pair.leg,
+        mutual=others[meeting.peer].mutual if meeting.peer in others else (),
+        belief=Belief(
+            possible=belief.possible,
+            branch=belief.branch,
+            branch_kind=belief.branch_kind,
+            phase1_done_tick=belief.phase1_done_tick,
+            own_anchor=belief.own_anchor,
+            own=belief.own,
+            branches=belief.branches,
+            ranges_at_last_fit=belief.ranges_at_last_fit,
         ),
+    )
+    return GroupState(
+        pair=replace(visitor, mode=Travelling(_stop(state.frame, visitor))),
         met=state.met + 1,
         verdict=state.verdict,
         frame=state.frame,
@@ -215,9 +228,10 @@ def _next_meeting(state: GroupState) -> GroupState:
     )
 
 
-def _stop(frame: Pose, pair: RobotState, meeting: Meeting) -> tuple[float, float]:
+def _stop(frame: Pose, pair: RobotState) -> tuple[float, float]:
     """Return the place of a visit, in m in the odometry's frame: on the way to the anchor, but short of it."""
-    anchor = compose(inverse(frame), Pose(meeting.peer_anchor.x, meeting.peer_anchor.y, 0.0))
+    peer_anchor = pair.config.peer_anchor
+    anchor = compose(inverse(frame), Pose(peer_anchor.x, peer_anchor.y, 0.0))
     dx, dy = anchor.x - pair.odometry.x, anchor.y - pair.odometry.y
     distance = math.hypot(dx, dy)
     short = SHORT_OF_ANCHOR * pair.config.mission.sensing_range

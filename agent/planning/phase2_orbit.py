@@ -46,10 +46,15 @@ class Orbiting(msgspec.Struct, frozen=True):
 
 
 class Travelling(msgspec.Struct, frozen=True):
-    """A localised robot of a group drives to the next one, which waits beside its anchor."""
+    """A localised robot of a group drives to the next one, which waits beside its anchor.
+
+    If noise has led it astray and the other robot is not in range there, it searches on a square spiral.
+    """
 
     place: tuple[float, float]
-    """The place in m, in the frame of the odometry."""
+    """The end of the present straight, in m in the frame of the odometry."""
+    side: int = 0
+    """The number of sides of the spiral up to this place; 0 on the way to the robot."""
 
 
 Phase2Mode = Aligning | Radial | Tangent | Orbiting
@@ -115,6 +120,15 @@ def travel_controls(mode: Travelling, odometry: Pose, mission: Mission, toleranc
     if abs(bearing) > max(tolerance, ASIDE * mission.first_straight / distance):
         return turn(odometry, odometry.heading + bearing, mission)
     return straight(distance, mission)
+
+
+def next_side(mode: Travelling, mission: Mission) -> Travelling:
+    """Return the next side of the spiral after `mode`. Each second one is longer, by R."""
+    length = (mode.side // 2 + 1) * mission.sensing_range
+    along, sign = mode.side % 2, 1.0 if mode.side % 4 < 2 else -1.0
+    x, y = mode.place
+    place = (x, y + sign * length) if along else (x + sign * length, y)
+    return Travelling(place, mode.side + 1)
 
 
 def pursuit(local: Pose, orbit: Orbit, mission: Mission) -> Controls:
