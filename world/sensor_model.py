@@ -83,8 +83,8 @@ class SensorModel(msgspec.Struct, frozen=True):
     """The true position of each robot's anchor less the one that the robots are told, in m."""
     anchors: tuple[RangeSensor, ...]
     """The ranges of each robot to its anchor."""
-    mutual: tuple[RangeSensor, ...]
-    """The ranges of each pair of robots that may measure each other, in the order of `Scenario.radio_pairs`."""
+    mutual: dict[tuple[int, int], RangeSensor]
+    """The ranges of each pair of robots that may measure each other, by their places in the scenario."""
     anchor_lobes: tuple[Lobes, ...]
     """The pattern of each robot's anchor."""
     robot_lobes: tuple[Lobes, ...]
@@ -249,20 +249,18 @@ def sensor_model(
                 for robot in ids
             ]
         ),
-        mutual=tuple(
-            [
-                ranging(
-                    "mutual",
-                    noise.mutual_sigma,
-                    key,
-                    _of_pair(world.mutual_bias, ids[i], ids[j]),
-                    _of_pair(world.mutual_scale, ids[i], ids[j]),
-                    ("robot", ids[i]),
-                    ("robot", ids[j]),
-                )
-                for (i, j), key in zip(pairs, keys, strict=True)
-            ]
-        ),
+        mutual={
+            (i, j): ranging(
+                "mutual",
+                noise.mutual_sigma,
+                key,
+                _of_pair(world.mutual_bias, ids[i], ids[j]),
+                _of_pair(world.mutual_scale, ids[i], ids[j]),
+                ("robot", ids[i]),
+                ("robot", ids[j]),
+            )
+            for (i, j), key in zip(pairs, keys, strict=True)
+        },
         anchor_lobes=tuple([lobes("anchor", robot) for robot in ids]),
         robot_lobes=tuple([lobes("robot", robot) for robot in ids]),
         odometers={

@@ -65,7 +65,8 @@ def mutual_ranges(truth: Truth, scenario: Scenario, pairs: Sequence[tuple[int, i
             ranges.append(None if exact is None else Mutual(exact))
         return ranges
     lobed = sensors.world.lobe_depth
-    for (i, j), sensor in zip(pairs, sensors.mutual, strict=True):
+    for i, j in pairs:
+        sensor = sensors.mutual[i, j]
         one, other, robot = truth.local[i], truth.local[j], sensor.robot
         x, y = one.x - other.x, one.y - other.y
         rho, pattern = math.hypot(x, y), 1.0

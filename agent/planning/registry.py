@@ -21,7 +21,7 @@ class Assured(AssuredExact):
         return AssuredExact() if mission.noise.exact else AccuracySeeking()
 
 
-GROUPS: dict[str, type[LogPlanner]] = {"assured": Assured}
+GROUPS: dict[str, type[Assured]] = {"assured": Assured}
 """The classes of the shipped planners with which robots can form a group."""
 
 SHIPPED: dict[str, type[Planner[Any, Any]]] = {"assured": Assured, "paper": Paper}

@@ -102,7 +102,9 @@ class Robot:
         for contact in observation.contacts:
             peer = contact.peer
             self.unheard.add((peer, observation.tick))
-            self.unheard.difference_update([(peer, tick) for tick in (*(contact.heard or ()), *contact.damaged)])
+            self.unheard.difference_update(
+                [(peer, tick) for tick in (*(contact.heard or ()), *contact.damaged)]
+            )
             self.damaged += len(contact.damaged)
             self.mutual_ranges += contact.range is not None
             body = self.planner.report_to(self.state, peer)

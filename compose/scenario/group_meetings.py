@@ -49,12 +49,16 @@ def group_meetings(robots: Sequence[RobotTable], mission: Mission, planner: Plan
     Raises Unworkable if the planner is not made for groups.
     """
     if planner.name not in PLANNERS:
-        raise Unworkable(f"planner.name: robots with the planner {planner.name} meet in pairs: set robot.peer")
+        raise Unworkable(
+            f"planner.name: robots with the planner {planner.name} meet in pairs: set robot.peer"
+        )
     anchors, ids = [robot.anchor for robot in robots], [robot.id for robot in robots]
     near = _neighbours(anchors)
 
     def rendezvous(i: int, j: int) -> Rendezvous:
-        return planner_loader.orbits(planner.name, planner.options, mission, math.dist(anchors[i], anchors[j]))
+        return planner_loader.orbits(
+            planner.name, planner.options, mission, math.dist(anchors[i], anchors[j])
+        )
 
     def pair_time(i: int, j: int) -> float:
         if len(robots) >= LARGE and j not in near[i]:
@@ -81,5 +85,3 @@ def _neighbours(anchors: Sequence[tuple[float, float]]) -> list[set[int]]:
         set(sorted(range(len(anchors)), key=lambda j: math.dist(one, anchors[j]))[1 : NEIGHBOURS + 1])
         for one in anchors
     ]
-
-

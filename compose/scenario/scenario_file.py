@@ -275,7 +275,10 @@ def _first_meetings(file: ScenarioFile, source: str) -> dict[str, FirstMeeting]:
         peer = peers[robot.id]
         if i < place[peer]:
             orbits = _plan(file, i, place[peer], source)
-            found[robot.id], found[peer] = FirstMeeting(peer, "a", orbits), FirstMeeting(robot.id, "b", orbits)
+            found[robot.id], found[peer] = (
+                FirstMeeting(peer, "a", orbits),
+                FirstMeeting(robot.id, "b", orbits),
+            )
     return found
 
 
@@ -362,7 +365,9 @@ def _check_models(file: ScenarioFile, source: str) -> None:
 def _plan(file: ScenarioFile, first: int, second: int, source: str) -> Rendezvous:
     """Return the rendezvous orbits of the pair of robots at the places `first` and `second` in the file."""
     one, other = file.robot[first], file.robot[second]
-    distance = _check_distance(file, one, other, f"{source}: robot[{second}].anchor", f"its peer '{one.id}'", source)
+    distance = _check_distance(
+        file, one, other, f"{source}: robot[{second}].anchor", f"its peer '{one.id}'", source
+    )
     return planner_loader.orbits(file.planner.name, file.planner.options, file.mission, distance)
 
 
