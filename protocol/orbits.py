@@ -68,12 +68,22 @@ class Rendezvous(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fi
 
 def tick_budget(mission: Mission, plan: Rendezvous) -> int:
     """Return the default of `max_ticks`: twice T_max, and ample time for phases 1 and 3."""
-    turn = math.ceil(TAU / (mission.max_turn_rate * mission.period))
+    return math.ceil(plan.bound / mission.period) + pair_ticks(mission, plan)
+
+
+def pair_ticks(mission: Mission, plan: Rendezvous) -> int:
+    """Return the ticks until a pair is localised: T_max, and ample time for phases 1 and 3."""
     reach = max(plan.a.radius, plan.b.radius) + mission.sensing_range
     radial = math.ceil(reach / (mission.max_speed * mission.period))
+    return math.ceil(plan.bound / mission.period) + radial + 2 * meeting_ticks(mission)
+
+
+def meeting_ticks(mission: Mission) -> int:
+    """Return ample time in ticks for phase 1 or 3: a circle of radius A_0, turns, and some manoeuvres."""
+    turn = math.ceil(TAU / (mission.max_turn_rate * mission.period))
     circle_rate = min(mission.max_turn_rate, mission.max_speed / mission.first_straight)
     circle = math.ceil(TAU / (circle_rate * mission.period))
-    return 2 * math.ceil(plan.bound / mission.period) + 2 * circle + radial + 6 * turn + 50
+    return circle + 3 * turn + 25
 
 
 # --- the orbits of the `paper` planner ----------------------------------------------------------------
@@ -131,6 +141,15 @@ def searching(mission: Mission, distance: float) -> Rendezvous:
             ticks = math.ceil((TAU - 2.0 * half) / (omega * period))
             plan = Rendezvous(Orbit(radius, omega * radius, omega), waiting, ticks * period)
     return plan
+
+
+def visiting(mission: Mission, distance: float) -> Rendezvous:
+    """Return the orbits of a robot that knows its pose and drives straight to one that waits.
+
+    `distance` (m) is that of their anchors. The bound is the time of that way.
+    """
+    waiting = Orbit(WAITING_PLACE * mission.sensing_range, 0.0, 0.0)
+    return Rendezvous(Orbit(distance, 0.0, 0.0), waiting, distance / mission.max_speed)
 
 
 def clearance(mission: Mission, distance: float) -> float:

@@ -176,7 +176,7 @@ def observation_rows(run: recorded.Run, period: float) -> Iterator[ObservationRo
     """Yield the measurements by tick; `period` is T_s in s."""
     for tick, observations in enumerate(run.observations[: run.length]):
         for robot, one in observations.items():
-            contact = next(iter(one.contacts), None)
+            contact = recorded.nearest_contact(one.contacts)
             yield ObservationRow(
                 tick,
                 tick * period,

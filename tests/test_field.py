@@ -105,7 +105,7 @@ def test_two_robots_localise_in_hardware_mode(tmp_path: Path) -> None:
         both_have_ended(tmp_path, robots)
     a, b = told(tmp_path, "a"), told(tmp_path, "b")
     for one, other in ((a, b), (b, a)):
-        sent = {step.observation.tick for step in other.steps if step.report is not None}
+        sent = {step.observation.tick for step in other.steps if step.reports}
         heard = [report.report.tick for step in one.steps for report in step.received]
         assert heard
         assert len(heard) == len(set(heard))

@@ -306,8 +306,8 @@ def test_the_agent_counts_and_drops_a_report_that_the_decoder_refuses() -> None:
         frame = encode(report_of(parcel, tick, "b"))
         buffer.take(Arrival("report", "key", frame, keys.Key(keys.report, "run", "b")), 1)
     assert inbox.refused["report"] == 1
-    assert buffer.of(0) is not None
-    assert buffer.of(1) is None
+    assert buffer.of("b", 0) is not None
+    assert buffer.of("b", 1) is None
 
 
 def test_a_decoder_that_fails_refuses_the_report() -> None:

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from compose.scenario.group_plan import GroupPlan, PlannedMeeting, group_plan, planned_meetings
+from compose.scenario.group_plan import GroupPlan, PlannedVisit, group_plan, planned_meetings
 from compose.scenario.wake_up_search import short_forest
 from compose.scenario.wake_up_tree import MeetingTimes, WakeUpForest, optimal_forest
 
@@ -56,7 +56,7 @@ def ratio_of_search(anchors: Anchors) -> float:
 
 
 def simulated_ends(
-    meetings: tuple[PlannedMeeting, ...], anchors: Anchors, seed_time: SeedTime, speed: float, meeting: float
+    meetings: tuple[PlannedVisit, ...], anchors: Anchors, seed_time: SeedTime, speed: float, meeting: float
 ) -> list[float]:
     """Drive the robots through `meetings` and return the end of each, after checks that each is possible."""
     free: dict[int, tuple[int, float]] = {}

@@ -80,13 +80,14 @@ def decide_outcome(
 
     A claim is compared with the true pose at the tick of the claim, which is in `claimed`, or with the
     current one if `claimed` is None. The run does not wait for a robot whose peer is undecided or
-    inconsistent, because it can no longer be localised. A claim below the required accuracy does not count
-    as localised.
+    inconsistent, because it can no longer be localised; in a group, another robot may still come. A claim
+    below the required accuracy does not count as localised.
     """
     open_cases = [
         robot.id
         for robot in scenario.robots
-        if robot.id not in verdicts and not isinstance(verdicts.get(robot.peer), Undecided | Inconsistent)
+        if robot.id not in verdicts
+        and (scenario.meetings or not isinstance(verdicts.get(robot.peer), Undecided | Inconsistent))
     ]
     if open_cases and truth.tick < scenario.max_ticks:
         return None

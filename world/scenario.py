@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cached_property
+from itertools import combinations
 from typing import Any
 
 import msgspec
 from msgspec.structs import asdict
 
 from protocol.attack import Attack
-from protocol.messages import RobotConfig, RobotConfigWithOptions
+from protocol.messages import Member, RobotConfig, RobotConfigInGroup, RobotConfigWithOptions
 from protocol.mission import Anchor, Mission, Options, PlannerName, Role
 from protocol.motion import Pose
 from protocol.orbits import Rendezvous
-from protocol.units import RobotId, Tick
+from protocol.units import RobotId, Tick, Time
 from world.faults import Fault
 from world.radio_models import RADIO_MODELS
 from world.range_models import RANGE_MODELS
@@ -48,6 +49,17 @@ class RobotSpec(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fie
     """The orbits of the pair."""
     attack: Attack | None = None
     """The false data that the robot injects into its Reports; None for an honest robot."""
+
+
+class PlannedMeeting(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """A meeting of two robots of a group, after which both are localised."""
+
+    visitor: RobotId
+    """The robot that drives to the other one, with the role a."""
+    visited: RobotId
+    """The robot that waits beside its anchor, with the role b."""
+    ends: Time
+    """The bound in s of the time at which both are localised."""
 
 
 class Scenario(
@@ -106,12 +118,26 @@ class Scenario(
     def sensors(self) -> SensorModel:
         """The sensors of all robots, with everything that is drawn once for the mission."""
         robots = [(robot.id, robot.anchor) for robot in self.robots]
-        return sensor_model(self.mission, self.world_noise, robots, self.pairs(), self.seed)
+        return sensor_model(self.mission, self.world_noise, robots, self.radio_pairs(), self.seed)
+
+    @property
+    def meetings(self) -> tuple[PlannedMeeting, ...]:
+        """The meetings of a group, in the order in which they end; here, none: the robots form pairs."""
+        return ()
 
     def pairs(self) -> tuple[tuple[int, int], ...]:
-        """Return the pairs of peers as indices into `robots`, with robot a first."""
+        """Return the pairs that meet as indices into `robots`, with robot a first.
+
+        In a group, they are the meetings, and a robot may be in several of them.
+        """
         place = {robot.id: i for i, robot in enumerate(self.robots)}
+        if self.meetings:
+            return tuple((place[one.visitor], place[one.visited]) for one in self.meetings)
         return tuple((place[one.id], place[one.peer]) for one in self.robots if one.role == "a")
+
+    def radio_pairs(self) -> tuple[tuple[int, int], ...]:
+        """Return the pairs that measure their range if it is at most R: the peers, or any two of a group."""
+        return tuple(combinations(range(len(self.robots)), 2)) if self.meetings else self.pairs()
 
     def robot(self, robot: str) -> RobotSpec:
         """Return the specification of `robot`. Raises KeyError if there is no such robot."""
@@ -143,9 +169,26 @@ class Scenario(
             attack=own.attack,
             tick_s=tick_s,
         )
+        if self.meetings:
+            visits = [
+                one.visited for one in self.meetings if one.visitor == own.id and one.visited != own.peer
+            ]
+            return RobotConfigInGroup(
+                **asdict(config),
+                planner_options=self.planner_options,
+                members=self.members,
+                visits=tuple(visits),
+            )
         if not self.planner_options:
             return config
         return RobotConfigWithOptions(**asdict(config), planner_options=self.planner_options)
+
+    @cached_property
+    def members(self) -> tuple[Member, ...]:
+        """The robots of the group, as they know each other; empty for pairs."""
+        ends = {one.visited: one.ends for one in reversed(self.meetings)}
+        ends |= {one.visitor: one.ends for one in reversed(self.meetings) if one.visitor not in ends}
+        return tuple([Member(one.id, one.anchor, ends[one.id]) for one in self.robots]) if ends else ()
 
 
 class ScenarioWithWorldNoise(
@@ -174,5 +217,14 @@ class ScenarioWithOptions(
     """The model of the delivery of reports; None if all are delivered."""
 
 
-RecordedScenario = Scenario | ScenarioWithWorldNoise | ScenarioWithOptions
+class ScenarioOfGroup(
+    ScenarioWithOptions, frozen=True, array_like=True, forbid_unknown_fields=True, tag="scenario-of-group"
+):
+    """A mission whose robots form a group: each meets a robot that is localised, then others that are not."""
+
+    meetings: tuple[PlannedMeeting, ...] = ()
+    """The meetings, in the order in which they end."""
+
+
+RecordedScenario = Scenario | ScenarioWithWorldNoise | ScenarioWithOptions | ScenarioOfGroup
 """The kinds of scenario in a world's journal."""

@@ -83,8 +83,8 @@ class SensorModel(msgspec.Struct, frozen=True):
     """The true position of each robot's anchor less the one that the robots are told, in m."""
     anchors: tuple[RangeSensor, ...]
     """The ranges of each robot to its anchor."""
-    mutual: dict[int, RangeSensor]
-    """The ranges of each pair, by the place of its first robot."""
+    mutual: dict[tuple[int, int], RangeSensor]
+    """The ranges of each pair of robots that may measure each other, by their places in the scenario."""
     anchor_lobes: tuple[Lobes, ...]
     """The pattern of each robot's anchor."""
     robot_lobes: tuple[Lobes, ...]
@@ -189,10 +189,14 @@ def sensor_model(
 ) -> SensorModel:
     """Return the sensors of a mission.
 
-    `robots` are the ids and the anchors of the robots; `pairs` are pairs of places in it.
+    `robots` are the ids and the anchors of the robots; `pairs` are pairs of places in it, those that may
+    measure each other.
     """
     noise = world.shared(mission.noise)
     ids = [robot for robot, _ in robots]
+    # A robot with one partner keys the errors of their ranges; in a group, both robots do.
+    alone = len(dict(pairs)) == len(pairs)
+    keys = [ids[i] if alone else f"{ids[i]}-{ids[j]}" for i, j in pairs]
 
     def drawn(name: str, robot: str, sigma: float) -> float:
         return sigma * gaussian(seed, name, robot, 0) if sigma else 0.0
@@ -246,16 +250,16 @@ def sensor_model(
             ]
         ),
         mutual={
-            i: ranging(
+            (i, j): ranging(
                 "mutual",
                 noise.mutual_sigma,
-                ids[i],
+                key,
                 _of_pair(world.mutual_bias, ids[i], ids[j]),
                 _of_pair(world.mutual_scale, ids[i], ids[j]),
                 ("robot", ids[i]),
                 ("robot", ids[j]),
             )
-            for i, j in pairs
+            for (i, j), key in zip(pairs, keys, strict=True)
         },
         anchor_lobes=tuple([lobes("anchor", robot) for robot in ids]),
         robot_lobes=tuple([lobes("robot", robot) for robot in ids]),

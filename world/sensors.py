@@ -66,7 +66,8 @@ def mutual_ranges(truth: Truth, scenario: Scenario, pairs: Sequence[tuple[int, i
         return ranges
     lobed = sensors.world.lobe_depth
     for i, j in pairs:
-        one, other, robot = truth.local[i], truth.local[j], scenario.robots[i].id
+        sensor = sensors.mutual[i, j]
+        one, other, robot = truth.local[i], truth.local[j], sensor.robot
         x, y = one.x - other.x, one.y - other.y
         rho, pattern = math.hypot(x, y), 1.0
         if lobed:
@@ -88,7 +89,7 @@ def mutual_ranges(truth: Truth, scenario: Scenario, pairs: Sequence[tuple[int, i
         elif sensors.exact:
             ranges.append(Mutual(rho))
         else:
-            measured = sensors.measured(sensors.mutual[i], rho, truth.tick)
+            measured = sensors.measured(sensor, rho, truth.tick)
             ranges.append(Mutual(_modelled(measured, model, radios)))
     return ranges
 

@@ -31,7 +31,7 @@ class World(msgspec.Struct, frozen=True):
     claimed: dict[str, Pose]
     """The true pose in <W> of each localised robot at the tick of its claim. Noise may move it afterwards."""
     pairs: tuple[tuple[int, int], ...]
-    """The pairs of peers, as indices into the scenario's robots."""
+    """The pairs of robots that may measure each other, as indices into the scenario's robots."""
     links: tuple[LinkState, ...] = ()
     """The state of the links: for each pair, from the first to the second robot, then back.
 
@@ -43,8 +43,8 @@ class World(msgspec.Struct, frozen=True):
 
 def release(scenario: Scenario) -> World:
     """Return the world at tick 0."""
-    pairs = scenario.pairs()
-    origins = {place: scenario.robots[pair[0]].anchor for pair in pairs for place in pair}
+    pairs = scenario.radio_pairs()
+    origins = {place: scenario.robots[i].anchor for i, j in reversed(pairs) for place in (i, j)}
     local = tuple(
         Pose(robot.start.x - origins[i].x, robot.start.y - origins[i].y, robot.start.heading)
         for i, robot in enumerate(scenario.robots)
@@ -73,8 +73,8 @@ def observations(world: World) -> list[Observation]:
             to_other, to_one = (
                 world.links[2 * i : 2 * i + 2] if world.links else (LinkState((tick,)), LinkState((tick,)))
             )
-            contacts[one] = (Contact(robots[other].id, mutual.range, to_one.heard, to_one.damaged),)
-            contacts[other] = (Contact(robots[one].id, mutual.range, to_other.heard, to_other.damaged),)
+            contacts[one] += (Contact(robots[other].id, mutual.range, to_one.heard, to_one.damaged),)
+            contacts[other] += (Contact(robots[one].id, mutual.range, to_other.heard, to_other.damaged),)
     ranges = anchor_ranges(truth, scenario)
     return [
         Observation(tick, robot.id, measured[i], ranges[i], contacts[i]) for i, robot in enumerate(robots)
@@ -115,7 +115,7 @@ def _carried(
     mutuals = mutual_ranges(truth, scenario, pairs)
     ids = [robot.id for robot in scenario.robots]
     links = [(way, mutual) for pair, mutual in zip(pairs, mutuals, strict=True) for way in (pair, pair[::-1])]
-    senders = [sender for (sender, _), mutual in links if mutual is not None]
+    senders = list(dict.fromkeys([sender for (sender, _), mutual in links if mutual is not None]))
     delivered = _delivered(before, scenario, truth, links, senders) if scenario.radio is not None else {}
     return tuple(
         [
@@ -125,7 +125,7 @@ def _carried(
                 scenario.seed,
                 truth.tick,
                 in_contact=mutual is not None,
-                delivered=delivered.get(sender, (link.radio, 0)),
+                delivered=delivered.get((sender, receiver), (link.radio, 0)),
             )
             for link, ((sender, receiver), mutual) in zip(before, links, strict=True)
         ]
@@ -138,17 +138,17 @@ def _delivered(
     truth: Truth,
     links: Sequence[tuple[tuple[int, ...], object]],
     senders: Sequence[int],
-) -> dict[int, tuple[Any, int | None]]:
-    """Return the state of the link and the delay of the report of each of `senders`, by the radio model."""
+) -> dict[tuple[int, ...], tuple[Any, int | None]]:
+    """Return the state and the delay of the report of each link of `senders`, by the radio model."""
     assert scenario.radio is not None
     places = [(pose.x, pose.y) for pose in truth.poses]
     ids, reach = [robot.id for robot in scenario.robots], scenario.sensors.reach
     sending = tuple([(ids[sender], places[sender]) for sender in senders])
-    found: dict[int, tuple[Any, int | None]] = {}
+    found: dict[tuple[int, ...], tuple[Any, int | None]] = {}
     for link, ((sender, receiver), mutual) in zip(before, links, strict=True):
         if mutual is not None:
             name = f"report/{ids[sender]}->{ids[receiver]}"
             radios = Radios(name, places[sender], places[receiver], truth.tick, scenario.seed)
             transmission = Transmission(radios, reach, scenario.mission.period, sending, ids[sender])
-            found[sender] = scenario.radio.sent(link.radio, transmission)
+            found[sender, receiver] = scenario.radio.sent(link.radio, transmission)
     return found

@@ -10,6 +10,7 @@ import msgspec
 from protocol.journal.environment import named_in
 from protocol.journal.journal_file import CorruptJournal, UnexpectedFrame, take_all
 from protocol.messages import Command, DeadlineMissed, Environment, FinalReport, MissionEnd
+from protocol.mission import Role
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 from world.referee import MissionOutcome
 from world.scenario import RecordedScenario, Scenario
@@ -193,10 +194,28 @@ def _unpaired(scenario: Scenario) -> str | None:
     robots = {robot.id: robot for robot in scenario.robots}
     if not robots or len(robots) != len(scenario.robots):
         return "its scenario has no robots, or several of the same name"
+    if scenario.meetings:
+        return _unplanned(scenario)
     for robot in scenario.robots:
         peer = robots.get(robot.peer)
         if peer is None or peer.peer != robot.id or peer.role == robot.role:
             return f"in its scenario {robot.id} has no peer"
+    return None
+
+
+def _unplanned(scenario: Scenario) -> str | None:
+    """Return which robot of a group does not meet another one as planned, for a user; None if all do."""
+    first: dict[str, tuple[str, Role]] = {}
+    for one in scenario.meetings:
+        first.setdefault(one.visitor, (one.visited, "a"))
+        if one.visited in first:
+            return f"in its scenario {one.visited} is visited after it has met another robot"
+        first[one.visited] = (one.visitor, "b")
+    if first.keys() != {robot.id for robot in scenario.robots}:
+        return "in its scenario the meetings are not those of its robots"
+    for robot in scenario.robots:
+        if first[robot.id] != (robot.peer, robot.role):
+            return f"in its scenario {robot.id} has another peer than in its first meeting"
     return None
 
 

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from agent.planning import exchange, phase3_last_manoeuvre, transitions
 from agent.planning.log_exchange import LogPlanner
 from agent.planning.manoeuvres import Manoeuvres
-from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent
+from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent, Travelling
 from agent.planning.phase3_last_manoeuvre import SPEEDS, Standing, Waiting
 from agent.planning.state import MODE_NAMES, Done, RobotState
 from protocol.messages import Command, Localised, Observation, Report
@@ -52,7 +52,7 @@ class AssuredExact(LogPlanner):
         if not state.in_contact or isinstance(state.mode, Done):
             return state
         match state.mode:
-            case Aligning() | Radial() | Tangent() | Orbiting():
+            case Aligning() | Radial() | Tangent() | Orbiting() | Travelling():
                 peer = state.peer_state
                 met = peer.phase == 3 or (peer.start is not None and state.off_anchor)
                 return transitions.begin_phase3(state) if met else state
@@ -79,7 +79,7 @@ class AssuredExact(LogPlanner):
         return (
             state.in_contact
             and (state.peer_state.start is None or state.config.role == "a")
-            and isinstance(state.mode, Aligning | Radial | Tangent | Orbiting)
+            and isinstance(state.mode, Aligning | Radial | Tangent | Orbiting | Travelling)
         )
 
     def _after_range(self, state: RobotState) -> RobotState:

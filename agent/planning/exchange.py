@@ -21,6 +21,7 @@ from protocol.messages import (
     Report,
     RobotConfig,
     Undecided,
+    Verdict,
 )
 from protocol.motion import REST, Controls, Pose, step
 
@@ -89,6 +90,30 @@ def report(state: RobotState) -> Report:
         ranges_heard=len(state.peer_state.peer.ranges),
         verdict=state.verdict,
     )
+
+
+def report_without_log(state: RobotState, verdict: Verdict | None) -> Report:
+    """Return a report to a robot with which this one is not in a meeting: its `verdict` in an earlier one."""
+    return Report(
+        tick=state.tick,
+        robot=state.config.robot,
+        phase=state.phase,
+        state=state.mode_name,
+        start=None,
+        since=0,
+        through=0,
+        runs=(),
+        ranges_since=len(state.log.ranges),
+        ranges=(),
+        heard=0,
+        ranges_heard=0,
+        verdict=verdict,
+    )
+
+
+def is_without_log(report: Report) -> bool:
+    """Return whether `report` is one to a robot with which its sender is not in a meeting."""
+    return report.start is None and report.through == 0
 
 
 def with_reports(state: RobotState, reports: Sequence[Report]) -> RobotState:

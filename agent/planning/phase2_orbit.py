@@ -11,6 +11,9 @@ from protocol.mission import Mission
 from protocol.motion import Controls, Pose, compose, wrap
 from protocol.orbits import Orbit
 
+ASIDE = 1e-9
+"""The distance from the place of Travelling at which a straight may end beside it, as a fraction of A_0."""
+
 LOOKAHEAD = 2.0
 """The distance of the pursued point ahead on the orbit, in ticks of the orbit's speed."""
 
@@ -40,6 +43,18 @@ class Orbiting(msgspec.Struct, frozen=True):
     """Noisy sensors: the controls of pure pursuit, or of active sensing while the robot waits."""
     since: int = 0
     """Noisy sensors: the tick in which the robot reached its orbit."""
+
+
+class Travelling(msgspec.Struct, frozen=True):
+    """A localised robot of a group drives to the next one, which waits beside its anchor.
+
+    If noise has led it astray and the other robot is not in range there, it searches on a square spiral.
+    """
+
+    place: tuple[float, float]
+    """The end of the present straight, in m in the frame of the odometry."""
+    side: int = 0
+    """The number of sides of the spiral up to this place; 0 on the way to the robot."""
 
 
 Phase2Mode = Aligning | Radial | Tangent | Orbiting
@@ -89,6 +104,31 @@ def controls(
             return turn(odometry, heading, mission)
         case Radial():
             return straight(left_to_orbit(odometry, start, orbit), mission)
+
+
+def travel_controls(mode: Travelling, odometry: Pose, mission: Mission, tolerance: float) -> Controls | None:
+    """Return the controls of `mode` at the pose `odometry`: a turn, then straight on; None on arrival.
+
+    `tolerance` is `Estimator.pose_tolerance`.
+    """
+    dx, dy = mode.place[0] - odometry.x, mode.place[1] - odometry.y
+    distance = math.hypot(dx, dy)
+    if distance <= tolerance * mission.first_straight:
+        return None
+    bearing = wrap(math.atan2(dy, dx) - odometry.heading)
+    # a tick of driving that begins with a small error of the heading ends beside the place by that error
+    if abs(bearing) > max(tolerance, ASIDE * mission.first_straight / distance):
+        return turn(odometry, odometry.heading + bearing, mission)
+    return straight(distance, mission)
+
+
+def next_side(mode: Travelling, mission: Mission) -> Travelling:
+    """Return the next side of the spiral after `mode`. Each second one is longer, by R."""
+    length = (mode.side // 2 + 1) * mission.sensing_range
+    along, sign = mode.side % 2, 1.0 if mode.side % 4 < 2 else -1.0
+    x, y = mode.place
+    place = (x, y + sign * length) if along else (x + sign * length, y)
+    return Travelling(place, mode.side + 1)
 
 
 def pursuit(local: Pose, orbit: Orbit, mission: Mission) -> Controls:

@@ -124,6 +124,14 @@ class Planner(Generic[S, B]):
 
     # --- optional ---
 
+    def report_to(self, state: S, peer: str) -> B:
+        """Return the body of the report of this tick to the robot `peer`, which is in contact.
+
+        In a group, several robots may be. Default: the same report for all.
+        """
+        del peer
+        return self.report(state)
+
     def suited(self, mission: Mission) -> Planner[Any, Any]:
         """Return the planner that is used with the noise of `mission`: by default, this one."""
         del mission

@@ -6,6 +6,8 @@ from typing import Any
 
 from agent.planning.accuracy_seeking import AccuracySeeking
 from agent.planning.assured import AssuredExact
+from agent.planning.group import GroupPlanner
+from agent.planning.log_exchange import LogPlanner
 from agent.planning.paper import Paper
 from agent.planning.planner import Planner
 from protocol.mission import Mission
@@ -14,13 +16,21 @@ from protocol.mission import Mission
 class Assured(AssuredExact):
     """The planner `assured`, of which there are two: for exact and for noisy sensors."""
 
-    def suited(self, mission: Mission) -> Planner[Any, Any]:
+    def suited(self, mission: Mission) -> LogPlanner:
         """Return the planner for the noise of `mission`."""
         return AssuredExact() if mission.noise.exact else AccuracySeeking()
 
 
+GROUPS: dict[str, type[Assured]] = {"assured": Assured}
+"""The classes of the shipped planners with which robots can form a group."""
+
 SHIPPED: dict[str, type[Planner[Any, Any]]] = {"assured": Assured, "paper": Paper}
 """The classes of the shipped planners."""
+
+
+def group_planner(name: str, mission: Mission) -> Planner[Any, Any]:
+    """Return the shipped planner `name` for a robot in a group. Raises KeyError if there is none."""
+    return GroupPlanner(GROUPS[name]().suited(mission))
 
 
 def planner(name: str, mission: Mission) -> Planner[Any, Any]:

@@ -11,7 +11,7 @@ from agent.estimation.gaussian.gaussian_estimator import GAUSSIAN
 from agent.estimation.knowledge import Knowledge
 from agent.planning.active_sensing import Listening, Retreating, Surveying
 from agent.planning.phase1_anchor import ThirdPoint
-from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent
+from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent, Travelling
 from agent.planning.phase3_last_manoeuvre import LastManoeuvre, Plan, Returning, Standing, Waiting
 from agent.planning.range_seeking import Backing, Circling, Homing, Seeking, Straight, Turning
 from protocol import messages
@@ -38,7 +38,7 @@ class Done(msgspec.Struct, frozen=True):
 
 
 Phase1 = Straight | Backing | Turning | Circling | ThirdPoint | Surveying | Homing
-Phase2 = Aligning | Radial | Tangent | Orbiting
+Phase2 = Aligning | Radial | Tangent | Orbiting | Travelling
 Phase3 = Straight | Backing | Turning | Circling | Standing | Waiting | LastManoeuvre | Returning
 Noisy3 = Surveying | Listening | Retreating
 Mode = Asleep | Phase1 | Phase2 | Phase3 | Noisy3 | Done
@@ -57,6 +57,7 @@ MODE_NAMES: dict[type, str] = {
     Radial: "radial",
     Tangent: "tangent",
     Orbiting: "orbiting",
+    Travelling: "travelling",
     Standing: "standing",
     Waiting: "waiting",
     LastManoeuvre: "last-manoeuvre",
@@ -73,6 +74,7 @@ PHASES: dict[type, int] = {
     Radial: 2,
     Tangent: 2,
     Orbiting: 2,
+    Travelling: 2,
     Standing: 3,
     Waiting: 3,
     LastManoeuvre: 3,

@@ -11,7 +11,7 @@ from agent.planning import phase1_anchor, phase2_orbit, phase3_last_manoeuvre, r
 from agent.planning.active_sensing import Retreating, Surveying
 from agent.planning.manoeuvres import Manoeuvres
 from agent.planning.phase1_anchor import ThirdPoint
-from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent
+from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent, Travelling
 from agent.planning.phase3_last_manoeuvre import (
     LastManoeuvre,
     Plan,
@@ -262,5 +262,8 @@ def controls(state: RobotState) -> Controls:
             return planned
         case Homing():
             return homing_controls(state) or REST
+        case Travelling():
+            tolerance = state.estimator.pose_tolerance
+            return phase2_orbit.travel_controls(mode, state.odometry, state.config.mission, tolerance) or REST
         case _:
             return REST

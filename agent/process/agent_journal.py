@@ -41,8 +41,8 @@ class Step(msgspec.Struct, frozen=True):
     observation: Observation
     frame: bytes
     """The frame of the Observation."""
-    report: FramedReport | None = None
-    """The robot's report to its peer; None without contact."""
+    reports: tuple[FramedReport, ...] = ()
+    """The robot's reports, in the order of the contacts in `observation`."""
     received: tuple[FramedReport, ...] = ()
     missed: tuple[str, ...] = ()
     """The peers whose report did not arrive in time."""
@@ -50,6 +50,13 @@ class Step(msgspec.Struct, frozen=True):
     command_frame: bytes | None = None
     estimate: Estimate | None = None
     estimate_frame: bytes | None = None
+
+    def sent_to(self, peer: str) -> FramedReport | None:
+        """Return the robot's report to `peer`; None without contact, or if the journal lacks it."""
+        for contact, framed in zip(self.observation.contacts, self.reports, strict=False):
+            if contact.peer == peer:
+                return framed
+        return None
 
 
 class AgentHistory(msgspec.Struct, frozen=True):
@@ -177,9 +184,11 @@ class AgentJournalReading:
             case Report() | PlannerReport() if message.robot != self.config.robot and is_open:
                 step["received"] = (*step.get("received", ()), FramedReport(message, frame))
             case Report() | PlannerReport() if (
-                message.robot == self.config.robot and is_now and "report" not in step
+                message.robot == self.config.robot
+                and is_now
+                and len(step.get("reports", ())) < len(step["observation"].contacts)
             ):
-                step["report"] = FramedReport(message, frame)
+                step["reports"] = (*step.get("reports", ()), FramedReport(message, frame))
             case DeadlineMissed() if is_open and is_now:
                 step["missed"] = (*step.get("missed", ()), message.robot)
             case _:

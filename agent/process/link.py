@@ -8,7 +8,7 @@ from typing import Any
 
 import zenoh
 
-from protocol.messages import RobotConfig
+from protocol.messages import RobotConfig, RobotConfigInGroup
 from protocol.network import keys, session
 from protocol.network.inbox import NOTHING, Arrival, Inbox
 
@@ -29,7 +29,9 @@ class AgentLink:
 
     def __init__(self, config: RobotConfig, run: str, inbox: Inbox) -> None:
         self._id = config.robot
-        self._peer = config.peer
+        in_group = isinstance(config, RobotConfigInGroup)
+        self._senders = "*" if in_group else config.peer
+        """The robots whose Reports are received: the peer, or in a group all robots."""
         self._run = run
         self._inbox = inbox
         self._link_timeout = SILENCE_S + (config.tick_s or 0.0)
@@ -38,13 +40,14 @@ class AgentLink:
 
     def attach(self, link: zenoh.Session) -> None:
         """Use `link` to send and receive from now on."""
-        me, peer, run = self._id, self._peer, self._run
+        me, run = self._id, self._run
+        self._session = link
         self._command = session.publisher(link, keys.command(run, me))
-        self._report = session.publisher(link, keys.report(run, me, peer))
+        self._reports: dict[str, zenoh.Publisher] = {}
         self._estimate = session.publisher(link, keys.estimate(run, me))
         session.on_matching(self._estimate, self._want_estimate)
         session.subscribe_directly(link, keys.observation(run, me), self._inbox, "observation")
-        session.subscribe(link, keys.report(run, peer, me), self._inbox, "report")
+        session.subscribe(link, keys.report(run, self._senders, me), self._inbox, "report")
         session.watch_liveliness(link, keys.world_alive(run), self._inbox)
         self._show_alive = partial(session.show_alive, link, keys.robot_alive(run, me))
         self._token = self._show_alive()
@@ -76,9 +79,13 @@ class AgentLink:
         """Send a Command or a FinalReport to the world."""
         self._command.put(frame)
 
-    def report(self, frame: bytes) -> None:
-        """Send a Report to the peer."""
-        self._report.put(frame)
+    def report(self, peer: str, frame: bytes) -> None:
+        """Send a Report to `peer`."""
+        publisher = self._reports.get(peer)
+        if publisher is None:
+            key = keys.report(self._run, self._id, peer)
+            publisher = self._reports[peer] = session.publisher(self._session, key)
+        publisher.put(frame)
 
     def estimate(self, frame: bytes) -> None:
         """Send an Estimate to the viewers."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 
 import zenoh
@@ -96,7 +96,7 @@ class AgentProcess:
         self._repeat_at: float | None = None
         """The time of the next repetition, if one was requested within AGAIN_S of the last."""
         self._own_reports = deque(memory.own_reports, maxlen=OWN_REPORTS_KEPT)
-        """The robot's own latest reports."""
+        """The robot's own reports of its latest ticks in contact, by the receiving robot."""
         self.end: MissionEnd | None = memory.end if memory.final_report is not None else None
         """The MissionEnd, once it is accepted."""
         self._final_report = memory.final_report
@@ -197,10 +197,10 @@ class AgentProcess:
             self._out_of_step.over()
             self._observation = observation
             self._set_due()
-            framed = self._robot.observation(observation, frame)
-            if framed is not None:
-                self._own_reports.append(framed)
-                self._send_report(framed)
+            reports = self._robot.observation(observation, frame)
+            if reports:
+                self._own_reports.append(reports)
+                self._send_reports(reports)
             return True
         if observation == self._observation:
             self._out_of_step.over()
@@ -222,18 +222,18 @@ class AgentProcess:
         received: list[FramedReport] = []
         missed: list[str] = []
         for contact in self._observation.contacts:
-            listed = contact.heard
+            peer, now, listed = contact.peer, self._observation.tick, contact.heard
             if listed is None:
-                received += self._report_buffer.waiting(self._observation.tick)
-                listed = () if self._report_buffer.of(self._observation.tick) else (self._observation.tick,)
+                received += self._report_buffer.waiting(peer, now)
+                listed = () if self._report_buffer.of(peer, now) else (now,)
             for tick in listed:
-                framed = self._report_buffer.of(tick)
+                framed = self._report_buffer.of(peer, tick)
                 if framed is not None:
                     received.append(framed)
                 elif self._due is None or time.monotonic() < self._due:
                     return
                 else:
-                    missed.append(contact.peer)
+                    missed.append(peer)
         command = self._robot.decide(received, missed)
         self._due = None
         self._send_command(command.tick)
@@ -241,15 +241,16 @@ class AgentProcess:
             estimate = self._robot.estimate()
             if self._link.estimate_wanted:
                 self._link.estimate(estimate)
-        self._report_buffer.list(framed.report.tick for framed in received)
+        self._report_buffer.list((framed.report.robot, framed.report.tick) for framed in received)
         for contact in self._observation.contacts:
-            self._report_buffer.list(contact.damaged)
+            self._report_buffer.list((contact.peer, tick) for tick in contact.damaged)
         self._report_buffer.forget(command.tick - REPORTS_KEPT, self._robot.unheard)
 
-    def _send_report(self, framed: FramedReport) -> None:
-        self._link.report(framed.frame)
-        if self._on_kill_point is not None:
-            self._on_kill_point("report", framed.report.tick)
+    def _send_reports(self, reports: Mapping[str, FramedReport]) -> None:
+        for peer, framed in reports.items():
+            self._link.report(peer, framed.frame)
+            if self._on_kill_point is not None:
+                self._on_kill_point("report", framed.report.tick)
 
     def _send_command(self, tick: int) -> None:
         if self._on_kill_point is not None:
@@ -261,18 +262,23 @@ class AgentProcess:
     def _repeat_answers(self) -> None:
         """Send the stored answers again, for a process that was restarted and may have lost them.
 
-        In contact these include earlier reports to the peer.
+        In contact these include earlier reports.
         """
         now = time.monotonic()
         if now < self._repeated_at + AGAIN_S:
             self._repeat_at = self._repeated_at + AGAIN_S
             return
         self._repeated_at, self._repeat_at = now, None
-        if self._robot.report is not None:
-            oldest = self._robot.report.report.tick - OWN_REPORTS_KEPT
-            for framed in self._own_reports:
-                if framed.report.tick > oldest:
-                    self._send_report(framed)
+        if self._robot.reports:
+            oldest = self._robot.tick - OWN_REPORTS_KEPT
+            for reports in self._own_reports:
+                self._send_reports(
+                    {
+                        peer: framed
+                        for peer, framed in reports.items()
+                        if framed.report.tick > oldest and peer in self._robot.reports
+                    }
+                )
         if self._robot.command is not None:
             self._send_command(self._robot.command.tick)
 

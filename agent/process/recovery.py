@@ -22,7 +22,7 @@ from protocol.messages import FinalReport, MissionEnd, Observation, RobotConfig
 from protocol.wire import encode
 
 REPORTS_KEPT = 64
-"""The number of ticks for which a report of the peer is stored that no Observation has listed yet."""
+"""The number of ticks for which a received report is stored that no Observation has listed yet."""
 OWN_REPORTS_KEPT = REPORTS_KEPT - 4
 """The number of ticks for which a robot can repeat its own reports.
 
@@ -37,10 +37,10 @@ class Memory(msgspec.Struct, frozen=True):
     robot: Robot
     observation: Observation | None = None
     """The latest Observation."""
-    own_reports: tuple[FramedReport, ...] = ()
-    """The robot's own latest reports."""
+    own_reports: tuple[dict[str, FramedReport], ...] = ()
+    """The robot's own reports of its latest ticks in contact, by the receiving robot."""
     received: tuple[FramedReport, ...] = ()
-    """The latest reports received from the peer."""
+    """The latest reports received."""
     end: MissionEnd | None = None
     final_report: FinalReport | None = None
     """The answer to the MissionEnd."""
@@ -60,11 +60,11 @@ def remember(recording: Retrace, planner_of: Callable[[RobotConfig], Planner[Any
     recording.write(*[encode(one) for one in head if one is not None])
     replay = PlannerReplay(journal, planner_of(journal.config), recording)
     robot = replay.robot
-    own_reports: deque[FramedReport] = deque(maxlen=OWN_REPORTS_KEPT)
+    own_reports: deque[dict[str, FramedReport]] = deque(maxlen=OWN_REPORTS_KEPT)
     try:
         for step in replay:
-            if robot.report is not None:  # although its frame may be torn in the journal
-                own_reports.append(robot.report)
+            if robot.reports:  # although their frames may be torn in the journal
+                own_reports.append(robot.reports)
             if step.command is not None:
                 robot.estimate()
     except ReplayMismatch:

@@ -1,4 +1,4 @@
-"""A buffer for the peer's reports, which stores each until an Observation lists it or it is too old."""
+"""A buffer for received reports, which stores each until an Observation lists it or it is too old."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode
 
 
 class ReportBuffer:
-    """The received reports, by tick."""
+    """The received reports, by their sender and tick."""
 
     def __init__(
         self,
@@ -29,9 +29,9 @@ class ReportBuffer:
         self._malformed = malformed
         self._inbox = inbox
         self._real_time = real_time
-        self._reports = {framed.report.tick: framed for framed in received}
+        self._reports = {(framed.report.robot, framed.report.tick): framed for framed in received}
         self._listed = set(self._reports)
-        """The ticks of reports that an Observation has listed."""
+        """The senders and ticks of the reports that an Observation has listed."""
         self.unheard = 0
         """The number of reports that were received, but never listed."""
 
@@ -50,32 +50,33 @@ class ReportBuffer:
             return
         if not self._real_time and report.tick > known + 1:
             self._inbox.refuse(arrival, "its tick is in the future")
-        elif abs(report.tick - max(known, 0)) > REPORTS_KEPT:
+            return
+        if abs(report.tick - max(known, 0)) > REPORTS_KEPT:
             self.unheard += 1
-        elif (
-            self._reports.setdefault(report.tick, FramedReport(report, arrival.frame)).frame != arrival.frame
-        ):
+            return
+        framed = FramedReport(report, arrival.frame)
+        if self._reports.setdefault((report.robot, report.tick), framed).frame != arrival.frame:
             self._inbox.refuse(arrival, "it differs from an earlier report of this tick")
 
-    def of(self, tick: int) -> FramedReport | None:
-        """Return the report of `tick`, or None if it has not arrived."""
-        return self._reports.get(tick)
+    def of(self, sender: str, tick: int) -> FramedReport | None:
+        """Return the report that `sender` sent in `tick`, or None if it has not arrived."""
+        return self._reports.get((sender, tick))
 
-    def waiting(self, known: int) -> list[FramedReport]:
-        """Return the reports of ticks up to `known` that were never listed, oldest first."""
+    def waiting(self, sender: str, known: int) -> list[FramedReport]:
+        """Return the reports of `sender` from ticks up to `known` that were never listed, oldest first."""
         return [
-            self._reports[tick]
-            for tick in sorted(self._reports)
-            if tick <= known and tick not in self._listed
+            self._reports[one]
+            for one in sorted(self._reports)
+            if one[0] == sender and one[1] <= known and one not in self._listed
         ]
 
-    def list(self, ticks: Iterable[int]) -> None:
-        """Mark the reports of `ticks` as listed by an Observation."""
-        self._listed.update(ticks)
+    def list(self, reports: Iterable[tuple[str, int]]) -> None:
+        """Mark the reports with these senders and ticks as listed by an Observation."""
+        self._listed.update(reports)
 
-    def forget(self, before: int, asked_for: Collection[int]) -> None:
+    def forget(self, before: int, asked_for: Collection[tuple[str, int]]) -> None:
         """Delete the reports of ticks below `before`, and count those neither in `asked_for` nor listed."""
-        for tick in [tick for tick in self._reports if tick < before]:
-            del self._reports[tick]
-            self.unheard += tick not in self._listed and tick not in asked_for
-            self._listed.discard(tick)
+        for one in [one for one in self._reports if one[1] < before]:
+            del self._reports[one]
+            self.unheard += one not in self._listed and one not in asked_for
+            self._listed.discard(one)

@@ -46,8 +46,8 @@ class Robot:
         self.planner = planner
         self._logs = planner.BODY is Report
         self.state: Any = planner.start(config)
-        self.report: FramedReport | None = None
-        """The report of this tick; None if no peer is in contact."""
+        self.reports: dict[str, FramedReport] = {}
+        """The reports of this tick, by the robot in contact to which each is sent."""
         self.command: Command | None = None
         """The Command of this tick; None until it is decided."""
         self.tick = 0
@@ -55,15 +55,15 @@ class Robot:
         self.anchor_ranges = self.mutual_ranges = 0
         """The numbers of ranges that were measured."""
         self.reports_received = 0
-        self._heard: int | None = None
-        """The tick of the peer's latest report; None if none was received."""
+        self._heard: dict[str, int] = {}
+        """The tick of the latest report received from each robot."""
         self._verdict: Verdict | None = None
         """The verdict in the latest Command."""
         self.reports_sent = 0
         self.damaged = 0
         """The number of reports that were received damaged."""
-        self.unheard: set[int] = set()
-        """The ticks of contact from which the peer's report has not been received yet."""
+        self.unheard: set[tuple[str, int]] = set()
+        """The other robot and the tick of each contact from which its report has not been received yet."""
         self.bytes_sent = 0
         self._command_frame: bytes | None = None
         self._unwritten: bytes | None = None
@@ -89,32 +89,36 @@ class Robot:
             self._command_frame = self._encode(self.command)
         return self._command_frame
 
-    def observation(self, observation: Observation, frame: bytes | None = None) -> FramedReport | None:
-        """Update the state with an Observation, and return the report to send; None if no peer is in contact.
+    def observation(self, observation: Observation, frame: bytes | None = None) -> dict[str, FramedReport]:
+        """Update the state with an Observation, and return the reports to send, by the receiving robot.
 
         `frame` is the encoded Observation, if it was received as one.
         """
         self.tick = observation.tick
         self.state = self.planner.observe(self.state, observation)
         self.anchor_ranges += observation.anchor_range is not None
-        self.report = self.command = self._command_frame = None
+        self.command = self._command_frame = None
+        self.reports = {}
         for contact in observation.contacts:
-            self.unheard.add(observation.tick)
-            self.unheard.difference_update(contact.heard or (), contact.damaged)
+            peer = contact.peer
+            self.unheard.add((peer, observation.tick))
+            self.unheard.difference_update(
+                [(peer, tick) for tick in (*(contact.heard or ()), *contact.damaged)]
+            )
             self.damaged += len(contact.damaged)
             self.mutual_ranges += contact.range is not None
-        if observation.contacts:
-            report = report_of(
-                self.planner.report(self.state), self.tick, self.config.robot, self._heard, self._verdict
-            )
-            self.report = FramedReport(report, self._encode(report))
+            body = self.planner.report_to(self.state, peer)
+            report = report_of(body, self.tick, self.config.robot, self._heard.get(peer), self._verdict)
+            framed = self.reports[peer] = FramedReport(report, self._encode(report))
             self.reports_sent += 1
-            self.bytes_sent += len(self.report.frame)
-            if self._journal is not None:
-                self._journal.write(frame or self._encode(observation), self.report.frame)
-        elif self._journal is not None:
-            self._unwritten = frame or self._encode(observation)
-        return self.report
+            self.bytes_sent += len(framed.frame)
+        if self._journal is not None:
+            if self.reports:
+                frames = [framed.frame for framed in self.reports.values()]
+                self._journal.write(frame or self._encode(observation), *frames)
+            else:
+                self._unwritten = frame or self._encode(observation)
+        return self.reports
 
     def decide(self, received: Sequence[FramedReport] = (), missed: Sequence[str] = ()) -> Command:
         """Update the state with the received reports, and return the Command of this tick.
@@ -129,8 +133,10 @@ class Robot:
         self.state = self.planner.decide(self.state, bodies)
         if received:
             self.reports_received += len(received)
-            self._heard = max(self._heard or 0, *[framed.report.tick for framed in received])
-            self.unheard.difference_update([framed.report.tick for framed in received])
+            for framed in received:
+                sender, tick = framed.report.robot, framed.report.tick
+                self._heard[sender] = max(self._heard.get(sender, 0), tick)
+                self.unheard.discard((sender, tick))
         self.command = self.planner.command(self.state)
         self._verdict = self.command.verdict
         if self._journal is not None:

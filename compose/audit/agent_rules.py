@@ -46,13 +46,11 @@ def _answers(replayed: Robot, robot: str, step: Step, *, cut: bool) -> Checks:
 
     If `cut`, the journal ends in this tick, and messages may be missing.
     """
-    tick, report = step.observation.tick, replayed.report
-    if report is not None and step.report is not None:
-        yield _same(tick, robot, step.report.report, step.report.frame, report.frame)
-    elif report is not None and not (cut and step.command is None):
+    tick, reports = step.observation.tick, tuple(replayed.reports.values())
+    for found, expected in zip(step.reports, reports, strict=False):
+        yield _same(tick, robot, found.report, found.frame, expected.frame)
+    if len(step.reports) < len(reports) and not (cut and step.command is None):
         yield Violation("decision", tick, robot, "it sent no Report, expected one")
-    elif step.report is not None:
-        yield Violation("decision", tick, robot, "it sent a Report, expected none: no peer is in contact")
     if step.command is not None:
         yield _same(tick, robot, step.command, step.command_frame, replayed.command_frame)
     if step.estimate is not None:
@@ -123,9 +121,9 @@ def log(run: Run) -> Checks:
         planner = planner_of(agent.config)
         observations = [step.observation for step in agent.steps]
         for step in agent.steps:
-            if step.report is not None:
+            for framed in step.reports:
                 tick = step.observation.tick
-                what = _misreport(planner, step.report.report, observations)
+                what = _misreport(planner, framed.report, observations)
                 yield Violation("log", tick, robot, what) if what is not None else None
 
 

@@ -55,7 +55,12 @@ def _redundant(run: Run, placed: RobotSpec, agent: AgentHistory, tick: int) -> V
     planner, mission = planner_of(agent.config), run.scenario.mission
     through = tick
     if planner.BODY is Report:
-        ends = [_through(framed.report) for step in agent.steps[: tick + 1] for framed in step.received]
+        ends = [
+            _through(framed.report)
+            for step in agent.steps[: tick + 1]
+            for framed in step.received
+            if framed.report.robot == agent.config.peer
+        ]
         through = min(max(ends, default=-1), tick)
     mutual = _ranged(agent, through)
     if mission.noise.exact:
@@ -78,11 +83,14 @@ def _too_few(tick: int, placed: RobotSpec, what: str, found: int, expected: int)
 
 
 def _ranged(agent: AgentHistory, through: int) -> list[int]:
-    """Return the ticks of the mutual ranges up to the tick `through`."""
+    """Return the ticks of the ranges to the peer up to the tick `through`."""
     return [
         step.observation.tick
         for step in agent.steps[: through + 1]
-        if any(contact.range is not None for contact in step.observation.contacts)
+        if any(
+            contact.range is not None and contact.peer == agent.config.peer
+            for contact in step.observation.contacts
+        )
     ]
 
 

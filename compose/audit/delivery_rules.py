@@ -29,7 +29,7 @@ def contact(run: Run) -> Checks:
     """Check that Reports were sent and received only in contact, and that those received are listed."""
     for robot, agent in run.agents.items():
         for step in agent.steps:
-            if step.report is not None and step.observation.tick < len(run.observations):
+            if step.reports and step.observation.tick < len(run.observations):
                 yield _sent(run, robot, step)
             if step.command is not None:
                 yield _listed(robot, step)
@@ -38,26 +38,29 @@ def contact(run: Run) -> Checks:
 
 
 def _sent(run: Run, robot: str, step: Step) -> Violation | None:
-    if run.contact(robot, step.observation.tick) is not None:
+    tick, sent = step.observation.tick, len(step.reports)
+    partners = len(run.observations[tick][robot].contacts)
+    if sent <= partners:
         return None
-    return Violation(
-        "contact", step.observation.tick, robot, "it sent a report, expected none: out of contact"
-    )
+    what = "a report, expected none" if sent == 1 else f"{sent} reports, expected {partners}"
+    return Violation("contact", tick, robot, f"it sent {what}: out of contact")
 
 
 def _listed(robot: str, step: Step) -> Violation | None:
     if not (step.observation.contacts or step.received or step.missed):
         return None
-    listed = [tick for contact in step.observation.contacts for tick in contact.heard or ()]
-    received = [framed.report.tick for framed in step.received]
+    contacts = step.observation.contacts
+    listed = [(contact.peer, tick) for contact in contacts for tick in contact.heard or ()]
+    received = [(framed.report.robot, framed.report.tick) for framed in step.received]
     if len(received) + len(step.missed) == len(listed) and _is_subsequence(received, listed):
         return None
     missed = f" and missed {len(step.missed)}" if step.missed else ""
-    what = f"it received the reports of ticks {quoted(received)}{missed}, expected {quoted(listed)}"
+    found, expected = [[tick for _, tick in reports] for reports in (received, listed)]
+    what = f"it received the reports of ticks {quoted(found)}{missed}, expected {quoted(expected)}"
     return Violation("contact", step.observation.tick, robot, what)
 
 
-def _is_subsequence(some: Sequence[int], of: Sequence[int]) -> bool:
+def _is_subsequence(some: Sequence[object], of: Sequence[object]) -> bool:
     """Return whether `some` is `of` without some of its elements, in the same order."""
     rest = iter(of)
     return all(one in rest for one in some)
@@ -68,35 +71,33 @@ def _received(run: Run, robot: str, step: Step, framed: FramedReport) -> Violati
     if max(now, then) >= len(run.observations):
         return None  # the ground truth of these ticks is not in the recording
     for tick in (now, then):
-        if run.contact(robot, tick) is None:
+        if run.contact(robot, tick, framed.report.robot) is None:
             what = f"it received the report of tick {then}, expected none: out of contact at tick {tick}"
             return Violation("contact", now, robot, what)
     return None
 
 
 def report(run: Run) -> Checks:
-    """Check that each received Report is, to the byte, the one in the peer's journal."""
+    """Check that each received Report is, to the byte, the one in its sender's journal."""
     for robot, agent in run.agents.items():
-        peer = run.agents.get(agent.config.peer)
-        if peer is None:
-            continue
         for step in agent.steps:
             for framed in step.received:
-                if framed.report.tick < _complete_until(peer):
-                    yield _as_sent(robot, step, framed, peer)
+                sender = run.agents.get(framed.report.robot)
+                if sender is not None and framed.report.tick < _complete_until(sender):
+                    yield _as_sent(robot, step, framed, sender)
 
 
 def _complete_until(peer: AgentHistory) -> float:
     """Return the tick before which the peer's journal contains every Report that it sent."""
     if peer.final_report is not None:
         return math.inf
-    cut = peer.steps and peer.steps[-1].command is None and peer.steps[-1].report is None
+    cut = peer.steps and peer.steps[-1].command is None and not peer.steps[-1].reports
     return len(peer.steps) - 1 if cut else len(peer.steps)
 
 
 def _as_sent(robot: str, step: Step, framed: FramedReport, peer: AgentHistory) -> Violation | None:
     tick, steps = step.observation.tick, peer.steps
-    sent = steps[framed.report.tick].report if framed.report.tick < len(steps) else None
+    sent = steps[framed.report.tick].sent_to(robot) if framed.report.tick < len(steps) else None
     if sent is None:
         what = f"it received a report of tick {framed.report.tick}, which {peer.config.robot} never sent"
         return Violation("report", tick, robot, what)

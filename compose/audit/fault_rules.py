@@ -16,10 +16,10 @@ def faults(run: Run) -> Checks:
         return
     for robot, agent in run.agents.items():
         for step in agent.steps[: len(run.observations)]:
-            expected = run.contact(robot, step.observation.tick)
-            if expected is None:
-                continue
             for found in step.observation.contacts:
+                expected = run.contact(robot, step.observation.tick, found.peer)
+                if expected is None:
+                    continue
                 listed, planned = (found.heard, found.damaged), (expected.heard, expected.damaged)
                 if listed == planned:
                     yield None
@@ -32,19 +32,28 @@ def link_statistics(run: Run) -> tuple[LinkStatistics, ...]:
     """Return the statistics of each link whose receiver has a journal; none if all reports are delivered."""
     if not run.scenario.faults and run.scenario.radio is None:
         return ()
-    return tuple([_statistics(agent) for agent in run.agents.values()])
+    return tuple([_statistics(agent, peer) for agent in run.agents.values() for peer in _peers(agent)])
 
 
-def _statistics(agent: AgentHistory) -> LinkStatistics:
-    """Return the statistics of the link to the robot whose journal is `agent`."""
+def _peers(agent: AgentHistory) -> list[str]:
+    """Return the robots that the robot whose journal is `agent` met, and the one that it should have met."""
+    contacts = [contact for step in agent.steps for contact in step.observation.contacts]
+    return list(dict.fromkeys([agent.config.peer, *[contact.peer for contact in contacts]]))
+
+
+def _statistics(agent: AgentHistory, peer: str) -> LinkStatistics:
+    """Return the statistics of the link from `peer` to the robot whose journal is `agent`."""
     contacts = [
-        (step.observation.tick, contact) for step in agent.steps for contact in step.observation.contacts
+        (step.observation.tick, contact)
+        for step in agent.steps
+        for contact in step.observation.contacts
+        if contact.peer == peer
     ]
     received = [(now, tick) for now, contact in contacts for tick in contact.heard or ()]
     damaged = [tick for _, contact in contacts for tick in contact.damaged]
     ticks = [tick for _, tick in received]
     return LinkStatistics(
-        link=f"{agent.config.peer}->{agent.config.robot}",
+        link=f"{peer}->{agent.config.robot}",
         sent=len(contacts),
         heard=len(received),
         late=sum([tick < now for now, tick in received]),

@@ -350,11 +350,12 @@ def _parts(scenarios: Sequence[Scenario]) -> tuple[float, float, float]:
             observed = time.perf_counter()
             commands = {}
             for observation in observations:
-                reports = [
-                    own_reports[contact.peer] for contact in observation.contacts for _ in contact.heard or ()
-                ]
                 commands[observation.robot] = robots[observation.robot].decide(
-                    [one for one in reports if one is not None]
+                    [
+                        own_reports[contact.peer][observation.robot]
+                        for contact in observation.contacts
+                        for _ in contact.heard or ()
+                    ]
                 )
             decided = time.perf_counter()
             end = simulation.command(commands)

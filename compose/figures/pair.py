@@ -219,9 +219,10 @@ def pair_of(run: Run, robots: Sequence[str], replays: Mapping[str, AgentReplay])
         ticks = {robot: len(history.steps) for robot, history in known.items()}
     else:
         return None
+    peer = {config.robot: config.peer, config.peer: config.robot}
     mutual: list[tuple[bool, float | None]] = []
     for tick in range(max(ticks.values())):
-        contacts = [one for robot in ticks if (one := run.contact(robot, tick)) is not None]
+        contacts = [one for robot in ticks if (one := run.contact(robot, tick, peer[robot])) is not None]
         mutual.append((bool(contacts), next((one.range for one in contacts if one.range is not None), None)))
 
     def side(role: Role) -> Side:

@@ -76,18 +76,18 @@ def played(
     ticks: list[Tick] = []
     end: MissionEnd | None = None
     claims: dict[str, Estimate] = {}
-    sent: dict[tuple[str, int], FramedReport] = {}
+    sent: dict[tuple[str, int], dict[str, FramedReport]] = {}
     while end is None:
         observations = simulation.observations()
         for observation in observations:
-            report = robots[observation.robot].observation(observation)
-            if report is not None:
-                sent[observation.robot, observation.tick] = report
+            reports = robots[observation.robot].observation(observation)
+            if reports:
+                sent[observation.robot, observation.tick] = reports
         commands: dict[str, Command] = {}
         for observation in observations:
             agent, received = robots[observation.robot], []
             for contact in observation.contacts:
-                received += [sent[contact.peer, tick] for tick in contact.heard or ()]
+                received += [sent[contact.peer, tick][observation.robot] for tick in contact.heard or ()]
             commands[observation.robot] = agent.decide(received)
             if sinks:
                 agent.estimate()

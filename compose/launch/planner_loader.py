@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 from compose.errors import UserError
 from compose.launch.class_loader import named
+from protocol.messages import RobotConfig, RobotConfigInGroup
 from protocol.mission import Mission
 from protocol.orbits import RENDEZVOUS, Rendezvous, rendezvous
 from protocol.spelling import did_you_mean
 
 if TYPE_CHECKING:
     from agent.planning.planner import Planner
-    from protocol.messages import RobotConfig
+
 
 GROUP = "tandem.planners"
 """The group of entry points with which packages add planners."""
@@ -89,6 +90,10 @@ def planner_copy(name: str, options: Mapping[str, Any], mission: Mission) -> Pla
 
 def planner_of(config: RobotConfig) -> Planner[Any, Any]:
     """Return the planner of the robot with this configuration. Raises like `planner`."""
+    if isinstance(config, RobotConfigInGroup):
+        from agent.planning import registry  # noqa: PLC0415  # it imports numpy
+
+        return registry.group_planner(config.planner_name, config.mission)
     return planner(config.planner_name, config.planner_options, config.mission)
 
 

@@ -14,11 +14,13 @@ INSTANTS = 32
 
 
 def nearest(run: Run) -> float | None:
-    """Return the smallest distance in m of any pair from its first mutual range on, also between ticks.
+    """Return the smallest distance in m of a pair from its first mutual range on, also between ticks.
+
+    In a group, any two robots are a pair.
 
     The result is None if no pair had a mutual range.
     """
-    found = [_of_pair(run, pair) for pair in run.scenario.pairs()]
+    found = [_of_pair(run, pair) for pair in run.scenario.radio_pairs()]
     return min([one for one in found if one is not None], default=None)
 
 

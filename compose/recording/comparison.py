@@ -89,8 +89,8 @@ def _report_difference(one: Run, other: Run, robot: str, tick: int) -> str | Non
     if any(tick >= len(of_run) for of_run in steps):
         return None
     left, right = steps[0][tick], steps[1][tick]
-    if left.report != right.report:
-        return f"{robot}'s report"
+    if left.reports != right.reports:
+        return f"{robot}'s report{'s' if len(left.reports) > 1 else ''}"
     if (left.received, left.missed) != (right.received, right.missed):
         return f"the reports that {robot} received"
     return None

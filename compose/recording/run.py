@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -149,11 +150,15 @@ class Run(msgspec.Struct, frozen=True, dict=True):
         failed = self.world is None or (self.world.end is not None and self.world.end.outcome == "failed")
         return failed or any(agent.config.tick_s is not None for agent in self.agents.values())
 
-    def contact(self, robot: str, tick: int) -> Contact | None:
-        """Return the contact in the Observation of `robot` at `tick`; None if it is unknown."""
+    def contact(self, robot: str, tick: int, peer: str | None = None) -> Contact | None:
+        """Return the contact with `peer` in the Observation of `robot` at `tick`; None if it is unknown.
+
+        Without `peer`, that with the nearest robot.
+        """
         if not 0 <= tick < len(self.observations) or robot not in self.observations[tick]:
             return None
-        return next(iter(self.observations[tick][robot].contacts), None)
+        contacts = self.observations[tick][robot].contacts
+        return nearest_contact(contacts if peer is None else [one for one in contacts if one.peer == peer])
 
     def command(self, robot: str, tick: int) -> Command | None:
         """Return the Command of `robot` at `tick`; None if it was late or is unknown."""
@@ -276,6 +281,11 @@ class Run(msgspec.Struct, frozen=True, dict=True):
         agents = {robot: self.agents[robot] for robot in pair}
         planner_name = next(iter(agents.values())).config.planner_name
         return f"{' and '.join(agents)} in hardware mode, {planner_name}: {_outcome(agents)}"
+
+
+def nearest_contact(contacts: Sequence[Contact]) -> Contact | None:
+    """Return the contact with the shortest range; None if there is none. Drop-outs come last."""
+    return min(contacts, key=lambda one: math.inf if one.range is None else one.range, default=None)
 
 
 def _outcome(agents: Mapping[str, AgentHistory]) -> str:

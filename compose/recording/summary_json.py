@@ -72,8 +72,11 @@ def _world_noise(scenario: Scenario) -> Any:
 
 
 def first_contact(run: Run) -> int | None:
-    """Return the first tick at which two peers were in range of each other; None if there is none."""
-    pairs = run.scenario.pairs()
+    """Return the first tick at which two robots were in range of each other; None if there is none.
+
+    Robots of different pairs do not count.
+    """
+    pairs = run.scenario.radio_pairs()
     for tick in run.ticks:
         if any(mutual is not None for mutual in mutual_ranges(tick.truth, run.scenario, pairs)):
             return tick.truth.tick

@@ -33,7 +33,7 @@ class TickRow(msgspec.Struct, frozen=True):
     anchor_range: float | None
     """Measured range to the anchor in m."""
     mutual_range: float | None
-    """Measured range to the peer in m."""
+    """Measured range to the peer in m; in a group, to the nearest robot."""
     phase: int | None
     """Phase of the Command; None if the Command was late."""
     state: str | None

@@ -14,7 +14,7 @@ MOST_OPTIMAL = 8
 """The most robots whose plan is optimal. The time that the optimum takes triples with each further robot."""
 
 
-class PlannedMeeting(msgspec.Struct, frozen=True, array_like=True):
+class PlannedVisit(msgspec.Struct, frozen=True, array_like=True):
     """A meeting of a plan, at the anchor of the robot that is visited."""
 
     visitor: int
@@ -28,7 +28,7 @@ class PlannedMeeting(msgspec.Struct, frozen=True, array_like=True):
 class GroupPlan(msgspec.Struct, frozen=True):
     """The meetings that localise a group, each robot's in order."""
 
-    meetings: tuple[PlannedMeeting, ...]
+    meetings: tuple[PlannedVisit, ...]
     """In the order of their ends."""
     bound: float
     """The bound in s of the time at which all are localised."""
@@ -71,7 +71,7 @@ def group_plan(
     return GroupPlan(meetings, meetings[-1].ends, _travel_lower_bound(MeetingTimes(seed, travel)))
 
 
-def planned_meetings(forest: WakeUpForest, times: MeetingTimes) -> list[PlannedMeeting]:
+def planned_meetings(forest: WakeUpForest, times: MeetingTimes) -> list[PlannedVisit]:
     """Return the meetings of `forest`, in the order of their ends.
 
     The robot that was visited makes the hop whose branch ends last, and its visitor the other.
@@ -81,11 +81,11 @@ def planned_meetings(forest: WakeUpForest, times: MeetingTimes) -> list[PlannedM
     for place, robot in reversed(forest.hops):
         last[place] = max(last[place], last[robot])
     visitors = {b: a for a, b in forest.seeds}
-    meetings = [PlannedMeeting(a, b, ends[b], first=True) for a, b in forest.seeds]
+    meetings = [PlannedVisit(a, b, ends[b], first=True) for a, b in forest.seeds]
     for place, robot in forest.hops:
         branches = [other for start, other in forest.hops if start == place]
         visitors[robot] = place if robot == max(branches, key=last.__getitem__) else visitors[place]
-        meetings.append(PlannedMeeting(visitors[robot], robot, ends[robot]))
+        meetings.append(PlannedVisit(visitors[robot], robot, ends[robot]))
     return sorted(meetings, key=lambda meeting: meeting.ends)
 
 

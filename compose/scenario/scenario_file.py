@@ -6,6 +6,7 @@ import math
 import random
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from msgspec.structs import asdict
 from compose.errors import BadFault, BadKill, BadScenario, Unworkable, UserError
 from compose.launch import model_loader, planner_loader
 from compose.scenario.fault_syntax import FaultTable, added, table_of
+from compose.scenario.group_meetings import FirstMeeting, GroupMeetings, group_meetings
 from compose.scenario.kills import WORLD, Kill, drawn
 from compose.scenario.scenario_tables import MAX_TICKS, PlannerTable, RobotTable, ScenarioFile
 from compose.scenario.shipped_files import misplaced, shipped, unknown
@@ -24,7 +26,6 @@ from protocol.messages import AnyRobotConfig
 from protocol.mission import (
     Anchor,
     Mission,
-    Role,
     infeasibility,
     noise_infeasibility,
     safety_infeasibility,
@@ -40,11 +41,14 @@ from world.scenario import (
     RecordedScenario,
     RobotSpec,
     Scenario,
+    ScenarioOfGroup,
     ScenarioWithOptions,
     ScenarioWithWorldNoise,
 )
 from world.world_noise import world_noise_infeasibility, world_noise_mistake
 
+GROUP_BUDGET = 3
+"""The default of `max_ticks` of a group, in bounds of its plan: visits that fail are made up for by others."""
 EXCHANGES = 20
 """The number of reports for each of which `max_ticks` allows the full `delivery_time_bound`."""
 NEAREST_ANCHORS = TOLERANCE
@@ -180,17 +184,13 @@ def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scena
     """Return the scenario of `file`, with the faults of the `--fault` options added to its own."""
     _check_noise(file.mission, source)
     _check_planner(file.planner, source)
-    peers = _peers(file.robot, source)
-    _check_world_noise(file, list(peers.items()), source)
+    meetings = _meetings(file, source)
+    first = meetings.first if meetings is not None else _first_meetings(file, source)
+    linked = _linked(file.robot, first, in_group=meetings is not None)
+    _check_world_noise(file, linked, source)
     _check_models(file, source)
-    place = {robot.id: i for i, robot in enumerate(file.robot)}
     placed: list[RobotSpec] = []
-    plans: dict[str, Rendezvous] = {}
     for i, robot in enumerate(file.robot):
-        peer = peers[robot.id]
-        role: Role = "a" if i < place[peer] else "b"
-        if role == "a":
-            plans[robot.id] = plans[peer] = _plan(file, i, place[peer], source)
         start = _start(robot, file.mission.sensing_range, file.seed)
         rho0 = math.dist((start.x, start.y), robot.anchor)
         if rho0 > file.mission.sensing_range:
@@ -203,11 +203,13 @@ def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scena
                 f"{source}: robot[{i}].attack.part: an attack of kind {robot.attack.kind} changes "
                 "the start, so part must be 'all'"
             )
-        placed.append(
-            RobotSpec(robot.id, peer, role, Anchor(*robot.anchor), start, plans[robot.id], robot.attack)
-        )
-    faults = _faults(file, options, list(peers.items()), source)
-    budget = max(tick_budget(file.mission, plan) for plan in plans.values())
+        peer, role, orbits = first[robot.id]
+        placed.append(RobotSpec(robot.id, peer, role, Anchor(*robot.anchor), start, orbits, robot.attack))
+    faults = _faults(file, options, linked, source)
+    if meetings is not None:
+        budget = GROUP_BUDGET * math.ceil(meetings.bound / file.mission.period)
+    else:
+        budget = max(tick_budget(file.mission, one.rendezvous) for one in first.values())
     delay = EXCHANGES * delivery_time_bound(faults) if faults else 0
     if file.max_ticks is None and budget + delay > MAX_TICKS:
         cause = "mission: the rendezvous" if budget > MAX_TICKS else "fault: the delivery of reports"
@@ -221,7 +223,16 @@ def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scena
         robots=tuple(placed),
         faults=faults,
     )
-    if file.planner.options or file.world.range is not None or file.world.radio is not None:
+    if meetings is not None:
+        scenario = ScenarioOfGroup(
+            **asdict(scenario),
+            world_noise=file.world.noise,
+            planner_options=file.planner.options,
+            range_model=file.world.range,
+            radio_model=file.world.radio,
+            meetings=meetings.planned,
+        )
+    elif file.planner.options or file.world.range is not None or file.world.radio is not None:
         scenario = ScenarioWithOptions(
             **asdict(scenario),
             world_noise=file.world.noise,
@@ -237,6 +248,49 @@ def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scena
     except MalformedFrame as error:
         raise Unworkable(f"{source}: mission: a robot's configuration cannot be encoded: {error}") from None
     return scenario
+
+
+def _meetings(file: ScenarioFile, source: str) -> GroupMeetings | None:
+    """Return the meetings of the group that the robots form; None if they form pairs.
+
+    Raises BadScenario and Unworkable.
+    """
+    robots = file.robot
+    if len(robots) == 2 or any(robot.peer is not None for robot in robots):
+        return None
+    _check_ids(robots, source)
+    for j, robot in enumerate(robots):
+        for other in robots[:j]:
+            _check_distance(file, other, robot, f"{source}: robot[{j}].anchor", f"'{other.id}'", source)
+    try:
+        return group_meetings(robots, file.mission, file.planner)
+    except Unworkable as error:
+        raise Unworkable(f"{source}: {error}") from None
+
+
+def _first_meetings(file: ScenarioFile, source: str) -> dict[str, FirstMeeting]:
+    """Return the meeting of each robot with its peer. Raises BadScenario and Unworkable."""
+    peers = _peers(file.robot, source)
+    place = {robot.id: i for i, robot in enumerate(file.robot)}
+    found: dict[str, FirstMeeting] = {}
+    for i, robot in enumerate(file.robot):
+        peer = peers[robot.id]
+        if i < place[peer]:
+            orbits = _plan(file, i, place[peer], source)
+            found[robot.id], found[peer] = (
+                FirstMeeting(peer, "a", orbits),
+                FirstMeeting(robot.id, "b", orbits),
+            )
+    return found
+
+
+def _linked(
+    robots: Sequence[RobotTable], first: Mapping[str, FirstMeeting], *, in_group: bool
+) -> list[tuple[str, str]]:
+    """Return the pairs of robots that can exchange reports, each in both orders."""
+    if in_group:
+        return list(permutations([robot.id for robot in robots], 2))
+    return [(robot.id, first[robot.id].peer) for robot in robots]
 
 
 def _faults(
@@ -312,12 +366,23 @@ def _check_models(file: ScenarioFile, source: str) -> None:
 
 def _plan(file: ScenarioFile, first: int, second: int, source: str) -> Rendezvous:
     """Return the rendezvous orbits of the pair of robots at the places `first` and `second` in the file."""
-    distance = math.dist(file.robot[first].anchor, file.robot[second].anchor)
+    one, other = file.robot[first], file.robot[second]
+    distance = _check_distance(
+        file, one, other, f"{source}: robot[{second}].anchor", f"its peer '{one.id}'", source
+    )
+    return planner_loader.orbits(file.planner.name, file.planner.options, file.mission, distance)
+
+
+def _check_distance(
+    file: ScenarioFile, one: RobotTable, other: RobotTable, field: str, whose: str, source: str
+) -> float:
+    """Return the distance in m of the anchors of two robots that may meet.
+
+    Raises BadScenario if it is too small, Unworkable if they could not localise themselves.
+    """
+    distance = math.dist(one.anchor, other.anchor)
     if distance < NEAREST_ANCHORS:
-        raise BadScenario(
-            f"{source}: robot[{second}].anchor: less than {NEAREST_ANCHORS:g} m from the anchor of "
-            f"its peer '{file.robot[first].id}'"
-        )
+        raise BadScenario(f"{field}: less than {NEAREST_ANCHORS:g} m from the anchor of {whose}")
     why = infeasibility(file.mission, distance)
     if why is not None:
         raise Unworkable(f"{source}: mission: {why}")
@@ -328,14 +393,19 @@ def _plan(file: ScenarioFile, first: int, second: int, source: str) -> Rendezvou
         why = forbidding_prior(file.mission, distance)
         if why is not None:
             raise Unworkable(f"{source}: mission.{why}")
-    return planner_loader.orbits(file.planner.name, file.planner.options, file.mission, distance)
+    return distance
+
+
+def _check_ids(robots: Sequence[RobotTable], source: str) -> None:
+    """Raise BadScenario if two robots have the same id."""
+    for name, count in Counter(robot.id for robot in robots).items():
+        if count > 1:
+            raise BadScenario(f"{source}: robot.id: {count} robots have the id '{name}'")
 
 
 def _peers(robots: list[RobotTable], source: str) -> dict[str, str]:
     """Return the peer of each robot. With two robots, each is the peer of the other by default."""
-    for name, count in Counter(robot.id for robot in robots).items():
-        if count > 1:
-            raise BadScenario(f"{source}: robot.id: {count} robots have the id '{name}'")
+    _check_ids(robots, source)
     ids = [robot.id for robot in robots]
     if len(robots) == 2 and all(robot.peer is None for robot in robots):
         return {ids[0]: ids[1], ids[1]: ids[0]}
