@@ -38,7 +38,7 @@ from mcap.records import Schema
 from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 
-from compose.audit.replay import replay
+from compose.audit.replay import replayed
 from compose.cli import export_bar, run
 from compose.cli.main import parse
 from compose.launch import in_process
@@ -430,7 +430,7 @@ def test_a_robot_that_has_left_no_journal_is_named(paper_1: Path, tmp_path: Path
     for name in (WORLD_JOURNAL, A):
         (tmp_path / name).write_bytes((paper_1 / name).read_bytes())
     ended = tandem("export", tmp_path)
-    assert (ended.status, ended.err) == (3, "agent-b.journal is missing\n")
+    assert (ended.status, ended.err) == (3, "tandem export: agent-b.journal is missing\n")
     assert set(journals_of(tmp_path / "run.mcap")) == {WORLD_JOURNAL, A}
     assert len(seen(tmp_path / "run.mcap", "/b/pose")) == 49
 
@@ -594,7 +594,7 @@ def test_a_viewer_sees_a_run_from_its_start_to_its_end(tmp_path: Path) -> None:
     assert re.search(r"\n(localised|undecided) after ", ended.out)
     assert topics["/tf"] == "foxglove.FrameTransforms"
     assert topics["/journal/agent-a/observation"] == "tandem.Observation"
-    again, _ = replay(out)
+    again = replayed(read(out))
     assert again.differences == ()
 
 
