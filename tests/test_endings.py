@@ -145,7 +145,7 @@ def test_a_run_interrupted_as_it_ends_reports_the_outcome_or_the_interruption(
     if ended.status == 130:
         assert ended[1:] == ("", f"tandem run: stopped by {number.name}\n")
     else:  # the signal may arrive after the FinalReport
-        assert ended.status in (0, -number)
+        assert ended.status == 0
         assert ended[1:] == (f"localised after {LONG_TICKS} ticks\n", "")
 
 
@@ -160,7 +160,9 @@ def test_a_run_interrupted_while_it_starts_leaves_no_process(
         run.tell(SIGTERM)
         ended = run.ended(AT_ONCE_S)
     assert not processes_of(out)
-    assert ended in ((-SIGTERM, "", ""), (130, "", "tandem run: stopped by SIGTERM\n"))
+    if ended.status != -SIGTERM:  # Python was not yet started
+        assert ended.status == 130
+        assert ended[1:] in (("", ""), ("", "tandem run: stopped by SIGTERM\n"))
 
 
 def test_a_second_ctrl_c_changes_nothing(endless: Path, tmp_path: Path) -> None:
@@ -170,7 +172,7 @@ def test_a_second_ctrl_c_changes_nothing(endless: Path, tmp_path: Path) -> None:
         until(lambda: not run.tell(SIGINT), "it ends, told again and again")
         ended = run.ended(AT_ONCE_S)
     assert not processes_of(out)
-    assert ended.status in (130, -SIGINT)
+    assert ended.status == 130
     assert "Traceback" not in ended.err
 
 

@@ -1,9 +1,11 @@
 """The entry point of the program `tandem`."""
 
+import os
 import signal
 
 for _number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-    signal.signal(_number, signal.SIG_DFL)  # until a command sets its handlers, end without a traceback
+    if _number == signal.SIGINT or signal.getsignal(_number) is not signal.SIG_IGN:  # as under nohup
+        signal.signal(_number, lambda *_: os._exit(130))  # until `main`, end without a traceback
 
 from compose.cli.main import main  # noqa: E402  # after the lines above, because it takes time
 

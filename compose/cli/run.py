@@ -14,6 +14,7 @@ from compose.cli import arguments, export_bar
 from compose.errors import FAILED, STOPPED, UserError
 from compose.extras import need
 from compose.launch import processes, supervisor
+from compose.launch.interruption import INTERRUPTION
 from compose.launch.signals import stop_by_signal
 from compose.launch.viewers import Viewer, foxglove_server, page, stay, viewing
 from compose.recording.kills_file import KILLS
@@ -140,6 +141,9 @@ def _in_process(options: argparse.Namespace, scenario: Scenario, kills: tuple[Ki
             finished = in_process.run_mission(scenario, folder)
         except CannotRecord as error:
             raise UserError(f"--out: {error}") from None
+        except KeyboardInterrupt:
+            break_off(options, folder, f"stopped by {INTERRUPTION.signal_name}", began)
+            raise
         status = conclude(options, finished, folder, "in-process", began)
         stop_by_signal(inbox)
         return _after_outcome(options, folder, viewers, inbox, status)

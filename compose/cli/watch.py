@@ -21,7 +21,7 @@ from compose.cli.arguments import (
     folder,
 )
 from compose.cli.recording import note
-from compose.errors import ENDED, UserError
+from compose.errors import ENDED, STOPPED, UserError
 from compose.extras import need
 from compose.launch.viewers import OVER
 from protocol.output import say
@@ -97,7 +97,7 @@ def main(options: argparse.Namespace) -> int:
         server.serve(shown, taken, ready)
     finally:
         shown.stop()
-    return ENDED
+    return ENDED if options.launched else STOPPED  # alone, only a signal ends it
 
 
 def _recorded(folders: Sequence[Path], launched: bool) -> Site:
