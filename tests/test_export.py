@@ -415,7 +415,10 @@ def test_a_torn_journal_is_exported_to_the_tear(name: str, faulty: Path, tmp_pat
     (torn / name).write_bytes((torn / name).read_bytes()[:size])
     whole = journal_file.packed(journal_file.read(torn / name))
     ended = tandem("export", torn)
-    assert (ended.status, ended.err) == (0, f"{name} ends with {size - len(whole)} bytes of a torn write\n")
+    assert (ended.status, ended.err) == (
+        0,
+        f"tandem export: {name} ends with {size - len(whole)} bytes of a torn write\n",
+    )
     assert journals_of(torn / "run.mcap") == on_disk(faulty) | {name: whole}
     assert complaints(torn / "run.mcap") == []
 
@@ -514,7 +517,7 @@ def stopped_unless(some: Iterator[bool]) -> None:
 
 def test_ctrl_c_ends_an_export_and_leaves_nothing_half_written(paper_1: Path, tmp_path: Path) -> None:
     with TandemProcess("export", paper_1, "--out", tmp_path / "out") as command:
-        command.until(lambda: command.catches(Signals.SIGTERM), "it catches signals")
+        command.until(lambda: command.catches(Signals.SIGHUP), "it catches signals")
         command.tell(Signals.SIGINT)
         ended = command.ended()
     assert (ended.status, ended.out, ended.err) == (130, "", "tandem export: stopped by SIGINT\n")
@@ -763,13 +766,13 @@ def test_a_run_with_an_export_reads_its_recording_once(
     """The outcome and the export are of one Run."""
     found: list[Run] = []
 
-    def counted(folder: Path) -> Run:
+    def counted(folder: Path, *_command: str) -> Run:
         found.append(read(folder))
         return found[-1]
 
     monkeypatch.setattr(run, "stop_by_signal", lambda _: None)  # it would affect the process of the tests
     monkeypatch.setattr(run, "read", counted)
-    monkeypatch.setattr(export_bar, "read", counted)
+    monkeypatch.setattr(export_bar, "read_noted", counted)
     assert run.main(parse(["run", "paper-1", "-q", "--out", str(tmp_path)])) == 0
     assert (tmp_path / "run.mcap").exists()
     assert len(found) == 1

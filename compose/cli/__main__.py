@@ -3,9 +3,8 @@
 import os
 import signal
 
-for _number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-    if _number == signal.SIGINT or signal.getsignal(_number) is not signal.SIG_IGN:  # as under nohup
-        signal.signal(_number, lambda *_: os._exit(130))  # until `main`, end without a traceback
+for _number in (signal.SIGINT, signal.SIGTERM):
+    signal.signal(_number, lambda *_: os._exit(130))  # until `main`, end without a traceback
 
 from compose.cli.main import main  # noqa: E402  # after the lines above, because it takes time
 

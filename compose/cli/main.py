@@ -110,17 +110,19 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command in `arguments`, or in sys.argv, and end the process with its exit status."""
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115  # the launching process has closed it
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
-    INTERRUPTION.begin()
-    name = "tandem"
     try:
         command, words = _split(sys.argv[1:] if arguments is None else arguments)
-        name = f"tandem {command.name}"
+    except SystemExit:
+        INTERRUPTION.end()
+        raise
+    INTERRUPTION.begin()
+    try:
         limits.need_memory(limits.START_BYTES, "Tandem")
         options = command_parser(command).parse_all(words)
         status: int = import_module(command.module).main(options)
         sys.stdout.flush()
     except BaseException as error:  # noqa: BLE001  # a bug must have another exit status than a mission
-        status = _status_of(error, name)
+        status = _status_of(error, f"tandem {command.name}")
     INTERRUPTION.end()
     forked = sys.modules.get("compose.launch.forked")
     if forked is not None:
