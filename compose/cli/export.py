@@ -8,10 +8,10 @@ from pathlib import Path
 from compose.cli.arguments import add_closing, add_recording, folder
 from compose.cli.export_bar import MODULES, exported
 from compose.cli.recording import note, read_noted
-from compose.errors import ENDED, FAILED, STOPPED, UserError
+from compose.errors import ENDED, FAILED, STOPPED, CannotWrite
 from compose.extras import need
 from compose.launch.signals import stop_by_signal
-from compose.recording.recording_files import cannot_write, make_folder, user_errors
+from compose.recording.recording_files import make_folder, user_errors
 from protocol import files
 from protocol.network.inbox import Inbox, Interrupted
 from protocol.output import say
@@ -150,5 +150,5 @@ def _written(out: Path, name: str, text: str | bytes) -> Path:
     try:
         files.write(out / name, text)
     except OSError as error:
-        raise UserError(cannot_write(out, error)) from None
+        raise CannotWrite(out, error) from None
     return out / name

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from compose.cli.arguments import add_closing, add_recording, add_trusted_planner
 from compose.cli.recording import read_noted
-from compose.errors import ENDED, FAILED, UserError
+from compose.errors import ENDED, FAILED, CannotWrite
 from compose.extras import need
 from compose.figures import FORMATS, PICTURES
 from compose.launch.planner_loader import trust
@@ -93,7 +93,7 @@ def main(options: argparse.Namespace) -> int:
             except BrokenPipeError:
                 raise
             except OSError as error:
-                raise UserError(f"{folder} cannot be written: {error.strerror or error}") from None
+                raise CannotWrite(folder, error) from None
     return status
 
 
