@@ -110,19 +110,17 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command in `arguments`, or in sys.argv, and end the process with its exit status."""
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115  # the launching process has closed it
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
+    name = "tandem"
     try:
         command, words = _split(sys.argv[1:] if arguments is None else arguments)
-    except SystemExit:
-        INTERRUPTION.end()
-        raise
-    INTERRUPTION.begin()
-    try:
+        name = f"tandem {command.name}"
+        INTERRUPTION.begin()
         limits.need_memory(limits.START_BYTES, "Tandem")
         options = command_parser(command).parse_all(words)
         status: int = import_module(command.module).main(options)
         sys.stdout.flush()
     except BaseException as error:  # noqa: BLE001  # a bug must have another exit status than a mission
-        status = _status_of(error, f"tandem {command.name}")
+        status = _status_of(error, name)
     INTERRUPTION.end()
     forked = sys.modules.get("compose.launch.forked")
     if forked is not None:
@@ -138,26 +136,26 @@ def _status_of(error: BaseException, command: str) -> int:
     INTERRUPTION.end()
     if INTERRUPTION.signal_name is not None or isinstance(error, KeyboardInterrupt):
         _discard(sys.stdout)  # a part of a line may be in its buffer
-        say(f"{command}: stopped by {INTERRUPTION.signal_name or 'SIGINT'}", error=True)
+        _complain(f"{command}: stopped by {INTERRUPTION.signal_name or 'SIGINT'}")
         return STOPPED
     match error:
         case UserError():
-            say(f"{command}: {error}", error=True)
+            _complain(f"{command}: {error}")
             return error.exit_status
         case BrokenPipeError():
             _discard(sys.stdout)
             return BROKEN_PIPE
         case OSError():
             _discard(sys.stdout)
-            say(f"{command}: cannot continue: {error_text(error)}", error=True)
+            _complain(f"{command}: cannot continue: {error_text(error)}")
             return FAILED
     shortage = limits.shortage(error)
     if shortage is not None:
-        say(f"{command}: cannot continue: {shortage}", error=True)
+        _complain(f"{command}: cannot continue: {shortage}")
         return FAILED
     if not isinstance(error, Exception):
         raise error
-    say(*"".join(traceback.format_exception(error)).splitlines(), error=True)
+    _complain(*"".join(traceback.format_exception(error)).splitlines())
     return BUG
 
 
@@ -215,6 +213,14 @@ def _command_list() -> str:
         members = [command for command in COMMANDS if command.group == group]
         lines += [f"{group}:", *[f"  {one.name:{width}}  {one.summary}" for one in members], ""]
     return "\n".join(lines).rstrip()
+
+
+def _complain(*lines: str) -> None:
+    """Print `lines` on standard error, if it can be written."""
+    try:
+        say(*lines, error=True)
+    except OSError:  # the exit status must be known all the same
+        _discard(sys.stderr)
 
 
 def _discard(stream: TextIO) -> None:
