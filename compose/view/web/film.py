@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 """The names of the program that draws the page."""
-WIDTH, HEIGHT = 900, 560
+WIDTH, HEIGHT = 900, 640
 """The size of the picture in pixels."""
 FRAME_MS = 250
 """The time between two frames of a picture in ms; the page lets no more pass between two of its drawings."""
@@ -39,8 +39,9 @@ MOST_MS = 300_000
 QUALITY = "20"
 """The constant rate factor of a video; text is sharp with it, and a smaller one makes larger files."""
 STYLE = """
-header, aside, details, #transport button, #pace { display: none !important; }
+header, aside, #further, #legend summary, #transport button, #pace { display: none !important; }
 #mission { grid-template-columns: 1fr; }
+#caption { min-height: 2.8rem; }
 """
 """The style that hides the parts of the page which are not the story, or are for the mouse."""
 SHARES = (1.0, 0.72, 0.45, 0.2)
