@@ -36,7 +36,9 @@ SHOWN: dict[str, dict[str, str]] = {
 """By scenario: the titles of the figures of `tandem figures` that pages show, and their file names here."""
 
 FILMED = "paper-1"
-"""The scenario whose guided play is page.gif."""
+"""The scenario whose guided play is page.gif, and of which page.png is one picture."""
+STILL = ("distance that a configuration predicts", (1360, 840))
+"""The mark of the legend that page.png shows, and its size in pixels."""
 
 
 def main() -> None:
@@ -46,6 +48,7 @@ def main() -> None:
             draw(name, shown, Path(folder))
             if name == FILMED:
                 (DOCS / "page.gif").write_bytes(film.gif(Path(folder)))
+                (DOCS / "page.png").write_bytes(film.still(Path(folder), *STILL))
 
 
 def draw(name: str, shown: Mapping[str, str], folder: Path) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
@@ -32,6 +33,8 @@ FRAME_MS = 250
 """The time between two frames of a picture in ms; the page lets no more pass between two of its drawings."""
 VIDEO_FRAME_MS = 100
 """The time between two frames of a video in ms."""
+STILL_AFTER = 6
+"""The number of frames with a mark before the one that is a picture of it."""
 LAST_MS = 3000
 """The time in ms for which the last frame is shown."""
 MOST_MS = 300_000
@@ -68,8 +71,37 @@ def mp4(folder: Path) -> bytes:
     return _mp4(_frames(folder, "--mp4", VIDEO_FRAME_MS))
 
 
+def still(folder: Path, mark: str, size: tuple[int, int]) -> bytes:
+    """Return the page in guided play as a PNG file, STILL_AFTER frames after its legend first lists `mark`.
+
+    It is the last frame if the legend never does. Raises like `gif`.
+    """
+    from PIL import Image  # noqa: PLC0415  # optional
+
+    with _opened(folder, "a picture of the page", size) as page:
+        marked = page.locator("#legend li").get_by_text(mark)
+        after = 0
+        for _ in _played(page, FRAME_MS):
+            after += marked.count() > 0
+            if after > STILL_AFTER:
+                break
+        file = BytesIO()
+        with Image.open(BytesIO(page.screenshot())) as picture:
+            picture.convert("RGB").quantize(256).save(file, "PNG", optimize=True)
+    return file.getvalue()
+
+
 def _frames(folder: Path, flag: str, frame_ms: int) -> list[bytes]:
     """Return the frames of guided play as PNG files, one for each `frame_ms`. Raises like `gif`."""
+    with _opened(folder, flag, (WIDTH, HEIGHT)) as page:
+        page.add_style_tag(content=STYLE)
+        page.keyboard.press("f")  # a camera at rest: most of the picture stays the same
+        return list(_played(page, frame_ms))
+
+
+@contextmanager
+def _opened(folder: Path, flag: str, size: tuple[int, int]) -> Iterator[Page]:
+    """Yield the page of the recording in `folder`, whose clock stands still. Raises like `gif`."""
     found = next(filter(None, map(shutil.which, BROWSERS)), None)
     if found is None:
         raise UserError(f"{flag} needs chromium: apt-get install chromium")
@@ -80,20 +112,17 @@ def _frames(folder: Path, flag: str, frame_ms: int) -> list[bytes]:
         file = Path(temporary) / "run.html"
         file.write_text(html, encoding="utf-8")
         browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, color_scheme="light")
+        page = browser.new_page(viewport={"width": size[0], "height": size[1]}, color_scheme="light")
         page.clock.install(time=0)
         page.goto(file.as_uri())
-        page.add_style_tag(content=STYLE)
         page.clock.pause_at(1000)
-        frames = list(_played(page, frame_ms))
+        page.wait_for_selector("body[data-shown='0']", state="attached")
+        yield page
         browser.close()
-    return frames
 
 
 def _played(page: Page, frame_ms: int) -> Iterator[bytes]:
     """Play the page, and yield a PNG file for each `frame_ms`."""
-    page.wait_for_selector("body[data-shown='0']", state="attached")
-    page.keyboard.press("f")  # a camera at rest: most of the picture stays the same
     page.locator("#play").evaluate("(button) => button.click()")
     for _ in range(MOST_MS // frame_ms):
         page.clock.fast_forward(frame_ms)
