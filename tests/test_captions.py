@@ -68,7 +68,7 @@ def test_the_story_of_paper_1_has_a_caption_for_each_of_its_beats(paper_1: Run) 
         (
             5,
             "They drive on circles around their anchors to find each other, b more slowly than a, "
-            "so that sooner or later both are where the circles meet.",
+            "so that sooner or later both are near where the circles cross.",
         ),
         (
             46,

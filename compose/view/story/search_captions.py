@@ -81,7 +81,7 @@ def _search(robots: Sequence[RobotSetup]) -> str:
         text = "They drive on circles around their anchors to find each other"
         if abs(slow.orbit.omega) == abs(fast.orbit.omega):
             return f"{text}."
-        both = "so that sooner or later both are where the circles meet"
+        both = "so that sooner or later both are near where the circles cross"
         return f"{text}, {slow.id} more slowly than {fast.id}, {both}."
     waits = ", which waits near its own" if len(robots) > 1 else ""
     if not moving:

@@ -36,7 +36,7 @@ const MARKS = {
   waiting: [dot('fill="none" stroke="var(--link)"'), "report under way"],
   lost: [dot('fill="none" stroke="var(--fault)" stroke-dasharray="2 2"'), "report that is lost"],
   damaged: [drawn(`<circle cx="15" cy="8" r="5" fill="none" stroke="var(--fault)" stroke-width="1.6"/><path d="${cross}" stroke="var(--fault)"/>`), "report that arrives damaged"],
-  configuration: [drawn('<path d="M5 8h20" stroke="var(--tint-1)"/><circle cx="5" cy="8" r="3.6" fill="var(--card)" stroke="var(--tint-1)" stroke-width="2"/><circle cx="25" cy="8" r="3.6" fill="var(--card)" stroke="var(--tint-1)" stroke-width="2"/>'), ([a, b]) => `configuration: poses of ${a} and ${b} that belong together`],
+  configuration: [drawn('<path d="M5 8h20" stroke="var(--tint-1)"/><circle cx="5" cy="8" r="3.6" fill="var(--card)" stroke="var(--tint-1)" stroke-width="2"/><circle cx="25" cy="8" r="3.6" fill="var(--card)" stroke="var(--tint-1)" stroke-width="2"/>'), "configuration: a pose of each robot, in one colour"],
   reachable: [drawn('<path d="M3 13q12-14 24-4" fill="none" stroke="var(--faint)" stroke-width="4"/>'), (_, mover) => `where ${mover} could drive; thick: J, how well this tells them apart, is large`],
   choice: [drawn('<path d="M3 11q10-9 19-4" fill="none" stroke="var(--ink)" stroke-width="2"/><path d="M28 9.5l-8 1.5 3.5-6z" fill="var(--ink)"/>'), (_, mover) => `manoeuvre chosen by ${mover}`],
   predicted: [ring("tint-1", 'stroke-dasharray="4 2.5"'), "distance that a configuration predicts"],

@@ -307,7 +307,7 @@ function draw() {
     cards.draw(view);
     log.draw(view);
     timeline.draw(view, activities(store, view));
-    const story = guide.pair(view.focus), mover = joined(store.scene(view.tick), story[0].id)?.manoeuvre?.robot ?? "";
+    const story = guide.pair(view.focus), mover = joined(store.scene(view.tick), story[0].id)?.manoeuvre?.robot ?? "it";
     legend.draw(plane.marks, timeline.kinds, store.stage.robots.length > story.length ? [] : story, mover);
     sequence.draw(store, view);
     charts.draw(store, view, guide.pair(view.focus));

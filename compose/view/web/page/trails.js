@@ -57,13 +57,13 @@ export class Trails {
     const pose = store.player(tick, robot.id)?.pose, size = this.plane.robot_size(store), alpha = fading(share, moving);
     if (!told || !pose || !held || held.world.length || alpha <= 0) return;
     this.plane.marks.add("turned");
-    const [x, y] = robot.anchor;
+    const [x, y] = robot.anchor, pieces = this.#pieces(store, robot, TRUE, store.first, Math.min(tick, store.last), false);
     for (let i = 1; i < TURNS; i++) {
       const angle = (i * TAU) / TURNS, turn = compose([x, y, angle], [-x, -y, 0]);
       this.#stroked(pen, view, robot, TRUE, (stroke) => {
         pen.globalAlpha = 0.35 * alpha;
         pen.transform(Math.cos(angle), Math.sin(angle), -Math.sin(angle), Math.cos(angle), turn[0], turn[1]);
-        for (const [phase, path] of this.#pieces(store, robot, TRUE, store.first, Math.min(tick, store.last), false)) stroke(path, phase);
+        for (const [phase, path] of pieces) stroke(path, phase);
       });
       const [at_x, at_y, heading] = compose(turn, pose);
       pen.globalAlpha = 0.5 * alpha;
