@@ -66,6 +66,7 @@ def test_the_plane_keeps_its_size_through_guided_play(
 # --- the legend -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_the_legend_lists_only_the_marks_that_are_drawn(opened: Open, address: str) -> None:
     page = opened(f"{address}#tick=0")
     at: dict[int, str] = {}
@@ -88,6 +89,7 @@ def test_the_legend_lists_only_the_marks_that_are_drawn(opened: Open, address: s
         assert {tick for tick, listed in at.items() if words in listed} == ticks, words
 
 
+@pytest.mark.long
 def test_the_legend_is_beside_the_plane_or_folded_and_opens_by_a_key(opened: Open, address: str) -> None:
     wide, narrow = opened(address), opened(address, width=390, height=844)
     for page in (wide, narrow):
@@ -114,6 +116,7 @@ def labels(page: Page) -> dict[str, list[float]]:
     return {one["text"]: one["box"] for one in page.evaluate("document.getElementById('canvas').labels")}
 
 
+@pytest.mark.long
 def test_both_first_distances_have_labels_and_no_name_lies_on_the_line_between_robots(
     opened: Open, address: str
 ) -> None:
