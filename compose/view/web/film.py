@@ -87,8 +87,7 @@ def still(html: str, program: str, mark: str, size: tuple[int, int]) -> bytes:
     """Return a picture of the standalone page in guided play, as a PNG file.
 
     It is the one STILL_AFTER frames after the legend lists `mark`; the last one if it never does.
-    `program` is
-    the browser.
+    `program` is the browser.
     """
     from PIL import Image  # noqa: PLC0415  # optional
 
