@@ -20,7 +20,7 @@ from protocol import files
 from protocol.messages import FinalReport
 from protocol.motion import Pose, wrap
 from world.scenario import Scenario
-from world.sensors import mutual_ranges
+from world.sensors import in_contact
 
 Mode = Literal["processes", "in-process"]
 SUMMARY = "summary.json"
@@ -78,7 +78,7 @@ def first_contact(run: Run) -> int | None:
     """
     pairs = run.scenario.radio_pairs()
     for tick in run.ticks:
-        if any(mutual is not None for mutual in mutual_ranges(tick.truth, run.scenario, pairs)):
+        if in_contact(tick.truth, run.scenario, pairs):
             return tick.truth.tick
     return None
 
