@@ -4,12 +4,25 @@ from __future__ import annotations
 
 import math
 import random
+from collections.abc import Callable
 from itertools import combinations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
+from agent.process.agent_journal import Step
+from compose.audit.rules import audit_run
+from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
+from compose.recording.run import of_frames
+from compose.scenario.scenario_file import parse
+from protocol.journal.journal_file import CorruptJournal
+from protocol.wire import encode
+from tests.commands import SECTION_IV
+from tests.test_audit import kept
 from world.near_pairs import near_pairs
+from world.scenario import PlannedMeeting, ScenarioOfGroup
 
 places = st.lists(st.tuples(*[st.floats(-50.0, 50.0) | st.integers(-9, 9).map(float)] * 2), max_size=30)
 
@@ -33,3 +46,155 @@ def test_few_pairs_are_near_where_robots_are_spread() -> None:
     side = 30.0 * math.sqrt(100)
     places = [(side * draw.random(), side * draw.random()) for _ in range(100)]
     assert len(near_pairs(places, 3.0)) < 100
+
+
+# --- the audit ----------------------------------------------------------------------------------------
+
+GROUP = f"""
+name = "group"
+seed = 3
+{SECTION_IV}
+[[robot]]
+id = "a"
+anchor = [0.0, 0.0]
+[[robot]]
+id = "b"
+anchor = [5.0, 1.0]
+[[robot]]
+id = "c"
+anchor = [2.0, 6.0]
+[[robot]]
+id = "d"
+anchor = [-4.0, 4.0]
+"""
+Journals = dict[str, list[bytes]]
+
+
+@pytest.fixture(scope="module")
+def group() -> Journals:
+    """Return the journals of a group of four."""
+    return kept(parse(GROUP, "group"))
+
+
+def audited(journals: Journals) -> list[tuple[int | None, str | None, str]]:
+    """Return the tick, robot and rule of each violation."""
+    return [(one.tick, one.robot, one.rule) for one in audit_run(of_frames(journals)).violations]
+
+
+def several(journals: Journals) -> tuple[str, Step]:
+    """Return a robot, and a step in which it reports to two others, not the same to both."""
+    for robot, agent in of_frames(journals).agents.items():
+        for step in agent.steps:
+            if len(step.reports) == 2 and step.reports[0].frame != step.reports[1].frame:
+                return robot, step
+    raise AssertionError("no robot reports to two others")
+
+
+def test_the_audit_of_a_group_finds_nothing_where_nothing_is_wrong(group: Journals) -> None:
+    assert audited(group) == []
+
+
+def test_reports_that_are_swapped_between_two_receivers_are_found(group: Journals) -> None:
+    robot, step = several(group)
+    frames = list(group[agent_journal(robot)])
+    i, j = [frames.index(one.frame) for one in step.reports]
+    frames[i], frames[j] = frames[j], frames[i]
+    tick = step.observation.tick
+    found = audited(group | {agent_journal(robot): frames})
+    assert (tick, robot, "decision") in found
+    assert {one for one in found if one[2] == "report"} == {
+        (tick, contact.peer, "report") for contact in step.observation.contacts
+    }
+
+
+def test_a_report_that_was_meant_for_another_robot_is_found(group: Journals) -> None:
+    _, step = several(group)
+    (to_one, to_other), (one, _) = step.reports, [contact.peer for contact in step.observation.contacts]
+    frames = list(group[agent_journal(one)])
+    frames[frames.index(to_one.frame)] = to_other.frame
+    assert (step.observation.tick, one, "report") in audited(group | {agent_journal(one): frames})
+
+
+def test_a_second_report_to_the_same_robot_is_found(group: Journals) -> None:
+    robot, step = several(group)
+    frames = list(group[agent_journal(robot)])
+    frames.insert(frames.index(step.reports[1].frame), step.reports[0].frame)
+    assert (step.observation.tick, robot, "order") in audited(group | {agent_journal(robot): frames})
+
+
+def test_a_missing_report_is_found(group: Journals) -> None:
+    robot, step = several(group)
+    frames = list(group[agent_journal(robot)])
+    frames.remove(step.reports[1].frame)
+    lonely = step.observation.contacts[1].peer
+    found = audited(group | {agent_journal(robot): frames})
+    assert (step.observation.tick, robot, "decision") in found
+    assert (step.observation.tick, lonely, "report") in found
+
+
+def with_scenario(journals: Journals, scenario: ScenarioOfGroup) -> Journals:
+    """Return `journals` with another scenario in the world's."""
+    world = list(journals[WORLD_JOURNAL])
+    world[1] = encode(scenario)
+    return journals | {WORLD_JOURNAL: world}
+
+
+def scenario_of(journals: Journals) -> ScenarioOfGroup:
+    found = of_frames(journals).scenario
+    assert isinstance(found, ScenarioOfGroup)
+    return found
+
+
+def test_a_bound_that_is_not_the_planned_one_is_found(group: Journals) -> None:
+    scenario = scenario_of(group)
+    later = replace(scenario.meetings[-1], ends=scenario.meetings[-1].ends + 1.0)
+    changed = replace(scenario, meetings=(*scenario.meetings[:-1], later))
+    assert (None, None, "scenario") in audited(with_scenario(group, changed))
+
+
+def test_another_visitor_than_the_planned_one_is_found(group: Journals) -> None:
+    scenario = scenario_of(group)
+    last = scenario.meetings[-1]
+    other = next(one.id for one in scenario.robots if one.id not in (last.visitor, last.visited))
+    changed = replace(
+        scenario,
+        meetings=(*scenario.meetings[:-1], replace(last, visitor=other)),
+        robots=tuple(
+            [replace(one, peer=other) if one.id == last.visited else one for one in scenario.robots]
+        ),
+    )
+    found = audited(with_scenario(group, changed))
+    assert (None, None, "scenario") in found
+    assert (None, last.visited, "scenario") in found
+    assert (None, last.visited, "config") in found
+
+
+def test_orbits_that_are_not_the_planned_ones_are_found(group: Journals) -> None:
+    scenario = scenario_of(group)
+    last = scenario.meetings[-1].visited
+    other = replace(scenario.robot(last).rendezvous, bound=1.0)
+    robots = [replace(one, rendezvous=other) if one.id == last else one for one in scenario.robots]
+    found = audited(with_scenario(group, replace(scenario, robots=tuple(robots))))
+    assert {(None, last, "scenario"), (None, last, "config")} <= set(found)
+
+
+@pytest.mark.parametrize(
+    ("changed", "why"),
+    [
+        (lambda meetings: meetings[:-1], "the meetings are not those of its robots"),
+        (lambda meetings: (*meetings, meetings[-1]), "is visited after it has met another robot"),
+        (lambda meetings: (*meetings[:-1], replace(meetings[-1], visited="z")), "the meetings are not those"),
+        (
+            lambda meetings: (*meetings[:-1], replace(meetings[-1], visitor=meetings[-1].visited)),
+            "is visited after it has met another robot",
+        ),
+    ],
+)
+def test_a_plan_that_is_no_tree_is_refused(
+    group: Journals,
+    changed: Callable[[tuple[PlannedMeeting, ...]], tuple[PlannedMeeting, ...]],
+    why: str,
+) -> None:
+    scenario = scenario_of(group)
+    with pytest.raises(CorruptJournal, match=why):
+        of_frames(with_scenario(group, replace(scenario, meetings=changed(scenario.meetings))))
