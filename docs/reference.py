@@ -26,6 +26,7 @@ from compose.recording.estimating.estimate_rows import (
     RobotEstimate,
 )
 from compose.recording.estimating.learned_errors import LearnedErrors
+from compose.recording.group_localisation import MeetingResult
 from compose.recording.ranging import recording_rows
 from compose.recording.ticks_csv import TickRow
 from compose.scenario.fault_syntax import FaultTable
@@ -288,6 +289,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "estimate-table": partial(columns_of, rows.EstimateRow),
     "message-table": partial(columns_of, rows.MessageRow),
     "claim-table": partial(columns_of, rows.ClaimRow),
+    "meeting-table": partial(columns_of, MeetingResult),
     "odometry-columns": partial(fields_of, recording_rows.OdometryRow),
     "range-columns": partial(fields_of, recording_rows.RangeRow),
     "anchor-columns": partial(fields_of, recording_rows.AnchorRow),
