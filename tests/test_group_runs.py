@@ -4,19 +4,30 @@ from __future__ import annotations
 
 import math
 import random
+import re
 from collections.abc import Callable
 from itertools import combinations
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+import tandem
 from agent.process.agent_journal import Step
 from compose.audit.rules import audit_run
+from compose.errors import UserError
+from compose.launch.in_process import run_mission
 from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
 from compose.recording.run import of_frames
-from compose.scenario.scenario_file import parse
+from compose.recording.summary_json import summary
+from compose.scenario.scenario_change import file_table
+from compose.scenario.scenario_file import load, parse, scenario_table, setting, validate
+from compose.sweep.trial import Trial, row
+from compose.terminal.progress import result
 from protocol.journal.journal_file import CorruptJournal
 from protocol.wire import encode
 from tests.commands import SECTION_IV
@@ -198,3 +209,111 @@ def test_a_plan_that_is_no_tree_is_refused(
     scenario = scenario_of(group)
     with pytest.raises(CorruptJournal, match=why):
         of_frames(with_scenario(group, replace(scenario, meetings=changed(scenario.meetings))))
+
+
+# --- results ------------------------------------------------------------------------------------------
+
+
+def test_the_summary_has_the_meetings_their_bounds_and_the_truth_at_each_claim() -> None:
+    run = run_mission(parse(GROUP, "group"))
+    found = summary(run, None, None)
+    group = found["group"]
+    assert [(one["visitor"], one["visited"]) for one in group["meetings"]] == [
+        (one.visitor, one.visited) for one in run.scenario.meetings
+    ]
+    assert group["bound_s"] == run.scenario.meetings[-1].ends
+    claims = {robot: run.claim(robot) for robot in run.robots}
+    for one in group["meetings"]:
+        both = [claims[one[name]] for name in ("visitor", "visited")]
+        assert one["localised_tick"] == max(claim.tick for claim in both if claim is not None)
+        assert one["localised_tick"] <= one["bound_ticks"] < one["bound_s"] + 1.0
+    assert group["localised_tick"] == found["ticks"] <= group["bound_ticks"]
+    for robot in found["robots"].values():
+        assert robot["truth_at_claim"] == pytest.approx(robot["estimate"], abs=1e-6)
+    moved = [robot for robot in found["robots"].values() if robot["truth"] != robot["truth_at_claim"]]
+    assert moved  # the truth at the end is another one
+
+
+def test_the_summary_of_a_pair_says_nothing_of_groups() -> None:
+    found = summary(run_mission(load("paper-1")), None, None)
+    assert "group" not in found
+    assert "truth_at_claim" not in found["robots"]["a"]
+
+
+def test_the_result_of_a_group_shows_the_truth_at_the_claims_and_the_bound(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    found = summary(run_mission(parse(GROUP, "group")), None, None)
+    result(found)
+    shown = capsys.readouterr().out
+    tick, bound = found["ticks"], found["group"]["bound_ticks"]
+    assert "true at the claim" in shown
+    assert f"all robots were localised by tick {tick}; the computed bound is {bound} ticks" in shown
+
+
+# --- drawn groups and sweeps --------------------------------------------------------------------------
+
+
+def test_the_anchors_and_the_plan_of_a_drawn_group_follow_from_the_seed() -> None:
+    template = setting("random-group")
+    one, again, other = template.seeded(7), load("random-group", seed=7), template.seeded(8)
+    assert one == again
+    assert {robot.anchor for robot in one.robots}.isdisjoint({robot.anchor for robot in other.robots})
+    assert one.meetings != other.meetings
+    side = 30.0 * math.sqrt(4)
+    assert all(0.0 <= at <= side for robot in one.robots for at in (robot.anchor.x, robot.anchor.y))
+    written = validate(file_table(one), "written").scenario
+    assert written == one
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"group": {"robots": 2, "spacing": 30.0}}, "group.robots: "),
+        ({"group": {"robots": 201, "spacing": 30.0}}, "group.robots: "),
+        ({"group": {"robots": 4}}, "group: missing field 'spacing'"),
+        ({"robot": [{"id": "a", "anchor": [0.0, 0.0]}] * 2}, "group: its robots are drawn"),
+        ({"planner": {"name": "paper"}}, "planner.name: robots with the planner paper meet in pairs"),
+    ],
+)
+def test_a_group_that_cannot_be_is_refused_in_one_line(change: dict[str, Any], why: str) -> None:
+    table = {**scenario_table("random-group"), **change}
+    with pytest.raises(UserError, match=re.escape(why)) as refusal:
+        validate(table, "it")
+    assert len(str(refusal.value).splitlines()) == 1
+
+
+@pytest.mark.long
+def test_a_sweep_of_groups_has_the_share_of_the_bound_that_each_used(tmp_path: Path) -> None:
+    sweep = {
+        "name": "few",
+        "scenario": "random-group",
+        "trials": 2,
+        "axis": [{"field": "group.robots", "values": [3, 5]}],
+    }
+    found = tandem.sweep(sweep, workers=1, out=tmp_path / "few")
+    cells, trials = found.cells, found.trials
+    assert list(cells["rate"]) == [1.0, 1.0]
+    shares = trials["ticks"] / trials["bound_ticks"]
+    assert list(cells["bound_share_max"]) == [shares[:2].max(), shares[2:].max()]
+    assert (shares <= 1.0).all()
+    assert np.isfinite(trials["r3_position_error_m"]).all()
+    assert np.isnan(trials["r5_position_error_m"][:2]).all()
+    assert np.isfinite(trials["r5_position_error_m"][2:]).all()
+    run = tandem.run(found.scenario(1, 1))
+    assert run.ticks == trials["ticks"][3]
+    assert len(run.meetings["visitor"]) == 4
+
+
+@pytest.mark.long
+def test_a_noisy_group_has_a_bound_of_each_claim_that_a_sweep_compares() -> None:
+    text = GROUP.replace(
+        "[mission]", "[mission]\naccuracy = 0.3\nnoise = {anchor_sigma = 0.05, mutual_sigma = 0.05}"
+    )
+    scenario = parse(text, "noisy")
+    found = row(Trial(0, 0, scenario, processes=False), run_mission(scenario), 1.0)
+    assert found.outcome == "localised"
+    for one in found.robots.values():
+        assert one.bound_m is not None
+        assert one.position_sigma_m is not None
+        assert 0.2 < one.bound_m / one.position_sigma_m < 5.0
