@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from functools import cached_property
 from itertools import combinations
@@ -12,10 +11,10 @@ import msgspec
 from msgspec.structs import asdict
 
 from protocol.attack import Attack
-from protocol.messages import Meeting, RobotConfig, RobotConfigInGroup, RobotConfigWithOptions
+from protocol.messages import Member, Retry, RobotConfig, RobotConfigInGroup, RobotConfigWithOptions
 from protocol.mission import Anchor, Mission, Options, PlannerName, Role
 from protocol.motion import Pose
-from protocol.orbits import Rendezvous, visiting
+from protocol.orbits import Rendezvous
 from protocol.units import RobotId, Tick, Time
 from world.faults import Fault
 from world.radio_models import RADIO_MODELS
@@ -52,6 +51,10 @@ class RobotSpec(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fie
     """The false data that the robot injects into its Reports; None for an honest robot."""
 
 
+GIVES_UP = 0.97
+"""The time at which a robot that no meeting has localised gives up, as a fraction of that of `max_ticks`."""
+
+
 class PlannedMeeting(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """A meeting of two robots of a group, after which both are localised."""
 
@@ -61,6 +64,19 @@ class PlannedMeeting(msgspec.Struct, frozen=True, array_like=True, forbid_unknow
     """The robot that waits beside its anchor, with the role b."""
     ends: Time
     """The bound in s of the time at which both are localised."""
+
+
+class PlannedRetry(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """A meeting of two robots of a group that takes place if neither is localised by then."""
+
+    visitor: RobotId
+    """The robot that searches for the other one, with the role a."""
+    visited: RobotId
+    """The robot that waits beside its anchor, with the role b."""
+    rendezvous: Rendezvous
+    """The orbits of both robots."""
+    begins: Time
+    """The time in s at which it begins."""
 
 
 class Scenario(
@@ -171,29 +187,42 @@ class Scenario(
             tick_s=tick_s,
         )
         if self.meetings:
-            later = self._later_meetings(own)
+            visits = [
+                one.visited for one in self.meetings if one.visitor == own.id and one.visited != own.peer
+            ]
             return RobotConfigInGroup(
-                **asdict(config), planner_options=self.planner_options, later_meetings=later
+                **asdict(config),
+                planner_options=self.planner_options,
+                members=self.members,
+                visits=tuple(visits),
+                retries=self._retries_of(own.id),
+                gives_up=self.max_ticks * self.mission.period * GIVES_UP,
             )
         if not self.planner_options:
             return config
         return RobotConfigWithOptions(**asdict(config), planner_options=self.planner_options)
 
-    def _later_meetings(self, own: RobotSpec) -> tuple[Meeting, ...]:
-        """Return the meetings of the robot `own` after its first one."""
-        visits = [one.visited for one in self.meetings if one.visitor == own.id and one.visited != own.peer]
-        anchors = [self.robot(visited).anchor for visited in visits]
-        return tuple(
-            [
-                Meeting(visited, "a", anchor, visiting(self.mission, _distance(own.anchor, anchor)))
-                for visited, anchor in zip(visits, anchors, strict=True)
-            ]
-        )
+    @property
+    def retries(self) -> tuple[PlannedRetry, ...]:
+        """The meetings with which a group tries again; here, none."""
+        return ()
 
+    def _retries_of(self, robot: str) -> tuple[Retry, ...]:
+        """Return the meetings in which `robot` tries again."""
+        found = []
+        for one in self.retries:
+            if one.visitor == robot:
+                found.append(Retry(one.visited, "a", one.rendezvous, one.begins))
+            elif one.visited == robot:
+                found.append(Retry(one.visitor, "b", one.rendezvous, one.begins))
+        return tuple(found)
 
-def _distance(one: Anchor, other: Anchor) -> float:
-    """Return the distance of two anchors in m."""
-    return math.hypot(one.x - other.x, one.y - other.y)
+    @cached_property
+    def members(self) -> tuple[Member, ...]:
+        """The robots of the group, as they know each other; empty for pairs."""
+        ends = {one.visited: one.ends for one in reversed(self.meetings)}
+        ends |= {one.visitor: one.ends for one in reversed(self.meetings) if one.visitor not in ends}
+        return tuple([Member(one.id, one.anchor, ends[one.id]) for one in self.robots]) if ends else ()
 
 
 class ScenarioWithWorldNoise(
@@ -229,6 +258,8 @@ class ScenarioOfGroup(
 
     meetings: tuple[PlannedMeeting, ...] = ()
     """The meetings, in the order in which they end."""
+    retries: tuple[PlannedRetry, ...] = ()
+    """The meetings with which the group tries again, in the order in which they begin."""
 
 
 RecordedScenario = Scenario | ScenarioWithWorldNoise | ScenarioWithOptions | ScenarioOfGroup
