@@ -77,13 +77,16 @@ anchor = [2.0, 6.0]
 [[robot]]
 id = "d"
 anchor = [-4.0, 4.0]
+[[robot]]
+id = "e"
+anchor = [-3.0, -5.0]
 """
 Journals = dict[str, list[bytes]]
 
 
 @pytest.fixture(scope="module")
 def group() -> Journals:
-    """Return the journals of a group of four."""
+    """Return the journals of a group of five."""
     return kept(parse(GROUP, "group"))
 
 
@@ -166,6 +169,7 @@ def test_a_bound_that_is_not_the_planned_one_is_found(group: Journals) -> None:
 def test_another_visitor_than_the_planned_one_is_found(group: Journals) -> None:
     scenario = scenario_of(group)
     last = scenario.meetings[-1]
+    assert last.visitor in {robot for one in scenario.meetings[:-1] for robot in (one.visitor, one.visited)}
     other = next(one.id for one in scenario.robots if one.id not in (last.visitor, last.visited))
     changed = replace(
         scenario,
@@ -178,6 +182,15 @@ def test_another_visitor_than_the_planned_one_is_found(group: Journals) -> None:
     assert (None, None, "scenario") in found
     assert (None, last.visited, "scenario") in found
     assert (None, last.visited, "config") in found
+
+
+def test_a_retry_that_is_not_planned_is_found(group: Journals) -> None:
+    scenario = scenario_of(group)
+    changed = replace(scenario, retries=scenario.retries[:-1])
+    assert (None, None, "scenario") in audited(with_scenario(group, changed))
+    astray = replace(scenario.retries[0], visited="z")
+    with pytest.raises(CorruptJournal, match="the retries are not those of its robots"):
+        of_frames(with_scenario(group, replace(scenario, retries=(astray,))))
 
 
 def test_orbits_that_are_not_the_planned_ones_are_found(group: Journals) -> None:
@@ -302,7 +315,7 @@ def test_a_sweep_of_groups_has_the_share_of_the_bound_that_each_used(tmp_path: P
     assert np.isfinite(trials["r5_position_error_m"][2:]).all()
     run = tandem.run(found.scenario(1, 1))
     assert run.ticks == trials["ticks"][3]
-    assert len(run.meetings["visitor"]) == 4
+    assert list(run.meetings["visited"]) == [one.visited for one in run.model.scenario.meetings]
 
 
 @pytest.mark.long

@@ -59,9 +59,16 @@ def _group(found: Scenario) -> Checks:
     if len(found.meetings) != len(planned.planned):
         what = f"{len(found.meetings)} meetings are planned, expected {len(planned.planned)}"
         yield Violation("scenario", None, None, what)
-    for i, (meeting, expected) in enumerate(zip(found.meetings, planned.planned, strict=False)):
-        off = None if meeting == expected else f"meetings[{i}].{difference(meeting, expected)}"
-        yield _violation(None, off)
+    if len(found.retries) != len(planned.retries):
+        what = f"{len(found.retries)} retries are planned, expected {len(planned.retries)}"
+        yield Violation("scenario", None, None, what)
+    for name, some, others in (
+        ("meetings", found.meetings, planned.planned),
+        ("retries", found.retries, planned.retries),
+    ):
+        for i, (given, expected) in enumerate(zip(some, others, strict=False)):
+            off = None if given == expected else f"{name}[{i}].{difference(given, expected)}"
+            yield _violation(None, off)
     for robot in found.robots:
         first = planned.first[robot.id]
         for why in (
