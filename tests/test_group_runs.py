@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import math
 import random
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack
 from itertools import combinations
 from pathlib import Path
+from signal import Signals
 from typing import Any
 
 import numpy as np
@@ -18,19 +21,24 @@ from msgspec.structs import replace
 
 import tandem
 from agent.process.agent_journal import Step
+from compose.audit.replay import replayed
 from compose.audit.rules import audit_run
 from compose.errors import UserError
+from compose.launch.driver_loader import mission
 from compose.launch.in_process import run_mission
+from compose.launch.processes import free_endpoint
 from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
-from compose.recording.run import of_frames
+from compose.recording.run import of_frames, read
 from compose.recording.summary_json import summary
 from compose.scenario.scenario_change import file_table
 from compose.scenario.scenario_file import load, parse, scenario_table, setting, validate
+from compose.scenario.shipped_files import shipped
 from compose.sweep.trial import Trial, row
 from compose.terminal.progress import result
 from protocol.journal.journal_file import CorruptJournal
 from protocol.wire import encode
-from tests.commands import SECTION_IV
+from tests.commands import OVER, SECTION_IV, TandemProcess, journals, processes_of, until
+from tests.commands import tandem as tandem_command
 from tests.test_audit import kept
 from world.near_pairs import near_pairs
 from world.scenario import PlannedMeeting, ScenarioOfGroup
@@ -330,3 +338,107 @@ def test_a_noisy_group_has_a_bound_of_each_claim_that_a_sweep_compares() -> None
         assert one.bound_m is not None
         assert one.position_sigma_m is not None
         assert 0.2 < one.bound_m / one.position_sigma_m < 5.0
+
+
+# --- processes ----------------------------------------------------------------------------------------
+
+THREE = GROUP[: GROUP.index('[[robot]]\nid = "d"')]
+"""The first three robots: in tick 12 c meets a, and b from tick 25 on."""
+LINKS = ("a->c: loss=0.9", "c->b: delay=1..3", "loss=0.3, duplicate=0.2")
+"""Faults of one link each, and of all."""
+
+
+@pytest.fixture(scope="module")
+def three(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the scenario file of a group of three."""
+    file = tmp_path_factory.mktemp("three") / "three.toml"
+    file.write_text(THREE)
+    return file
+
+
+def options(name: str, values: Iterable[str]) -> list[str]:
+    return [word for value in values for word in (name, value)]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("faults", "kills", "more"),
+    [
+        ((), (), ("--secure",)),
+        ((), ("a@5:observation", "b@9", "world@12:journal", "c@14:command"), ()),
+        (LINKS, ("c@14:journal", "world@20:report", "a@25", "b@28:command"), ()),
+        (LINKS, ("world@0", "world@13:command", "a@13:journal", "c@13:journal"), ()),
+    ],
+)
+def test_a_group_as_processes_records_what_it_records_in_one_process(
+    faults: tuple[str, ...], kills: tuple[str, ...], more: tuple[str, ...], three: Path, tmp_path: Path
+) -> None:
+    own, out = tmp_path / "own", tmp_path / "out"
+    common = ("--no-export", "-q", *options("--fault", faults))
+    alone = tandem_command("run", three, "--in-process", "--out", own, *common)
+    ended = tandem_command("run", three, "--out", out, *common, *options("--kill", kills), *more)
+    assert (ended.status, ended.out) == (alone.status, alone.out) == (0, alone.out), ended
+    assert ended.err.count("was killed at tick") == len(kills)
+    assert journals(out) == journals(own)
+    assert (out / "ticks.csv").read_bytes() == (own / "ticks.csv").read_bytes()
+    assert audit_run(read(out)).violations == ()
+    assert not processes_of(out)
+
+
+@pytest.mark.long
+def test_a_group_in_real_time_leaves_a_recording_that_repeats(three: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    ended = tandem_command("run", three, "--rate", "20", "--out", out, "--no-export", "-q")
+    assert ended.status in OVER, ended
+    assert audit_run(read(out)).violations == ()
+    assert replayed(read(out)).differences == ()
+
+
+@pytest.mark.long
+def test_any_two_robots_of_a_group_may_talk_with_certificates_and_the_doctor_finds_them_well(
+    three: Path, tmp_path: Path
+) -> None:
+    folder, endpoint, own = tmp_path / "keys", free_endpoint("tls"), tmp_path / "own"
+    assert tandem_command("keys", folder, "--robots", "a,b,c").status == 0
+    assert tandem_command("run", three, "--in-process", "--out", own, "--no-export", "-q").status == 0
+    with ExitStack() as stack:
+
+        def start(name: str, *arguments: str | Path) -> TandemProcess:
+            given = (*arguments, "--keys", folder / name, "--out", tmp_path / name)
+            return stack.enter_context(TandemProcess(*given))
+
+        clock = start("world", "world", three, "--listen", endpoint)
+        clock.until_prints("waiting for")
+        first = [start(f"agent-{one}", "agent", one, "--connect", endpoint) for one in "ab"]
+        tested = ("--connect", endpoint, "--keys", folder / "agent-a", "--timeout", "1")
+        found = tandem_command("doctor", *tested)
+        assert "agent-a can publish Reports of a" in found.out, found
+        assert "cannot publish" in found.out
+        listed = tandem_command("ps", "--connect", endpoint, "--keys", folder / "viewer", "--json")
+        [mission] = json.loads(listed.out)["missions"]
+        assert {one["robot"] for one in mission["robots"]} == {"a", "b", "c"}
+        last = start("agent-c", "agent", "c", "--connect", endpoint)
+        for one in (*first, last, clock):
+            ended = one.ended()
+            assert ended.status == 0, ended
+    recorded = {
+        name: frames for one in tmp_path.glob("*/*.journal") for name, frames in journals(one.parent).items()
+    }
+    assert recorded == journals(own)
+
+
+@pytest.mark.long
+def test_a_group_that_is_stopped_leaves_no_process(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    file = tmp_path / "eight.toml"
+    file.write_text((shipped()["random-group"].read_text()).replace("robots = 4", "robots = 8"))
+    with TandemProcess("run", file, "--rate", "5", "--out", out, "--no-export", "-q") as run:
+        run.until(lambda: len(list(out.glob("*.journal"))) == 9, "all robots have a journal")
+        run.tell(Signals.SIGINT)
+        assert run.ended().status == 130
+    until(lambda: not processes_of(out), "no process is left")
+
+
+def test_a_robot_of_a_group_is_refused_in_hardware_mode(three: Path) -> None:
+    with pytest.raises(UserError, match="robot: in hardware mode, robots meet in pairs"):
+        mission(str(three), "a")
