@@ -298,6 +298,8 @@ class Retry(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=
     """The orbits of both robots."""
     begins: Time
     """The time in s at which it begins."""
+    lasts: Time
+    """The bound in s of the time until both are localised."""
 
 
 class RobotConfigInGroup(RobotConfigWithOptions, frozen=True, dict=True):

@@ -77,6 +77,8 @@ class PlannedRetry(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_
     """The orbits of both robots."""
     begins: Time
     """The time in s at which it begins."""
+    lasts: Time
+    """The bound in s of the time until both are localised."""
 
 
 class Scenario(
@@ -212,9 +214,9 @@ class Scenario(
         found = []
         for one in self.retries:
             if one.visitor == robot:
-                found.append(Retry(one.visited, "a", one.rendezvous, one.begins))
+                found.append(Retry(one.visited, "a", one.rendezvous, one.begins, one.lasts))
             elif one.visited == robot:
-                found.append(Retry(one.visitor, "b", one.rendezvous, one.begins))
+                found.append(Retry(one.visitor, "b", one.rendezvous, one.begins, one.lasts))
         return tuple(found)
 
     @cached_property

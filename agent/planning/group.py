@@ -27,6 +27,7 @@ from protocol.messages import (
     Command,
     Estimate,
     Localised,
+    Member,
     Observation,
     Ranged,
     Report,
@@ -38,6 +39,9 @@ from protocol.messages import (
 from protocol.mission import Mission, Role
 from protocol.motion import ORIGIN, Pose, compose, inverse
 from protocol.orbits import Rendezvous
+
+TRAVELLING = MODE_NAMES[Travelling]
+"""The mode of a robot that is localised, and drives to another one."""
 
 SHORT_OF_ANCHOR = 0.5
 """The distance from the visited robot's anchor at which a visitor stops, as a fraction of R.
@@ -70,8 +74,10 @@ class Other(msgspec.Struct, frozen=True):
     """The ranges to it."""
     localised: bool = False
     """True once it has reported that it is localised."""
-    avoided: bool = False
-    """True once a meeting with it has failed, or a search for it: this robot does not visit it again."""
+    failed: bool = False
+    """True once a meeting with it has failed: this robot does not meet it again."""
+    missed: int | None = None
+    """The latest tick in which this robot has not found it where it should wait; None if there is none."""
 
 
 class GroupState(msgspec.Struct, frozen=True):
@@ -83,6 +89,8 @@ class GroupState(msgspec.Struct, frozen=True):
     """The number of planned visits that the robot has begun or left out."""
     retries: int = 0
     """The number of retries whose time has come."""
+    until: float | None = None
+    """The time in s at which the search of a retry ends; None if there is none."""
     visiting: bool = False
     """True if the present meeting is a visit: the robot knows its pose already."""
     verdict: Verdict | None = None
@@ -132,6 +140,8 @@ class GroupPlanner(Planner[GroupState, Report]):
     def observe(self, state: GroupState, observation: Observation) -> GroupState:
         """Return `state` with the sensor data of one tick, ranges to all robots of the group included."""
         pair = self._pair.observe(state.pair, observation)
+        if pair.in_contact and _refused(state, pair.config.peer):
+            pair = replace(pair, in_contact=False)
         for contact in observation.contacts:
             if contact.peer != pair.config.peer and contact.range is not None:
                 known = state.other(contact.peer)
@@ -157,10 +167,11 @@ class GroupPlanner(Planner[GroupState, Report]):
     def decide(self, state: GroupState, reports: Sequence[Report] = ()) -> GroupState:
         """Return `state` with the `reports` of others, and in the next meeting if this one has ended."""
         for one in reports:
-            if exchange.is_without_log(one) and isinstance(one.verdict, Localised):
+            without_log = exchange.is_without_log(one)
+            if one.state == TRAVELLING or (without_log and isinstance(one.verdict, Localised)):
                 state = state.with_other(one.robot, replace(state.other(one.robot), localised=True))
         logs = [one for one in reports if not exchange.is_without_log(one)]
-        state = _answering(state, [one.robot for one in logs if one.state == MODE_NAMES[Travelling]])
+        state = _answering(state, [one.robot for one in logs if one.state == TRAVELLING])
         peer, before = state.pair.config.peer, state.pair
         of_peer = [] if _refused(state, peer) else [one for one in logs if one.robot == peer]
         pair = self._pair.decide(before, of_peer)
@@ -230,7 +241,7 @@ def _answering(state: GroupState, visitors: Sequence[str]) -> GroupState:
 
 def _refused(state: GroupState, robot: str) -> bool:
     """Return whether this robot, which is not localised, has had a meeting with `robot` that failed."""
-    return state.verdict is None and state.other(robot).avoided
+    return state.verdict is None and state.other(robot).failed
 
 
 def _onward(state: GroupState) -> GroupState:
@@ -241,13 +252,16 @@ def _onward(state: GroupState) -> GroupState:
     if state.visiting and pair.verdict is None:
         if state.other(peer).localised:  # by another robot
             return _next_visit(state)
-        if _has_searched(state) or state.silence > SILENT_AFTER:
-            return _next_visit(_avoiding(state, peer))
+        if _has_searched(state):
+            known = replace(state.other(peer), missed=pair.tick)
+            return _next_visit(state.with_other(peer, known))
+        if state.silence > SILENT_AFTER:
+            return _next_visit(_after_meeting(state))
         return state
     if not isinstance(pair.mode, Done):
         return state
     if not isinstance(pair.verdict, Localised):
-        return _next_visit(_avoiding(state, peer))
+        return _next_visit(_after_meeting(state))
     over = pair.peer_state.verdict is not None or state.unmet >= PARTED_AFTER
     return _next_visit(state) if over else state
 
@@ -265,7 +279,9 @@ def _after_failure(state: GroupState) -> GroupState:
         late = Undecided(f"not localised after {now:g} s")
         return replace(state, verdict=pair.verdict or state.failure or late)
     if pair.verdict is not None:
-        state = _waiting(_avoiding(replace(state, failure=pair.verdict), config.peer), config.peer)
+        state = _waiting(_after_meeting(replace(state, failure=pair.verdict)), config.peer)
+    elif state.until is not None and now >= state.until and not pair.in_contact:
+        state = _waiting(replace(state, until=None), config.peer)
     return _trying_again(state)
 
 
@@ -280,7 +296,8 @@ def _trying_again(state: GroupState) -> GroupState:
         return state
     if retry.role == "b":
         return _waiting(state, retry.peer)
-    return _aligned(_in_meeting(state, retry.peer, "a", retry.rendezvous))
+    until = _now(pair) + retry.lasts
+    return replace(_aligned(_in_meeting(state, retry.peer, "a", retry.rendezvous)), until=until)
 
 
 def _now(pair: RobotState) -> float:
@@ -288,9 +305,10 @@ def _now(pair: RobotState) -> float:
     return pair.tick * pair.config.mission.period
 
 
-def _avoiding(state: GroupState, robot: str) -> GroupState:
-    """Return `state` of a robot that does not meet `robot` again."""
-    return state.with_other(robot, replace(state.other(robot), avoided=True))
+def _after_meeting(state: GroupState) -> GroupState:
+    """Return `state` of a robot whose meeting has failed, and which does not meet its peer again."""
+    peer = state.config.peer
+    return state.with_other(peer, replace(state.other(peer), failed=True))
 
 
 def _waiting(state: GroupState, peer: str) -> GroupState:
@@ -319,19 +337,28 @@ def _next_visit(state: GroupState) -> GroupState:
     while visits < len(config.visits):
         peer = config.visits[visits]
         visits += 1
-        if not (state.other(peer).localised or state.other(peer).avoided):
+        if not (state.other(peer).localised or state.other(peer).failed):
             return _on_visit(replace(state, visits=visits), peer)
-    now = _now(state.pair)
     here = compose(state.frame, state.pair.odometry)
     late = [
         (math.hypot(one.anchor.x - here.x, one.anchor.y - here.y), one.robot)
         for one in config.members
-        if one.robot != config.robot
-        and one.ends < now
-        and not (state.other(one.robot).localised or state.other(one.robot).avoided)
+        if one.robot != config.robot and _is_late(state, one)
     ]
     state = replace(state, visits=visits)
     return _on_visit(state, min(late)[1]) if late else state
+
+
+def _is_late(state: GroupState, member: Member) -> bool:
+    """Return whether `member` should be localised by now, and may still wait for a visitor.
+
+    A robot that was not there is visited again after as long as the whole plan takes.
+    """
+    known, now, config = state.other(member.robot), _now(state.pair), state.config
+    if known.localised or known.failed or now <= member.ends:
+        return False
+    period = config.mission.period
+    return known.missed is None or now - known.missed * period > max(one.ends for one in config.members)
 
 
 def _on_visit(state: GroupState, peer: str) -> GroupState:

@@ -89,11 +89,12 @@ def group_meetings(robots: Sequence[RobotTable], mission: Mission, planner: Plan
         first[b] = FirstMeeting(a, "b", orbits)
     seeds = [(one.visitor, one.visited) for one in plan.meetings if one.first]
     spread = plan.bound - min(one.ends for one in plan.meetings if one.first)
-    begins, retries = plan.bound, []
+    begins, retries = plan.bound + SLOWER * spread, []
     for i, j in _retried(seeds, len(robots), pair_time):
-        retries.append(PlannedRetry(ids[i], ids[j], rendezvous(i, j), begins))
-        begins += pair_time(i, j) + SLOWER * spread
-    return GroupMeetings(planned, first, plan.bound, tuple(retries), begins + SLOWER * spread)
+        lasts = pair_time(i, j)
+        retries.append(PlannedRetry(ids[i], ids[j], rendezvous(i, j), begins, lasts))
+        begins += lasts + SLOWER * spread
+    return GroupMeetings(planned, first, plan.bound, tuple(retries), begins)
 
 
 def _retried(
