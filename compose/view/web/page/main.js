@@ -11,6 +11,7 @@ import { embedded, on_clock, pass_on, tell, tell_state } from "./embedding.js";
 import { needed, release_focus } from "./focus.js";
 import { Guide } from "./guide.js";
 import { fill_help } from "./help.js";
+import { Legend } from "./legend.js";
 import { Log } from "./log.js";
 import { list_missions, state_of } from "./missions.js";
 import { Plane } from "./plane.js";
@@ -21,7 +22,8 @@ import { Sequence } from "./sequence.js";
 import { SPEEDS, USUAL } from "./speeds.js";
 import { Store } from "./store.js";
 import { Timeline } from "./timeline.js";
-import { plural } from "./words.js";
+import { joined } from "./tints.js";
+import { plural, seconds } from "./words.js";
 
 const SETTLED_MS = 200; // after the last movement of the camera
 
@@ -50,6 +52,7 @@ const announcer = new Announcer();
 const plane = new Plane($("canvas"), () => draw(), select);
 const tip = new Tip($("tip"));
 const predictions = new Predictions($("predictions"), plane);
+const legend = new Legend($("legend"), () => draw());
 const timeline = new Timeline($("line"), $("bands"), $("scrub"), (tick) => go(tick));
 const sequence = new Sequence($("exchange"), (tick) => go(tick), () => draw());
 const charts = new Charts($("charts"), $("strips"), (tick) => go(tick), () => draw());
@@ -288,9 +291,11 @@ function draw() {
     store.want(view.tick);
     view.moving = (view.playing || view.driven) && !still.matches && (view.guided || view.speed <= 60);
     view.eliminated = guide.eliminated(view);
+    view.planned = guide.planned(view);
     // First the texts: they decide the size of the plane, and its camera and its labels keep clear of them.
     controls();
-    text($("caption"), guide.text(view));
+    $("caption").classList.toggle("several", guide.several(view));
+    caption(guide.text(view));
     predictions.draw(view, store, guide.pair(view.focus));
     if (plane.following) plane.follow(view, store, guide.pair(view.focus), still.matches ? null : now);
     document.body.dataset.tick = view.tick;
@@ -302,6 +307,8 @@ function draw() {
     cards.draw(view);
     log.draw(view);
     timeline.draw(view, activities(store, view));
+    const story = guide.pair(view.focus), mover = joined(store.scene(view.tick), story[0].id)?.manoeuvre?.robot ?? "it";
+    legend.draw(plane.marks, timeline.kinds, store.stage.robots.length > story.length ? [] : story, mover);
     sequence.draw(store, view);
     charts.draw(store, view, guide.pair(view.focus));
     const news = view.playing && view.guided ? null : announcer.text(store, view, now);
@@ -317,6 +324,7 @@ function controls() {
   $("status").dataset.outcome = lost ? "lost" : store.end?.outcome ?? (store.live ? "live" : "torn");
   $("status").title = store.end?.reason ?? "";
   text($("tick"), `tick ${view.tick} of ${Math.max(store.last, 0)}`);
+  $("tick").dataset.time = seconds(view.tick * store.stage.mission.period);
   $("play").classList.toggle("on", view.playing);
   $("play").setAttribute("aria-label", view.playing ? "Pause" : "Play");
   $("play").classList.toggle("invite", view.guided && !view.playing && !store.live && view.tick === store.first);
@@ -345,6 +353,16 @@ function controls() {
 function knows_bearing() {
   const players = store.scene(view.tick)?.players ?? [];
   return players.filter((player) => !view.focus || player.robot === view.focus).every((player) => player.held?.world.length);
+}
+
+/** Shows a caption. Its room never becomes smaller in a window, so that the plane keeps its size. */
+function caption(content) {
+  const box = $("caption"), room = `${window.innerWidth}x${window.innerHeight}`;
+  if (box.textContent === content && box.dataset.room === room) return;
+  if (box.dataset.room !== room) box.style.minHeight = "";
+  box.dataset.room = room;
+  text(box, content);
+  box.style.minHeight = `${box.offsetHeight}px`;
 }
 
 function text(element, content) {
@@ -419,6 +437,7 @@ function pressed(event) {
     s: () => plane.shift(event.shiftKey ? -60 : 0, event.shiftKey ? 0 : -60),
     d: () => { $("exchange").open = !$("exchange").open; },
     e: () => change(),
+    k: () => { $("legend").open = !$("legend").open; },
     v: () => { $("charts").open = !$("charts").open; },
     "?": () => $("keys").showModal(),
   };
@@ -448,7 +467,7 @@ $("near").addEventListener("click", () => plane.near(store, view));
 $("help").addEventListener("click", () => $("keys").showModal());
 $("view").addEventListener("submit", (event) => event.preventDefault());
 $("speed").append(...SPEEDS.map((speed) => make("option", { value: speed, textContent: speed })));
-fill_help($("key-list"), $("signs"), $("legend"));
+fill_help($("key-list"), $("signs"));
 
 window.addEventListener("hashchange", () => {
   const { show, tick, robot, selected, view: look, truth } = address_state();
@@ -460,7 +479,7 @@ window.addEventListener("hashchange", () => {
   if (tick !== null) go(tick);
   else draw();
 });
-new ResizeObserver(() => draw()).observe($("plane"));
+new ResizeObserver(() => draw()).observe($("stage"));
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => draw());
 
 listen();
