@@ -24,7 +24,8 @@ def table_of(robots: int, seed: int, *, sigma: float = 0.0, side: float = 10.0) 
         "max_turn_rate": 3.141592653589793,
     }
     if sigma:
-        mission |= {"noise": {"anchor_sigma": sigma, "mutual_sigma": sigma}, "accuracy": 0.3}
+        noise = {"anchor_sigma": sigma, "mutual_sigma": sigma, "gyro_bias": 0.0003}
+        mission |= {"noise": noise, "accuracy": 0.3}
     placed = [
         {"id": f"r{i}", "anchor": [rng.uniform(0.0, length), rng.uniform(0.0, length)]} for i in range(robots)
     ]

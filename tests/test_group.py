@@ -138,6 +138,10 @@ def test_the_configuration_of_a_robot_names_its_group_and_its_visits() -> None:
             {"planner": {"name": "paper"}},
             "group.toml: planner.name: robots with the planner paper meet in pairs",
         ),
+        (
+            {"mission": table_of(3, 1)["mission"] | {"noise": {"anchor_sigma": 0.05}, "accuracy": 0.3}},
+            "group.toml: mission.noise.gyro_bias: within the",
+        ),
         ({"twice": True}, "group.toml: robot.id: 2 robots have the id 'r0'"),
         ({"near": True}, "group.toml: robot[1].anchor: less than"),
         ({"peer": True}, "group.toml: robot[1].peer: 'r1' needs a peer, because there are 3 robots"),

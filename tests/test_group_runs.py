@@ -329,7 +329,8 @@ def test_a_sweep_of_groups_has_the_share_of_the_bound_that_each_used(tmp_path: P
 @pytest.mark.long
 def test_a_noisy_group_has_a_bound_of_each_claim_that_a_sweep_compares() -> None:
     text = GROUP.replace(
-        "[mission]", "[mission]\naccuracy = 0.3\nnoise = {anchor_sigma = 0.05, mutual_sigma = 0.05}"
+        "[mission]",
+        "[mission]\naccuracy = 0.3\nnoise = {anchor_sigma = 0.05, mutual_sigma = 0.05, gyro_bias = 0.0003}",
     )
     scenario = parse(text, "noisy")
     found = row(Trial(0, 0, scenario, processes=False), run_mission(scenario), 1.0)
