@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -159,6 +160,17 @@ def test_a_group_that_cannot_be_is_refused_in_one_line(change: dict[str, Any], w
         validate(table | change, "group.toml")
     assert what in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_the_gyros_that_a_refusal_asks_for_are_good_enough() -> None:
+    table = table_of(4, 1)
+    table["mission"] |= {"noise": {"anchor_sigma": 0.05, "mutual_sigma": 0.05}, "accuracy": 0.3}
+    with pytest.raises(BadScenario) as refused:
+        validate(table, "group.toml")
+    asked = re.search(r"calibrate the gyros to (\S+) rad/s", str(refused.value))
+    assert asked is not None
+    table["mission"]["noise"]["gyro_bias"] = float(asked[1])
+    assert validate(table, "group.toml").scenario.meetings
 
 
 # --- visits -------------------------------------------------------------------------------------------

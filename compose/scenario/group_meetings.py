@@ -90,11 +90,11 @@ def group_meetings(robots: Sequence[RobotTable], mission: Mission, planner: Plan
     plan = group_plan(anchors, pair_time, mission.max_speed, meeting_ticks(mission) * mission.period)
     turned = mission.noise.priors.gyro_bias * plan.bound
     if not mission.noise.exact and turned > MOST_TURNED:
+        enough = math.floor(1e5 * MOST_TURNED / plan.bound) / 1e5
         raise Unworkable(
             f"mission.noise.gyro_bias: within the {plan.bound:.0f} s of the plan, a bias of "
             f"{mission.noise.priors.gyro_bias:g} rad/s turns a robot by {turned:.2g} rad, more than "
-            f"{MOST_TURNED:g}: "
-            f"calibrate the gyros to {MOST_TURNED / plan.bound:.1g} rad/s, or let the robots meet in pairs"
+            f"{MOST_TURNED:g}: calibrate the gyros to {enough:g} rad/s, or let the robots meet in pairs"
         )
     planned = tuple([PlannedMeeting(ids[one.visitor], ids[one.visited], one.ends) for one in plan.meetings])
     first: dict[str, FirstMeeting] = {}
