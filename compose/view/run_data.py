@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import msgspec
 
 from compose.recording.kills_file import Killed
+from compose.recording.run_setup import RunSetup
 from compose.scenario.kills import WORLD
+from compose.view.meetings import Meetings, meetings_after
 from protocol.messages import (
     Command,
     DeadlineMissed,
@@ -48,8 +50,8 @@ class TickData(msgspec.Struct, frozen=True):
     tick: int
     truth: dict[str, Pose] = msgspec.field(default_factory=dict)
     observations: dict[str, Observation] = msgspec.field(default_factory=dict)
-    reports: dict[str, SizedReport] = msgspec.field(default_factory=dict)
-    """Reports by sender."""
+    reports: dict[Link, SizedReport] = msgspec.field(default_factory=dict)
+    """Reports by sender and receiver."""
     commands: dict[str, Command] = msgspec.field(default_factory=dict)
     estimates: dict[str, Estimate] = msgspec.field(default_factory=dict)
     late: set[str] = msgspec.field(default_factory=set)
@@ -97,6 +99,12 @@ class RunData:
         """The processes that were killed in ticks after `_complete`, by tick."""
         self._absences: dict[str | None, Absence] = {}
         """The latest absence of each process that was killed and is not known to be back."""
+        self._meetings: dict[int, tuple[Meetings, Mapping[str, Command]]] = {}
+        """The meetings of a group in each tick, and the latest commands; the latest tick is the last entry."""
+        self._setup_at: tuple[RunSetup, Meetings, RunSetup] | None = None
+        """The latest arguments and result of `setup_at`: setup, meetings, and the setup with these."""
+        self._written: dict[str, tuple[int, int]] = {}
+        """The latest tick of the reports in the journal of each sender, and their number."""
         self.touched: int | None = None
         """The earliest tick that has changed since the user of this object last set this to None."""
 
@@ -112,6 +120,23 @@ class RunData:
 
     def _touch(self, tick: int) -> None:
         self.touched = tick if self.touched is None else min(tick, self.touched)
+        while self._meetings and next(reversed(self._meetings)) >= tick:
+            self._meetings.popitem()
+
+    def setup_at(self, setup: RunSetup, tick: int) -> RunSetup:
+        """Return `setup` with the peer that each robot of a group meets in `tick`; for pairs, `setup`."""
+        if not setup.visits or not self.ticks:
+            return setup
+        latest = next(reversed(self._meetings), next(iter(self.ticks)) - 1)
+        for later in range(latest + 1, min(tick, self.last) + 1):
+            met, earlier = self._meetings.get(later - 1, ({}, {}))
+            commands = self.ticks[later].commands if later in self.ticks else {}
+            known = commands if len(commands) == len(setup.robots) else {**earlier, **commands}
+            self._meetings[later] = meetings_after(setup, met, earlier, commands), known
+        now = self._meetings.get(tick, ({}, {}))[0]
+        if self._setup_at is None or self._setup_at[:2] != (setup, now):
+            self._setup_at = setup, now, setup.in_meetings(now)
+        return self._setup_at[2]
 
     def conclude(self, end: MissionEnd) -> None:
         """Set the end of the mission, which changes its last tick, unless it is known already."""
@@ -216,11 +241,13 @@ class RunData:
             now.down.add(robot)
             now.back.discard(robot)
 
-    def add(self, message: Message, size: int, journal_owner: str | None = None) -> None:
+    def add(
+        self, message: Message, size: int, journal_owner: str | None = None, receiver: str | None = None
+    ) -> None:
         """Add `message`, from a frame of `size` bytes. Data that is already known is not replaced.
 
         `journal_owner` is the robot whose journal holds the message; None for the world's journal and for
-        the network.
+        the network. `receiver` is that of a report from the network.
         """
         match message:
             case Observation(tick, robot):
@@ -230,7 +257,10 @@ class RunData:
             case Estimate(tick, robot):
                 self.at(tick).estimates.setdefault(robot, message)
             case Report(tick, robot) | PlannerReport(tick, robot):
-                self.at(tick).reports.setdefault(robot, SizedReport(message, size))
+                to = receiver or (
+                    self._receiver(robot, tick) if journal_owner in (None, robot) else journal_owner
+                )
+                self.at(tick).reports.setdefault((robot, to), SizedReport(message, size))
                 self._add_reported(message)
             case GroundTruth(tick, poses):
                 self.at(tick).truth.update(poses)
@@ -240,6 +270,18 @@ class RunData:
                 (data.late if journal_owner is None else data.without).add(journal_owner or robot)
             case _:
                 self._add_once(message)
+
+    def _receiver(self, sender: str, tick: int) -> str:
+        """Return the receiver of the next report in its sender's journal: one for each contact, in order."""
+        latest, count = self._written.get(sender, (-1, 0))
+        count = count if latest == tick else 0
+        self._written[sender] = tick, count + 1
+        observation = self.ticks[tick].observations.get(sender) if tick in self.ticks else None
+        contacts = observation.contacts if observation is not None else ()
+        if count < len(contacts):
+            return contacts[count].peer
+        config = self.configs.get(sender)
+        return config.peer if config is not None else ""
 
     def _add_reported(self, report: PeerReport) -> None:
         """Extend the reported log of an attacker; a report may change earlier ticks than its own."""

@@ -174,7 +174,8 @@ class _Drawing:
             self._draw_robot(robot, player)
             self._draw_hypotheses(robot, player)
         for robot in self._setup.robots[:PLOTTED]:
-            numbers = Numbers.of(scene.player(robot.id), robot.anchor, scene.held_by(robot.peer))
+            player = scene.player(robot.id)
+            numbers = Numbers.of(player, robot.anchor, scene.held_by(player.peer or robot.peer))
             for number in numbers.__struct_fields__:
                 value = getattr(numbers, number)
                 if any(number in plotted for plotted in PLOTS.values()):
@@ -231,7 +232,7 @@ class _Drawing:
         self._while(f"robots/{robot.id}/ellipse", outline)
 
     def _draw_contacts(self, scene: Scene) -> None:
-        for one, other in self._setup.pairs():
+        for one, other in self._setup.links():
             a, b = scene.player(one.id), scene.player(other.id)
             contact = next((contact for contact in a.contacts if contact.peer == other.id), None)
             link = None

@@ -148,7 +148,7 @@ class Views:
         yield Shown("/tf", fox.FrameTransforms(transforms=list(self._transforms(scene, at))))
         for player in scene.players:
             robot_setup = self.setup.robot_setup(player.robot)
-            numbers = Numbers.of(player, robot_setup.anchor, scene.held_by(robot_setup.peer))
+            numbers = Numbers.of(player, robot_setup.anchor, scene.held_by(player.peer or robot_setup.peer))
             yield Shown(f"/{player.robot}/numbers", numbers)
             yield from self._robot(player, at)
         yield Shown("/contact", fox.SceneUpdate(entities=list(self._contacts(scene, at))))
@@ -229,7 +229,7 @@ class Views:
 
     def _contacts(self, scene: Scene, at: fox.Timestamp) -> Iterator[fox.SceneEntity]:
         """Yield one entity per pair. In contact it shows the link, the range and deliveries of reports."""
-        for one, other in self.setup.pairs():
+        for one, other in self.setup.links():
             a, b = scene.player(one.id), scene.player(other.id)
             contact = next((contact for contact in a.contacts if contact.peer == other.id), None)
             lines, texts = [], []
@@ -240,7 +240,7 @@ class Views:
                 words += [
                     f"{passage.sender}'s report of tick {passage.tick}: {DELIVERED[passage.what]}"
                     for passage in scene.passages
-                    if passage.sender in (one.id, other.id) and passage.what != "sent"
+                    if {passage.sender, passage.receiver} == {one.id, other.id} and passage.what != "sent"
                 ]
                 middle = Pose((a.pose.x + b.pose.x) / 2, (a.pose.y + b.pose.y) / 2, 0.0)
                 texts = [shapes.words("\n".join(words), middle, self._unit, shapes.colour(GREEN))]
