@@ -9,6 +9,7 @@ import { Charts } from "./charts.js";
 import * as data from "./data.js";
 import { embedded, on_clock, pass_on, tell, tell_state } from "./embedding.js";
 import { needed, release_focus } from "./focus.js";
+import { name_group } from "./group.js";
 import { Guide } from "./guide.js";
 import { fill_help } from "./help.js";
 import { Log } from "./log.js";
@@ -168,6 +169,7 @@ function staged() {
   document.title = `${store.stage.name} · Tandem`;
   const all = make("option", { value: "", textContent: "all" });
   $("robot").replaceChildren(all, ...store.stage.robots.map((robot) => make("option", { value: robot.id, textContent: robot.id })));
+  if (store.grouped) name_group($("legend"));
   cards.stage(store);
   timeline.stage(store);
   log.stage(store);
@@ -286,6 +288,7 @@ function draw() {
     if (!store) return;
     advance(now);
     store.want(view.tick);
+    store.show(view.tick);
     view.moving = (view.playing || view.driven) && !still.matches && (view.guided || view.speed <= 60);
     view.eliminated = guide.eliminated(view);
     // First the texts: they decide the size of the plane, and its camera and its labels keep clear of them.
@@ -303,7 +306,7 @@ function draw() {
     log.draw(view);
     timeline.draw(view, activities(store, view));
     sequence.draw(store, view);
-    charts.draw(store, view, guide.pair(view.focus));
+    charts.draw(store, view, store.grouped ? [store.chosen(view.focus)] : guide.pair(view.focus));
     const news = view.playing && view.guided ? null : announcer.text(store, view, now);
     if (news !== null) text($("live"), news);
     if (view.playing || plane.easing) draw();
