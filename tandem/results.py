@@ -208,7 +208,8 @@ class Run(msgspec.Struct, frozen=True, dict=True, eq=False):
         """The pairs with data, with the planner states of each robot whose journal can be read."""
         from compose.figures.pair import pair_of  # noqa: PLC0415
 
-        found = [pair_of(self.model, robots, self._replays(robots)) for robots in self.model.pairs]
+        replays = self._replays(self.robots)
+        found = [pair_of(self.model, robots, replays) for robots in self.model.pairs]
         return [pair for pair in found if pair is not None]
 
     def _replays(self, robots: Iterable[str]) -> dict[str, AgentReplay]:

@@ -66,10 +66,13 @@ def main(options: argparse.Namespace) -> int:
     kinds = [kind for kind in PICTURES if kind in (options.only or PICTURES)]
     formats = [one for one in FORMATS if one in (options.format or FORMATS)]
     with counting("tandem figures", sum([len(robots) + len(kinds) for robots in run.pairs])) as done:
+        found: dict[str, AgentReplay | None] = {}
         for robots in run.pairs:
             replays = {}
             for robot in robots:
-                replay = _replay(run, robot)
+                if robot not in found:
+                    found[robot] = _replay(run, robot)
+                replay = found[robot]
                 if replay is not None:
                     replays[robot] = replay
                 if replay is None or replay.broken is not None:

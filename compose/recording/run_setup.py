@@ -98,7 +98,11 @@ class RunSetup(msgspec.Struct, frozen=True, dict=True):
     def links(self) -> tuple[tuple[RobotSetup, RobotSetup], ...]:
         """Return all pairs that meet during the run: in a group, the robots of each meeting."""
         known = {one.id: one for one in self.robots}
-        met = [(known[one.visitor], known[one.visited]) for one in self.visits if {one.visitor, one.visited} <= known.keys()]
+        met = [
+            (known[one.visitor], known[one.visited])
+            for one in self.visits
+            if {one.visitor, one.visited} <= known.keys()
+        ]
         return tuple(met) if self.visits else self.pairs()
 
     @cached_property
@@ -116,7 +120,9 @@ class RunSetup(msgspec.Struct, frozen=True, dict=True):
         """Return this setup with the peer and the role of each robot in its present one of `meetings`."""
         if not self.visits:
             return self
-        return replace(self, robots=tuple([self._in_meeting(one, meetings.get(one.id, 0)) for one in self.robots]))
+        return replace(
+            self, robots=tuple([self._in_meeting(one, meetings.get(one.id, 0)) for one in self.robots])
+        )
 
     def _in_meeting(self, one: RobotSetup, meeting: int) -> RobotSetup:
         return replace(one, peer=self.partners[one.id][meeting], role="a") if meeting else one

@@ -60,7 +60,9 @@ def _links(setup: RunSetup, before: TickData | None, now: TickData) -> list[Link
     for data in (before, now):
         found.update([link for link, ticks in data.under_way.items() if ticks] if data is not None else [])
     place = {robot: i for i, robot in enumerate(setup.ids)}
-    return sorted([link for link in found if place.keys() >= {*link}], key=lambda link: (place[link[0]], place[link[1]]))
+    return sorted(
+        [link for link in found if place.keys() >= {*link}], key=lambda link: (place[link[0]], place[link[1]])
+    )
 
 
 def contact_of(now: TickData, robot: str, peer: str) -> Contact | None:

@@ -11,7 +11,7 @@ from compose.recording.run_setup import RobotSetup, RunSetup
 from compose.view.captions import COUNTS, Caption
 from compose.view.deliveries import Passage, contact_of
 from compose.view.events import metres
-from compose.view.meetings import TRAVELLING
+from compose.recording.meetings import TRAVELLING
 from compose.view.run_data import TickData
 from compose.view.words import end_reason
 from protocol.messages import Inconsistent, Localised, MissionEnd, Undecided
@@ -100,11 +100,11 @@ def _concluding(
 def _departing(setup: RunSetup, before: TickData, now: TickData) -> Iterator[Caption]:
     """Yield the beginnings of the ways to other robots, in one caption."""
     found = []
-    for robot in setup.robots:
-        command, earlier = now.commands.get(robot.id), before.commands.get(robot.id)
-        if command is not None and command.state == TRAVELLING and earlier is not None:
-            if earlier.state != TRAVELLING:
-                found.append((robot.id, robot.peer))
+    for one in setup.robots:
+        command, earlier = now.commands.get(one.id), before.commands.get(one.id)
+        leaves = command is not None and command.state == TRAVELLING
+        if leaves and earlier is not None and earlier.state != TRAVELLING:
+            found.append((one.id, one.peer))
     if not found:
         return
     robots = tuple(robot for pair in found for robot in pair)

@@ -10,7 +10,7 @@ import msgspec
 from compose.recording.kills_file import Killed
 from compose.recording.run_setup import RunSetup
 from compose.scenario.kills import WORLD
-from compose.view.meetings import Meetings, meetings_after
+from compose.recording.meetings import Meetings, meetings_after
 from protocol.messages import (
     Command,
     DeadlineMissed,

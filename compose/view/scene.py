@@ -175,7 +175,11 @@ def player_of(
 ) -> Player:
     """Return the entry of one robot in the scene of the tick of `now`; `setup` and `reported` as in `scene`."""
     robot, peer = robot_setup.id, robot_setup.peer
-    pose, observation, sent = now.truth.get(robot), now.observations.get(robot), now.reports.get((robot, peer))
+    pose, observation, sent = (
+        now.truth.get(robot),
+        now.observations.get(robot),
+        now.reports.get((robot, peer)),
+    )
     command = now.commands.get(robot)
     sentence = f"{robot} has not answered"
     down = robot in now.down - now.back

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from compose.recording.run import Run
 from compose.recording.run_setup import RunSetup
 from protocol.messages import Command
 
@@ -43,6 +44,28 @@ def meetings_after(
             if goes_on and (now == 0 or _has_verdict(partners[now], earlier)):
                 changed[robot] = now + 1
     return {**meetings, **changed} if changed else meetings
+
+
+def meeting_begins(run: Run) -> dict[str, tuple[int, ...]]:
+    """Return the ticks in which the meetings of each robot begin, as far as the run has them.
+
+    A meeting begins when the robot leaves for it, and the first one in tick 0. Empty if the robots are pairs.
+    """
+    setup = run.setup
+    if setup is None or not setup.visits:
+        return {}
+    begins: dict[str, tuple[int, ...]] = dict.fromkeys(setup.ids, (0,))
+    meetings: Meetings = {}
+    latest: dict[str, Command] = {}
+    for tick in range(run.length):
+        found = {robot: run.command(robot, tick) for robot in setup.ids}
+        commands = {robot: command for robot, command in found.items() if command is not None}
+        after = meetings_after(setup, meetings, latest, commands)
+        for robot in after:
+            if after[robot] != meetings.get(robot, 0):
+                begins[robot] = (*begins[robot], tick)
+        meetings, latest = after, {**latest, **commands}
+    return begins
 
 
 def _unmet(partners: Sequence[str], commands: Mapping[str, Command], own: Command) -> int:
