@@ -39,6 +39,7 @@ from __future__ import annotations
 import math
 import re
 from functools import cached_property
+from itertools import combinations
 from typing import Annotated, Literal
 
 import msgspec
@@ -48,7 +49,7 @@ from msgspec.structs import force_setattr
 from protocol.attack import Attack
 from protocol.mission import Anchor, Mission, Options, PlannerName, Role
 from protocol.motion import Controls, Covariance, Pose, Segment
-from protocol.orbits import Orbit, Rendezvous
+from protocol.orbits import Orbit, Rendezvous, visiting
 from protocol.units import (
     Angle,
     AngularVelocity,
@@ -56,6 +57,7 @@ from protocol.units import (
     Range,
     RobotId,
     Tick,
+    Time,
     Velocity,
 )
 
@@ -95,8 +97,8 @@ MAX_REPORT_RUNS = 70
 MAX_REPORT_RANGES = 70
 """The maximum number of ranges in a Report, for the same reason."""
 
-MAX_MEETINGS = 1000
-"""The maximum number of meetings of a robot after its first one."""
+MAX_MEMBERS = 1000
+"""The maximum number of robots of a group."""
 
 MAX_BODY_BYTES = 3890
 """The maximum size of the body of a PlannerReport, so that its frame fits in `wire.MAX_REPORT_BYTES`."""
@@ -256,6 +258,11 @@ class RobotConfig(Message, frozen=True, dict=True):
         """The distance D between the two anchors, in m."""
         return math.hypot(self.anchor.x - self.peer_anchor.x, self.anchor.y - self.peer_anchor.y)
 
+    @property
+    def widest_distance(self) -> float:
+        """The largest distance in m between the anchors of two robots that may meet; here, D."""
+        return self.anchor_distance
+
     @cached_property
     def orbit(self) -> Orbit:
         """The orbit of this robot in phase 2."""
@@ -269,17 +276,15 @@ class RobotConfigWithOptions(RobotConfig, frozen=True, dict=True):
     """The options of the planner, by name."""
 
 
-class Meeting(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """A meeting of a robot with another one of its group."""
+class Member(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """A robot of a group, as all of them know it."""
 
-    peer: RobotId
-    """The other robot."""
-    role: Role
-    """The role of this robot in the pair that they form."""
-    peer_anchor: Anchor
-    """The position of the peer's anchor in <W>, in m."""
-    rendezvous: Rendezvous
-    """The orbits of both robots, on which they meet."""
+    robot: RobotId
+    """The robot."""
+    anchor: Anchor
+    """The position of its anchor in <W>, in m."""
+    ends: Time
+    """The planned bound in s of the time at which it is localised."""
 
 
 class RobotConfigInGroup(RobotConfigWithOptions, frozen=True, dict=True):
@@ -288,18 +293,33 @@ class RobotConfigInGroup(RobotConfigWithOptions, frozen=True, dict=True):
     `peer`, `role`, `peer_anchor` and `rendezvous` are those of its first meeting.
     """
 
-    later_meetings: Annotated[tuple[Meeting, ...], Meta(max_length=MAX_MEETINGS)] = ()
-    """The meetings after the first one, in their order."""
+    members: Annotated[tuple[Member, ...], Meta(max_length=MAX_MEMBERS)] = ()
+    """All robots of the group, in the order of the scenario."""
+    visits: Annotated[tuple[RobotId, ...], Meta(max_length=MAX_MEMBERS)] = ()
+    """The robots that this one visits after its first meeting, in their order."""
 
-    def at(self, meeting: Meeting) -> RobotConfigInGroup:
-        """Return the configuration for `meeting`: the pair that this robot and its peer then form."""
-        return msgspec.structs.replace(
-            self,
-            peer=meeting.peer,
-            role=meeting.role,
-            peer_anchor=meeting.peer_anchor,
-            rendezvous=meeting.rendezvous,
-        )
+    @cached_property
+    def widest_distance(self) -> float:
+        """The largest distance between two anchors of the group, in m."""
+        anchors = [(one.anchor.x, one.anchor.y) for one in self.members]
+        return max([math.dist(*two) for two in combinations(anchors, 2)], default=self.anchor_distance)
+
+    def member(self, robot: str) -> Member:
+        """Return the robot of the group with this id. Raises KeyError if there is none."""
+        for one in self.members:
+            if one.robot == robot:
+                return one
+        raise KeyError(robot)
+
+    def in_meeting(self, peer: str, role: Role) -> RobotConfigInGroup:
+        """Return the configuration for a meeting with `peer`, in which this robot has `role`.
+
+        The robot of role a knows its pose, and visits the other one. Raises KeyError if there is none.
+        """
+        anchor = self.member(peer).anchor
+        distance = math.hypot(self.anchor.x - anchor.x, self.anchor.y - anchor.y)
+        orbits = visiting(self.mission, distance)
+        return msgspec.structs.replace(self, peer=peer, role=role, peer_anchor=anchor, rendezvous=orbits)
 
 
 AnyRobotConfig = RobotConfig | RobotConfigWithOptions | RobotConfigInGroup

@@ -80,12 +80,14 @@ def decide_outcome(
 
     A claim is compared with the true pose at the tick of the claim, which is in `claimed`, or with the
     current one if `claimed` is None. The run does not wait for a robot whose peer is undecided or
-    inconsistent, because it can no longer be localised; in a group, its peer is the robot that it meets
-    first. A claim below the required accuracy does not count as localised.
+    inconsistent, because it can no longer be localised; in a group, another robot may still come. A claim
+    below the required accuracy does not count as localised.
     """
-    hopeless = _hopeless(scenario, verdicts)
     open_cases = [
-        robot.id for robot in scenario.robots if robot.id not in verdicts and robot.id not in hopeless
+        robot.id
+        for robot in scenario.robots
+        if robot.id not in verdicts
+        and (scenario.meetings or not isinstance(verdicts.get(robot.peer), Undecided | Inconsistent))
     ]
     if open_cases and truth.tick < scenario.max_ticks:
         return None
@@ -96,18 +98,6 @@ def decide_outcome(
             if why is not None:
                 return MissionOutcome("wrong", f"{robot.id} claims a pose that is {why}")
     return _no_better(scenario, verdicts, open_cases)
-
-
-def _hopeless(scenario: Scenario, verdicts: Mapping[str, Verdict]) -> set[str]:
-    """Return the robots without a verdict that no other robot can localise any more."""
-    failed = {robot for robot, verdict in verdicts.items() if not isinstance(verdict, Localised)}
-    found: set[str] = set()
-    if not failed:
-        return found
-    waiting = {robot.id: robot.peer for robot in scenario.robots if robot.id not in verdicts}
-    while more := {robot for robot, peer in waiting.items() if peer in failed | found} - found:
-        found |= more
-    return found
 
 
 def _no_better(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from functools import cached_property
 from itertools import combinations
@@ -12,10 +11,10 @@ import msgspec
 from msgspec.structs import asdict
 
 from protocol.attack import Attack
-from protocol.messages import Meeting, RobotConfig, RobotConfigInGroup, RobotConfigWithOptions
+from protocol.messages import Member, RobotConfig, RobotConfigInGroup, RobotConfigWithOptions
 from protocol.mission import Anchor, Mission, Options, PlannerName, Role
 from protocol.motion import Pose
-from protocol.orbits import Rendezvous, visiting
+from protocol.orbits import Rendezvous
 from protocol.units import RobotId, Tick, Time
 from world.faults import Fault
 from world.radio_models import RADIO_MODELS
@@ -171,29 +170,25 @@ class Scenario(
             tick_s=tick_s,
         )
         if self.meetings:
-            later = self._later_meetings(own)
+            visits = [
+                one.visited for one in self.meetings if one.visitor == own.id and one.visited != own.peer
+            ]
             return RobotConfigInGroup(
-                **asdict(config), planner_options=self.planner_options, later_meetings=later
+                **asdict(config),
+                planner_options=self.planner_options,
+                members=self.members,
+                visits=tuple(visits),
             )
         if not self.planner_options:
             return config
         return RobotConfigWithOptions(**asdict(config), planner_options=self.planner_options)
 
-    def _later_meetings(self, own: RobotSpec) -> tuple[Meeting, ...]:
-        """Return the meetings of the robot `own` after its first one."""
-        visits = [one.visited for one in self.meetings if one.visitor == own.id and one.visited != own.peer]
-        anchors = [self.robot(visited).anchor for visited in visits]
-        return tuple(
-            [
-                Meeting(visited, "a", anchor, visiting(self.mission, _distance(own.anchor, anchor)))
-                for visited, anchor in zip(visits, anchors, strict=True)
-            ]
-        )
-
-
-def _distance(one: Anchor, other: Anchor) -> float:
-    """Return the distance of two anchors in m."""
-    return math.hypot(one.x - other.x, one.y - other.y)
+    @cached_property
+    def members(self) -> tuple[Member, ...]:
+        """The robots of the group, as they know each other; empty for pairs."""
+        ends = {one.visited: one.ends for one in reversed(self.meetings)}
+        ends |= {one.visitor: one.ends for one in reversed(self.meetings) if one.visitor not in ends}
+        return tuple([Member(one.id, one.anchor, ends[one.id]) for one in self.robots]) if ends else ()
 
 
 class ScenarioWithWorldNoise(

@@ -21,8 +21,11 @@ from protocol.rounding import BETTER, OUT_AND_BACK, SAME, SURE, WELL, required_a
 
 
 def size(knowledge: Knowledge) -> float:
-    """Return D + R in m: the largest coordinate in the computations of the robots and the world."""
-    return knowledge.config.anchor_distance + knowledge.config.mission.sensing_range
+    """Return D + R in m: the largest coordinate in the computations of the robots and the world.
+
+    In a group, D is the largest distance of two anchors.
+    """
+    return knowledge.config.widest_distance + knowledge.config.mission.sensing_range
 
 
 def range_rounding(knowledge: Knowledge, log: MotionLog, tick: int) -> float:
@@ -73,7 +76,7 @@ def anchor(knowledge: Knowledge, start: Pose, log: MotionLog) -> Known:
     result.
     """
     mission, extent = knowledge.config.mission, size(knowledge)
-    enough = required_anchor_error(extent, knowledge.config.anchor_distance, mission.sensing_range)
+    enough = required_anchor_error(extent, knowledge.config.widest_distance, mission.sensing_range)
     known = least = error = math.inf
     ranges = 0
     ranged: list[tuple[Pose, float, float]] = []

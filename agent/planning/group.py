@@ -3,6 +3,9 @@
 The first meeting localises the robot. In a later one it visits a robot that waits beside its anchor. Both
 determine their poses from the logs and ranges of the two of them alone, so no robot has to believe what
 another one has concluded, and no measurement counts twice.
+
+Nobody leads. Each robot follows the meetings of its configuration. One that has made its visits goes to
+those that should be localised by then and have not reported it; one that waits meets whoever comes.
 """
 
 from __future__ import annotations
@@ -14,16 +17,15 @@ import msgspec
 from msgspec.structs import replace
 
 from agent.estimation.knowledge import Belief
-from agent.planning import exchange
+from agent.planning import exchange, phase2_orbit, transitions
 from agent.planning.log_exchange import LogPlanner
-from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Travelling, next_side, travel_controls
+from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Travelling
 from agent.planning.planner import Planner, Summary
 from agent.planning.state import Done, RobotState
 from protocol.messages import (
     Command,
     Estimate,
     Localised,
-    Meeting,
     Observation,
     Ranged,
     Report,
@@ -31,7 +33,7 @@ from protocol.messages import (
     RobotConfigInGroup,
     Verdict,
 )
-from protocol.mission import Mission
+from protocol.mission import Mission, Role
 from protocol.motion import ORIGIN, Pose, compose, inverse
 
 SHORT_OF_ANCHOR = 0.5
@@ -48,14 +50,28 @@ As long as it has not heard of the peer's verdict, it waits for it. A peer that 
 robot's verdict before.
 """
 
+SILENT_AFTER = 200
+"""The ticks in contact without a report after which a robot takes its peer for lost."""
 
-class Earlier(msgspec.Struct, frozen=True):
-    """What a robot keeps of one with which it is not in a meeting."""
+SIDES = 12
+"""The number of sides of the square spiral on which a visitor searches. Its radius is then three times R.
+
+With exact sensors, a robot that is not in range at the end of the way is not there.
+"""
+
+GIVE_UP = 2.9
+"""The time after which a robot that no meeting has localised gives up, in planned bounds of the group."""
+
+
+class Other(msgspec.Struct, frozen=True):
+    """What a robot knows of another one of its group, besides the logs of their present meeting."""
 
     mutual: tuple[Ranged, ...] = ()
     """The ranges to it."""
-    verdict: Verdict | None = None
-    """This robot's verdict in their meeting; None if there was none."""
+    localised: bool = False
+    """True once it has reported that it is localised."""
+    avoided: bool = False
+    """True once a meeting with it has failed, or a search for it: this robot does not visit it again."""
 
 
 class GroupState(msgspec.Struct, frozen=True):
@@ -63,22 +79,34 @@ class GroupState(msgspec.Struct, frozen=True):
 
     pair: RobotState
     """The state in the present meeting. Its configuration names the peer and the role."""
-    met: int = 0
-    """The number of meetings that have ended."""
+    visits: int = 0
+    """The number of planned visits that the robot has begun or left out."""
+    visiting: bool = False
+    """True if the present meeting is a visit: the robot knows its pose already."""
     verdict: Verdict | None = None
-    """The verdict of the first meeting, which is the robot's."""
+    """The verdict of the robot: that of the meeting which localised it."""
     frame: Pose = ORIGIN
     """The pose in <W> of the odometry's frame, from the latest meeting in which the robot was localised."""
-    others: Mapping[str, Earlier] = {}
-    """What the robot keeps of each other robot that it has been in range of."""
+    others: Mapping[str, Other] = {}
+    """What the robot knows of the others that it has been in range of."""
     unmet: int = 0
     """The number of consecutive ticks out of range of the peer since this robot's verdict in the meeting."""
+    silence: int = 0
+    """The number of consecutive ticks in range of the peer without a log of it."""
 
     @property
-    def later_meetings(self) -> tuple[Meeting, ...]:
-        """The meetings after the first one."""
-        config = self.pair.config
-        return config.later_meetings if isinstance(config, RobotConfigInGroup) else ()
+    def config(self) -> RobotConfigInGroup:
+        """The configuration, with the peer and the role of the present meeting."""
+        assert isinstance(self.pair.config, RobotConfigInGroup)
+        return self.pair.config
+
+    def other(self, robot: str) -> Other:
+        """Return what the robot knows of `robot`."""
+        return self.others.get(robot, Other())
+
+    def with_other(self, robot: str, known: Other) -> GroupState:
+        """Return this state with what the robot now knows of `robot`."""
+        return replace(self, others={**self.others, robot: known})
 
 
 class GroupPlanner(Planner[GroupState, Report]):
@@ -105,42 +133,46 @@ class GroupPlanner(Planner[GroupState, Report]):
     def observe(self, state: GroupState, observation: Observation) -> GroupState:
         """Return `state` with the sensor data of one tick, ranges to all robots of the group included."""
         pair = self._pair.observe(state.pair, observation)
-        if state.met and isinstance(pair.mode, Aligning | Radial | Orbiting):  # out of range again
-            pair = replace(pair, mode=Travelling(_stop(state.frame, pair)))
-        others = state.others
         for contact in observation.contacts:
             if contact.peer != pair.config.peer and contact.range is not None:
-                known = others.get(contact.peer, Earlier())
+                known = state.other(contact.peer)
                 ranges = (*known.mutual, Ranged(observation.tick, contact.range))
-                others = {**others, contact.peer: replace(known, mutual=ranges)}
+                state = state.with_other(contact.peer, replace(known, mutual=ranges))
+        if state.visiting and isinstance(pair.mode, Aligning | Radial | Orbiting):  # out of range again
+            pair = replace(pair, mode=Travelling(_stop(state.frame, pair)))
         if isinstance(pair.mode, Travelling) and not pair.in_contact:
             pair = _searching(pair)
         ended = isinstance(pair.mode, Done) and not pair.in_contact
-        return replace(state, pair=pair, others=others, unmet=state.unmet + 1 if ended else 0)
+        return replace(state, pair=pair, unmet=state.unmet + 1 if ended else 0)
 
     def report(self, state: GroupState) -> Report:
         """Return the report to the peer of the present meeting."""
         return exchange.report(state.pair)
 
     def report_to(self, state: GroupState, peer: str) -> Report:
-        """Return the report to `peer`: the log, or without a meeting only the verdict of an earlier one."""
+        """Return the report to `peer`: the log, or outside a meeting only this robot's verdict."""
         if peer == state.pair.config.peer:
             return exchange.report(state.pair)
-        verdict = state.others[peer].verdict if peer in state.others else None
-        return exchange.report_without_log(state.pair, verdict)
+        return exchange.report_without_log(state.pair, state.verdict)
 
     def decide(self, state: GroupState, reports: Sequence[Report] = ()) -> GroupState:
-        """Return `state` with the peer's `reports`, and in the next meeting if the present one has ended."""
-        peer = state.pair.config.peer
-        pair = self._pair.decide(state.pair, [one for one in reports if one.robot == peer])
-        frame = state.frame
-        if isinstance(pair.verdict, Localised) and state.pair.verdict is None:
+        """Return `state` with the `reports` of others, and in the next meeting if this one has ended."""
+        for one in reports:
+            if exchange.is_without_log(one) and isinstance(one.verdict, Localised):
+                state = state.with_other(one.robot, replace(state.other(one.robot), localised=True))
+        logs = [one for one in reports if not exchange.is_without_log(one)]
+        state = _answering(state, [one.robot for one in logs])
+        peer, before = state.pair.config.peer, state.pair
+        of_peer = [] if _refused(state, peer) else [one for one in logs if one.robot == peer]
+        pair = self._pair.decide(before, of_peer)
+        silence = state.silence + 1 if pair.in_contact and not of_peer else 0
+        state = replace(state, pair=pair, silence=silence)
+        if isinstance(pair.verdict, Localised) and before.verdict is None:
             frame = compose(pair.verdict.pose, inverse(pair.odometry))
-        verdict = pair.verdict if state.verdict is None else state.verdict
-        state = replace(state, pair=pair, verdict=verdict, frame=frame)
-        if isinstance(pair.mode, Done) and isinstance(state.verdict, Localised) and _is_over(state):
-            return _next_meeting(state)
-        return state
+            known = replace(state.other(peer), localised=True)
+            verdict = pair.verdict if state.verdict is None else state.verdict
+            state = replace(state.with_other(peer, known), frame=frame, verdict=verdict)
+        return _onward(state)
 
     def command(self, state: GroupState) -> Command:
         """Return the command for the next tick, with the phase, the mode and the robot's verdict."""
@@ -181,38 +213,122 @@ class GroupPlanner(Planner[GroupState, Report]):
         return self._pair.required_mutual_ranges(mission)
 
 
-def _searching(pair: RobotState) -> RobotState:
-    """Return `pair`, a visitor out of range; if it has arrived, on the next side of the search."""
-    assert isinstance(pair.mode, Travelling)
-    mission, tolerance = pair.config.mission, pair.estimator.pose_tolerance
-    if travel_controls(pair.mode, pair.odometry, mission, tolerance) is not None:
-        return pair
-    return replace(pair, mode=next_side(pair.mode, mission))
+# --- meetings -----------------------------------------------------------------------------------------
 
 
-def _is_over(state: GroupState) -> bool:
-    """Return whether the robot may leave its meeting: the peer has its verdict, or has left before."""
-    return state.pair.peer_state.verdict is not None or state.unmet >= PARTED_AFTER
-
-
-def _next_meeting(state: GroupState) -> GroupState:
-    """Return `state` on the way to the next robot; at rest if there is none."""
+def _answering(state: GroupState, callers: Sequence[str]) -> GroupState:
+    """Return `state` in a meeting with one of `callers`, robots that send their logs, if it waits for one."""
     pair = state.pair
-    if state.met >= len(state.later_meetings):
+    if state.verdict is not None or pair.belief.phase1_done_tick is None or pair.config.peer in callers:
         return state
-    meeting = state.later_meetings[state.met]
-    config = pair.config
-    assert isinstance(config, RobotConfigInGroup)
-    known = state.others.get(config.peer, Earlier())
-    others = {**state.others, config.peer: replace(known, mutual=pair.mutual, verdict=pair.verdict)}
+    if pair.in_contact and not _refused(state, pair.config.peer) and state.silence <= SILENT_AFTER:
+        return state
+    for caller in callers:
+        if not _refused(state, caller):
+            return _waiting(state, caller)
+    return state
+
+
+def _refused(state: GroupState, robot: str) -> bool:
+    """Return whether this robot, which is not localised, has had a meeting with `robot` that failed."""
+    return state.verdict is None and state.other(robot).avoided
+
+
+def _onward(state: GroupState) -> GroupState:
+    """Return `state` in the next meeting if the present one is over."""
+    pair, peer = state.pair, state.pair.config.peer
+    if not isinstance(state.verdict, Localised):
+        return _after_failure(state)
+    if state.visiting and pair.verdict is None:
+        if state.other(peer).localised:  # by another robot
+            return _next_visit(state)
+        if _has_searched(state) or state.silence > SILENT_AFTER:
+            return _next_visit(_avoiding(state, peer))
+        return state
+    if not isinstance(pair.mode, Done):
+        return state
+    if not isinstance(pair.verdict, Localised):
+        return _next_visit(_avoiding(state, peer))
+    over = pair.peer_state.verdict is not None or state.unmet >= PARTED_AFTER
+    return _next_visit(state) if over else state
+
+
+def _after_failure(state: GroupState) -> GroupState:
+    """Return `state`, of a robot that is not localised: if its meeting has failed, it waits for another one.
+
+    It gives up after GIVE_UP, with the verdict of the meeting; at once if its own phase 1 has failed.
+    """
+    pair = state.pair
+    if pair.verdict is None:
+        return state
+    bound = max(one.ends for one in state.config.members)
+    late = pair.tick * pair.config.mission.period >= GIVE_UP * bound
+    if late or pair.belief.phase1_done_tick is None:
+        return replace(state, verdict=pair.verdict)
+    return _waiting(_avoiding(state, pair.config.peer), pair.config.peer)
+
+
+def _avoiding(state: GroupState, robot: str) -> GroupState:
+    """Return `state` of a robot that does not meet `robot` again."""
+    return state.with_other(robot, replace(state.other(robot), avoided=True))
+
+
+def _waiting(state: GroupState, peer: str) -> GroupState:
+    """Return `state` of a robot that waits beside its anchor, in a meeting with `peer`."""
+    before = state.pair.mode
+    state = _in_meeting(state, peer, "b")
+    pair = state.pair
+    if isinstance(before, Orbiting | Aligning | Radial):
+        return replace(state, pair=replace(pair, mode=before))
+    mu = phase2_orbit.orientation(pair.local_pose)
+    return replace(state, pair=transitions.continue_phase2(pair, Aligning(pair.odometry.heading - mu)))
+
+
+def _next_visit(state: GroupState) -> GroupState:
+    """Return `state` on the way to the next robot; as it is if there is none.
+
+    After the planned visits, it is the nearest one that should be localised by now, and has not reported it.
+    """
+    visits, config = state.visits, state.config
+    while visits < len(config.visits):
+        peer = config.visits[visits]
+        visits += 1
+        if not (state.other(peer).localised or state.other(peer).avoided):
+            return _on_visit(replace(state, visits=visits), peer)
+    time = state.pair.tick * config.mission.period
+    here = compose(state.frame, state.pair.odometry)
+    late = [
+        (math.hypot(one.anchor.x - here.x, one.anchor.y - here.y), one.robot)
+        for one in config.members
+        if one.robot != config.robot
+        and one.ends < time
+        and not (state.other(one.robot).localised or state.other(one.robot).avoided)
+    ]
+    state = replace(state, visits=visits)
+    return _on_visit(state, min(late)[1]) if late else state
+
+
+def _on_visit(state: GroupState, peer: str) -> GroupState:
+    """Return `state` of a localised robot that drives to `peer`."""
+    state = _in_meeting(state, peer, "a")
+    pair = replace(state.pair, mode=Travelling(_stop(state.frame, state.pair)))
+    return replace(state, pair=pair, visiting=True)
+
+
+def _in_meeting(state: GroupState, peer: str, role: Role) -> GroupState:
+    """Return `state` in a new meeting with `peer`, of which the robot knows only its ranges to it."""
+    pair = state.pair
+    before = state.other(pair.config.peer)
+    state = state.with_other(pair.config.peer, replace(before, mutual=pair.mutual))
     belief = pair.belief
-    visitor = RobotState(
-        config.at(meeting),
+    fresh = RobotState(
+        state.config.in_meeting(peer, role),
         tick=pair.tick,
         odometry=pair.odometry,
         log=pair.log,
         leg=pair.leg,
-        mutual=others[meeting.peer].mutual if meeting.peer in others else (),
+        mutual=state.other(peer).mutual,
+        in_contact=bool(state.other(peer).mutual) and state.other(peer).mutual[-1].tick == pair.tick,
         belief=Belief(
             possible=belief.possible,
             branch=belief.branch,
@@ -224,17 +340,30 @@ def _next_meeting(state: GroupState) -> GroupState:
             ranges_at_last_fit=belief.ranges_at_last_fit,
         ),
     )
-    return GroupState(
-        pair=replace(visitor, mode=Travelling(_stop(state.frame, visitor))),
-        met=state.met + 1,
-        verdict=state.verdict,
-        frame=state.frame,
-        others=others,
-    )
+    return replace(state, pair=fresh, visiting=False, unmet=0, silence=0)
+
+
+# --- visits -------------------------------------------------------------------------------------------
+
+
+def _searching(pair: RobotState) -> RobotState:
+    """Return `pair`, a visitor out of range; if it has arrived, on the next side of the search."""
+    assert isinstance(pair.mode, Travelling)
+    mission, tolerance = pair.config.mission, pair.estimator.pose_tolerance
+    if phase2_orbit.travel_controls(pair.mode, pair.odometry, mission, tolerance) is not None:
+        return pair
+    return replace(pair, mode=phase2_orbit.next_side(pair.mode, mission))
+
+
+def _has_searched(state: GroupState) -> bool:
+    """Return whether the robot has searched for its peer in vain."""
+    assert isinstance(state.verdict, Localised)
+    mode = state.pair.mode
+    return isinstance(mode, Travelling) and mode.side > (0 if state.verdict.covariance is None else SIDES)
 
 
 def _stop(frame: Pose, pair: RobotState) -> tuple[float, float]:
-    """Return the place of a visit, in m in the odometry's frame: on the way to the anchor, but short of it."""
+    """Return the place of a visit, in m in the odometry's frame: on the way to the anchor, short of it."""
     peer_anchor = pair.config.peer_anchor
     anchor = compose(inverse(frame), Pose(peer_anchor.x, peer_anchor.y, 0.0))
     dx, dy = anchor.x - pair.odometry.x, anchor.y - pair.odometry.y

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 from compose.errors import Unworkable
 from compose.launch import planner_loader
+from compose.scenario.group_plan import group_plan
 from compose.scenario.scenario_tables import PlannerTable, RobotTable
-from compose.scenario.wake_up_tree import group_plan
 from protocol.mission import Mission, Role
 from protocol.orbits import Rendezvous, meeting_ticks, pair_ticks, visiting
 from world.scenario import PlannedMeeting

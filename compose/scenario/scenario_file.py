@@ -47,6 +47,8 @@ from world.scenario import (
 )
 from world.world_noise import world_noise_infeasibility, world_noise_mistake
 
+GROUP_BUDGET = 3
+"""The default of `max_ticks` of a group, in bounds of its plan: visits that fail are made up for by others."""
 EXCHANGES = 20
 """The number of reports for each of which `max_ticks` allows the full `delivery_time_bound`."""
 NEAREST_ANCHORS = TOLERANCE
@@ -205,7 +207,7 @@ def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scena
         placed.append(RobotSpec(robot.id, peer, role, Anchor(*robot.anchor), start, orbits, robot.attack))
     faults = _faults(file, options, linked, source)
     if meetings is not None:
-        budget = 2 * math.ceil(meetings.bound / file.mission.period)
+        budget = GROUP_BUDGET * math.ceil(meetings.bound / file.mission.period)
     else:
         budget = max(tick_budget(file.mission, one.rendezvous) for one in first.values())
     delay = EXCHANGES * delivery_time_bound(faults) if faults else 0

@@ -1,0 +1,100 @@
+"""The plan of meetings of a group: its seed pairs, the hops of its wake-up trees, and the bounds of both."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from math import inf, sqrt
+
+import msgspec
+
+from compose.scenario.wake_up_search import short_forest
+from compose.scenario.wake_up_tree import MeetingTimes, WakeUpForest, optimal_forest
+
+MOST_OPTIMAL = 8
+"""The most robots whose plan is optimal. The time that the optimum takes triples with each further robot."""
+
+
+class PlannedVisit(msgspec.Struct, frozen=True, array_like=True):
+    """A meeting of a plan, at the anchor of the robot that is visited."""
+
+    visitor: int
+    visited: int
+    ends: float
+    """The bound in s of the time at which both are localised."""
+    first: bool = False
+    """The visitor is not localised before: a seed pair."""
+
+
+class GroupPlan(msgspec.Struct, frozen=True):
+    """The meetings that localise a group, each robot's in order."""
+
+    meetings: tuple[PlannedVisit, ...]
+    """In the order of their ends."""
+    bound: float
+    """The bound in s of the time at which all are localised."""
+    travel_lower_bound: float
+    """A lower bound in s of the bound of any plan: of seed pairs and travel alone, with no time for meetings.
+
+    The least bound of such plans up to MOST_OPTIMAL robots; beyond, that of the robot that is reached last.
+    """
+
+
+def group_plan(
+    anchors: Sequence[tuple[float, float]],
+    seed_time: Callable[[int, int], float],
+    speed: float,
+    meeting: float,
+) -> GroupPlan:
+    """Return the plan of the group whose robots wait beside `anchors`, given in m.
+
+    `seed_time(a, b)` bounds in s how long it takes until a, which searches, and b, which waits, are both
+    localised beside the anchor of b; it is infinite if they cannot meet. Later a localised robot drives at
+    `speed` in m/s to the anchor of one that waits, where their meeting lasts at most `meeting` in s.
+
+    The plan is optimal up to MOST_OPTIMAL robots; beyond, `short_forest` says what is known. Numbering and
+    translation change the bound by rounding only, unless two anchors are at one place. Raises ValueError for
+    fewer than two robots, or if no two can meet first.
+    """
+    if len(anchors) < 2:
+        raise ValueError(f"a group has at least two robots, not {len(anchors)}")
+    order = sorted(range(len(anchors)), key=anchors.__getitem__)
+    seed = tuple(tuple(inf if a == b else seed_time(a, b) for b in order) for a in order)
+    if min(map(min, seed)) == inf:
+        raise ValueError("no two robots of the group can meet first")
+    travel = tuple(tuple(_distance(anchors[a], anchors[b]) / speed for b in order) for a in order)
+    times = MeetingTimes(seed, tuple(tuple(time + meeting for time in row) for row in travel))
+    forest = optimal_forest(times) if len(order) <= MOST_OPTIMAL else short_forest(times)
+    meetings = tuple(
+        msgspec.structs.replace(each, visitor=order[each.visitor], visited=order[each.visited])
+        for each in planned_meetings(forest, times)
+    )
+    return GroupPlan(meetings, meetings[-1].ends, _travel_lower_bound(MeetingTimes(seed, travel)))
+
+
+def planned_meetings(forest: WakeUpForest, times: MeetingTimes) -> list[PlannedVisit]:
+    """Return the meetings of `forest`, in the order of their ends.
+
+    The robot that was visited makes the hop whose branch ends last, and its visitor the other.
+    """
+    ends = forest.ends(times)
+    last = dict(ends)
+    for place, robot in reversed(forest.hops):
+        last[place] = max(last[place], last[robot])
+    visitors = {b: a for a, b in forest.seeds}
+    meetings = [PlannedVisit(a, b, ends[b], first=True) for a, b in forest.seeds]
+    for place, robot in forest.hops:
+        branches = [other for start, other in forest.hops if start == place]
+        visitors[robot] = place if robot == max(branches, key=last.__getitem__) else visitors[place]
+        meetings.append(PlannedVisit(visitors[robot], robot, ends[robot]))
+    return sorted(meetings, key=lambda meeting: meeting.ends)
+
+
+def _travel_lower_bound(times: MeetingTimes) -> float:
+    """Return the least last end for `times` up to MOST_OPTIMAL robots, and a lower bound of it beyond."""
+    if len(times.robots) <= MOST_OPTIMAL:
+        return max(optimal_forest(times).ends(times).values())
+    return times.earliest_end()
+
+
+def _distance(a: tuple[float, float], b: tuple[float, float]) -> float:
+    return sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2)

@@ -1,0 +1,227 @@
+"""The plan of meetings of a group: valid, bounded, optimal when small, near the optimum when large."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable, Iterator
+from statistics import mean
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from compose.scenario.group_plan import GroupPlan, PlannedVisit, group_plan, planned_meetings
+from compose.scenario.wake_up_search import short_forest
+from compose.scenario.wake_up_tree import MeetingTimes, WakeUpForest, optimal_forest
+
+MEETING_S = 10.0
+Anchors = list[tuple[float, float]]
+SeedTime = Callable[[int, int], float]
+
+
+def orbit_time(anchors: Anchors) -> SeedTime:
+    """Return the seed time of the measured series: an orbit at 1 m/s and 20 s."""
+    return lambda a, b: 2 * math.pi * math.dist(anchors[a], anchors[b]) + 20.0
+
+
+def plan_of(anchors: Anchors) -> GroupPlan:
+    return group_plan(anchors, orbit_time(anchors), speed=1.0, meeting=MEETING_S)
+
+
+def drawn_anchors(robots: int, seed: int) -> Anchors:
+    """Return anchors drawn in a square of side 10 sqrt(n), R being 1."""
+    draw = random.Random(1000 * seed + robots)
+    side = 10 * math.sqrt(robots)
+    return [(draw.uniform(0, side), draw.uniform(0, side)) for _ in range(robots)]
+
+
+def meeting_times(anchors: Anchors, meeting: float = MEETING_S) -> MeetingTimes:
+    seed_time = orbit_time(anchors)
+    numbers = range(len(anchors))
+    return MeetingTimes(
+        seed=tuple(tuple(seed_time(a, b) for b in numbers) for a in numbers),
+        hop=tuple(tuple(math.dist(p, q) + meeting for q in anchors) for p in anchors),
+    )
+
+
+def last_end(forest: WakeUpForest, times: MeetingTimes) -> float:
+    return max(forest.ends(times).values())
+
+
+def ratio_of_search(anchors: Anchors) -> float:
+    """Return how many times longer than the optimum the forest of the search is."""
+    times = meeting_times(anchors)
+    return last_end(short_forest(times), times) / last_end(optimal_forest(times), times)
+
+
+def simulated_ends(
+    meetings: tuple[PlannedVisit, ...], anchors: Anchors, seed_time: SeedTime, speed: float, meeting: float
+) -> list[float]:
+    """Drive the robots through `meetings` and return the end of each, after checks that each is possible."""
+    free: dict[int, tuple[int, float]] = {}
+    """The anchor at which each localised robot is, and the time from which it can leave."""
+    ends = []
+    for each in meetings:
+        assert each.visited not in free
+        assert each.first == (each.visitor not in free)
+        if each.first:
+            end = seed_time(each.visitor, each.visited)
+        else:
+            place, time = free[each.visitor]
+            end = time + math.dist(anchors[place], anchors[each.visited]) / speed + meeting
+        free[each.visitor] = free[each.visited] = (each.visited, end)
+        ends.append(end)
+    assert sorted(free) == list(range(len(anchors)))
+    return ends
+
+
+def least_bound(anchors: Anchors, seed_time: SeedTime, meeting: float) -> float:
+    """Return the least bound of all plans at 1 m/s, each of which is tried."""
+
+    def bounds(free: dict[int, tuple[int, float]], latest: float) -> Iterator[float]:
+        waiting = [robot for robot in range(len(anchors)) if robot not in free]
+        if not waiting:
+            yield latest
+        for visited in waiting:
+            for visitor, (place, time) in free.items():
+                end = time + math.dist(anchors[place], anchors[visited]) + meeting
+                here = (visited, end)
+                yield from bounds({**free, visitor: here, visited: here}, max(latest, end))
+
+    def with_seeds(free: dict[int, tuple[int, float]], latest: float, least: int) -> Iterator[float]:
+        if free:
+            yield from bounds(free, latest)
+        waiting = [robot for robot in range(len(anchors)) if robot not in free]
+        for a in waiting:
+            for b in waiting:
+                if a != b and min(a, b) > least:
+                    end = seed_time(a, b)
+                    yield from with_seeds({**free, a: (b, end), b: (b, end)}, max(latest, end), min(a, b))
+
+    return min(with_seeds({}, 0.0, -1))
+
+
+def groups(least: int, most: int) -> st.SearchStrategy[Anchors]:
+    """Anchors at different places whose coordinates, differences and shifts are exact."""
+    coordinate = st.integers(-400, 400).map(lambda number: number / 8)
+    return st.lists(st.tuples(coordinate, coordinate), min_size=least, max_size=most, unique=True)
+
+
+@given(groups(2, 14), st.floats(0.1, 3.0), st.floats(0.0, 60.0))
+@settings(max_examples=30, deadline=None)
+def test_a_plan_is_possible_and_ends_at_its_bound(anchors: Anchors, speed: float, meeting: float) -> None:
+    seed_time = orbit_time(anchors)
+    plan = group_plan(anchors, seed_time, speed, meeting)
+    ends = simulated_ends(plan.meetings, anchors, seed_time, speed, meeting)
+    assert [each.ends for each in plan.meetings] == pytest.approx(ends)
+    assert plan.bound == pytest.approx(max(ends))
+    assert ends == pytest.approx(sorted(ends))
+    assert plan.bound >= plan.travel_lower_bound * (1 - 1e-12)
+
+
+@given(groups(2, 5), st.lists(st.floats(1.0, 400.0), min_size=25, max_size=25), st.floats(0.0, 60.0))
+@settings(max_examples=20, deadline=None)
+def test_a_small_plan_is_the_best_of_all_plans(anchors: Anchors, drawn: list[float], meeting: float) -> None:
+    def seed_time(a: int, b: int) -> float:
+        return drawn[5 * a + b]
+
+    plan = group_plan(anchors, seed_time, 1.0, meeting)
+    assert plan.bound == pytest.approx(least_bound(anchors, seed_time, meeting))
+    assert plan.travel_lower_bound == pytest.approx(least_bound(anchors, seed_time, 0.0))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(4))
+def test_a_plan_of_six_robots_is_the_best_of_all_plans(seed: int) -> None:
+    anchors = drawn_anchors(6, seed)
+    assert plan_of(anchors).bound == pytest.approx(least_bound(anchors, orbit_time(anchors), MEETING_S))
+
+
+@given(groups(3, 7), st.randoms(use_true_random=False))
+@settings(max_examples=20, deadline=None)
+def test_the_optimum_is_between_the_lower_bound_and_any_search(anchors: Anchors, draw: random.Random) -> None:
+    seed = tuple(tuple(draw.uniform(1.0, 400.0) for _ in anchors) for _ in anchors)
+    times = MeetingTimes(seed, meeting_times(anchors).hop)
+    optimum = last_end(optimal_forest(times), times)
+    assert times.earliest_end() <= optimum * (1 + 1e-12)
+    for steps in (0, 20):
+        assert optimum <= last_end(short_forest(times, steps), times) * (1 + 1e-12)
+
+
+@given(groups(3, 12), st.integers(-1000, 1000), st.integers(-1000, 1000), st.randoms(use_true_random=False))
+@settings(max_examples=20, deadline=None)
+def test_numbers_and_the_origin_do_not_change_the_bound(
+    anchors: Anchors, east: int, north: int, draw: random.Random
+) -> None:
+    moved = [(x + east, y + north) for x, y in anchors]
+    draw.shuffle(moved)
+    here, there = plan_of(anchors), plan_of(moved)
+    assert there.bound == pytest.approx(here.bound)
+    assert there.travel_lower_bound == pytest.approx(here.travel_lower_bound)
+
+
+@pytest.mark.parametrize("robots", [5, 6, 7])
+def test_the_search_is_near_the_optimum(robots: int) -> None:
+    """Not more than 1.001 times on average: 1.2 is promised."""
+    assert mean(ratio_of_search(drawn_anchors(robots, seed)) for seed in range(3)) < 1.001
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("robots", [5, 6, 7, 8])
+def test_the_search_is_near_the_optimum_in_200_groups(robots: int) -> None:
+    ratios = [ratio_of_search(drawn_anchors(robots, seed)) for seed in range(200)]
+    assert mean(ratios) < 1.001
+    assert max(ratios) < 1.01
+
+
+@pytest.mark.parametrize("robots", [16, pytest.param(50, marks=pytest.mark.long)])
+def test_a_large_plan_is_possible_and_near_its_lower_bound(robots: int) -> None:
+    anchors = drawn_anchors(robots, 0)
+    plan = plan_of(anchors)
+    ends = simulated_ends(plan.meetings, anchors, orbit_time(anchors), 1.0, MEETING_S)
+    assert plan.bound == pytest.approx(max(ends))
+    assert plan.travel_lower_bound <= plan.bound <= 1.4 * plan.travel_lower_bound
+
+
+def test_the_same_group_has_the_same_plan() -> None:
+    anchors = drawn_anchors(12, 0)
+    assert plan_of(anchors) == plan_of(anchors)
+
+
+def test_pairs_that_are_far_apart_meet_at_the_same_time() -> None:
+    plan = plan_of([(0.0, 0.0), (5.0, 0.0), (35.0, 0.0), (40.0, 0.0), (70.0, 0.0), (75.0, 0.0)])
+    assert [each.first for each in plan.meetings] == [True, True, True]
+    assert plan.bound == pytest.approx(10 * math.pi + 20)
+
+
+def test_one_seed_pair_fetches_all_others_if_the_next_takes_too_long() -> None:
+    anchors = [(0.0, 0.0), (1.0, 0.0), (30.0, 0.0), (60.0, 0.0)]
+    plan = group_plan(anchors, lambda a, b: 20.0 if a + b == 1 else 1000.0, speed=1.0, meeting=5.0)
+    assert [(each.visitor, each.visited) for each in plan.meetings] == [(0, 1), (0, 2), (1, 3)]
+    assert [each.ends for each in plan.meetings] == [20.0, 54.0, 84.0]
+
+
+@pytest.mark.parametrize("robots", [4, 12])
+def test_robots_that_cannot_meet_first_are_fetched(robots: int) -> None:
+    anchors = drawn_anchors(robots, 1)
+    plan = group_plan(anchors, lambda a, b: 30.0 if (a, b) == (3, 2) else math.inf, 1.0, MEETING_S)
+    assert [(each.visitor, each.visited) for each in plan.meetings if each.first] == [(3, 2)]
+    assert plan.bound < math.inf
+
+
+def test_the_visited_robot_goes_where_the_last_end_is() -> None:
+    anchors = [(0.0, 0.0), (0.0, 0.0), (1.0, 0.0), (9.0, 0.0)]
+    times = meeting_times(anchors)
+    meetings = planned_meetings(WakeUpForest(seeds=((0, 1),), hops=((1, 2), (1, 3))), times)
+    assert [(each.visitor, each.visited) for each in meetings] == [(0, 1), (0, 2), (1, 3)]
+
+
+def test_a_group_in_which_no_two_can_meet_first_has_no_plan() -> None:
+    with pytest.raises(ValueError, match="no two robots of the group can meet first"):
+        group_plan([(0.0, 0.0), (1.0, 0.0)], lambda _a, _b: math.inf, speed=1.0, meeting=MEETING_S)
+
+
+def test_one_robot_is_no_group() -> None:
+    with pytest.raises(ValueError, match="at least two robots, not 1"):
+        plan_of([(0.0, 0.0)])
