@@ -23,11 +23,11 @@ class AgentReplay(msgspec.Struct, frozen=True):
     history: AgentHistory | None
     """The journal's content; None if the robot was killed before it received its configuration."""
     states: tuple[RobotState, ...] = ()
-    """The state after each tick in which the robot decided, starting at tick 0; in a group, in its meeting."""
+    """The state after each tick in which the robot decided, from tick 0; in a group, that in its meeting."""
     broken: str | None = None
     """The reason why `states` ends before the recording does; None if it does not."""
     planner: Planner[Any, Any] | None = None
-    """The planner, in a group that of a meeting; None if its states cannot be drawn or its code is not loaded."""
+    """The planner, in a group that of a meeting; None if it cannot be drawn or its code is not loaded."""
 
     @property
     def estimates(self) -> tuple[Estimate, ...]:

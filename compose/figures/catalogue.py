@@ -8,17 +8,18 @@ from matplotlib.figure import Figure
 
 from compose.figures import (
     decisions,
-    group_plan,
     manoeuvre,
     one_robot,
     over_time,
     phase_one,
+    spread,
     steps,
     trajectory,
 )
 from compose.figures.pair import PairRecord
 from compose.figures.sheet import Absent
 from compose.figures.style import SCREEN, Medium
+from compose.recording.meetings import past_meetings
 
 Picture = tuple[str, Figure | Absent]
 
@@ -34,8 +35,9 @@ def pictures(pair: PairRecord, kind: str, medium: Medium = SCREEN) -> Iterator[P
 def _meetings(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
     """Yield the figure of the whole group with its first meeting; none for pairs."""
     run = pair.run
-    if run.setup is not None and run.setup.visits and run.pairs[0] == (pair.a.id, pair.b.id):
-        yield "meetings", group_plan.draw(run, medium)
+    meetings = past_meetings(run)
+    if meetings and (meetings[0].a, meetings[0].b) == (pair.a.id, pair.b.id):
+        yield "meetings", spread.draw(run, medium)
 
 
 def _trajectory(pair: PairRecord, medium: Medium) -> Iterator[Picture]:

@@ -174,8 +174,9 @@ def _second_row(pair: PairRecord) -> float:
 def _ranges(axes: Axes, pair: PairRecord) -> None:
     apart = pair.separations[pair.first : len(pair.mutual)]
     if apart:
+        ticks = range(pair.first, pair.first + len(apart))
         axes.plot(
-            range(pair.first, pair.first + len(apart)), apart, "-", lw=1.1, color=INK, zorder=2, gid="separation",
+            ticks, apart, "-", lw=1.1, color=INK, zorder=2, gid="separation",
             label="true separation" if pair.true else "separation, from claims",
         )  # fmt: skip
     for role in ROLES:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from itertools import groupby
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 from msgspec.structs import replace
@@ -15,9 +15,9 @@ from agent.planning.planner import Planner
 from agent.planning.state import RobotState
 from compose.figures.agent_replay import AgentReplay
 from compose.recording.claim import Claim
-from compose.recording.meetings import meeting_begins
+from compose.recording.meetings import PastMeeting, past_meetings
 from compose.recording.run import Run
-from protocol.messages import Command, Estimate
+from protocol.messages import Command, Estimate, RobotConfig, RobotConfigInGroup
 from protocol.mission import Anchor, Mission, PlannerName, Role
 from protocol.motion import Pose
 from protocol.orbits import Orbit
@@ -34,7 +34,7 @@ class Span(msgspec.Struct, frozen=True):
 
 
 class Side(msgspec.Struct, frozen=True, dict=True):
-    """One robot of a pair, with one entry per tick in each sequence, from tick 0 to the end of the meeting."""
+    """One robot of a pair, with one entry per tick in each sequence, from tick 0 to the meeting's end."""
 
     id: str
     anchor: Anchor
@@ -48,7 +48,7 @@ class Side(msgspec.Struct, frozen=True, dict=True):
     replay: AgentReplay | None
     """The recomputed planner states; None if the robot's journal cannot be read."""
     claim: Claim | None = None
-    """The robot's first claim, compared with the ground truth; None in hardware mode, and in later meetings."""
+    """The robot's first claim, compared with the ground truth; None in hardware mode and later meetings."""
     first: int = 0
     """The tick in which the robot leaves for the meeting; 0 in its first one."""
 
@@ -237,24 +237,33 @@ def others(estimate: Estimate) -> tuple[Pose, ...]:
     return estimate.world[1:] if estimate.probabilities or len(estimate.world) == 1 else estimate.world
 
 
-def pair_of(run: Run, robots: Sequence[str], replays: Mapping[str, AgentReplay]) -> PairRecord | None:
+def pairs_of(run: Run, replays: Mapping[str, AgentReplay]) -> Iterator[PairRecord]:
+    """Yield the pairs of `run` that have data; in a group, the meetings that have begun."""
+    found: Sequence[PairRecord | None] = [
+        pair_of(run, (one.a, one.b), replays, one) for one in past_meetings(run)
+    ] or [pair_of(run, robots, replays) for robots in run.pairs]
+    yield from [pair for pair in found if pair is not None]
+
+
+def pair_of(
+    run: Run, robots: Sequence[str], replays: Mapping[str, AgentReplay], meeting: PastMeeting | None = None
+) -> PairRecord | None:
     """Return the pair of `robots`, role a first; None in hardware mode if no journal has a configuration.
 
-    In a group, it is their meeting. `replays` holds the readable journals by robot id.
+    In a group, it is their `meeting`. `replays` holds the readable journals by robot id.
     """
     histories = {one: replays[one].history for one in robots if one in replays}
     known = {robot: history for robot, history in histories.items() if history is not None}
-    meeting = _meeting(run, robots)
     if run.world is not None:
-        config = run.scenario.config(robots[-1] if meeting else robots[0])
+        config = run.scenario.config(robots[0])
         ticks = dict.fromkeys(robots, run.length)
     elif known:
-        met = [history.config for history in known.values() if history.config.peer in robots]
-        config = met[0] if met else next(iter(known.values())).config
+        config = next(iter(known.values())).config
         ticks = {robot: len(history.steps) for robot, history in known.items()}
     else:
         return None
-    if meeting:
+    if meeting is not None:
+        config = _in_meeting(config, meeting)
         ticks = {robot: min(count, meeting.last + 1) for robot, count in ticks.items()}
     peer = {config.robot: config.peer, config.peer: config.robot}
     mutual: list[tuple[bool, float | None]] = []
@@ -265,7 +274,7 @@ def pair_of(run: Run, robots: Sequence[str], replays: Mapping[str, AgentReplay])
     def side(role: Role) -> Side:
         own = config.role == role
         robot = config.robot if own else config.peer
-        first = meeting.first if meeting and role == "a" else 0
+        first = meeting.first if meeting is not None and role == "a" else 0
         if run.world is not None:
             path = run.truth(robot) or (run.scenario.robot(robot).start,)
         else:
@@ -275,7 +284,7 @@ def pair_of(run: Run, robots: Sequence[str], replays: Mapping[str, AgentReplay])
             id=robot,
             anchor=config.anchor if own else config.peer_anchor,
             orbit=config.rendezvous.of(role),
-            path=path[: meeting.last + 1] if meeting else path,
+            path=path[: meeting.last + 1] if meeting is not None else path,
             commands=tuple([run.command(robot, tick) for tick in seen]),
             anchor_ranges=tuple([run.observations[tick][robot].anchor_range for tick in seen]),
             replay=replays.get(robot),
@@ -284,7 +293,7 @@ def pair_of(run: Run, robots: Sequence[str], replays: Mapping[str, AgentReplay])
         )
 
     title = run.title(list(known))
-    if meeting:
+    if meeting is not None:
         title += f"; meeting of {robots[0]} and {robots[-1]}, ticks {meeting.first} to {meeting.last}"
     pair = PairRecord(
         title=title,
@@ -300,22 +309,10 @@ def pair_of(run: Run, robots: Sequence[str], replays: Mapping[str, AgentReplay])
     return replace(pair, title=f"{pair.title}; positions from claims")
 
 
-class MeetingSpan(NamedTuple):
-    """The ticks of a meeting of a group."""
-
-    first: int
-    """The tick in which the visitor leaves for it; 0 if it is the first one of both robots."""
-    last: int
-    """The tick before the first of the robots leaves for its next meeting, or the last one of the run."""
-
-
-def _meeting(run: Run, robots: Sequence[str]) -> MeetingSpan | None:
-    """Return the ticks of the meeting of `robots`; None if they are a pair."""
-    begins = meeting_begins(run)
-    if not begins or run.setup is None or len(robots) < 2:
-        return None
-    a, b = robots
-    place = run.setup.partners[a].index(b)
-    first = begins[a][place] if place < len(begins[a]) else run.length - 1
-    leave = [*begins[a][place + 1 : place + 2], *begins[b][1:2]]
-    return MeetingSpan(first, min([run.length, *leave]) - 1)
+def _in_meeting(config: RobotConfig, meeting: PastMeeting) -> RobotConfig:
+    """Return `config`, of a robot of a group, with its peer and its role in `meeting`."""
+    role: Role = "a" if config.robot == meeting.a else "b"
+    peer = meeting.b if role == "a" else meeting.a
+    if config.peer == peer or not isinstance(config, RobotConfigInGroup):
+        return config
+    return config.in_meeting(peer, role)

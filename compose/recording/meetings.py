@@ -1,81 +1,162 @@
-"""The meetings of a group: which one each robot is in, tick by tick, as its commands show.
+"""The meetings of a group: which one each robot is in, tick by tick, as its commands and reports show.
 
-A robot goes on to its next meeting with a command of the state "travelling", once the robot that it has met
-has a verdict. It may travel to the same robot again if it has lost contact with it before.
+A robot leaves for its next meeting with a command of the state "travelling", once the robot that it has
+visited has a verdict. It may travel to the same robot again if it has lost contact with it before. The peer
+is the next one of the plan, and after the plan, the nearest robot without a verdict. Once the two are in
+contact, the robot sends its log to no other one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Iterable, Mapping
+
+import msgspec
 
 from compose.recording.run import Run
-from compose.recording.run_setup import RunSetup
-from protocol.messages import Command
+from compose.recording.run_setup import PresentMeeting, RunSetup
+from protocol.messages import Command, Localised, PeerReport, Report
+from protocol.motion import Pose
 
 TRAVELLING = "travelling"
 """The state of a robot that drives to the next robot of its group."""
 
-Meetings = Mapping[str, int]
-"""The number of meetings that each robot has left; robots in their first meeting may be absent."""
+Meetings = Mapping[str, PresentMeeting]
+"""The meeting of each robot; robots in their first meeting may be absent."""
+
+
+class GroupTick(msgspec.Struct, frozen=True):
+    """What is known of one tick of a group."""
+
+    commands: Mapping[str, Command]
+    """The commands by robot."""
+    logs: Iterable[tuple[str, str]]
+    """The senders and receivers of the reports with a log."""
+    place: Callable[[str], Pose | None]
+    """Returns where a robot is, as far as it is known."""
+
+
+class PastMeeting(msgspec.Struct, frozen=True):
+    """A meeting of a group in a run."""
+
+    a: str
+    """The robot of role a: the visitor."""
+    b: str
+    """The robot of role b."""
+    first: int
+    """The tick in which the visitor leaves for it; 0 if it is the first one of both robots."""
+    last: int
+    """The tick before the first of the robots leaves for its next meeting, or the last one of the run."""
+
+
+def has_log(report: PeerReport) -> bool:
+    """Return whether `report` is to a robot with which its sender is in a meeting."""
+    return isinstance(report, Report) and (report.start is not None or report.through > 0)
 
 
 def meetings_after(
-    setup: RunSetup,
-    meetings: Meetings,
-    earlier: Mapping[str, Command],
-    commands: Mapping[str, Command],
+    setup: RunSetup, meetings: Meetings, earlier: Mapping[str, Command], now: GroupTick
 ) -> Meetings:
-    """Return the meetings in a tick with `commands`; `meetings` are those before, `earlier` the last commands.
+    """Return the meetings in the tick of `now`; `meetings` are those before, `earlier` the last commands.
 
-    Without an earlier command of a robot, for a viewer that has missed the start, its meeting is the first one
-    whose peer has no verdict yet.
+    Without an earlier command of a robot, for a viewer that has missed the start, its meeting is the first
+    one of the plan whose peer has no verdict yet.
     """
-    changed = {}
+    changed: dict[str, PresentMeeting] = {}
+    receivers: dict[str, list[str]] = {}
+    for sender, receiver in now.logs:
+        receivers.setdefault(sender, []).append(receiver)
     for robot, partners in setup.partners.items():
-        command = commands.get(robot)
-        if command is None or len(partners) == 1:
+        command, before = now.commands.get(robot), earlier.get(robot)
+        if command is None:
             continue
-        now = meetings.get(robot, 0)
-        if robot not in earlier and command.tick > 0:
-            changed[robot] = _unmet(partners, commands, command)
-        elif command.state == TRAVELLING and now + 1 < len(partners):
-            before = earlier.get(robot)
-            goes_on = before is None or before.state != TRAVELLING
-            if goes_on and (now == 0 or _has_verdict(partners[now], earlier)):
-                changed[robot] = now + 1
+        present = meetings.get(robot, PresentMeeting(partners[0], False))
+        localised = before is not None and isinstance(before.verdict, Localised)
+        leaves = command.state == TRAVELLING and (before is None or before.state != TRAVELLING)
+        heard = receivers.get(robot, [])
+        if heard and present.peer not in heard:
+            changed[robot] = PresentMeeting(heard[0], localised)
+        elif before is None and command.tick > 0 and isinstance(command.verdict, Localised):
+            changed[robot] = PresentMeeting(_next(setup, robot, None, now, now.commands), True)
+        elif leaves and (not present.visiting or _has_verdict(present.peer, earlier)):
+            changed[robot] = PresentMeeting(_next(setup, robot, present.peer, now, earlier), True)
     return {**meetings, **changed} if changed else meetings
 
 
-def meeting_begins(run: Run) -> dict[str, tuple[int, ...]]:
-    """Return the ticks in which the meetings of each robot begin, as far as the run has them.
-
-    A meeting begins when the robot leaves for it, and the first one in tick 0. Empty if the robots are pairs.
-    """
-    setup = run.setup
-    if setup is None or not setup.visits:
-        return {}
-    begins: dict[str, tuple[int, ...]] = dict.fromkeys(setup.ids, (0,))
-    meetings: Meetings = {}
-    latest: dict[str, Command] = {}
-    for tick in range(run.length):
-        found = {robot: run.command(robot, tick) for robot in setup.ids}
-        commands = {robot: command for robot, command in found.items() if command is not None}
-        after = meetings_after(setup, meetings, latest, commands)
-        for robot in after:
-            if after[robot] != meetings.get(robot, 0):
-                begins[robot] = (*begins[robot], tick)
-        meetings, latest = after, {**latest, **commands}
-    return begins
-
-
-def _unmet(partners: Sequence[str], commands: Mapping[str, Command], own: Command) -> int:
-    """Return the meeting of a robot of which only the present command is known."""
-    if own.verdict is None:
-        return 0
-    met = next((i for i, peer in enumerate(partners) if not _has_verdict(peer, commands)), len(partners) - 1)
-    return met if own.state == TRAVELLING or own.phase == 3 else max(0, met - 1)
+def _next(setup: RunSetup, robot: str, peer: str | None, now: GroupTick, known: Mapping[str, Command]) -> str:
+    """Return the robot that `robot` visits after `peer`; the last of its plan if there is no other one."""
+    partners = setup.partners[robot]
+    after = partners[partners.index(peer) + 1 :] if peer in partners else partners
+    planned = [one for one in after if not _has_verdict(one, known)]
+    if planned:
+        return planned[0]
+    here = now.place(robot)
+    others = [one for one in setup.robots if one.id != robot and not _has_verdict(one.id, known)]
+    if here is None or not others:
+        return partners[-1]
+    return min(others, key=lambda one: math.hypot(one.anchor.x - here.x, one.anchor.y - here.y)).id
 
 
 def _has_verdict(robot: str, commands: Mapping[str, Command]) -> bool:
     command = commands.get(robot)
     return command is not None and command.verdict is not None
+
+
+# --- of a run -----------------------------------------------------------------------------------------
+
+
+def past_meetings(run: Run) -> tuple[PastMeeting, ...]:
+    """Return the meetings of the group in `run` that have begun, in that order; empty for pairs."""
+    setup = run.setup
+    if setup is None or not setup.visits:
+        return ()
+    begun = _begun(run, setup)
+    found = [
+        PastMeeting(one.id, one.peer, 0, _last(begun, one.id, one.peer, 0, run.length))
+        for one in setup.robots
+        if one.role == "a" and begun[one.peer][0][1].peer == one.id
+    ]
+    found += [
+        PastMeeting(robot, meeting.peer, tick, _last(begun, robot, meeting.peer, tick, run.length))
+        for robot, meetings in begun.items()
+        for tick, meeting in meetings[1:]
+        if meeting.visiting
+    ]
+    return tuple(sorted(found, key=lambda one: (one.first, one.last)))
+
+
+Begun = Mapping[str, list[tuple[int, PresentMeeting]]]
+"""The meetings of each robot with the ticks in which they begin."""
+
+
+def _begun(run: Run, setup: RunSetup) -> Begun:
+    begun = {robot: [(0, PresentMeeting(setup.partners[robot][0], False))] for robot in setup.ids}
+    meetings: Meetings = {}
+    latest: dict[str, Command] = {}
+    paths = {robot: run.truth(robot) for robot in setup.ids}
+    for tick in range(run.length):
+        found = {robot: run.command(robot, tick) for robot in setup.ids}
+        commands = {robot: command for robot, command in found.items() if command is not None}
+        poses = {robot: path[tick] for robot, path in paths.items() if tick < len(path)}
+        after = meetings_after(setup, meetings, latest, GroupTick(commands, _logs(run, tick), poses.get))
+        for robot, meeting in after.items():
+            if meeting is not meetings.get(robot):
+                begun[robot].append((tick, meeting))
+        meetings, latest = after, {**latest, **commands}
+    return begun
+
+
+def _logs(run: Run, tick: int) -> Iterable[tuple[str, str]]:
+    for robot, agent in run.agents.items():
+        if tick < len(agent.steps):
+            step = agent.steps[tick]
+            for contact, framed in zip(step.observation.contacts, step.reports, strict=False):
+                if has_log(framed.report):
+                    yield robot, contact.peer
+
+
+def _last(begun: Begun, a: str, b: str, first: int, length: int) -> int:
+    """Return the last tick of the meeting of `a` and `b` that begins in tick `first`."""
+    leaves = [tick for tick, _ in begun[a] if tick > first]
+    leaves += [tick for tick, meeting in begun[b] if tick > first and meeting.peer != a]
+    return min([length, *leaves]) - 1

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
+from typing import NamedTuple
 
 import msgspec
 from msgspec.structs import replace
@@ -42,8 +43,16 @@ class Visit(msgspec.Struct, frozen=True):
 
     visitor: RobotId
     visited: RobotId
-    ends_s: float | None = None
-    """The bound in s of the time at which both are localised; None without the world's journal."""
+    ends_s: float
+    """The planned bound in s of the time at which both are localised."""
+
+
+class PresentMeeting(NamedTuple):
+    """The meeting that a robot of a group is in, or on its way to."""
+
+    peer: RobotId
+    visiting: bool
+    """True if the robot knows its pose already."""
 
 
 class RunSetup(msgspec.Struct, frozen=True, dict=True):
@@ -116,16 +125,20 @@ class RunSetup(msgspec.Struct, frozen=True, dict=True):
             found[visit.visited] = (visit.visitor, *found.get(visit.visited, ()))
         return found
 
-    def in_meetings(self, meetings: Mapping[RobotId, int]) -> RunSetup:
-        """Return this setup with the peer and the role of each robot in its present one of `meetings`."""
-        if not self.visits:
+    def in_meetings(self, meetings: Mapping[RobotId, PresentMeeting]) -> RunSetup:
+        """Return this setup with the peer and the role that each robot has in its meeting."""
+        if not meetings:
             return self
         return replace(
-            self, robots=tuple([self._in_meeting(one, meetings.get(one.id, 0)) for one in self.robots])
+            self,
+            robots=tuple(
+                [_in_meeting(one, meetings[one.id]) if one.id in meetings else one for one in self.robots]
+            ),
         )
 
-    def _in_meeting(self, one: RobotSetup, meeting: int) -> RobotSetup:
-        return replace(one, peer=self.partners[one.id][meeting], role="a") if meeting else one
+
+def _in_meeting(one: RobotSetup, meeting: PresentMeeting) -> RobotSetup:
+    return replace(one, peer=meeting.peer, role="a" if meeting.visiting else "b")
 
 
 def of_scenario(scenario: Scenario, mode: str | None = None, tick_s: float | None = None) -> RunSetup:
@@ -169,6 +182,7 @@ def of_configs(name: str, configs_by_robot: Mapping[str, RobotConfig]) -> RunSet
     `configs_by_robot` maps robot ids to configurations and must not be empty.
     """
     configs = list(configs_by_robot.values())
+    visits = _visits(configs)
     return RunSetup(
         name=name,
         robots=tuple(
@@ -179,17 +193,19 @@ def of_configs(name: str, configs_by_robot: Mapping[str, RobotConfig]) -> RunSet
         ),
         mission=configs[0].mission,
         planner_name=configs[0].planner_name,
-        t_max_s=max(one.rendezvous.bound for one in configs),
+        t_max_s=max([one.ends_s for one in visits] or [one.rendezvous.bound for one in configs]),
         tick_s=configs[0].tick_s,
-        visits=tuple(_visits(configs)),
+        visits=tuple(visits),
     )
 
 
-def _visits(configs: Sequence[RobotConfig]) -> Iterator[Visit]:
-    """Yield the meetings in the configurations of a group, each visitor's in their order."""
+def _visits(configs: Sequence[RobotConfig]) -> list[Visit]:
+    """Return the planned meetings in the configurations of a group."""
     grouped = [one for one in configs if isinstance(one, RobotConfigInGroup)]
-    yield from [Visit(one.robot, one.peer) for one in grouped if one.role == "a"]
-    yield from [Visit(one.robot, meeting.peer) for one in grouped for meeting in one.later_meetings]
+    found = [(one, one.peer) for one in grouped if one.role == "a"]
+    found += [(one, visited) for one in grouped for visited in one.visits]
+    visits = [Visit(one.robot, visited, one.member(visited).ends) for one, visited in found]
+    return sorted(visits, key=lambda visit: visit.ends_s)
 
 
 def frame(anchor: Anchor, start: Pose) -> Pose:

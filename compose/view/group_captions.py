@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from compose.recording.meetings import TRAVELLING
 from compose.recording.run_setup import RobotSetup, RunSetup
 from compose.view.captions import COUNTS, Caption
 from compose.view.deliveries import Passage, contact_of
 from compose.view.events import metres
-from compose.recording.meetings import TRAVELLING
 from compose.view.run_data import TickData
 from compose.view.words import end_reason
 from protocol.messages import Inconsistent, Localised, MissionEnd, Undecided
@@ -43,8 +43,9 @@ def group_captions(
 
 def _beginning(setup: RunSetup) -> Caption:
     visited = {visit.visited for visit in setup.visits}
-    first = [f"{one.id} and {one.peer}" for one in setup.robots if one.id not in visited]
-    meet = _listed(first, "pairs") + " meet first; then those that are localised drive to the others."
+    first = [f"{one.id} meets {one.peer}" for one in setup.robots if one.id not in visited]
+    meet = f"First, {_listed(first, 'pairs meet')}"
+    meet += "; then those that are localised drive to the others." if len(first) < len(setup.visits) else "."
     text = f"{_counted(len(setup.robots))} robots measure no more than the distance to their own anchor."
     attackers = [robot.id for robot in setup.robots if robot.attack is not None]
     truth = f"{_listed(attackers, 'robots')} will report false data." if attackers else None
@@ -93,7 +94,8 @@ def _concluding(
         return
     known = sum([isinstance(one.verdict, Localised) for one in now.commands.values()])
     many = len(claiming) > 1
-    text = f"{_listed(claiming, 'robots')} claim{'' if many else 's'} to know {'their poses' if many else 'its pose'}"
+    claim = "claim to know their poses" if many else "claims to know its pose"
+    text = f"{_listed(claiming, 'robots')} {claim}"
     yield Caption("claim", f"{text}: {known} of {len(setup.robots)} robots now do.", tuple(claiming))
 
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
 from compose.recording.kills_file import Killed
+from compose.recording.meetings import GroupTick, Meetings, has_log, meetings_after
 from compose.recording.run_setup import RunSetup
 from compose.scenario.kills import WORLD
-from compose.recording.meetings import Meetings, meetings_after
 from protocol.messages import (
     Command,
     DeadlineMissed,
@@ -100,7 +101,7 @@ class RunData:
         self._absences: dict[str | None, Absence] = {}
         """The latest absence of each process that was killed and is not known to be back."""
         self._meetings: dict[int, tuple[Meetings, Mapping[str, Command]]] = {}
-        """The meetings of a group in each tick, and the latest commands; the latest tick is the last entry."""
+        """The meetings of a group, and the latest commands, by tick, in the order of the ticks."""
         self._setup_at: tuple[RunSetup, Meetings, RunSetup] | None = None
         """The latest arguments and result of `setup_at`: setup, meetings, and the setup with these."""
         self._written: dict[str, tuple[int, int]] = {}
@@ -132,11 +133,25 @@ class RunData:
             met, earlier = self._meetings.get(later - 1, ({}, {}))
             commands = self.ticks[later].commands if later in self.ticks else {}
             known = commands if len(commands) == len(setup.robots) else {**earlier, **commands}
-            self._meetings[later] = meetings_after(setup, met, earlier, commands), known
-        now = self._meetings.get(tick, ({}, {}))[0]
-        if self._setup_at is None or self._setup_at[:2] != (setup, now):
-            self._setup_at = setup, now, setup.in_meetings(now)
+            now = GroupTick(commands, self._logs(later), partial(self._place, later))
+            self._meetings[later] = meetings_after(setup, met, earlier, now), known
+        present = self._meetings.get(tick, ({}, {}))[0]
+        if self._setup_at is None or self._setup_at[:2] != (setup, present):
+            self._setup_at = setup, present, setup.in_meetings(present)
         return self._setup_at[2]
+
+    def _logs(self, tick: int) -> list[Link]:
+        """Return the links of the reports with a log in `tick`."""
+        reports = self.ticks[tick].reports if tick in self.ticks else {}
+        return [link for link, sized in reports.items() if has_log(sized.report)]
+
+    def _place(self, tick: int, robot: str) -> Pose | None:
+        """Return the true pose of a robot in `tick`, or where it believes to be."""
+        data = self.ticks.get(tick)
+        if data is None or robot in data.truth:
+            return data.truth[robot] if data is not None else None
+        estimate = data.estimates.get(robot)
+        return estimate.world[0] if estimate is not None and estimate.world else None
 
     def conclude(self, end: MissionEnd) -> None:
         """Set the end of the mission, which changes its last tick, unless it is known already."""

@@ -173,7 +173,7 @@ def held_poses(robot: str, now: TickData) -> HeldPoses | None:
 def player_of(
     robot_setup: RobotSetup, setup: RunSetup, now: TickData, reported: Pose | None = None
 ) -> Player:
-    """Return the entry of one robot in the scene of the tick of `now`; `setup` and `reported` as in `scene`."""
+    """Return the entry of one robot in the scene of the tick of `now`; the arguments are as in `scene`."""
     robot, peer = robot_setup.id, robot_setup.peer
     pose, observation, sent = (
         now.truth.get(robot),

@@ -59,15 +59,14 @@ def series(
     for place, one in enumerate(setup.robots):
         if robots is not None and one.id not in robots:
             continue
-        bins: list[list[Numbers]] = []
-        for begin in range(first, last + 1, step):
-            bins.append(
-                [
-                    _numbers(setups[tick], place, known.ticks[tick])
-                    for tick in range(begin, min(begin + step, last + 1))
-                    if tick in setups
-                ]
-            )
+        bins = [
+            [
+                _numbers(setups[tick], place, known.ticks[tick])
+                for tick in range(begin, min(begin + step, last + 1))
+                if tick in setups
+            ]
+            for begin in range(first, last + 1, step)
+        ]
         curves = {name: _curve(name, bins) for name in Numbers.__struct_fields__}
         found.append(
             RobotSeries(

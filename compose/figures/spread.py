@@ -1,4 +1,4 @@
-"""The meetings of a group: the wake-up tree in the plane with all paths, and below it the robots over time."""
+"""The meetings of a group: the wake-up tree in the plane, with all paths, and the robots over time."""
 
 from __future__ import annotations
 
@@ -92,8 +92,7 @@ def group_robots(run: Run, setup: RunSetup) -> list[GroupRobot]:
     bounds: dict[str, float] = {}
     for visit in setup.visits:
         for robot in (visit.visitor, visit.visited):
-            if visit.ends_s is not None:
-                bounds.setdefault(robot, visit.ends_s / setup.mission.period)
+            bounds.setdefault(robot, visit.ends_s / setup.mission.period)
     robots = []
     for one in setup.robots:
         claim = run.claim(one.id)
@@ -173,7 +172,7 @@ def _key(axes: Axes, reach: float) -> None:
 
 
 def _lanes(axes: Axes, setup: RunSetup, robots: list[GroupRobot]) -> None:
-    """Draw a lane for each robot: wide in meetings, with a star where it is localised, and the bound of that tick."""
+    """Draw a lane for each robot: wide in meetings, with a star where it is localised, and its bound."""
     rows = {one.id: row for row, one in enumerate(robots)}
     for row, one in enumerate(robots):
         for (known, meets), group in groupby(enumerate(one.commands), key=lambda two: _state(two[1])):
