@@ -1,6 +1,6 @@
 """The exit statuses of all commands, and the exceptions that stand for a user's mistake."""
 
-from typing import ClassVar
+import errno
 
 from protocol.messages import Outcome
 
@@ -26,13 +26,25 @@ BROKEN_PIPE = 141
 """The exit status of a command whose output was closed by its reader."""
 STOPPED = 130
 """The exit status of a command that was stopped by Ctrl-C or an equivalent signal."""
+FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""The errors of writing for which nothing is wrong with the path."""
 
 
 class UserError(Exception):
     """A user's mistake; its text is one line that names the file or the flag, and what is wrong there."""
 
-    exit_status: ClassVar[int] = USER_ERROR
+    exit_status = USER_ERROR
     """The exit status of the command that raises it."""
+
+
+class CannotWrite(UserError):
+    """A file or a folder cannot be written. The exit status is FAILED if the disk is full."""
+
+    def __init__(self, place: object, error: OSError) -> None:
+        """`place` is its path, with the flag that gave it if there is one."""
+        super().__init__(f"{place} cannot be written: {error.strerror or error}")
+        if error.errno in FULL_DISK:
+            self.exit_status = FAILED
 
 
 # --- scenarios --------------------------------------------------------------------------------------
@@ -64,7 +76,7 @@ class BadKill(UserError):
 class PlannerFailed(UserError):
     """A planner of the user raised an error or gave an invalid answer; the text names the method and tick."""
 
-    exit_status: ClassVar[int] = FAILED
+    exit_status = FAILED
 
 
 # --- sweeps -----------------------------------------------------------------------------------------

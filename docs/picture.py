@@ -16,6 +16,7 @@ from compose.launch import in_process
 from compose.recording.run import read
 from compose.scenario import scenario_file
 from compose.view.web import film
+from compose.view.web.standalone import standalone_page
 
 DOCS = Path(__file__).parent
 SHOWN: dict[str, dict[str, str]] = {
@@ -45,7 +46,8 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             draw(name, shown, Path(folder))
             if name == FILMED:
-                (DOCS / "page.gif").write_bytes(film.gif(Path(folder)))
+                page = standalone_page(Path(folder)).html
+                (DOCS / "page.gif").write_bytes(film.gif(page, film.browser("page.gif")))
 
 
 def draw(name: str, shown: Mapping[str, str], folder: Path) -> None:

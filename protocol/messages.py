@@ -287,6 +287,21 @@ class Member(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields
     """The planned bound in s of the time at which it is localised."""
 
 
+class Retry(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """A meeting of a pair that is only needed if earlier ones have failed."""
+
+    peer: RobotId
+    """The other robot."""
+    role: Role
+    """The role of this robot in the pair."""
+    rendezvous: Rendezvous
+    """The orbits of both robots."""
+    begins: Time
+    """The time in s at which it begins."""
+    lasts: Time
+    """The bound in s of the time until both are localised."""
+
+
 class RobotConfigInGroup(RobotConfigWithOptions, frozen=True, dict=True):
     """The configuration of a robot in a group, which meets one robot after another.
 
@@ -297,6 +312,10 @@ class RobotConfigInGroup(RobotConfigWithOptions, frozen=True, dict=True):
     """All robots of the group, in the order of the scenario."""
     visits: Annotated[tuple[RobotId, ...], Meta(max_length=MAX_MEMBERS)] = ()
     """The robots that this one visits after its first meeting, in their order."""
+    retries: Annotated[tuple[Retry, ...], Meta(max_length=MAX_MEMBERS)] = ()
+    """The meetings in which it tries again if it is not localised by then, in their order."""
+    gives_up: Time = 0.0
+    """The time in s after which it gives up if it is not localised."""
 
     @cached_property
     def widest_distance(self) -> float:
@@ -311,14 +330,16 @@ class RobotConfigInGroup(RobotConfigWithOptions, frozen=True, dict=True):
                 return one
         raise KeyError(robot)
 
-    def in_meeting(self, peer: str, role: Role) -> RobotConfigInGroup:
+    def in_meeting(self, peer: str, role: Role, orbits: Rendezvous | None = None) -> RobotConfigInGroup:
         """Return the configuration for a meeting with `peer`, in which this robot has `role`.
 
-        The robot of role a knows its pose, and visits the other one. Raises KeyError if there is none.
+        Without `orbits`, the robot of role a knows its pose, and visits the other one. Raises KeyError if
+        there is no such peer.
         """
         anchor = self.member(peer).anchor
-        distance = math.hypot(self.anchor.x - anchor.x, self.anchor.y - anchor.y)
-        orbits = visiting(self.mission, distance)
+        if orbits is None:
+            distance = math.hypot(self.anchor.x - anchor.x, self.anchor.y - anchor.y)
+            orbits = visiting(self.mission, distance)
         return msgspec.structs.replace(self, peer=peer, role=role, peer_anchor=anchor, rendezvous=orbits)
 
 

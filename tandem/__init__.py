@@ -13,12 +13,10 @@ imported before it is used.
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
-from tandem.clash import ModuleClash, check
-
+TYPE_CHECKING = False  # as in typing, which takes time to import
 if TYPE_CHECKING:
+    from typing import Any
+
     from compose.audit.findings import Findings, Violation
     from compose.errors import (
         BadFault,
@@ -31,6 +29,7 @@ if TYPE_CHECKING:
         UserError,
     )
     from compose.launch.supervisor import ChildFailed
+    from tandem.clash import ModuleClash
     from tandem.columns import Table
     from tandem.estimates import PoseEstimates, estimate
     from tandem.missions import run
@@ -77,6 +76,7 @@ _PLACES = {
     "Table": "tandem.columns:Table",
     "Findings": "compose.audit.findings:Findings",
     "Violation": "compose.audit.findings:Violation",
+    "ModuleClash": "tandem.clash:ModuleClash",
     "ChildFailed": "compose.launch.supervisor:ChildFailed",
     **{
         error: f"compose.errors:{error}"
@@ -99,6 +99,10 @@ def __getattr__(name: str) -> Any:
     """Import and return a public name. Raises ModuleClash, and AttributeError if there is no such name."""
     if name not in _PLACES:
         raise AttributeError(f"module 'tandem' has no attribute '{name}'")
+    from importlib import import_module  # noqa: PLC0415  # `tandem --help` starts without it
+
+    from tandem.clash import check  # noqa: PLC0415
+
     check()
     module, _, there = _PLACES[name].partition(":")
     value = getattr(import_module(module), there)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from compose.errors import UserError
+from compose.errors import CannotWrite, UserError
 from compose.extras import need
 from compose.recording.estimating.estimate_epoch import ClaimRule
 from compose.recording.estimating.estimate_files import write_estimate
@@ -77,7 +77,7 @@ class PoseEstimates(msgspec.Struct, frozen=True, dict=True, eq=False):
         try:
             write_estimate(out, self.result.rows, self.summary)
         except OSError as error:
-            raise UserError(f"{out} cannot be written: {error.strerror or error}") from None
+            raise CannotWrite(out, error) from None
         return out
 
     def __repr__(self) -> str:

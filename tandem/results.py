@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from compose.errors import UserError
+from compose.errors import CannotWrite, UserError
 from compose.extras import need
 from compose.figures import PICTURES
 from compose.launch import model_loader, planner_loader
@@ -190,7 +190,7 @@ class Run(msgspec.Struct, frozen=True, dict=True, eq=False):
             if self.model.world is not None:
                 leave(self.model, self.summary, out)
         except OSError as error:
-            raise UserError(f"{out} cannot be written: {error.strerror or error}") from None
+            raise CannotWrite(out, error) from None
         return out
 
     # --- display ---

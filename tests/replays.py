@@ -24,7 +24,7 @@ from pathlib import Path
 import msgpack
 from mcap.reader import make_reader
 
-from compose.audit.replay import Replay, replay
+from compose.audit.replay import Replay, replayed
 from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
 from compose.recording.run import read
 from compose.view.export.folder import export
@@ -66,9 +66,9 @@ def _both_ways(name: str | int, folder: Path) -> tuple[str, bool]:
             tandem("run", name, "-q", "--out", folder / out, *mode)
         found = [journals(folder / out) for out in ("processes", "one-process")]
         what = "a simulation of the paper"
-    once: list[Replay] = [replay(folder / "processes")[0]]
+    once: list[Replay] = [replayed(read(folder / "processes"))]
     if found[0] != found[1]:
-        once.append(replay(folder / "one-process")[0])
+        once.append(replayed(read(folder / "one-process")))
     same = all(not one.differences and not one.tears and one.checks for one in once)
     return f"{once[0].checks} checks in {once[0].ticks} ticks; {what}", same
 
@@ -88,7 +88,8 @@ def killed(draw: random.Random, folder: Path) -> tuple[str, bool]:
         os.kill(run.pid if victim == "run" else process_of(out, *victim.split()), signal.SIGKILL)
         run.ended()
     until(lambda: not processes_of(out), "no process writes any more")
-    result, torn = replay(out)
+    recording = read(out, audited=True)
+    result, torn = replayed(recording), {name: one.torn for name, one in recording.journals.items()}
     export(read(out), folder / "exported")
     there = {name: journal_file.packed(journal_file.read(out / name)) for name in torn}
     whole = all(len(there[name]) + torn[name] == (out / name).stat().st_size for name in torn)

@@ -20,7 +20,7 @@ from agent.planning.state import RobotState
 from agent.process import agent_journal as reader_of_agent
 from agent.process.robot import Robot
 from compose.audit.findings import Findings, Violation
-from compose.audit.rules import RULES, audit, audit_run
+from compose.audit.rules import RULES, audit_run
 from compose.launch import in_process
 from compose.launch.planner_loader import planner_of
 from compose.recording.recording_files import KINDS, WORLD_JOURNAL, agent_journal
@@ -62,6 +62,12 @@ from world import world_journal as reader_of_world
 from world.referee import MissionOutcome
 from world.scenario import Scenario
 from world.simulation import Simulation
+
+
+def audit(folder: Path) -> Findings:
+    """Return the findings in the recording in `folder`."""
+    return audit_run(read(folder, audited=True))
+
 
 Found = tuple[int | None, str | None, str]
 """The tick, robot and rule of a violation."""

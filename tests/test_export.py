@@ -38,7 +38,7 @@ from mcap.records import Schema
 from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 
-from compose.audit.replay import replay
+from compose.audit.replay import replayed
 from compose.cli import export_bar, run
 from compose.cli.main import parse
 from compose.launch import in_process
@@ -415,7 +415,10 @@ def test_a_torn_journal_is_exported_to_the_tear(name: str, faulty: Path, tmp_pat
     (torn / name).write_bytes((torn / name).read_bytes()[:size])
     whole = journal_file.packed(journal_file.read(torn / name))
     ended = tandem("export", torn)
-    assert (ended.status, ended.err) == (0, f"{name} ends with {size - len(whole)} bytes of a torn write\n")
+    assert (ended.status, ended.err) == (
+        0,
+        f"tandem export: {name} ends with {size - len(whole)} bytes of a torn write\n",
+    )
     assert journals_of(torn / "run.mcap") == on_disk(faulty) | {name: whole}
     assert complaints(torn / "run.mcap") == []
 
@@ -430,7 +433,7 @@ def test_a_robot_that_has_left_no_journal_is_named(paper_1: Path, tmp_path: Path
     for name in (WORLD_JOURNAL, A):
         (tmp_path / name).write_bytes((paper_1 / name).read_bytes())
     ended = tandem("export", tmp_path)
-    assert (ended.status, ended.err) == (3, "agent-b.journal is missing\n")
+    assert (ended.status, ended.err) == (3, "tandem export: agent-b.journal is missing\n")
     assert set(journals_of(tmp_path / "run.mcap")) == {WORLD_JOURNAL, A}
     assert len(seen(tmp_path / "run.mcap", "/b/pose")) == 49
 
@@ -442,7 +445,7 @@ def test_a_missing_recording_and_an_unwritable_folder_are_refused(paper_1: Path,
     (tmp_path / "file").touch()
     ended = tandem("export", paper_1, "--out", tmp_path / "file")
     assert ended.status == 2
-    assert ended.err.startswith(f"tandem export: --out: {tmp_path / 'file'} cannot be written: ")
+    assert ended.err.startswith(f"tandem export: {tmp_path / 'file'} cannot be written: ")
 
 
 # --- exports during a run, and the Foxglove server --------------------------------------------------------
@@ -501,8 +504,8 @@ def test_where_there_is_no_room_nothing_half_written_is_left(paper_1: Path, tmp_
         limit = f'ulimit -f {sizes[name] // 2 // 512}; exec "$@"'  # blocks of 512 bytes
         with TandemProcess("export", paper_1, "--out", out, through=["sh", "-c", limit, "sh"]) as command:
             ended = command.ended()
-        assert (ended.status, ended.out) == (2, "")
-        assert re.fullmatch(r"tandem export: --out: \S+ cannot be written: .*\n", ended.err), ended.err
+        assert (ended.status, ended.out) == (3, "")
+        assert re.fullmatch(r"tandem export: \S+ cannot be written: .*\n", ended.err), ended.err
         assert {path.name: path.stat().st_size for path in out.iterdir()}.items() <= sizes.items()
         assert name not in {path.name for path in out.iterdir()}
 
@@ -514,7 +517,7 @@ def stopped_unless(some: Iterator[bool]) -> None:
 
 def test_ctrl_c_ends_an_export_and_leaves_nothing_half_written(paper_1: Path, tmp_path: Path) -> None:
     with TandemProcess("export", paper_1, "--out", tmp_path / "out") as command:
-        command.until(lambda: command.catches(Signals.SIGTERM), "it catches signals")
+        command.until(lambda: command.catches(Signals.SIGHUP), "it catches signals")
         command.tell(Signals.SIGINT)
         ended = command.ended()
     assert (ended.status, ended.out, ended.err) == (130, "", "tandem export: stopped by SIGINT\n")
@@ -594,7 +597,7 @@ def test_a_viewer_sees_a_run_from_its_start_to_its_end(tmp_path: Path) -> None:
     assert re.search(r"\n(localised|undecided) after ", ended.out)
     assert topics["/tf"] == "foxglove.FrameTransforms"
     assert topics["/journal/agent-a/observation"] == "tandem.Observation"
-    again, _ = replay(out)
+    again = replayed(read(out))
     assert again.differences == ()
 
 
@@ -763,13 +766,13 @@ def test_a_run_with_an_export_reads_its_recording_once(
     """The outcome and the export are of one Run."""
     found: list[Run] = []
 
-    def counted(folder: Path) -> Run:
+    def counted(folder: Path, *_command: str) -> Run:
         found.append(read(folder))
         return found[-1]
 
     monkeypatch.setattr(run, "stop_by_signal", lambda _: None)  # it would affect the process of the tests
     monkeypatch.setattr(run, "read", counted)
-    monkeypatch.setattr(export_bar, "read", counted)
+    monkeypatch.setattr(export_bar, "read_noted", counted)
     assert run.main(parse(["run", "paper-1", "-q", "--out", str(tmp_path)])) == 0
     assert (tmp_path / "run.mcap").exists()
     assert len(found) == 1

@@ -181,8 +181,8 @@ def test_the_outcome_is_printed_where_a_full_disk_takes_no_summary(how: list[str
         check=False,
     )
     assert ended.stdout == "localised after 48 ticks\n"
-    assert ended.stderr == "tandem run: --out: full cannot be written: File too large\n"
-    assert ended.returncode == 2
+    assert ended.stderr == "tandem run: full cannot be written: File too large\n"
+    assert ended.returncode == 3
     assert not (tmp_path / "full" / "ticks.csv").exists()
 
 

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
+from signal import SIGINT, SIGTERM, Signals
 
 import av
 import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-from compose.errors import UserError
 from compose.view.web import film
-from tests.commands import TandemProcess, tandem
+from tests.commands import TandemProcess, tandem, temporary_in, until
+from tests.series import series
 
 MOST_BYTES = 600_000
 """The largest size of the picture of paper-1."""
@@ -24,10 +25,15 @@ FRAME_S = 1.0
 """The time in s in which the browser draws a frame on any machine."""
 
 
-@pytest.mark.long
-def test_the_picture_lasts_as_long_as_guided_play_and_is_small(paper_1: Path, tmp_path: Path) -> None:
+def need_browser() -> None:
+    """Skip the test where no browser is installed."""
     if not any(map(shutil.which, film.BROWSERS)):
         pytest.skip("there is no chromium: apt-get install chromium")
+
+
+@pytest.mark.long
+def test_the_picture_lasts_as_long_as_guided_play_and_is_small(paper_1: Path, tmp_path: Path) -> None:
+    need_browser()
     ended = tandem("export", paper_1, "--gif", "--out", tmp_path)
     assert (ended.status, ended.out, ended.err) == (0, f"{tmp_path / 'run.gif'}\n", "")
     assert (tmp_path / "run.gif").stat().st_size < MOST_BYTES
@@ -40,8 +46,7 @@ def test_the_picture_lasts_as_long_as_guided_play_and_is_small(paper_1: Path, tm
 
 @pytest.mark.long
 def test_the_video_lasts_as_long_as_guided_play_and_is_small(paper_1: Path, tmp_path: Path) -> None:
-    if not any(map(shutil.which, film.BROWSERS)):
-        pytest.skip("there is no chromium: apt-get install chromium")
+    need_browser()
     with TandemProcess("export", paper_1, "--mp4", "--out", tmp_path) as export:
         ended = export.ended(MOST_FRAMES * FRAME_S)
     assert (ended.status, ended.out, ended.err) == (0, f"{tmp_path / 'run.mp4'}\n", "")
@@ -56,11 +61,38 @@ def test_the_video_lasts_as_long_as_guided_play_and_is_small(paper_1: Path, tmp_
     assert changes > 100
 
 
-@pytest.mark.parametrize("kind", [film.gif, film.mp4])
+@pytest.mark.parametrize("kind", ["gif", "mp4"])
 def test_without_a_browser_there_is_one_line(
-    kind: Callable[[Path], bytes], paper_1: Path, monkeypatch: pytest.MonkeyPatch
+    kind: str, paper_1: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(film, "BROWSERS", ("no-such-browser",))
-    message = f"^--{kind.__name__} needs chromium: apt-get install chromium$"
-    with pytest.raises(UserError, match=message):
-        kind(paper_1)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    ended = tandem("export", paper_1, f"--{kind}", "--out", tmp_path / "out")
+    message = f"tandem export: --{kind} needs chromium: apt-get install chromium\n"
+    assert ended == (2, "", message)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("number", series([SIGINT, SIGTERM]), ids=["SIGINT", "SIGTERM"])
+def test_a_stopped_film_leaves_no_file_and_no_browser(
+    number: Signals, paper_1: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A signal that reaches all processes of the command, as Ctrl-C does."""
+    need_browser()
+    temporary = temporary_in(tmp_path, monkeypatch)
+    with TandemProcess("export", paper_1, "--gif", "--out", tmp_path / "out") as export:
+        export.until(lambda: browsers(temporary), "the browser has started")
+        assert export.tell(number)
+        assert export.ended() == (130, "", f"tandem export: stopped by {number.name}\n")
+    until(lambda: not browsers(temporary), "the browser has ended")
+    assert [*temporary.iterdir()] == []
+    assert not (tmp_path / "out").exists()
+
+
+def browsers(temporary: Path) -> list[str]:
+    """Return the ids of all processes of browsers whose profile is in `temporary`."""
+    profile = f"--user-data-dir={temporary}/".encode()
+    found = []
+    for line in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError):  # it has ended meanwhile
+            found += [line.parent.name] * (profile in line.read_bytes())
+    return found

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import re
+import time
+from itertools import count
 from math import remainder, tau
+from pathlib import Path
 from typing import Any
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
@@ -15,9 +18,12 @@ from playwright.sync_api import Page, Route, expect
 
 from compose.errors import UserError
 from compose.launch import in_process
-from compose.scenario.scenario_change import changed, values_of
+from compose.scenario.scenario_change import ScenarioChange, changed, values_of
 from compose.scenario.scenario_file import load, parse
-from compose.view.web.changed_missions import MOST_TICKS
+from compose.scenario.toml_file import field_first
+from compose.view.web import changed_missions
+from compose.view.web.changed_missions import MOST_TICKS, ChangedMissions
+from compose.view.web.sources import Recorded
 from tests.browser import Open, chromium_only, shot, until_loaded, until_shown
 from world.scenario import Scenario
 
@@ -32,6 +38,27 @@ def posted(address: str, change: object, what: str = "changed", origin: str | No
     with urlopen(request, timeout=60) as answer:
         text = answer.read().decode()
     return text if what.endswith("toml") else json.loads(text)
+
+
+def test_an_error_in_a_body_that_is_no_json_begins_with_what_it_is() -> None:
+    assert field_first("JSON is malformed: invalid character (byte 0)", ScenarioChange).startswith("JSON is")
+
+
+def test_a_mission_that_takes_too_long_ends_at_the_next_decision(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Time passes by one second from one decision to the next."""
+    in_process.run_mission(load("paper-1"), tmp_path)
+    show, looks = Recorded("", tmp_path), count()
+    show.poll()
+    show.live = False
+    missions = ChangedMissions()
+    change = missions.values(show)
+    monkeypatch.setattr(time, "monotonic", lambda: float(next(looks)))
+    with pytest.raises(UserError, match="the mission has not ended after 8 s"):
+        missions.run(show, change, lambda: False)
+    assert next(looks) == changed_missions.LONGEST_S + 2
+    missions.close()
 
 
 def values(**changed: object) -> dict[str, Any]:

@@ -15,8 +15,9 @@ import pytest
 
 import tandem
 from compose import extras
-from compose.audit.rules import audit
+from compose.audit.rules import audit_run
 from compose.recording.estimating.estimate_rows import PoseEstimateRow
+from compose.recording.run import read
 from compose.recording.summary_json import summary
 from compose.recording.ticks_csv import rows
 from tandem.columns import Table
@@ -69,7 +70,7 @@ def test_a_run_in_one_process_has_everything_that_a_recording_has(run: tandem.Ru
     opened = tandem.open(recording)
     for name in TABLES:
         assert same(getattr(run, name), getattr(opened, name)), name
-    assert run.audit() == opened.audit() == audit(recording)
+    assert run.audit() == opened.audit() == audit_run(read(recording))
     assert run.audit().violations == ()
     assert opened.mode == "processes"
     assert opened.wall_s is not None

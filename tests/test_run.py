@@ -295,6 +295,20 @@ def test_a_closed_output_is_one_line_and_no_traceback() -> None:
     assert ended.err == "tandem run: cannot continue: No space left on device\n"
 
 
+def test_the_version_on_a_full_disk_is_one_line_and_no_traceback() -> None:
+    with Path("/dev/full").open("wb") as full, TandemProcess("--version", terminal=full.fileno()) as run:
+        ended = run.ended()
+    assert (ended.status, ended.err) == (3, "tandem: cannot continue: No space left on device\n")
+
+
+def test_a_mistake_has_its_exit_status_where_it_cannot_be_printed(tmp_path: Path) -> None:
+    with (
+        Path("/dev/full").open("wb") as full,
+        TandemProcess("audit", tmp_path, errors=full.fileno()) as audit,
+    ):
+        assert audit.ended().status == 2
+
+
 def test_a_world_with_a_closed_output_does_not_blame_its_journal(tmp_path: Path) -> None:
     options = ("--listen", free_endpoint(), "--out", tmp_path / "out")
     with (

@@ -517,7 +517,7 @@ def test_ctrl_c_ends_a_page_that_is_open_in_a_browser(paper_1: Path) -> None:
         connection.request("GET", "/api/news?show=paper-1")
         assert connection.getresponse().readline().startswith(b"data: ")
         command.tell(SIGINT)
-        assert command.ended().status == 0
+        assert command.ended().status == 130
         assert command.err == ""
         connection.close()
 

@@ -11,7 +11,7 @@ import msgspec
 from msgspec.structs import asdict
 
 from protocol.attack import Attack
-from protocol.messages import Member, RobotConfig, RobotConfigInGroup, RobotConfigWithOptions
+from protocol.messages import Member, Retry, RobotConfig, RobotConfigInGroup, RobotConfigWithOptions
 from protocol.mission import Anchor, Mission, Options, PlannerName, Role
 from protocol.motion import Pose
 from protocol.orbits import Rendezvous
@@ -51,6 +51,10 @@ class RobotSpec(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fie
     """The false data that the robot injects into its Reports; None for an honest robot."""
 
 
+GIVES_UP = 0.97
+"""The time at which a robot that no meeting has localised gives up, as a fraction of that of `max_ticks`."""
+
+
 class PlannedMeeting(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """A meeting of two robots of a group, after which both are localised."""
 
@@ -60,6 +64,21 @@ class PlannedMeeting(msgspec.Struct, frozen=True, array_like=True, forbid_unknow
     """The robot that waits beside its anchor, with the role b."""
     ends: Time
     """The bound in s of the time at which both are localised."""
+
+
+class PlannedRetry(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """A meeting of two robots of a group that takes place if neither is localised by then."""
+
+    visitor: RobotId
+    """The robot that searches for the other one, with the role a."""
+    visited: RobotId
+    """The robot that waits beside its anchor, with the role b."""
+    rendezvous: Rendezvous
+    """The orbits of both robots."""
+    begins: Time
+    """The time in s at which it begins."""
+    lasts: Time
+    """The bound in s of the time until both are localised."""
 
 
 class Scenario(
@@ -178,10 +197,27 @@ class Scenario(
                 planner_options=self.planner_options,
                 members=self.members,
                 visits=tuple(visits),
+                retries=self._retries_of(own.id),
+                gives_up=self.max_ticks * self.mission.period * GIVES_UP,
             )
         if not self.planner_options:
             return config
         return RobotConfigWithOptions(**asdict(config), planner_options=self.planner_options)
+
+    @property
+    def retries(self) -> tuple[PlannedRetry, ...]:
+        """The meetings with which a group tries again; here, none."""
+        return ()
+
+    def _retries_of(self, robot: str) -> tuple[Retry, ...]:
+        """Return the meetings in which `robot` tries again."""
+        found = []
+        for one in self.retries:
+            if one.visitor == robot:
+                found.append(Retry(one.visited, "a", one.rendezvous, one.begins, one.lasts))
+            elif one.visited == robot:
+                found.append(Retry(one.visitor, "b", one.rendezvous, one.begins, one.lasts))
+        return tuple(found)
 
     @cached_property
     def members(self) -> tuple[Member, ...]:
@@ -224,6 +260,8 @@ class ScenarioOfGroup(
 
     meetings: tuple[PlannedMeeting, ...] = ()
     """The meetings, in the order in which they end."""
+    retries: tuple[PlannedRetry, ...] = ()
+    """The meetings with which the group tries again, in the order in which they begin."""
 
 
 RecordedScenario = Scenario | ScenarioWithWorldNoise | ScenarioWithOptions | ScenarioOfGroup

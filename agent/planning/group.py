@@ -5,7 +5,8 @@ determine their poses from the logs and ranges of the two of them alone, so no r
 another one has concluded, and no measurement counts twice.
 
 Nobody leads. Each robot follows the meetings of its configuration. One that has made its visits goes to
-those that should be localised by then and have not reported it; one that waits meets whoever comes.
+those that should be localised by then and have not reported it; one that waits meets whoever comes. If the
+first pair has failed, another one meets in its place.
 """
 
 from __future__ import annotations
@@ -21,20 +22,26 @@ from agent.planning import exchange, phase2_orbit, transitions
 from agent.planning.log_exchange import LogPlanner
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Travelling
 from agent.planning.planner import Planner, Summary
-from agent.planning.state import Done, RobotState
+from agent.planning.state import MODE_NAMES, Done, RobotState
 from protocol.messages import (
     Command,
     Estimate,
     Localised,
+    Member,
     Observation,
     Ranged,
     Report,
     RobotConfig,
     RobotConfigInGroup,
+    Undecided,
     Verdict,
 )
 from protocol.mission import Mission, Role
 from protocol.motion import ORIGIN, Pose, compose, inverse
+from protocol.orbits import Rendezvous
+
+TRAVELLING = MODE_NAMES[Travelling]
+"""The mode of a robot that is localised, and drives to another one."""
 
 SHORT_OF_ANCHOR = 0.5
 """The distance from the visited robot's anchor at which a visitor stops, as a fraction of R.
@@ -59,9 +66,6 @@ SIDES = 12
 With exact sensors, a robot that is not in range at the end of the way is not there.
 """
 
-GIVE_UP = 2.9
-"""The time after which a robot that no meeting has localised gives up, in planned bounds of the group."""
-
 
 class Other(msgspec.Struct, frozen=True):
     """What a robot knows of another one of its group, besides the logs of their present meeting."""
@@ -70,8 +74,10 @@ class Other(msgspec.Struct, frozen=True):
     """The ranges to it."""
     localised: bool = False
     """True once it has reported that it is localised."""
-    avoided: bool = False
-    """True once a meeting with it has failed, or a search for it: this robot does not visit it again."""
+    failed: bool = False
+    """True once a meeting with it has failed: this robot does not meet it again."""
+    missed: int | None = None
+    """The latest tick in which this robot has not found it where it should wait; None if there is none."""
 
 
 class GroupState(msgspec.Struct, frozen=True):
@@ -81,10 +87,16 @@ class GroupState(msgspec.Struct, frozen=True):
     """The state in the present meeting. Its configuration names the peer and the role."""
     visits: int = 0
     """The number of planned visits that the robot has begun or left out."""
+    retries: int = 0
+    """The number of retries whose time has come."""
+    until: float | None = None
+    """The time in s at which the search of a retry ends; None if there is none."""
     visiting: bool = False
     """True if the present meeting is a visit: the robot knows its pose already."""
     verdict: Verdict | None = None
     """The verdict of the robot: that of the meeting which localised it."""
+    failure: Verdict | None = None
+    """The verdict of the latest meeting that has failed before the robot was localised."""
     frame: Pose = ORIGIN
     """The pose in <W> of the odometry's frame, from the latest meeting in which the robot was localised."""
     others: Mapping[str, Other] = {}
@@ -133,6 +145,8 @@ class GroupPlanner(Planner[GroupState, Report]):
     def observe(self, state: GroupState, observation: Observation) -> GroupState:
         """Return `state` with the sensor data of one tick, ranges to all robots of the group included."""
         pair = self._pair.observe(state.pair, observation)
+        if pair.in_contact and _refused(state, pair.config.peer):
+            pair = replace(pair, in_contact=False)
         for contact in observation.contacts:
             if contact.peer != pair.config.peer and contact.range is not None:
                 known = state.other(contact.peer)
@@ -158,10 +172,11 @@ class GroupPlanner(Planner[GroupState, Report]):
     def decide(self, state: GroupState, reports: Sequence[Report] = ()) -> GroupState:
         """Return `state` with the `reports` of others, and in the next meeting if this one has ended."""
         for one in reports:
-            if exchange.is_without_log(one) and isinstance(one.verdict, Localised):
+            without_log = exchange.is_without_log(one)
+            if one.state == TRAVELLING or (without_log and isinstance(one.verdict, Localised)):
                 state = state.with_other(one.robot, replace(state.other(one.robot), localised=True))
         logs = [one for one in reports if not exchange.is_without_log(one)]
-        state = _answering(state, [one.robot for one in logs])
+        state = _answering(state, [one.robot for one in logs if one.state == TRAVELLING])
         peer, before = state.pair.config.peer, state.pair
         of_peer = [] if _refused(state, peer) else [one for one in logs if one.robot == peer]
         pair = self._pair.decide(before, of_peer)
@@ -216,22 +231,22 @@ class GroupPlanner(Planner[GroupState, Report]):
 # --- meetings -----------------------------------------------------------------------------------------
 
 
-def _answering(state: GroupState, callers: Sequence[str]) -> GroupState:
-    """Return `state` in a meeting with one of `callers`, robots that send their logs, if it waits for one."""
+def _answering(state: GroupState, visitors: Sequence[str]) -> GroupState:
+    """Return `state` in a meeting with one of `visitors`, which have come to it, if it waits for one."""
     pair = state.pair
-    if state.verdict is not None or pair.belief.phase1_done_tick is None or pair.config.peer in callers:
+    if state.verdict is not None or pair.belief.phase1_done_tick is None or pair.config.peer in visitors:
         return state
     if pair.in_contact and not _refused(state, pair.config.peer) and state.silence <= SILENT_AFTER:
         return state
-    for caller in callers:
-        if not _refused(state, caller):
-            return _waiting(state, caller)
+    for visitor in visitors:
+        if not _refused(state, visitor):
+            return _waiting(state, visitor)
     return state
 
 
 def _refused(state: GroupState, robot: str) -> bool:
     """Return whether this robot, which is not localised, has had a meeting with `robot` that failed."""
-    return state.verdict is None and state.other(robot).avoided
+    return state.verdict is None and state.other(robot).failed
 
 
 def _onward(state: GroupState) -> GroupState:
@@ -242,13 +257,16 @@ def _onward(state: GroupState) -> GroupState:
     if state.visiting and pair.verdict is None:
         if state.other(peer).localised:  # by another robot
             return _next_visit(state)
-        if _has_searched(state) or state.silence > SILENT_AFTER:
-            return _next_visit(_avoiding(state, peer))
+        if _has_searched(state):
+            known = replace(state.other(peer), missed=pair.tick)
+            return _next_visit(state.with_other(peer, known))
+        if state.silence > SILENT_AFTER:
+            return _next_visit(_after_meeting(state))
         return state
     if not isinstance(pair.mode, Done):
         return state
     if not isinstance(pair.verdict, Localised):
-        return _next_visit(_avoiding(state, peer))
+        return _next_visit(_after_meeting(state))
     over = pair.peer_state.verdict is not None or state.unmet >= PARTED_AFTER
     return _next_visit(state) if over else state
 
@@ -256,21 +274,46 @@ def _onward(state: GroupState) -> GroupState:
 def _after_failure(state: GroupState) -> GroupState:
     """Return `state`, of a robot that is not localised: if its meeting has failed, it waits for another one.
 
-    It gives up after GIVE_UP, with the verdict of the meeting; at once if its own phase 1 has failed.
+    It gives up in the end, with the verdict of its latest meeting; at once if its own phase 1 has failed.
     """
-    pair = state.pair
-    if pair.verdict is None:
-        return state
-    bound = max(one.ends for one in state.config.members)
-    late = pair.tick * pair.config.mission.period >= GIVE_UP * bound
-    if late or pair.belief.phase1_done_tick is None:
+    pair, config = state.pair, state.config
+    if pair.belief.phase1_done_tick is None:
         return replace(state, verdict=pair.verdict)
-    return _waiting(_avoiding(state, pair.config.peer), pair.config.peer)
+    now = _now(pair)
+    if now >= config.gives_up:
+        late = Undecided(f"not localised after {now:g} s")
+        return replace(state, verdict=pair.verdict or state.failure or late)
+    if pair.verdict is not None:
+        state = _waiting(_after_meeting(replace(state, failure=pair.verdict)), config.peer)
+    elif state.until is not None and now >= state.until and not pair.in_contact:
+        state = _waiting(replace(state, until=None), config.peer)
+    return _trying_again(state)
 
 
-def _avoiding(state: GroupState, robot: str) -> GroupState:
-    """Return `state` of a robot that does not meet `robot` again."""
-    return state.with_other(robot, replace(state.other(robot), avoided=True))
+def _trying_again(state: GroupState) -> GroupState:
+    """Return `state` of a robot that is not localised, in the retry whose time has come."""
+    pair, config = state.pair, state.config
+    if state.retries >= len(config.retries) or _now(pair) < config.retries[state.retries].begins:
+        return state
+    retry = config.retries[state.retries]
+    state = replace(state, retries=state.retries + 1)
+    if (pair.in_contact and not _refused(state, config.peer)) or _refused(state, retry.peer):
+        return state
+    if retry.role == "b":
+        return _waiting(state, retry.peer)
+    until = _now(pair) + retry.lasts
+    return replace(_aligned(_in_meeting(state, retry.peer, "a", retry.rendezvous)), until=until)
+
+
+def _now(pair: RobotState) -> float:
+    """Return the time since tick 0 in s."""
+    return pair.tick * pair.config.mission.period
+
+
+def _after_meeting(state: GroupState) -> GroupState:
+    """Return `state` of a robot whose meeting has failed, and which does not meet its peer again."""
+    peer = state.config.peer
+    return state.with_other(peer, replace(state.other(peer), failed=True))
 
 
 def _waiting(state: GroupState, peer: str) -> GroupState:
@@ -280,6 +323,12 @@ def _waiting(state: GroupState, peer: str) -> GroupState:
     pair = state.pair
     if isinstance(before, Orbiting | Aligning | Radial):
         return replace(state, pair=replace(pair, mode=before))
+    return _aligned(state)
+
+
+def _aligned(state: GroupState) -> GroupState:
+    """Return `state` on the way to its orbit or its waiting place."""
+    pair = state.pair
     mu = phase2_orbit.orientation(pair.local_pose)
     return replace(state, pair=transitions.continue_phase2(pair, Aligning(pair.odometry.heading - mu)))
 
@@ -293,19 +342,28 @@ def _next_visit(state: GroupState) -> GroupState:
     while visits < len(config.visits):
         peer = config.visits[visits]
         visits += 1
-        if not (state.other(peer).localised or state.other(peer).avoided):
+        if not (state.other(peer).localised or state.other(peer).failed):
             return _on_visit(replace(state, visits=visits), peer)
-    time = state.pair.tick * config.mission.period
     here = compose(state.frame, state.pair.odometry)
     late = [
         (math.hypot(one.anchor.x - here.x, one.anchor.y - here.y), one.robot)
         for one in config.members
-        if one.robot != config.robot
-        and one.ends < time
-        and not (state.other(one.robot).localised or state.other(one.robot).avoided)
+        if one.robot != config.robot and _is_late(state, one)
     ]
     state = replace(state, visits=visits)
     return _on_visit(state, min(late)[1]) if late else state
+
+
+def _is_late(state: GroupState, member: Member) -> bool:
+    """Return whether `member` should be localised by now, and may still wait for a visitor.
+
+    A robot that was not there is visited again after as long as the whole plan takes.
+    """
+    known, now, config = state.other(member.robot), _now(state.pair), state.config
+    if known.localised or known.failed or now <= member.ends:
+        return False
+    period = config.mission.period
+    return known.missed is None or now - known.missed * period > max(one.ends for one in config.members)
 
 
 def _on_visit(state: GroupState, peer: str) -> GroupState:
@@ -315,14 +373,14 @@ def _on_visit(state: GroupState, peer: str) -> GroupState:
     return replace(state, pair=pair, visiting=True)
 
 
-def _in_meeting(state: GroupState, peer: str, role: Role) -> GroupState:
+def _in_meeting(state: GroupState, peer: str, role: Role, orbits: Rendezvous | None = None) -> GroupState:
     """Return `state` in a new meeting with `peer`, of which the robot knows only its ranges to it."""
     pair = state.pair
     before = state.other(pair.config.peer)
     state = state.with_other(pair.config.peer, replace(before, mutual=pair.mutual))
     belief = pair.belief
     fresh = RobotState(
-        state.config.in_meeting(peer, role),
+        state.config.in_meeting(peer, role, orbits),
         tick=pair.tick,
         odometry=pair.odometry,
         log=pair.log,

@@ -186,7 +186,7 @@ class AgentJournalReading:
             case Report() | PlannerReport() if (
                 message.robot == self.config.robot
                 and is_now
-                and len(step.get("reports", ())) < len(step["observation"].contacts)
+                and len(step.get("reports", ())) < max(1, len(step["observation"].contacts))
             ):
                 step["reports"] = (*step.get("reports", ()), FramedReport(message, frame))
             case DeadlineMissed() if is_open and is_now:

@@ -51,6 +51,8 @@ def _answers(replayed: Robot, robot: str, step: Step, *, cut: bool) -> Checks:
         yield _same(tick, robot, found.report, found.frame, expected.frame)
     if len(step.reports) < len(reports) and not (cut and step.command is None):
         yield Violation("decision", tick, robot, "it sent no Report, expected one")
+    if len(step.reports) > len(reports):
+        yield Violation("decision", tick, robot, "it sent a Report, expected none: no peer is in contact")
     if step.command is not None:
         yield _same(tick, robot, step.command, step.command_frame, replayed.command_frame)
     if step.estimate is not None:

@@ -7,8 +7,6 @@ something. In hardware mode, only the agents' journals are replayed.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import msgspec
 
 from compose.audit.agent_rules import decision
@@ -17,7 +15,7 @@ from compose.audit.delivery_rules import contact, observation, report
 from compose.audit.findings import Violation
 from compose.audit.journal_rules import config, order
 from compose.audit.rules import Rules, audit_run
-from compose.recording.run import Run, read
+from compose.recording.run import Run
 
 RULES: Rules = (config, observation, contact, report, decision, order, outcome)
 """The rules of a replay, in the order of a tick: the first difference is the cause of later ones."""
@@ -43,18 +41,11 @@ class Replay(msgspec.Struct, frozen=True):
     """Description of how those versions differ from the ones of this process; None if they do not."""
 
 
-def replay(folder: Path) -> tuple[Replay, dict[str, int]]:
-    """Replay the recording in `folder`; return the result, and the torn bytes at the end of each journal.
-
-    Raises OSError if there is no recording, CorruptJournal if a frame cannot be decoded or is in the journal
-    of another robot.
-    """
-    run = read(folder, audited=True)
-    return replayed(run), {name: journal.torn for name, journal in run.journals.items()}
-
-
 def replayed(run: Run) -> Replay:
-    """Replay `run`, and return the result. Raises CorruptJournal like `replay`."""
+    """Replay `run`, and return the result.
+
+    Raises CorruptJournal if a frame cannot be decoded or is in the journal of another robot.
+    """
     findings = audit_run(run, RULES, HARDWARE_RULES)
     return Replay(
         findings.scenario,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 from compose.audit import scenario_rules
 from compose.audit.agent_rules import decision, limits, log
@@ -14,7 +13,7 @@ from compose.audit.findings import Checks, Findings, findings_of
 from compose.audit.journal_rules import config, order
 from compose.audit.scenario_rules import scenario
 from compose.recording.recording_files import agent_journal
-from compose.recording.run import Run, read
+from compose.recording.run import Run
 from protocol.journal.environment import of_robot, of_world, otherwise
 
 Rules = Sequence[Callable[[Run], Checks]]
@@ -35,15 +34,6 @@ RULES: Rules = (
 HARDWARE_RULES: Rules = (order, scenario_rules.config, report, decision, limits, log)
 """The rules of the audit in hardware mode, where there is no ground truth: the decisions of each robot follow
 from its inputs, and it received what its peer sent."""
-
-
-def audit(folder: Path) -> Findings:
-    """Audit the recording in `folder`, with or without a world's journal, and return the findings.
-
-    Raises OSError if there is no recording. Raises CorruptJournal if a frame cannot be decoded, if it is in
-    the journal of another robot, or if two peers' journals are of different runs.
-    """
-    return audit_run(read(folder, audited=True))
 
 
 def audit_run(run: Run, rules: Rules = RULES, hardware_rules: Rules = HARDWARE_RULES) -> Findings:

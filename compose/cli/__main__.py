@@ -1,9 +1,10 @@
 """The entry point of the program `tandem`."""
 
+import os
 import signal
 
-for _number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-    signal.signal(_number, signal.SIG_DFL)  # until a command sets its handlers, end without a traceback
+for _number in (signal.SIGINT, signal.SIGTERM):
+    signal.signal(_number, lambda *_: os._exit(130))  # until `main`, end without a traceback
 
 from compose.cli.main import main  # noqa: E402  # after the lines above, because it takes time
 

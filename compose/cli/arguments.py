@@ -28,14 +28,16 @@ def add_closing(parser: ArgumentParser, example: str, page: str) -> None:
 
 def add_scenario(parser: ArgumentParser) -> None:
     """Add one scenario and its seed, and the flags that change it."""
-    parser.add_argument("scenario", metavar="SCENARIO", help=SCENARIO_HELP)
+    parser.add_argument("scenario", type=source, metavar="SCENARIO", help=SCENARIO_HELP)
     parser.add_argument("--seed", type=natural, metavar="N", help=f"{SEED_HELP} [default: the scenario's]")
     add_scenario_flags(parser)
 
 
 def add_scenarios(parser: ArgumentParser) -> None:
     """Add one or several scenarios and seeds, and the flags that change them."""
-    parser.add_argument("scenario", metavar="SCENARIO", nargs="+", help=f"{SCENARIO_HELP}; or several")
+    parser.add_argument(
+        "scenario", type=source, metavar="SCENARIO", nargs="+", help=f"{SCENARIO_HELP}; or several"
+    )
     parser.add_argument(
         "--seed",
         type=seeds,
@@ -220,6 +222,13 @@ def add_port(parser: ArgumentParser) -> None:
 
 
 # --- types ------------------------------------------------------------------------------------------
+
+
+def source(text: str) -> str:
+    """Return the name of a scenario or the path of a file. Raises ArgumentTypeError."""
+    if not text:
+        raise ArgumentTypeError("'' is neither a name nor a path")
+    return text
 
 
 def folder(text: str) -> Path:

@@ -7,8 +7,9 @@ import argparse
 from msgspec.structs import astuple
 
 from compose.audit.findings import Findings, LinkStatistics
-from compose.audit.rules import audit
+from compose.audit.rules import audit_run
 from compose.cli.arguments import add_closing, add_recording, add_trusted_planner
+from compose.cli.recording import read_noted
 from compose.errors import CLEAN, VIOLATED
 from compose.launch.planner_loader import trust
 from compose.recording.recording_files import user_errors
@@ -31,7 +32,7 @@ def main(options: argparse.Namespace) -> int:
     for name in options.planner:
         trust(name)
     with user_errors(options.recording):
-        findings = audit(options.recording)
+        findings = audit_run(read_noted(options.recording, "audit", audited=True))
     _show(findings)
     return VIOLATED if findings.violations else CLEAN
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from compose.cli.arguments import add_closing, add_part_of_recording, folder, names
-from compose.errors import ENDED, UserError
+from compose.errors import ENDED, CannotWrite, UserError
 from protocol import files
 from protocol.output import say
 
@@ -70,7 +70,7 @@ def main(options: argparse.Namespace) -> int:
     try:
         files.write(path, text)
     except OSError as error:
-        raise UserError(f"--out: {path} cannot be written: {error.strerror or error}") from None
+        raise CannotWrite(f"--out: {path}", error) from None
     say(str(path))
     return ENDED
 

@@ -62,6 +62,6 @@ def main(options: argparse.Namespace) -> int:
             say(*text_width.wrapped(one_line(line), MARKED))
             failed |= one.wrong is not None
     except Interrupted as signal_name:
-        say(f"stopped by {signal_name}", error=True)
+        say(f"tandem check-planner: stopped by {signal_name}", error=True)
         return STOPPED
     return VIOLATED if failed else CLEAN

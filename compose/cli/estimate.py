@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from compose.cli.arguments import add_closing, add_part_of_recording, confidence, folder, names, positive
-from compose.errors import ENDED, NOT_LOCALISED, STOPPED, UserError
+from compose.errors import ENDED, NOT_LOCALISED, STOPPED, CannotWrite, UserError
 from compose.extras import need
 from compose.launch.signals import until_signal
-from compose.recording.recording_files import cannot_write, make_folder
+from compose.recording.recording_files import make_folder
 from compose.terminal.outcome import counting
 from protocol.output import say
 
@@ -148,7 +148,7 @@ def _written(out: Path, problem: EstimationProblem, estimate: RecordingEstimate)
     try:
         return [*write_estimate(out, estimate.rows, estimate.summary), *_drawn(out, problem, estimate)]
     except OSError as error:
-        raise UserError(cannot_write(out, error)) from None
+        raise CannotWrite(out, error) from None
 
 
 def _drawn(out: Path, problem: EstimationProblem, estimate: RecordingEstimate) -> list[Path]:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from compose.cli.arguments import add_closing, add_recording, folder
 from compose.cli.export_bar import MODULES, exported
-from compose.errors import ENDED, FAILED, STOPPED, UserError
+from compose.cli.recording import note, read_noted
+from compose.errors import ENDED, FAILED, STOPPED, CannotWrite
 from compose.extras import need
 from compose.launch.signals import stop_by_signal
-from compose.recording.recording_files import cannot_write, make_folder, user_errors
-from compose.recording.run import read
+from compose.recording.recording_files import make_folder, user_errors
 from protocol import files
 from protocol.network.inbox import Inbox, Interrupted
 from protocol.output import say
@@ -66,9 +66,9 @@ def main(options: argparse.Namespace) -> int:
     if options.html:
         return _html(options.recording, out)
     if options.gif:
-        return _gif(options.recording, out)
+        return _film(options.recording, out, "gif")
     if options.mp4:
-        return _mp4(options.recording, out)
+        return _film(options.recording, out, "mp4")
     if options.rerun:
         return _rerun(options.recording, out)
     need(*MODULES)
@@ -82,9 +82,9 @@ def main(options: argparse.Namespace) -> int:
     for path in done.files:
         say(str(path))
     for name, size in done.torn.items():
-        say(f"{name} ends with {size} bytes of a torn write", error=True)
+        note("export", [f"{name} ends with {size} bytes of a torn write"])
     for name in done.missing:
-        say(f"{name} is missing", error=True)
+        note("export", [f"{name} is missing"])
     return FAILED if done.missing else ENDED
 
 
@@ -94,7 +94,7 @@ def _pyfg(recording: Path, out: Path) -> int:
     from compose.recording.ranging.run_ranges import ranges_of_run  # noqa: PLC0415
 
     with user_errors(recording):
-        graph = written_pyfg(ranges_of_run(read(recording)))
+        graph = written_pyfg(ranges_of_run(read_noted(recording, "export")))
     say(str(_written(out, "run.pyfg", graph.text)))
     say(", ".join([f"{name} is {letter}" for name, letter in graph.names.items()]))
     return ENDED
@@ -106,26 +106,27 @@ def _html(recording: Path, out: Path) -> int:
 
     page = standalone_page(recording)
     say(str(_written(out, "run.html", page.html)))
-    for note in page.notes:
-        say(note, error=True)
+    note("export", page.notes)
     return ENDED
 
 
-def _gif(recording: Path, out: Path) -> int:
-    """Write run.gif to `out`, and print its path."""
-    need("PIL", "playwright", extra="film")
-    from compose.view.web import film  # noqa: PLC0415  # it imports Zenoh
+def _film(recording: Path, out: Path, kind: str) -> int:
+    """Write run.gif or run.mp4 to `out`, and print its path."""
+    need(*["av"] * (kind == "mp4"), "PIL", "playwright", extra="film")
+    from compose.view.web import film  # noqa: PLC0415  # slow to import, and optional
+    from compose.view.web.standalone import standalone_page  # noqa: PLC0415  # it imports Zenoh
 
-    say(str(_written(out, "run.gif", film.gif(recording))))
-    return ENDED
-
-
-def _mp4(recording: Path, out: Path) -> int:
-    """Write run.mp4 to `out`, and print its path."""
-    need("av", "PIL", "playwright", extra="film")
-    from compose.view.web import film  # noqa: PLC0415  # it imports Zenoh
-
-    say(str(_written(out, "run.mp4", film.mp4(recording))))
+    inbox = Inbox("tandem export")
+    program = film.browser(f"--{kind}")
+    page = standalone_page(recording)
+    note("export", page.notes)
+    stop_by_signal(inbox)
+    try:
+        content = (film.gif if kind == "gif" else film.mp4)(page.html, program, lambda: inbox.next(0.0))
+    except Interrupted as signal_name:
+        inbox.say(f"stopped by {signal_name}")
+        return STOPPED
+    say(str(_written(out, f"run.{kind}", content)))
     return ENDED
 
 
@@ -136,7 +137,7 @@ def _rerun(recording: Path, out: Path) -> int:
     from compose.view.recorded import checked, scenes_of  # noqa: PLC0415
 
     with user_errors(recording):
-        run = read(recording)
+        run = read_noted(recording, "export")
         _, setup = checked(run)
         content = rerun_recording(setup, scenes_of(run))
     say(str(_written(out, "run.rrd", content)))
@@ -149,5 +150,5 @@ def _written(out: Path, name: str, text: str | bytes) -> Path:
     try:
         files.write(out / name, text)
     except OSError as error:
-        raise UserError(cannot_write(out, error)) from None
+        raise CannotWrite(out, error) from None
     return out / name

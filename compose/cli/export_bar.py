@@ -6,8 +6,9 @@ import gc
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from compose.cli.recording import read_noted
 from compose.recording.recording_files import user_errors
-from compose.recording.run import Run, read
+from compose.recording.run import Run
 from compose.terminal.outcome import counting
 from protocol.network.inbox import Inbox
 
@@ -31,6 +32,6 @@ def exported(
     # a process with a run of its own may have sessions and threads, with which a fork is not safe
     alone = run is not None
     with user_errors(folder), counting("tandem export", 0 if quiet else len(FILES)) as done:
-        run = run or read(folder)
+        run = run or read_noted(folder, "export")
         gc.freeze()  # else each garbage collection goes through all messages again
         return export(run, out, done=done, check=lambda: inbox.next(0.0), alone=alone)

@@ -9,14 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from compose.cli.arguments import add_closing, add_recording, add_trusted_planner
-from compose.errors import ENDED, FAILED, UserError
+from compose.cli.recording import read_noted
+from compose.errors import ENDED, FAILED, CannotWrite
 from compose.extras import need
 from compose.figures import FORMATS, PICTURES
 from compose.launch.planner_loader import trust
 from compose.launch.second_process import OutputLine, Task, share
 from compose.recording.meetings import PastMeeting, past_meetings
 from compose.recording.recording_files import agent_journal, user_errors
-from compose.recording.run import Run, read
+from compose.recording.run import Run
 from compose.terminal.outcome import counting
 from protocol.journal.journal_file import CorruptJournal
 from protocol.output import say
@@ -62,7 +63,7 @@ def main(options: argparse.Namespace) -> int:
     for name in options.planner:
         trust(name)
     with user_errors(options.recording):
-        run = read(options.recording)
+        run = read_noted(options.recording, "figures")
     folder, status = options.recording / "figures", ENDED
     kinds = [kind for kind in PICTURES if kind in (options.only or PICTURES)]
     formats = [one for one in FORMATS if one in (options.format or FORMATS)]
@@ -91,7 +92,7 @@ def main(options: argparse.Namespace) -> int:
             except BrokenPipeError:
                 raise
             except OSError as error:
-                raise UserError(f"{folder} cannot be written: {error.strerror or error}") from None
+                raise CannotWrite(folder, error) from None
     return status
 
 

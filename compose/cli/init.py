@@ -9,7 +9,7 @@ from importlib import resources
 from pathlib import Path
 
 from compose.cli.arguments import add_closing, folder
-from compose.errors import ENDED, UserError
+from compose.errors import ENDED, CannotWrite, UserError
 from compose.scenario.json_schema import json_schema
 from compose.scenario.scenario_tables import ScenarioFile
 from compose.sweep.spec import SpecFile
@@ -40,7 +40,7 @@ def main(options: argparse.Namespace) -> int:
         for name, text in content.items():
             files.write(out / name, text)
     except OSError as error:
-        raise UserError(f"{out} cannot be written: {error.strerror or error}") from None
+        raise CannotWrite(out, error) from None
     say(*[str(out / name) for name in content], "", "to go on:")
     say(*[f"  {command}" for command in commands(out)])
     return ENDED

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from compose.cli.arguments import add_closing, days, folder, names
-from compose.errors import ENDED, UserError
+from compose.errors import ENDED, CannotWrite, UserError
 from compose.extras import need
 from protocol.output import say
 
@@ -50,7 +50,7 @@ def main(options: argparse.Namespace) -> int:
     try:
         made, kept = certificates.make(options.folder, options.robots, options.host, options.days)
     except OSError as error:
-        raise UserError(f"{options.folder} cannot be written: {error.strerror or error}") from None
+        raise CannotWrite(options.folder, error) from None
     if made:
         say(f"created, valid for {options.days} days: {', '.join(made)}")
     if kept:

@@ -16,7 +16,8 @@ from functools import cache
 from importlib import import_module
 from typing import NamedTuple, NoReturn, TextIO
 
-from compose.errors import BROKEN_PIPE, BUG, FAILED, USER_ERROR, UserError
+from compose.errors import BROKEN_PIPE, BUG, FAILED, STOPPED, USER_ERROR, UserError
+from compose.launch.interruption import INTERRUPTION
 from protocol import limits
 from protocol.files import error_text
 from protocol.output import one_line, say
@@ -109,31 +110,18 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command in `arguments`, or in sys.argv, and end the process with its exit status."""
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115  # the launching process has closed it
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
-    command, words = _split(sys.argv[1:] if arguments is None else arguments)
+    name = "tandem"
     try:
+        command, words = _split(sys.argv[1:] if arguments is None else arguments)
+        name = f"tandem {command.name}"
+        INTERRUPTION.begin()
         limits.need_memory(limits.START_BYTES, "Tandem")
         options = command_parser(command).parse_all(words)
         status: int = import_module(command.module).main(options)
         sys.stdout.flush()
-    except UserError as error:
-        say(f"tandem {command.name}: {error}", error=True)
-        status = error.exit_status
-    except BrokenPipeError:
-        _discard(sys.stdout)
-        status = BROKEN_PIPE
-    except OSError as error:
-        _discard(sys.stdout)
-        say(f"tandem {command.name}: cannot continue: {error_text(error)}", error=True)
-        status = FAILED
-    except BaseException as error:  # its exit status must differ from those of missions
-        shortage = limits.shortage(error)
-        if shortage is None and not isinstance(error, Exception):
-            raise
-        if shortage is None:
-            say(*traceback.format_exc().splitlines(), error=True)
-        else:
-            say(f"tandem {command.name}: cannot continue: {shortage}", error=True)
-        status = BUG if shortage is None else FAILED
+    except BaseException as error:  # noqa: BLE001  # a bug must have another exit status than a mission
+        status = _status_of(error, name)
+    INTERRUPTION.end()
     forked = sys.modules.get("compose.launch.forked")
     if forked is not None:
         forked.close()
@@ -141,6 +129,34 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     if session is not None:
         session.leave(status)
     sys.exit(status)
+
+
+def _status_of(error: BaseException, command: str) -> int:
+    """Return the exit status of a `command` that ended with `error`, and print why. Raises SystemExit."""
+    INTERRUPTION.end()
+    if INTERRUPTION.signal_name is not None or isinstance(error, KeyboardInterrupt):
+        _discard(sys.stdout)  # a part of a line may be in its buffer
+        _complain(f"{command}: stopped by {INTERRUPTION.signal_name or 'SIGINT'}")
+        return STOPPED
+    match error:
+        case UserError():
+            _complain(f"{command}: {error}")
+            return error.exit_status
+        case BrokenPipeError():
+            _discard(sys.stdout)
+            return BROKEN_PIPE
+        case OSError():
+            _discard(sys.stdout)
+            _complain(f"{command}: cannot continue: {error_text(error)}")
+            return FAILED
+    shortage = limits.shortage(error)
+    if shortage is not None:
+        _complain(f"{command}: cannot continue: {shortage}")
+        return FAILED
+    if not isinstance(error, Exception):
+        raise error
+    _complain(*"".join(traceback.format_exception(error)).splitlines())
+    return BUG
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
@@ -197,6 +213,14 @@ def _command_list() -> str:
         members = [command for command in COMMANDS if command.group == group]
         lines += [f"{group}:", *[f"  {one.name:{width}}  {one.summary}" for one in members], ""]
     return "\n".join(lines).rstrip()
+
+
+def _complain(*lines: str) -> None:
+    """Print `lines` on standard error, if it can be written."""
+    try:
+        say(*lines, error=True)
+    except OSError:  # the exit status must be known all the same
+        _discard(sys.stderr)
 
 
 def _discard(stream: TextIO) -> None:

@@ -10,6 +10,7 @@ from compose.cli import arguments
 from compose.errors import FAILED, STOPPED, UserError
 from compose.launch.signals import stop_by_signal, stop_with_launcher
 from compose.network import beyond, reach
+from compose.recording.recording_files import not_recorded
 from protocol.journal.journal_file import CannotRecord, CorruptJournal, OtherVersion
 from protocol.journal.resume import Retrace
 from protocol.network import session
@@ -60,7 +61,7 @@ def participate(
     except session.CannotListen as error:
         raise UserError(f"--listen: {error}") from None
     except CannotRecord as error:
-        raise UserError(f"--out: {error}") from None
+        raise not_recorded(error) from None
     except OtherVersion as error:
         raise UserError(f"--out: {error.path}: {error.versions}; choose another folder") from None
     except CorruptJournal as error:

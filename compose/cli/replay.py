@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 
 from compose.audit.findings import Violation
-from compose.audit.replay import replay
+from compose.audit.replay import replayed
 from compose.cli.arguments import add_closing, add_recording, add_trusted_planner
+from compose.cli.recording import read_noted
 from compose.errors import CLEAN, VIOLATED
 from compose.launch.planner_loader import trust
 from compose.recording.recording_files import user_errors
@@ -25,30 +26,31 @@ def main(options: argparse.Namespace) -> int:
     for name in options.planner:
         trust(name)
     with user_errors(options.recording):
-        replayed, torn = replay(options.recording)
-    if replayed.differences:
-        first, *more = replayed.differences
-        say(f"{replayed.scenario}: not as recorded")
+        run = read_noted(options.recording, "replay", audited=True)
+        found = replayed(run)
+    if found.differences:
+        first, *more = found.differences
+        say(f"{found.scenario}: not as recorded")
         say(_difference(first))
         if more:
             say(f"and {len(more)} more, which `tandem audit` lists")
-        if replayed.versions is not None:
-            say(f"{replayed.versions}: that alone can lead to other decisions")
-    elif replayed.rounding:
+        if found.versions is not None:
+            say(f"{found.versions}: that alone can lead to other decisions")
+    elif found.rounding:
         say(
-            f"{replayed.scenario}: as recorded but for the last bits, over {replayed.ticks} ticks: "
-            f"{replayed.rounding} of {replayed.checks} checks differ by rounding alone"
+            f"{found.scenario}: as recorded but for the last bits, over {found.ticks} ticks: "
+            f"{found.rounding} of {found.checks} checks differ by rounding alone"
         )
-        say(str(replayed.versions))
+        say(str(found.versions))
     else:
-        counts = f"{replayed.ticks} ticks ({replayed.checks} checks)"
-        say(f"{replayed.scenario}: as recorded, to the bit, over {counts}")
-    for tear in replayed.tears:
+        counts = f"{found.ticks} ticks ({found.checks} checks)"
+        say(f"{found.scenario}: as recorded, to the bit, over {counts}")
+    for tear in found.tears:
         say(f"{_where(tear)}: {tear.what}")
-    for name, size in torn.items():
-        if size:
-            say(f"{name} ends with {size} bytes of a torn write")
-    return VIOLATED if replayed.differences else CLEAN
+    for name, journal in run.journals.items():
+        if journal.torn:
+            say(f"{name} ends with {journal.torn} bytes of a torn write")
+    return VIOLATED if found.differences else CLEAN
 
 
 def _where(found: Violation) -> str:

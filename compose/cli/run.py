@@ -14,10 +14,11 @@ from compose.cli import arguments, export_bar
 from compose.errors import FAILED, STOPPED, UserError
 from compose.extras import need
 from compose.launch import processes, supervisor
+from compose.launch.interruption import INTERRUPTION
 from compose.launch.signals import stop_by_signal
 from compose.launch.viewers import Viewer, foxglove_server, page, stay, viewing
 from compose.recording.kills_file import KILLS
-from compose.recording.recording_files import folder_for
+from compose.recording.recording_files import folder_for, not_recorded
 from compose.recording.run import Run, read
 from compose.scenario.kills import Kill
 from compose.scenario.run_settings import check_rate, run_name
@@ -139,7 +140,10 @@ def _in_process(options: argparse.Namespace, scenario: Scenario, kills: tuple[Ki
         try:
             finished = in_process.run_mission(scenario, folder)
         except CannotRecord as error:
-            raise UserError(f"--out: {error}") from None
+            raise not_recorded(error) from None
+        except KeyboardInterrupt:
+            break_off(options, folder, f"stopped by {INTERRUPTION.signal_name}", began)
+            raise
         status = conclude(options, finished, folder, "in-process", began)
         stop_by_signal(inbox)
         return _after_outcome(options, folder, viewers, inbox, status)

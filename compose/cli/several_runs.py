@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from compose.errors import FAILED, STOPPED, UserError
-from compose.launch.signals import end_by_signal
+from compose.launch.interruption import INTERRUPTION
 from compose.recording.summary_json import outcome_line
 from compose.scenario.scenario_file import setting
 from protocol.output import say
@@ -39,7 +39,7 @@ def run_all(
         results: list[Mapping[str, Any]] = []
         out: Path | None = options.out / name if options.out is not None else None
         one = {"scenario": source, "seed": seed, "out": out, "results": results, "export": False}
-        end_by_signal()
+        INTERRUPTION.begin()
         statuses.append(run_one(argparse.Namespace(**{**vars(options), **one})))
         if options.quiet:
             say(*[f"{name}: {outcome_line(result)}" for result in results])

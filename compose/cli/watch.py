@@ -20,7 +20,8 @@ from compose.cli.arguments import (
     address,
     folder,
 )
-from compose.errors import ENDED, UserError
+from compose.cli.recording import note
+from compose.errors import ENDED, STOPPED, UserError
 from compose.extras import need
 from compose.launch.viewers import OVER
 from protocol.output import say
@@ -73,8 +74,7 @@ def main(options: argparse.Namespace) -> int:
         raise UserError(f"{flag}: a recording needs no network; give either DIR or {flag}")
     else:
         shown = _recorded(options.recording, options.launched)
-    for note in shown.notes:
-        say(f"tandem watch: {note}", error=True)
+    note("watch", shown.notes)
     try:
         taken = server.bound(options.port or 0, options.address)
     except server.CannotServe as error:
@@ -97,7 +97,7 @@ def main(options: argparse.Namespace) -> int:
         server.serve(shown, taken, ready)
     finally:
         shown.stop()
-    return ENDED
+    return ENDED if options.launched else STOPPED  # alone, only a signal ends it
 
 
 def _recorded(folders: Sequence[Path], launched: bool) -> Site:

@@ -16,8 +16,8 @@ from typing import NamedTuple, NoReturn
 
 import msgspec
 
+from compose.launch.interruption import STOPPING
 from compose.launch.parent_end import end_with_parent
-from compose.launch.signals import STOPPING
 
 NUMBER = struct.Struct("<H")
 """The number of a task in the pipe from which both processes take the next one."""

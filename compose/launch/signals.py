@@ -8,10 +8,8 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
+from compose.launch.interruption import STOPPING
 from protocol.network.inbox import Inbox
-
-STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""The signals that stop a command."""
 
 
 def stop_with_launcher(inbox: Inbox) -> None:
@@ -25,24 +23,19 @@ def stop_with_launcher(inbox: Inbox) -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-def end_by_signal() -> None:
-    """Let SIGINT, SIGTERM and SIGHUP end the process at once and without output, until `stop_by_signal`."""
-    for number in STOPPING:
-        signal.signal(number, signal.SIG_DFL)
-
-
 def stop_by_signal(inbox: Inbox) -> None:
     """Put "stop" into `inbox` on SIGINT, SIGTERM and SIGHUP, from now until the process ends.
 
-    Before this call, such a signal ends the process at once and without output. The handlers are not
-    removed after a run, so that a signal cannot interrupt the output and the files at the end of a run.
+    Before this call, such a signal raises an error (see `interruption`). The handlers are not removed after a
+    run, so that a signal cannot interrupt the output and the files at the end of a run.
     """
 
     def hand_over(number: int, _frame: object) -> None:
         inbox.put("stop", signal.Signals(number).name)
 
     for number in STOPPING:
-        signal.signal(number, hand_over)
+        if number == signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
+            signal.signal(number, hand_over)
 
 
 @contextmanager

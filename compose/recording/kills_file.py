@@ -56,13 +56,28 @@ def add_kill(folder: Path, kill: Kill) -> None:
         file.write(msgspec.json.encode(killed) + b"\n")
 
 
-def kills_in(folder: Path) -> tuple[Killed, ...]:
+def kills_in(folder: Path) -> tuple[tuple[Killed, ...], str | None]:
     """Return the processes that were killed in the run recorded in `folder`, in the order of the file.
+
+    If the file cannot be read, there are none, and the second value is a line for the user that says why: the
+    recording is complete without it.
+    """
+    path = folder / KILLS
+    try:
+        return _listed(path), None
+    except OSError as error:
+        why = f"{path}: {error.strerror or error}"
+    except CorruptJournal as error:
+        why = str(error)
+    return (), f"{why}; the recording is read without the processes that were killed"
+
+
+def _listed(path: Path) -> tuple[Killed, ...]:
+    """Return the processes in the file at `path`; none if there is no file.
 
     Raises OSError if the file cannot be read, and CorruptJournal if a line is not that of a process or there
     are more than MOST_BYTES.
     """
-    path = folder / KILLS
     try:
         with files.open_file(path) as file:
             content = file.read(MOST_BYTES + 1)

@@ -11,9 +11,9 @@ from typing import Any
 
 import msgspec
 
-from compose.errors import UserError
+from compose.errors import FAILED, FULL_DISK, CannotWrite, UserError
 from protocol.journal import journal_file
-from protocol.journal.journal_file import CorruptJournal
+from protocol.journal.journal_file import CannotRecord, CorruptJournal
 from protocol.messages import OfRobot
 from world.scenario import RecordedScenario
 
@@ -56,12 +56,15 @@ def make_folder(out: Path) -> None:
         with tempfile.TemporaryFile(dir=out):
             pass
     except OSError as error:
-        raise UserError(cannot_write(out, error)) from None
+        raise CannotWrite(out, error) from None
 
 
-def cannot_write(out: Path, error: OSError) -> str:
-    """Return the message for the user that `out` cannot be written."""
-    return f"--out: {out} cannot be written: {error.strerror or error}"
+def not_recorded(error: CannotRecord) -> UserError:
+    """Return the error for the user that a journal in the folder `--out` cannot be written."""
+    found = UserError(f"--out: {error}")
+    if error.errno in FULL_DISK:
+        found.exit_status = FAILED
+    return found
 
 
 class JournalFile(msgspec.Struct, frozen=True):

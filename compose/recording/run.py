@@ -65,6 +65,8 @@ class Run(msgspec.Struct, frozen=True, dict=True):
     """The folder of the journals, for errors."""
     kills: tuple[Killed, ...] = ()
     """The processes that were killed in the run."""
+    notes: tuple[str, ...] = ()
+    """One line for each file other than a journal that cannot be read, and is ignored."""
     claim_estimates: dict[str, Estimate] = {}
     """The Estimate of each robot at its first claim, if the run took place in this process."""
 
@@ -314,16 +316,18 @@ def ended(outcome: Outcome, ticks: int, reason: str | None) -> str:
 def read(folder: Path, *, audited: bool = False) -> Run:
     """Return the run recorded in `folder`.
 
-    Raises OSError if there is no recording, or if the world's journal or the list of killed processes cannot
-    be read. Raises CorruptJournal if one of these two is damaged before its end; if the world's journal has a
-    frame out of order, unless the run is to be `audited`; or if there is no world's journal and two peers'
-    journals are of different runs.
+    A damaged list of killed processes is ignored, and is one of the notes.
+
+    Raises OSError if there is no recording, or if the world's journal cannot be read. Raises CorruptJournal
+    if the world's journal is damaged before its end; if it has a frame out of order, unless the run is to be
+    `audited`; or if there is no world's journal and two peers' journals are of different runs.
     """
     paths = journals_in(folder) or [folder / WORLD_JOURNAL]
     run = of_journals({path.name: opened(path) for path in paths}, folder)
     if not audited and run.world is not None and run.world.unexpected is not None:
         raise CorruptJournal(f"{folder / WORLD_JOURNAL}: {run.world.unexpected.what}")
-    return replace(run, kills=kills_in(folder))
+    kills, note = kills_in(folder)
+    return replace(run, kills=kills, notes=(note,) if note is not None else ())
 
 
 def of_frames(

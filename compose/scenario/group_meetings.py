@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from itertools import permutations
 from typing import NamedTuple
 
 from compose.errors import Unworkable
@@ -12,13 +13,19 @@ from compose.scenario.group_plan import group_plan
 from compose.scenario.scenario_tables import PlannerTable, RobotTable
 from protocol.mission import Mission, Role
 from protocol.orbits import Rendezvous, meeting_ticks, pair_ticks, visiting
-from world.scenario import PlannedMeeting
+from world.scenario import PlannedMeeting, PlannedRetry
 
 PLANNERS = ("assured",)
 """The planners with which robots can form a group."""
 
 NEIGHBOURS = 3
 """The number of nearest anchors among which a robot's first peer is chosen, in a large group."""
+
+RETRIES = 2
+"""The number of pairs that try again, one after the other. For three robots, there are no others."""
+
+SLOWER = 2.0
+"""The time for the visits after them, in units of the planned one: robots are not where they were planned."""
 
 LARGE = 12
 """The number of robots from which on a group is large."""
@@ -41,6 +48,10 @@ class GroupMeetings(NamedTuple):
     """The first meeting of each robot."""
     bound: float
     """The bound in s of the time at which all robots are localised."""
+    retries: tuple[PlannedRetry, ...]
+    """The meetings with which the group tries again if a first meeting has failed."""
+    latest: float
+    """The bound in s of the time at which the last of these has localised all robots that can be."""
 
 
 def group_meetings(robots: Sequence[RobotTable], mission: Mission, planner: PlannerTable) -> GroupMeetings:
@@ -76,7 +87,40 @@ def group_meetings(robots: Sequence[RobotTable], mission: Mission, planner: Plan
             orbits = rendezvous(one.visitor, one.visited)
             first[a] = FirstMeeting(b, "a", orbits)
         first[b] = FirstMeeting(a, "b", orbits)
-    return GroupMeetings(planned, first, plan.bound)
+    seeds = [(one.visitor, one.visited) for one in plan.meetings if one.first]
+    spread = plan.bound - min(one.ends for one in plan.meetings if one.first)
+    begins, retries = plan.bound + SLOWER * spread, []
+    for i, j in _retried(seeds, len(robots), pair_time):
+        lasts = pair_time(i, j)
+        retries.append(PlannedRetry(ids[i], ids[j], rendezvous(i, j), begins, lasts))
+        begins += lasts + SLOWER * spread
+    return GroupMeetings(planned, first, plan.bound, tuple(retries), begins)
+
+
+def _retried(
+    seeds: Sequence[tuple[int, int]], robots: int, pair_time: Callable[[int, int], float]
+) -> list[tuple[int, int]]:
+    """Return the pairs that try again one after the other: robots that have been in few, then quick ones.
+
+    After one failure, one of the first two of them has two robots without it.
+    """
+    uses = [sum([robot in pair for pair in seeds]) for robot in range(robots)]
+    tried = {frozenset(pair) for pair in seeds}
+    found: list[tuple[int, int]] = []
+    while len(found) < RETRIES:
+        left = [
+            (uses[a] + uses[b], pair_time(a, b), a, b)
+            for a, b in permutations(range(robots), 2)
+            if frozenset((a, b)) not in tried and pair_time(a, b) < math.inf
+        ]
+        if not left:
+            break
+        _, _, a, b = min(left)
+        found.append((a, b))
+        tried.add(frozenset((a, b)))
+        uses[a] += 1
+        uses[b] += 1
+    return found
 
 
 def _neighbours(anchors: Sequence[tuple[float, float]]) -> list[set[int]]:

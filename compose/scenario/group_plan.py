@@ -29,7 +29,7 @@ class GroupPlan(msgspec.Struct, frozen=True):
     """The meetings that localise a group, each robot's in order."""
 
     meetings: tuple[PlannedVisit, ...]
-    """In the order of their ends."""
+    """The meetings in the order of their ends."""
     bound: float
     """The bound in s of the time at which all are localised."""
     travel_lower_bound: float

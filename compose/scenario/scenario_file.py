@@ -47,8 +47,6 @@ from world.scenario import (
 )
 from world.world_noise import world_noise_infeasibility, world_noise_mistake
 
-GROUP_BUDGET = 3
-"""The default of `max_ticks` of a group, in bounds of its plan: visits that fail are made up for by others."""
 EXCHANGES = 20
 """The number of reports for each of which `max_ticks` allows the full `delivery_time_bound`."""
 NEAREST_ANCHORS = TOLERANCE
@@ -207,7 +205,7 @@ def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scena
         placed.append(RobotSpec(robot.id, peer, role, Anchor(*robot.anchor), start, orbits, robot.attack))
     faults = _faults(file, options, linked, source)
     if meetings is not None:
-        budget = GROUP_BUDGET * math.ceil(meetings.bound / file.mission.period)
+        budget = math.ceil(meetings.latest / file.mission.period)
     else:
         budget = max(tick_budget(file.mission, one.rendezvous) for one in first.values())
     delay = EXCHANGES * delivery_time_bound(faults) if faults else 0
@@ -223,30 +221,37 @@ def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scena
         robots=tuple(placed),
         faults=faults,
     )
+    scenario = _with_world(scenario, file, meetings)
+    try:
+        for one in scenario.robots:
+            decode(encode(scenario.config(one.id)), AnyRobotConfig)
+    except MalformedFrame as error:
+        raise Unworkable(f"{source}: mission: a robot's configuration cannot be encoded: {error}") from None
+    return scenario
+
+
+def _with_world(scenario: Scenario, file: ScenarioFile, meetings: GroupMeetings | None) -> Scenario:
+    """Return `scenario` with what its file says about the group and the world, if that is anything."""
     if meetings is not None:
-        scenario = ScenarioOfGroup(
+        return ScenarioOfGroup(
             **asdict(scenario),
             world_noise=file.world.noise,
             planner_options=file.planner.options,
             range_model=file.world.range,
             radio_model=file.world.radio,
             meetings=meetings.planned,
+            retries=meetings.retries,
         )
-    elif file.planner.options or file.world.range is not None or file.world.radio is not None:
-        scenario = ScenarioWithOptions(
+    if file.planner.options or file.world.range is not None or file.world.radio is not None:
+        return ScenarioWithOptions(
             **asdict(scenario),
             world_noise=file.world.noise,
             planner_options=file.planner.options,
             range_model=file.world.range,
             radio_model=file.world.radio,
         )
-    elif not file.world.noise.changes_nothing(file.mission.noise):
-        scenario = ScenarioWithWorldNoise(**asdict(scenario), world_noise=file.world.noise)
-    try:
-        for one in scenario.robots:
-            decode(encode(scenario.config(one.id)), AnyRobotConfig)
-    except MalformedFrame as error:
-        raise Unworkable(f"{source}: mission: a robot's configuration cannot be encoded: {error}") from None
+    if not file.world.noise.changes_nothing(file.mission.noise):
+        return ScenarioWithWorldNoise(**asdict(scenario), world_noise=file.world.noise)
     return scenario
 
 

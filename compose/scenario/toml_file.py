@@ -50,7 +50,8 @@ def field_first(error: str, schema: type[msgspec.Struct]) -> str:
     assert match is not None
     what, where = match["what"].replace("`", "'"), match["where"] or ""
     what = what.replace("Object contains ", "").replace("Object missing required field", "missing field")
-    what = what[0].lower() + what[1:]
+    if not what[1:2].isupper():  # "JSON is malformed" stays as it is
+        what = what[0].lower() + what[1:]
     quoted = re.search(r"'(.*)'", what, re.DOTALL)
     word = quoted[1] if quoted is not None else ""
     if what.startswith("invalid enum value") and (words := known_words(schema, where)):

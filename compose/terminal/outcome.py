@@ -9,9 +9,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from compose.errors import UserError, status_of
+from compose.errors import CannotWrite, status_of
 from compose.recording import run
-from compose.recording.recording_files import cannot_write
 from compose.recording.summary_json import Mode, leave, outcome_line, summary
 from protocol.journal.journal_file import Journal
 from protocol.journal.resume import Retrace
@@ -85,7 +84,7 @@ def conclude(
         try:
             leave(recording, result, folder)
         except OSError as error:
-            raise UserError(cannot_write(folder, error)) from None
+            raise CannotWrite(folder, error) from None
     return status_of(result["outcome"])
 
 

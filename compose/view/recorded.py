@@ -131,15 +131,12 @@ class Journals:
             self.setup = of_configs(self.folder.name, configs)
 
     def _read_kills(self) -> None:
-        try:
-            kills = kills_in(self.folder)
-        except OSError as error:
-            self._note(f"{files.error_text(error)}; the processes that were killed are not shown")
-        except CorruptJournal as error:
-            self._note(str(error))
-        else:
-            self.known.add_kills(kills[self._kills :])
-            self._kills = len(kills)
+        kills, note = kills_in(self.folder)
+        if note is not None:
+            self._note(note)
+            return
+        self.known.add_kills(kills[self._kills :])
+        self._kills = len(kills)
 
     def fill(self) -> None:
         """Compute missing observations from the world's journal. Call once the journals are complete."""

@@ -142,7 +142,9 @@ class Journal:
             raise self._cannot(error) from None
 
     def _cannot(self, error: OSError) -> CannotRecord:
-        return CannotRecord(f"{self.path} cannot be written: {error.strerror or error}")
+        found = CannotRecord(f"{self.path} cannot be written: {error.strerror or error}")
+        found.errno = error.errno
+        return found
 
     def close(self) -> None:
         """Close and unlock the file. Nothing is lost without it."""

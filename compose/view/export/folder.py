@@ -7,10 +7,10 @@ from pathlib import Path
 
 import msgspec
 
-from compose.errors import UserError
+from compose.errors import CannotWrite, UserError
 from compose.launch.second_process import OutputLine, Task, share
 from compose.recording.frames import in_time
-from compose.recording.recording_files import agent_journal, cannot_write, make_folder
+from compose.recording.recording_files import agent_journal, make_folder
 from compose.recording.run import Run
 from compose.recording.ticks_csv import rows, table
 from compose.view.export.parquet import frames_csv, write_ticks
@@ -66,7 +66,7 @@ def export(
     try:
         share(tasks, lambda _: done(), check, alone=alone)
     except OSError as error:
-        raise UserError(cannot_write(out, error)) from None
+        raise CannotWrite(out, error) from None
     except TooLong as error:
         raise UserError(str(error)) from None
     names = [agent_journal(robot) for robot in robots]

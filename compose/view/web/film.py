@@ -6,19 +6,22 @@ speed of the machine.
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
-from collections.abc import Iterator
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from compose.errors import UserError
-from compose.view.web.standalone import PAGE, standalone_page
+from compose.view.web.standalone import PAGE
 
 if TYPE_CHECKING:
     from PIL.Image import Image as Picture
@@ -50,58 +53,88 @@ MIXED = (("robot-a", "ink", 0.8), ("robot-b", "ink", 0.8), ("accent", "paper", 0
 
 They are those of contact on the time line, and of the range of an anchor.
 """
+REMOVE_S = 2.0
+"""The time in s in which the processes of a browser that has been stopped end."""
 SAME = 255
 """The colour of pixels that are as in the frame before."""
 
 
-def gif(folder: Path) -> bytes:
-    """Return the guided play of the recording in `folder` as an animated GIF.
-
-    Raises UserError if there is not exactly one recording, or if Chromium is not installed.
-    """
-    return _gif(_frames(folder, "--gif", FRAME_MS))
-
-
-def mp4(folder: Path) -> bytes:
-    """Return the guided play of the recording in `folder` as a video: MP4 with H.264. Raises like `gif`."""
-    return _mp4(_frames(folder, "--mp4", VIDEO_FRAME_MS))
-
-
-def _frames(folder: Path, flag: str, frame_ms: int) -> list[bytes]:
-    """Return the frames of guided play as PNG files, one for each `frame_ms`. Raises like `gif`."""
+def browser(flag: str) -> str:
+    """Return the path of the program that draws the page. Raises UserError, which names `flag`."""
     found = next(filter(None, map(shutil.which, BROWSERS)), None)
     if found is None:
         raise UserError(f"{flag} needs chromium: apt-get install chromium")
-    html = standalone_page(folder).html
+    return found
+
+
+def gif(page: str, program: str, check: Callable[[], object] = lambda: None) -> bytes:
+    """Return the guided play of the standalone `page` as an animated GIF.
+
+    `program` is the browser. `check` is called between two frames; if it raises, the browser is closed.
+    """
+    return _gif(_frames(page, program, FRAME_MS, check), check)
+
+
+def mp4(page: str, program: str, check: Callable[[], object] = lambda: None) -> bytes:
+    """Return the same as a video: MP4 with H.264."""
+    return _mp4(_frames(page, program, VIDEO_FRAME_MS, check), check)
+
+
+def _frames(html: str, program: str, frame_ms: int, check: Callable[[], object]) -> list[bytes]:
+    """Return the frames of guided play as PNG files, one for each `frame_ms`."""
     from playwright.sync_api import sync_playwright  # noqa: PLC0415  # slow, and optional
 
-    with TemporaryDirectory() as temporary, sync_playwright() as playwright:
-        file = Path(temporary) / "run.html"
+    with _temporary() as folder:
+        file = folder / "run.html"
         file.write_text(html, encoding="utf-8")
-        browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, color_scheme="light")
-        page.clock.install(time=0)
-        page.goto(file.as_uri())
-        page.add_style_tag(content=STYLE)
-        page.clock.pause_at(1000)
-        frames = list(_played(page, frame_ms))
-        browser.close()
+        try:
+            with sync_playwright() as playwright:
+                shown = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
+                page = shown.new_page(viewport={"width": WIDTH, "height": HEIGHT}, color_scheme="light")
+                page.clock.install(time=0)
+                page.goto(file.as_uri())
+                page.add_style_tag(content=STYLE)
+                page.clock.pause_at(1000)
+                frames = list(_played(page, frame_ms, check))
+                shown.close()
+        except Exception:
+            check()  # Ctrl-C in a terminal reaches Playwright's own process, too
+            raise
     return frames
 
 
-def _played(page: Page, frame_ms: int) -> Iterator[bytes]:
+@contextmanager
+def _temporary() -> Iterator[Path]:
+    """Yield a folder for all temporary files, the browser's included, and remove it with them."""
+    before = os.environ.get("TMPDIR")
+    folder = Path(tempfile.mkdtemp(prefix="tandem-"))
+    os.environ["TMPDIR"] = str(folder)
+    try:
+        yield folder
+    finally:
+        if before is None:
+            del os.environ["TMPDIR"]
+        else:
+            os.environ["TMPDIR"] = before
+        give_up = time.monotonic() + REMOVE_S
+        while folder.exists() and time.monotonic() < give_up:
+            shutil.rmtree(folder, ignore_errors=True)  # a process of the browser may still write into it
+
+
+def _played(page: Page, frame_ms: int, check: Callable[[], object]) -> Iterator[bytes]:
     """Play the page, and yield a PNG file for each `frame_ms`."""
     page.wait_for_selector("body[data-shown='0']", state="attached")
     page.keyboard.press("f")  # a camera at rest: most of the picture stays the same
     page.locator("#play").evaluate("(button) => button.click()")
     for _ in range(MOST_MS // frame_ms):
+        check()
         page.clock.fast_forward(frame_ms)
         yield page.screenshot()
         if page.locator("#play").get_attribute("aria-label") == "Play":
             return
 
 
-def _gif(frames: list[bytes]) -> bytes:
+def _gif(frames: list[bytes], check: Callable[[], object]) -> bytes:
     """Return PNG files as an animated GIF; equal frames in a row become one."""
     from PIL import Image  # noqa: PLC0415  # optional
 
@@ -109,6 +142,7 @@ def _gif(frames: list[bytes]) -> bytes:
     durations: list[int] = []
     before = b""
     for frame in frames:
+        check()
         if frame == before:
             durations[-1] += FRAME_MS
             continue
@@ -131,7 +165,7 @@ def _gif(frames: list[bytes]) -> bytes:
     return file.getvalue()
 
 
-def _mp4(frames: list[bytes]) -> bytes:
+def _mp4(frames: list[bytes], check: Callable[[], object]) -> bytes:
     """Return PNG files as a video; the last one stays for LAST_MS."""
     import av  # noqa: PLC0415  # optional
     from PIL import Image  # noqa: PLC0415
@@ -141,6 +175,7 @@ def _mp4(frames: list[bytes]) -> bytes:
         stream = video.add_stream("libx264", rate=1000 // VIDEO_FRAME_MS, options={"crf": QUALITY})
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
         for frame in frames + frames[-1:] * (LAST_MS // VIDEO_FRAME_MS):
+            check()
             pixels = np.asarray(Image.open(BytesIO(frame)).convert("RGB"))
             video.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
         video.mux(stream.encode())

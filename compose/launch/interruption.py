@@ -1,0 +1,62 @@
+"""SIGINT, SIGTERM and SIGHUP of a command that does not handle them itself: they end it with STOPPED."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from types import FrameType
+
+from compose.errors import STOPPED
+
+STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""The signals that stop a command."""
+CLEANING_S = 5.0
+"""The time in s in which a stopped command may clean up. A signal after it ends the process at once."""
+
+
+class StoppedBySignal(KeyboardInterrupt):
+    """A signal has stopped the command. The text of the error is the name of the signal."""
+
+
+class Interruption:
+    """The handlers of a command without an inbox: the first signal raises StoppedBySignal in the main thread.
+
+    The error may come out of a library as another one, so that what counts is `signal_name`.
+    """
+
+    def __init__(self) -> None:
+        self.signal_name: str | None = None
+        """The name of the first signal; None until there is one."""
+        self._first_s = 0.0
+
+    def begin(self) -> None:
+        """Set the handlers. A signal that was ignored stays ignored, unless it is that of Ctrl-C."""
+        sys.unraisablehook = self._unraisable
+        for number in STOPPING:
+            if number == signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, self._interrupt)
+
+    def end(self) -> None:
+        """Ignore all signals from now on: the exit status is known."""
+        for number in STOPPING:
+            signal.signal(number, signal.SIG_IGN)
+
+    def _interrupt(self, number: int, _frame: FrameType | None) -> None:
+        if self.signal_name is None:
+            self.signal_name = signal.Signals(number).name
+            self._first_s = time.monotonic()
+            raise StoppedBySignal(self.signal_name)
+        if time.monotonic() > self._first_s + CLEANING_S:
+            os._exit(STOPPED)
+
+    def _unraisable(self, unraisable: sys.UnraisableHookArgs) -> None:
+        """End the process if the error of a signal was lost, in a finalizer or in a callback from C."""
+        if issubclass(unraisable.exc_type, StoppedBySignal):
+            os._exit(STOPPED)
+        sys.__unraisablehook__(unraisable)
+
+
+INTERRUPTION = Interruption()
+"""The one of this process."""
