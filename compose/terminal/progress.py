@@ -10,8 +10,10 @@ from compose.terminal import tables, text_width
 from protocol.output import say
 
 TRUTH, ESTIMATE, ERROR, SIGMA = "true x, y, heading", "estimate", "error m", "sigma m"
+TICK = "tick"
 RANGES, REPORTS, LATE = "ranges", "reports", "late"
 NOTES = (
+    (TICK, "tick: of the estimate; the robot may have driven on"),
     (SIGMA, "sigma: claimed, of the position"),
     (LATE, "late: ticks in which the robot stopped because its command was late"),
     (ERROR, "poses in m and rad"),
@@ -26,22 +28,25 @@ CHOICES = (
     (ERROR, SIGMA, LATE),
 )
 """Sets of columns, of which the first that fits is shown; empty columns SIGMA and LATE are omitted."""
+GROUP_CHOICES = tuple((TICK, *[column for column in columns if column != TRUTH]) for columns in CHOICES[1:])
+"""Those for a group, whose robots do not stay where they claim to be."""
 LISTED = 4
 """The largest number of robots that are shown as a list if the table of all columns does not fit."""
 NAMED = 10
 """The largest number of robots named in a sentence."""
 
 
-def result(summary: Mapping[str, Any], rate: float | None = None) -> None:
+def result(summary: Mapping[str, Any], rate: float | None = None, *, grouped: bool = False) -> None:
     """Print the table at the end of a run at `rate`, and the number of missed deadlines.
 
     `summary` is the content of `summary.json`; `rate` is the speed relative to real time, None for lockstep.
+    `grouped` states that the robots form a group.
     """
     robots: Mapping[str, Any] = summary["robots"]
     exact = all(robot["covariance"] is None for robot in robots.values())
     late = {name: missed for name, robot in robots.items() if (missed := robot["deadlines_missed"])}
     omitted = {*([SIGMA] if exact else []), *([] if late else [LATE])}
-    for choice in CHOICES:
+    for choice in GROUP_CHOICES if grouped else CHOICES:
         columns = [column for column in choice if column not in omitted]
         cells = {name: _cells(robot, columns) for name, robot in robots.items()}
         rows = [(name, *of_robot.values()) for name, of_robot in cells.items()]
@@ -76,6 +81,7 @@ def _cells(robot: Mapping[str, Any], columns: Sequence[str]) -> dict[str, str]:
     """Return the cells of the robot's row, by column."""
     cells = {
         TRUTH: _pose(robot["truth"]),
+        TICK: _number(robot["localised_tick"]),
         ESTIMATE: _pose(robot["estimate"]),
         ERROR: _number(robot["position_error_m"], ".1e"),
         SIGMA: _number(robot["position_sigma_m"], ".1e"),

@@ -16,6 +16,7 @@ from compose.view.run_data import TickData
 from compose.view.words import doing
 from protocol.messages import (
     Contact,
+    Localised,
     MissionEnd,
     PeerReport,
     Phase,
@@ -24,6 +25,7 @@ from protocol.messages import (
     Verdict,
     Word,
 )
+from protocol.mission import Role
 from protocol.motion import Controls, Covariance, Pose, travelled, wrap
 
 
@@ -100,6 +102,17 @@ class Player(msgspec.Struct, frozen=True, omit_defaults=True):
     """What the robot reports about itself, if the scenario has an attack of it and its true pose is known."""
     peer: str | None = None
     """The robot that it meets at present, or next, in a group; None for pairs."""
+
+    def hue(self, robot_setup: RobotSetup) -> Role:
+        """Return the role whose colour the robot has: in a group, a once it is localised, and b before."""
+        if self.peer is None:
+            return robot_setup.role
+        return "a" if self.is_localised else "b"
+
+    @property
+    def is_localised(self) -> bool:
+        """True if the robot claims to know its pose."""
+        return self.command is not None and isinstance(self.command.verdict, Localised)
 
 
 class Scene(msgspec.Struct, frozen=True):
