@@ -42,8 +42,8 @@ export class Guide {
 
   #about(captions, focus) {
     if (this.store.grouped && !focus) return captions;
-    const one = this.store.chosen(focus);
-    return captions.filter(({ robots }) => !robots?.length || robots.includes(one.id));
+    const one = this.store.grouped ? focus : this.pair(focus)[0].id;
+    return captions.filter(({ robots }) => !robots?.length || robots.includes(one));
   }
 
   #read() {

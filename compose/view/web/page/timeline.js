@@ -56,7 +56,7 @@ export class Timeline {
         const spans = this.spans.get(player.robot);
         if (!spans) continue; // a robot that has just joined: `stage` is called again when the mission has been read again
         const phase = player.command?.phase ?? Math.abs(spans.at(-1)?.value ?? 1);
-        lengthen(spans, this.read, player.down ? -phase : phase, store.role(this.read, player.robot));
+        lengthen(spans, this.read, player.down ? -phase : phase, store.grouped ? store.role(this.read, player.robot) : null);
         if (player.contacts?.length) lengthen(this.contacts.get(player.robot), this.read, 1);
       }
       for (const event of scene.events) {
@@ -112,7 +112,7 @@ export class Timeline {
       for (const { from, to, value, role } of this.spans.get(robot.id)) {
         const left = x(from), width = Math.max(x(Math.min(to + 1, this.last)) - left, 1.5);
         const phase = Math.abs(value), inner = { 1: 0.4, 2: 0.62, 3: 1 }[phase] * band;
-        pen.fillStyle = pen.strokeStyle = of(`robot-${role}`);
+        pen.fillStyle = pen.strokeStyle = of(`robot-${role ?? robot.role}`);
         if (value < 0) {
           pen.lineWidth = 1;
           pen.strokeRect(left + 0.5, y + (band - inner) / 2 + 0.5, Math.max(width - 1, 0.5), inner - 1);

@@ -96,7 +96,7 @@ export class Trails {
         continue;
       }
       const now = here.command?.phase ?? phase ?? store.phase(k, robot.id);
-      const hue = store.role(k, robot.id);
+      const hue = store.grouped ? store.role(k, robot.id) : robot.role;
       if (now !== phase || hue !== role || !path) {
         path = new Path2D();
         path.moveTo(start[0], start[1]);
