@@ -26,6 +26,7 @@ from agent.planning.state import MODE_NAMES, Done, RobotState
 from protocol.messages import (
     Command,
     Estimate,
+    Inconsistent,
     Localised,
     Member,
     Observation,
@@ -164,7 +165,12 @@ class GroupPlanner(Planner[GroupState, Report]):
         return exchange.report(state.pair)
 
     def report_to(self, state: GroupState, peer: str) -> Report:
-        """Return the report to `peer`: the log, or outside a meeting only this robot's verdict."""
+        """Return the report to `peer`: the log, or outside a meeting only this robot's verdict.
+
+        A robot that is not localised tells one that it refuses the verdict of their meeting.
+        """
+        if _refused(state, peer):
+            return exchange.report_without_log(state.pair, state.failure)
         if peer == state.pair.config.peer:
             return exchange.report(state.pair)
         return exchange.report_without_log(state.pair, state.verdict)
@@ -187,6 +193,11 @@ class GroupPlanner(Planner[GroupState, Report]):
             known = replace(state.other(peer), localised=True)
             verdict = pair.verdict if state.verdict is None else state.verdict
             state = replace(state.with_other(peer, known), frame=frame, verdict=verdict)
+        refusals = [one for one in reports if exchange.is_without_log(one) and one.robot == peer]
+        if pair.verdict is None and any(
+            isinstance(one.verdict, Inconsistent | Undecided) for one in refusals
+        ):
+            return _after_refusal(state)
         return _onward(state)
 
     def command(self, state: GroupState) -> Command:
@@ -249,6 +260,15 @@ def _refused(state: GroupState, robot: str) -> bool:
     return state.verdict is None and state.other(robot).failed
 
 
+def _after_refusal(state: GroupState) -> GroupState:
+    """Return `state` of a robot whose peer has ended their meeting, because it contradicts what it knows."""
+    if state.visiting:
+        return _next_visit(_after_meeting(state))
+    peer = state.config.peer
+    failure = Undecided(f"{peer} does not go on with the meeting")
+    return _waiting(_after_meeting(replace(state, failure=failure)), peer)
+
+
 def _onward(state: GroupState) -> GroupState:
     """Return `state` in the next meeting if the present one is over."""
     pair, peer = state.pair, state.pair.config.peer
@@ -300,7 +320,7 @@ def _trying_again(state: GroupState) -> GroupState:
     if (pair.in_contact and not _refused(state, config.peer)) or _refused(state, retry.peer):
         return state
     if retry.role == "b":
-        return _waiting(state, retry.peer)
+        return _waiting(state, retry.peer, retry.rendezvous)
     until = _now(pair) + retry.lasts
     return replace(_aligned(_in_meeting(state, retry.peer, "a", retry.rendezvous)), until=until)
 
@@ -316,10 +336,10 @@ def _after_meeting(state: GroupState) -> GroupState:
     return state.with_other(peer, replace(state.other(peer), failed=True))
 
 
-def _waiting(state: GroupState, peer: str) -> GroupState:
+def _waiting(state: GroupState, peer: str, orbits: Rendezvous | None = None) -> GroupState:
     """Return `state` of a robot that waits beside its anchor, in a meeting with `peer`."""
     before = state.pair.mode
-    state = _in_meeting(state, peer, "b")
+    state = _in_meeting(state, peer, "b", orbits)
     pair = state.pair
     if isinstance(before, Orbiting | Aligning | Radial):
         return replace(state, pair=replace(pair, mode=before))

@@ -1,0 +1,46 @@
+"""Scenarios of groups for tests."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Mapping
+from typing import Any
+
+from compose.recording.run import Run
+from compose.scenario.scenario_file import validate
+from world.scenario import Scenario
+
+R = 3.0
+"""The sensing range in m."""
+
+
+def table_of(robots: int, seed: int, *, sigma: float = 0.0, side: float = 10.0) -> dict[str, Any]:
+    """Return a scenario file of `robots` beside anchors in a square of `side` R sqrt(robots)."""
+    rng, length = random.Random(f"{robots}/{seed}"), side * R * robots**0.5
+    mission: dict[str, Any] = {
+        "sensing_range": R,
+        "period": 1.0,
+        "max_speed": 1.0,
+        "max_turn_rate": 3.141592653589793,
+    }
+    if sigma:
+        mission |= {"noise": {"anchor_sigma": sigma, "mutual_sigma": sigma}, "accuracy": 0.3}
+    placed = [
+        {"id": f"r{i}", "anchor": [rng.uniform(0.0, length), rng.uniform(0.0, length)]} for i in range(robots)
+    ]
+    return {"name": "group", "seed": seed, "mission": mission, "robot": placed}
+
+
+def group_of(
+    robots: int, seed: int, *, sigma: float = 0.0, attacker: int | None = None, attack: Mapping[str, Any] = {}
+) -> Scenario:
+    """Return a group, of which one robot may be an `attacker`."""
+    table = table_of(robots, seed, sigma=sigma)
+    if attacker is not None:
+        table["robot"][attacker]["attack"] = dict(attack)
+    return validate(table, "group.toml").seeded(None)
+
+
+def localised(run: Run) -> set[str]:
+    """Return the robots that have claimed a pose."""
+    return {robot for robot in run.robots if run.claim(robot) is not None}

@@ -1,0 +1,213 @@
+"""Groups: robots that meet in turn, localise themselves, and help where a meeting has failed."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from agent.planning.exchange import is_without_log
+from agent.planning.phase2_orbit import Travelling, next_side, travel_controls
+from compose.errors import BadScenario
+from compose.launch.in_process import run_mission
+from compose.recording.run import Run, read
+from compose.scenario.scenario_file import validate
+from protocol.messages import Localised, Report, RobotConfigInGroup
+from protocol.mission import Mission
+from protocol.motion import Pose, step
+from tests.groups import R, group_of, localised, table_of
+from tests.series import series
+from world.referee import mistake
+
+MISSION = Mission(R, 1.0, 1.0, math.pi)
+SCALED = {"kind": "scale", "part": "encounter", "size": 0.5}
+"""False reports that each honest peer finds."""
+
+
+def met_before(run: Run, robot: str) -> bool:
+    """Return whether `robot` was, at its claim, in range of one that was localised then, or a tick later."""
+    claim = run.claim(robot)
+    assert claim is not None
+    contacts = run.observations[claim.tick][robot].contacts
+    claims = [run.claim(contact.peer) for contact in contacts]
+    return any(one is not None and one.tick <= claim.tick + 1 for one in claims)
+
+
+@pytest.mark.parametrize("group", series([(3, 1), (4, 2), (8, 1), (3, 323), (16, 1), (50, 1)], 3))
+def test_all_robots_of_a_group_are_localised_before_the_bound_of_its_plan(group: tuple[int, int]) -> None:
+    scenario = group_of(*group)
+    run = run_mission(scenario)
+    assert run.end is not None
+    assert run.end.outcome == "localised"
+    assert localised(run) == set(run.robots)
+    assert run.end.tick * scenario.mission.period <= scenario.meetings[-1].ends
+    for meeting in scenario.meetings:
+        claim = run.claim(meeting.visited)
+        assert claim is not None
+        assert claim.tick * scenario.mission.period <= meeting.ends
+
+
+@pytest.mark.parametrize("group", series([(3, 2), (4, 1), (8, 2), (4, 9)], 2))
+def test_a_group_with_noisy_ranges_is_localised_as_accurately_as_it_claims(group: tuple[int, int]) -> None:
+    run = run_mission(group_of(*group, sigma=0.05))
+    assert run.end is not None
+    assert run.end.outcome == "localised"
+    for robot in run.robots:
+        claim = run.claim(robot)
+        assert claim is not None
+        assert claim.nees is not None
+        assert claim.nees < 25.0
+
+
+def test_each_robot_is_localised_by_one_that_is_localised_before_or_with_it() -> None:
+    run = run_mission(group_of(8, 3))
+    assert all(met_before(run, robot) for robot in run.robots)
+
+
+@pytest.mark.parametrize("seed", series([9, 0, 1, 2, 3, 4, 5, 6, 14], 2))
+def test_one_attacker_keeps_no_honest_robot_from_a_right_claim(seed: int) -> None:
+    for attacker in range(4):
+        scenario = group_of(4, seed, attacker=attacker, attack=SCALED)
+        run = run_mission(scenario)
+        honest = set(run.robots) - {f"r{attacker}"}
+        assert honest <= localised(run)
+        for place, robot in enumerate(run.robots):
+            claim = run.claim(robot)
+            if robot in honest:
+                assert claim is not None
+                at = run.ticks[claim.tick].truth.poses[place]
+                assert mistake(Localised(claim.pose), at, scenario.mission) is None
+
+
+def test_a_pair_tries_again_with_another_robot_when_its_first_meeting_has_failed() -> None:
+    honest = group_of(3, 1)
+    first = honest.meetings[0]
+    attacker = int(first.visited[1:])
+    scenario = group_of(3, 1, attacker=attacker, attack=SCALED)
+    run = run_mission(scenario)
+    assert localised(run) >= set(run.robots) - {first.visited}
+    claim = run.claim(first.visitor)
+    assert claim is not None
+    assert claim.tick * scenario.mission.period > scenario.retries[0].begins
+
+
+def test_a_robot_sends_its_log_only_to_the_robot_that_it_meets(tmp_path: Path) -> None:
+    scenario = group_of(8, 1)
+    run_mission(scenario, tmp_path)
+    run = read(tmp_path)
+    partners = {frozenset((one.visitor, one.visited)) for one in scenario.meetings}
+    strangers = 0
+    for robot, agent in run.agents.items():
+        for step_ in agent.steps:
+            for contact, framed in zip(step_.observation.contacts, step_.reports, strict=True):
+                assert isinstance(framed.report, Report)
+                if frozenset((robot, contact.peer)) not in partners:
+                    assert is_without_log(framed.report)
+                    assert not framed.report.runs
+                    assert not framed.report.ranges
+                    strangers += 1
+    assert strangers > 0
+
+
+def test_the_configuration_of_a_robot_names_its_group_and_its_visits() -> None:
+    scenario = group_of(4, 2)
+    for robot in scenario.robots:
+        config = scenario.config(robot.id)
+        assert isinstance(config, RobotConfigInGroup)
+        assert [one.robot for one in config.members] == ["r0", "r1", "r2", "r3"]
+        visited = [one.visited for one in scenario.meetings if one.visitor == robot.id]
+        assert list(config.visits) == [one for one in visited if one != config.peer]
+        apart = [
+            math.hypot(one.anchor.x - other.anchor.x, one.anchor.y - other.anchor.y)
+            for one in config.members
+            for other in config.members
+        ]
+        assert config.widest_distance == max(apart)
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        (
+            {"planner": {"name": "paper"}},
+            "group.toml: planner.name: robots with the planner paper meet in pairs",
+        ),
+        ({"twice": True}, "group.toml: robot.id: 2 robots have the id 'r0'"),
+        ({"near": True}, "group.toml: robot[1].anchor: less than"),
+        ({"peer": True}, "group.toml: robot[1].peer: 'r1' needs a peer, because there are 3 robots"),
+    ],
+)
+def test_a_group_that_cannot_be_is_refused_in_one_line(change: dict[str, Any], what: str) -> None:
+    table = table_of(3, 1)
+    if change.pop("twice", False):
+        table["robot"][1]["id"] = "r0"
+    if change.pop("near", False):
+        table["robot"][1]["anchor"] = table["robot"][0]["anchor"]
+    if change.pop("peer", False):
+        table["robot"][0]["peer"] = "r1"
+    with pytest.raises(BadScenario) as refused:
+        validate(table | change, "group.toml")
+    assert what in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+# --- visits -------------------------------------------------------------------------------------------
+
+
+PLACES = st.tuples(st.floats(-50.0, 50.0), st.floats(-50.0, 50.0))
+
+
+@given(PLACES, st.floats(-math.pi, math.pi))
+def test_a_visitor_reaches_its_place_by_a_turn_and_straights(
+    place: tuple[float, float], heading: float
+) -> None:
+    pose, mode = Pose(0.0, 0.0, heading), Travelling(place)
+    distance = math.hypot(*place)
+    for _ in range(math.ceil(distance) + 4):
+        controls = travel_controls(mode, pose, MISSION, 1e-9)
+        if controls is None:
+            break
+        assert abs(controls.v) <= MISSION.max_speed * (1.0 + 1e-12)
+        assert abs(controls.omega) <= MISSION.max_turn_rate * (1.0 + 1e-12)
+        assert controls.v == 0.0 or controls.omega == 0.0
+        pose = step(pose, controls.v, controls.omega, MISSION.period)
+    assert math.hypot(pose.x - place[0], pose.y - place[1]) <= 1e-6
+
+
+@given(st.floats(0.0, 3.0 * R), st.floats(-math.pi, math.pi))
+def test_the_square_spiral_passes_every_place_near_its_begin_within_range(
+    away: float, bearing: float
+) -> None:
+    target = away * math.cos(bearing), away * math.sin(bearing)
+    mode = Travelling((0.0, 0.0))
+    places = [mode.place]
+    for _ in range(14):
+        mode = next_side(mode, MISSION)
+        places.append(mode.place)
+    nearest = min(_distance(target, one, other) for one, other in pairwise(places))
+    assert nearest <= 0.5 * R + 1e-9
+
+
+def _distance(target: tuple[float, float], one: tuple[float, float], other: tuple[float, float]) -> float:
+    """Return the distance in m of `target` from the straight between two places."""
+    (x, y), (ax, ay), (bx, by) = target, one, other
+    length = (bx - ax) ** 2 + (by - ay) ** 2
+    share = min(1.0, max(0.0, ((x - ax) * (bx - ax) + (y - ay) * (by - ay)) / length))
+    return math.hypot(x - ax - share * (bx - ax), y - ay - share * (by - ay))
+
+
+def test_pairs_are_no_group() -> None:
+    table = table_of(4, 1)
+    for i, peer in enumerate(("r1", "r0", "r3", "r2")):
+        table["robot"][i]["peer"] = peer
+    scenario = validate(table, "group.toml").seeded(None)
+    assert scenario.meetings == ()
+    assert scenario.radio_pairs() == ((0, 1), (2, 3))
+    assert not isinstance(scenario.config("r0"), RobotConfigInGroup)
+    assert replace(scenario, seed=1).pairs() == ((0, 1), (2, 3))
