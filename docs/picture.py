@@ -38,7 +38,9 @@ SHOWN: dict[str, dict[str, str]] = {
 """By scenario: the titles of the figures of `tandem figures` that pages show, and their file names here."""
 
 FILMED = "paper-1"
-"""The scenario whose guided play is page.gif."""
+"""The scenario whose guided play is page.gif, and of which page.png is one picture."""
+STILL = ("distance that a configuration predicts", (1360, 840))
+"""The mark of the legend that page.png shows, and its size in pixels."""
 
 
 def main() -> None:
@@ -49,6 +51,7 @@ def main() -> None:
             if name == FILMED:
                 page = standalone_page(Path(folder)).html
                 (DOCS / "page.gif").write_bytes(film.gif(page, film.browser("page.gif")))
+                (DOCS / "page.png").write_bytes(film.still(page, film.browser("page.png"), *STILL))
 
 
 def draw(name: str, shown: Mapping[str, str], folder: Path) -> None:

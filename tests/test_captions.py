@@ -13,10 +13,11 @@ from compose.recording.run import Run, read
 from compose.recording.run_setup import RunSetup
 from compose.scenario.scenario_file import load, parse
 from compose.scenario.shipped_files import shipped
-from compose.view.captions import Caption, captions
 from compose.view.recorded import run_data, scenes_of
 from compose.view.run_data import TickData
 from compose.view.scene import Scene
+from compose.view.story.caption import Caption
+from compose.view.story.captions import captions
 from protocol.attack import Attack
 from protocol.messages import Contact, Inconsistent, Localised, MissionEnd, Outcome, Undecided
 from tests.commands import SECTION_IV
@@ -52,32 +53,43 @@ def test_the_story_of_paper_1_has_a_caption_for_each_of_its_beats(paper_1: Run) 
         (
             0,
             "Each robot measures the distance to one beacon, its anchor. "
-            "It knows how far away that is, not where.",
+            "It knows how far away that is, not in which direction.",
+        ),
+        (
+            2,
+            "b had two possible poses relative to its anchor, mirror images of each other. "
+            "The distance now measured, 1.69 m, rules out one of them.",
         ),
         (
             5,
             "After a short drive, each robot knows its path relative to its anchor, "
-            "but turned around the anchor by an unknown angle. "
-            "They drive on circles around their anchors to find each other.",
+            "but the whole path may be turned around the anchor by any angle.",
+        ),
+        (
+            5,
+            "They drive on circles around their anchors to find each other, b more slowly than a, "
+            "so that sooner or later both are near where the circles cross.",
         ),
         (
             46,
-            "a and b meet. They measure the distance between them, 2.95 m. "
-            "They exchange reports of their paths.",
+            "a and b meet, 2.95 m apart, and exchange reports of their paths. "
+            "a drives on to measure a second distance, while b stands still.",
         ),
         (
             47,
-            "Four configurations, each with one pose of a and one of b, fit what was measured and reported.",
+            "Four configurations, each with one pose of a and one of b, fit what was measured and reported. "
+            "Two distances for two unknown angles allow at most four.",
         ),
         (
             47,
             "b makes one manoeuvre, chosen so that the four predict distances that differ most: "
             "then the next measured distance can tell which one is true.",
         ),
-        (48, "With the distance now measured, 2.39 m, only one of the four configurations is left."),
-        (48, "Both are localised."),
+        (48, "The distance is 2.39 m now: configurations that predicted another distance are ruled out."),
+        (48, "Only one of the four configurations is left."),
+        (48, "Both are localised: each knows its position and its heading."),
     ]
-    assert scenes_of(paper_1)[-1].captions[-1].truth == "The largest error of a claim is less than 1 µm."
+    assert scenes_of(paper_1)[-1].captions[-1].truth == "The claimed positions are off by less than 1 µm."
 
 
 @pytest.mark.long
@@ -87,8 +99,9 @@ def test_under_noise_captions_speak_of_estimates_and_probabilities(recorded: Rec
     assert "a drives on a circle around its anchor to find b, which waits near its own." in text
     assert re.search(r"the most probable with \d\d %\.", text)
     assert "Both drive to where the next distances are expected to distinguish them" in text
-    assert "only one of the two configurations is left. It is not claimed yet." in text
-    assert text.endswith("Both are localised.")
+    assert "Only one of the two configurations is left. It is not claimed yet." in text
+    assert "at most four" not in text
+    assert text.endswith("Both are localised: each knows its position and its heading.")
 
 
 def test_robots_that_lose_contact_are_told_to_meet_again(recorded: Record) -> None:
@@ -122,7 +135,7 @@ def test_what_each_robot_of_a_pair_finds_at_another_time_is_told_of_it_alone(rec
         "A report of a is lost.",
         "For a, two configurations, each with one pose of a and one of b, fit",
         "For b, two configurations, each with one pose of a and one of b, fit",
-        "for b, only one of the two configurations is left.",
+        "For b, only one of the two configurations is left.",
         "b claims to know its pose.",
     ):
         assert one in text
@@ -143,7 +156,9 @@ def test_each_pair_of_several_has_its_captions_and_the_end_counts_all(recorded: 
         )
         assert "contact" in kinds
         assert "ruled-out" in kinds
-    assert scenes[-1].captions[-1].text == "All 4 robots are localised."
+    assert (
+        scenes[-1].captions[-1].text == "All 4 robots are localised: each knows its position and its heading."
+    )
     assert scenes[-1].captions[-1].robots == ()
 
 
@@ -175,7 +190,7 @@ def with_verdicts(now: TickData, **verdicts: object) -> TickData:
             "max_ticks: a, b not localised by then",
             "The mission ends undecided: the time is up, and a and b are not localised.",
         ),
-        ("localised", None, "Both are localised."),
+        ("localised", None, "Both are localised: each knows its position and its heading."),
     ],
 )
 def test_only_an_end_that_is_localised_says_so(
@@ -199,7 +214,7 @@ def test_a_link_that_delivers_nothing_is_named_at_the_end_with_the_truth(paper_1
     ):
         *_, told = captions(replace(setup, faults=faults), before, now, (), end)
         assert told.text == "The mission ends undecided: the time is up, and b is not localised."
-        assert (told.truth or "").startswith(text or "The largest error")
+        assert (told.truth or "").startswith(text or "The claimed positions are off by")
 
 
 def test_a_robot_that_stops_without_a_claim_is_told_with_its_reason(paper_1: Run) -> None:
@@ -250,7 +265,7 @@ def test_no_configuration_and_more_configurations_are_told(paper_1: Run) -> None
     setup, before, now = last(paper_1)
     held = before.estimates
     none = {robot: replace(one, world=()) for robot, one in held.items()}
-    assert texts(setup, before, replace(now, estimates=none))[0] == (
+    assert texts(setup, before, replace(now, estimates=none))[1] == (
         "No configuration fits what was measured and reported any more."
     )
     two = {robot: replace(one, world=one.world[:2]) for robot, one in held.items()}

@@ -17,9 +17,9 @@ from compose.view.web import film
 from tests.commands import TandemProcess, tandem, temporary_in, until
 from tests.series import series
 
-MOST_BYTES = 600_000
+MOST_BYTES = 500_000
 """The largest size of the picture of paper-1."""
-MOST_FRAMES = 500
+MOST_FRAMES = 600
 """The largest number of frames of the video of paper-1."""
 FRAME_S = 1.0
 """The time in s in which the browser draws a frame on any machine."""
@@ -40,11 +40,12 @@ def test_the_picture_lasts_as_long_as_guided_play_and_is_small(paper_1: Path, tm
     with Image.open(tmp_path / "run.gif") as picture:
         assert picture.size == (film.WIDTH, film.HEIGHT)
         durations = [frame.info["duration"] for frame in ImageSequence.Iterator(picture)]
-    assert 30_000 < sum(durations) < 50_000
+    assert 40_000 < sum(durations) < 60_000
     assert len(durations) > 30
 
 
 @pytest.mark.long
+@pytest.mark.timeout(300)  # it draws hundreds of frames
 def test_the_video_lasts_as_long_as_guided_play_and_is_small(paper_1: Path, tmp_path: Path) -> None:
     need_browser()
     with TandemProcess("export", paper_1, "--mp4", "--out", tmp_path) as export:
@@ -55,9 +56,9 @@ def test_the_video_lasts_as_long_as_guided_play_and_is_small(paper_1: Path, tmp_
         (stream,) = video.streams.video
         assert (stream.width, stream.height) == (film.WIDTH, film.HEIGHT)
         frames = [frame.to_ndarray(format="gray") for frame in video.decode(stream)]
-    assert 30_000 < len(frames) * film.VIDEO_FRAME_MS < 50_000
+    assert 40_000 < len(frames) * film.VIDEO_FRAME_MS < 60_000
     assert len(frames) < MOST_FRAMES
-    changes = sum([bool(np.abs(now.astype(int) - was).max() > 64) for was, now in pairwise(frames)])
+    changes = sum([bool(np.abs(now.astype(np.int16) - was).max() > 64) for was, now in pairwise(frames)])
     assert changes > 100
 
 

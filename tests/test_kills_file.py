@@ -181,6 +181,19 @@ def test_kills_of_no_process_and_of_ticks_that_never_come_are_ignored(paper_1: P
     assert processes_shown(replace(read(paper_1), kills=tuple(killed))) == []
 
 
+@pytest.mark.parametrize(
+    ("replayed", "said"), [(19, "runs again"), (22, "runs again"), (20, None), (21, None)]
+)
+def test_a_number_of_replayed_ticks_that_cannot_be_right_is_left_out(
+    paper_1: Path, replayed: int, said: str | None
+) -> None:
+    """A process that is killed in tick 20 has 20 or 21 ticks in its journal."""
+    killed = (Killed("b", 20, "command", 0.0, replayed),)
+    *_, (tick, kind, robot, text) = processes_shown(replace(read(paper_1), kills=killed))
+    assert (tick, kind, robot) == (20, "back", "b")
+    assert text == f"b is back: its process {said or f'replayed {replayed} ticks, identical'}"
+
+
 def test_thousands_of_kills_are_shown_in_time(paper_1: Path) -> None:
     """Each is looked at once, not once a tick."""
     killed = tuple(Killed("a", tick % 49, "report", None, tick) for tick in range(14_000))

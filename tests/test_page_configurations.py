@@ -99,12 +99,12 @@ def test_the_predicted_distances_and_j_of_the_last_manoeuvre_are_listed(opened: 
     listed = page.locator("#predictions li")
     expect(listed).to_have_text(
         [
-            "predicted distances",
+            "predicted",
             "1: 2.39 m",
             "2: 2.75 m",
             "3: 1.14 m",
             "4: 3.06 m",
-            "least difference J = 1.80 m²",
+            "told apart by J = 1.80 m²",
         ]
     )
     page.keyboard.press("ArrowLeft")

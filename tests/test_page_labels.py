@@ -183,4 +183,4 @@ def test_no_text_overlaps_another_at_any_moment_of_guided_play(
             shot(page, f"guided-{size[0]}-{len(caption)}")
         if page.locator("#play").get_attribute("aria-label") == "Play":
             break
-    assert told.startswith("Both are localised.")
+    assert told.startswith("Both are localised:")

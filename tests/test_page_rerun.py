@@ -189,6 +189,13 @@ def test_a_planner_that_is_not_shipped_is_not_run_again() -> None:
 # --- in a browser ---------------------------------------------------------------------------------------
 
 
+ON_TOP = """(one) => {
+  const { left, top, width, height } = one.getBoundingClientRect();
+  return one.disabled || document.elementFromPoint(left + width / 2, top + height / 2) === one;
+}"""
+"""Returns whether nothing covers the middle of an element."""
+
+
 def opened_form(opened: Open, address: str, **window: Any) -> Page:
     """Return the page of paper-1 with the form open, and its values in it."""
     page = opened(f"{address}#show=paper-1&tick=0", **window)
@@ -282,6 +289,21 @@ def test_an_empty_field_and_what_the_server_refuses_run_nothing(opened: Open, ad
     expect(page.get_by_role("alert")).to_contain_text("robot[0].start: 'a' is")
     expect(page.locator("#title")).to_have_text("paper-1")
     assert [one["robots"]["a"]["x"] for one in sent] == [5.0]
+
+
+@pytest.mark.long
+def test_in_a_narrow_window_the_handles_stay_in_view_while_the_form_is_scrolled(
+    opened: Open, address: str
+) -> None:
+    page = opened_form(opened, address, width=390, height=844)
+    start = PAPER_1.robots[0].start
+    fields = page.locator("#changes button, #changes input").all()
+    for one in [*fields, *reversed(fields)]:
+        one.focus()
+        expect(page.locator("#canvas")).to_be_in_viewport(ratio=1.0)
+        assert one.evaluate(ON_TOP)
+    drag(page, (start.x, start.y), (1.0, 2.0))
+    assert float(page.get_by_label("start x", exact=True).input_value()) == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.long

@@ -89,10 +89,6 @@ def draw(run: Run, medium: Medium = SCREEN) -> Figure | Absent:
 
 def group_robots(run: Run, setup: RunSetup) -> list[GroupRobot]:
     """Return the robots of the group in the order in which they are localised, then those that are not."""
-    bounds: dict[str, float] = {}
-    for visit in setup.visits:
-        for robot in (visit.visitor, visit.visited):
-            bounds.setdefault(robot, visit.ends_s / setup.mission.period)
     robots = []
     for one in setup.robots:
         claim = run.claim(one.id)
@@ -103,7 +99,7 @@ def group_robots(run: Run, setup: RunSetup) -> list[GroupRobot]:
                 path=run.truth(one.id),
                 commands=tuple([run.command(one.id, tick) for tick in range(run.length)]),
                 localised=claim.tick if claim is not None else None,
-                bound=bounds.get(one.id),
+                bound=setup.bounds_s[one.id] / setup.mission.period if one.id in setup.bounds_s else None,
             )
         )
     return sorted(robots, key=lambda one: math.inf if one.localised is None else one.localised)

@@ -2,20 +2,21 @@
 
 A robot leaves for its next meeting with a command of the state "travelling", once the robot that it has
 visited has a verdict. It may travel to the same robot again if it has lost contact with it before. The peer
-is the next one of the plan, and after the plan, the nearest robot without a verdict. Once the two are in
-contact, the robot sends its log to no other one.
+is the next one of the plan, and after the plan, the nearest one that should be localised by then; robots of
+which it has heard that they are localised are left out. Once the two are in contact, the robot sends its log
+to no other one.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
 import msgspec
 
 from compose.recording.run import Run
 from compose.recording.run_setup import PresentMeeting, RunSetup
-from protocol.messages import Command, Localised, PeerReport, Report
+from protocol.messages import Command, Localised, Observation, PeerReport, Report
 from protocol.motion import Pose
 
 TRAVELLING = "travelling"
@@ -26,12 +27,14 @@ Meetings = Mapping[str, PresentMeeting]
 
 
 class GroupTick(msgspec.Struct, frozen=True):
-    """What is known of one tick of a group."""
+    """The known data of one tick of a group."""
 
     commands: Mapping[str, Command]
     """The commands by robot."""
     logs: Iterable[tuple[str, str]]
     """The senders and receivers of the reports with a log."""
+    heard: Mapping[str, Sequence[str]]
+    """The senders of the reports that each robot receives."""
     place: Callable[[str], Pose | None]
     """Returns where a robot is, as far as it is known."""
 
@@ -54,6 +57,11 @@ def has_log(report: PeerReport) -> bool:
     return isinstance(report, Report) and (report.start is not None or report.through > 0)
 
 
+def senders(observation: Observation) -> list[str]:
+    """Return the robots of which reports are received in the tick of `observation`."""
+    return [one.peer for one in observation.contacts if one.heard or one.heard is None]
+
+
 def meetings_after(
     setup: RunSetup, meetings: Meetings, earlier: Mapping[str, Command], now: GroupTick
 ) -> Meetings:
@@ -72,29 +80,40 @@ def meetings_after(
             continue
         present = meetings.get(robot, PresentMeeting(partners[0], False))
         localised = before is not None and isinstance(before.verdict, Localised)
+        if before is None and command.tick > 0 and isinstance(command.verdict, Localised):
+            known = frozenset([one for one in setup.ids if _has_verdict(one, now.commands)])
+            changed[robot] = PresentMeeting(_next(setup, robot, None, now, known), True, known)
+            continue
+        known = present.known | {one for one in now.heard.get(robot, ()) if _has_verdict(one, earlier)}
+        if localised and _has_verdict(present.peer, earlier):
+            known |= {present.peer}
         leaves = command.state == TRAVELLING and (before is None or before.state != TRAVELLING)
-        heard = receivers.get(robot, [])
-        if heard and present.peer not in heard:
-            changed[robot] = PresentMeeting(heard[0], localised)
-        elif before is None and command.tick > 0 and isinstance(command.verdict, Localised):
-            changed[robot] = PresentMeeting(_next(setup, robot, None, now, now.commands), True)
-        elif leaves and (not present.visiting or _has_verdict(present.peer, earlier)):
-            changed[robot] = PresentMeeting(_next(setup, robot, present.peer, now, earlier), True)
+        to = receivers.get(robot, [])
+        if to and present.peer not in to:
+            present = PresentMeeting(to[0], localised)
+        elif leaves and (not present.visiting or present.peer in known):
+            present = PresentMeeting(_next(setup, robot, present.peer, now, known), True)
+        if (present, known) != (meetings.get(robot), present.known):
+            changed[robot] = present._replace(known=known)
     return {**meetings, **changed} if changed else meetings
 
 
-def _next(setup: RunSetup, robot: str, peer: str | None, now: GroupTick, known: Mapping[str, Command]) -> str:
+def _next(setup: RunSetup, robot: str, peer: str | None, now: GroupTick, known: Collection[str]) -> str:
     """Return the robot that `robot` visits after `peer`; the last of its plan if there is no other one."""
     partners = setup.partners[robot]
     after = partners[partners.index(peer) + 1 :] if peer in partners else partners
-    planned = [one for one in after if not _has_verdict(one, known)]
+    planned = [one for one in after if one not in known]
     if planned:
         return planned[0]
-    here = now.place(robot)
-    others = [one for one in setup.robots if one.id != robot and not _has_verdict(one.id, known)]
-    if here is None or not others:
+    here, time = now.place(robot), now.commands[robot].tick * setup.mission.period
+    late = [
+        one
+        for one in setup.robots
+        if one.id != robot and one.id not in known and setup.bounds_s.get(one.id, time) < time
+    ]
+    if here is None or not late:
         return partners[-1]
-    return min(others, key=lambda one: math.hypot(one.anchor.x - here.x, one.anchor.y - here.y)).id
+    return min(late, key=lambda one: math.hypot(one.anchor.x - here.x, one.anchor.y - here.y)).id
 
 
 def _has_verdict(robot: str, commands: Mapping[str, Command]) -> bool:
@@ -138,9 +157,11 @@ def _begun(run: Run, setup: RunSetup) -> Begun:
         found = {robot: run.command(robot, tick) for robot in setup.ids}
         commands = {robot: command for robot, command in found.items() if command is not None}
         poses = {robot: path[tick] for robot, path in paths.items() if tick < len(path)}
-        after = meetings_after(setup, meetings, latest, GroupTick(commands, _logs(run, tick), poses.get))
+        heard = {robot: senders(one) for robot, one in run.observations[tick].items()}
+        now = GroupTick(commands, _logs(run, tick), heard, poses.get)
+        after = meetings_after(setup, meetings, latest, now)
         for robot, meeting in after.items():
-            if meeting is not meetings.get(robot):
+            if meeting[:2] != begun[robot][-1][1][:2]:
                 begun[robot].append((tick, meeting))
         meetings, latest = after, {**latest, **commands}
     return begun

@@ -53,6 +53,8 @@ class PresentMeeting(NamedTuple):
     peer: RobotId
     visiting: bool
     """True if the robot knows its pose already."""
+    known: frozenset[RobotId] = frozenset()
+    """The robots of which it has heard that they are localised."""
 
 
 class RunSetup(msgspec.Struct, frozen=True, dict=True):
@@ -113,6 +115,15 @@ class RunSetup(msgspec.Struct, frozen=True, dict=True):
             if {one.visitor, one.visited} <= known.keys()
         ]
         return tuple(met) if self.visits else self.pairs()
+
+    @cached_property
+    def bounds_s(self) -> dict[RobotId, float]:
+        """The planned bound in s of the time at which each robot of a group is localised; empty for pairs."""
+        found: dict[RobotId, float] = {}
+        for visit in self.visits:
+            for robot in (visit.visitor, visit.visited):
+                found.setdefault(robot, visit.ends_s)
+        return found
 
     @cached_property
     def partners(self) -> dict[RobotId, tuple[RobotId, ...]]:

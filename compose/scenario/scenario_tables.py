@@ -57,7 +57,7 @@ class RobotTable(_Table, frozen=True):
     start: tuple[Place, Place, Annotated[float, Meta(ge=-1e6, le=1e6)]] | None = None
     """Start pose x, y in m and heading in rad; None: drawn from the seed, within range of the anchor."""
     peer: RobotId | None = None
-    """Id of the peer; required with more than two robots."""
+    """Id of the peer. More than two robots without one form a group, which meets in turn."""
     attack: Attack | None = None
     """False data injection: the falsification of the reports that this robot sends to its peer."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import msgspec
 
 from compose.recording.kills_file import Killed
-from compose.recording.meetings import GroupTick, Meetings, has_log, meetings_after
+from compose.recording.meetings import GroupTick, Meetings, has_log, meetings_after, senders
 from compose.recording.run_setup import RunSetup
 from compose.scenario.kills import WORLD
 from protocol.messages import (
@@ -66,7 +67,9 @@ class TickData(msgspec.Struct, frozen=True):
     back: set[str | None] = msgspec.field(default_factory=set)
     """Robots in `down` whose process was seen again in the same tick."""
     replayed: dict[str | None, int] = msgspec.field(default_factory=dict)
-    """The number of ticks that the process of a robot in `back` replayed, if it was killed on purpose."""
+    """The number of ticks that the process of a robot in `back` replayed, if it was killed on purpose.
+
+    A number that cannot be right is left out: the launcher's list is not part of the journals."""
 
 
 class Absence(NamedTuple):
@@ -98,6 +101,8 @@ class RunData:
         """The latest tick that the world's journal has completely."""
         self._kills: dict[int, list[Killed]] = {}
         """The processes that were killed in ticks after `_complete`, by tick."""
+        self._missed: dict[str, list[int]] = {}
+        """The complete ticks whose deadline each robot has missed, in ascending order."""
         self._absences: dict[str | None, Absence] = {}
         """The latest absence of each process that was killed and is not known to be back."""
         self._meetings: dict[int, tuple[Meetings, Mapping[str, Command]]] = {}
@@ -133,7 +138,9 @@ class RunData:
             met, earlier = self._meetings.get(later - 1, ({}, {}))
             commands = self.ticks[later].commands if later in self.ticks else {}
             known = commands if len(commands) == len(setup.robots) else {**earlier, **commands}
-            now = GroupTick(commands, self._logs(later), partial(self._place, later))
+            seen = self.ticks[later].observations if later in self.ticks else {}
+            heard = {robot: senders(observation) for robot, observation in seen.items()}
+            now = GroupTick(commands, self._logs(later), heard, partial(self._place, later))
             self._meetings[later] = meetings_after(setup, met, earlier, now), known
         present = self._meetings.get(tick, ({}, {}))[0]
         if self._setup_at is None or self._setup_at[:2] != (setup, present):
@@ -178,6 +185,8 @@ class RunData:
         for robot, command in tick.commands.items():
             data.commands.setdefault(robot, command)
         data.late.update({robot.id for robot in tick.world.scenario.robots} - tick.commands.keys())
+        for robot in data.late:
+            self._missed.setdefault(robot, []).append(tick.truth.tick)
         self._complete = tick.truth.tick
         self._extend_absences()
         for killed in self._kills.pop(self._complete, ()):
@@ -227,7 +236,16 @@ class RunData:
             del self._absences[robot]
             if killed.after is not None:
                 self.at(last).back.add(robot)
-                self.ticks[last].replayed[robot] = killed.replayed_ticks
+                if self._can_have_replayed(killed, robot):
+                    self.ticks[last].replayed[robot] = killed.replayed_ticks
+
+    def _can_have_replayed(self, killed: Killed, robot: str | None) -> bool:
+        """Return whether a process can have replayed as many ticks as `killed` says.
+
+        It has answered all ticks before the kill but those whose deadline it missed, and none after it.
+        """
+        missed = bisect_left(self._missed.get(robot, []), killed.tick) if robot is not None else 0
+        return killed.tick - missed <= killed.replayed_ticks <= killed.tick + 1
 
     def add_observations(self, worlds: Iterable[World]) -> None:
         """Add the Observations that are still missing in the ticks of `worlds`."""

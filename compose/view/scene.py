@@ -7,12 +7,13 @@ from collections.abc import Mapping
 import msgspec
 
 from compose.recording.run_setup import RobotSetup, RunSetup
-from compose.view.captions import Caption, captions
 from compose.view.configurations import Configurations, configurations
 from compose.view.deliveries import Passage, passages
 from compose.view.events import Event, events
-from compose.view.group_captions import group_captions
 from compose.view.run_data import TickData
+from compose.view.story.caption import Caption
+from compose.view.story.captions import captions
+from compose.view.story.group_captions import group_captions
 from compose.view.words import doing
 from protocol.messages import (
     Contact,

@@ -29,12 +29,14 @@ if TYPE_CHECKING:
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 """The names of the program that draws the page."""
-WIDTH, HEIGHT = 900, 560
+WIDTH, HEIGHT = 900, 640
 """The size of the picture in pixels."""
 FRAME_MS = 250
 """The time between two frames of a picture in ms; the page lets no more pass between two of its drawings."""
 VIDEO_FRAME_MS = 100
 """The time between two frames of a video in ms."""
+STILL_AFTER = 6
+"""The number of frames with a mark before the one that is a picture of it."""
 LAST_MS = 3000
 """The time in ms for which the last frame is shown."""
 MOST_MS = 300_000
@@ -42,8 +44,9 @@ MOST_MS = 300_000
 QUALITY = "20"
 """The constant rate factor of a video; text is sharp with it, and a smaller one makes larger files."""
 STYLE = """
-header, aside, details, #transport button, #pace { display: none !important; }
+header, aside, #further, #legend summary, #transport button, #pace { display: none !important; }
 #mission { grid-template-columns: 1fr; }
+#caption { min-height: 2.8rem; }
 """
 """The style that hides the parts of the page which are not the story, or are for the mouse."""
 SHARES = (1.0, 0.72, 0.45, 0.2)
@@ -80,8 +83,38 @@ def mp4(page: str, program: str, check: Callable[[], object] = lambda: None) -> 
     return _mp4(_frames(page, program, VIDEO_FRAME_MS, check), check)
 
 
+def still(html: str, program: str, mark: str, size: tuple[int, int]) -> bytes:
+    """Return a picture of the standalone page in guided play, as a PNG file.
+
+    It is the one STILL_AFTER frames after the legend lists `mark`; the last one if it never does.
+    `program` is the browser.
+    """
+    from PIL import Image  # noqa: PLC0415  # optional
+
+    with _opened(html, program, size, lambda: None) as page:
+        marked = page.locator("#legend li").get_by_text(mark)
+        after = 0
+        for _ in _played(page, FRAME_MS, lambda: None):
+            after += marked.count() > 0
+            if after > STILL_AFTER:
+                break
+        file = BytesIO()
+        with Image.open(BytesIO(page.screenshot())) as picture:
+            picture.convert("RGB").quantize(256).save(file, "PNG", optimize=True)
+    return file.getvalue()
+
+
 def _frames(html: str, program: str, frame_ms: int, check: Callable[[], object]) -> list[bytes]:
     """Return the frames of guided play as PNG files, one for each `frame_ms`."""
+    with _opened(html, program, (WIDTH, HEIGHT), check) as page:
+        page.add_style_tag(content=STYLE)
+        page.keyboard.press("f")  # a camera at rest: most of the picture stays the same
+        return list(_played(page, frame_ms, check))
+
+
+@contextmanager
+def _opened(html: str, program: str, size: tuple[int, int], check: Callable[[], object]) -> Iterator[Page]:
+    """Yield the standalone page with a clock that stands still; if something fails, call `check` first."""
     from playwright.sync_api import sync_playwright  # noqa: PLC0415  # slow, and optional
 
     with _temporary() as folder:
@@ -90,17 +123,16 @@ def _frames(html: str, program: str, frame_ms: int, check: Callable[[], object])
         try:
             with sync_playwright() as playwright:
                 shown = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
-                page = shown.new_page(viewport={"width": WIDTH, "height": HEIGHT}, color_scheme="light")
+                page = shown.new_page(viewport={"width": size[0], "height": size[1]}, color_scheme="light")
                 page.clock.install(time=0)
                 page.goto(file.as_uri())
-                page.add_style_tag(content=STYLE)
                 page.clock.pause_at(1000)
-                frames = list(_played(page, frame_ms, check))
+                page.wait_for_selector("body[data-shown='0']", state="attached")
+                yield page
                 shown.close()
         except Exception:
             check()  # Ctrl-C in a terminal reaches Playwright's own process, too
             raise
-    return frames
 
 
 @contextmanager
@@ -123,8 +155,6 @@ def _temporary() -> Iterator[Path]:
 
 def _played(page: Page, frame_ms: int, check: Callable[[], object]) -> Iterator[bytes]:
     """Play the page, and yield a PNG file for each `frame_ms`."""
-    page.wait_for_selector("body[data-shown='0']", state="attached")
-    page.keyboard.press("f")  # a camera at rest: most of the picture stays the same
     page.locator("#play").evaluate("(button) => button.click()")
     for _ in range(MOST_MS // frame_ms):
         check()

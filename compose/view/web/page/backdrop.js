@@ -31,6 +31,7 @@ export class Backdrop {
       if (store.grouped && truth) draw_tree(this.pen, plane, view);
       for (const robot of robots) this.#anchor(view, robot);
       if (truth) for (const robot of robots) for (const kind of kinds_of(robot)) this.trails.trail(this.pen, view, robot, kind);
+      this.paths = [...plane.marks]; // the trails have named them
     }
     plane.context.save();
     plane.context.setTransform(1, 0, 0, 1, 0, 0);
@@ -38,6 +39,7 @@ export class Backdrop {
     plane.context.restore();
     plane.labels.placed.push(this.bar);
     for (const robot of robots) this.#name(view, robot);
+    for (const mark of ["anchor", "orbit", ...this.paths]) plane.marks.add(mark);
   }
 
   /** Draws the grid, and a bar with its unit. */

@@ -23,6 +23,7 @@ export class Beliefs {
     const tints = this.plane.tints.of(store, tick, robot.id);
     if (!poses.length) return this.#somewhere(view, robot, player);
     this.#ruled_out(view, robot);
+    this.plane.marks.add(tints.length ? "configuration" : "pose");
     if (!held.world.length && !truth) this.#any_bearing(view, robot, poses[0]);
     poses.slice(0, 60).forEach((pose, place) => {
       const chance = held.probability[place] ?? 1 / poses.length;
@@ -72,6 +73,7 @@ export class Beliefs {
       pen.strokeStyle = colour;
       pen.lineWidth = 2.6;
       pen.stroke();
+      this.plane.marks.add(out ? "ruled-out" : "configuration");
       if (out) cross(pen, x, y, size, look);
       else if (size > 6) this.plane.labels.put(String(tint + 1), x - grown - 4, y + grown + 8, colour, "right", { around: grown + 4 });
     }
@@ -82,6 +84,7 @@ export class Beliefs {
   /** Draws the circle on which the robot is, or its anchor's sensing range, before it has a pose. */
   #somewhere({ look, truth, store, moving, share }, robot, player) {
     if (!player || (truth && player.anchor_range === undefined)) return;
+    this.plane.marks.add("places");
     const pen = this.plane.context, [x, y] = this.plane.at(robot.anchor);
     const range = player.anchor_range ?? store.stage.mission.sensing_range;
     pen.beginPath();
@@ -98,6 +101,7 @@ export class Beliefs {
 
   /** Draws the circle of possible positions of a robot whose bearing from its anchor is unknown. */
   #any_bearing({ look }, robot, pose) {
+    this.plane.marks.add("places");
     const pen = this.plane.context, [x, y] = this.plane.at(robot.anchor);
     const radius = distance(pose, robot.anchor) * this.plane.scale;
     pen.beginPath();
@@ -143,6 +147,8 @@ export class Beliefs {
         pen.stroke();
         pen.setLineDash([]);
         cross(pen, x, y, size, look);
+        this.plane.marks.add("ruled-out");
+        if (size > 6) this.plane.labels.placed.push([x - size, y - size, x + size, y + size]);
       }
       pen.globalAlpha = 1;
     }
@@ -151,6 +157,7 @@ export class Beliefs {
   #ellipse(pose, covariance, look) {
     const { major, minor, turn } = ellipse(covariance, SIGMAS), pen = this.plane.context;
     if (major * this.plane.scale < LEGIBLE) return;
+    this.plane.marks.add("ellipse");
     const [x, y] = this.plane.at(pose);
     pen.beginPath();
     pen.ellipse(x, y, major * this.plane.scale, Math.max(minor * this.plane.scale, 0.5), -turn, 0, TAU);

@@ -48,7 +48,7 @@ export class Changes {
   /** Opens the form for the mission of `store`, with its values. */
   async stage(store) {
     this.section.hidden = false;
-    this.section.scrollIntoView({ block: "nearest" });
+    this.section.closest("main").scrollTop = 0; // in a narrow window, the form is below the plane
     this.values = null;
     this.#name = store.name;
     this.#title = store.stage.name;

@@ -1,11 +1,15 @@
 // The configurations of a pair: each in its tint, joined by a line, with the distance that it predicts as a circle
 // around the robot that drives, and the manoeuvres between which that robot has chosen.
 
-import { compose, distance, step, TAU } from "./geometry.js";
+import { between, compose, distance, step, TAU } from "./geometry.js";
 import { held_now } from "./held.js";
+import { DASHES } from "./pen.js";
 import { joined, poses_of } from "./tints.js";
 
 const MOST = 12; // configurations that are drawn
+/** Where on its circle the number of the first configuration is, and how much farther that of the next one, in rad. */
+const FIRST_NUMBER = -2.6, NEXT_NUMBER = -0.35;
+const BENDS = 16, HEAD_PX = 9;
 const THICK = 5; // the width in pixels of the reachable arc where J is largest
 
 /**
@@ -19,7 +23,8 @@ export function shown(view, robot, tints) {
   const now = joined(scene, robot.id), before = joined(store.scene(tick - 1), robot.id);
   const measured = store.player(tick, robot.id)?.contacts?.[0]?.[1] ?? null;
   const left = tints.of(store, tick, robot.id);
-  if (before && eliminated < 1 && before.count > (now?.count ?? 0)) {
+  const none = pair.every((id) => !store.player(tick, id)?.held?.world.length);
+  if (before && (now || none) && eliminated < 1 && before.count > (now?.count ?? 0)) {
     const had = tints.of(store, tick - 1, robot.id), { period } = store.stage.mission;
     const driven = pair.map((id) => store.player(tick, id)?.executed ?? [0, 0]);
     const all = poses_of(store, tick - 1, pair).map((poses, i) => {
@@ -58,7 +63,8 @@ export class Configurations {
     const { all, measured } = shown(view, robot, this.plane.tints), live = all.slice(0, MOST);
     if (live.length < 2) return;
     const manoeuvre = joined(scene, robot.id)?.manoeuvre;
-    if (manoeuvre) this.#arc(view, robot, manoeuvre, live);
+    this.plane.marks.add("configuration");
+    if (manoeuvre && view.planned) this.#arc(view, robot, manoeuvre, live);
     pen.lineWidth = 1.3;
     for (const { tint, a, b, out } of live) {
       pen.globalAlpha = out ? 0.25 : 0.9;
@@ -71,12 +77,21 @@ export class Configurations {
     const driving = view.moving && view.share > 0 && store.player(tick, robot.id)?.contacts?.length;
     if (ruling || driving) {
       const mover = this.#mover(store, ruling ? tick - 1 : tick, robot), of_a = mover === robot.id;
-      for (const one of live) {
-        const centre = truth ? places.get(mover) : of_a ? one.a : one.b;
-        if (centre) this.#circle(centre, one.predicted, look.tint(one.tint), one.out ? 0.2 : 0.9, [5, 4]);
+      if (ruling && truth && places.get(mover)) {
+        this.plane.marks.add("measured");
+        this.#circle(places.get(mover), measured, look.ink, 0.2, [], 9);
       }
-      const centre = places.get(mover);
-      if (ruling && truth && centre) this.#circle(centre, measured, look.link, 1, [], 2.6);
+      live.forEach((one, i) => {
+        const centre = truth ? places.get(mover) : of_a ? one.a : one.b;
+        if (!centre) return;
+        this.plane.marks.add("predicted");
+        const colour = look.tint(one.tint), angle = FIRST_NUMBER + i * NEXT_NUMBER;
+        this.#circle(centre, one.predicted, colour, one.out ? 0.2 : 0.9, DASHES[one.tint] ?? DASHES[0]);
+        const [x, y] = this.plane.at(centre), radius = one.predicted * this.plane.scale;
+        if (one.out) return;
+        pen.globalAlpha = 1;
+        this.plane.labels.put(String(one.tint + 1), x + radius * Math.cos(angle), y + radius * Math.sin(angle) + 4, colour, "center");
+      });
     }
     pen.globalAlpha = 1;
   }
@@ -98,10 +113,25 @@ export class Configurations {
     pen.setLineDash([]);
   }
 
-  /** Draws where the robot can be after the tick: the wider the arc, the larger J; and where it will be. */
+  /** Draws an arrow along poses of a robot that drives with the speed `v`. */
+  #arrow(way, v, colour) {
+    const pen = this.plane.context, [x, y] = this.plane.at(way.at(-1)), course = way.at(-1)[2] + (v < 0 ? Math.PI : 0);
+    const back = (angle) => [x - HEAD_PX * Math.cos(course + angle), y + HEAD_PX * Math.sin(course + angle)];
+    pen.strokeStyle = pen.fillStyle = colour;
+    pen.lineWidth = 2;
+    pen.beginPath();
+    for (const pose of way) pen.lineTo(...this.plane.at(pose));
+    pen.stroke();
+    pen.beginPath();
+    pen.moveTo(x, y); pen.lineTo(...back(0.45)); pen.lineTo(...back(-0.45)); pen.closePath();
+    pen.fill();
+  }
+
+  /** Draws where the robot can be after the tick: the wider the arc, the larger J; and an arrow to where it will be. */
   #arc({ store, tick, look, truth, scene }, robot, { robot: mover, reachable, separation_m2 }, live) {
     const pen = this.plane.context, { period } = store.stage.mission, { command } = store.player(tick, mover);
     const player = scene.players[store.places.get(mover)], most = Math.max(separation_m2, 1e-9);
+    for (const mark of ["reachable", "choice"]) this.plane.marks.add(mark);
     const starts = truth && player.pose ? [player.pose] : live.map((one) => (mover === robot.id ? one.a : one.b));
     for (const start of starts) {
       const ends = reachable.map(({ x, y }) => this.plane.at(compose(start, [x, y, 0])));
@@ -113,12 +143,8 @@ export class Configurations {
         pen.moveTo(...ends[i - 1]); pen.lineTo(...ends[i]);
         pen.stroke();
       }
-      const [x, y] = this.plane.at(step(start, command.v, command.omega, period));
-      pen.strokeStyle = look.ink;
-      pen.lineWidth = 2.4;
-      pen.beginPath();
-      pen.moveTo(x - 5, y - 5); pen.lineTo(x + 5, y + 5); pen.moveTo(x + 5, y - 5); pen.lineTo(x - 5, y + 5);
-      pen.stroke();
+      const way = [...Array(BENDS + 1).keys()].map((k) => between(start, null, [command.v, command.omega], k / BENDS, period));
+      this.#arrow(way, command.v, look.ink);
     }
   }
 }

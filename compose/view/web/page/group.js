@@ -7,11 +7,11 @@ import { plural } from "./words.js";
 const HEAD = 7; // the length in pixels of an arrow's head
 const TRAVELLING = "travelling";
 
-/** Names the hues in the legend: in a group, they are not those of roles. */
-export function name_group(legend) {
-  const names = { a: "localised", b: "not yet localised" };
-  for (const item of legend.querySelectorAll("[data-role]")) item.textContent = names[item.dataset.role];
-}
+/** The names of marks whose hue says, in a group, whether a robot is localised. */
+const HUES = { "robot-a": "localised", "robot-b": "unlocalised" };
+
+/** Returns the names of the marks for the legend of a group. */
+export const group_marks = (marks) => new Set([...[...marks].map((mark) => HUES[mark] ?? mark), "meeting"]);
 
 /** Draws a thin arrow for each meeting, between the anchors: dotted until the visited robot is localised. */
 export function draw_tree(pen, plane, { store, tick, look }) {

@@ -7,6 +7,8 @@ const GROUP_S = 24; // the ticks of a group's mission together
 const LONGEST_TICK_S = { search: 0.25, encounter: 1.5 };
 const MANOEUVRE_S = 2.5;
 const ELIMINATION_S = 3.5;
+/** How much of an elimination has been shown when all configurations that are ruled out are crossed out. */
+const ALMOST = 0.999;
 const HOLDS_S = 45; // all captions together
 const PASSING = new Set(["report-lost", "process"]); // kinds of captions for which time does not stop
 
@@ -67,12 +69,23 @@ export class Guide {
     return "";
   }
 
+  /** Returns whether the text to show is that of several captions. */
+  several(view) { return view.beat === null && this.captions(view).length > 1; }
+
   /** Returns how much of the elimination of configurations has been shown in this tick, from 0 to 1. */
   eliminated(view) {
     if (view.beat === null) return 1;
-    const here = this.captions(view), place = here.findIndex(({ kind }) => kind === "ruled-out");
-    if (place < 0 || view.beat > place) return 1;
-    return view.beat < place ? 0 : Math.min(1, view.held / this.#hold(here[place], view.focus));
+    const here = this.captions(view), first = here.findIndex(({ kind }) => kind === "measured");
+    const last = here.findLastIndex(({ kind }) => kind === "ruled-out");
+    if (first < 0 || view.beat > last) return 1;
+    if (view.beat !== first) return view.beat < first ? 0 : ALMOST;
+    return Math.min(ALMOST, view.held / this.#hold(here[first], view.focus));
+  }
+
+  /** Returns whether the last manoeuvre of this tick may be shown: its caption, if there is one, has been reached. */
+  planned(view) {
+    const place = this.captions(view).findIndex(({ kind }) => kind === "manoeuvre");
+    return view.beat === null || view.beat >= place;
   }
 
   /** Passes `s` seconds. Returns false once the story has ended. */
@@ -105,7 +118,7 @@ export class Guide {
     if (PASSING.has(kind)) return 0;
     const seconds = (one) => {
       const reading = Math.min(1 + 0.03 * (one.text.length + (one.truth?.length ?? 0)), 4.5);
-      return one.kind === "ruled-out" ? Math.max(reading, ELIMINATION_S) : reading;
+      return one.kind === "measured" ? Math.max(reading, ELIMINATION_S) : reading;
     };
     let all = 0;
     for (const { captions } of this.beats) {

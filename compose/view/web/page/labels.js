@@ -2,6 +2,11 @@
 
 const GAP = 2;
 const LEAST_ALPHA = 0.9;
+/** The opacity of the ground of a label, under which lines are pale, and how far it reaches around the text. */
+const GROUND_ALPHA = 0.65, AROUND = 2;
+/** The distance of the points of a line of which labels keep clear, and half of its width, in pixels. */
+const EVERY = 6, HALF = 4;
+const MOST_PARTS = 60;
 /** The rank of the names of robots. */
 export const NAME = 2;
 
@@ -23,6 +28,15 @@ export class Labels {
     this.asked.push({ text, x, y, colour, align, font, rank, around, others, alpha: this.pen.globalAlpha });
   }
 
+  /** Keeps labels clear of the line between two points. */
+  avoid([x, y], [to_x, to_y]) {
+    const parts = Math.min(Math.ceil(Math.hypot(to_x - x, to_y - y) / EVERY), MOST_PARTS);
+    for (let k = 0; k <= parts; k++) {
+      const at = [x + (k / Math.max(parts, 1)) * (to_x - x), y + (k / Math.max(parts, 1)) * (to_y - y)];
+      this.placed.push([at[0] - HALF, at[1] - HALF, at[0] + HALF, at[1] + HALF]);
+    }
+  }
+
   draw() {
     const { pen } = this;
     for (const one of [...this.asked].sort((a, b) => b.rank - a.rank)) {
@@ -34,6 +48,10 @@ export class Labels {
       if (!spot) continue;
       this.placed.push(spot.box);
       this.drawn.push({ text: one.text, box: spot.box });
+      const [left, top, right, bottom] = spot.box;
+      pen.globalAlpha = GROUND_ALPHA;
+      pen.fillStyle = this.look.paper;
+      pen.fillRect(left - AROUND, top - AROUND, right - left + 2 * AROUND, bottom - top + 2 * AROUND);
       pen.globalAlpha = Math.max(one.alpha, LEAST_ALPHA);
       pen.textAlign = spot.align;
       pen.lineWidth = 3.5;

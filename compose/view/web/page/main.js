@@ -9,9 +9,10 @@ import { Charts } from "./charts.js";
 import * as data from "./data.js";
 import { embedded, on_clock, pass_on, tell, tell_state } from "./embedding.js";
 import { needed, release_focus } from "./focus.js";
-import { name_group } from "./group.js";
+import { group_marks } from "./group.js";
 import { Guide } from "./guide.js";
 import { fill_help } from "./help.js";
+import { Legend } from "./legend.js";
 import { Log } from "./log.js";
 import { list_missions, state_of } from "./missions.js";
 import { Plane } from "./plane.js";
@@ -22,7 +23,8 @@ import { Sequence } from "./sequence.js";
 import { SPEEDS, USUAL } from "./speeds.js";
 import { Store } from "./store.js";
 import { Timeline } from "./timeline.js";
-import { plural } from "./words.js";
+import { joined } from "./tints.js";
+import { plural, seconds } from "./words.js";
 
 const SETTLED_MS = 200; // after the last movement of the camera
 
@@ -51,6 +53,7 @@ const announcer = new Announcer();
 const plane = new Plane($("canvas"), () => draw(), select);
 const tip = new Tip($("tip"));
 const predictions = new Predictions($("predictions"), plane);
+const legend = new Legend($("legend"), () => draw());
 const timeline = new Timeline($("line"), $("bands"), $("scrub"), (tick) => go(tick));
 const sequence = new Sequence($("exchange"), (tick) => go(tick), () => draw());
 const charts = new Charts($("charts"), $("strips"), (tick) => go(tick), () => draw());
@@ -169,7 +172,6 @@ function staged() {
   document.title = `${store.stage.name} · Tandem`;
   const all = make("option", { value: "", textContent: "all" });
   $("robot").replaceChildren(all, ...store.stage.robots.map((robot) => make("option", { value: robot.id, textContent: robot.id })));
-  if (store.grouped) name_group($("legend"));
   cards.stage(store);
   timeline.stage(store);
   log.stage(store);
@@ -291,9 +293,11 @@ function draw() {
     store.show(view.tick);
     view.moving = (view.playing || view.driven) && !still.matches && (view.guided || view.speed <= 60);
     view.eliminated = guide.eliminated(view);
+    view.planned = guide.planned(view);
     // First the texts: they decide the size of the plane, and its camera and its labels keep clear of them.
     controls();
-    text($("caption"), guide.text(view));
+    $("caption").classList.toggle("several", guide.several(view));
+    caption(guide.text(view));
     predictions.draw(view, store, guide.pair(view.focus));
     if (plane.following) plane.follow(view, store, guide.pair(view.focus), still.matches ? null : now);
     document.body.dataset.tick = view.tick;
@@ -305,6 +309,8 @@ function draw() {
     cards.draw(view);
     log.draw(view);
     timeline.draw(view, activities(store, view));
+    const story = guide.pair(view.focus), mover = joined(store.scene(view.tick), story[0].id)?.manoeuvre?.robot ?? "it";
+    legend.draw(store.grouped ? group_marks(plane.marks) : plane.marks, timeline.kinds, store.stage.robots.length > story.length ? [] : story, mover);
     sequence.draw(store, view);
     charts.draw(store, view, store.grouped ? [store.chosen(view.focus)] : guide.pair(view.focus));
     const news = view.playing && view.guided ? null : announcer.text(store, view, now);
@@ -320,6 +326,7 @@ function controls() {
   $("status").dataset.outcome = lost ? "lost" : store.end?.outcome ?? (store.live ? "live" : "torn");
   $("status").title = store.end?.reason ?? "";
   text($("tick"), `tick ${view.tick} of ${Math.max(store.last, 0)}`);
+  $("tick").dataset.time = seconds(view.tick * store.stage.mission.period);
   $("play").classList.toggle("on", view.playing);
   $("play").setAttribute("aria-label", view.playing ? "Pause" : "Play");
   $("play").classList.toggle("invite", view.guided && !view.playing && !store.live && view.tick === store.first);
@@ -348,6 +355,16 @@ function controls() {
 function knows_bearing() {
   const players = store.scene(view.tick)?.players ?? [];
   return players.filter((player) => !view.focus || player.robot === view.focus).every((player) => player.held?.world.length);
+}
+
+/** Shows a caption. Its room never becomes smaller in a window, so that the plane keeps its size. */
+function caption(content) {
+  const box = $("caption"), room = `${window.innerWidth}x${window.innerHeight}`;
+  if (box.textContent === content && box.dataset.room === room) return;
+  if (box.dataset.room !== room) box.style.minHeight = "";
+  box.dataset.room = room;
+  text(box, content);
+  box.style.minHeight = `${box.offsetHeight}px`;
 }
 
 function text(element, content) {
@@ -422,6 +439,7 @@ function pressed(event) {
     s: () => plane.shift(event.shiftKey ? -60 : 0, event.shiftKey ? 0 : -60),
     d: () => { $("exchange").open = !$("exchange").open; },
     e: () => change(),
+    k: () => { $("legend").open = !$("legend").open; },
     v: () => { $("charts").open = !$("charts").open; },
     "?": () => $("keys").showModal(),
   };
@@ -451,7 +469,7 @@ $("near").addEventListener("click", () => plane.near(store, view));
 $("help").addEventListener("click", () => $("keys").showModal());
 $("view").addEventListener("submit", (event) => event.preventDefault());
 $("speed").append(...SPEEDS.map((speed) => make("option", { value: speed, textContent: speed })));
-fill_help($("key-list"), $("signs"), $("legend"));
+fill_help($("key-list"), $("signs"));
 
 window.addEventListener("hashchange", () => {
   const { show, tick, robot, selected, view: look, truth } = address_state();
@@ -463,7 +481,7 @@ window.addEventListener("hashchange", () => {
   if (tick !== null) go(tick);
   else draw();
 });
-new ResizeObserver(() => draw()).observe($("plane"));
+new ResizeObserver(() => draw()).observe($("stage"));
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => draw());
 
 listen();

@@ -23,6 +23,9 @@ export function shape(pen, role, x, y, heading, size) {
 /** Returns the opacity of a range, which fades until the next tick. */
 export const fading = (share, moving) => (moving ? Math.max(0, 1 - 1.6 * share) : 1);
 
+/** The dashes of the circle that a configuration predicts, by its number from 0, so that circles differ without colour. */
+export const DASHES = [[6, 4], [12, 4], [2, 4], [10, 3, 2, 3]];
+
 /** Draws a cross over a robot. */
 export function cross(pen, x, y, size, look) {
   const r = 0.7 * size;

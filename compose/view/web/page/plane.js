@@ -53,6 +53,8 @@ export class Plane {
     this.#signals = new Signals(this);
     this.#configurations = new Configurations(this);
     this.tints = new Tints();
+    /** The names of the marks that are drawn, for the legend. */
+    this.marks = new Set();
     /** What is drawn above all else and can be dragged; see Changes. */
     this.handles = null;
     canvas.addEventListener("wheel", (event) => {
@@ -215,7 +217,7 @@ export class Plane {
     return [this.centre[0] + (x - this.width / 2) / this.scale, this.centre[1] - (y - this.height / 2) / this.scale];
   }
 
-  draw(store, { tick, share, focus, truth, moving, eliminated, selected }) {
+  draw(store, { tick, share, focus, truth, moving, eliminated, planned, selected }) {
     this.#measure();
     const ratio = (window.devicePixelRatio || 1) * unit();
     const width = Math.round(this.width * ratio), height = Math.round(this.height * ratio);
@@ -225,6 +227,7 @@ export class Plane {
     }
     if (this.fitted) this.fit(store, focus, truth);
     this.targets = [];
+    this.marks.clear();
     if (this.#revision !== store.revision) {
       this.#trails.forget();
       this.tints.forget();
@@ -236,7 +239,7 @@ export class Plane {
     pen.clearRect(0, 0, this.width, this.height);
     pen.lineCap = pen.lineJoin = "round";
     pen.font = look.font;
-    const view = { store, tick, share, focus, truth, moving, eliminated, look, scene: store.scene(tick) };
+    const view = { store, tick, share, focus, truth, moving, eliminated, planned, look, scene: store.scene(tick) };
     this.labels = new Labels(pen, look, this.width, this.height, this.#overlays());
     const shown = (robot) => truth || !focus || robot.id === focus;
     const robots = store.stage.robots.filter(shown);
@@ -244,6 +247,7 @@ export class Plane {
     for (const robot of robots) {
       if (!truth) this.#trails.believed_trail(view, robot);
       else for (const kind of kinds_of(robot)) this.#trails.newest(pen, view, robot, kind);
+      if (truth) this.#trails.turned(pen, view, robot);
     }
     if (view.scene) this.#scene(view, robots);
     this.#ring(this.targets.find((one) => same(one, selected)), look);
@@ -265,10 +269,12 @@ export class Plane {
     pen.stroke();
   }
 
+  /** Returns the size in pixels with which robots are drawn. */
+  robot_size(store) { return Math.max(4.5, Math.min(11, 0.18 * store.stage.mission.sensing_range * this.scale)); }
+
   #scene(view, robots) {
     const { store, truth, focus } = view;
-    const size = Math.max(4.5, Math.min(11, 0.18 * store.stage.mission.sensing_range * this.scale));
-    view.size = size;
+    view.size = this.robot_size(store);
     view.places = new Map(store.stage.robots.map((robot) => [robot.id, pose_now(view, robot, TRUE)]));
     for (const robot of robots) if (store.grouped ? heads(view, robot) : robot.role === "a") this.#configurations.draw(view, robot);
     for (const robot of robots) if (!focus || robot.id === focus) this.#beliefs.belief(view, robot);
@@ -286,6 +292,7 @@ export class Plane {
     const pose = pose_now(view, robot, REPORTED), true_pose = view.places.get(robot.id);
     if (!pose || !true_pose || distance(pose, true_pose) < LEAST_GAP_M) return;
     const [x, y] = this.at(pose), [to_x, to_y] = this.at(true_pose);
+    this.marks.add("reported");
     pen.globalAlpha = focus && robot.id !== focus && robot.peer !== focus ? 0.45 : 1;
     pen.strokeStyle = look.fault;
     pen.lineWidth = 1;
@@ -311,7 +318,7 @@ export class Plane {
   /** Returns the boxes of the texts over the plane, as [left, top, right, bottom]. */
   #overlays() {
     const { left, top } = this.canvas.getBoundingClientRect(), scale = unit();
-    return [...this.canvas.parentElement.querySelectorAll("p, ul")].filter((one) => one.textContent && !one.hidden).map((one) => {
+    return [...document.querySelectorAll("#stage :is(p, ul), #legend summary, #legend[open] ul")].filter((one) => one.textContent && !one.hidden).map((one) => {
       const box = one.getBoundingClientRect();
       return [(box.left - left) / scale, (box.top - top) / scale, (box.right - left) / scale, (box.bottom - top) / scale];
     });
@@ -334,6 +341,7 @@ export class Plane {
     pen.strokeStyle = down ? look.robot[robot.role] : look.ink;
     pen.stroke();
     if (down) cross(pen, x, y, size, look);
+    this.marks.add(down ? "down" : `robot-${robot.role}`);
     this.targets.push({ kind: "robot", robot: robot.id, at: [x, y], radius: size });
     if (size > 6) this.labels.placed.push([x - size, y - size, x + size, y + size]);
     if (size > 6 || down || robot.id === focus || (store.grouped && store.places.size <= NAMED)) {

@@ -29,7 +29,7 @@ export class Predictions {
       return item;
     });
     const measured = found.measured ? [make("li", { className: "measured", textContent: `measured ${found.measured}` })] : [];
-    const value = found.value ? [make("li", { className: "value" }, make("span", { textContent: "least difference " }), found.value)] : [];
+    const value = found.value ? [make("li", { className: "value" }, make("span", { textContent: "told apart by " }), found.value)] : [];
     this.root.replaceChildren(make("li", { className: "title", textContent: found.title }), ...items, ...measured, ...value);
   }
 
@@ -39,11 +39,11 @@ export class Predictions {
     const listed = (all) => all.map(({ tint, predicted: length, out }) => ({ tint, at: metres(length), out })).sort((a, b) => a.tint - b.tint);
     if (eliminated < 1) {
       const { all, measured } = shown(view, robot, tints);
-      if (all.length > 1 && measured !== null) return { title: "predicted distances", all: listed(all), measured: metres(measured) };
+      if (all.length > 1 && measured !== null) return { title: "predicted", all: listed(all), measured: metres(measured) };
     }
-    if (!now || now.count < 2) return null;
+    if (!now || now.count < 2 || !view.planned) return null;
     const all = predicted(store, tick, robot, tints);
     const value = now.manoeuvre && `J = ${now.manoeuvre.separation_m2.toPrecision(3)} m²`;
-    return all.length ? { title: "predicted distances", all: listed(all), value } : null;
+    return all.length ? { title: "predicted", all: listed(all), value } : null;
   }
 }

@@ -6,6 +6,8 @@ import { fading } from "./pen.js";
 import { metres } from "./words.js";
 
 const MOST_ORIGINS = 6;
+const LEGIBLE = 46; // the least length in pixels of a line that has its label in any case
+const BESIDE = 10; // the distance in pixels of a label from its line
 
 export class Signals {
   constructor(plane) { this.plane = plane; }
@@ -18,24 +20,31 @@ export class Signals {
   }
 
   anchor_range(view, robot) {
-    const { scene, store, look, share, moving } = view;
+    const { scene, store, share, moving } = view;
     const range = scene.players[store.places.get(robot.id)]?.anchor_range;
     const true_pose = scene.players[store.places.get(robot.id)]?.pose;
     const poses = view.truth ? [true_pose].filter(Boolean) : this.#origins(view, robot);
     if (range === undefined || !poses.length) return;
-    for (const pose of poses) this.#anchor_line(pose, robot, range, look, fading(share, moving));
+    for (const pose of poses) this.#anchor_line(pose, robot, range, view, fading(share, moving));
   }
 
-  #anchor_line(pose, robot, range, look, alpha) {
+  #anchor_line(pose, robot, range, { look, size }, alpha) {
     const pen = this.plane.context, from = this.plane.at(pose), to = this.plane.at(robot.anchor);
+    this.plane.marks.add("distance");
     pen.globalAlpha = alpha;
     pen.beginPath();
     pen.moveTo(...from); pen.lineTo(...to);
     pen.strokeStyle = look.range;
     pen.lineWidth = 1.8;
     pen.stroke();
-    if (distance(from, to) > 46) {
-      this.plane.labels.put(metres(range), (from[0] + to[0]) / 2, (from[1] + to[1]) / 2 - 5, look.range, "center");
+    if (size > 6) this.plane.labels.avoid(from, to);
+    const length = distance(from, to), x = (from[0] + to[0]) / 2, y = (from[1] + to[1]) / 2;
+    if (length > LEGIBLE || (size > 6 && length > 1)) {
+      const across = [(to[1] - from[1]) / length, (from[0] - to[0]) / length].map((one) => BESIDE * one);
+      const spots = [[x + across[0], y + across[1] + 4], [x - across[0], y - across[1] + 4]].sort((a, b) => a[1] - b[1]);
+      const [spot, other] = spots, steep = Math.abs(across[0]) > 0.5 * BESIDE;
+      const align = !steep ? "center" : spot[0] > x ? "left" : "right";
+      this.plane.labels.put(metres(range), ...spot, look.range, align, { around: steep ? BESIDE : 0, others: steep ? [] : [other] });
     }
     pen.globalAlpha = 1;
   }
@@ -47,6 +56,7 @@ export class Signals {
     const contact = contacts.find((one) => one[0] === robot.peer) ?? contacts[0];
     const poses = this.#origins(view, robot);
     if (!contact || contact[1] === null || !poses.length) return;
+    this.plane.marks.add("measured");
     const pen = this.plane.context, radius = contact[1] * this.plane.scale;
     pen.globalAlpha = fading(share, moving) * (poses.length > 1 ? 0.6 : 1);
     pen.strokeStyle = look.link;
@@ -82,6 +92,8 @@ export class Signals {
       pen.lineWidth = 1.4;
       pen.stroke();
     }
+    this.plane.marks.add("contact");
+    if (size > 6) this.plane.labels.avoid(one, other);
     if (contact[1] !== null && length > 60) {
       const x = (one[0] + other[0]) / 2 + 16 * across[0], y = (one[1] + other[1]) / 2 + 16 * across[1];
       this.plane.labels.put(metres(contact[1]), x, y, look.link, across[0] < 0 ? "right" : "left", { around: 16 * Math.abs(across[0]) });
@@ -120,6 +132,7 @@ export class Signals {
   #report([x, y], sign, alpha, behind, look, size) {
     const pen = this.plane.context, before = pen.globalAlpha;
     pen.globalAlpha = before * alpha;
+    this.plane.marks.add(sign === "heard" ? "report" : sign);
     if (sign === "late") {
       pen.beginPath();
       pen.moveTo(...behind); pen.lineTo(x, y);

@@ -33,6 +33,9 @@ export class Timeline {
     scrub.addEventListener("input", () => go(Number(scrub.value)));
   }
 
+  /** The kinds of events that have a sign. */
+  get kinds() { return new Set(this.marks.map(([, kind]) => kind)); }
+
   inset = 30;
   last = 0;
 

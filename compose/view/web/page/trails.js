@@ -1,15 +1,17 @@
 // The trails of the robots: true, as an attacker reports it, or as implied by their most probable current pose. As in the
 // figures, the hue is the robot, and the line style of all but reported ones the phase: dotted, dashed, solid.
 
-import { between, compose, controls, inverse } from "./geometry.js";
+import { between, compose, controls, inverse, TAU } from "./geometry.js";
 import { held_now, leads } from "./held.js";
-import { unit } from "./pen.js";
+import { fading, shape, unit } from "./pen.js";
 
 const TRAIL = { 1: { dash: [1.5, 4.5], width: 2.4 }, 2: { dash: [8, 5.5], width: 2 }, 3: { dash: [], width: 2.6 } };
 const REPORTED_STYLE = { dash: [4, 4], width: 1.3 };
 const CHUNK = 64;
 const BENDS = 6;
 const MOST_TRAILS = 6;
+/** The number of directions in which a path is shown while its bearing from the anchor is unknown. */
+const TURNS = 8;
 
 /** The poses of a trail, and the controls between two of them. */
 export const TRUE = { name: "true", pose: (player) => player?.pose, driven: (here, next) => next.executed };
@@ -48,6 +50,31 @@ export class Trails {
     });
   }
 
+  /** Draws faint copies of the true trail around the anchor, in the tick with the caption that the robot knows its path. */
+  turned(pen, view, robot) {
+    const { store, tick, scene, look, share, moving } = view, held = store.player(tick, robot.id)?.held;
+    const told = scene?.captions?.some(({ kind, robots }) => kind === "path" && robots.includes(robot.id));
+    const pose = store.player(tick, robot.id)?.pose, size = this.plane.robot_size(store), alpha = fading(share, moving);
+    if (!told || !pose || !held || held.world.length || alpha <= 0) return;
+    this.plane.marks.add("turned");
+    const [x, y] = robot.anchor, pieces = this.#pieces(store, robot, TRUE, store.first, Math.min(tick, store.last), false);
+    for (let i = 1; i < TURNS; i++) {
+      const angle = (i * TAU) / TURNS, turn = compose([x, y, angle], [-x, -y, 0]);
+      this.#stroked(pen, view, robot, TRUE, (stroke) => {
+        pen.globalAlpha = 0.35 * alpha;
+        pen.transform(Math.cos(angle), Math.sin(angle), -Math.sin(angle), Math.cos(angle), turn[0], turn[1]);
+        for (const [phase, path] of pieces) stroke(path, phase);
+      });
+      const [at_x, at_y, heading] = compose(turn, pose);
+      pen.globalAlpha = 0.5 * alpha;
+      shape(pen, robot.role, ...this.plane.at([at_x, at_y]), heading, 0.8 * size);
+      pen.strokeStyle = look.robot[robot.role];
+      pen.lineWidth = 1.2;
+      pen.stroke();
+    }
+    pen.globalAlpha = 1;
+  }
+
   /** Draws the part of a trail that `robot` has driven since the tick. */
   newest(pen, view, robot, kind) {
     const { store, tick, share, moving } = view;
@@ -74,6 +101,7 @@ export class Trails {
     draw((path, phase, role) => {
       pen.strokeStyle = look.robot[role];
       const { dash, width } = kind === REPORTED ? REPORTED_STYLE : TRAIL[phase] ?? TRAIL[2];
+      this.plane.marks.add(kind === REPORTED ? "reported" : `path-${phase}`);
       pen.lineWidth = (faint ? 0.7 * width : width) / s;
       pen.setLineDash(dash.map((length) => length / s));
       pen.stroke(path);
@@ -149,6 +177,7 @@ export class Trails {
         if (phase !== null) pen.stroke();
         phase = next;
         const { dash, width } = TRAIL[phase];
+        this.plane.marks.add(`path-${phase}`);
         pen.setLineDash(dash);
         pen.lineWidth = width;
         pen.strokeStyle = look.robot[robot.role];

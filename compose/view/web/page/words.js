@@ -12,6 +12,9 @@ export function metres(value) {
   return `${value.toExponential(1).replace("-", "−")} m`;
 }
 
+/** Returns a time in s, to the millisecond. */
+export const seconds = (value) => `${Number(value.toFixed(3))} s`;
+
 export const rad = (value) => `${value < 0 ? "" : "+"}${number(value, 2)} rad`;
 export const speed = (value) => `${number(value, 2)} m/s`;
 export const turning = (value) => `${value < 0 ? "" : "+"}${number(value, 2)} rad/s`;
@@ -63,6 +66,7 @@ export const KEYS = [
   ["F", "zoom to the whole scenario"],
   ["D", "show or hide the sequence diagram of the reports; in it, + − zoom in time and 0 shows all ticks"],
   ["E", "change the scenario, and run it again"],
+  ["K", "show or hide the legend"],
   ["V", "show or hide the charts; in them, + − zoom in time and 0 shows all ticks"],
   ["?", "this help"],
 ];
@@ -71,14 +75,15 @@ export const MEANINGS = [
   ["filled robot", "true pose; pointed for role a, round for role b"],
   ["outlined robot", "pose that the robot considers possible; paler means less probable; crossed out: just ruled out"],
   ["colour of outlined robots", "poses of a and b in one colour, joined by a line, belong to one configuration of the pair"],
-  ["dashed circles around a driving robot", "the distances that the configurations predict; solid: the measured one"],
-  ["arc with a cross", "where the last manoeuvre can end: the thicker, the larger J of eq. (8); the cross is the choice"],
+  ["dashed circles around a driving robot", "the distances that the configurations predict; wide and pale: the measured one"],
+  ["arc with an arrow", "where the last manoeuvre can end: the thicker, the larger J of eq. (8); the arrow is the choice"],
   ["J", "the least difference between the squares of two distances that the configurations predict"],
   ["dotted circle around an anchor", "where the robot may be by its only range"],
   ["ellipse", "3 sigma of the most probable position"],
   ["hollow robot, crossed out", "its process is gone"],
   ["line to an anchor", "range measured in this tick"],
   ["double line", "contact; dots are reports: filled received, with a tail late, hollow lost, crossed out damaged"],
+  ["faint copies of a trail", "the same path, turned around the anchor: just as possible"],
   ["trail", "in the colour of the robot, as in the figures; dotted in phase 1, dashed in phase 2, solid in phase 3"],
   ["dashed robot and thin dashed trail", "the path that an attacker reports; a line joins it to the true one"],
   ["in a group", "the hue of a robot, of its trail and of its anchor's range tells whether it is localised; thin arrows join the anchors of robots that meet, and are dotted until the second one is localised"],

@@ -1,6 +1,6 @@
 """Captions of a group: who meets first, who drives to whom, and how many robots claim to know their poses.
 
-They are fewer than those of a pair, whose meeting has captions of its own (see `compose.view.captions`).
+They are fewer than those of a pair, whose meeting has captions of its own (see `compose.view.story`).
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ from collections.abc import Iterator, Sequence
 
 from compose.recording.meetings import TRAVELLING
 from compose.recording.run_setup import RobotSetup, RunSetup
-from compose.view.captions import COUNTS, Caption
 from compose.view.deliveries import Passage, contact_of
 from compose.view.events import metres
 from compose.view.run_data import TickData
+from compose.view.story.caption import Caption, count_word, stopped
 from compose.view.words import end_reason
 from protocol.messages import Inconsistent, Localised, MissionEnd, Undecided
 from protocol.motion import travelled
@@ -46,7 +46,8 @@ def _beginning(setup: RunSetup) -> Caption:
     first = [f"{one.id} meets {one.peer}" for one in setup.robots if one.id not in visited]
     meet = f"First, {_listed(first, 'pairs meet')}"
     meet += "; then those that are localised drive to the others." if len(first) < len(setup.visits) else "."
-    text = f"{_counted(len(setup.robots))} robots measure no more than the distance to their own anchor."
+    number = count_word(len(setup.robots)).capitalize()
+    text = f"{number} robots measure no more than the distance to their own anchor."
     attackers = [robot.id for robot in setup.robots if robot.attack is not None]
     truth = f"{_listed(attackers, 'robots')} will report false data." if attackers else None
     return Caption("ranging", f"{text} {meet}", truth=truth)
@@ -86,10 +87,10 @@ def _concluding(
             case Localised():
                 claiming.append(robot.id)
             case Undecided(reason):
-                yield Caption("undecided", f"{robot.id} stops without a claim: {_stopped(reason)}", pair)
+                yield Caption("undecided", f"{robot.id} stops without a claim: {stopped(reason)}", pair)
             case Inconsistent(claim):
                 text = f"{robot.id} finds that the reports of {robot.peer} contradict what it measured: "
-                yield Caption("inconsistent", text + _stopped(claim), pair)
+                yield Caption("inconsistent", text + stopped(claim), pair)
     if not claiming or (ended is not None and ended.outcome == "localised"):
         return
     known = sum([isinstance(one.verdict, Localised) for one in now.commands.values()])
@@ -142,7 +143,7 @@ def _end(setup: RunSetup, now: TickData, end: MissionEnd) -> Caption:
     largest = f"The largest error of a localised robot is {size}." if errors else None
     if end.outcome == "localised":
         return Caption("end", f"All {len(setup.robots)} robots are localised.", truth=largest)
-    why = f": {_stopped(end_reason(end.reason))}" if end.reason else "."
+    why = f": {stopped(end_reason(end.reason))}" if end.reason else "."
     return Caption("end", f"The mission ends: {end.outcome}{why}", truth=largest)
 
 
@@ -151,13 +152,3 @@ def _listed(names: Sequence[str], what: str) -> str:
     if len(names) > MOST_LISTED:
         return f"{len(names)} {what}"
     return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
-
-
-def _counted(number: int) -> str:
-    """Return a number as the first word of a sentence."""
-    return COUNTS[number].capitalize() if number < len(COUNTS) else str(number)
-
-
-def _stopped(text: str) -> str:
-    """Return `text` as the end of a sentence."""
-    return text if not text or text.endswith((".", "!", "?")) else f"{text}."

@@ -1,0 +1,61 @@
+"""Captions of a mission: a sentence or two for each important event.
+
+Captions follow from the data of a tick and of the one before, as events do. There are far fewer of them,
+and each is about a pair of robots. They state what was measured, held, claimed and decided, and no more: a
+claim counts as true only once the mission has ended `localised`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from compose.recording.run_setup import RobotSetup, RunSetup
+from compose.view.deliveries import Passage
+from compose.view.pair_data import PairData
+from compose.view.run_data import TickData
+from compose.view.story.caption import Caption, listed
+from compose.view.story.encounter_captions import fitting, meeting, planning
+from compose.view.story.ending_captions import concluding, ending
+from compose.view.story.search_captions import choosing_branch, ranging, searching
+from protocol.messages import MissionEnd
+
+
+def captions(
+    setup: RunSetup,
+    before: TickData | None,
+    now: TickData,
+    passages: Sequence[Passage],
+    end: MissionEnd | None,
+) -> Iterator[Caption]:
+    """Yield the captions of the tick of `now`, pair by pair, and at last that of the end of the mission."""
+    pairs: list[tuple[RobotSetup, ...]] = [*setup.pairs()]
+    paired = {robot.id for pair in pairs for robot in pair}
+    groups = [*pairs, *[(robot,) for robot in setup.robots if robot.id not in paired]]
+    ended = end if end is not None and end.tick == now.tick else None
+    for robots in groups:
+        pair = PairData(robots, setup.mission.noise.exact, before, now)
+        yield from ranging(pair, len(groups))
+        yield from choosing_branch(pair)
+        yield from searching(pair)
+        yield from meeting(pair)
+        yield from fitting(pair)
+        yield from planning(pair)
+        yield from concluding(pair, ended)
+        yield from _losing(pair, passages)
+    if ended is not None:
+        yield ending(setup, now, ended)
+
+
+def _losing(pair: PairData, passages: Sequence[Passage]) -> Iterator[Caption]:
+    """Yield what is lost: reports, and processes."""
+    lost = [one.sender for one in passages if one.what == "lost" and one.sender in pair.ids]
+    if lost:
+        reports = "A report" if len(lost) == 1 else "Reports"
+        verb = "is" if len(lost) == 1 else "are"
+        yield Caption("report-lost", f"{reports} of {listed(sorted({*lost}))} {verb} lost.", pair.ids)
+    for robot in pair.ids:
+        was = pair.before is not None and robot in pair.before.down - pair.before.back
+        if robot in pair.now.down and not was:
+            yield Caption("process", f"The process of {robot} is gone.", pair.ids)
+        if robot in pair.now.back:
+            yield Caption("process", f"The process of {robot} runs again.", pair.ids)

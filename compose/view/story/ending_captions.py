@@ -1,0 +1,121 @@
+"""Captions of verdicts and of the end of a mission."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from compose.recording.run_setup import RunSetup
+from compose.view.events import metres
+from compose.view.pair_data import PairData
+from compose.view.run_data import TickData
+from compose.view.story.caption import Caption, attacked, stopped
+from compose.view.words import end_reason
+from protocol.messages import Inconsistent, Localised, MissionEnd, Undecided
+
+MOST_LINKS = 2
+"""The largest number of links that a sentence names."""
+
+
+def concluding(pair: PairData, ended: MissionEnd | None) -> Iterator[Caption]:
+    """Yield the new verdicts. Claims with which the mission ends `localised` are left to its last caption."""
+    claiming: list[str] = []
+    claimed: list[str] = []
+    for robot in pair.robots:
+        earlier, command = pair.commands(robot.id)
+        if command is None or command.verdict is None:
+            continue
+        new = earlier is None or earlier.verdict is None
+        match command.verdict:
+            case Localised():
+                (claiming if new else claimed).append(robot.id)
+            case Undecided(reason) if new:
+                yield Caption("undecided", f"{robot.id} stops without a claim: {stopped(reason)}", pair.ids)
+            case Inconsistent(what) if new:
+                text = f"{robot.id} finds that the reports of {robot.peer} contradict what it measured: "
+                text += stopped(what)
+                truth = attacked(pair, "does report") or "No robot reports false data."
+                yield Caption("inconsistent", text, pair.ids, truth)
+            case _:
+                pass
+    if not claiming or (ended is not None and ended.outcome == "localised"):
+        return
+    everyone = len(claiming) == len(pair.ids) > 1
+    text = "Both claim to know their poses." if everyone else f"{claiming[0]} claims to know its pose."
+    if not everyone and claimed:
+        text = f"{claiming[0]} claims to know its pose, too."
+    yield Caption("claim", text, pair.ids)
+
+
+def ending(setup: RunSetup, now: TickData, end: MissionEnd) -> Caption:
+    """Return the caption of the end of the mission."""
+    why = f": {stopped(end_reason(end.reason))}" if end.reason else "."
+    errors = _claim_errors(setup, now)
+    largest = _off(errors) if errors else None
+    silent = _silent_links(setup)
+    robots = len(setup.robots)
+    match end.outcome:
+        case "localised":
+            who = {1: setup.ids[0], 2: "Both"}.get(robots, f"All {robots} robots")
+            each = (
+                "it knows its position and its heading"
+                if robots == 1
+                else "each knows its position and its heading"
+            )
+            are = "is" if robots == 1 else "are"
+            return Caption("end", f"{who} {are} localised: {each}.", truth=largest)
+        case "undecided":
+            return Caption(
+                "end",
+                f"The mission ends undecided{why}",
+                truth=" ".join(filter(None, [silent, largest])) or None,
+            )
+        case "inconsistent":
+            text = "The mission ends, because measurements and reports contradict each other"
+            return Caption("end", stopped(text) if _just_told(setup, now) else f"{text}{why}", truth=largest)
+        case "wrong":
+            return Caption("end", f"The mission ends with a wrong claim{why}", truth=largest)
+        case _:
+            return Caption("end", f"The mission fails{why}", truth=largest)
+
+
+def _just_told(setup: RunSetup, now: TickData) -> bool:
+    """Return whether a robot of the only pair has found the contradiction: its caption has the reason."""
+    verdicts = [now.commands[robot].verdict for robot in setup.ids if robot in now.commands]
+    return len(setup.robots) == 2 and any(isinstance(verdict, Inconsistent) for verdict in verdicts)
+
+
+def _silent_links(setup: RunSetup) -> str | None:
+    """Return a sentence about the links that deliver nothing all the time; None if there are none."""
+    dead = [
+        fault
+        for fault in setup.faults
+        if (fault.partition or not fault.let_through) and fault.ticks is None and fault.contact_ticks is None
+    ]
+    links = [
+        f"from {robot.id} to {robot.peer}"
+        for robot in setup.robots
+        if any(fault.on(robot.id, robot.peer) for fault in dead)
+    ]
+    if len(links) > MOST_LINKS:
+        return f"No report arrives on {len(links)} of the {len(setup.robots)} links between robots."
+    return f"No report {' or '.join(links)} ever arrives." if links else None
+
+
+def _claim_errors(setup: RunSetup, now: TickData) -> list[float]:
+    """Return the position errors in m of the claims in this tick; empty without the ground truth."""
+    errors = []
+    for robot in setup.ids:
+        command, truth = now.commands.get(robot), now.truth.get(robot)
+        if command is not None and truth is not None and isinstance(command.verdict, Localised):
+            pose = command.verdict.pose
+            errors.append(math.hypot(pose.x - truth.x, pose.y - truth.y))
+    return errors
+
+
+def _off(errors: list[float]) -> str:
+    """Return a sentence about the errors of claims, in m."""
+    claims = "claimed position is" if len(errors) == 1 else "claimed positions are"
+    if max(errors) < 1e-6:
+        return f"The {claims} off by less than 1 µm."
+    return f"The {claims} off by {'' if len(errors) == 1 else 'at most '}{metres(max(errors))}."

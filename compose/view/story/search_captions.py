@@ -1,0 +1,98 @@
+"""Captions of phases 1 and 2: ranges to the anchors, branches, paths, and the search for the peer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from compose.recording.run_setup import RobotSetup
+from compose.view.events import metres
+from compose.view.pair_data import PairData
+from compose.view.story.caption import Caption, attacked, count_word, listed
+from protocol.messages import Estimate
+
+
+def ranging(pair: PairData, pairs: int) -> Iterator[Caption]:
+    """Yield what the robots measure in the first tick. `pairs` is the number of pairs."""
+    if pair.before is not None or pair.now.tick != 0:
+        return
+    found = [pair.now.observations.get(robot) for robot in pair.ids]
+    if None in found:
+        return
+    ranged = [one.robot for one in found if one is not None and one.anchor_range is not None]
+    without = [robot for robot in pair.ids if robot not in ranged]
+    only = "the distance to one beacon, its anchor. It knows how far away that is, not in which direction."
+    if not ranged:
+        text = "There is no distance to an anchor yet."
+    elif not without:
+        text = f"{'Each robot' if len(ranged) > 1 else ranged[0]} measures {only}"
+    else:
+        text = f"{ranged[0]} measures {only} {without[0]} has no such distance yet."
+    if pairs > 1 < len(pair.ids):
+        text = f"{listed(pair.ids)} are one of {pairs} pairs. {text}"
+    yield Caption("ranging", text, pair.ids, attacked(pair, "will report"))
+
+
+def choosing_branch(pair: PairData) -> Iterator[Caption]:
+    """Yield how each robot that had several possible poses relative to its anchor is left with one."""
+    for robot in pair.ids:
+        earlier, held = pair.held(robot)
+        if earlier is None or held is None or earlier.world or held.world:
+            continue
+        if len(earlier.local) < 2 or len(held.local) != 1:
+            continue
+        mirrored = ", mirror images of each other" if pair.exact and len(earlier.local) == 2 else ""
+        had = f"{robot} had {count_word(len(earlier.local))} possible poses relative to its anchor{mirrored}"
+        all_but_one = "one of them" if len(earlier.local) == 2 else "all but one of them"
+        yield Caption("branch", f"{had}. {_measured_now(pair, robot)} rules out {all_but_one}.", pair.ids)
+
+
+def _measured_now(pair: PairData, robot: str) -> str:
+    """Return what the robot has measured in this tick, as the subject of a sentence."""
+    observation = pair.now.observations.get(robot)
+    if observation is None:
+        return "What it has measured since"
+    if observation.anchor_range is None:
+        return "That no distance is measured now"
+    return f"The distance now measured, {metres(observation.anchor_range)},"
+
+
+def searching(pair: PairData) -> Iterator[Caption]:
+    """Yield what the robots know when all of them have begun phase 2, and how they search."""
+    commands = [pair.commands(robot) for robot in pair.ids]
+    earlier = [before.phase for before, _ in commands if before is not None]
+    phases = [now.phase for _, now in commands if now is not None]
+    if len(earlier) + len(phases) < 2 * len(pair.ids) or min(phases) < 2 or min(earlier) >= 2:
+        return
+    if all(_knows_path(pair.held(robot)[1]) for robot in pair.ids):
+        subject = "each robot" if len(pair.ids) > 1 else pair.ids[0]
+        what = "knows its path" if pair.exact else "has an estimate of its path"
+        turned = "but the whole path may be turned around the anchor by any angle."
+        yield Caption(
+            "path", f"After a short drive, {subject} {what} relative to its anchor, {turned}", pair.ids
+        )
+    if max(phases) < 3:
+        yield Caption("search", _search(pair.robots), pair.ids)
+
+
+def _search(robots: Sequence[RobotSetup]) -> str:
+    moving = [robot for robot in robots if robot.orbit.v != 0.0]
+    if len(moving) > 1:
+        slow, fast = sorted(moving, key=lambda robot: abs(robot.orbit.omega))
+        text = "They drive on circles around their anchors to find each other"
+        if abs(slow.orbit.omega) == abs(fast.orbit.omega):
+            return f"{text}."
+        both = "so that sooner or later both are near where the circles cross"
+        return f"{text}, {slow.id} more slowly than {fast.id}, {both}."
+    waits = ", which waits near its own" if len(robots) > 1 else ""
+    if not moving:
+        return f"{robots[0].id} waits near its anchor for {robots[0].peer}."
+    return f"{moving[0].id} drives on a circle around its anchor to find {moving[0].peer}{waits}."
+
+
+def _knows_path(held: Estimate | None) -> bool:
+    """Return whether one pose relative to the anchor is left, or more probable than all others together."""
+    if held is None or not held.local:
+        return False
+    return len(held.local) == 1 or (
+        not held.world and bool(held.probabilities) and held.probabilities[0] > 0.5
+    )

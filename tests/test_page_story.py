@@ -1,0 +1,174 @@
+"""What a reader who knows nothing needs: captions that follow the drawing, a legend, legible labels."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from itertools import combinations
+from typing import Any
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from compose.view.web.standalone import PAGE
+from tests.browser import Open, picture, stop_clock, until_shown
+
+STEP_MS = 250
+STORY = """() => ({
+  tick: document.body.dataset.tick,
+  caption: document.getElementById('caption').textContent,
+  title: document.querySelector('#predictions:not([hidden]) .title')?.textContent ?? null,
+  out: document.querySelectorAll('#predictions:not([hidden]) .out').length,
+  plane: [document.getElementById('canvas').clientWidth, document.getElementById('canvas').clientHeight],
+  marks: [...document.querySelectorAll('#legend li')].map((one) => one.textContent),
+  busy: document.getElementById('play').getAttribute('aria-label') === 'Pause',
+})"""
+"""What guided play shows."""
+
+
+def played(page: Page, tick: int) -> Iterator[dict[str, Any]]:
+    """Yield what guided play shows from `tick` on, every STEP_MS."""
+    until_shown(page, tick)
+    stop_clock(page)
+    page.keyboard.press("Space")
+    for _ in range(90_000 // STEP_MS):
+        page.clock.fast_forward(STEP_MS)
+        shown = page.evaluate(STORY)
+        yield shown
+        if not shown["busy"]:
+            return
+    raise AssertionError("the page still plays")
+
+
+@pytest.mark.long
+def test_captions_speak_of_the_manoeuvre_and_of_what_is_left_when_it_is_drawn(
+    opened: Open, address: str
+) -> None:
+    crossed: dict[str, list[int]] = {}
+    for shown in played(opened(f"{address}#tick=46"), 46):
+        crossed.setdefault(shown["caption"].split(" ")[0], []).append(shown["out"])
+        if shown["title"] is not None:
+            assert re.match("b makes one manoeuvre|The distance is|Only one", shown["caption"])
+    assert [min(crossed["The"]), max(crossed["The"])] == [0, 3]
+    assert crossed["The"] == sorted(crossed["The"])
+    assert set(crossed["Only"]) == {3}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("size", [(1280, 720), (800, 600), (390, 844)], ids=str)
+def test_the_plane_keeps_its_size_through_guided_play(
+    size: tuple[int, int], opened: Open, address: str
+) -> None:
+    page = opened(f"{address}#tick=0", width=size[0], height=size[1])
+    assert len({str(shown["plane"]) for shown in played(page, 0)}) == 1
+
+
+# --- the legend -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+def test_the_legend_lists_only_the_marks_that_are_drawn(opened: Open, address: str) -> None:
+    page = opened(f"{address}#tick=0")
+    at: dict[int, str] = {}
+    for tick in (0, 2, 5, 47, 48):
+        page.evaluate(f"location.hash = 'tick={tick}'")
+        until_shown(page, tick)
+        picture(page)
+        at[tick] = " ".join(page.locator("#legend li").all_text_contents())
+    for words, ticks in (
+        ("all places at that distance", {0}),
+        ("distance to the anchor", {0, 2, 5}),
+        ("pose that is ruled out", {2, 48}),
+        ("the path turned around the anchor", {5}),
+        ("path, phase 3: encounter", {47, 48}),
+        ("report to the other robot", {47, 48}),
+        ("where b could drive", {47}),
+        ("manoeuvre chosen by b", {47}),
+        ("robot a", {0, 2, 5, 47, 48}),
+    ):
+        assert {tick for tick, listed in at.items() if words in listed} == ticks, words
+
+
+@pytest.mark.long
+def test_the_legend_is_beside_the_plane_or_folded_and_opens_by_a_key(opened: Open, address: str) -> None:
+    wide, narrow = opened(address), opened(address, width=390, height=844)
+    for page in (wide, narrow):
+        until_shown(page, 0)
+    assert [page.locator("#legend[open]").count() for page in (wide, narrow)] == [1, 0]
+    boxes = [wide.locator(one).bounding_box() for one in ("#legend", "#canvas")]
+    assert boxes[0] is not None
+    assert boxes[1] is not None
+    assert boxes[0]["x"] + boxes[0]["width"] <= boxes[1]["x"]
+    for page in (wide, narrow):
+        page.keyboard.press("k")
+    expect(wide.locator("#legend ul")).to_be_hidden()
+    expect(narrow.get_by_text("robot a", exact=True)).to_be_visible()
+    narrow.locator("#legend summary").press("Enter")
+    expect(narrow.locator("#legend ul")).to_be_hidden()
+
+
+# --- labels and colours ---------------------------------------------------------------------------------
+
+
+def labels(page: Page) -> dict[str, list[float]]:
+    """Return the labels of the plane and their boxes."""
+    picture(page)
+    return {one["text"]: one["box"] for one in page.evaluate("document.getElementById('canvas').labels")}
+
+
+@pytest.mark.long
+def test_both_first_distances_have_labels_and_no_name_lies_on_the_line_between_robots(
+    opened: Open, address: str
+) -> None:
+    page = opened(f"{address}#tick=0")
+    until_shown(page, 0)
+    assert {"2.68 m", "1.36 m"} <= labels(page).keys()
+    for tick in (46, 47, 48):
+        page.evaluate(f"location.hash = 'tick={tick}'")
+        until_shown(page, tick)
+        names = labels(page)
+        targets = page.evaluate("document.getElementById('canvas').targets")
+        (ax, ay), (bx, by) = [one["at"] for one in targets if one["kind"] == "robot"]
+        for k in range(21):
+            x, y = ax + k / 20 * (bx - ax), ay + k / 20 * (by - ay)
+            for name in "ab":
+                left, top, right, bottom = names[name]
+                assert not (left < x < right and top < y < bottom), (tick, name)
+
+
+SEEN = {
+    "all cones": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    "deuteranopia": ((0.367, 0.861, -0.228), (0.280, 0.673, 0.047), (-0.012, 0.043, 0.969)),
+    "protanopia": ((0.152, 1.053, -0.205), (0.115, 0.786, 0.099), (-0.004, -0.048, 1.052)),
+}
+"""What is seen of linear red, green and blue: Machado, Oliveira and Fernandes (2009), severity 1."""
+LEAST_DIFFERENCE = 20.0
+"""The least difference of two colours in CIELAB; from about 10 on, they are told apart at a glance."""
+
+
+def lab(colour: str, seen: tuple[tuple[float, ...], ...]) -> tuple[float, float, float]:
+    """Return a colour in CIELAB, as one sees it whose sight is `seen`."""
+    parts = [int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5)]
+    linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
+    r, g, b = (max(sum(m * part for m, part in zip(row, linear, strict=True)), 0.0) for row in seen)
+    white = (0.9505, 1.0, 1.089)
+    xyz = (
+        0.4124 * r + 0.3576 * g + 0.1805 * b,
+        0.2126 * r + 0.7152 * g + 0.0722 * b,
+        0.0193 * r + 0.1192 * g + 0.9505 * b,
+    )
+    x, y, z = (
+        (one / of) ** (1 / 3) if one / of > 0.008856 else 7.787 * one / of + 16 / 116
+        for one, of in zip(xyz, white, strict=True)
+    )
+    return 116 * y - 16, 500 * (x - y), 200 * (y - z)
+
+
+@pytest.mark.parametrize("seen", SEEN)
+def test_configurations_differ_in_colour_also_for_the_colour_blind(seen: str) -> None:
+    themes = (PAGE / "style.css").read_text("utf-8").split("@media (prefers-color-scheme: dark)")
+    for theme in themes[0], themes[1].split("box-sizing")[0]:
+        tints = dict(re.findall(r"--tint-([1-4]): (#[0-9a-f]{6});", theme))
+        for one, other in combinations(tints, 2):
+            pairs = zip(lab(tints[one], SEEN[seen]), lab(tints[other], SEEN[seen]), strict=True)
+            assert sum((a - b) ** 2 for a, b in pairs) > LEAST_DIFFERENCE**2, (one, other)
