@@ -78,7 +78,7 @@ def meetings_after(
         command, before = now.commands.get(robot), earlier.get(robot)
         if command is None:
             continue
-        present = meetings.get(robot, PresentMeeting(partners[0], False))
+        present = was = meetings.get(robot, PresentMeeting(partners[0], False))
         localised = before is not None and isinstance(before.verdict, Localised)
         if before is None and command.tick > 0 and isinstance(command.verdict, Localised):
             known = frozenset([one for one in setup.ids if _has_verdict(one, now.commands)])
@@ -93,8 +93,9 @@ def meetings_after(
             present = PresentMeeting(to[0], localised)
         elif leaves and (not present.visiting or present.peer in known):
             present = PresentMeeting(_next(setup, robot, present.peer, now, known), True)
-        if (present, known) != (meetings.get(robot), present.known):
-            changed[robot] = present._replace(known=known)
+        present = present._replace(known=known)
+        if present != was:
+            changed[robot] = present
     return {**meetings, **changed} if changed else meetings
 
 

@@ -149,6 +149,8 @@ class RunSetup(msgspec.Struct, frozen=True, dict=True):
 
 
 def _in_meeting(one: RobotSetup, meeting: PresentMeeting) -> RobotSetup:
+    if meeting.peer == one.peer and not meeting.visiting:
+        return one
     return replace(one, peer=meeting.peer, role="a" if meeting.visiting else "b")
 
 
