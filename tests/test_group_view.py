@@ -11,16 +11,19 @@ from matplotlib.text import Annotation
 from playwright.sync_api import expect
 from rich.console import Console
 
+from agent.process.planner_replay import PlannerReplay
 from compose.figures import catalogue
 from compose.figures.agent_replay import agent_replay
 from compose.figures.pair import PairRecord, pairs_of
 from compose.figures.sheet import Absent
 from compose.figures.style import SCREEN, look
 from compose.launch import in_process
+from compose.launch.planner_loader import planner_of
 from compose.recording.meetings import PastMeeting, past_meetings
 from compose.recording.run import Run
 from compose.recording.run import read as read_run
 from compose.scenario.scenario_file import parse
+from compose.scenario.shipped_files import shipped
 from compose.terminal import progress
 from compose.terminal.live_display import RobotMap
 from compose.view.foxglove.views import Views
@@ -110,6 +113,36 @@ def test_the_scene_says_with_which_robot_each_one_is_or_to_which_it_drives(shown
     assert shown[63].player("r3").activity == (
         "r3 drives to where the remaining configurations predict different ranges"
     )
+
+
+@pytest.mark.parametrize(
+    "faults",
+    [
+        "",
+        pytest.param("[[fault]]\nloss = 0.7\ndelay = [0, 4]\n", marks=pytest.mark.long),
+        pytest.param('[[fault]]\nlink = "r0->r3"\npartition = true\n', marks=pytest.mark.long),
+    ],
+    ids=["no fault", "loss", "a failed visit"],
+)
+def test_the_meetings_that_viewers_find_are_those_of_the_planners(faults: str, tmp_path: Path) -> None:
+    text = shipped()["group-8"].read_text().replace("[[robot]]", f"{faults}[[robot]]", 1)
+    in_process.run_mission(parse(text, "group-8"), tmp_path)
+    run = read_run(tmp_path)
+    compared, same = 0, 0
+    played: dict[str, list[str]] = {robot: [] for robot in run.robots}
+    for robot, agent in run.agents.items():
+        again = PlannerReplay(agent, planner_of(agent.config))
+        for step in again:
+            if step.command is not None:
+                played[robot].append(again.robot.state.pair.config.peer)
+    for scene in scenes_of(run):
+        for player in scene.players:
+            compared += 1
+            same += player.peer == played[player.robot][scene.tick]
+    assert compared == 8 * run.length
+    assert same >= 0.99 * compared
+    if not faults:
+        assert same == compared
 
 
 def test_journals_that_grow_show_the_same_meetings(folder: Path, run: Run, tmp_path: Path) -> None:

@@ -22,6 +22,9 @@ from protocol.motion import Pose
 TRAVELLING = "travelling"
 """The state of a robot that drives to the next robot of its group."""
 
+ARRIVED = 0.55
+"""The distance from an anchor at which a visit there ends, as a fraction of R: R / 2 and some tolerance."""
+
 Meetings = Mapping[str, PresentMeeting]
 """The meeting of each robot; robots in their first meeting may be absent."""
 
@@ -85,13 +88,14 @@ def meetings_after(
             changed[robot] = PresentMeeting(_next(setup, robot, None, now, known), True, known)
             continue
         known = present.known | {one for one in now.heard.get(robot, ()) if _has_verdict(one, earlier)}
-        if localised and _has_verdict(present.peer, earlier):
+        met = command.state != TRAVELLING or not present.visiting
+        if (localised and met and _has_verdict(present.peer, earlier)) or _missed(setup, robot, present, now):
             known |= {present.peer}
-        leaves = command.state == TRAVELLING and (before is None or before.state != TRAVELLING)
+        leaves = command.state == TRAVELLING and (not present.visiting or present.peer in known)
         to = receivers.get(robot, [])
         if to and present.peer not in to:
             present = PresentMeeting(to[0], localised)
-        elif leaves and (not present.visiting or present.peer in known):
+        elif leaves:
             present = PresentMeeting(_next(setup, robot, present.peer, now, known), True)
         present = present._replace(known=known)
         if present != was:
@@ -100,9 +104,9 @@ def meetings_after(
 
 
 def _next(setup: RunSetup, robot: str, peer: str | None, now: GroupTick, known: Collection[str]) -> str:
-    """Return the robot that `robot` visits after `peer`; the last of its plan if there is no other one."""
+    """Return the robot that `robot` visits after `peer`; the same if there is no other one."""
     partners = setup.partners[robot]
-    after = partners[partners.index(peer) + 1 :] if peer in partners else partners
+    after = partners[partners.index(peer) + 1 :] if peer in partners else partners[1:]
     planned = [one for one in after if one not in known]
     if planned:
         return planned[0]
@@ -113,8 +117,18 @@ def _next(setup: RunSetup, robot: str, peer: str | None, now: GroupTick, known: 
         if one.id != robot and one.id not in known and setup.bounds_s.get(one.id, time) < time
     ]
     if here is None or not late:
-        return partners[-1]
+        return peer if peer is not None else partners[-1]
     return min(late, key=lambda one: math.hypot(one.anchor.x - here.x, one.anchor.y - here.y)).id
+
+
+def _missed(setup: RunSetup, robot: str, present: PresentMeeting, now: GroupTick) -> bool:
+    """Return whether a robot with exact sensors has come to where its peer should be, and it is not there."""
+    here, anchor = now.place(robot), setup.robot_setup(present.peer).anchor
+    if here is None or not (present.visiting and setup.mission.noise.exact):
+        return False
+    near = math.hypot(anchor.x - here.x, anchor.y - here.y) < ARRIVED * setup.mission.sensing_range
+    travels = now.commands[robot].state == TRAVELLING
+    return travels and near and present.peer not in now.heard.get(robot, ())
 
 
 def _has_verdict(robot: str, commands: Mapping[str, Command]) -> bool:
