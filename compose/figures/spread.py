@@ -38,6 +38,8 @@ LANE, MOST_LANES = 0.17, 8.0
 """The height of a robot's lane, and the maximum height of all of them, in inches."""
 AXIS, BOUND = 0.72, 0.45
 """The space left of the lanes for the robots' names, and right of them for their bounds, in inches."""
+MOST_TICKS = 16
+"""The largest number of robots with whose anchors the ticks of their claims are written."""
 HUES: dict[bool, Role] = {False: "b", True: "a"}
 """The colours of robots before and after they are localised, by role as in other figures."""
 WIDTHS = {False: 1.6, True: 4.5}
@@ -73,7 +75,7 @@ def draw(run: Run, medium: Medium = SCREEN) -> Figure | Absent:
     axes = sheet.panel()
     reach = setup.mission.sensing_range
     for one in robots:
-        _anchor(axes, one, reach)
+        _anchor(axes, one, reach, ticks=len(robots) <= MOST_TICKS)
         _path(axes, one)
     _tree(axes, setup, robots)
     _key(axes, reach)
@@ -114,12 +116,12 @@ def _window(robots: list[GroupRobot], reach: float) -> Window:
     return around(points, 0.03)
 
 
-def _anchor(axes: Axes, one: GroupRobot, reach: float) -> None:
-    """Draw the anchor of a robot, its sensing range, and the tick in which the robot is localised."""
+def _anchor(axes: Axes, one: GroupRobot, reach: float, *, ticks: bool) -> None:
+    """Draw the anchor of a robot, its sensing range, and with `ticks`, when the robot is localised."""
     hue = COLOURS[HUES[one.localised is not None]]
     axes.plot(*one.anchor, "x", color="k", ms=4, mew=1.2, ls="", zorder=4, gid=f"anchor-{one.id}")
     circle(axes, one.anchor, reach, ls="-", lw=0.8, color=hue, gid=f"range-{one.id}")
-    name = one.id if one.localised is None else f"{one.id}, $k$ = {one.localised}"
+    name = one.id if one.localised is None or not ticks else f"{one.id}, $k$ = {one.localised}"
     axes.annotate(
         name, (one.anchor[0], one.anchor[1] + reach), xytext=(0, 2), textcoords="offset points", ha="center",
         zorder=7, bbox=LABEL,
