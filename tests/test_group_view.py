@@ -250,6 +250,21 @@ def test_reports_to_several_robots_in_a_tick_are_all_deliveries(crowd: Run) -> N
     assert several > 0
 
 
+def test_one_journal_has_all_reports_of_its_robot_and_the_world_s_all_that_are_received(
+    crowd: Run, tmp_path: Path
+) -> None:
+    folder = Path(str(crowd.source))
+    (tmp_path / "agent-a.journal").write_bytes((folder / "agent-a.journal").read_bytes())
+    known = run_data(read_run(tmp_path))
+    for tick, step in enumerate(crowd.agents["a"].steps):
+        sent = {link for link in known.ticks[tick].reports if link[0] == "a"}
+        assert sent == {("a", contact.peer) for contact in step.observation.contacts}
+    (tmp_path / "agent-a.journal").unlink()
+    (tmp_path / "world.journal").write_bytes((folder / "world.journal").read_bytes())
+    alone = scenes_of(read_run(tmp_path))
+    assert [one.passages for one in alone] == [one.passages for one in scenes_of(crowd)]
+
+
 def test_the_report_of_a_robot_is_the_one_to_the_robot_that_it_meets(crowd: Run) -> None:
     compared = 0
     for scene in scenes_of(crowd):
