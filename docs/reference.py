@@ -26,12 +26,13 @@ from compose.recording.estimating.estimate_rows import (
     RobotEstimate,
 )
 from compose.recording.estimating.learned_errors import LearnedErrors
+from compose.recording.group_localisation import MeetingResult
 from compose.recording.ranging import recording_rows
 from compose.recording.ticks_csv import TickRow
 from compose.scenario.fault_syntax import FaultTable
 from compose.scenario.json_schema import described
 from compose.scenario.kills import KillTable
-from compose.scenario.scenario_tables import PlannerTable, RobotTable, ScenarioFile, WorldTable
+from compose.scenario.scenario_tables import GroupTable, PlannerTable, RobotTable, ScenarioFile, WorldTable
 from compose.sweep.draws import DrawTable, StartsTable
 from compose.sweep.spec import AxisTable, RowTable, SpecFile
 from compose.sweep.trial import RobotRow, TrialRow
@@ -56,6 +57,7 @@ PARTS = (
 NAMES = {
     "Mission": "table `[mission]`",
     "RobotTable": "`[[robot]]`",
+    "GroupTable": "`[group]`",
     "PlannerTable": "table `[planner]`",
     "FaultTable": "`[[fault]]`",
     "KillTable": "`[[kill]]`",
@@ -265,6 +267,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "mission": partial(fields_of, Mission),
     "planner": partial(fields_of, PlannerTable),
     "robot": partial(fields_of, RobotTable),
+    "group": partial(fields_of, GroupTable),
     "attack": partial(fields_of, Attack),
     "noise": partial(fields_of, Noise),
     "velocity-noise": partial(fields_of, VelocityNoise),
@@ -288,6 +291,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "estimate-table": partial(columns_of, rows.EstimateRow),
     "message-table": partial(columns_of, rows.MessageRow),
     "claim-table": partial(columns_of, rows.ClaimRow),
+    "meeting-table": partial(columns_of, MeetingResult),
     "odometry-columns": partial(fields_of, recording_rows.OdometryRow),
     "range-columns": partial(fields_of, recording_rows.RangeRow),
     "anchor-columns": partial(fields_of, recording_rows.AnchorRow),

@@ -18,6 +18,7 @@ from compose.figures import PICTURES
 from compose.launch import model_loader, planner_loader
 from compose.launch.class_loader import name_of
 from compose.recording import run as recorded
+from compose.recording.group_localisation import MeetingResult, meeting_results
 from compose.recording.recording_files import make_folder, user_errors
 from compose.recording.summary_json import SUMMARY, Mode, leave, summary
 from protocol import files
@@ -137,6 +138,11 @@ class Run(msgspec.Struct, frozen=True, dict=True, eq=False):
     def claims(self) -> Table:
         """The result of each robot, one row per robot: the columns of `ClaimRow`."""
         return table_of(rows.ClaimRow, rows.claim_rows(self.model))
+
+    @cached_property
+    def meetings(self) -> Table:
+        """The meetings of a group, by their bounds: the columns of `MeetingResult`; empty for pairs."""
+        return table_of(MeetingResult, meeting_results(self.model))
 
     # --- what can be done with it ---
 

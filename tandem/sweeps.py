@@ -176,6 +176,8 @@ def _results(results: Results, *, kept: bool) -> SweepResults:
 
 def _cells(results: Results) -> dict[str, Column]:
     """Return the columns of `summary.csv`, with the values of the axes as they were given."""
+    from compose.sweep.statistics import columns_of  # noqa: PLC0415  # it needs the optional pyarrow
+
     columns: dict[str, list[Any]] = {"cell": [cell.index for cell in results.cells]}
     for place, axis in enumerate(results.sweep.axes):
         if axis.labels is not None:
@@ -183,7 +185,7 @@ def _cells(results: Results) -> dict[str, Column]:
         for field in axis.fields:
             columns[field] = [cell.fields[field] for cell in results.cells]
     figures = [results.figures[cell.index] for cell in results.cells]
-    for name in figures[0].__struct_fields__:
+    for name in columns_of(results.sweep):
         columns[name] = [getattr(one, name) for one in figures]
     return {name: _array(values) for name, values in columns.items()}
 

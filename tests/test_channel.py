@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from tests.test_noise import Z, has_share
-from world.channel import LinkState, link_faults, next_link_state
+from world.channel import LinkState, idle_link_state, link_faults, next_link_state
 from world.faults import (
     LATEST,
     MAX_DELAY,
@@ -64,6 +64,20 @@ def flown(
         air = next_link_state(air, links, seed, tick, in_contact=together)
         found.append(air)
     return found
+
+
+@given(plans, seeds, st.integers(0, 40), st.integers(1, 20))
+def test_a_link_before_its_first_contact_needs_no_state(
+    plan: list[Fault], seed: int, first: int, ticks: int
+) -> None:
+    """From its first contact on, it has the states of a link that was followed from tick 0."""
+    links = link_faults(plan, "a", "b")
+    followed = flown(plan, [False] * first + [True] * ticks, seed)[first:]
+    air, found = idle_link_state(links, first), []
+    for tick in range(first, first + ticks):
+        air = next_link_state(air, links, seed, tick, in_contact=True)
+        found.append(air)
+    assert found == followed
 
 
 def came(airs: Sequence[LinkState]) -> list[tuple[int, int, bool]]:

@@ -47,6 +47,7 @@ PURE = {
     "world.tick",
     "world.truth",
     "world.hardware.driver",
+    "world.near_pairs",
     "world.sensors",
     "world.random_streams",
     "world.faults",

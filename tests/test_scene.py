@@ -26,6 +26,7 @@ from protocol.messages import MissionEnd
 from protocol.motion import compose, wrap
 from protocol.wire import decode
 from tests.report_outcomes import flights_of
+from world.channel import LinkState
 from world.world_journal import world_history
 
 
@@ -149,10 +150,10 @@ def test_the_deliveries_in_a_scene_are_those_of_the_simulation(tmp_path: Path) -
     told = world_history(journal_file.read(tmp_path / "world.journal"), tmp_path)
     shown = {one.tick: one.passages for one in read(tmp_path).scenes}
     ever: set[str] = set()
-    for place, sender in enumerate(("a", "b")):
+    for way, sender in (((0, 1), "a"), ((1, 0), "b")):
         flying: set[int] = set()
         for tick in told.ticks:
-            k, air = tick.world.truth.tick, tick.world.links[place]
+            k, air = tick.world.truth.tick, (tick.world.links or {}).get(way, LinkState())
             here = {
                 what: [one.tick for one in shown[k] if (one.sender, one.what) == (sender, what)]
                 for what in ("sent", "heard", "damaged", "lost")
@@ -174,7 +175,8 @@ def test_every_report_has_the_outcome_of_its_deliveries(tmp_path: Path) -> None:
     assert {flight.outcome for flight in flights} == {"heard", "late", "damaged", "lost"}
     told = world_history(journal_file.read(tmp_path / "world.journal"), tmp_path)
     airs = {
-        sender: [tick.world.links[place] for tick in told.ticks] for place, sender in enumerate(("a", "b"))
+        sender: [(tick.world.links or {}).get(way, LinkState()) for tick in told.ticks]
+        for way, sender in (((0, 1), "a"), ((1, 0), "b"))
     }
     lost = {
         (passage.sender, passage.tick)

@@ -71,6 +71,25 @@ def link_faults(plan: Sequence[Fault], sender: str, receiver: str) -> LinkFaults
     return LinkFaults(sender, receiver, tuple(on_it))
 
 
+def idle_link_state(links: LinkFaults, tick: int, radio: Any = None) -> LinkState:
+    """Return the state before `tick` of a link whose robots have not been in contact before.
+
+    Only the room under the bandwidths of its faults may have changed. `radio` is that in the radio model.
+    """
+    room = [1.0 + (_idle_rate(fault) if _has_begun(fault, tick) else 0.0) for _, fault in links.faults]
+    return LinkState(room=tuple(room), radio=radio)
+
+
+def _idle_rate(fault: Fault) -> float:
+    return fault.reports_per_tick or 0.0
+
+
+def _has_begun(fault: Fault, tick: int) -> bool:
+    """Return whether `fault` was active in a tick before `tick`, on a link that was never in contact."""
+    first = fault.ticks[0] if fault.ticks is not None else 0
+    return first < tick and fault.active(first, 0)
+
+
 def next_link_state(
     air: LinkState,
     links: LinkFaults,

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from protocol.motion import REST, Controls
 from protocol.noise import VelocityNoise
+from world.near_pairs import near_pairs
 from world.random_streams import gaussian
 from world.scenario import Scenario
 from world.sensor_model import LONGEST
@@ -52,6 +53,19 @@ class Mutual(NamedTuple):
 
     range: float | None
     """The measured range in m, the same for both robots; None for a drop-out."""
+
+
+def in_contact(
+    truth: Truth, scenario: Scenario, pairs: Sequence[tuple[int, int]]
+) -> dict[tuple[int, int], Mutual]:
+    """Return the measurements of those of `pairs` whose robots are in range of each other, in their order.
+
+    `pairs` are all that may measure each other. In a group, those that are too far apart are not tried.
+    """
+    if scenario.meetings and scenario.range_model is None:
+        pairs = near_pairs([(pose.x, pose.y) for pose in truth.local], scenario.sensors.reach)
+    mutuals = mutual_ranges(truth, scenario, pairs)
+    return {pair: mutual for pair, mutual in zip(pairs, mutuals, strict=True) if mutual is not None}
 
 
 def mutual_ranges(truth: Truth, scenario: Scenario, pairs: Sequence[tuple[int, int]]) -> list[Mutual | None]:

@@ -9,10 +9,10 @@ import msgspec
 
 from protocol.messages import Command, Contact, Localised, Observation, Verdict
 from protocol.motion import REST, Controls, Pose
-from world.channel import LinkState, link_faults, next_link_state
+from world.channel import LinkState, idle_link_state, link_faults, next_link_state
 from world.referee import MissionOutcome, decide_outcome
 from world.scenario import Scenario
-from world.sensors import anchor_ranges, executed, mutual_ranges, odometry
+from world.sensors import anchor_ranges, executed, in_contact, odometry
 from world.truth import Truth, limited_controls
 from world.world_models import Radios, Transmission
 
@@ -32,10 +32,10 @@ class World(msgspec.Struct, frozen=True):
     """The true pose in <W> of each localised robot at the tick of its claim. Noise may move it afterwards."""
     pairs: tuple[tuple[int, int], ...]
     """The pairs of robots that may measure each other, as indices into the scenario's robots."""
-    links: tuple[LinkState, ...] = ()
-    """The state of the links: for each pair, from the first to the second robot, then back.
+    links: dict[tuple[int, int], LinkState] | None = None
+    """The state of each link whose robots have been in contact, by the places of sender and receiver.
 
-    Empty without faults.
+    None if all reports are delivered.
     """
     executed_before: tuple[Controls, ...] | None = None
     """The executed controls over the tick before the previous one; None until tick 2."""
@@ -50,9 +50,9 @@ def release(scenario: Scenario) -> World:
         for i, robot in enumerate(scenario.robots)
     )
     truth = Truth(0, local, tuple(origins[i] for i in range(len(local))))
-    radio = scenario.radio
-    fresh = LinkState() if radio is None else LinkState(radio=radio.start())
-    still = (fresh,) * (2 * len(pairs)) if scenario.faults or radio is not None else ()
+    still: dict[tuple[int, int], LinkState] | None = None
+    if scenario.faults or scenario.radio is not None:
+        still = {}
     return World(scenario, truth, None, {}, {}, pairs, _carried(still, scenario, truth, pairs))
 
 
@@ -67,14 +67,13 @@ def observations(world: World) -> list[Observation]:
             odometry(driven[i], scenario, robot.id, tick, before[i]) for i, robot in enumerate(robots)
         ]
     contacts: list[tuple[Contact, ...]] = [()] * len(robots)
-    mutuals = mutual_ranges(truth, scenario, world.pairs)
-    for i, ((one, other), mutual) in enumerate(zip(world.pairs, mutuals, strict=True)):
-        if mutual is not None:
-            to_other, to_one = (
-                world.links[2 * i : 2 * i + 2] if world.links else (LinkState((tick,)), LinkState((tick,)))
-            )
-            contacts[one] += (Contact(robots[other].id, mutual.range, to_one.heard, to_one.damaged),)
-            contacts[other] += (Contact(robots[one].id, mutual.range, to_other.heard, to_other.damaged),)
+    at_once = LinkState((tick,))
+    for (one, other), mutual in in_contact(truth, scenario, world.pairs).items():
+        to_other, to_one = at_once, at_once
+        if world.links is not None:
+            to_other, to_one = world.links[one, other], world.links[other, one]
+        contacts[one] += (Contact(robots[other].id, mutual.range, to_one.heard, to_one.damaged),)
+        contacts[other] += (Contact(robots[one].id, mutual.range, to_other.heard, to_other.damaged),)
     ranges = anchor_ranges(truth, scenario)
     return [
         Observation(tick, robot.id, measured[i], ranges[i], contacts[i]) for i, robot in enumerate(robots)
@@ -107,48 +106,52 @@ def advance(world: World, commands: Mapping[str, Command]) -> World | MissionOut
 
 
 def _carried(
-    before: Sequence[LinkState], scenario: Scenario, truth: Truth, pairs: Sequence[tuple[int, int]]
-) -> tuple[LinkState, ...]:
+    before: Mapping[tuple[int, int], LinkState] | None,
+    scenario: Scenario,
+    truth: Truth,
+    pairs: Sequence[tuple[int, int]],
+) -> dict[tuple[int, int], LinkState] | None:
     """Return the state of each link at the tick of `truth`, given its state in `before` one tick earlier."""
-    if not before:
-        return ()
-    mutuals = mutual_ranges(truth, scenario, pairs)
-    ids = [robot.id for robot in scenario.robots]
-    links = [(way, mutual) for pair, mutual in zip(pairs, mutuals, strict=True) for way in (pair, pair[::-1])]
-    senders = list(dict.fromkeys([sender for (sender, _), mutual in links if mutual is not None]))
-    delivered = _delivered(before, scenario, truth, links, senders) if scenario.radio is not None else {}
-    return tuple(
-        [
-            next_link_state(
-                link,
-                link_faults(scenario.faults, ids[sender], ids[receiver]),
-                scenario.seed,
-                truth.tick,
-                in_contact=mutual is not None,
-                delivered=delivered.get((sender, receiver), (link.radio, 0)),
-            )
-            for link, ((sender, receiver), mutual) in zip(before, links, strict=True)
-        ]
-    )
+    if before is None:
+        return None
+    ids, radio, tick = [robot.id for robot in scenario.robots], scenario.radio, truth.tick
+    sending = [way for pair in in_contact(truth, scenario, pairs) for way in (pair, pair[::-1])]
+    links = {way: link_faults(scenario.faults, ids[way[0]], ids[way[1]]) for way in (*before, *sending)}
+    states = dict(before)
+    for way in sending:
+        if way not in states:
+            states[way] = idle_link_state(links[way], tick, None if radio is None else radio.start())
+    delivered = _delivered(states, scenario, truth, sending) if radio is not None else {}
+    together = set(sending)
+    return {
+        way: next_link_state(
+            link,
+            links[way],
+            scenario.seed,
+            tick,
+            in_contact=way in together,
+            delivered=delivered.get(way, (link.radio, 0)),
+        )
+        for way, link in states.items()
+    }
 
 
 def _delivered(
-    before: Sequence[LinkState],
+    before: Mapping[tuple[int, int], LinkState],
     scenario: Scenario,
     truth: Truth,
-    links: Sequence[tuple[tuple[int, ...], object]],
-    senders: Sequence[int],
-) -> dict[tuple[int, ...], tuple[Any, int | None]]:
-    """Return the state and the delay of the report of each link of `senders`, by the radio model."""
+    links: Sequence[tuple[int, int]],
+) -> dict[tuple[int, int], tuple[Any, int | None]]:
+    """Return the state and the delay of the report of each of `links`, by the radio model."""
     assert scenario.radio is not None
     places = [(pose.x, pose.y) for pose in truth.poses]
     ids, reach = [robot.id for robot in scenario.robots], scenario.sensors.reach
+    senders = dict.fromkeys([sender for sender, _ in links])
     sending = tuple([(ids[sender], places[sender]) for sender in senders])
-    found: dict[tuple[int, ...], tuple[Any, int | None]] = {}
-    for link, ((sender, receiver), mutual) in zip(before, links, strict=True):
-        if mutual is not None:
-            name = f"report/{ids[sender]}->{ids[receiver]}"
-            radios = Radios(name, places[sender], places[receiver], truth.tick, scenario.seed)
-            transmission = Transmission(radios, reach, scenario.mission.period, sending, ids[sender])
-            found[sender, receiver] = scenario.radio.sent(link.radio, transmission)
+    found: dict[tuple[int, int], tuple[Any, int | None]] = {}
+    for sender, receiver in links:
+        name = f"report/{ids[sender]}->{ids[receiver]}"
+        radios = Radios(name, places[sender], places[receiver], truth.tick, scenario.seed)
+        transmission = Transmission(radios, reach, scenario.mission.period, sending, ids[sender])
+        found[sender, receiver] = scenario.radio.sent(before[sender, receiver].radio, transmission)
     return found

@@ -213,6 +213,9 @@ def _unplanned(scenario: Scenario) -> str | None:
         first[one.visited] = (one.visitor, "b")
     if first.keys() != {robot.id for robot in scenario.robots}:
         return "in its scenario the meetings are not those of its robots"
+    for retry in scenario.retries:
+        if retry.visitor == retry.visited or not {retry.visitor, retry.visited} <= first.keys():
+            return "in its scenario the retries are not those of its robots"
     for robot in scenario.robots:
         if first[robot.id] != (robot.peer, robot.role):
             return f"in its scenario {robot.id} has another peer than in its first meeting"

@@ -364,11 +364,11 @@ def _next_visit(state: GroupState) -> GroupState:
         visits += 1
         if not (state.other(peer).localised or state.other(peer).failed):
             return _on_visit(replace(state, visits=visits), peer)
-    here = compose(state.frame, state.pair.odometry)
+    here, now = compose(state.frame, state.pair.odometry), _now(state.pair)
     late = [
         (math.hypot(one.anchor.x - here.x, one.anchor.y - here.y), one.robot)
         for one in config.members
-        if one.robot != config.robot and _is_late(state, one)
+        if one.ends < now and one.robot != config.robot and _is_late(state, one)  # few are
     ]
     state = replace(state, visits=visits)
     return _on_visit(state, min(late)[1]) if late else state

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from msgspec.structs import astuple
 
 from agent.estimation.mutual_ranges import ELSEWHERE
+from agent.planning.planner import Planner
 from agent.process.agent_journal import AgentHistory
 from compose.audit.findings import Checks, Violation, between
 from compose.launch.planner_loader import planner_of
@@ -50,25 +52,37 @@ def _redundant(run: Run, placed: RobotSpec, agent: AgentHistory, tick: int) -> V
     """Return a violation if the claim at `tick` is based on too few mutual ranges.
 
     How many it needs depends on the planner. Ranges count up to the latest tick for which the robot had
-    received the peer's log, if there are logs.
+    received the peer's log, if there are logs. In a group, the peer may be any robot whose log it had, but
+    ranges to several robots do not add up.
     """
     planner, mission = planner_of(agent.config), run.scenario.mission
-    through = tick
-    if planner.BODY is Report:
-        ends = [
-            _through(framed.report)
-            for step in agent.steps[: tick + 1]
-            for framed in step.received
-            if framed.report.robot == agent.config.peer
-        ]
-        through = min(max(ends, default=-1), tick)
-    mutual = _ranged(agent, through)
+    peers = [agent.config.peer]
+    if run.scenario.meetings:
+        senders = [framed.report.robot for step in agent.steps[: tick + 1] for framed in step.received]
+        peers = list(dict.fromkeys([*peers, *senders]))
+    ranged = {peer: _ranged(agent, peer, _known_until(agent, peer, tick, planner)) for peer in peers}
     if mission.noise.exact:
         least = planner.REQUIRED_PLACES
-        places = _places(run, placed, mutual) if least else 0
+        places = max([_places(run, placed.id, peer, ranged[peer]) for peer in peers]) if least else 0
         return _too_few(tick, placed, "relative placements with a mutual range", places, least)
     least = planner.required_mutual_ranges(mission)
-    return _too_few(tick, placed, "mutual ranges", len(mutual), least)
+    return _too_few(tick, placed, "mutual ranges", max(map(len, ranged.values())), least)
+
+
+def _known_until(agent: AgentHistory, peer: str, tick: int, planner: Planner[Any, Any]) -> int:
+    """Return the latest tick up to `tick` for which the robot had received the log of `peer`.
+
+    It is `tick` if the planner's reports have no logs.
+    """
+    if planner.BODY is not Report:
+        return tick
+    ends = [
+        _through(framed.report)
+        for step in agent.steps[: tick + 1]
+        for framed in step.received
+        if framed.report.robot == peer
+    ]
+    return min(max(ends, default=-1), tick)
 
 
 def _through(report: PeerReport) -> int:
@@ -82,22 +96,19 @@ def _too_few(tick: int, placed: RobotSpec, what: str, found: int, expected: int)
     return Violation("claim", tick, placed.id, f"it claims with {found} {what}, expected at least {expected}")
 
 
-def _ranged(agent: AgentHistory, through: int) -> list[int]:
-    """Return the ticks of the ranges to the peer up to the tick `through`."""
+def _ranged(agent: AgentHistory, peer: str, through: int) -> list[int]:
+    """Return the ticks of the ranges to `peer` up to the tick `through`."""
     return [
         step.observation.tick
         for step in agent.steps[: through + 1]
-        if any(
-            contact.range is not None and contact.peer == agent.config.peer
-            for contact in step.observation.contacts
-        )
+        if any(contact.range is not None and contact.peer == peer for contact in step.observation.contacts)
     ]
 
 
-def _places(run: Run, placed: RobotSpec, ticks: Sequence[int]) -> int:
-    """Return the number of different relative placements of the pair at `ticks`."""
+def _places(run: Run, robot: str, peer: str, ticks: Sequence[int]) -> int:
+    """Return the number of different relative placements of `robot` and `peer` at `ticks`."""
     ids = [robot.id for robot in run.scenario.robots]
-    one, other = ids.index(placed.id), ids.index(placed.peer)
+    one, other = ids.index(robot), ids.index(peer)
     found: list[tuple[Pose, Pose]] = []
     for tick in ticks:
         local = run.ticks[tick].world.truth.local

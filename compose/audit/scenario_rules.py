@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+from itertools import combinations
 
 from compose.audit.findings import Checks, Violation, difference
+from compose.errors import Unworkable
 from compose.launch import planner_loader
 from compose.recording.run import Run
+from compose.scenario.group_meetings import FirstMeeting, GroupMeetings, group_meetings
 from compose.scenario.scenario_file import NEAREST_ANCHORS
+from compose.scenario.scenario_tables import PlannerTable, RobotTable
 from protocol.attack import OF_THE_START
-from protocol.messages import RobotConfig
+from protocol.messages import RobotConfig, RobotConfigInGroup
 from protocol.mission import (
     Anchor,
     Mission,
@@ -17,17 +21,20 @@ from protocol.mission import (
     noise_infeasibility,
     safety_infeasibility,
 )
-from protocol.orbits import Rendezvous
+from protocol.orbits import Rendezvous, visiting
 from world.scenario import RobotSpec, Scenario
 from world.world_noise import world_noise_infeasibility, world_noise_mistake
 
 
 def scenario(run: Run) -> Checks:
-    """Check that `tandem run` accepts the scenario, and that its orbits follow from the rest of it."""
+    """Check that `tandem run` accepts the scenario, and that its meetings and orbits follow from the rest."""
     found = run.scenario
     for why in (noise_infeasibility(found.mission), safety_infeasibility(found.mission)):
         yield _violation(None, why and f"mission.{why}")
     yield _violation(None, _off_world_noise(found))
+    if found.meetings:
+        yield from _group(found)
+        return
     place = {robot.id: place for place, robot in enumerate(found.robots)}
     for robot in found.robots:
         peer = found.robots[place[robot.peer]]
@@ -40,14 +47,63 @@ def scenario(run: Run) -> Checks:
             yield _violation(robot.id, why)
 
 
+def _group(found: Scenario) -> Checks:
+    """Check that the meetings of a group are those that are planned for its anchors."""
+    for one, other in combinations(found.robots, 2):
+        yield _violation(other.id, _off_distance(found.mission, one.anchor, other.anchor, one.id))
+    try:
+        planned = planned_meetings(found)
+    except Unworkable as error:
+        yield Violation("scenario", None, None, str(error))
+        return
+    if len(found.meetings) != len(planned.planned):
+        what = f"{len(found.meetings)} meetings are planned, expected {len(planned.planned)}"
+        yield Violation("scenario", None, None, what)
+    if len(found.retries) != len(planned.retries):
+        what = f"{len(found.retries)} retries are planned, expected {len(planned.retries)}"
+        yield Violation("scenario", None, None, what)
+    for name, some, others in (
+        ("meetings", found.meetings, planned.planned),
+        ("retries", found.retries, planned.retries),
+    ):
+        for i, (given, expected) in enumerate(zip(some, others, strict=False)):
+            off = None if given == expected else f"{name}[{i}].{difference(given, expected)}"
+            yield _violation(None, off)
+    for robot in found.robots:
+        first = planned.first[robot.id]
+        for why in (
+            _off_first(robot, first),
+            _off_range(robot, found.mission),
+            _off_attack(robot),
+        ):
+            yield _violation(robot.id, why)
+
+
+def planned_meetings(found: Scenario) -> GroupMeetings:
+    """Return the meetings of the group in a scenario. Raises Unworkable if its planner has none."""
+    robots = [RobotTable(robot.id, (robot.anchor.x, robot.anchor.y)) for robot in found.robots]
+    planner = PlannerTable(found.planner_name, found.planner_options)
+    return group_meetings(robots, found.mission, planner)
+
+
+def _off_first(robot: RobotSpec, first: FirstMeeting) -> str | None:
+    """Return how the first meeting of `robot` differs from the planned one; None if it does not."""
+    if (robot.peer, robot.role) != (first.peer, first.role):
+        return f"its peer is {robot.peer} in role {robot.role}, expected {first.peer} in role {first.role}"
+    if robot.rendezvous == first.rendezvous:
+        return None
+    return f"rendezvous.{difference(robot.rendezvous, first.rendezvous)}"
+
+
 def config(run: Run) -> Checks:
     """Check that the orbits in each RobotConfig follow from the mission and the anchors in it.
 
     This is for hardware mode. Otherwise, `journal_rules.config` compares the RobotConfig with the scenario.
+    In a group, a robot that waits is told the orbits of a pair, or of a visitor that is localised.
     """
     for robot, agent in run.agents.items():
         found = agent.config
-        why = _off_plan(found.rendezvous, found, found.anchor, found.peer_anchor)
+        why = _off_config(found)
         yield Violation("config", None, robot, why) if why is not None else None
 
 
@@ -77,16 +133,32 @@ def _off_attack(robot: RobotSpec) -> str | None:
     return "its attack changes the start, and its part is not all" if early else None
 
 
+def _off_config(found: RobotConfig) -> str | None:
+    """Return why the orbits in the configuration of a robot are not those of its first meeting."""
+    why = _off_plan(found.rendezvous, found, found.anchor, found.peer_anchor)
+    visited = isinstance(found, RobotConfigInGroup) and found.role == "b"
+    if visited and found.rendezvous == visiting(found.mission, found.anchor_distance):
+        return None
+    return why
+
+
 def _off_plan(found: Rendezvous, given: Scenario | RobotConfig, anchor: Anchor, peer: Anchor) -> str | None:
     """Return why `found` are not the orbits of the planner for these anchors; None if they are."""
     mission = given.mission
+    if (why := _off_distance(mission, anchor, peer, "its peer")) is not None:
+        return why
     distance = math.dist((anchor.x, anchor.y), (peer.x, peer.y))
-    if distance < NEAREST_ANCHORS:
-        return f"its anchor is {distance:.3g} m from its peer's, expected at least {NEAREST_ANCHORS:g} m"
-    if (why := infeasibility(mission, distance)) is not None:
-        return f"mission: {why}"
     expected = planner_loader.orbits(given.planner_name, given.planner_options, mission, distance)
     return None if found == expected else f"rendezvous.{difference(found, expected)}"
+
+
+def _off_distance(mission: Mission, anchor: Anchor, other: Anchor, whose: str) -> str | None:
+    """Return why robots with these anchors, the other one of `whose`, cannot meet; None if they can."""
+    distance = math.dist((anchor.x, anchor.y), (other.x, other.y))
+    if distance < NEAREST_ANCHORS:
+        return f"its anchor is {distance:.3g} m from {whose}'s, expected at least {NEAREST_ANCHORS:g} m"
+    why = infeasibility(mission, distance)
+    return why and f"mission: {why}"
 
 
 def _violation(robot: str | None, what: str | None) -> Violation | None:

@@ -33,6 +33,7 @@ from protocol.messages import (
     Observation,
     Outcome,
     RobotConfig,
+    RobotConfigInGroup,
 )
 from protocol.motion import Controls, Pose
 from protocol.output import one_line
@@ -395,7 +396,7 @@ def _agent(
 
 
 def _agree(configs: Mapping[str, RobotConfig], source: object) -> None:
-    """Raise CorruptJournal if the configurations of two peers are not of the same pair and mission."""
+    """Raise CorruptJournal if two peers' configurations are not of the same pair, or group, and mission."""
     for robot, one in configs.items():
         other = configs.get(one.peer)
         if other is not None and _shared(one, robot) != _shared(other, robot):
@@ -406,7 +407,12 @@ def _agree(configs: Mapping[str, RobotConfig], source: object) -> None:
 
 
 def _shared(config: RobotConfig, robot: str) -> tuple[object, ...]:
-    """Return the part of a configuration that both robots of a pair share, in the view of `robot`."""
+    """Return the part of a configuration that both robots of a pair share, in the view of `robot`.
+
+    In a group, a peer may have another one in its first meeting, and all robots share the rest.
+    """
+    if isinstance(config, RobotConfigInGroup):
+        return config.members, config.mission, config.planner_name, config.tick_s
     own = config.robot == robot
     return (
         config.robot if own else config.peer,

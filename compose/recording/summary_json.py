@@ -14,13 +14,14 @@ import msgspec
 
 from compose.extras import version
 from compose.recording.claim import matrix
+from compose.recording.group_localisation import meeting_results
 from compose.recording.run import Run, ended
 from compose.recording.ticks_csv import ticks_csv
 from protocol import files
 from protocol.messages import FinalReport
 from protocol.motion import Pose, wrap
 from world.scenario import Scenario
-from world.sensors import mutual_ranges
+from world.sensors import in_contact
 
 Mode = Literal["processes", "in-process"]
 SUMMARY = "summary.json"
@@ -32,7 +33,7 @@ def summary(run: Run, mode: Mode | None, wall_s: float | None) -> dict[str, Any]
     `wall_s` is the wall time of the run in s.
     """
     scenario, ticks = run.scenario, run.ticks
-    return {
+    found: dict[str, Any] = {
         "scenario": scenario.name,
         "seed": scenario.seed,
         "mode": mode,
@@ -62,6 +63,19 @@ def summary(run: Run, mode: Mode | None, wall_s: float | None) -> dict[str, Any]
         "versions": versions(),
         "robots": {robot: _robot_summary(run, robot) for robot in run.robots},
     }
+    return {**found, "group": _group(run)} if scenario.meetings else found
+
+
+def _group(run: Run) -> dict[str, Any]:
+    """Return the bound until all robots of the group are localised, and its meetings."""
+    meetings = list(meeting_results(run))
+    ticks = [one.localised_tick for one in meetings]
+    return {
+        "bound_s": max(one.bound_s for one in meetings),
+        "bound_ticks": max(one.bound_ticks for one in meetings),
+        "localised_tick": max(tick for tick in ticks if tick is not None) if None not in ticks else None,
+        "meetings": msgspec.to_builtins(meetings),
+    }
 
 
 def _world_noise(scenario: Scenario) -> Any:
@@ -78,7 +92,7 @@ def first_contact(run: Run) -> int | None:
     """
     pairs = run.scenario.radio_pairs()
     for tick in run.ticks:
-        if any(mutual is not None for mutual in mutual_ranges(tick.truth, run.scenario, pairs)):
+        if in_contact(tick.truth, run.scenario, pairs):
             return tick.truth.tick
     return None
 
@@ -88,12 +102,14 @@ def _robot_summary(run: Run, robot: str) -> dict[str, Any]:
     claimed = run.claim(robot)
     covariance = claimed.covariance if claimed is not None else None
     truth = run.truth(robot)
+    at_claim = {"truth_at_claim": _listed(truth[claimed.tick]) if claimed is not None else None}
     return {
         "localised": claimed is not None,
         "localised_tick": claimed.tick if claimed is not None else None,
         "estimate": _listed(claimed.pose) if claimed is not None else None,
         "covariance": matrix(covariance) if covariance is not None else None,
         "truth": _listed(truth[-1]) if truth else None,
+        **(at_claim if run.scenario.meetings else {}),
         "position_error_m": claimed.position_error if claimed is not None else None,
         "heading_error_rad": claimed.heading_error if claimed is not None else None,
         "position_sigma_m": covariance.position_sigma if covariance is not None else None,

@@ -181,7 +181,7 @@ def file_table(scenario: Scenario) -> dict[str, Any]:
         "robot": [
             {
                 "id": one.id,
-                "peer": one.peer,
+                **({"peer": one.peer} if not scenario.meetings else {}),
                 "anchor": [one.anchor.x, one.anchor.y],
                 "start": [one.start.x, one.start.y, one.start.heading],
                 **({"attack": _given(one.attack)} if one.attack is not None else {}),

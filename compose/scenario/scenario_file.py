@@ -59,13 +59,25 @@ class ScenarioTemplate(msgspec.Struct, frozen=True):
     """A validated scenario file with its scenario, from which scenarios of other seeds are drawn cheaply."""
 
     file: ScenarioFile
+    """The content of the file, with the robots that its `[group]` has with the seed of the file."""
     scenario: RecordedScenario
     """Scenario with the seed of the file."""
+    source: str
+    """The name or path of the file, for errors."""
+    faults: tuple[str, ...]
+    """The faults of the user that are added to those of the file."""
 
     def seeded(self, seed: int | None) -> Scenario:
-        """Return the scenario with open starts drawn from `seed`; None stands for the seed of the file."""
+        """Return the scenario with open starts drawn from `seed`; None stands for the seed of the file.
+
+        The anchors of a `[group]` are drawn, too, and its meetings are planned. Raises BadScenario and
+        Unworkable if that is not possible, and only then.
+        """
         if seed is None:
             return self.scenario
+        if self.file.group is not None:
+            file = _with_robots(msgspec.structs.replace(self.file, seed=seed))
+            return _validated(file, self.source, self.faults)
         reach = self.file.mission.sensing_range
         return msgspec.structs.replace(
             self.scenario,
@@ -162,12 +174,29 @@ def validate(table: Mapping[str, Any], source: str, faults: Sequence[str] = ()) 
         file = msgspec.convert(_with_profile(table), ScenarioFile)
     except msgspec.ValidationError as error:
         raise BadScenario(f"{source}: {field_first(str(error), ScenarioFile)}") from None
-    found = ScenarioTemplate(file, _validated(file, source, faults))
+    if file.group is None and not file.robot:
+        raise BadScenario(f"{source}: missing field 'robot'")
+    if file.group is not None and file.robot:
+        raise BadScenario(f"{source}: group: its robots are drawn, so there can be no [[robot]]")
+    file = _with_robots(file)
+    found = ScenarioTemplate(file, _validated(file, source, faults), source, tuple(faults))
     try:
         found.kills(file.seed)
     except BadKill as error:
         raise BadScenario(f"{source}: {error}") from None
     return found
+
+
+def _with_robots(file: ScenarioFile) -> ScenarioFile:
+    """Return `file` with the robots of its `[group]`, whose anchors are drawn from its seed."""
+    if file.group is None:
+        return file
+    side = file.group.spacing * math.sqrt(file.group.robots)
+    robots = []
+    for i in range(1, file.group.robots + 1):
+        draw = random.Random(f"{file.seed}/anchor/r{i}").random
+        robots.append(RobotTable(f"r{i}", (side * draw(), side * draw())))
+    return msgspec.structs.replace(file, robot=robots)
 
 
 def _with_profile(table: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -62,6 +62,15 @@ class RobotTable(_Table, frozen=True):
     """False data injection: the falsification of the reports that this robot sends to its peer."""
 
 
+class GroupTable(_Table, frozen=True):
+    """The `[group]` table: robots whose anchors are drawn from the seed, instead of `[[robot]]`."""
+
+    robots: Annotated[int, Meta(ge=3, le=MAX_ROBOTS)]
+    """The number n of robots, which are r1 to rn."""
+    spacing: Annotated[float, Meta(gt=0.0, le=1e5)]
+    """The anchors are uniform in a square, whose side in m is this times the square root of n."""
+
+
 LONGEST_NAME = 48
 """The maximum number of characters of the name of a scenario."""
 
@@ -73,8 +82,10 @@ class ScenarioFile(_Table, frozen=True):
     """The name of the scenario, and the beginning of the names of its runs."""
     mission: Mission
     """The `[mission]` table."""
-    robot: Annotated[list[RobotTable], Meta(min_length=2, max_length=MAX_ROBOTS)]
-    """One `[[robot]]` for each robot."""
+    robot: Annotated[list[RobotTable], Meta(min_length=2, max_length=MAX_ROBOTS)] = []
+    """One `[[robot]]` for each robot; required without `[group]`."""
+    group: GroupTable | None = None
+    """The `[group]` table."""
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
     """The seed of all random draws, starts included."""
     max_ticks: Annotated[int, Meta(ge=1, le=MAX_TICKS)] | None = None

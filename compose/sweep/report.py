@@ -27,6 +27,7 @@ NOTES = (
     ("rate_low", "rate: 95 % interval (Wilson)"),
     ("p50", "p50, p95, max: ticks of trials that localised"),
     ("error p50", "error: position error in m of the worse robot"),
+    ("share p50", "share: ticks / the computed bound of the group"),
     ("within", "within: claims within 3 x accuracy"),
     ("nees low", "nees: mean, and the 99 % band for consistent covariances"),
 )
@@ -41,6 +42,8 @@ CHOICES = (
     ("trials", "rate"),
 )
 """The possible choices of columns. The first that fits the terminal is used."""
+OF_GROUP = ("share p50", "share max")
+"""The additional columns of sweeps of groups: the duration over the computed bound."""
 OF_NOISE = ("within", "nees", "nees low", "nees high")
 """The additional columns of sweeps in which robots claim covariances."""
 MOST_ROWS = 100
@@ -178,9 +181,10 @@ def _noisy(results: Results) -> bool:
 
 def _choices(results: Results) -> tuple[tuple[str, ...], ...]:
     """Return the possible choices of columns, the widest first."""
-    if not _noisy(results):
+    more = (*(OF_GROUP if results.sweep.of_group else ()), *(OF_NOISE if _noisy(results) else ()))
+    if not more:
         return CHOICES
-    return tuple((*columns, *OF_NOISE) for columns in CHOICES) + CHOICES[-1:]
+    return tuple((*columns, *more) for columns in CHOICES) + CHOICES[-1:]
 
 
 def _table(results: Results, columns: Sequence[str]) -> Table:
@@ -214,6 +218,8 @@ def _figures(figures: CellSummary) -> dict[str, str]:
         "nees": _number(figures.nees_mean, ".3g"),
         "nees low": _number(figures.nees_low, ".3g"),
         "nees high": _number(figures.nees_high, ".3g"),
+        "share p50": _number(figures.bound_share_p50, ".2f"),
+        "share max": _number(figures.bound_share_max, ".2f"),
     }
 
 

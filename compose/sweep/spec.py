@@ -136,6 +136,14 @@ class Sweep(msgspec.Struct, frozen=True):
     draws: Draws = Draws()
     """values drawn for each trial, in addition to starts that the scenario leaves open"""
 
+    @property
+    def of_group(self) -> bool:
+        """True if its robots form a group."""
+        robots = self.base.get("robot")
+        if not isinstance(robots, list):
+            return "group" in self.base
+        return len(robots) > 2 and not any("peer" in robot for robot in robots if isinstance(robot, dict))
+
 
 def shipped() -> dict[str, Path]:
     """Return the paths of the shipped sweep files, by name."""
@@ -182,7 +190,7 @@ def validated(
     axes = tuple(_axis(axis, f"{source}: axis[{i}]", base) for i, axis in enumerate(spec.axis))
     draws = Draws(_draws(spec, axes, base, source), spec.starts)
     _check_together(axes, draws, source)
-    return Sweep(
+    found = Sweep(
         source=source,
         name=spec.name,
         base=base,
@@ -192,6 +200,9 @@ def validated(
         trial_timeout=spec.trial_timeout,
         draws=draws,
     )
+    if found.of_group and spec.starts is not None:
+        raise BadSpec(f"{source}: starts: the robots form a group, and its kinds are those of pairs")
+    return found
 
 
 def _base(spec: SpecFile, folder: Path, source: str) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from compose.recording.claim import DEGREES_OF_FREEDOM
 from compose.sweep.cells import Cell
 from compose.sweep.field_paths import canonical
 from compose.sweep.spec import Sweep
+from compose.sweep.table import OF_GROUP
 from compose.sweep.trial import TrialOutcome
 from protocol.messages import Outcome
 
@@ -98,6 +99,10 @@ class CellSummary(msgspec.Struct, frozen=True):
     """number of trials whose scenario is infeasible with the drawn values; no other figure counts them"""
     refused: str | None
     """reason why the scenario of this cell is infeasible"""
+    bound_share_p50: float | None
+    """only for groups: median over trials that localised of ticks / bound_ticks"""
+    bound_share_max: float | None
+    """only for groups: the largest of these"""
 
 
 class NotableTrial(msgspec.Struct, frozen=True):
@@ -128,6 +133,7 @@ def counted(table: pa.Table, refused: str | None = None) -> CellSummary:
     claims, nees = int(_known(column(table, "claims")).sum()), _known(column(right, "nees"))
     nees_low, nees_high = nees_band(len(nees))
     violations = _known(column(table, "violations"))
+    shares = _shares_of_bound(table, outcomes)
     return CellSummary(
         trials=n,
         **counts,
@@ -161,7 +167,18 @@ def counted(table: pa.Table, refused: str | None = None) -> CellSummary:
         reports_refused=int(_known(column(table, "reports_refused")).sum()),
         refused_trials=everything - n,
         refused=refused,
+        bound_share_p50=_percentile(shares, 50),
+        bound_share_max=_percentile(shares, 100),
     )
+
+
+def _shares_of_bound(table: pa.Table, outcomes: Sequence[str]) -> Floats:
+    """Return the duration of each trial that localised over the bound of its group; none for pairs."""
+    if OF_GROUP not in table.schema.names:
+        return np.zeros(0)
+    localised = np.array([outcome == "localised" for outcome in outcomes], bool)
+    shares: Floats = (column(table, "ticks") / column(table, OF_GROUP))[localised]
+    return shares
 
 
 def _rmse_over_bound(table: pa.Table) -> float | None:
@@ -232,7 +249,9 @@ def summary_csv(sweep: Sweep, cells: Sequence[Cell], figures: Mapping[int, CellS
         for axis, place in zip(sweep.axes, cell.place, strict=True):
             axes += [axis.label(place)] if axis.labels is not None else []
             axes += [_text(value) for value in axis.values[place]]
-        rows.writerow([cell.index, *axes, *msgspec.structs.astuple(figures[cell.index])])
+        rows.writerow(
+            [cell.index, *axes, *[getattr(figures[cell.index], name) for name in columns_of(sweep)]]
+        )
     return out.getvalue()
 
 
@@ -250,7 +269,14 @@ def header(sweep: Sweep) -> list[str]:
         for axis in sweep.axes
         for name in ([axis.name] if axis.labels is not None else []) + list(axis.fields)
     ]
-    return ["cell", *axes, *CellSummary.__struct_fields__]
+    return ["cell", *axes, *columns_of(sweep)]
+
+
+def columns_of(sweep: Sweep) -> list[str]:
+    """Return the fields of a CellSummary that `sweep` has."""
+    return [
+        name for name in CellSummary.__struct_fields__ if sweep.of_group or not name.startswith("bound_share")
+    ]
 
 
 def _not_refused(table: pa.Table) -> pa.Table:

@@ -13,6 +13,7 @@ from compose.launch.model_loader import trust_all
 from compose.launch.planner_loader import trust
 from compose.recording.claim import Claim
 from compose.recording.closest_approach import nearest
+from compose.recording.group_localisation import meeting_results
 from compose.recording.run import Run
 from compose.recording.summary_json import first_contact
 from compose.scenario.kills import Kill
@@ -119,6 +120,8 @@ class TrialRow(msgspec.Struct, frozen=True, array_like=True):
     """T_max in s, the bound on the time in orbit until two robots meet; the largest of all robots"""
     t_max_ticks: int | None = None
     """T_max in ticks, rounded up"""
+    bound_ticks: int | None = None
+    """only for a group: the computed bound in ticks until all its robots are localised"""
     candidates: int | None = None
     """largest number of solutions of eq. (7) of any robot"""
     candidates_left: int | None = None
@@ -208,9 +211,11 @@ def row(trial: Trial, run: Run, wall_s: float, findings: Findings | None = None)
         return lost(trial.cell, trial.number, scenario.seed, "the recording is incomplete", wall_s)
     robots = {robot: _robot_row(run, robot) for robot in run.robots}
     for pair in scenario.pairs():
-        robots |= _bounded(robots, run, pair)
+        # a robot of a group claims after its first meeting, so its bound is that of this one
+        bounded = _bounded(robots, run, pair)
+        robots |= {name: one for name, one in bounded.items() if robots[name].bound_m is None}
     t_max_s = max(robot.rendezvous.bound for robot in scenario.robots)
-    encounters = [_meeting(run, *pair) for pair in run.pairs]
+    encounters = [_meeting(run, a, b, in_group=bool(scenario.meetings)) for a, b in run.pairs]
     final_reports = run.final_reports.values()
     errors = [robot.position_error_m for robot in robots.values() if robot.position_error_m is not None]
     nees = [robot.nees for robot in robots.values() if robot.nees is not None]
@@ -228,6 +233,7 @@ def row(trial: Trial, run: Run, wall_s: float, findings: Findings | None = None)
         period_s=scenario.mission.period,
         t_max_s=t_max_s,
         t_max_ticks=math.ceil(t_max_s / scenario.mission.period - ROUNDING),
+        bound_ticks=max([one.bound_ticks for one in meeting_results(run)], default=None),
         candidates=_most([robot.candidates for robot in robots.values()]),
         candidates_left=_most([robot.candidates_left for robot in robots.values()]),
         position_error_m=_most([robot.position_error_m for robot in robots.values()]),
@@ -302,20 +308,23 @@ def _bounded(robots: dict[str, RobotRow], run: Run, pair: tuple[int, int]) -> di
     return {name: replace(robots[name], bound_m=bound) for name, bound in zip(names, bounds, strict=True)}
 
 
-def _meeting(run: Run, a: str, b: str) -> tuple[int | None, int | None]:
+def _meeting(run: Run, a: str, b: str, *, in_group: bool) -> tuple[int | None, int | None]:
     """Return the first tick at which both robots of a pair orbit, and the tick at which phase 3 begins.
 
-    The first is None if phase 3 begins earlier, and each is None if it never happens.
+    The first is None if phase 3 begins earlier, and each is None if it never happens. In a group, where a may
+    have been in phase 3 before, the tick is that of b, and the first is None.
     """
+    meeting = (b,) if in_group else (a, b)
     orbiting = None
     for tick in run.ticks:
         commands = [
             command for command in (tick.commands.get(a), tick.commands.get(b)) if command is not None
         ]
-        if any(command.phase == 3 for command in commands):
+        if any(command.phase == 3 and command.robot in meeting for command in commands):
             return orbiting, tick.truth.tick
         if (
-            orbiting is None
+            not in_group
+            and orbiting is None
             and len(commands) == 2
             and all(command.state == "orbiting" for command in commands)
         ):

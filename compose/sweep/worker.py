@@ -127,14 +127,15 @@ def _played(chunk: Chunk, number: int, seed: int) -> trial.TrialRow:
     try:
         player = _function(chunk.play)
         setting, drawn = chunk.setting, {}
-        if chunk.draws:
-            table = chunk.draws.table(chunk.table, seed)
-            drawn = chunk.draws.values(table)
-            try:
+        try:
+            if chunk.draws:
+                table = chunk.draws.table(chunk.table, seed)
+                drawn = chunk.draws.values(table)
                 setting = validate(table, "its draws")
-            except Unworkable as error:
-                return trial.refused(chunk.cell, number, seed, str(error).removeprefix("its draws: "), drawn)
-        scenario = setting.seeded(seed)
+            scenario = setting.seeded(seed)
+        except Unworkable as error:
+            why = str(error).removeprefix("its draws: ").removeprefix(f"{setting.source}: ")
+            return trial.refused(chunk.cell, number, seed, why, drawn)
         kills = setting.kills(seed) if setting.file.kill else None
         row = player(trial.Trial(chunk.cell, number, scenario, chunk.processes, chunk.audit, kills))
         return replace(row, drawn=drawn) if drawn else row

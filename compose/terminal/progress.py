@@ -12,6 +12,7 @@ from protocol.output import say
 TRUTH, ESTIMATE, ERROR, SIGMA = "true x, y, heading", "estimate", "error m", "sigma m"
 TICK = "tick"
 RANGES, REPORTS, LATE = "ranges", "reports", "late"
+TRUTH_AT_CLAIM = "true at the claim"
 NOTES = (
     (TICK, "tick: of the estimate; the robot may have driven on"),
     (SIGMA, "sigma: claimed, of the position"),
@@ -43,11 +44,14 @@ def result(summary: Mapping[str, Any], rate: float | None = None, *, grouped: bo
     `grouped` states that the robots form a group.
     """
     robots: Mapping[str, Any] = summary["robots"]
+    group: Mapping[str, Any] | None = summary.get("group")
     exact = all(robot["covariance"] is None for robot in robots.values())
     late = {name: missed for name, robot in robots.items() if (missed := robot["deadlines_missed"])}
     omitted = {*([SIGMA] if exact else []), *([] if late else [LATE])}
     for choice in GROUP_CHOICES if grouped else CHOICES:
         columns = [column for column in choice if column not in omitted]
+        if group is not None:  # its robots drive on after their claims
+            columns = [TRUTH_AT_CLAIM if column == TRUTH else column for column in columns]
         cells = {name: _cells(robot, columns) for name, robot in robots.items()}
         rows = [(name, *of_robot.values()) for name, of_robot in cells.items()]
         made = tables.table(["robot"], columns, rows)
@@ -64,8 +68,18 @@ def result(summary: Mapping[str, Any], rate: float | None = None, *, grouped: bo
     else:
         lines = tables.lines(made, text_width.room())
     say(f"{summary['scenario']}: {outcome_line(summary)}", "", *lines, "", *text_width.notes(NOTES, columns))
+    if group is not None:
+        say(*text_width.wrapped(_bound(group)))
     if late:
         say(*text_width.wrapped(_missed(late, summary["ticks"], rate)))
+
+
+def _bound(group: Mapping[str, Any]) -> str:
+    """Return the sentence on the computed bound of a group, and the tick in which it was localised."""
+    tick, bound = group["localised_tick"], group["bound_ticks"]
+    if tick is None:
+        return f"the group's bound is {bound} ticks; not all robots are localised"
+    return f"all robots were localised by tick {tick}; the computed bound is {bound} ticks"
 
 
 def _missed(late: Mapping[str, int], ticks: int, rate: float | None) -> str:
@@ -81,7 +95,11 @@ def _cells(robot: Mapping[str, Any], columns: Sequence[str]) -> dict[str, str]:
     """Return the cells of the robot's row, by column."""
     cells = {
         TRUTH: _pose(robot["truth"]),
+<<<<<<< HEAD
         TICK: _number(robot["localised_tick"]),
+=======
+        TRUTH_AT_CLAIM: _pose(robot.get("truth_at_claim")),
+>>>>>>> group
         ESTIMATE: _pose(robot["estimate"]),
         ERROR: _number(robot["position_error_m"], ".1e"),
         SIGMA: _number(robot["position_sigma_m"], ".1e"),

@@ -173,10 +173,12 @@ class RunData:
         data = self.at(world.truth.tick)
         data.truth.update(zip(ids, world.truth.poses, strict=True))
         self.has_truth = True
-        if world.links:
-            links = [link for one, other in world.pairs for link in ((one, other), (other, one))]
-            for (sender, receiver), air in zip(links, world.links, strict=True):
-                data.under_way[ids[sender], ids[receiver]] = tuple([flying.tick for flying in air.flying])
+        before = self.ticks.get(world.truth.tick - 1)
+        for (sender, receiver), air in (world.links or {}).items():
+            link = ids[sender], ids[receiver]
+            data.under_way[link] = tuple([flying.tick for flying in air.flying])
+            if before is not None:  # the world has no state of a link before its first contact
+                before.under_way.setdefault(link, ())
 
     def add_tick(self, tick: Tick) -> None:
         """Add a complete tick of the world's journal. A robot without a Command is late."""
