@@ -371,16 +371,16 @@ def test_tandem_figures_draws_a_group_and_no_such_sheet_for_a_pair(folder: Path,
 # --- terminal, Foxglove, thumbnail --------------------------------------------------------------------
 
 
-def test_the_table_has_the_tick_of_each_claim_in_place_of_the_last_pose(
+def test_the_table_has_the_tick_and_the_pose_of_each_claim_in_place_of_the_last_pose(
     run: Run, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from compose.recording.summary_json import summary  # noqa: PLC0415
 
-    progress.result(summary(run, None, None), grouped=True)
+    progress.result(summary(run, None, None))
     out = capsys.readouterr().out
     assert re.search(r"r7 +108 ", out)
     assert "true x, y" not in out
-    assert "tick: of the estimate" in out
+    assert "tick: of the claim" in out
 
 
 def test_the_map_counts_localised_robots_and_names_destinations(

@@ -78,7 +78,7 @@ def conclude(
     else:
         from compose.terminal import progress  # noqa: PLC0415  # as above
 
-        progress.result(result, getattr(options, "rate", None), grouped=bool(recording.scenario.meetings))
+        progress.result(result, getattr(options, "rate", None))
     if folder is not None and options.out is not None:
         sys.stdout.flush()
         try:

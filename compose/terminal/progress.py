@@ -14,7 +14,7 @@ TICK = "tick"
 RANGES, REPORTS, LATE = "ranges", "reports", "late"
 TRUTH_AT_CLAIM = "true at the claim"
 NOTES = (
-    (TICK, "tick: of the estimate; the robot may have driven on"),
+    (TICK, "tick: of the claim; the robot may have driven on"),
     (SIGMA, "sigma: claimed, of the position"),
     (LATE, "late: ticks in which the robot stopped because its command was late"),
     (ERROR, "poses in m and rad"),
@@ -29,29 +29,28 @@ CHOICES = (
     (ERROR, SIGMA, LATE),
 )
 """Sets of columns, of which the first that fits is shown; empty columns SIGMA and LATE are omitted."""
-GROUP_CHOICES = tuple((TICK, *[column for column in columns if column != TRUTH]) for columns in CHOICES[1:])
-"""Those for a group, whose robots do not stay where they claim to be."""
+GROUP_CHOICES = tuple(
+    (TICK, *[TRUTH_AT_CLAIM if column == TRUTH else column for column in columns]) for columns in CHOICES
+)
+"""Those for a group, whose robots drive on after their claims."""
 LISTED = 4
 """The largest number of robots that are shown as a list if the table of all columns does not fit."""
 NAMED = 10
 """The largest number of robots named in a sentence."""
 
 
-def result(summary: Mapping[str, Any], rate: float | None = None, *, grouped: bool = False) -> None:
+def result(summary: Mapping[str, Any], rate: float | None = None) -> None:
     """Print the table at the end of a run at `rate`, and the number of missed deadlines.
 
     `summary` is the content of `summary.json`; `rate` is the speed relative to real time, None for lockstep.
-    `grouped` states that the robots form a group.
     """
     robots: Mapping[str, Any] = summary["robots"]
     group: Mapping[str, Any] | None = summary.get("group")
     exact = all(robot["covariance"] is None for robot in robots.values())
     late = {name: missed for name, robot in robots.items() if (missed := robot["deadlines_missed"])}
     omitted = {*([SIGMA] if exact else []), *([] if late else [LATE])}
-    for choice in GROUP_CHOICES if grouped else CHOICES:
+    for choice in CHOICES if group is None else GROUP_CHOICES:
         columns = [column for column in choice if column not in omitted]
-        if group is not None:  # its robots drive on after their claims
-            columns = [TRUTH_AT_CLAIM if column == TRUTH else column for column in columns]
         cells = {name: _cells(robot, columns) for name, robot in robots.items()}
         rows = [(name, *of_robot.values()) for name, of_robot in cells.items()]
         made = tables.table(["robot"], columns, rows)
@@ -95,11 +94,8 @@ def _cells(robot: Mapping[str, Any], columns: Sequence[str]) -> dict[str, str]:
     """Return the cells of the robot's row, by column."""
     cells = {
         TRUTH: _pose(robot["truth"]),
-<<<<<<< HEAD
         TICK: _number(robot["localised_tick"]),
-=======
         TRUTH_AT_CLAIM: _pose(robot.get("truth_at_claim")),
->>>>>>> group
         ESTIMATE: _pose(robot["estimate"]),
         ERROR: _number(robot["position_error_m"], ".1e"),
         SIGMA: _number(robot["position_sigma_m"], ".1e"),
