@@ -9,7 +9,7 @@ from pathlib import Path
 
 from compose.figures import PICTURES, catalogue
 from compose.figures.agent_replay import agent_replay
-from compose.figures.pair import pair_of
+from compose.figures.pair import pairs_of
 from compose.figures.sheet import Absent
 from compose.figures.style import SCREEN, look, save
 from compose.launch import in_process
@@ -33,6 +33,7 @@ SHOWN: dict[str, dict[str, str]] = {
         "encounter-a-b": "paper-2-encounter",
     },
     "noisy": {"plan-a-b": "noisy-plan", "robot-a": "noisy-a"},
+    "group-8": {"meetings": "group-8"},
 }
 """By scenario: the titles of the figures of `tandem figures` that pages show, and their file names here."""
 
@@ -57,8 +58,7 @@ def draw(name: str, shown: Mapping[str, str], folder: Path) -> None:
     """Run the scenario in `folder`, and copy those of its figures to docs/ that `shown` names."""
     in_process.run_mission(scenario_file.load(name), folder)
     run = read(folder)
-    pair = pair_of(run, run.pairs[0], {robot: agent_replay(run, robot) for robot in run.robots})
-    assert pair is not None
+    pair = next(pairs_of(run, {robot: agent_replay(run, robot) for robot in run.robots}))
     for kind in PICTURES:
         with look(SCREEN):
             for title, figure in catalogue.pictures(pair, kind):

@@ -212,10 +212,9 @@ class Run(msgspec.Struct, frozen=True, dict=True, eq=False):
     @cached_property
     def _pairs(self) -> list[PairRecord]:
         """The pairs with data, with the planner states of each robot whose journal can be read."""
-        from compose.figures.pair import pair_of  # noqa: PLC0415
+        from compose.figures.pair import pairs_of  # noqa: PLC0415
 
-        found = [pair_of(self.model, robots, self._replays(robots)) for robots in self.model.pairs]
-        return [pair for pair in found if pair is not None]
+        return list(pairs_of(self.model, self._replays(self.robots)))
 
     def _replays(self, robots: Iterable[str]) -> dict[str, AgentReplay]:
         from compose.figures.agent_replay import agent_replay  # noqa: PLC0415

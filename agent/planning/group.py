@@ -132,6 +132,11 @@ class GroupPlanner(Planner[GroupState, Report]):
         self._pair = pair_planner
         self.REQUIRED_PLACES = pair_planner.REQUIRED_PLACES
 
+    @property
+    def pair_planner(self) -> LogPlanner:
+        """The planner of each meeting."""
+        return self._pair
+
     # --- decisions ---
 
     def start(self, config: RobotConfig) -> GroupState:

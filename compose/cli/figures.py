@@ -15,6 +15,7 @@ from compose.extras import need
 from compose.figures import FORMATS, PICTURES
 from compose.launch.planner_loader import trust
 from compose.launch.second_process import OutputLine, Task, share
+from compose.recording.meetings import PastMeeting, past_meetings
 from compose.recording.recording_files import agent_journal, user_errors
 from compose.recording.run import Run
 from compose.terminal.outcome import counting
@@ -66,23 +67,21 @@ def main(options: argparse.Namespace) -> int:
     folder, status = options.recording / "figures", ENDED
     kinds = [kind for kind in PICTURES if kind in (options.only or PICTURES)]
     formats = [one for one in FORMATS if one in (options.format or FORMATS)]
-    with counting("tandem figures", sum([len(robots) + len(kinds) for robots in run.pairs])) as done:
-        for robots in run.pairs:
-            replays = {}
-            for robot in robots:
-                replay = _replay(run, robot)
-                if replay is not None:
-                    replays[robot] = replay
-                if replay is None or replay.broken is not None:
-                    status = FAILED
-                done()
+    past = past_meetings(run)
+    pairs: list[tuple[Sequence[str], PastMeeting | None]] = [((one.a, one.b), one) for one in past]
+    pairs = pairs or [(robots, None) for robots in run.pairs]
+    replayed: dict[str, AgentReplay | None] = {}
+    with counting("tandem figures", sum([len(robots) + len(kinds) for robots, _ in pairs])) as done:
+        for robots, meeting in pairs:
+            replays, complete = _replays(run, robots, replayed, done)
+            status = status if complete else FAILED
             torn = [
                 name for name, one in replays.items() if one.history is not None and one.history.end is None
             ]
             torn += ["the world"] if run.world is not None and run.world.end is None else []
             if torn:
                 _say(f"the recording of {' and '.join(torn)} ends before the mission does")
-            pair = pair_of(run, robots, replays)
+            pair = pair_of(run, robots, replays, meeting)
             if pair is None:
                 _say(f"no figure of {' and '.join(robots)}: the recording has no data")
                 status = FAILED
@@ -131,6 +130,23 @@ def _printed(done: Callable[[], None], lines: Sequence[OutputLine]) -> None:
     for line in lines:
         say(line.text, error=line.error)
     done()
+
+
+def _replays(
+    run: Run, robots: Sequence[str], known: dict[str, AgentReplay | None], done: Callable[[], None]
+) -> tuple[dict[str, AgentReplay], bool]:
+    """Return the replays of `robots`, added to those `known` so far, and whether all are complete."""
+    found = {}
+    complete = True
+    for robot in robots:
+        if robot not in known:
+            known[robot] = _replay(run, robot)
+        replay = known[robot]
+        if replay is not None:
+            found[robot] = replay
+        complete = complete and replay is not None and replay.broken is None
+        done()
+    return found, complete
 
 
 def _replay(run: Run, robot: str) -> AgentReplay | None:

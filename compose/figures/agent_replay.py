@@ -6,6 +6,7 @@ from typing import Any
 
 import msgspec
 
+from agent.planning.group import GroupPlanner, GroupState
 from agent.planning.planner import Planner
 from agent.planning.state import RobotState
 from agent.process.agent_journal import AgentHistory
@@ -22,11 +23,11 @@ class AgentReplay(msgspec.Struct, frozen=True):
     history: AgentHistory | None
     """The journal's content; None if the robot was killed before it received its configuration."""
     states: tuple[RobotState, ...] = ()
-    """The state after each tick in which the robot decided, starting at tick 0."""
+    """The state after each tick in which the robot decided, from tick 0; in a group, that in its meeting."""
     broken: str | None = None
     """The reason why `states` ends before the recording does; None if it does not."""
     planner: Planner[Any, Any] | None = None
-    """The planner; None if its states cannot be drawn or its code has not been loaded."""
+    """The planner, in a group that of a meeting; None if it cannot be drawn or its code is not loaded."""
 
     @property
     def estimates(self) -> tuple[Estimate, ...]:
@@ -47,11 +48,15 @@ def agent_replay(run: Run, robot: str) -> AgentReplay:
         planner = planner_of(history.config)
     except UserError:
         return AgentReplay(history)
-    return _recomputed(history, planner) if planner.MANOEUVRES is not None else AgentReplay(history)
+    drawn = planner.pair_planner if isinstance(planner, GroupPlanner) else planner
+    return _recomputed(history, planner, drawn) if drawn.MANOEUVRES is not None else AgentReplay(history)
 
 
-def _recomputed(history: AgentHistory, planner: Planner[Any, Any]) -> AgentReplay:
-    """Return the replay of `history`, which ends at the first decision that differs from the recording."""
+def _recomputed(history: AgentHistory, planner: Planner[Any, Any], drawn: Planner[Any, Any]) -> AgentReplay:
+    """Return the replay of `history`, which ends at the first decision that differs from the recording.
+
+    `drawn` is the planner of the states: `planner`, or in a group that of a meeting.
+    """
     again = PlannerReplay(history, planner)
     states: list[RobotState] = []
     try:
@@ -60,9 +65,10 @@ def _recomputed(history: AgentHistory, planner: Planner[Any, Any]) -> AgentRepla
                 break
             if again.robot.command_frame != step.command_frame:
                 why = f"the recorded decision at tick {again.tick} differs: another version wrote the journal"
-                return AgentReplay(history, tuple(states), why, planner)
-            states.append(again.robot.state)
+                return AgentReplay(history, tuple(states), why, drawn)
+            state = again.robot.state
+            states.append(state.pair if isinstance(state, GroupState) else state)
     except Exception as error:  # noqa: BLE001  # recorded inputs may raise any error in the planner
         why = f"the planner fails on its inputs of tick {again.tick}: {type(error).__name__}: {error}"
-        return AgentReplay(history, tuple(states), why, planner)
-    return AgentReplay(history, tuple(states), planner=planner)
+        return AgentReplay(history, tuple(states), why, drawn)
+    return AgentReplay(history, tuple(states), planner=drawn)

@@ -6,10 +6,20 @@ from collections.abc import Callable, Iterator
 
 from matplotlib.figure import Figure
 
-from compose.figures import decisions, manoeuvre, one_robot, over_time, phase_one, steps, trajectory
+from compose.figures import (
+    decisions,
+    manoeuvre,
+    one_robot,
+    over_time,
+    phase_one,
+    spread,
+    steps,
+    trajectory,
+)
 from compose.figures.pair import PairRecord
 from compose.figures.sheet import Absent
 from compose.figures.style import SCREEN, Medium
+from compose.recording.meetings import past_meetings
 
 Picture = tuple[str, Figure | Absent]
 
@@ -22,12 +32,20 @@ def pictures(pair: PairRecord, kind: str, medium: Medium = SCREEN) -> Iterator[P
     return _DRAWN[kind](pair, medium)
 
 
+def _meetings(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
+    """Yield the figure of the whole group with its first meeting; none for pairs."""
+    run = pair.run
+    meetings = past_meetings(run)
+    if meetings and (meetings[0].a, meetings[0].b) == (pair.a.id, pair.b.id):
+        yield "meetings", spread.draw(run, medium)
+
+
 def _trajectory(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
     yield f"trajectory-{pair.name}", trajectory.draw(pair, medium)
 
 
 def _phase_one(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
-    for role in pair.readable:
+    for role in pair.newcomers:
         name = f"phase-1-{pair.robot(role).id}"
         yield name, phase_one.draw(pair, role, medium) if pair.planner is not None else _foreign(pair)
 
@@ -61,11 +79,12 @@ def _errors(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
 
 
 def _robot(pair: PairRecord, medium: Medium) -> Iterator[Picture]:
-    for role in pair.readable:
+    for role in pair.newcomers:
         yield f"robot-{pair.robot(role).id}", one_robot.draw(pair, role, medium)
 
 
 _DRAWN: dict[str, Callable[[PairRecord, Medium], Iterator[Picture]]] = {
+    "meetings": _meetings,
     "trajectory": _trajectory,
     "phase-1": _phase_one,
     "plan": _plan,

@@ -22,6 +22,11 @@ FINE = 12
 """The number of line segments per tick of a drawn manoeuvre."""
 LIKELY = 1e-3
 """The minimum probability of a hypothesis that the panels' window must contain."""
+FARTHEST = 4.0
+"""Its maximum distance from the second anchor, as a multiple of the distance of the anchors and R.
+
+The first fit of a meeting after a long way may be farther off, with a sigma as large.
+"""
 
 
 class PairDecision(NamedTuple):
@@ -80,6 +85,9 @@ def _window(pair: PairRecord, shown: list[PairDecision]) -> Window:
         ends = list(_places(pair, one.tick).values())
         ends += [end for state in one.states.values() for end in _ends(state, pair)]
         points += [(end.x, end.y) for end in ends]
+    a, b = [(pair.robot(role).anchor.x, pair.robot(role).anchor.y) for role in ROLES]
+    farthest = FARTHEST * (math.dist(a, b) + pair.mission.sensing_range)
+    points = [point for point in points if math.dist(point, b) <= farthest]
     return square(points, 0.16, 0.5 * pair.mission.sensing_range)
 
 

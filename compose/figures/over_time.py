@@ -172,30 +172,38 @@ def _second_row(pair: PairRecord) -> float:
 
 
 def _ranges(axes: Axes, pair: PairRecord) -> None:
-    apart = pair.separations[: len(pair.mutual)]
+    apart = pair.separations[pair.first : len(pair.mutual)]
     if apart:
+        ticks = range(pair.first, pair.first + len(apart))
         axes.plot(
-            range(len(apart)), apart, "-", lw=1.1, color=INK, zorder=2, gid="separation",
+            ticks, apart, "-", lw=1.1, color=INK, zorder=2, gid="separation",
             label="true separation" if pair.true else "separation, from claims",
         )  # fmt: skip
     for role in ROLES:
         one = pair.robot(role)
         _measured(
             axes, one.anchor_ranges, f"anchor-range-{one.id}", COLOURS[role], MARKS[role],
-            rf"$\rho$ of {one.id} to ${ANCHORS[role]}$, measured",
+            rf"$\rho$ of {one.id} to ${ANCHORS[role]}$, measured", pair.first,
         )  # fmt: skip
     diamonds = {"marker": "D", "markerfacecolor": INK, "markeredgecolor": INK}
     mutual = [rho for _, rho in pair.mutual]
-    _measured(axes, mutual, "mutual-range", INK, diamonds, "mutual range, measured")
+    _measured(axes, mutual, "mutual-range", INK, diamonds, "mutual range, measured", pair.first)
     reach = pair.mission.sensing_range
     axes.axhline(reach, ls="-.", lw=0.9, color=PALE, gid="reach", label=f"$R$ = {reach:g} m", zorder=1)
-    axes.set_ylim(0.0, 1.05 * max([reach, *pair.separations]))
+    axes.set_ylim(0.0, 1.05 * max([reach, *pair.separations[pair.first :]]))
 
 
 def _measured(
-    axes: Axes, values: Sequence[float | None], gid: str, colour: str, mark: dict[str, Any], label: str
+    axes: Axes,
+    values: Sequence[float | None],
+    gid: str,
+    colour: str,
+    mark: dict[str, Any],
+    label: str,
+    first: int,
 ) -> None:
-    points = [(tick, rho) for tick, rho in enumerate(values) if rho is not None]
+    """Draw the measured ranges from tick `first` on."""
+    points = [(tick, rho) for tick, rho in enumerate(values) if rho is not None and tick >= first]
     if points:
         ticks, measured_ranges = zip(*points, strict=True)
         axes.plot(

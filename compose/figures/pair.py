@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from itertools import groupby
 from typing import Any
@@ -15,8 +15,9 @@ from agent.planning.planner import Planner
 from agent.planning.state import RobotState
 from compose.figures.agent_replay import AgentReplay
 from compose.recording.claim import Claim
+from compose.recording.meetings import PastMeeting, past_meetings
 from compose.recording.run import Run
-from protocol.messages import Command, Estimate
+from protocol.messages import Command, Estimate, RobotConfig, RobotConfigInGroup
 from protocol.mission import Anchor, Mission, PlannerName, Role
 from protocol.motion import Pose
 from protocol.orbits import Orbit
@@ -33,7 +34,7 @@ class Span(msgspec.Struct, frozen=True):
 
 
 class Side(msgspec.Struct, frozen=True, dict=True):
-    """One robot of a pair, with one entry per tick in each sequence."""
+    """One robot of a pair, with one entry per tick in each sequence, from tick 0 to the meeting's end."""
 
     id: str
     anchor: Anchor
@@ -47,13 +48,27 @@ class Side(msgspec.Struct, frozen=True, dict=True):
     replay: AgentReplay | None
     """The recomputed planner states; None if the robot's journal cannot be read."""
     claim: Claim | None = None
-    """The robot's first claim, compared with the ground truth; None in hardware mode."""
+    """The robot's first claim, compared with the ground truth; None in hardware mode and later meetings."""
+    first: int = 0
+    """The tick in which the robot leaves for the meeting; 0 in its first one."""
 
     @cached_property
     def estimates(self) -> tuple[tuple[Estimate, Pose], ...]:
-        """The journaled estimates, each with the pose of `path` in the same tick, where both are known."""
+        """The journaled estimates of the meeting, each with the pose of `path` in the same tick, if known."""
         estimates = self.replay.estimates if self.replay is not None else ()
-        return tuple([(one, self.path[one.tick]) for one in estimates if one.tick < len(self.path)])
+        return tuple(
+            [(one, self.path[one.tick]) for one in estimates if self.first <= one.tick < len(self.path)]
+        )
+
+    @property
+    def on_orbit(self) -> bool:
+        """True if the robot drives to its orbit in phase 2, and not straight to its peer."""
+        return self.first == 0
+
+    @property
+    def way(self) -> tuple[Pose, ...]:
+        """The poses of the meeting."""
+        return self.path[self.first :]
 
     @cached_property
     def placed(self) -> tuple[tuple[Estimate, Pose], ...]:
@@ -79,7 +94,7 @@ class Side(msgspec.Struct, frozen=True, dict=True):
 
 
 class PairRecord(msgspec.Struct, frozen=True, dict=True):
-    """Two robots that are each other's peers."""
+    """Two robots that are each other's peers; in a group, in one meeting."""
 
     title: str
     """The name of the run and its outcome."""
@@ -153,14 +168,19 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
         """The roles of the robots whose journals can be read."""
         return [role for role in ROLES if self.robot(role).replay is not None]
 
+    @property
+    def newcomers(self) -> list[Role]:
+        """Those of them whose first meeting this is: for pairs, all."""
+        return [role for role in self.readable if self.robot(role).first == 0]
+
     def states(self, role: Role) -> tuple[RobotState, ...]:
         """Return the planner state after each tick, up to the last tick of the recording."""
-        replay = self.robot(role).replay
-        return replay.states[: max(1, len(self.mutual))] if replay is not None else ()
+        one = self.robot(role)
+        return one.replay.states[one.first : max(1, len(self.mutual))] if one.replay is not None else ()
 
     @cached_property
     def separations(self) -> list[float]:
-        """The distance between the robots in m, one entry per tick in which both poses are known."""
+        """The distance between the robots in m, one entry per tick, from 0, in which both poses are known."""
         return [math.hypot(p.x - q.x, p.y - q.y) for p, q in zip(self.a.path, self.b.path, strict=False)]
 
     @cached_property
@@ -168,6 +188,8 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
         """The first and the last tick of each stretch of contact."""
         spans: list[tuple[int, int]] = []
         for tick, (near, _) in enumerate(self.mutual):
+            if tick < self.first:
+                continue
             if near and spans and spans[-1][1] == tick - 1:
                 spans[-1] = (spans[-1][0], tick)
             elif near:
@@ -177,18 +199,29 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
     @cached_property
     def encounter_tick(self) -> int | None:
         """The first tick in which one of the robots is in phase 3; None if there is none."""
-        ticks = [side.phases.index(3) for side in (self.a, self.b) if 3 in side.phases]
-        return min(ticks, default=None)
+        return next((tick for tick in range(self.first, len(self.mutual)) if self._meet(tick)), None)
+
+    def _meet(self, tick: int) -> bool:
+        return any(tick < len(side.phases) and side.phases[tick] == 3 for side in (self.a, self.b))
+
+    @property
+    def first(self) -> int:
+        """The tick in which the meeting begins; 0 for pairs."""
+        return max(self.a.first, self.b.first)
 
     def spans(self, *roles: Role) -> tuple[Span, ...]:
-        """Return the phases of the robots with `roles`, the earlier one where they differ, over all ticks."""
+        """Return the phases of the robots with `roles`, the earlier one where they differ, over all ticks.
+
+        In a group, these are the ticks from which on all these robots are in the meeting.
+        """
         sides = [self.robot(role) for role in roles]
         known = [side for side in sides if side.phases] or sides
-        phases = [min(side.phase(tick) for side in known) for tick in range(len(self.mutual))]
-        if self.encounter_tick is not None and len(roles) > 1:
-            phases[self.encounter_tick :] = [3] * (len(phases) - self.encounter_tick)
+        first, met = max(side.first for side in sides), self.encounter_tick
+        phases = [min(side.phase(tick) for side in known) for tick in range(first, len(self.mutual))]
+        if met is not None and len(roles) > 1:
+            phases[met - first :] = [3] * (len(phases) - (met - first))
         spans = []
-        for phase, group in groupby(enumerate(phases), key=lambda one: one[1]):
+        for phase, group in groupby(enumerate(phases, first), key=lambda one: one[1]):
             ticks = [tick for tick, _ in group]
             spans.append(Span(phase, ticks[0], ticks[-1]))
         return tuple(spans) or (Span(1, 0, 0),)
@@ -204,10 +237,20 @@ def others(estimate: Estimate) -> tuple[Pose, ...]:
     return estimate.world[1:] if estimate.probabilities or len(estimate.world) == 1 else estimate.world
 
 
-def pair_of(run: Run, robots: Sequence[str], replays: Mapping[str, AgentReplay]) -> PairRecord | None:
+def pairs_of(run: Run, replays: Mapping[str, AgentReplay]) -> Iterator[PairRecord]:
+    """Yield the pairs of `run` that have data; in a group, the meetings that have begun."""
+    found: Sequence[PairRecord | None] = [
+        pair_of(run, (one.a, one.b), replays, one) for one in past_meetings(run)
+    ] or [pair_of(run, robots, replays) for robots in run.pairs]
+    yield from [pair for pair in found if pair is not None]
+
+
+def pair_of(
+    run: Run, robots: Sequence[str], replays: Mapping[str, AgentReplay], meeting: PastMeeting | None = None
+) -> PairRecord | None:
     """Return the pair of `robots`, role a first; None in hardware mode if no journal has a configuration.
 
-    `replays` holds the readable journals by robot id.
+    In a group, it is their `meeting`. `replays` holds the readable journals by robot id.
     """
     histories = {one: replays[one].history for one in robots if one in replays}
     known = {robot: history for robot, history in histories.items() if history is not None}
@@ -219,6 +262,9 @@ def pair_of(run: Run, robots: Sequence[str], replays: Mapping[str, AgentReplay])
         ticks = {robot: len(history.steps) for robot, history in known.items()}
     else:
         return None
+    if meeting is not None:
+        config = _in_meeting(config, meeting)
+        ticks = {robot: min(count, meeting.last + 1) for robot, count in ticks.items()}
     peer = {config.robot: config.peer, config.peer: config.robot}
     mutual: list[tuple[bool, float | None]] = []
     for tick in range(max(ticks.values())):
@@ -228,6 +274,7 @@ def pair_of(run: Run, robots: Sequence[str], replays: Mapping[str, AgentReplay])
     def side(role: Role) -> Side:
         own = config.role == role
         robot = config.robot if own else config.peer
+        first = meeting.first if meeting is not None and role == "a" else 0
         if run.world is not None:
             path = run.truth(robot) or (run.scenario.robot(robot).start,)
         else:
@@ -237,15 +284,19 @@ def pair_of(run: Run, robots: Sequence[str], replays: Mapping[str, AgentReplay])
             id=robot,
             anchor=config.anchor if own else config.peer_anchor,
             orbit=config.rendezvous.of(role),
-            path=path,
+            path=path[: meeting.last + 1] if meeting is not None else path,
             commands=tuple([run.command(robot, tick) for tick in seen]),
             anchor_ranges=tuple([run.observations[tick][robot].anchor_range for tick in seen]),
             replay=replays.get(robot),
-            claim=run.claim(robot),
+            claim=run.claim(robot) if first == 0 else None,
+            first=first,
         )
 
+    title = run.title(list(known))
+    if meeting is not None:
+        title += f"; meeting of {robots[0]} and {robots[-1]}, ticks {meeting.first} to {meeting.last}"
     pair = PairRecord(
-        title=run.title(list(known)),
+        title=title,
         mission=config.mission,
         planner_name=config.planner_name,
         a=side("a"),
@@ -256,3 +307,12 @@ def pair_of(run: Run, robots: Sequence[str], replays: Mapping[str, AgentReplay])
     if pair.true or not pair.placed:
         return pair
     return replace(pair, title=f"{pair.title}; positions from claims")
+
+
+def _in_meeting(config: RobotConfig, meeting: PastMeeting) -> RobotConfig:
+    """Return `config`, of a robot of a group, with its peer and its role in `meeting`."""
+    role: Role = "a" if config.robot == meeting.a else "b"
+    peer = meeting.b if role == "a" else meeting.a
+    if config.peer == peer or not isinstance(config, RobotConfigInGroup):
+        return config
+    return config.in_meeting(peer, role)

@@ -76,7 +76,8 @@ def _panel(axes: Axes, pair: PairRecord, first: int, before: int, tick: int) -> 
     begin = max(0, first - BEFORE)
     for role in ROLES:
         one, colour = pair.robot(role), COLOURS[role]
-        circle(axes, (one.anchor.x, one.anchor.y), one.orbit.radius, lw=0.6, color=colour, alpha=0.5)
+        if one.on_orbit:
+            circle(axes, (one.anchor.x, one.anchor.y), one.orbit.radius, lw=0.6, color=colour, alpha=0.5)
         draw_trail(axes, one, role, range(begin, before + 1), alpha=0.4)
         draw_trail(axes, one, role, range(before, tick + 1), lw=1.8)
         for ranged in (True, False):

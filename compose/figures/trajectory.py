@@ -40,14 +40,17 @@ def draw_plane(axes: Axes, pair: PairRecord, about: Role | None = None) -> None:
     for role in ROLES:
         draw_anchor(axes, pair, role)
         one = pair.robot(role)
-        circle(
+        if one.on_orbit:
+            circle(
             axes, (one.anchor.x, one.anchor.y), one.orbit.radius, lw=0.6, color=COLOURS[role], alpha=0.5,
             gid=f"orbit-{one.id}", label=f"orbit of {one.id}, {one.orbit.radius:.4g} m",
         )  # fmt: skip
     for role in ROLES:
         _path(axes, pair, role, pale=about not in {None, role})
     axes.plot([], [], "s", ms=6, mfc="white", mec=INK, mew=1.2, label="start")
-    for phase in sorted({phase for role in ROLES for phase in pair.robot(role).phases}):
+    for phase in sorted(
+        {phase for role in ROLES for phase in pair.robot(role).phases[pair.robot(role).first :]}
+    ):
         axes.plot([], [], ls=line_style(phase), lw=1.2, color=PALE, label=f"path in phase {phase}")
     _meetings(axes, pair)
     if about is None:
@@ -56,10 +59,10 @@ def draw_plane(axes: Axes, pair: PairRecord, about: Role | None = None) -> None:
 
 def window(pair: PairRecord) -> Window:
     """Return the window that contains both paths, sensing ranges and orbits."""
-    points = [(pose.x, pose.y) for role in ROLES for pose in pair.robot(role).path]
+    points = [(pose.x, pose.y) for role in ROLES for pose in pair.robot(role).way]
     for role in ROLES:
         one = pair.robot(role)
-        reach = max(pair.mission.sensing_range, one.orbit.radius)
+        reach = max(pair.mission.sensing_range, one.orbit.radius if one.on_orbit else 0.0)
         points += [(one.anchor.x + dx, one.anchor.y + dy) for dx in (-reach, reach) for dy in (-reach, reach)]
     return around(points, 0.03)
 
@@ -84,14 +87,14 @@ def draw_anchor(axes: Axes, pair: PairRecord, role: Role) -> None:
 def _path(axes: Axes, pair: PairRecord, role: Role, *, pale: bool) -> None:
     """Draw a path: positions as markers, joined in the line style of each phase, from the start pose on."""
     one, colour, alpha = pair.robot(role), COLOURS[role], 0.4 if pale else 1.0
-    draw_trail(axes, one, role, range(len(one.path)), alpha=alpha)
+    draw_trail(axes, one, role, range(one.first, len(one.path)), alpha=alpha)
     axes.plot(
-        [p.x for p in one.path], [p.y for p in one.path], ls="", ms=2.6, mew=0.7, color=colour, alpha=alpha,
-        markevery=max(1, math.ceil(len(one.path) / MANY)), gid=f"path-{one.id}", zorder=3, **MARKS[role],
+        [p.x for p in one.way], [p.y for p in one.way], ls="", ms=2.6, mew=0.7, color=colour, alpha=alpha,
+        markevery=max(1, math.ceil(len(one.way) / MANY)), gid=f"path-{one.id}", zorder=3, **MARKS[role],
     )  # fmt: skip
     label = f"true path of {one.id}" if pair.true else f"path of {one.id}, from its claim"
     axes.plot([], [], "-", lw=1.2, ms=3.5, mew=0.8, color=colour, alpha=alpha, label=label, **MARKS[role])
-    start = one.path[0]
+    start = one.path[one.first]
     axes.plot(
         start.x, start.y, "s", ms=6, mfc="white", mec=colour, mew=1.2, zorder=4, gid=f"released-{one.id}",
         alpha=alpha,

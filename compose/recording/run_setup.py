@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import NamedTuple
 
 import msgspec
+from msgspec.structs import replace
 
 from protocol.attack import Attack
-from protocol.messages import RobotConfig
+from protocol.messages import RobotConfig, RobotConfigInGroup
 from protocol.mission import Anchor, Mission, PlannerName, Role
 from protocol.motion import Pose
 from protocol.orbits import Orbit
@@ -18,7 +21,7 @@ from world.scenario import Scenario
 
 
 class RobotSetup(msgspec.Struct, frozen=True):
-    """One robot: its role, peer, anchor and orbit."""
+    """One robot: its role, peer, anchor and orbit. In a group, they are those of its first meeting."""
 
     id: RobotId
     peer: RobotId
@@ -35,7 +38,26 @@ class RobotSetup(msgspec.Struct, frozen=True):
     """
 
 
-class RunSetup(msgspec.Struct, frozen=True):
+class Visit(msgspec.Struct, frozen=True):
+    """A planned meeting of a group: the robot of role a, and that of role b."""
+
+    visitor: RobotId
+    visited: RobotId
+    ends_s: float
+    """The planned bound in s of the time at which both are localised."""
+
+
+class PresentMeeting(NamedTuple):
+    """The meeting that a robot of a group is in, or on its way to."""
+
+    peer: RobotId
+    visiting: bool
+    """True if the robot knows its pose already."""
+    known: frozenset[RobotId] = frozenset()
+    """The robots of which it has heard that they are localised."""
+
+
+class RunSetup(msgspec.Struct, frozen=True, dict=True):
     """The static data of a run, known before its first tick."""
 
     name: str
@@ -53,6 +75,8 @@ class RunSetup(msgspec.Struct, frozen=True):
     tick_s: float | None = None
     """The wall-clock duration of a tick in s; None in lockstep."""
     faults: tuple[Fault, ...] = ()
+    visits: tuple[Visit, ...] = ()
+    """The meetings of a group, in the order in which they are planned to end; empty for pairs."""
 
     @property
     def ids(self) -> tuple[str, ...]:
@@ -67,9 +91,67 @@ class RunSetup(msgspec.Struct, frozen=True):
         raise KeyError(robot)
 
     def pairs(self) -> tuple[tuple[RobotSetup, RobotSetup], ...]:
-        """Return the pairs whose robots are both known, as (robot of role a, robot of role b)."""
+        """Return the pairs whose robots are both known, as (robot of role a, robot of role b).
+
+        In a group, these are the robots that are each other's peers: with `in_meetings`, at present.
+        """
         known = {one.id: one for one in self.robots}
-        return tuple([(one, known[one.peer]) for one in self.robots if one.role == "a" and one.peer in known])
+        return tuple(
+            [
+                (one, known[one.peer])
+                for one in self.robots
+                if one.role == "a"
+                and one.peer in known
+                and (not self.visits or known[one.peer].peer == one.id)
+            ]
+        )
+
+    def links(self) -> tuple[tuple[RobotSetup, RobotSetup], ...]:
+        """Return all pairs that meet during the run: in a group, the robots of each meeting."""
+        known = {one.id: one for one in self.robots}
+        met = [
+            (known[one.visitor], known[one.visited])
+            for one in self.visits
+            if {one.visitor, one.visited} <= known.keys()
+        ]
+        return tuple(met) if self.visits else self.pairs()
+
+    @cached_property
+    def bounds_s(self) -> dict[RobotId, float]:
+        """The planned bound in s of the time at which each robot of a group is localised; empty for pairs."""
+        found: dict[RobotId, float] = {}
+        for visit in self.visits:
+            for robot in (visit.visitor, visit.visited):
+                found.setdefault(robot, visit.ends_s)
+        return found
+
+    @cached_property
+    def partners(self) -> dict[RobotId, tuple[RobotId, ...]]:
+        """The peers of each robot's meetings, in their order; for pairs, one each."""
+        if not self.visits:
+            return {robot.id: (robot.peer,) for robot in self.robots}
+        found: dict[RobotId, tuple[RobotId, ...]] = {}
+        for visit in self.visits:
+            found[visit.visitor] = (*found.get(visit.visitor, ()), visit.visited)
+            found[visit.visited] = (visit.visitor, *found.get(visit.visited, ()))
+        return found
+
+    def in_meetings(self, meetings: Mapping[RobotId, PresentMeeting]) -> RunSetup:
+        """Return this setup with the peer and the role that each robot has in its meeting."""
+        if not meetings:
+            return self
+        return replace(
+            self,
+            robots=tuple(
+                [_in_meeting(one, meetings[one.id]) if one.id in meetings else one for one in self.robots]
+            ),
+        )
+
+
+def _in_meeting(one: RobotSetup, meeting: PresentMeeting) -> RobotSetup:
+    if meeting.peer == one.peer and not meeting.visiting:
+        return one
+    return replace(one, peer=meeting.peer, role="a" if meeting.visiting else "b")
 
 
 def of_scenario(scenario: Scenario, mode: str | None = None, tick_s: float | None = None) -> RunSetup:
@@ -95,12 +177,15 @@ def of_scenario(scenario: Scenario, mode: str | None = None, tick_s: float | Non
         ),
         mission=scenario.mission,
         planner_name=scenario.planner_name,
-        t_max_s=max(robot.rendezvous.bound for robot in scenario.robots),
+        t_max_s=max(
+            [one.ends for one in scenario.meetings] or [robot.rendezvous.bound for robot in scenario.robots]
+        ),
         max_ticks=scenario.max_ticks,
         seed=scenario.seed,
         mode=mode,
         tick_s=tick_s,
         faults=scenario.faults,
+        visits=tuple([Visit(one.visitor, one.visited, one.ends) for one in scenario.meetings]),
     )
 
 
@@ -110,6 +195,7 @@ def of_configs(name: str, configs_by_robot: Mapping[str, RobotConfig]) -> RunSet
     `configs_by_robot` maps robot ids to configurations and must not be empty.
     """
     configs = list(configs_by_robot.values())
+    visits = _visits(configs)
     return RunSetup(
         name=name,
         robots=tuple(
@@ -120,9 +206,19 @@ def of_configs(name: str, configs_by_robot: Mapping[str, RobotConfig]) -> RunSet
         ),
         mission=configs[0].mission,
         planner_name=configs[0].planner_name,
-        t_max_s=max(one.rendezvous.bound for one in configs),
+        t_max_s=max([one.ends_s for one in visits] or [one.rendezvous.bound for one in configs]),
         tick_s=configs[0].tick_s,
+        visits=tuple(visits),
     )
+
+
+def _visits(configs: Sequence[RobotConfig]) -> list[Visit]:
+    """Return the planned meetings in the configurations of a group."""
+    grouped = [one for one in configs if isinstance(one, RobotConfigInGroup)]
+    found = [(one, one.peer) for one in grouped if one.role == "a"]
+    found += [(one, visited) for one in grouped for visited in one.visits]
+    visits = [Visit(one.robot, visited, one.member(visited).ends) for one, visited in found]
+    return sorted(visits, key=lambda visit: visit.ends_s)
 
 
 def frame(anchor: Anchor, start: Pose) -> Pose:

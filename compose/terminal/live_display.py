@@ -11,6 +11,7 @@ from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
+from compose.recording.meetings import TRAVELLING
 from compose.recording.recording_files import WORLD_JOURNAL
 from compose.recording.run_setup import of_scenario
 from compose.terminal import tables
@@ -110,13 +111,17 @@ class RobotMap:
         self._scene = new[-1] if new else self._scene
         scene = self._scene
         title = _title(self._scenario, scene.tick if scene is not None else 0)
+        if scene is not None and self._setup.visits:
+            count = sum([player.is_localised for player in scene.players])
+            title.append(f", {count} of {len(scene.players)} robots localised")
         if scene is None:
             return Group(title, Text(f"waiting for {', '.join(self._setup.ids)}"))
         lines = [Text(_line(player), no_wrap=True, overflow="ellipsis") for player in scene.players]
         rows = min(MOST_ROWS, self._console.size.height - len(lines) - 3)
         if rows < LEAST_ROWS or not self._console.encoding.lower().startswith("utf"):
             return Group(title, *lines)
-        return Group(title, self._map(scene, rows), *lines, Text(LEGEND, style="dim", no_wrap=True))
+        legend = f"{LEGEND}; localised robots are blue" if self._setup.visits else LEGEND
+        return Group(title, self._map(scene, rows), *lines, Text(legend, style="dim", no_wrap=True))
 
     def _map(self, scene: Scene, rows: int) -> Text:
         drawing = Drawing(self._console.size.width - 1, rows, box(self._setup))
@@ -124,13 +129,14 @@ class RobotMap:
             at = robot.anchor.x, robot.anchor.y
             drawing.dots(circle(at, self._setup.mission.sensing_range), "dim")
         for robot in self._setup.robots:
-            drawing.line(self._paths[robot.id], HUES[robot.role])
+            drawing.line(self._paths[robot.id], self._hue(scene.player(robot.id)))
         for player in scene.players:
             self._lines(drawing, scene, player)
         for robot in self._setup.robots:
-            drawing.letter((robot.anchor.x, robot.anchor.y), "+", f"bold {HUES[robot.role]}")
+            hue = self._hue(scene.player(robot.id))
+            drawing.letter((robot.anchor.x, robot.anchor.y), "+", f"bold {hue}")
         for player in scene.players:
-            hue = HUES[self._setup.robot_setup(player.robot).role]
+            hue = self._hue(player)
             for pose in self._hypotheses(player):
                 drawing.letter(pose, "o", hue)
             if player.pose is not None:
@@ -144,11 +150,15 @@ class RobotMap:
         here = player.pose.x, player.pose.y
         robot = self._setup.robot_setup(player.robot)
         if player.anchor_range is not None:
-            drawing.line([here, (robot.anchor.x, robot.anchor.y)], HUES[robot.role], gap=3)
+            drawing.line([here, (robot.anchor.x, robot.anchor.y)], self._hue(player), gap=3)
         for contact in player.contacts:
             peer = scene.player(contact.peer).pose
             if peer is not None:
                 drawing.line([here, (peer.x, peer.y)], "green")
+
+    def _hue(self, player: Player) -> str:
+        """Return the colour of a robot."""
+        return HUES[player.hue(self._setup.robot_setup(player.robot))]
 
     def _hypotheses(self, player: Player) -> list[Point]:
         """Return the positions of a robot's hypotheses in the world frame."""
@@ -168,13 +178,19 @@ def _verdict(command: Command) -> str:
     return str(command.verdict.__struct_config__.tag) if command.verdict is not None else UNDECIDED
 
 
+def _destination(player: Player) -> str:
+    """Return the robot to which a robot of a group travels, as the end of a line."""
+    travels = player.command is not None and player.command.state == TRAVELLING
+    return f" to {player.peer}" if travels and player.peer is not None else ""
+
+
 def _line(player: Player) -> str:
     """Return the line of a robot: phase and state, speeds, the number of hypotheses, and ranges."""
     command, held = player.command, player.held
     if command is None:
         return f"{player.robot}  {one_line(player.activity)}"
     parts = [
-        f"phase {command.phase}: {one_line(command.state)}",
+        f"phase {command.phase}: {one_line(command.state)}{_destination(player)}",
         f"{command.v:.2f} m/s {command.omega:+.2f} rad/s",
     ]
     if held is not None:

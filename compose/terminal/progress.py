@@ -10,9 +10,11 @@ from compose.terminal import tables, text_width
 from protocol.output import say
 
 TRUTH, ESTIMATE, ERROR, SIGMA = "true x, y, heading", "estimate", "error m", "sigma m"
+TICK = "tick"
 RANGES, REPORTS, LATE = "ranges", "reports", "late"
 TRUTH_AT_CLAIM = "true at the claim"
 NOTES = (
+    (TICK, "tick: of the claim; the robot may have driven on"),
     (SIGMA, "sigma: claimed, of the position"),
     (LATE, "late: ticks in which the robot stopped because its command was late"),
     (ERROR, "poses in m and rad"),
@@ -27,6 +29,10 @@ CHOICES = (
     (ERROR, SIGMA, LATE),
 )
 """Sets of columns, of which the first that fits is shown; empty columns SIGMA and LATE are omitted."""
+GROUP_CHOICES = tuple(
+    (TICK, *[TRUTH_AT_CLAIM if column == TRUTH else column for column in columns]) for columns in CHOICES
+)
+"""Those for a group, whose robots drive on after their claims."""
 LISTED = 4
 """The largest number of robots that are shown as a list if the table of all columns does not fit."""
 NAMED = 10
@@ -43,10 +49,8 @@ def result(summary: Mapping[str, Any], rate: float | None = None) -> None:
     exact = all(robot["covariance"] is None for robot in robots.values())
     late = {name: missed for name, robot in robots.items() if (missed := robot["deadlines_missed"])}
     omitted = {*([SIGMA] if exact else []), *([] if late else [LATE])}
-    for choice in CHOICES:
+    for choice in CHOICES if group is None else GROUP_CHOICES:
         columns = [column for column in choice if column not in omitted]
-        if group is not None:  # its robots drive on after their claims
-            columns = [TRUTH_AT_CLAIM if column == TRUTH else column for column in columns]
         cells = {name: _cells(robot, columns) for name, robot in robots.items()}
         rows = [(name, *of_robot.values()) for name, of_robot in cells.items()]
         made = tables.table(["robot"], columns, rows)
@@ -90,6 +94,7 @@ def _cells(robot: Mapping[str, Any], columns: Sequence[str]) -> dict[str, str]:
     """Return the cells of the robot's row, by column."""
     cells = {
         TRUTH: _pose(robot["truth"]),
+        TICK: _number(robot["localised_tick"]),
         TRUTH_AT_CLAIM: _pose(robot.get("truth_at_claim")),
         ESTIMATE: _pose(robot["estimate"]),
         ERROR: _number(robot["position_error_m"], ".1e"),

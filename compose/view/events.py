@@ -49,7 +49,7 @@ def events(
         yield from _presence(robot, before, now)
     for robot_setup in setup.robots:
         yield from _sensing(robot_setup, before, now)
-        yield from _deciding(robot_setup, before, now)
+        yield from _deciding(robot_setup, before, now, grouped=bool(setup.visits))
         yield from _believing(robot_setup, before, now)
     yield from _radio(now.tick, passages)
     if end is not None and end.tick == now.tick:
@@ -115,7 +115,10 @@ def _sensing(robot_setup: RobotSetup, before: TickData | None, now: TickData) ->
         yield Event(tick, "contact-lost", robot, f"{robot} and {peer} have lost contact")
 
 
-def _deciding(robot_setup: RobotSetup, before: TickData | None, now: TickData) -> Iterator[Event]:
+def _deciding(
+    robot_setup: RobotSetup, before: TickData | None, now: TickData, *, grouped: bool
+) -> Iterator[Event]:
+    """Yield the changes of phase, state and verdict. Robots that are `grouped` have states after a claim."""
     robot, tick = robot_setup.id, now.tick
     if robot in now.late:
         yield Event(tick, "late", robot, f"{robot} misses the deadline and stops for this tick")
@@ -128,7 +131,8 @@ def _deciding(robot_setup: RobotSetup, before: TickData | None, now: TickData) -
         return
     if earlier is None or command.phase != earlier.phase:
         yield Event(tick, "phase", robot, f"{robot} begins phase {command.phase}: {PHASES[command.phase]}")
-    if (earlier is None or command.state != earlier.state) and command.verdict is None:
+    active = command.verdict is None or (grouped and command.state != "localised")
+    if active and (earlier is None or command.state != earlier.state):
         yield Event(tick, "state", robot, doing(robot_setup, command.phase, command.state, None))
     if command.verdict is not None and (earlier is None or earlier.verdict is None):
         yield _verdict(robot_setup, command, now)

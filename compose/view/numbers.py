@@ -42,7 +42,11 @@ class Numbers(msgspec.Struct, frozen=True):
         hypotheses = held.world or held.local if held is not None else ()
         world = held.world if held is not None else ()
         covariance = held.covariance if world and held is not None else None
-        ranges = [contact.range for contact in player.contacts if contact.range is not None]
+        ranges = [
+            contact.range
+            for contact in player.contacts
+            if contact.range is not None and player.peer in (None, contact.peer)
+        ]
         expected = None
         if world:
             expected = math.hypot(world[0].x - anchor.x, world[0].y - anchor.y)

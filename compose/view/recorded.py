@@ -60,7 +60,7 @@ def scenes(setup: RunSetup, known: RunData, first: int = 0, last: int | None = N
         now = known.ticks.get(tick)
         if now is not None:
             reported = {robot: path[tick] for robot, path in paths.items() if tick < len(path)}
-            shown.append(scene(setup, before, now, known.end, reported))
+            shown.append(scene(known.setup_at(setup, tick), before, now, known.end, reported))
         before = now
     return tuple(shown)
 

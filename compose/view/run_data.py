@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
 from compose.recording.kills_file import Killed
+from compose.recording.meetings import GroupTick, Meetings, has_log, meetings_after, senders
+from compose.recording.run_setup import RunSetup
 from compose.scenario.kills import WORLD
 from protocol.messages import (
     Command,
@@ -49,8 +52,8 @@ class TickData(msgspec.Struct, frozen=True):
     tick: int
     truth: dict[str, Pose] = msgspec.field(default_factory=dict)
     observations: dict[str, Observation] = msgspec.field(default_factory=dict)
-    reports: dict[str, SizedReport] = msgspec.field(default_factory=dict)
-    """Reports by sender."""
+    reports: dict[Link, SizedReport] = msgspec.field(default_factory=dict)
+    """Reports by sender and receiver."""
     commands: dict[str, Command] = msgspec.field(default_factory=dict)
     estimates: dict[str, Estimate] = msgspec.field(default_factory=dict)
     late: set[str] = msgspec.field(default_factory=set)
@@ -102,6 +105,12 @@ class RunData:
         """The complete ticks whose deadline each robot has missed, in ascending order."""
         self._absences: dict[str | None, Absence] = {}
         """The latest absence of each process that was killed and is not known to be back."""
+        self._meetings: dict[int, tuple[Meetings, Mapping[str, Command]]] = {}
+        """The meetings of a group, and the latest commands, by tick, in the order of the ticks."""
+        self._setup_at: tuple[RunSetup, Meetings, RunSetup] | None = None
+        """The latest arguments and result of `setup_at`: setup, meetings, and the setup with these."""
+        self._written: dict[str, tuple[int, int]] = {}
+        """The latest tick of the reports in the journal of each sender, and their number."""
         self.touched: int | None = None
         """The earliest tick that has changed since the user of this object last set this to None."""
 
@@ -117,6 +126,39 @@ class RunData:
 
     def _touch(self, tick: int) -> None:
         self.touched = tick if self.touched is None else min(tick, self.touched)
+        while self._meetings and next(reversed(self._meetings)) >= tick:
+            self._meetings.popitem()
+
+    def setup_at(self, setup: RunSetup, tick: int) -> RunSetup:
+        """Return `setup` with the peer that each robot of a group meets in `tick`; for pairs, `setup`."""
+        if not setup.visits or not self.ticks:
+            return setup
+        latest = next(reversed(self._meetings), next(iter(self.ticks)) - 1)
+        for later in range(latest + 1, min(tick, self.last) + 1):
+            met, earlier = self._meetings.get(later - 1, ({}, {}))
+            commands = self.ticks[later].commands if later in self.ticks else {}
+            known = commands if len(commands) == len(setup.robots) else {**earlier, **commands}
+            seen = self.ticks[later].observations if later in self.ticks else {}
+            heard = {robot: senders(observation) for robot, observation in seen.items()}
+            now = GroupTick(commands, self._logs(later), heard, partial(self._place, later))
+            self._meetings[later] = meetings_after(setup, met, earlier, now), known
+        present = self._meetings.get(tick, ({}, {}))[0]
+        if self._setup_at is None or self._setup_at[:2] != (setup, present):
+            self._setup_at = setup, present, setup.in_meetings(present)
+        return self._setup_at[2]
+
+    def _logs(self, tick: int) -> list[Link]:
+        """Return the links of the reports with a log in `tick`."""
+        reports = self.ticks[tick].reports if tick in self.ticks else {}
+        return [link for link, sized in reports.items() if has_log(sized.report)]
+
+    def _place(self, tick: int, robot: str) -> Pose | None:
+        """Return the true pose of a robot in `tick`, or where it believes to be."""
+        data = self.ticks.get(tick)
+        if data is None or robot in data.truth:
+            return data.truth[robot] if data is not None else None
+        estimate = data.estimates.get(robot)
+        return estimate.world[0] if estimate is not None and estimate.world else None
 
     def conclude(self, end: MissionEnd) -> None:
         """Set the end of the mission, which changes its last tick, unless it is known already."""
@@ -234,11 +276,13 @@ class RunData:
             now.down.add(robot)
             now.back.discard(robot)
 
-    def add(self, message: Message, size: int, journal_owner: str | None = None) -> None:
+    def add(
+        self, message: Message, size: int, journal_owner: str | None = None, receiver: str | None = None
+    ) -> None:
         """Add `message`, from a frame of `size` bytes. Data that is already known is not replaced.
 
         `journal_owner` is the robot whose journal holds the message; None for the world's journal and for
-        the network.
+        the network. `receiver` is that of a report from the network.
         """
         match message:
             case Observation(tick, robot):
@@ -248,7 +292,10 @@ class RunData:
             case Estimate(tick, robot):
                 self.at(tick).estimates.setdefault(robot, message)
             case Report(tick, robot) | PlannerReport(tick, robot):
-                self.at(tick).reports.setdefault(robot, SizedReport(message, size))
+                to = receiver or (
+                    self._receiver(robot, tick) if journal_owner in (None, robot) else journal_owner
+                )
+                self.at(tick).reports.setdefault((robot, to), SizedReport(message, size))
                 self._add_reported(message)
             case GroundTruth(tick, poses):
                 self.at(tick).truth.update(poses)
@@ -258,6 +305,18 @@ class RunData:
                 (data.late if journal_owner is None else data.without).add(journal_owner or robot)
             case _:
                 self._add_once(message)
+
+    def _receiver(self, sender: str, tick: int) -> str:
+        """Return the receiver of the next report in its sender's journal: one for each contact, in order."""
+        latest, count = self._written.get(sender, (-1, 0))
+        count = count if latest == tick else 0
+        self._written[sender] = tick, count + 1
+        observation = self.ticks[tick].observations.get(sender) if tick in self.ticks else None
+        contacts = observation.contacts if observation is not None else ()
+        if count < len(contacts):
+            return contacts[count].peer
+        config = self.configs.get(sender)
+        return config.peer if config is not None else ""
 
     def _add_reported(self, report: PeerReport) -> None:
         """Extend the reported log of an attacker; a report may change earlier ticks than its own."""

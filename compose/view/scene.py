@@ -13,9 +13,11 @@ from compose.view.events import Event, events
 from compose.view.run_data import TickData
 from compose.view.story.caption import Caption
 from compose.view.story.captions import captions
+from compose.view.story.group_captions import group_captions
 from compose.view.words import doing
 from protocol.messages import (
     Contact,
+    Localised,
     MissionEnd,
     PeerReport,
     Phase,
@@ -24,6 +26,7 @@ from protocol.messages import (
     Verdict,
     Word,
 )
+from protocol.mission import Role
 from protocol.motion import Controls, Covariance, Pose, travelled, wrap
 
 
@@ -98,6 +101,19 @@ class Player(msgspec.Struct, frozen=True, omit_defaults=True):
     held: HeldPoses | None = None
     reported: FalsePose | None = None
     """What the robot reports about itself, if the scenario has an attack of it and its true pose is known."""
+    peer: str | None = None
+    """The robot that it meets at present, or next, in a group; None for pairs."""
+
+    def hue(self, robot_setup: RobotSetup) -> Role:
+        """Return the role whose colour the robot has: in a group, a once it is localised, and b before."""
+        if self.peer is None:
+            return robot_setup.role
+        return "a" if self.is_localised else "b"
+
+    @property
+    def is_localised(self) -> bool:
+        """True if the robot claims to know its pose."""
+        return self.command is not None and isinstance(self.command.verdict, Localised)
 
 
 class Scene(msgspec.Struct, frozen=True):
@@ -133,17 +149,19 @@ def scene(
 ) -> Scene:
     """Return the scene of the tick of `now`; `before` is the previous tick, if it is known.
 
-    `reported` has the poses in <W> that attackers report of this tick.
+    `setup` has the peer of each robot in this tick (see `RunSetup.in_meetings`), and `reported` the poses in
+    <W> that attackers report of it.
     """
     false_poses = reported or {}
-    players = tuple([player_of(one, now, false_poses.get(one.id)) for one in setup.robots])
+    players = tuple([player_of(one, setup, now, false_poses.get(one.id)) for one in setup.robots])
     deliveries = tuple(passages(setup, before, now))
+    told = group_captions if setup.visits else captions
     return Scene(
         now.tick,
         players,
         deliveries,
         tuple(events(setup, before, now, deliveries, end)),
-        tuple(captions(setup, before, now, deliveries, end)),
+        tuple(told(setup, before, now, deliveries, end)),
         tuple(configurations(setup, before, now)),
     )
 
@@ -166,10 +184,16 @@ def held_poses(robot: str, now: TickData) -> HeldPoses | None:
     )
 
 
-def player_of(robot_setup: RobotSetup, now: TickData, reported: Pose | None = None) -> Player:
-    """Return the entry of one robot in the scene of the tick of `now`; `reported` as in `scene`."""
-    robot = robot_setup.id
-    pose, observation, sent = now.truth.get(robot), now.observations.get(robot), now.reports.get(robot)
+def player_of(
+    robot_setup: RobotSetup, setup: RunSetup, now: TickData, reported: Pose | None = None
+) -> Player:
+    """Return the entry of one robot in the scene of the tick of `now`; the arguments are as in `scene`."""
+    robot, peer = robot_setup.id, robot_setup.peer
+    pose, observation, sent = (
+        now.truth.get(robot),
+        now.observations.get(robot),
+        now.reports.get((robot, peer)),
+    )
     command = now.commands.get(robot)
     sentence = f"{robot} has not answered"
     down = robot in now.down - now.back
@@ -200,4 +224,5 @@ def player_of(robot_setup: RobotSetup, now: TickData, reported: Pose | None = No
             if reported is not None and pose is not None
             else None
         ),
+        peer=peer if setup.visits else None,
     )

@@ -9,7 +9,7 @@ from msgspec import UNSET
 
 from compose.recording.run_setup import RunSetup
 from compose.view.numbers import Numbers
-from compose.view.run_data import RunData
+from compose.view.run_data import RunData, TickData
 from compose.view.scene import held_poses, player_of
 
 MOST_BINS = 500
@@ -54,19 +54,19 @@ def series(
     last = max(min(last, known.last), first)
     step = -(-(last - first + 1) // MOST_BINS)
     found = []
-    for one in setup.robots:
+    ticks = [tick for tick in range(first, last + 1) if tick in known.ticks]
+    setups = {tick: known.setup_at(setup, tick) for tick in ticks}
+    for place, one in enumerate(setup.robots):
         if robots is not None and one.id not in robots:
             continue
-        bins: list[list[Numbers]] = []
-        for begin in range(first, last + 1, step):
-            data = [known.ticks.get(tick) for tick in range(begin, min(begin + step, last + 1))]
-            bins.append(
-                [
-                    Numbers.of(player_of(one, now), one.anchor, held_poses(one.peer, now))
-                    for now in data
-                    if now is not None
-                ]
-            )
+        bins = [
+            [
+                _numbers(setups[tick], place, known.ticks[tick])
+                for tick in range(begin, min(begin + step, last + 1))
+                if tick in setups
+            ]
+            for begin in range(first, last + 1, step)
+        ]
         curves = {name: _curve(name, bins) for name in Numbers.__struct_fields__}
         found.append(
             RobotSeries(
@@ -75,6 +75,11 @@ def series(
             )
         )
     return Series(first, last, step, setup.mission.noise.exact, tuple(found))
+
+
+def _numbers(setup: RunSetup, place: int, now: TickData) -> Numbers:
+    robot = setup.robots[place]
+    return Numbers.of(player_of(robot, setup, now), robot.anchor, held_poses(robot.peer, now))
 
 
 def _curve(name: str, bins: Iterable[Sequence[Numbers]]) -> Curve:

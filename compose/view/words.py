@@ -27,6 +27,7 @@ DOING = {
     "radial": "{robot} drives along the radius to its orbit",
     "tangent": "{robot} turns from the radius onto its orbit",
     "orbiting": "{robot} drives on its orbit until {peer} is in range",
+    "travelling": "{robot} drives to {peer} to localise it",
     "standing": "{robot} stands still and waits for {peer}'s second range",
     "waiting": "{robot} stands still and waits for {peer}'s last manoeuvre",
     "last-manoeuvre": "{robot} drives to where the remaining configurations predict different ranges",

@@ -1,8 +1,8 @@
 """`run.rrd`: the scenes of a run as a recording for Rerun, with the blueprint that arranges its views.
 
-Entities: `stage/anchor/ID`, `stage/range/ID` and `stage/orbit/ID`, which stand; `robots/ID/pose`, `path`,
-`hypotheses`, `ellipse` and `range`; `contact/A-B`; `plots/ID/NUMBER`; `log`. The timelines are `tick` and
-`time`, the simulated time.
+Entities: `stage/anchor/ID`, `stage/range/ID`, `stage/orbit/ID` and a group's `stage/meetings`, which stand;
+`robots/ID/pose`, `path`, `hypotheses`, `ellipse` and `range`; `contact/A-B`; `plots/ID/NUMBER`; `log`. The
+timelines are `tick` and `time`, the simulated time.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from compose.view import colours
 from compose.view.numbers import HYPOTHESES, PLOTS, PLOTTED, RANGES, Numbers
 from compose.view.outlines import box, circle, ellipse
 from compose.view.scene import Player, Scene
+from protocol.mission import Role
 from protocol.motion import Pose, compose
 
 TICK, TIME = "tick", "time"
@@ -139,7 +140,7 @@ class _Drawing:
     def stand(self) -> None:
         """Draw what does not change: anchors, sensing ranges and orbits, and the style of the plots."""
         for robot in self._setup.robots:
-            colour = _colour(robot)
+            colour = GREY if self._setup.visits else _colour(robot.role)
             at = (robot.anchor.x, robot.anchor.y)
             self._fixed(
                 f"stage/anchor/{robot.id}",
@@ -150,6 +151,9 @@ class _Drawing:
             reach, orbit = circle(at, self._setup.mission.sensing_range), circle(at, robot.orbit.radius)
             self._fixed(f"stage/range/{robot.id}", _lines([reach], colour, "thin"))
             self._fixed(f"stage/orbit/{robot.id}", _lines([orbit], GREY, "thin"))
+        ends = [((a.anchor.x, a.anchor.y), (b.anchor.x, b.anchor.y)) for a, b in self._setup.links()]
+        if self._setup.visits:
+            self._fixed("stage/meetings", _lines(ends, GREY, "thin"))
         for robot in self._setup.robots[:PLOTTED]:
             for numbers in PLOTS.values():
                 for place, number in enumerate(numbers):
@@ -158,7 +162,7 @@ class _Drawing:
     def _curve(self, robot: RobotSetup, number: str, place: int) -> rr.SeriesLines | rr.SeriesPoints:
         """Return the style of a number, which is the `place`-th of its plot. Ranges are single points."""
         name = [f"{robot.id}: {number.removesuffix('_m').replace('_', ' ')}"]
-        colour = [_colour(robot)] if len(self._setup.robots) == 2 else None
+        colour = [_colour(robot.role)] if len(self._setup.robots) == 2 else None
         if number.endswith("_range_m"):
             shape = (rr.components.MarkerShape.Circle, rr.components.MarkerShape.Diamond)[place]
             return rr.SeriesPoints(names=name, colors=colour, markers=[shape], marker_sizes=[4.0])
@@ -174,7 +178,8 @@ class _Drawing:
             self._draw_robot(robot, player)
             self._draw_hypotheses(robot, player)
         for robot in self._setup.robots[:PLOTTED]:
-            numbers = Numbers.of(scene.player(robot.id), robot.anchor, scene.held_by(robot.peer))
+            player = scene.player(robot.id)
+            numbers = Numbers.of(player, robot.anchor, scene.held_by(player.peer or robot.peer))
             for number in numbers.__struct_fields__:
                 value = getattr(numbers, number)
                 if any(number in plotted for plotted in PLOTS.values()):
@@ -189,7 +194,7 @@ class _Drawing:
         pose = player.pose
         if pose is None:
             return
-        colour = _colour(robot)
+        colour = _colour(player.hue(robot))
         body = rr.Arrows3D(
             origins=[(pose.x, pose.y, 0.0)],
             vectors=[self._ahead(pose)],
@@ -220,18 +225,18 @@ class _Drawing:
             origins=[(pose.x, pose.y, 0.0) for pose in poses],
             vectors=[self._ahead(pose) for pose in poses],
             radii=self._unit / 50,
-            colors=[_colour(robot)],
+            colors=[_colour(player.hue(robot))],
             labels=[f"{share:.2g}" for share in shares],
             show_labels=len(poses) > 1,
         )
         self._while(f"robots/{robot.id}/hypotheses", arrows if poses else None)
         outline = None
         if held.world and held.covariance is not None:
-            outline = _lines([ellipse(held.world[0], held.covariance)], _colour(robot), "thin")
+            outline = _lines([ellipse(held.world[0], held.covariance)], _colour(player.hue(robot)), "thin")
         self._while(f"robots/{robot.id}/ellipse", outline)
 
     def _draw_contacts(self, scene: Scene) -> None:
-        for one, other in self._setup.pairs():
+        for one, other in self._setup.links():
             a, b = scene.player(one.id), scene.player(other.id)
             contact = next((contact for contact in a.contacts if contact.peer == other.id), None)
             link = None
@@ -261,9 +266,9 @@ class _Drawing:
         self._stream.log(path, content, static=True)
 
 
-def _colour(robot: RobotSetup) -> tuple[int, int, int]:
-    """Return the colour of a robot as red, green and blue, each from 0 to 255."""
-    red, green, blue = bytes.fromhex(colours.COLOURS[robot.role][1:])
+def _colour(role: Role) -> tuple[int, int, int]:
+    """Return the colour of a role as red, green and blue, each from 0 to 255."""
+    red, green, blue = bytes.fromhex(colours.COLOURS[role][1:])
     return red, green, blue
 
 

@@ -117,6 +117,8 @@ class Views:
     def standing(self) -> Shown:
         """Return the static content: anchors, sensing ranges and orbits."""
         entities = [self._anchor(robot_setup) for robot_setup in self.setup.robots]
+        if self.setup.visits:
+            entities.append(self._tree())
         return Shown("/stage", fox.SceneUpdate(entities=entities))
 
     def of(self, scene: Scene) -> Iterator[Shown]:
@@ -148,7 +150,7 @@ class Views:
         yield Shown("/tf", fox.FrameTransforms(transforms=list(self._transforms(scene, at))))
         for player in scene.players:
             robot_setup = self.setup.robot_setup(player.robot)
-            numbers = Numbers.of(player, robot_setup.anchor, scene.held_by(robot_setup.peer))
+            numbers = Numbers.of(player, robot_setup.anchor, scene.held_by(player.peer or robot_setup.peer))
             yield Shown(f"/{player.robot}/numbers", numbers)
             yield from self._robot(player, at)
         yield Shown("/contact", fox.SceneUpdate(entities=list(self._contacts(scene, at))))
@@ -180,13 +182,14 @@ class Views:
             frame, hypotheses = _hypotheses(robot, player.held)
             poses = [shapes.pose(one) for one in hypotheses]
             yield Shown(f"/{robot}/hypotheses", fox.PosesInFrame(timestamp=at, frame_id=frame, poses=poses))
-            belief = self._belief(robot_setup, frame, hypotheses, player.held, at)
+            belief = self._belief(robot_setup, frame, hypotheses, player.held, at, player.hue(robot_setup))
             yield Shown(f"/{robot}/belief", fox.SceneUpdate(entities=[belief]))
 
     def _body(self, robot_setup: RobotSetup, player: Player, at: fox.Timestamp) -> fox.SceneEntity:
         """Return the drawing of a robot with its activity, its trail, and its anchor range if it has one."""
         assert player.pose is not None
-        colour = shapes.colour(COLOURS[robot_setup.role])
+        hue = COLOURS[player.hue(robot_setup)]
+        colour = shapes.colour(hue)
         lines = []
         texts = [shapes.words(f"{robot_setup.id}: {player.activity}", player.pose, self._unit, colour)]
         trail = self._trails[robot_setup.id].points
@@ -194,7 +197,7 @@ class Views:
             lines.append(shapes.line(trail, colour, 2.0))
         if player.anchor_range is not None:
             ends = [(player.pose.x, player.pose.y), (robot_setup.anchor.x, robot_setup.anchor.y)]
-            lines.append(shapes.strip(ends, shapes.colour(COLOURS[robot_setup.role], 0.5), 1.5))
+            lines.append(shapes.strip(ends, shapes.colour(hue, 0.5), 1.5))
             middle = Pose((ends[0][0] + ends[1][0]) / 2, (ends[0][1] + ends[1][1]) / 2, 0.0)
             texts.append(shapes.words(f"{player.anchor_range:.3f} m", middle, self._unit, colour))
         return fox.SceneEntity(
@@ -209,7 +212,7 @@ class Views:
     # --- anchors and contacts ---
 
     def _anchor(self, robot_setup: RobotSetup) -> fox.SceneEntity:
-        colour = COLOURS[robot_setup.role]
+        colour = GREY if self.setup.visits else COLOURS[robot_setup.role]
         centre = (robot_setup.anchor.x, robot_setup.anchor.y)
         here = Pose(*centre, 0.0)
         size = fox.Vector3(x=self._unit, y=self._unit, z=self._unit)
@@ -227,9 +230,20 @@ class Views:
             texts=[shapes.words(f"{robot_setup.id}'s anchor", here, self._unit, shapes.colour(colour))],
         )
 
+    def _tree(self) -> fox.SceneEntity:
+        """Return a line between the anchors of each planned meeting of a group."""
+        grey = shapes.colour(GREY, 0.6)
+        ends = [((a.anchor.x, a.anchor.y), (b.anchor.x, b.anchor.y)) for a, b in self.setup.links()]
+        return fox.SceneEntity(
+            timestamp=shapes.timestamp(0),
+            frame_id=WORLD,
+            id="meetings",
+            lines=[shapes.strip(two, grey, 1.0) for two in ends],
+        )
+
     def _contacts(self, scene: Scene, at: fox.Timestamp) -> Iterator[fox.SceneEntity]:
         """Yield one entity per pair. In contact it shows the link, the range and deliveries of reports."""
-        for one, other in self.setup.pairs():
+        for one, other in self.setup.links():
             a, b = scene.player(one.id), scene.player(other.id)
             contact = next((contact for contact in a.contacts if contact.peer == other.id), None)
             lines, texts = [], []
@@ -240,7 +254,7 @@ class Views:
                 words += [
                     f"{passage.sender}'s report of tick {passage.tick}: {DELIVERED[passage.what]}"
                     for passage in scene.passages
-                    if passage.sender in (one.id, other.id) and passage.what != "sent"
+                    if {passage.sender, passage.receiver} == {one.id, other.id} and passage.what != "sent"
                 ]
                 middle = Pose((a.pose.x + b.pose.x) / 2, (a.pose.y + b.pose.y) / 2, 0.0)
                 texts = [shapes.words("\n".join(words), middle, self._unit, shapes.colour(GREEN))]
@@ -251,10 +265,16 @@ class Views:
     # --- hypotheses ---
 
     def _belief(
-        self, robot_setup: RobotSetup, frame: str, poses: Sequence[Pose], held: HeldPoses, at: fox.Timestamp
+        self,
+        robot_setup: RobotSetup,
+        frame: str,
+        poses: Sequence[Pose],
+        held: HeldPoses,
+        at: fox.Timestamp,
+        hue: Role,
     ) -> fox.SceneEntity:
         """Return an arrow for each hypothesis, paler if less probable, and the error ellipse of the first."""
-        colour = COLOURS[robot_setup.role]
+        colour = COLOURS[hue]
         probability = held.probability or (1.0 / max(1, len(poses)),) * len(poses)
         lines = []
         if held.covariance is not None and held.world:

@@ -8,6 +8,8 @@ from compose.recording.run_setup import RunSetup
 from compose.view import colours
 from compose.view.outlines import box
 from compose.view.run_data import RunData
+from protocol.messages import Localised
+from protocol.mission import Role
 from protocol.motion import Pose
 
 WIDTH, HEIGHT = 160, 100
@@ -26,9 +28,10 @@ def thumbnail(setup: RunSetup, known: RunData) -> str:
     def at(x: float, y: float) -> tuple[float, float]:
         return WIDTH / 2 + (x - shown.x) * scale, HEIGHT / 2 - (y - shown.y) * scale
 
+    hues = _hues(setup, known)
     parts = []
     for robot in setup.robots[:MOST_ROBOTS]:
-        colour = colours.COLOURS[robot.role]
+        colour = colours.COLOURS[hues[robot.id]]
         x, y = at(robot.anchor.x, robot.anchor.y)
         radius = setup.mission.sensing_range * scale
         parts.append(
@@ -43,7 +46,7 @@ def thumbnail(setup: RunSetup, known: RunData) -> str:
         if points:
             path = " ".join([f"{x:.1f},{y:.1f}" for x, y in points])
             x, y = points[-1]
-            colour = colours.COLOURS[robot.role]
+            colour = colours.COLOURS[hues[robot.id]]
             parts.append(
                 f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="1.4" '
                 f'stroke-linejoin="round"/><circle cx="{x:.1f}" cy="{y:.1f}" r="2.4" fill="{colour}"/>'
@@ -52,6 +55,18 @@ def thumbnail(setup: RunSetup, known: RunData) -> str:
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}">'
         f'<rect width="{WIDTH}" height="{HEIGHT}" fill="#fdfcf9"/>{"".join(parts)}</svg>'
     )
+
+
+def _hues(setup: RunSetup, known: RunData) -> dict[str, Role]:
+    """Return the role whose colour each robot has: in a group, a if it is localised at last, and b if not."""
+    if not setup.visits:
+        return {robot.id: robot.role for robot in setup.robots}
+    hues: dict[str, Role] = dict.fromkeys(setup.ids, "b")
+    for data in known.ticks.values():
+        for robot, command in data.commands.items():
+            if isinstance(command.verdict, Localised):
+                hues[robot] = "a"
+    return hues
 
 
 def thinned(values: Sequence[Pose]) -> list[Pose]:

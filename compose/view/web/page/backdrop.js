@@ -2,6 +2,7 @@
 // tick. It is drawn once for many pictures.
 
 import { TAU } from "./geometry.js";
+import { draw_tree } from "./group.js";
 import { kinds_of } from "./trails.js";
 import { metres } from "./words.js";
 
@@ -27,6 +28,7 @@ export class Backdrop {
       this.pen.lineCap = this.pen.lineJoin = "round";
       this.pen.font = look.font;
       this.#grid(look);
+      if (store.grouped && truth) draw_tree(this.pen, plane, view);
       for (const robot of robots) this.#anchor(view, robot);
       if (truth) for (const robot of robots) for (const kind of kinds_of(robot)) this.trails.trail(this.pen, view, robot, kind);
       this.paths = [...plane.marks]; // the trails have named them
@@ -78,8 +80,9 @@ export class Backdrop {
     pen.arc(x, y, reach, 0, TAU);
     pen.fillStyle = look.disc;
     pen.fill();
-    pen.lineWidth = 1.2;
-    pen.strokeStyle = look.ring;
+    const localised = view.store.grouped && robot.role === "a";
+    pen.lineWidth = localised ? 2.2 : 1.2;
+    pen.strokeStyle = localised ? look.robot.a : look.ring;
     pen.stroke();
     pen.beginPath();
     pen.arc(x, y, robot.orbit[0] * plane.scale, 0, TAU);

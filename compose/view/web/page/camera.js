@@ -20,6 +20,7 @@ export function scenario_discs(robots, sensing_range) {
  */
 export function story_discs({ store, tick, focus, truth, eliminated }, pair) {
   const { robots, mission: { sensing_range } } = store.stage;
+  if (store.grouped && !focus) return scenario_discs(robots, sensing_range);
   const finished = pair.every((robot) => store.player(tick - 1, robot.id)?.command?.verdict);
   if (finished && truth && robots.length > pair.length) return scenario_discs(robots, sensing_range);
   const shown = truth || !focus ? pair : pair.filter((robot) => robot.id === focus);

@@ -1,6 +1,7 @@
 // The cards beside the plane: each robot's activity, measurements, reports, command, belief and totals.
 
 import { distance, wrap } from "./geometry.js";
+import { counted, task } from "./group.js";
 import { leads } from "./held.js";
 import { LEAST_GAP_M } from "./plane.js";
 import { metres, probability, PHASES, place, plural, rad, speed, turning } from "./words.js";
@@ -23,6 +24,7 @@ export class Cards {
     this.many = store.stage.robots.length > MANY;
     this.roster.hidden = !this.many;
     this.roster.replaceChildren();
+    this.roster.classList.toggle("group", store.grouped);
     this.entries = new Map();
     this.order = this.ranked = "";
     if (!this.many) return;
@@ -40,7 +42,7 @@ export class Cards {
     const { store } = this, robots = store.stage.robots;
     let shown = robots;
     if (this.many) {
-      const chosen = robots.find((robot) => robot.id === focus) ?? robots[0];
+      const chosen = store.chosen(focus);
       shown = robots.filter((robot) => robot === chosen || robot.id === chosen.peer);
     }
     if (!truth && focus) shown = shown.filter((robot) => robot.id === focus);
@@ -57,7 +59,9 @@ export class Cards {
     this.#rank(tick);
     for (const [id, entry] of this.entries) {
       const player = store.player(tick, id), phase = player ? store.phase(tick, id) : 0;
-      const text = `${id} ${player?.down ? "is down" : player?.command?.state ?? "–"}`;
+      const robot = robots[store.places.get(id)], state = store.grouped ? task(player, robot) : player?.command?.state ?? "–";
+      const text = `${id} ${player?.down ? "is down" : state}`;
+      if (entry.dataset.role !== robot.role) entry.dataset.role = robot.role;
       if (entry.textContent !== text) entry.textContent = text;
       entry.dataset.phase = phase;
       entry.setAttribute("aria-pressed", String(id === focus));
@@ -69,7 +73,8 @@ export class Cards {
   #rank(tick) {
     const groups = new Map(OUTCOMES.map((outcome) => [outcome, []]));
     for (const id of this.entries.keys()) groups.get(this.store.player(tick, id)?.command?.verdict?.[0] ?? "running").push(id);
-    const counts = OUTCOMES.filter((outcome) => groups.get(outcome).length).map((outcome) => `${groups.get(outcome).length} ${outcome}`);
+    const players = [...this.entries.keys()].map((id) => this.store.player(tick, id));
+    const counts = this.store.grouped ? [counted(players)] : OUTCOMES.filter((outcome) => groups.get(outcome).length).map((outcome) => `${groups.get(outcome).length} ${outcome}`);
     if (this.counts.textContent !== counts.join(", ")) this.counts.textContent = counts.join(", ");
     const sorted = [...groups.values()].flat(), order = sorted.join();
     if (order === this.order) return;
@@ -113,6 +118,7 @@ class Card {
   draw(store, tick, truth, chosen) {
     const player = store.player(tick, this.robot.id);
     this.root.classList.toggle("chosen", chosen);
+    this.root.dataset.role = this.robot.role;
     this.name.setAttribute("aria-pressed", String(chosen));
     this.name.title = chosen ? "Show all robots (A)" : `Show the belief of ${this.robot.id}`;
     if (!player) return void (this.doing.textContent = "…");
@@ -129,7 +135,7 @@ class Card {
     this.error.textContent = off;
     this.error.title = range;
     this.#row("measured", measured(player, this.robot));
-    this.#row("received", received(player, this.robot));
+    this.#row("received", received(player));
     this.#row("command", command ? commanded(command) : "–");
     this.#row("sent", player.sent ? `report of ${player.sent.bytes} bytes, log through tick ${player.sent.through}` : "nothing");
     this.#row("belief", held ? believed(held) : "–");
@@ -179,18 +185,20 @@ function measured(player, robot) {
   if (!player.sensed) return "unknown";
   const odometry = player.executed ? `odometry ${speed(player.executed[0])}, ${turning(player.executed[1])}; ` : "";
   const anchor = player.anchor_range === undefined ? "no range to its anchor" : `anchor ${metres(player.anchor_range)}`;
-  const contact = player.contacts?.[0];
-  if (!contact) return `${odometry}${anchor}; ${robot.peer} is not in range`;
-  return `${odometry}${anchor}; ${contact[0]} ${contact[1] === null ? "in range, not measured" : metres(contact[1])}`;
+  if (!player.contacts?.length) return `${odometry}${anchor}; ${robot.peer} is not in range`;
+  const contacts = player.contacts.map(([peer, range]) => `${peer} ${range === null ? "in range, not measured" : metres(range)}`);
+  return `${odometry}${anchor}; ${contacts.join(", ")}`;
 }
 
-function received(player, robot) {
-  const contact = player.contacts?.[0];
-  if (!contact) return "nothing";
-  if (contact[2] === null) return `reports of ${robot.peer} that arrive within the tick`;  // hardware mode
+function received(player) {
+  return player.contacts?.map(received_from).join("; ") || "nothing";
+}
+
+function received_from([peer, , heard, damaged]) {
+  if (heard === null) return `reports of ${peer} that arrive within the tick`;  // hardware mode
   const ticks = (list) => `${list.length > 1 ? "ticks" : "tick"} ${list.join(", ")}`;
-  const intact = contact[2].length ? `${robot.peer}'s report of ${ticks(contact[2])}` : `nothing from ${robot.peer}`;
-  return contact[3].length ? `${intact}; damaged: report of ${ticks(contact[3])}` : intact;
+  const intact = heard.length ? `${peer}'s report of ${ticks(heard)}` : `nothing from ${peer}`;
+  return damaged.length ? `${intact}; damaged: report of ${ticks(damaged)}` : intact;
 }
 
 const commanded = ({ v, omega, state }) => `${state}: ${v === 0 && omega === 0 ? "stop" : `${speed(v)}, ${turning(omega)}`}`;

@@ -169,7 +169,7 @@ export class Charts {
     this.#columns = this.wide >= TWO_COLUMNS ? 2 : 1;
     const rows = STRIPS.length / this.#columns, tall = rows * (TOP + this.tall) + (rows - 1) * (GAP - TOP) + AXIS;
     const style = getComputedStyle(document.documentElement), of = (name) => style.getPropertyValue(`--${name}`).trim();
-    const look = [this.wide, this.tall, ratio, of("paper"), this.#span, view.truth, robots.map((robot) => robot.id), this.#key, this.#failed].join();
+    const look = [this.wide, this.tall, ratio, of("paper"), this.#span, view.truth, robots.map(({ id, role }) => id + role), this.#key, this.#failed].join();
     if (look !== this.#drawn) {
       this.#drawn = look;
       for (const canvas of [this.canvas, this.cursor]) {

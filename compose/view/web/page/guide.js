@@ -3,6 +3,7 @@
 
 const SEARCH_S = 6; // phases 1 and 2 together, and again the time after the pair has finished
 const ENCOUNTER_S = 24; // the ticks of phase 3 together
+const GROUP_S = 24; // the ticks of a group's mission together
 const LONGEST_TICK_S = { search: 0.25, encounter: 1.5 };
 const MANOEUVRE_S = 2.5;
 const ELIMINATION_S = 3.5;
@@ -28,9 +29,10 @@ export class Guide {
     this.#span = null;
   }
 
-  /** Returns the robots that the story follows: the pair of the selected robot, or the first one. */
+  /** Returns the robots that the story follows: the pair of the selected robot, or the first one; else a whole group. */
   pair(focus) {
     const { robots } = this.store.stage;
+    if (this.store.grouped && !focus) return robots;
     const chosen = robots.find((robot) => robot.id === focus) ?? robots[0];
     return robots.filter((robot) => robot === chosen || robot.id === chosen.peer);
   }
@@ -41,8 +43,9 @@ export class Guide {
   }
 
   #about(captions, focus) {
-    const [one] = this.pair(focus);
-    return captions.filter(({ robots }) => !robots?.length || robots.includes(one.id));
+    if (this.store.grouped && !focus) return captions;
+    const one = this.store.grouped ? focus : this.pair(focus)[0].id;
+    return captions.filter(({ robots }) => !robots?.length || robots.includes(one));
   }
 
   #read() {
@@ -126,7 +129,9 @@ export class Guide {
 
   /** Returns the seconds that the robots drive from this tick to the next. */
   #lasts({ tick, focus }, captions) {
-    const { store } = this, { from, to } = this.#encounter(focus);
+    const { store } = this;
+    if (store.grouped) return Math.min(GROUP_S / Math.max(store.last - store.first, 1), LONGEST_TICK_S.search);
+    const { from, to } = this.#encounter(focus);
     if (tick < from || tick >= to) {
       const ticks = tick < from ? from - store.first : store.last - to;
       return Math.min(SEARCH_S / Math.max(ticks, 1), LONGEST_TICK_S.search);

@@ -18,6 +18,9 @@ const cross = 'M11 4l8 8M19 4l-8 8';
 const MARKS = {
   "robot-a": [drawn(`<path ${POINTED} fill="var(--robot-a)"/>`), ([a]) => `robot ${a}`],
   "robot-b": [drawn(`<path ${ROUND} fill="var(--robot-b)"/>`), ([, b]) => `robot ${b}`],
+  localised: [drawn(`<path ${POINTED} fill="var(--robot-a)"/>`), "localised robot, its path and its anchor"],
+  unlocalised: [drawn(`<path ${ROUND} fill="var(--robot-b)"/>`), "robot that is not yet localised, its path"],
+  meeting: [drawn('<path d="M1 8h20" stroke="var(--robot-a)" stroke-width="1.3"/><path d="M28 8l-7 3v-6z" fill="var(--robot-a)"/>'), "who localises whom; dotted: planned"],
   down: [drawn(`<path ${POINTED} fill="none" stroke="var(--faint)" stroke-width="2"/><path d="${cross}" stroke="var(--fault)" stroke-width="2"/>`), "its process is gone"],
   anchor: [drawn('<circle cx="15" cy="8" r="7.5" fill="var(--disc)" stroke="var(--ring)"/><path d="M15 4.5l3.5 6h-7z" fill="var(--ink)"/>'), "anchor (beacon), its range"],
   orbit: [ring("orbit", 'stroke-dasharray="5 2.5 1 2.5"'), "circle on which it searches"],

@@ -9,6 +9,7 @@ import { Charts } from "./charts.js";
 import * as data from "./data.js";
 import { embedded, on_clock, pass_on, tell, tell_state } from "./embedding.js";
 import { needed, release_focus } from "./focus.js";
+import { group_marks } from "./group.js";
 import { Guide } from "./guide.js";
 import { fill_help } from "./help.js";
 import { Legend } from "./legend.js";
@@ -289,6 +290,7 @@ function draw() {
     if (!store) return;
     advance(now);
     store.want(view.tick);
+    store.show(view.tick);
     view.moving = (view.playing || view.driven) && !still.matches && (view.guided || view.speed <= 60);
     view.eliminated = guide.eliminated(view);
     view.planned = guide.planned(view);
@@ -308,9 +310,9 @@ function draw() {
     log.draw(view);
     timeline.draw(view, activities(store, view));
     const story = guide.pair(view.focus), mover = joined(store.scene(view.tick), story[0].id)?.manoeuvre?.robot ?? "it";
-    legend.draw(plane.marks, timeline.kinds, store.stage.robots.length > story.length ? [] : story, mover);
+    legend.draw(store.grouped ? group_marks(plane.marks) : plane.marks, timeline.kinds, store.stage.robots.length > story.length ? [] : story, mover);
     sequence.draw(store, view);
-    charts.draw(store, view, guide.pair(view.focus));
+    charts.draw(store, view, store.grouped ? [store.chosen(view.focus)] : guide.pair(view.focus));
     const news = view.playing && view.guided ? null : announcer.text(store, view, now);
     if (news !== null) text($("live"), news);
     if (view.playing || plane.easing) draw();

@@ -5,6 +5,7 @@ import { Beliefs } from "./beliefs.js";
 import { Configurations } from "./configurations.js";
 import { scenario_discs, story_discs, true_and_reported } from "./camera.js";
 import { distance, TAU } from "./geometry.js";
+import { heads, links } from "./group.js";
 import { Labels, NAME } from "./labels.js";
 import { cross, Look, shape, unit } from "./pen.js";
 import { same, under } from "./selection.js";
@@ -26,6 +27,8 @@ const DRAG_PX = 4;
 export const LEAST_GAP_M = 1e-6;
 /** The least width and height in pixels of a picture: a lower window shows a part of it. */
 const LEAST_PX = 40;
+/** The largest group whose robots always have their names. */
+const NAMED = 20;
 
 /** The map from the world to the canvas, with pan and zoom, and the order in which things are drawn. */
 export class Plane {
@@ -273,10 +276,11 @@ export class Plane {
     const { store, truth, focus } = view;
     view.size = this.robot_size(store);
     view.places = new Map(store.stage.robots.map((robot) => [robot.id, pose_now(view, robot, TRUE)]));
-    for (const robot of robots) if (robot.role === "a") this.#configurations.draw(view, robot);
+    for (const robot of robots) if (store.grouped ? heads(view, robot) : robot.role === "a") this.#configurations.draw(view, robot);
     for (const robot of robots) if (!focus || robot.id === focus) this.#beliefs.belief(view, robot);
     for (const robot of robots) this.#signals.anchor_range(view, robot);
-    if (truth) for (const robot of robots) if (robot.role === "a") this.#signals.contact(view, robot);
+    const pairs = store.grouped ? links(view) : robots.filter(({ role }) => role === "a").map((robot) => [robot, robot.peer]);
+    if (truth) for (const [robot, peer] of pairs) this.#signals.contact(view, robot, peer);
     if (!truth) for (const robot of robots) this.#signals.mutual_ring(view, robot);
     if (truth) for (const robot of robots) this.#reported(view, robot);
     if (truth) for (const robot of robots) this.#robot(view, robot, view.places.get(robot.id));
@@ -340,7 +344,7 @@ export class Plane {
     this.marks.add(down ? "down" : `robot-${robot.role}`);
     this.targets.push({ kind: "robot", robot: robot.id, at: [x, y], radius: size });
     if (size > 6) this.labels.placed.push([x - size, y - size, x + size, y + size]);
-    if (size > 6 || down || robot.id === focus) {
+    if (size > 6 || down || robot.id === focus || (store.grouped && store.places.size <= NAMED)) {
       const name = down ? `${robot.id} is down` : robot.id;
       this.labels.put(name, x + size + 4, y - size - 2, look.ink, "left", { font: look.bold, rank: NAME, around: size + 4 });
     }

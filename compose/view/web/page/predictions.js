@@ -17,7 +17,7 @@ export class Predictions {
 
   /** Shows those of `pair`, a robot of role a and its peer. */
   draw(view, store, pair) {
-    const found = pair.length > 1 ? this.#found({ ...view, truth: view.truth, store }, pair.find(({ role }) => role === "a")) : null;
+    const found = pair.length === 2 ? this.#found({ ...view, truth: view.truth, store }, pair.find(({ role }) => role === "a") ?? pair[0]) : null;
     const key = JSON.stringify(found);
     if (key === this.key) return;
     this.key = key;

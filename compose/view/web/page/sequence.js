@@ -59,7 +59,7 @@ export class Sequence {
   /** Draws the visible ticks, around the current one if they are not all. */
   draw(store, { tick, focus }) {
     if (!this.box.open) return;
-    const { canvas } = this, robots = shown(store.stage.robots, focus);
+    const { canvas } = this, robots = shown(store, focus);
     const style = getComputedStyle(document.documentElement), of = (name) => style.getPropertyValue(`--${name}`).trim();
     const scale = unit(), ratio = (window.devicePixelRatio || 1) * scale;
     const wide = canvas.clientWidth / scale, tall = TOP + LANE * (robots.length + 1);
@@ -200,9 +200,10 @@ function told(store, tick, rows) {
 }
 
 /** Returns the robots with a lane: all if they are few, else the chosen one and its peer. */
-function shown(robots, focus) {
+function shown(store, focus) {
+  const { robots } = store.stage;
   if (robots.length <= MOST_LANES) return robots;
-  const chosen = robots.find((robot) => robot.id === focus) ?? robots[0];
+  const chosen = store.chosen(focus);
   return robots.filter((robot) => robot === chosen || robot.id === chosen.peer);
 }
 

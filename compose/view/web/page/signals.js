@@ -52,7 +52,8 @@ export class Signals {
   /** Draws a mutual range as a circle around the believed pose, for views that hide the ground truth. */
   mutual_ring(view, robot) {
     const { scene, store, look, share, moving } = view;
-    const contact = scene.players[store.places.get(robot.id)]?.contacts?.[0];
+    const contacts = scene.players[store.places.get(robot.id)]?.contacts ?? [];
+    const contact = contacts.find((one) => one[0] === robot.peer) ?? contacts[0];
     const poses = this.#origins(view, robot);
     if (!contact || contact[1] === null || !poses.length) return;
     this.plane.marks.add("measured");
@@ -72,16 +73,17 @@ export class Signals {
     pen.globalAlpha = 1;
   }
 
-  contact(view, robot) {
+  /** Draws the contact of `robot` with `peer`, and the reports between them. */
+  contact(view, robot, peer) {
     const { scene, store, look, places, size, focus } = view;
     const player = scene.players[store.places.get(robot.id)];
-    const contact = player?.contacts?.find((one) => one[0] === robot.peer);
-    const from = places.get(robot.id), to = places.get(robot.peer);
+    const contact = player?.contacts?.find((one) => one[0] === peer);
+    const from = places.get(robot.id), to = places.get(peer);
     if (!contact || !from || !to) return;
     const pen = this.plane.context, one = this.plane.at(from), other = this.plane.at(to), length = distance(one, other);
     if (length < 1) return;
     const across = [-(other[1] - one[1]) / length, (other[0] - one[0]) / length];
-    pen.globalAlpha = focus && robot.id !== focus && robot.peer !== focus ? 0.4 : 1;
+    pen.globalAlpha = focus && robot.id !== focus && peer !== focus ? 0.4 : 1;
     for (const side of [-3.5, 3.5]) {
       pen.beginPath();
       pen.moveTo(one[0] + side * across[0], one[1] + side * across[1]);
@@ -97,8 +99,8 @@ export class Signals {
       this.plane.labels.put(metres(contact[1]), x, y, look.link, across[0] < 0 ? "right" : "left", { around: 16 * Math.abs(across[0]) });
     }
     if (length > 3 * size && size > 6) {
-      this.#reports(view, robot.id, robot.peer, one, other, across, 3.5);
-      this.#reports(view, robot.peer, robot.id, other, one, across, -3.5);
+      this.#reports(view, robot.id, peer, one, other, across, 3.5);
+      this.#reports(view, peer, robot.id, other, one, across, -3.5);
     }
     pen.globalAlpha = 1;
   }

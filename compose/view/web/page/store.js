@@ -43,6 +43,9 @@ export class Store {
     this.#wake?.();
   }
 
+  /** True if the robots form a group, which meets in turn. */
+  get grouped() { return this.stage.visits?.length > 0; }
+
   scene(tick) { return this.scenes[tick]; }
 
   player(tick, robot) { return this.scenes[tick]?.players[this.places.get(robot)]; }
@@ -54,6 +57,31 @@ export class Store {
       if (command) return command.phase;
     }
     return 1;
+  }
+
+  /** Returns the role of a robot, and in a group "a" once it is localised and "b" before: the hue of what is drawn. */
+  role(tick, robot) {
+    if (!this.grouped) return this.stage.robots[this.places.get(robot)].role;
+    for (let k = tick; k >= this.first; k--) {
+      const command = this.player(k, robot)?.command;
+      if (command) return command.verdict?.[0] === "localised" ? "a" : "b";
+    }
+    return "b";
+  }
+
+  /** Gives the robots of a group the role and the peer that they have in `tick`. */
+  show(tick) {
+    if (!this.grouped || !this.scenes[tick]) return;
+    for (const robot of this.stage.robots) {
+      robot.role = this.role(tick, robot.id);
+      robot.peer = this.player(tick, robot.id)?.peer ?? robot.peer;
+    }
+  }
+
+  /** Returns the robot with the name `focus`; else the first one, in a group of those that meet first. */
+  chosen(focus) {
+    const { robots, visits } = this.stage, named = (id) => robots.find((robot) => robot.id === id);
+    return named(focus) ?? named(visits?.[0]?.visitor) ?? robots[0];
   }
 
   /** Gives `tick` priority in the background fetches. */

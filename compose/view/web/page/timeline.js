@@ -5,6 +5,7 @@ import { SIGNS } from "./words.js";
 
 const MARKED = Object.fromEntries(["contact", "claim", "inconsistent", "undecided", "down", "back"].map((kind) => [kind, SIGNS[kind]]));
 const MOST_BANDS = 6;
+const MOST_GROUP_BANDS = 16;
 /** The height of the signs and of the hand below them, and the width of a sign, in pixels. */
 const MARKS = 18;
 const SIGN = 11;
@@ -58,7 +59,7 @@ export class Timeline {
         const spans = this.spans.get(player.robot);
         if (!spans) continue; // a robot that has just joined: `stage` is called again when the mission has been read again
         const phase = player.command?.phase ?? Math.abs(spans.at(-1)?.value ?? 1);
-        lengthen(spans, this.read, player.down ? -phase : phase);
+        lengthen(spans, this.read, player.down ? -phase : phase, store.grouped ? store.role(this.read, player.robot) : null);
         if (player.contacts?.length) lengthen(this.contacts.get(player.robot), this.read, 1);
       }
       for (const event of scene.events) {
@@ -84,8 +85,8 @@ export class Timeline {
     this.last = Math.max(store.last, 0);
     const robots = store.stage.robots;
     let shown = robots;
-    if (robots.length > MOST_BANDS) {
-      const chosen = robots.find((robot) => robot.id === focus) ?? robots[0];
+    if (robots.length > (store.grouped ? MOST_GROUP_BANDS : MOST_BANDS)) {
+      const chosen = store.chosen(focus);
       shown = robots.filter((robot) => robot === chosen || robot.id === chosen.peer);
     }
     const style = getComputedStyle(document.documentElement), of = (name) => style.getPropertyValue(`--${name}`).trim();
@@ -111,10 +112,10 @@ export class Timeline {
       pen.fillText(robot.id, 4, y + band - (band > 10 ? 3 : 1));
       pen.fillStyle = of("grid");
       pen.fillRect(x(0), y, x(this.last) - x(0), band);
-      for (const { from, to, value } of this.spans.get(robot.id)) {
+      for (const { from, to, value, role } of this.spans.get(robot.id)) {
         const left = x(from), width = Math.max(x(Math.min(to + 1, this.last)) - left, 1.5);
         const phase = Math.abs(value), inner = { 1: 0.4, 2: 0.62, 3: 1 }[phase] * band;
-        pen.fillStyle = pen.strokeStyle = of(`robot-${robot.role}`);
+        pen.fillStyle = pen.strokeStyle = of(`robot-${role ?? robot.role}`);
         if (value < 0) {
           pen.lineWidth = 1;
           pen.strokeRect(left + 0.5, y + (band - inner) / 2 + 0.5, Math.max(width - 1, 0.5), inner - 1);
@@ -180,8 +181,8 @@ export class Timeline {
   }
 }
 
-function lengthen(spans, tick, value) {
+function lengthen(spans, tick, value, role = null) {
   const latest = spans.at(-1);
-  if (latest && latest.value === value && latest.to === tick - 1) latest.to = tick;
-  else spans.push({ from: tick, to: tick, value });
+  if (latest && latest.value === value && latest.role === role && latest.to === tick - 1) latest.to = tick;
+  else spans.push({ from: tick, to: tick, value, role });
 }

@@ -45,7 +45,7 @@ export class Trails {
     this.#stroked(pen, view, robot, kind, (stroke) => {
       for (let from = store.first; from < last; from += CHUNK) {
         const to = Math.min(from + CHUNK, last);
-        for (const [phase, path] of this.#pieces(store, robot, kind, from, to, to === from + CHUNK)) stroke(path, phase);
+        for (const [phase, path, role] of this.#pieces(store, robot, kind, from, to, to === from + CHUNK)) stroke(path, phase, role);
       }
     });
   }
@@ -88,7 +88,7 @@ export class Trails {
       const pose = between(start, end, driven, (share * k) / bends, period);
       path.lineTo(pose[0], pose[1]);
     }
-    this.#stroked(pen, view, robot, kind, (stroke) => stroke(path, store.phase(tick, robot.id)));
+    this.#stroked(pen, view, robot, kind, (stroke) => stroke(path, store.phase(tick, robot.id), robot.role));
   }
 
   /** Calls `draw` with a function that strokes a path in m, in the style of a phase. */
@@ -98,8 +98,8 @@ export class Trails {
     pen.save();
     pen.globalAlpha = faint ? 0.4 : 0.95;
     pen.setTransform(ratio * s, 0, 0, -ratio * s, ratio * (wide / 2 - centre[0] * s), ratio * (height / 2 + centre[1] * s));
-    pen.strokeStyle = look.robot[robot.role];
-    draw((path, phase) => {
+    draw((path, phase, role) => {
+      pen.strokeStyle = look.robot[role];
       const { dash, width } = kind === REPORTED ? REPORTED_STYLE : TRAIL[phase] ?? TRAIL[2];
       this.plane.marks.add(kind === REPORTED ? "reported" : `path-${phase}`);
       pen.lineWidth = (faint ? 0.7 * width : width) / s;
@@ -109,12 +109,12 @@ export class Trails {
     pen.restore();
   }
 
-  /** Returns the trail from tick `from` to `to`, one path per phase; cached once it is complete. */
+  /** Returns the trail from tick `from` to `to`, one path per phase and hue; cached once it is complete. */
   #pieces(store, robot, kind, from, to, whole) {
     const key = `${kind.name}/${robot.id}/${from}`, cached = this.#chunks.get(key);
     if (cached && whole) return cached;
     const pieces = [], period = store.stage.mission.period;
-    let path = null, phase = null, complete = true;
+    let path = null, phase = null, role = null, complete = true;
     for (let k = from; k < to; k++) {
       const here = store.player(k, robot.id), next = store.player(k + 1, robot.id);
       const start = kind.pose(here), end = kind.pose(next);
@@ -124,11 +124,13 @@ export class Trails {
         continue;
       }
       const now = here.command?.phase ?? phase ?? store.phase(k, robot.id);
-      if (now !== phase || !path) {
+      const hue = store.grouped ? store.role(k, robot.id) : robot.role;
+      if (now !== phase || hue !== role || !path) {
         path = new Path2D();
         path.moveTo(start[0], start[1]);
-        pieces.push([now, path]);
+        pieces.push([now, path, hue]);
         phase = now;
+        role = hue;
       }
       const driven = kind.driven(here, next, period), bends = bends_of(driven, period);
       for (let bend = 1; bend < bends; bend++) {

@@ -1,0 +1,154 @@
+"""Captions of a group: who meets first, who drives to whom, and how many robots claim to know their poses.
+
+They are fewer than those of a pair, whose meeting has captions of its own (see `compose.view.story`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from compose.recording.meetings import TRAVELLING
+from compose.recording.run_setup import RobotSetup, RunSetup
+from compose.view.deliveries import Passage, contact_of
+from compose.view.events import metres
+from compose.view.run_data import TickData
+from compose.view.story.caption import Caption, count_word, stopped
+from compose.view.words import end_reason
+from protocol.messages import Inconsistent, Localised, MissionEnd, Undecided
+from protocol.motion import travelled
+
+MOST_LISTED = 4
+"""The largest number of robots or meetings that a sentence names."""
+
+
+def group_captions(
+    setup: RunSetup,
+    before: TickData | None,
+    now: TickData,
+    passages: Sequence[Passage],
+    end: MissionEnd | None,
+) -> Iterator[Caption]:
+    """Yield the captions of the tick of `now`; `setup` has the peer of each robot in this tick."""
+    ended = end if end is not None and end.tick == now.tick else None
+    if before is None and now.tick == 0:
+        yield _beginning(setup)
+    if before is not None:
+        yield from _meeting(setup, before, now)
+        yield from _concluding(setup, before, now, ended)
+        yield from _departing(setup, before, now)
+        yield from _losing(setup, before, now, passages)
+    if ended is not None:
+        yield _end(setup, now, ended)
+
+
+def _beginning(setup: RunSetup) -> Caption:
+    visited = {visit.visited for visit in setup.visits}
+    first = [f"{one.id} meets {one.peer}" for one in setup.robots if one.id not in visited]
+    meet = f"First, {_listed(first, 'pairs meet')}"
+    meet += "; then those that are localised drive to the others." if len(first) < len(setup.visits) else "."
+    number = count_word(len(setup.robots)).capitalize()
+    text = f"{number} robots measure no more than the distance to their own anchor."
+    attackers = [robot.id for robot in setup.robots if robot.attack is not None]
+    truth = f"{_listed(attackers, 'robots')} will report false data." if attackers else None
+    return Caption("ranging", f"{text} {meet}", truth=truth)
+
+
+def _meeting(setup: RunSetup, before: TickData, now: TickData) -> Iterator[Caption]:
+    """Yield the first contact of each meeting, and those after contact was lost."""
+    for a, b in setup.pairs():
+        contact = contact_of(now, a.id, b.id) or contact_of(now, b.id, a.id)
+        if contact is None or contact_of(before, a.id, b.id) or contact_of(before, b.id, a.id):
+            continue
+        far = f" Their distance is {metres(contact.range)}." if contact.range is not None else ""
+        command = before.commands.get(a.id)
+        if command is not None and command.phase == 3:
+            text = f"{a.id} and {b.id} are in range of each other again."
+        else:
+            text = f"{a.id} reaches {b.id}." if _visits(setup, a) else f"{a.id} and {b.id} meet."
+        yield Caption("contact", text + far, (a.id, b.id))
+
+
+def _visits(setup: RunSetup, robot: RobotSetup) -> bool:
+    """Return whether the robot, of role a, is in a meeting after its first one."""
+    return robot.peer != setup.partners[robot.id][0]
+
+
+def _concluding(
+    setup: RunSetup, before: TickData, now: TickData, ended: MissionEnd | None
+) -> Iterator[Caption]:
+    """Yield the new verdicts. Claims with which the mission ends `localised` are left to its last caption."""
+    claiming = []
+    for robot in setup.robots:
+        command, earlier = now.commands.get(robot.id), before.commands.get(robot.id)
+        if command is None or command.verdict is None or (earlier is not None and earlier.verdict):
+            continue
+        pair = robot.id, robot.peer
+        match command.verdict:
+            case Localised():
+                claiming.append(robot.id)
+            case Undecided(reason):
+                yield Caption("undecided", f"{robot.id} stops without a claim: {stopped(reason)}", pair)
+            case Inconsistent(claim):
+                text = f"{robot.id} finds that the reports of {robot.peer} contradict what it measured: "
+                yield Caption("inconsistent", text + stopped(claim), pair)
+    if not claiming or (ended is not None and ended.outcome == "localised"):
+        return
+    known = sum([isinstance(one.verdict, Localised) for one in now.commands.values()])
+    many = len(claiming) > 1
+    claim = "claim to know their poses" if many else "claims to know its pose"
+    text = f"{_listed(claiming, 'robots')} {claim}"
+    yield Caption("claim", f"{text}: {known} of {len(setup.robots)} robots now do.", tuple(claiming))
+
+
+def _departing(setup: RunSetup, before: TickData, now: TickData) -> Iterator[Caption]:
+    """Yield the beginnings of the ways to other robots, in one caption."""
+    found = []
+    for one in setup.robots:
+        command, earlier = now.commands.get(one.id), before.commands.get(one.id)
+        leaves = command is not None and command.state == TRAVELLING
+        if leaves and earlier is not None and earlier.state != TRAVELLING:
+            found.append((one.id, one.peer))
+    if not found:
+        return
+    robots = tuple(robot for pair in found for robot in pair)
+    if len(found) == 1:
+        ((robot, peer),) = found
+        yield Caption("search", f"{robot} drives to {peer}, which waits beside its anchor.", robots)
+    else:
+        ways = [f"{robot} drives to {peer}" for robot, peer in found]
+        text = _listed(ways, "robots drive to others")
+        yield Caption("search", f"{text}, which wait beside their anchors.", robots)
+
+
+def _losing(
+    setup: RunSetup, before: TickData, now: TickData, passages: Sequence[Passage]
+) -> Iterator[Caption]:
+    lost = sorted({one.sender for one in passages if one.what == "lost"})
+    if lost:
+        yield Caption("report-lost", f"Reports of {_listed(lost, 'robots')} are lost.", tuple(lost))
+    for robot in setup.ids:
+        if robot in now.down and robot not in before.down - before.back:
+            yield Caption("process", f"The process of {robot} is gone.", (robot,))
+        if robot in now.back:
+            yield Caption("process", f"The process of {robot} runs again.", (robot,))
+
+
+def _end(setup: RunSetup, now: TickData, end: MissionEnd) -> Caption:
+    errors = [
+        travelled(truth, estimate.world[0])
+        for robot, estimate in now.estimates.items()
+        if estimate.localised and estimate.world and (truth := now.truth.get(robot)) is not None
+    ]
+    size = metres(max(errors)) if errors and max(errors) >= 1e-6 else "less than 1 µm"
+    largest = f"The largest error of a localised robot is {size}." if errors else None
+    if end.outcome == "localised":
+        return Caption("end", f"All {len(setup.robots)} robots are localised.", truth=largest)
+    why = f": {stopped(end_reason(end.reason))}" if end.reason else "."
+    return Caption("end", f"The mission ends: {end.outcome}{why}", truth=largest)
+
+
+def _listed(names: Sequence[str], what: str) -> str:
+    """Return `names` as a list, or their number if they are many."""
+    if len(names) > MOST_LISTED:
+        return f"{len(names)} {what}"
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)

@@ -1,0 +1,74 @@
+// What the page shows of a group: who localises whom, and how many robots are localised.
+
+import { distance } from "./geometry.js";
+import { joined } from "./tints.js";
+import { plural } from "./words.js";
+
+const HEAD = 7; // the length in pixels of an arrow's head
+const TRAVELLING = "travelling";
+
+/** The names of marks whose hue says, in a group, whether a robot is localised. */
+const HUES = { "robot-a": "localised", "robot-b": "unlocalised" };
+
+/** Returns the names of the marks for the legend of a group. */
+export const group_marks = (marks) => new Set([...[...marks].map((mark) => HUES[mark] ?? mark), "meeting"]);
+
+/** Draws a thin arrow for each meeting, between the anchors: dotted until the visited robot is localised. */
+export function draw_tree(pen, plane, { store, tick, look }) {
+  const reach = store.stage.mission.sensing_range * plane.scale;
+  for (const { visitor, visited } of store.stage.visits) {
+    const [from, to] = [visitor, visited].map((id) => plane.at(store.stage.robots[store.places.get(id)].anchor));
+    const length = distance(from, to), done = store.role(tick, visited) === "a";
+    if (length < 2 * reach) continue;
+    const ahead = [(to[0] - from[0]) / length, (to[1] - from[1]) / length];
+    const at = (way, across = 0) => [from[0] + way * ahead[0] - across * ahead[1], from[1] + way * ahead[1] + across * ahead[0]];
+    const tip = length - reach - 2;
+    pen.strokeStyle = pen.fillStyle = done ? look.robot.a : look.orbit;
+    pen.globalAlpha = done ? 0.75 : 0.8;
+    pen.lineWidth = done ? 1.3 : 1;
+    pen.setLineDash(done ? [] : [1.5, 5]);
+    pen.beginPath();
+    pen.moveTo(...at(reach + 2)); pen.lineTo(...at(tip - HEAD));
+    pen.stroke();
+    pen.setLineDash([]);
+    pen.beginPath();
+    pen.moveTo(...at(tip)); pen.lineTo(...at(tip - HEAD, 0.4 * HEAD)); pen.lineTo(...at(tip - HEAD, -0.4 * HEAD));
+    pen.closePath();
+    pen.fill();
+  }
+  pen.globalAlpha = 1;
+}
+
+/** Returns the robots in contact in a scene, each pair once, the one that is named first in the scenario first. */
+export function links({ scene, store }) {
+  const place = (id) => store.places.get(id);
+  return scene.players.flatMap(({ robot, contacts }) =>
+    (contacts ?? []).filter(([peer]) => place(peer) > place(robot)).map(([peer]) => [store.stage.robots[place(robot)], peer]));
+}
+
+/** Returns whether `robot` is the first one of a pair of a group whose configurations are known in the tick or before it. */
+export function heads({ store, scene, tick }, robot) {
+  return [scene, store.scene(tick - 1)].some((one) => joined(one, robot.id)?.robots[0] === robot.id);
+}
+
+/** Returns what a robot does, in a few words for its button. */
+export function task(player, robot) {
+  if (!player?.command) return "–";
+  const { state, verdict, phase } = player.command;
+  if (state === TRAVELLING) return `to ${robot.peer}`;
+  if (state === "localised" || (verdict && verdict[0] !== "localised")) return verdict?.[0] ?? state;
+  if (waits(player)) return "waiting";
+  return phase === 3 ? `meets ${robot.peer}` : state;
+}
+
+/** Returns whether a robot waits beside its anchor for another one. */
+const waits = ({ command }) => command?.state === "orbiting" && command.v === 0 && command.omega === 0;
+
+/** Returns how many robots are localised, travel to others, wait for them, and do something else. */
+export function counted(players) {
+  const is = (kind) => players.filter((player) => player?.command?.verdict?.[0] === kind).length;
+  const travelling = players.filter((player) => player?.command?.state === TRAVELLING).length;
+  const waiting = players.filter((player) => player && waits(player)).length;
+  const others = ["inconsistent", "undecided"].filter(is).map((kind) => `${is(kind)} ${kind}`);
+  return [...others, `${is("localised")} of ${plural(players.length, "robot")} localised`, `${travelling} travelling`, `${waiting} waiting`].join(", ");
+}
