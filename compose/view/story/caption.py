@@ -10,7 +10,7 @@ import msgspec
 from compose.view.pair_data import PairData
 
 CaptionKind = Literal[
-    "ranging", "branch", "path", "search", "contact", "contact-lost", "configurations", "manoeuvre",
+    "rules", "ranging", "mirrored", "branch", "path", "search", "contact", "contact-lost", "configurations", "manoeuvre",
     "measured", "ruled-out", "claim", "undecided", "inconsistent", "report-lost", "process", "end",
 ]  # fmt: skip
 COUNTS = (
