@@ -149,7 +149,7 @@ def test_a_single_journal_shows_the_estimates_of_one_robot(
     ]
     assert [path.name for path in (tmp_path / "figures").iterdir()] == ["ranges-a-b.png"]
     ended = tandem("export", tmp_path)
-    assert (ended.status, ended.err) == (3, "agent-a.journal is missing\n")
+    assert (ended.status, ended.err) == (3, "tandem export: agent-a.journal is missing\n")
     assert {row["robot"] for row in table(tmp_path)} == {"b"}
 
 
