@@ -87,7 +87,7 @@ def _fit(pair: PairData, had: int, has: int) -> str:
 
 
 def _two_distances(pair: PairData) -> str:
-    """Return a sentence about the distance of the tick before and of this one; empty if they do not differ."""
+    """Return a sentence on the distances of the tick before and of this one; empty if they are equal."""
     found = [pair.contact(pair.before), pair.contact(pair.now)]
     lengths = [metres(one.range) for one in found if one is not None and one.range is not None]
     if len(set(lengths)) < 2:
@@ -100,13 +100,14 @@ def _ruling_out(pair: PairData, count: int) -> str:
     contact = pair.contact(pair.now)
     if contact is None or contact.range is None:
         return "What was measured and reported since rules configurations out."
-    does = (
-        "predicted another distance" if pair.exact else "does not fit it" if count == 1 else "do not fit it"
-    )
-    others = f"The configuration that {does} is ruled out."
-    if count > 1:
-        others = f"Configurations that {does} are ruled out, one by one."
-    return f"The distance is {metres(contact.range)} now. {others}"
+    if count == 1:
+        others = (
+            f"The configuration that {'predicted another distance' if pair.exact else 'does not fit it'} is"
+        )
+    else:
+        others = f"Configurations that {'predicted another distance' if pair.exact else 'do not fit it'} are"
+    one_by_one = ", one by one" if count > 1 else ""
+    return f"The distance is {metres(contact.range)} now. {others} ruled out{one_by_one}."
 
 
 def _left(pair: PairData, for_whom: str, had: int, has: int) -> str:
