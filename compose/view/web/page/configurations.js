@@ -145,10 +145,12 @@ export class Configurations {
     for (const start of starts) this.#arc(view, found, player.command, start);
   }
 
-  #arc({ store, look }, { reachable, separation_m2 }, command, start) {
+  #arc({ store, look, eliminated }, { reachable, separation_m2 }, command, start) {
     const pen = this.plane.context, { period } = store.stage.mission, most = Math.max(separation_m2, 1e-9);
     const ends = reachable.map(({ x, y }) => this.plane.at(compose(start, [x, y, 0])));
     const way = [...Array(BENDS + 1).keys()].map((k) => between(start, null, [command.v, command.omega], k / BENDS, period));
+    // Once its range is measured, the label of that range counts more.
+    if (eliminated >= 1) for (let i = 2; i < ends.length; i += 2) this.plane.labels.avoid(ends[i - 2], ends[i]);
     pen.globalAlpha = 1;
     for (const [colour, halo] of [[look.paper, HALO], [look.faint, 0]]) {
       pen.strokeStyle = colour;
