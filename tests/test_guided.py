@@ -48,13 +48,16 @@ def test_guided_play_tells_paper_1_in_less_than_a_minute_most_of_them_at_the_enc
     seen = list(played(page))
     told = list(dict.fromkeys(caption for _, caption in seen))
     assert [re.split(r"[.,]", one)[0] for one in told] == [
-        "Each robot measures the distance to one beacon",
+        "Each robot knows where the anchors are and how it moves",
+        "A robot measures how far away its anchor or the other robot is",
+        "After a straight drive and a second distance",
         "b had two possible poses relative to its anchor",
         "After a short drive",
         "They drive on circles around their anchors to find each other",
         "a and b meet",
-        "Four configurations",
-        "b makes one manoeuvre",
+        "The distance was 2",
+        "Now a stands still and b drives to where the four predict distances that differ most: then the "
+        "next measured distance can tell which one is true",
         "The distance is 2",
         "Only one of the four configurations is left",
         "Both are localised: each knows its position and its heading",

@@ -93,7 +93,7 @@ def test_a_configuration_keeps_its_tint_though_its_place_changes(opened: Open, a
 # --- predicted distances ------------------------------------------------------------------------------
 
 
-def test_the_predicted_distances_and_j_of_the_last_manoeuvre_are_listed(opened: Open, address: str) -> None:
+def test_the_predicted_distances_and_their_least_difference_are_listed(opened: Open, address: str) -> None:
     page = opened(f"{address}#tick=47")
     until_shown(page, 47)
     listed = page.locator("#predictions li")
@@ -104,7 +104,7 @@ def test_the_predicted_distances_and_j_of_the_last_manoeuvre_are_listed(opened: 
             "2: 2.75 m",
             "3: 1.14 m",
             "4: 3.06 m",
-            "told apart by J = 1.80 m²",
+            "nearest two differ by 0.31 m",
         ]
     )
     page.keyboard.press("ArrowLeft")

@@ -46,12 +46,13 @@ def test_captions_speak_of_the_manoeuvre_and_of_what_is_left_when_it_is_drawn(
 ) -> None:
     crossed: dict[str, list[int]] = {}
     for shown in played(opened(f"{address}#tick=46"), 46):
-        crossed.setdefault(shown["caption"].split(" ")[0], []).append(shown["out"])
+        crossed.setdefault(" ".join(shown["caption"].split(" ")[:3]), []).append(shown["out"])
         if shown["title"] is not None:
-            assert re.match("b makes one manoeuvre|The distance is|Only one", shown["caption"])
-    assert [min(crossed["The"]), max(crossed["The"])] == [0, 3]
-    assert crossed["The"] == sorted(crossed["The"])
-    assert set(crossed["Only"]) == {3}
+            assert re.match("Now a stands still|The distance is|Only one", shown["caption"])
+    measured = crossed["The distance is"]
+    assert [min(measured), max(measured)] == [0, 3]
+    assert measured == sorted(measured)
+    assert set(crossed["Only one of"]) == {3}
 
 
 @pytest.mark.long
@@ -70,23 +71,27 @@ def test_the_plane_keeps_its_size_through_guided_play(
 def test_the_legend_lists_only_the_marks_that_are_drawn(opened: Open, address: str) -> None:
     page = opened(f"{address}#tick=0")
     at: dict[int, str] = {}
-    for tick in (0, 2, 5, 47, 48):
+    ticks = (0, 1, 2, 5, 20, 46, 47, 48)
+    for tick in ticks:
         page.evaluate(f"location.hash = 'tick={tick}'")
         until_shown(page, tick)
         picture(page)
         at[tick] = " ".join(page.locator("#legend li").all_text_contents())
-    for words, ticks in (
-        ("all places at that distance", {0}),
-        ("distance to the anchor", {0, 2, 5}),
+    for words, drawn in (
+        ("all places at the measured distance", {0}),
+        ("distance to the anchor", {0, 1, 2, 5}),
         ("pose that is ruled out", {2, 48}),
-        ("the path turned around the anchor", {5}),
+        ("turned around the anchor", {5, 20}),
         ("path, phase 3: encounter", {47, 48}),
-        ("report to the other robot", {47, 48}),
+        ("report to the other robot", {46, 47, 48}),
         ("where b could drive", {47}),
-        ("manoeuvre chosen by b", {47}),
-        ("robot a", {0, 2, 5, 47, 48}),
+        ("possible pose", {1}),
+        ("range between robots: 3\u00a0m", {46}),
+        ("anchor (beacon); range 3\u00a0m", set(ticks)),
+        ("manoeuvre chosen by b: J\u00a0=\u00a01.80\u00a0m²", {47}),
+        ("robot a", set(ticks)),
     ):
-        assert {tick for tick, listed in at.items() if words in listed} == ticks, words
+        assert {tick for tick, listed in at.items() if words in listed} == drawn, words
 
 
 @pytest.mark.long
@@ -134,6 +139,18 @@ def test_both_first_distances_have_labels_and_no_name_lies_on_the_line_between_r
             for name in "ab":
                 left, top, right, bottom = names[name]
                 assert not (left < x < right and top < y < bottom), (tick, name)
+
+
+@pytest.mark.long
+def test_the_label_of_a_mutual_distance_goes_as_soon_as_the_robots_drive_on(
+    opened: Open, address: str
+) -> None:
+    page = opened(f"{address}#tick=46")
+    texts = "document.getElementById('canvas').labels.map(({ text }) => text)"
+    labelled = ["2.95 m" in page.evaluate(texts) for shown in played(page, 46) if shown["tick"] == "46"]
+    assert labelled[0]
+    assert not labelled[-1]
+    assert labelled == sorted(labelled, reverse=True)
 
 
 SEEN = {

@@ -10,8 +10,9 @@ import msgspec
 from compose.view.pair_data import PairData
 
 CaptionKind = Literal[
-    "ranging", "branch", "path", "search", "contact", "contact-lost", "configurations", "manoeuvre",
-    "measured", "ruled-out", "claim", "undecided", "inconsistent", "report-lost", "process", "end",
+    "rules", "ranging", "mirrored", "branch", "path", "search", "contact", "contact-lost", "configurations",
+    "manoeuvre", "measured", "ruled-out", "claim", "undecided", "inconsistent", "report-lost", "process",
+    "end",
 ]  # fmt: skip
 COUNTS = (
     "no",

@@ -16,7 +16,7 @@ from compose.view.run_data import TickData
 from compose.view.story.caption import Caption, listed
 from compose.view.story.encounter_captions import fitting, meeting, planning
 from compose.view.story.ending_captions import concluding, ending
-from compose.view.story.search_captions import choosing_branch, ranging, searching
+from compose.view.story.search_captions import choosing_branch, mirrored, ranging, rules, searching
 from protocol.messages import MissionEnd
 
 
@@ -34,7 +34,9 @@ def captions(
     ended = end if end is not None and end.tick == now.tick else None
     for robots in groups:
         pair = PairData(robots, setup.mission.noise.exact, before, now)
-        yield from ranging(pair, len(groups))
+        yield from rules(pair, len(groups))
+        yield from ranging(pair, setup.mission.sensing_range)
+        yield from mirrored(pair)
         yield from choosing_branch(pair)
         yield from searching(pair)
         yield from meeting(pair)

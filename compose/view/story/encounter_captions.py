@@ -65,12 +65,12 @@ def fitting(pair: PairData) -> Iterator[Caption]:
     for (had, has), robots in changes.items():
         for_whom = "" if len(robots) == len(pair.ids) else f"for {robots[0]}, "
         if has < had:
-            yield Caption("measured", _ruling_out(pair), pair.ids)
+            yield Caption("measured", _ruling_out(pair, had - has), pair.ids)
             yield Caption("ruled-out", sentence(_left(pair, for_whom, had, has)), pair.ids)
         else:
             text = f"{for_whom}{_fit(pair, had, has)}{_most_probable(pair, robots[0])}"
-            most = _most(pair) if not had and has > 1 else ""
-            yield Caption("configurations", f"{sentence(text)}{most}", pair.ids)
+            distances = _two_distances(pair) if pair.exact and not had and has > 1 else ""
+            yield Caption("configurations", f"{distances}{sentence(text)}", pair.ids)
 
 
 def _fit(pair: PairData, had: int, has: int) -> str:
@@ -81,22 +81,33 @@ def _fit(pair: PairData, had: int, has: int) -> str:
     if has == 1:
         return "one configuration of the robots fits what was measured and reported"
     one, other = pair.robots[0].id, pair.robots[0].peer
-    poses = f"each with one pose of {one} and one of {other}"
-    return f"{count_word(has)} configurations, {poses}, fit what was measured and reported"
+    pose = "one angle, and so one pose," if pair.exact else "one pose"
+    poses = f"each with {pose} of {one} and one of {other}"
+    return f"{count_word(has)} configurations fit, {poses}"
 
 
-def _most(pair: PairData) -> str:
-    """Return how many configurations exact sensors allow at most: the number of solutions of eq. (7)."""
-    return " Two distances for two unknown angles allow at most four." if pair.exact else ""
+def _two_distances(pair: PairData) -> str:
+    """Return a sentence on the distances of the tick before and of this one; empty if they are equal."""
+    found = [pair.contact(pair.before), pair.contact(pair.now)]
+    lengths = [metres(one.range) for one in found if one is not None and one.range is not None]
+    if len(set(lengths)) < 2:
+        return ""
+    return f"The distance was {lengths[0]} and is {lengths[1]} now. "
 
 
-def _ruling_out(pair: PairData) -> str:
-    """Return what rules configurations out, before it says how many are left."""
+def _ruling_out(pair: PairData, count: int) -> str:
+    """Return what rules `count` configurations out, before it says how many are left."""
     contact = pair.contact(pair.now)
     if contact is None or contact.range is None:
         return "What was measured and reported since rules configurations out."
-    others = "predicted another distance" if pair.exact else "do not fit it"
-    return f"The distance is {metres(contact.range)} now: configurations that {others} are ruled out."
+    if count == 1:
+        others = (
+            f"The configuration that {'predicted another distance' if pair.exact else 'does not fit it'} is"
+        )
+    else:
+        others = f"Configurations that {'predicted another distance' if pair.exact else 'do not fit it'} are"
+    one_by_one = ", one by one" if count > 1 else ""
+    return f"The distance is {metres(contact.range)} now. {others} ruled out{one_by_one}."
 
 
 def _left(pair: PairData, for_whom: str, had: int, has: int) -> str:
@@ -132,14 +143,20 @@ def planning(pair: PairData) -> Iterator[Caption]:
         else:
             count = count_word(len(held.world))
             text = (
-                f"{robot} makes one manoeuvre, chosen so that the {count} predict distances that differ "
-                "most: then the next measured distance can tell which one is true."
+                f"{_turn(pair, robot)} to where the {count} predict distances that differ most: "
+                "then the next measured distance can tell which one is true."
             )
         yield Caption("manoeuvre", text, pair.ids)
     appeared = [r for r in pair.ids if _appeared(*pair.held(r)) and pair.state(r) == "surveying"]
     if len(appeared) == len(pair.ids) > 1:
         text = "Both drive to where the next distances are expected to distinguish them best."
         yield Caption("manoeuvre", text, pair.ids)
+
+
+def _turn(pair: PairData, robot: str) -> str:
+    """Return that `robot` drives, and that its peer stands still if it does, as a clause."""
+    still = [other for other in pair.ids if other != robot and pair.state(other) in ("waiting", "standing")]
+    return f"Now {still[0]} stands still and {robot} drives" if still else f"{robot} drives"
 
 
 def _appeared(earlier: Estimate | None, held: Estimate | None) -> bool:

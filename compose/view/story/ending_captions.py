@@ -51,7 +51,7 @@ def ending(setup: RunSetup, now: TickData, end: MissionEnd) -> Caption:
     """Return the caption of the end of the mission."""
     why = f": {stopped(end_reason(end.reason))}" if end.reason else "."
     errors = _claim_errors(setup, now)
-    largest = _off(errors) if errors else None
+    largest = _off(errors, setup.mission.noise.exact) if errors else None
     silent = _silent_links(setup)
     robots = len(setup.robots)
     match end.outcome:
@@ -113,9 +113,9 @@ def _claim_errors(setup: RunSetup, now: TickData) -> list[float]:
     return errors
 
 
-def _off(errors: list[float]) -> str:
-    """Return a sentence about the errors of claims, in m."""
+def _off(errors: list[float], exact: bool) -> str:
+    """Return a sentence about the errors of claims, in m, of robots whose sensors are exact or not."""
     claims = "claimed position is" if len(errors) == 1 else "claimed positions are"
     if max(errors) < 1e-6:
-        return f"The {claims} off by less than 1 µm."
+        return f"The {claims} off by less than 1 µm{': the simulated sensors are exact' if exact else ''}."
     return f"The {claims} off by {'' if len(errors) == 1 else 'at most '}{metres(max(errors))}."

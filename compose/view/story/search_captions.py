@@ -11,25 +11,52 @@ from compose.view.story.caption import Caption, attacked, count_word, listed
 from protocol.messages import Estimate
 
 
-def ranging(pair: PairData, pairs: int) -> Iterator[Caption]:
-    """Yield what the robots measure in the first tick. `pairs` is the number of pairs."""
-    if pair.before is not None or pair.now.tick != 0:
+def rules(pair: PairData, pairs: int) -> Iterator[Caption]:
+    """Yield what the robots know before the first tick. `pairs` is the number of pairs."""
+    if not _first(pair):
         return
-    found = [pair.now.observations.get(robot) for robot in pair.ids]
-    if None in found:
-        return
-    ranged = [one.robot for one in found if one is not None and one.anchor_range is not None]
-    without = [robot for robot in pair.ids if robot not in ranged]
-    only = "the distance to one beacon, its anchor. It knows how far away that is, not in which direction."
-    if not ranged:
-        text = "There is no distance to an anchor yet."
-    elif not without:
-        text = f"{'Each robot' if len(ranged) > 1 else ranged[0]} measures {only}"
-    else:
-        text = f"{ranged[0]} measures {only} {without[0]} has no such distance yet."
+    each = "Each robot" if len(pair.ids) > 1 else pair.ids[0]
+    moves = "how it moves" if pair.exact else "roughly how it moves"
+    text = f"{each} knows where the anchors are and {moves}, but not where it is or which way it heads."
     if pairs > 1 < len(pair.ids):
         text = f"{listed(pair.ids)} are one of {pairs} pairs. {text}"
-    yield Caption("ranging", text, pair.ids, attacked(pair, "will report"))
+    yield Caption("rules", text, pair.ids)
+
+
+def ranging(pair: PairData, sensing_range: float) -> Iterator[Caption]:
+    """Yield what the robots can measure, up to the sensing range in m, and what they do in the first tick."""
+    if not _first(pair):
+        return
+    ranged = [robot for robot in pair.ids if pair.now.observations[robot].anchor_range is not None]
+    without = [robot for robot in pair.ids if robot not in ranged]
+    measured = "how far away its anchor or the other robot is"
+    text = f"A robot measures {measured}, up to {sensing_range:g} m, but not in which direction."
+    if not ranged:
+        text = f"{text} There is no distance to an anchor yet."
+    elif without:
+        text = f"{text} {without[0]} has no distance to its anchor yet."
+    truth = ["The simulated sensors are exact."] if pair.exact else []
+    truth += filter(None, [attacked(pair, "will report")])
+    yield Caption("ranging", text, pair.ids, " ".join(truth) or None)
+
+
+def _first(pair: PairData) -> bool:
+    return pair.before is None and pair.now.tick == 0 and {*pair.ids} <= pair.now.observations.keys()
+
+
+def mirrored(pair: PairData) -> Iterator[Caption]:
+    """Yield which robots now have two possible poses relative to their anchors, if sensors are exact."""
+    robots = [robot for robot in pair.ids if _mirrored(*pair.held(robot))] if pair.exact else []
+    if robots:
+        who = f"{listed(robots)} each have" if len(robots) > 1 else f"{robots[0]} has"
+        relative = f"relative to {'their anchors' if len(robots) > 1 else 'its anchor'}"
+        after = "After a straight drive and a second distance"
+        text = f"{after}, {who} two possible poses {relative}, mirror images of each other."
+        yield Caption("mirrored", text, pair.ids)
+
+
+def _mirrored(earlier: Estimate | None, held: Estimate | None) -> bool:
+    return earlier is not None and held is not None and not earlier.local and len(held.local) == 2
 
 
 def choosing_branch(pair: PairData) -> Iterator[Caption]:
@@ -40,8 +67,7 @@ def choosing_branch(pair: PairData) -> Iterator[Caption]:
             continue
         if len(earlier.local) < 2 or len(held.local) != 1:
             continue
-        mirrored = ", mirror images of each other" if pair.exact and len(earlier.local) == 2 else ""
-        had = f"{robot} had {count_word(len(earlier.local))} possible poses relative to its anchor{mirrored}"
+        had = f"{robot} had {count_word(len(earlier.local))} possible poses relative to its anchor"
         all_but_one = "one of them" if len(earlier.local) == 2 else "all but one of them"
         yield Caption("branch", f"{had}. {_measured_now(pair, robot)} rules out {all_but_one}.", pair.ids)
 

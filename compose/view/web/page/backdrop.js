@@ -72,9 +72,9 @@ export class Backdrop {
     this.bar = [x - Math.max(bar, 60), y - 18, x, y + 4];
   }
 
-  /** Draws an anchor with its range and its robot's orbit. */
+  /** Draws the range of an anchor and its robot's orbit. */
   #anchor(view, robot) {
-    const { pen, plane } = this, { look } = view, { at: [x, y], reach, radius: r, alpha } = this.#place(view, robot);
+    const { pen, plane } = this, { look } = view, { at: [x, y], reach, alpha } = this.#place(view, robot);
     pen.globalAlpha = alpha;
     pen.beginPath();
     pen.arc(x, y, reach, 0, TAU);
@@ -91,9 +91,19 @@ export class Backdrop {
     pen.strokeStyle = look.orbit;
     pen.stroke();
     pen.setLineDash([]);
+    pen.globalAlpha = 1;
+  }
+
+  /** Draws an anchor, above paths and poses that are ruled out. */
+  beacon(view, robot) {
+    const pen = this.plane.context, { at: [x, y], radius: r, alpha } = this.#place(view, robot);
+    pen.globalAlpha = alpha;
     pen.beginPath();
     pen.moveTo(x, y - r); pen.lineTo(x + r, y + r * 0.75); pen.lineTo(x - r, y + r * 0.75); pen.closePath();
-    pen.fillStyle = look.ink;
+    pen.lineWidth = 2.5;
+    pen.strokeStyle = view.look.paper;
+    pen.stroke();
+    pen.fillStyle = view.look.ink;
     pen.fill();
     pen.globalAlpha = 1;
   }
@@ -103,7 +113,8 @@ export class Backdrop {
     const { plane } = this, { at, reach, radius, alpha } = this.#place(view, robot);
     plane.targets.push({ kind: "anchor", robot: robot.id, at, radius });
     plane.context.globalAlpha = alpha;
-    if (reach > LEGIBLE) plane.labels.put(`anchor of ${robot.id}`, at[0], at[1] + radius + 12, view.look.faint, "center");
+    const [x, y] = at, below = [[x, y + radius + 12]];
+    if (reach > LEGIBLE) plane.labels.put(`anchor of ${robot.id}`, x, y - reach - 5, view.look.faint, "center", { others: below });
     plane.context.globalAlpha = 1;
   }
 

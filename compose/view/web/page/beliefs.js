@@ -2,7 +2,7 @@
 
 import { shown } from "./configurations.js";
 import { between, compose, distance, ellipse, frame_of, step, TAU } from "./geometry.js";
-import { held_now } from "./held.js";
+import { held_now, lacks_bearing } from "./held.js";
 import { NAME } from "./labels.js";
 import { cross, fading, shape } from "./pen.js";
 import { probability } from "./words.js";
@@ -23,8 +23,10 @@ export class Beliefs {
     const tints = this.plane.tints.of(store, tick, robot.id);
     if (!poses.length) return this.#somewhere(view, robot, player);
     this.#ruled_out(view, robot);
-    this.plane.marks.add(tints.length ? "configuration" : "pose");
     if (!held.world.length && !truth) this.#any_bearing(view, robot, poses[0]);
+    // At the true bearing, which the robot does not know, the outline of its only pose would say that it does.
+    const bearing_unknown = truth && lacks_bearing(held);
+    if (!bearing_unknown) this.plane.marks.add(tints.length ? "configuration" : "pose");
     poses.slice(0, 60).forEach((pose, place) => {
       const chance = held.probability[place] ?? 1 / poses.length;
       const [x, y] = this.plane.at(pose);
@@ -33,10 +35,12 @@ export class Beliefs {
       const grown = truth ? size * 1.45 : size * 1.15;
       shape(pen, robot.role, x, y, pose[2], grown);
       this.plane.targets.push({ kind: "hypothesis", robot: robot.id, place, at: [x, y], radius: grown });
+      if (bearing_unknown) return;
       if (!truth && poses.length === 1) {
         pen.fillStyle = player.down ? look.paper : look.robot[robot.role];
         pen.fill();
       }
+      if (tints.length && size > 6) labels.placed.push([x - size, y - size, x + size, y + size]);
       const colour = tints.length ? look.tint(tints[place]) : look.ghost;
       pen.strokeStyle = colour;
       pen.lineWidth = tints.length ? 2.6 : 2;
@@ -75,7 +79,8 @@ export class Beliefs {
       pen.stroke();
       this.plane.marks.add(out ? "ruled-out" : "configuration");
       if (out) cross(pen, x, y, size, look);
-      else if (size > 6) this.plane.labels.put(String(tint + 1), x - grown - 4, y + grown + 8, colour, "right", { around: grown + 4 });
+      if (out && size > 6) this.plane.labels.placed.push([x - grown, y - grown, x + grown, y + grown]);
+      if (!out && size > 6) this.plane.labels.put(String(tint + 1), x - grown - 4, y + grown + 8, colour, "right", { around: grown + 4 });
     }
     pen.globalAlpha = 1;
     return true;

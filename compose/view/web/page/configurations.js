@@ -7,10 +7,11 @@ import { DASHES } from "./pen.js";
 import { joined, poses_of } from "./tints.js";
 
 const MOST = 12; // configurations that are drawn
-/** Where on its circle the number of the first configuration is, and how much farther that of the next one, in rad. */
-const FIRST_NUMBER = -2.6, NEXT_NUMBER = -0.35;
-const BENDS = 16, HEAD_PX = 9;
-const THICK = 5; // the width in pixels of the reachable arc where J is largest
+/** The angle in rad from the number of a configuration on its circle to that of the next one. */
+const NEXT_NUMBER = 0.35;
+const BENDS = 16, HEAD_PX = 12;
+const THICK = 6; // the width in pixels of the reachable arc where J is largest
+const HALO = 3; // the width in pixels of the ground on each side of the arc and the arrow
 
 /**
  * Returns the configurations to show, of the pair of `robot` of role a.
@@ -56,15 +57,13 @@ export function predicted(store, tick, robot, tints) {
 export class Configurations {
   constructor(plane) { this.plane = plane; }
 
-  /** Draws the lines, circles and arcs of the pair of `robot` of role a. */
+  /** Draws the lines and circles of the pair of `robot` of role a. */
   draw(view, robot) {
-    const { store, scene, tick, look, truth, places, focus } = view, pen = this.plane.context;
+    const { store, tick, look, truth, places, focus } = view, pen = this.plane.context;
     if (focus && !truth) return;
     const { all, measured } = shown(view, robot, this.plane.tints), live = all.slice(0, MOST);
     if (live.length < 2) return;
-    const manoeuvre = joined(scene, robot.id)?.manoeuvre;
     this.plane.marks.add("configuration");
-    if (manoeuvre && view.planned) this.#arc(view, robot, manoeuvre, live);
     pen.lineWidth = 1.3;
     for (const { tint, a, b, out } of live) {
       pen.globalAlpha = out ? 0.25 : 0.9;
@@ -82,10 +81,13 @@ export class Configurations {
         this.#circle(places.get(mover), measured, look.ink, 0.2, [], 9);
       }
       live.forEach((one, i) => {
-        const centre = truth ? places.get(mover) : of_a ? one.a : one.b;
+        const centre = truth ? places.get(mover) : of_a ? one.a : one.b, still = of_a ? one.b : one.a;
+        const opposite = truth ? places.get(of_a ? robot.peer : robot.id) ?? still : still;
         if (!centre) return;
         this.plane.marks.add("predicted");
-        const colour = look.tint(one.tint), angle = FIRST_NUMBER + i * NEXT_NUMBER;
+        // Numbers are on the far side of the circles: near the other robot are its name and its poses.
+        const away = Math.atan2(opposite[1] - centre[1], centre[0] - opposite[0]);
+        const colour = look.tint(one.tint), angle = away + (i - (live.length - 1) / 2) * NEXT_NUMBER;
         this.#circle(centre, one.predicted, colour, one.out ? 0.2 : 0.9, DASHES[one.tint] ?? DASHES[0]);
         const [x, y] = this.plane.at(centre), radius = one.predicted * this.plane.scale;
         if (one.out) return;
@@ -113,38 +115,53 @@ export class Configurations {
     pen.setLineDash([]);
   }
 
-  /** Draws an arrow along poses of a robot that drives with the speed `v`. */
-  #arrow(way, v, colour) {
+  /** Draws an arrow along poses of a robot that drives with the speed `v`; `halo` is the width of its ground. */
+  #arrow(way, v, colour, halo = 0) {
     const pen = this.plane.context, [x, y] = this.plane.at(way.at(-1)), course = way.at(-1)[2] + (v < 0 ? Math.PI : 0);
     const back = (angle) => [x - HEAD_PX * Math.cos(course + angle), y + HEAD_PX * Math.sin(course + angle)];
     pen.strokeStyle = pen.fillStyle = colour;
-    pen.lineWidth = 2;
+    pen.lineWidth = 2.4 + 2 * halo;
     pen.beginPath();
     for (const pose of way) pen.lineTo(...this.plane.at(pose));
     pen.stroke();
     pen.beginPath();
     pen.moveTo(x, y); pen.lineTo(...back(0.45)); pen.lineTo(...back(-0.45)); pen.closePath();
     pen.fill();
+    pen.lineWidth = 2 * halo;
+    if (halo) pen.stroke();
   }
 
-  /** Draws where the robot can be after the tick: the wider the arc, the larger J; and an arrow to where it will be. */
-  #arc({ store, tick, look, truth, scene }, robot, { robot: mover, reachable, separation_m2 }, live) {
-    const pen = this.plane.context, { period } = store.stage.mission, { command } = store.player(tick, mover);
-    const player = scene.players[store.places.get(mover)], most = Math.max(separation_m2, 1e-9);
+  /**
+   * Draws the last manoeuvre of the pair of `robot` of role a, above all configurations, until its distance has ruled configurations
+   * out: where the robot can be after it, the wider the larger J, and an arrow to where it will be.
+   */
+  manoeuvre(view, robot) {
+    const { store, tick, truth, focus, eliminated } = view, at = eliminated < 1 ? tick - 1 : tick;
+    const found = joined(store.scene(at), robot.id)?.manoeuvre, { all } = shown(view, robot, this.plane.tints);
+    if (!found || !view.planned || all.length < 2 || (focus && !truth)) return;
     for (const mark of ["reachable", "choice"]) this.plane.marks.add(mark);
-    const starts = truth && player.pose ? [player.pose] : live.map((one) => (mover === robot.id ? one.a : one.b));
-    for (const start of starts) {
-      const ends = reachable.map(({ x, y }) => this.plane.at(compose(start, [x, y, 0])));
-      pen.globalAlpha = 1;
-      pen.strokeStyle = look.faint;
+    const player = store.player(at, found.robot), poses = poses_of(store, at, [robot.id, robot.peer]).slice(0, MOST);
+    const starts = truth && player.pose ? [player.pose] : poses.map(([a, b]) => (found.robot === robot.id ? a : b));
+    for (const start of starts) this.#arc(view, found, player.command, start);
+  }
+
+  #arc({ store, look, eliminated }, { reachable, separation_m2 }, command, start) {
+    const pen = this.plane.context, { period } = store.stage.mission, most = Math.max(separation_m2, 1e-9);
+    const ends = reachable.map(({ x, y }) => this.plane.at(compose(start, [x, y, 0])));
+    const way = [...Array(BENDS + 1).keys()].map((k) => between(start, null, [command.v, command.omega], k / BENDS, period));
+    // Once its range is measured, the label of that range counts more.
+    if (eliminated >= 1) for (let i = 2; i < ends.length; i += 2) this.plane.labels.avoid(ends[i - 2], ends[i]);
+    pen.globalAlpha = 1;
+    for (const [colour, halo] of [[look.paper, HALO], [look.faint, 0]]) {
+      pen.strokeStyle = colour;
       for (let i = 1; i < ends.length; i++) {
-        pen.lineWidth = 0.8 + THICK * Math.min(reachable[i].separation_m2 / most, 1);
+        pen.lineWidth = 0.8 + THICK * Math.min(reachable[i].separation_m2 / most, 1) + halo;
         pen.beginPath();
         pen.moveTo(...ends[i - 1]); pen.lineTo(...ends[i]);
         pen.stroke();
       }
-      const way = [...Array(BENDS + 1).keys()].map((k) => between(start, null, [command.v, command.omega], k / BENDS, period));
-      this.#arrow(way, command.v, look.ink);
     }
+    this.#arrow(way, command.v, look.paper, 0.5 * HALO);
+    this.#arrow(way, command.v, look.ink);
   }
 }

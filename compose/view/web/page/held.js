@@ -8,6 +8,13 @@ const NEAR = 0.05, TURNED = 0.5;
 /** True if the first pose is the only one, or more probable than all others together. */
 export const leads = ({ world, local, probability }) => (world.length || local.length) === 1 || probability[0] > 0.5;
 
+/** The least probability of the first pose relative to the anchor from which on the others do not count. */
+const SURE = 0.99;
+/** True if a robot knows its path, but neither its bearing from the anchor nor, so, its place in the world. */
+export const lacks_bearing = ({ world, local, probability }) => (
+  !world.length && local.length > 0 && (probability[0] ?? 1 / local.length) > SURE
+);
+
 /** Returns the robot's possible poses on the plane and the first one's covariance; null without an estimate. */
 export function held_now({ store, scene, truth, tick, share, moving }, robot) {
   const held = scene.players[store.places.get(robot.id)]?.held;

@@ -14,37 +14,41 @@ const ROUND = 'd="M22 8 17.5 3.5a6.4 6.4 0 1 0 0 9z"';
 const dot = (more) => drawn(`<circle cx="15" cy="8" r="4.5" stroke-width="1.8" ${more}/>`);
 const cross = 'M11 4l8 8M19 4l-8 8';
 
-/** The marks of the plane in the order of the legend, each with its drawing and its words. */
-const MARKS = {
-  "robot-a": [drawn(`<path ${POINTED} fill="var(--robot-a)"/>`), ([a]) => `robot ${a}`],
-  "robot-b": [drawn(`<path ${ROUND} fill="var(--robot-b)"/>`), ([, b]) => `robot ${b}`],
+/** The marks of the plane that stay once they are drawn, in the order of the legend, each with its drawing and its words. */
+const LASTING = {
+  "robot-a": [drawn(`<path ${POINTED} fill="var(--robot-a)"/>`), ({ a }) => `robot ${a}`],
+  "robot-b": [drawn(`<path ${ROUND} fill="var(--robot-b)"/>`), ({ b }) => `robot ${b}`],
   localised: [drawn(`<path ${POINTED} fill="var(--robot-a)"/>`), "localised robot, its path and its anchor"],
   unlocalised: [drawn(`<path ${ROUND} fill="var(--robot-b)"/>`), "robot that is not yet localised, its path"],
   meeting: [drawn('<path d="M1 8h20" stroke="var(--robot-a)" stroke-width="1.3"/><path d="M28 8l-7 3v-6z" fill="var(--robot-a)"/>'), "who localises whom; dotted: planned"],
-  down: [drawn(`<path ${POINTED} fill="none" stroke="var(--faint)" stroke-width="2"/><path d="${cross}" stroke="var(--fault)" stroke-width="2"/>`), "its process is gone"],
-  anchor: [drawn('<circle cx="15" cy="8" r="7.5" fill="var(--disc)" stroke="var(--ring)"/><path d="M15 4.5l3.5 6h-7z" fill="var(--ink)"/>'), "anchor (beacon), its range"],
-  orbit: [ring("orbit", 'stroke-dasharray="5 2.5 1 2.5"'), "circle on which it searches"],
-  places: [ring("ghost", 'stroke-dasharray="1.5 3"'), "all places at that distance"],
-  distance: [line("range"), "distance to the anchor"],
+  anchor: [drawn('<circle cx="15" cy="8" r="7.5" fill="var(--disc)" stroke="var(--ring)"/><path d="M15 4.5l3.5 6h-7z" fill="var(--ink)"/>'), ({ range }) => `anchor (beacon); range ${range}`],
+  orbit: [drawn('<path d="M2 15q13-22 26 0" fill="none" stroke="var(--orbit)" stroke-width="1.6" stroke-dasharray="5 2.5 1 2.5"/>'), "search circle (phase 2)"],
   "path-1": [line("faint", 'stroke-dasharray="1.5 4"'), "path, phase 1: near anchor"],
   "path-2": [line("faint", 'stroke-dasharray="6 4"'), "path, phase 2: search"],
   "path-3": [line("faint"), "path, phase 3: encounter"],
-  turned: [drawn('<path d="M4 14q8-2 9-11M13 14q8-2 9-11" fill="none" stroke="var(--faint)" stroke-opacity="0.6"/>'), "the path turned around the anchor: just as possible"],
-  pose: [drawn(`<path ${POINTED} fill="none" stroke="var(--ghost)" stroke-width="1.6" stroke-dasharray="2.5 2"/>`), "pose (place and heading) that it considers possible"],
+  reported: [line("fault", 'stroke-dasharray="3 3"'), "path that an attacker reports"],
+};
+/** The other marks. */
+const MOMENTARY = {
+  down: [drawn(`<path ${POINTED} fill="none" stroke="var(--faint)" stroke-width="2"/><path d="${cross}" stroke="var(--fault)" stroke-width="2"/>`), "robot whose process is gone"],
+  places: [drawn('<circle cx="15" cy="8" r="6.5" fill="none" stroke="var(--ghost)" stroke-width="2.4" stroke-dasharray="1.6 2.5"/><path d="M15 5.5l2.5 4.3h-5z" fill="var(--ink)"/>'), "all places at the measured distance"],
+  distance: [line("range"), "distance to the anchor"],
+  turned: [drawn(`<path ${POINTED} fill="none" stroke="var(--faint)" stroke-opacity="0.7"/>`), "turned around the anchor: just as possible"],
+  pose: [drawn(`<path ${POINTED} fill="none" stroke="var(--ghost)" stroke-width="1.6" stroke-dasharray="2.5 2"/>`), "possible pose (place and heading) of a robot"],
   "ruled-out": [drawn(`<path ${POINTED} fill="none" stroke="var(--ghost)" stroke-dasharray="2 2"/><path d="${cross}" stroke="var(--fault)" stroke-width="1.8"/>`), "pose that is ruled out"],
   ellipse: [drawn('<ellipse cx="15" cy="8" rx="12" ry="5.5" fill="var(--cloud)" stroke="var(--ghost)"/>'), "uncertainty (3 sigma)"],
   contact: [drawn('<path d="M1 6h28M1 10h28" stroke="var(--link)" stroke-width="1.4"/>'), "in range of each other"],
+  reach: [ring("link", 'stroke-dasharray="3 2.4"'), ({ range }) => `range between robots: ${range}`],
   report: [dot('fill="var(--link)"'), "report to the other robot"],
   late: [drawn('<path d="M4 8h11" stroke="var(--link)" stroke-width="4"/><circle cx="17" cy="8" r="4.5" fill="var(--link)"/>'), "report that arrives late"],
   waiting: [dot('fill="none" stroke="var(--link)"'), "report under way"],
   lost: [dot('fill="none" stroke="var(--fault)" stroke-dasharray="2 2"'), "report that is lost"],
   damaged: [drawn(`<circle cx="15" cy="8" r="5" fill="none" stroke="var(--fault)" stroke-width="1.6"/><path d="${cross}" stroke="var(--fault)"/>`), "report that arrives damaged"],
   configuration: [drawn('<path d="M5 8h20" stroke="var(--tint-1)"/><circle cx="5" cy="8" r="3.6" fill="var(--card)" stroke="var(--tint-1)" stroke-width="2"/><circle cx="25" cy="8" r="3.6" fill="var(--card)" stroke="var(--tint-1)" stroke-width="2"/>'), "configuration: a pose of each robot, in one colour"],
-  reachable: [drawn('<path d="M3 13q12-14 24-4" fill="none" stroke="var(--faint)" stroke-width="4"/>'), (_, mover) => `where ${mover} could drive; thick: J, how well this tells them apart, is large`],
-  choice: [drawn('<path d="M3 11q10-9 19-4" fill="none" stroke="var(--ink)" stroke-width="2"/><path d="M28 9.5l-8 1.5 3.5-6z" fill="var(--ink)"/>'), (_, mover) => `manoeuvre chosen by ${mover}`],
-  predicted: [ring("tint-1", 'stroke-dasharray="4 2.5"'), "distance that a configuration predicts"],
+  reachable: [drawn('<path d="M3 13q12-14 24-4" fill="none" stroke="var(--faint)" stroke-width="4"/>'), ({ mover }) => `where ${mover} could drive; thick: predictions differ more`],
+  choice: [drawn('<path d="M3 11q10-9 19-4" fill="none" stroke="var(--ink)" stroke-width="2"/><path d="M28 9.5l-8 1.5 3.5-6z" fill="var(--ink)"/>'), ({ mover, value }) => `manoeuvre chosen by ${mover}${value}`],
+  predicted: [drawn('<circle cx="15" cy="8" r="6" fill="none" stroke="var(--tint-1)" stroke-width="1.8" stroke-dasharray="4 2.5"/><path d="M15 8h6" stroke="var(--tint-1)"/>'), "distance that a configuration predicts"],
   measured: [ring("ink", 'style="stroke-width: 4; opacity: 0.2"'), "measured distance"],
-  reported: [line("fault", 'stroke-dasharray="3 3"'), "path that an attacker reports"],
 };
 /** The drawing of the bands of the time line. */
 const BANDS = drawn('<path d="M1 8h9" stroke="var(--faint)" stroke-width="3"/><path d="M10 8h9" stroke="var(--faint)" stroke-width="6"/><path d="M19 8h10" stroke="var(--faint)" stroke-width="10"/>');
@@ -64,22 +68,29 @@ export class Legend {
 
   #key = "";
 
-  /** Lists `marks` of the plane and `kinds` of events above the time line, of the pair of `story`; `mover` makes the last manoeuvre. */
-  draw(marks, kinds, story, mover) {
-    const key = [...marks, "", ...kinds, "", ...story.map(({ id }) => id), mover].join();
+  /**
+   * Lists `marks` of the plane and `kinds` of events above the time line. What stays comes first, so that lines keep their places.
+   *
+   * `names` are the words of the story: the ids of robots `a` and `b`, the `mover` of the last manoeuvre and its `value`, and
+   * the sensing `range`.
+   */
+  draw(marks, kinds, names) {
+    const key = [...marks, "", ...kinds, "", ...Object.values(names)].join();
     if (key === this.#key) return;
     this.#key = key;
-    const of = (role) => story.find((robot) => robot.role === role)?.id ?? `of role ${role}`;
-    const said = (words) => (typeof words === "string" ? words : words([of("a"), of("b")], mover));
-    const items = Object.entries(MARKS).filter(([name]) => marks.has(name)).map(([, [picture, words]]) => entry(picture, said(words)));
+    const said = (words) => (typeof words === "string" ? words : words(names));
+    const items = (all) => Object.entries(all).filter(([name]) => marks.has(name)).map(([, [picture, words]]) => entry(picture, said(words)));
     const times = Object.entries(TIMES).filter(([kind]) => kinds.has(kind)).map(([kind, words]) => (
       make("li", {}, make("b", { textContent: SIGNS[kind] }), make("span", { textContent: words }))
     ));
-    times.push(entry(BANDS, "thin, medium, thick: phase 1, 2, 3"));
-    times.unshift(make("li", { className: "title", textContent: "on the time line" }));
-    this.list.replaceChildren(...items, ...times);
+    times.push(entry(BANDS, "thickness: phase 1, 2, 3"));
+    const passing = items(MOMENTARY);
+    if (passing.length) passing.unshift(title("now"));
+    this.list.replaceChildren(...items(LASTING), title("on the time line"), ...times, ...passing);
   }
 }
+
+const title = (words) => make("li", { className: "title", textContent: words });
 
 function entry(picture, words) {
   const item = make("li");

@@ -309,8 +309,7 @@ function draw() {
     cards.draw(view);
     log.draw(view);
     timeline.draw(view, activities(store, view));
-    const story = guide.pair(view.focus), mover = joined(store.scene(view.tick), story[0].id)?.manoeuvre?.robot ?? "it";
-    legend.draw(store.grouped ? group_marks(plane.marks) : plane.marks, timeline.kinds, store.stage.robots.length > story.length ? [] : story, mover);
+    legend.draw(store.grouped ? group_marks(plane.marks) : plane.marks, timeline.kinds, legend_names());
     sequence.draw(store, view);
     charts.draw(store, view, store.grouped ? [store.chosen(view.focus)] : guide.pair(view.focus));
     const news = view.playing && view.guided ? null : announcer.text(store, view, now);
@@ -318,6 +317,15 @@ function draw() {
     if (view.playing || plane.easing) draw();
     if (!view.playing) keep_address();
   });
+}
+
+/** Returns the words of the legend: several pairs share it, so it then names roles. */
+function legend_names() {
+  const story = guide.pair(view.focus), several = store.stage.robots.length > story.length;
+  const of = (role) => (several ? null : story.find((robot) => robot.role === role)?.id) ?? `of role ${role}`;
+  const at = view.eliminated < 1 ? view.tick - 1 : view.tick, manoeuvre = joined(store.scene(at), story[0].id)?.manoeuvre;
+  const value = manoeuvre ? `: J\u00a0=\u00a0${manoeuvre.separation_m2.toPrecision(3)}\u00a0m²` : "";
+  return { a: of("a"), b: of("b"), mover: manoeuvre?.robot ?? "a robot", value, range: `${Number(store.stage.mission.sensing_range.toFixed(3))}\u00a0m` };
 }
 
 function controls() {

@@ -250,6 +250,7 @@ export class Plane {
       if (truth) this.#trails.turned(pen, view, robot);
     }
     if (view.scene) this.#scene(view, robots);
+    else for (const robot of robots) this.#backdrop.beacon(view, robot);
     this.#ring(this.targets.find((one) => same(one, selected)), look);
     this.canvas.style.cursor = this.hovered ? "pointer" : "";
     this.labels.draw();
@@ -283,6 +284,8 @@ export class Plane {
     if (truth) for (const [robot, peer] of pairs) this.#signals.contact(view, robot, peer);
     if (!truth) for (const robot of robots) this.#signals.mutual_ring(view, robot);
     if (truth) for (const robot of robots) this.#reported(view, robot);
+    for (const robot of robots) this.#backdrop.beacon(view, robot);
+    for (const robot of robots) if (robot.role === "a") this.#configurations.manoeuvre(view, robot);
     if (truth) for (const robot of robots) this.#robot(view, robot, view.places.get(robot.id));
   }
 

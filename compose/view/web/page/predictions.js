@@ -29,7 +29,7 @@ export class Predictions {
       return item;
     });
     const measured = found.measured ? [make("li", { className: "measured", textContent: `measured ${found.measured}` })] : [];
-    const value = found.value ? [make("li", { className: "value" }, make("span", { textContent: "told apart by " }), found.value)] : [];
+    const value = found.least ? [make("li", { className: "value", textContent: `nearest two differ by ${found.least}` })] : [];
     this.root.replaceChildren(make("li", { className: "title", textContent: found.title }), ...items, ...measured, ...value);
   }
 
@@ -43,7 +43,8 @@ export class Predictions {
     }
     if (!now || now.count < 2 || !view.planned) return null;
     const all = predicted(store, tick, robot, tints);
-    const value = now.manoeuvre && `J = ${now.manoeuvre.separation_m2.toPrecision(3)} m²`;
-    return all.length ? { title: "predicted", all: listed(all), value } : null;
+    const lengths = all.map((one) => one.predicted).sort((a, b) => a - b);
+    const least = now.manoeuvre && metres(Math.min(...lengths.slice(1).map((length, i) => length - lengths[i])));
+    return all.length ? { title: "predicted", all: listed(all), least } : null;
   }
 }

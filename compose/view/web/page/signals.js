@@ -8,6 +8,8 @@ import { metres } from "./words.js";
 const MOST_ORIGINS = 6;
 const LEGIBLE = 46; // the least length in pixels of a line that has its label in any case
 const BESIDE = 10; // the distance in pixels of a label from its line
+/** The share of a tick after which the distance of its beginning has no label any more. */
+const LABELLED = 0.2;
 
 export class Signals {
   constructor(plane) { this.plane = plane; }
@@ -39,7 +41,7 @@ export class Signals {
     pen.stroke();
     if (size > 6) this.plane.labels.avoid(from, to);
     const length = distance(from, to), x = (from[0] + to[0]) / 2, y = (from[1] + to[1]) / 2;
-    if (length > LEGIBLE || (size > 6 && length > 1)) {
+    if (alpha > 1 - 1.6 * LABELLED && (length > LEGIBLE || (size > 6 && length > 1))) {
       const across = [(to[1] - from[1]) / length, (from[0] - to[0]) / length].map((one) => BESIDE * one);
       const spots = [[x + across[0], y + across[1] + 4], [x - across[0], y - across[1] + 4]].sort((a, b) => a[1] - b[1]);
       const [spot, other] = spots, steep = Math.abs(across[0]) > 0.5 * BESIDE;
@@ -75,7 +77,7 @@ export class Signals {
 
   /** Draws the contact of `robot` with `peer`, and the reports between them. */
   contact(view, robot, peer) {
-    const { scene, store, look, places, size, focus } = view;
+    const { scene, store, look, places, size, focus, moving, share } = view;
     const player = scene.players[store.places.get(robot.id)];
     const contact = player?.contacts?.find((one) => one[0] === peer);
     const from = places.get(robot.id), to = places.get(peer);
@@ -93,8 +95,9 @@ export class Signals {
       pen.stroke();
     }
     this.plane.marks.add("contact");
+    this.#reach(view, robot, peer, from);
     if (size > 6) this.plane.labels.avoid(one, other);
-    if (contact[1] !== null && length > 60) {
+    if (contact[1] !== null && length > LEGIBLE && !(moving && share > LABELLED)) {
       const x = (one[0] + other[0]) / 2 + 16 * across[0], y = (one[1] + other[1]) / 2 + 16 * across[1];
       this.plane.labels.put(metres(contact[1]), x, y, look.link, across[0] < 0 ? "right" : "left", { around: 16 * Math.abs(across[0]) });
     }
@@ -103,6 +106,23 @@ export class Signals {
       this.#reports(view, peer, robot.id, other, one, across, -3.5);
     }
     pen.globalAlpha = 1;
+  }
+
+  /** Draws how far `robot`, which is at `place`, can range `peer`, in the tick in which they come in range. */
+  #reach({ store, tick, share, moving, look }, robot, peer, place) {
+    const alpha = fading(share, moving), earlier = store.player(tick - 1, robot.id);
+    if (!earlier || earlier.contacts?.some(([id]) => id === peer) || alpha <= 0) return;
+    const pen = this.plane.context, before = pen.globalAlpha, radius = store.stage.mission.sensing_range * this.plane.scale;
+    this.plane.marks.add("reach");
+    pen.globalAlpha = 0.6 * alpha * before;
+    pen.strokeStyle = look.link;
+    pen.lineWidth = 1.2;
+    pen.setLineDash([5, 4]);
+    pen.beginPath();
+    pen.arc(...this.plane.at(place), radius, 0, TAU);
+    pen.stroke();
+    pen.setLineDash([]);
+    pen.globalAlpha = before;
   }
 
   /** Draws the reports on one lane, from `from` to `to`; reports in flight are in its middle. */

@@ -2,7 +2,7 @@
 // figures, the hue is the robot, and the line style of all but reported ones the phase: dotted, dashed, solid.
 
 import { between, compose, controls, inverse, TAU } from "./geometry.js";
-import { held_now, leads } from "./held.js";
+import { held_now, lacks_bearing, leads } from "./held.js";
 import { fading, shape, unit } from "./pen.js";
 
 const TRAIL = { 1: { dash: [1.5, 4.5], width: 2.4 }, 2: { dash: [8, 5.5], width: 2 }, 3: { dash: [], width: 2.6 } };
@@ -10,8 +10,9 @@ const REPORTED_STYLE = { dash: [4, 4], width: 1.3 };
 const CHUNK = 64;
 const BENDS = 6;
 const MOST_TRAILS = 6;
-/** The number of directions in which a path is shown while its bearing from the anchor is unknown. */
-const TURNS = 8;
+/** The number of directions in which a path is shown, and later a robot, while its bearing from the anchor is unknown. */
+const TURNS = 8, LATER_TURNS = 4;
+const LEAST_PX = 6; // the size of robots from which on copies of them are drawn
 
 /** The poses of a trail, and the controls between two of them. */
 export const TRUE = { name: "true", pose: (player) => player?.pose, driven: (here, next) => next.executed };
@@ -50,23 +51,31 @@ export class Trails {
     });
   }
 
-  /** Draws faint copies of the true trail around the anchor, in the tick with the caption that the robot knows its path. */
+  /**
+   * Draws faint copies of the robot around its anchor while it knows its path, but not its bearing from the anchor.
+   *
+   * They are there until it meets its peer; in the tick with the caption about its path, with copies of the path.
+   */
   turned(pen, view, robot) {
-    const { store, tick, scene, look, share, moving } = view, held = store.player(tick, robot.id)?.held;
+    const { store, tick, scene, look, share, moving } = view, player = store.player(tick, robot.id), held = player?.held;
     const told = scene?.captions?.some(({ kind, robots }) => kind === "path" && robots.includes(robot.id));
-    const pose = store.player(tick, robot.id)?.pose, size = this.plane.robot_size(store), alpha = fading(share, moving);
-    if (!told || !pose || !held || held.world.length || alpha <= 0) return;
+    const pose = pose_now(view, robot, TRUE), size = this.plane.robot_size(store);
+    if (!pose || !held?.local.length || held.world.length) return;
+    const searching = [robot.id, robot.peer].every((id) => !store.places.has(id) || store.phase(tick, id) === 2);
+    if (!told && (!searching || player.contacts?.length || !lacks_bearing(held) || size <= LEAST_PX)) return;
     this.plane.marks.add("turned");
-    const [x, y] = robot.anchor, pieces = this.#pieces(store, robot, TRUE, store.first, Math.min(tick, store.last), false);
-    for (let i = 1; i < TURNS; i++) {
-      const angle = (i * TAU) / TURNS, turn = compose([x, y, angle], [-x, -y, 0]);
+    const [x, y] = robot.anchor, alpha = told ? fading(share, moving) : 0;
+    const pieces = alpha > 0 ? this.#pieces(store, robot, TRUE, store.first, Math.min(tick, store.last), false) : [];
+    const turns = alpha > 0 ? TURNS : LATER_TURNS;
+    for (let i = 1; i < turns; i++) {
+      const angle = (i * TAU) / turns, turn = compose([x, y, angle], [-x, -y, 0]);
       this.#stroked(pen, view, robot, TRUE, (stroke) => {
         pen.globalAlpha = 0.35 * alpha;
         pen.transform(Math.cos(angle), Math.sin(angle), -Math.sin(angle), Math.cos(angle), turn[0], turn[1]);
         for (const [phase, path] of pieces) stroke(path, phase);
       });
       const [at_x, at_y, heading] = compose(turn, pose);
-      pen.globalAlpha = 0.5 * alpha;
+      pen.globalAlpha = 0.5;
       shape(pen, robot.role, ...this.plane.at([at_x, at_y]), heading, 0.8 * size);
       pen.strokeStyle = look.robot[robot.role];
       pen.lineWidth = 1.2;
