@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from agent.planning.exchange import is_without_log
+from agent.planning.group import TRAVELLING
 from agent.planning.phase2_orbit import Travelling, next_side, travel_controls
 from compose.errors import BadScenario
 from compose.launch.in_process import run_mission
@@ -64,6 +65,23 @@ def test_a_group_with_noisy_ranges_is_localised_as_accurately_as_it_claims(group
         assert claim is not None
         assert claim.nees is not None
         assert claim.nees < 25.0
+
+
+def test_a_noisy_visitor_states_no_covariance_on_its_way(tmp_path: Path) -> None:
+    run_mission(group_of(3, 2, sigma=0.05), tmp_path)
+    on_the_way = at_rest = 0
+    for agent in read(tmp_path).agents.values():
+        for one in agent.steps:
+            assert one.command is not None
+            assert one.estimate is not None
+            if one.command.state == TRAVELLING:
+                assert one.estimate.covariance is None
+                on_the_way += 1
+            elif one.command.state == "localised":
+                assert one.estimate.covariance is not None
+                at_rest += 1
+    assert on_the_way > 0
+    assert at_rest > 0
 
 
 def test_each_robot_is_localised_by_one_that_is_localised_before_or_with_it() -> None:

@@ -207,9 +207,10 @@ class GroupPlanner(Planner[GroupState, Report]):
     def estimate(self, state: GroupState) -> Estimate:
         """Return all poses that the robot considers possible in its anchor's frame and in <W>.
 
-        Once it is localised, there is one.
+        Once it is localised, there is one. On the way to another robot, it has no covariance, because the
+        planner does not compute how the noise of the odometry adds up.
         """
-        estimate = exchange.estimate(state.pair)
+        estimate, latest = exchange.estimate(state.pair), state.pair.verdict
         if not isinstance(state.verdict, Localised):
             return estimate
         return replace(
@@ -217,7 +218,7 @@ class GroupPlanner(Planner[GroupState, Report]):
             world=(compose(state.frame, state.pair.odometry),),
             localised=True,
             probabilities=(),
-            covariance=state.verdict.covariance,
+            covariance=latest.covariance if isinstance(latest, Localised) else None,
         )
 
     # --- optional ---
