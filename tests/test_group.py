@@ -200,6 +200,11 @@ def test_the_gyros_that_a_refusal_asks_for_are_good_enough_and_can_be_had(max_sp
     assert validate(table, "group.toml").scenario.meetings
 
 
+def test_two_robots_that_refuse_each_other_take_part_in_the_retries_of_the_plan() -> None:
+    run = run_mission(group_of(3, 2, attacker=2, attack=SCALED))
+    assert {"r0", "r1"} <= localised(run)
+
+
 # --- visits -------------------------------------------------------------------------------------------
 
 
