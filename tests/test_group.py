@@ -163,7 +163,10 @@ def test_the_configuration_of_a_robot_names_its_group_and_its_visits() -> None:
         ),
         ({"twice": True}, "group.toml: robot.id: 2 robots have the id 'r0'"),
         ({"near": True}, "group.toml: robot[1].anchor: less than"),
-        ({"peer": True}, "group.toml: robot[1].peer: 'r1' needs a peer, because there are 3 robots"),
+        (
+            {"peer": True},
+            "robot[1].peer: 'r1' needs a peer, because other robots have one; robots form a group if none",
+        ),
     ],
 )
 def test_a_group_that_cannot_be_is_refused_in_one_line(change: dict[str, Any], what: str) -> None:
@@ -180,15 +183,26 @@ def test_a_group_that_cannot_be_is_refused_in_one_line(change: dict[str, Any], w
     assert "\n" not in str(refused.value)
 
 
-def test_the_gyros_that_a_refusal_asks_for_are_good_enough() -> None:
+@pytest.mark.parametrize("max_speed", [1.0, 0.005])
+def test_the_gyros_that_a_refusal_asks_for_are_good_enough_and_can_be_had(max_speed: float) -> None:
     table = table_of(4, 1)
-    table["mission"] |= {"noise": {"anchor_sigma": 0.05, "mutual_sigma": 0.05}, "accuracy": 0.3}
+    table["mission"] |= {
+        "max_speed": max_speed,
+        "noise": {"anchor_sigma": 0.05, "mutual_sigma": 0.05},
+        "accuracy": 0.3,
+    }
     with pytest.raises(BadScenario) as refused:
         validate(table, "group.toml")
     asked = re.search(r"calibrate the gyros to (\S+) rad/s", str(refused.value))
     assert asked is not None
+    assert float(asked[1]) > 0.0
     table["mission"]["noise"]["gyro_bias"] = float(asked[1])
     assert validate(table, "group.toml").scenario.meetings
+
+
+def test_two_robots_that_refuse_each_other_take_part_in_the_retries_of_the_plan() -> None:
+    run = run_mission(group_of(3, 2, attacker=2, attack=SCALED))
+    assert {"r0", "r1"} <= localised(run)
 
 
 # --- visits -------------------------------------------------------------------------------------------

@@ -194,8 +194,10 @@ class GroupPlanner(Planner[GroupState, Report]):
             verdict = pair.verdict if state.verdict is None else state.verdict
             state = replace(state.with_other(peer, known), frame=frame, verdict=verdict)
         refusals = [one for one in reports if exchange.is_without_log(one) and one.robot == peer]
-        if pair.verdict is None and any(
-            isinstance(one.verdict, Inconsistent | Undecided) for one in refusals
+        if (
+            pair.verdict is None
+            and not _refused(state, peer)
+            and any(isinstance(one.verdict, Inconsistent | Undecided) for one in refusals)
         ):
             return _after_refusal(state)
         return _onward(state)

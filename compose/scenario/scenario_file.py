@@ -447,7 +447,8 @@ def _peers(robots: list[RobotTable], source: str) -> dict[str, str]:
     for i, robot in enumerate(robots):
         if robot.peer is None:
             raise BadScenario(
-                f"{source}: robot[{i}].peer: '{robot.id}' needs a peer, because there are {len(ids)} robots"
+                f"{source}: robot[{i}].peer: '{robot.id}' needs a peer, because other robots have one; "
+                "robots form a group if none of them has"
             )
         if robot.peer not in ids:
             near = did_you_mean(robot.peer, ids)
