@@ -159,7 +159,8 @@ class TandemProcess:
             return holds or not self.running
 
         until(check, lambda: f"{what}\n{self.out}{self.err}")
-        assert holds or condition(), f"ended before {what}: {self.out}{self.err}"
+        status = self._process.poll()
+        assert holds or condition(), f"ended with status {status} before {what}: {self.out}{self.err}"
 
     def until_prints(self, words: str) -> None:
         """Wait until the command has printed `words` on either stream."""
