@@ -1,4 +1,4 @@
-"""What shows a run shows a group: who meets whom at any time, and how localisation spreads."""
+"""The views of a group: who meets whom at any time, and how localisation spreads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a reader who knows nothing needs: captions that follow the drawing, a legend, legible labels."""
+"""Guided play for a reader who knows nothing: captions that follow the drawing, a legend, legible labels."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ STORY = """() => ({
   marks: [...document.querySelectorAll('#legend li')].map((one) => one.textContent),
   busy: document.getElementById('play').getAttribute('aria-label') === 'Pause',
 })"""
-"""What guided play shows."""
+"""A function of the page that returns the content of guided play."""
 
 
 def played(page: Page, tick: int) -> Iterator[dict[str, Any]]:
@@ -158,7 +158,7 @@ SEEN = {
     "deuteranopia": ((0.367, 0.861, -0.228), (0.280, 0.673, 0.047), (-0.012, 0.043, 0.969)),
     "protanopia": ((0.152, 1.053, -0.205), (0.115, 0.786, 0.099), (-0.004, -0.048, 1.052)),
 }
-"""What is seen of linear red, green and blue: Machado, Oliveira and Fernandes (2009), severity 1."""
+"""The matrices from linear red, green and blue to those perceived (Machado et al. 2009, severity 1)."""
 LEAST_DIFFERENCE = 20.0
 """The least difference of two colours in CIELAB; from about 10 on, they are told apart at a glance."""
 

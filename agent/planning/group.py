@@ -69,7 +69,7 @@ With exact sensors, a robot that is not in range at the end of the way is not th
 
 
 class Other(msgspec.Struct, frozen=True):
-    """What a robot knows of another one of its group, besides the logs of their present meeting."""
+    """The knowledge of a robot about another one of its group, besides the logs of their present meeting."""
 
     mutual: tuple[Ranged, ...] = ()
     """The ranges to it."""
@@ -101,7 +101,7 @@ class GroupState(msgspec.Struct, frozen=True):
     frame: Pose = ORIGIN
     """The pose in <W> of the odometry's frame, from the latest meeting in which the robot was localised."""
     others: Mapping[str, Other] = {}
-    """What the robot knows of the others that it has been in range of."""
+    """The knowledge about each robot that this one has been in range of, or heard of."""
     unmet: int = 0
     """The number of consecutive ticks out of range of the peer since this robot's verdict in the meeting."""
     silence: int = 0

@@ -23,7 +23,7 @@ FINE = 12
 LIKELY = 1e-3
 """The minimum probability of a hypothesis that the panels' window must contain."""
 FARTHEST = 4.0
-"""Its maximum distance from the second anchor, as a multiple of the distance of the anchors and R.
+"""The maximum distance of such a hypothesis from the second anchor, in units of D + R.
 
 The first fit of a meeting after a long way may be farther off, with a sigma as large.
 """

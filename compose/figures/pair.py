@@ -170,7 +170,7 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
 
     @property
     def newcomers(self) -> list[Role]:
-        """Those of them whose first meeting this is: for pairs, all."""
+        """The roles of the readable robots whose first meeting this is: for pairs, all."""
         return [role for role in self.readable if self.robot(role).first == 0]
 
     def states(self, role: Role) -> tuple[RobotState, ...]:

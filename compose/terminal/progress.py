@@ -32,7 +32,7 @@ CHOICES = (
 GROUP_CHOICES = tuple(
     (TICK, *[TRUTH_AT_CLAIM if column == TRUTH else column for column in columns]) for columns in CHOICES
 )
-"""Those for a group, whose robots drive on after their claims."""
+"""The sets of columns for a group, whose robots drive on after their claims."""
 LISTED = 4
 """The largest number of robots that are shown as a list if the table of all columns does not fit."""
 NAMED = 10
