@@ -413,6 +413,11 @@ class Report(Message, frozen=True):
     verdict: Verdict | None = None
     """The sender's final result; None until it has one."""
 
+    @property
+    def has_log(self) -> bool:
+        """True if this contains the log of the sender; False to a robot that it is not in a meeting with."""
+        return self.start is not None or self.through > 0
+
 
 class PlannerReport(Message, frozen=True):
     """A report whose content only the planners of the two robots understand."""

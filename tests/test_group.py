@@ -8,16 +8,17 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from agent.planning.exchange import is_without_log
 from agent.planning.group import TRAVELLING
 from agent.planning.phase2_orbit import Travelling, next_side, travel_controls
-from compose.errors import BadScenario
+from compose.errors import BadScenario, UserError
 from compose.launch.in_process import run_mission
+from compose.launch.planner_loader import planner_of
 from compose.recording.run import Run, read
 from compose.scenario.scenario_file import validate
 from protocol.messages import Localised, Report, RobotConfigInGroup
@@ -127,7 +128,7 @@ def test_a_robot_sends_its_log_only_to_the_robot_that_it_meets(tmp_path: Path) -
             for contact, framed in zip(step_.observation.contacts, step_.reports, strict=True):
                 assert isinstance(framed.report, Report)
                 if frozenset((robot, contact.peer)) not in partners:
-                    assert is_without_log(framed.report)
+                    assert not framed.report.has_log
                     assert not framed.report.runs
                     assert not framed.report.ranges
                     strangers += 1
@@ -203,6 +204,12 @@ def test_the_gyros_that_a_refusal_asks_for_are_good_enough_and_can_be_had(max_sp
 def test_two_robots_that_refuse_each_other_take_part_in_the_retries_of_the_plan() -> None:
     run = run_mission(group_of(3, 2, attacker=2, attack=SCALED))
     assert {"r0", "r1"} <= localised(run)
+
+
+def test_a_configuration_of_a_group_with_the_planner_paper_is_refused_in_one_line() -> None:
+    config = msgspec.structs.replace(group_of(3, 1).config("r0"), planner_name="paper")
+    with pytest.raises(UserError, match="robots with the planner paper meet in pairs, not in a group"):
+        planner_of(config)
 
 
 # --- visits -------------------------------------------------------------------------------------------

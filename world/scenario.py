@@ -222,8 +222,10 @@ class Scenario(
     @cached_property
     def members(self) -> tuple[Member, ...]:
         """The robots of the group, as they know each other; empty for pairs."""
-        ends = {one.visited: one.ends for one in reversed(self.meetings)}
-        ends |= {one.visitor: one.ends for one in reversed(self.meetings) if one.visitor not in ends}
+        ends: dict[str, float] = {}
+        for meeting in self.meetings:
+            ends.setdefault(meeting.visitor, meeting.ends)
+            ends.setdefault(meeting.visited, meeting.ends)
         return tuple([Member(one.id, one.anchor, ends[one.id]) for one in self.robots]) if ends else ()
 
 

@@ -111,11 +111,6 @@ def report_without_log(state: RobotState, verdict: Verdict | None) -> Report:
     )
 
 
-def is_without_log(report: Report) -> bool:
-    """Return whether `report` is one to a robot with which its sender is not in a meeting."""
-    return report.start is None and report.through == 0
-
-
 def with_reports(state: RobotState, reports: Sequence[Report]) -> RobotState:
     """Return `state` with the data of `reports`, and with a verdict if a report gives reason for one.
 

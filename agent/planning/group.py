@@ -129,23 +129,18 @@ class GroupPlanner(Planner[GroupState, Report]):
 
     def __init__(self, pair_planner: LogPlanner) -> None:
         """`pair_planner` decides in each meeting."""
-        self._pair = pair_planner
+        self.pair_planner = pair_planner
         self.REQUIRED_PLACES = pair_planner.REQUIRED_PLACES
-
-    @property
-    def pair_planner(self) -> LogPlanner:
-        """The planner of each meeting."""
-        return self._pair
 
     # --- decisions ---
 
     def start(self, config: RobotConfig) -> GroupState:
         """Return the state of a robot that has measured nothing yet."""
-        return GroupState(self._pair.start(config))
+        return GroupState(self.pair_planner.start(config))
 
     def observe(self, state: GroupState, observation: Observation) -> GroupState:
         """Return `state` with the sensor data of one tick, ranges to all robots of the group included."""
-        pair = self._pair.observe(state.pair, observation)
+        pair = self.pair_planner.observe(state.pair, observation)
         if pair.in_contact and _refused(state, pair.config.peer):
             pair = replace(pair, in_contact=False)
         for contact in observation.contacts:
@@ -178,14 +173,13 @@ class GroupPlanner(Planner[GroupState, Report]):
     def decide(self, state: GroupState, reports: Sequence[Report] = ()) -> GroupState:
         """Return `state` with the `reports` of others, and in the next meeting if this one has ended."""
         for one in reports:
-            without_log = exchange.is_without_log(one)
-            if one.state == TRAVELLING or (without_log and isinstance(one.verdict, Localised)):
+            if one.state == TRAVELLING or (not one.has_log and isinstance(one.verdict, Localised)):
                 state = state.with_other(one.robot, replace(state.other(one.robot), localised=True))
-        logs = [one for one in reports if not exchange.is_without_log(one)]
+        logs = [one for one in reports if one.has_log]
         state = _answering(state, [one.robot for one in logs if one.state == TRAVELLING])
         peer, before = state.pair.config.peer, state.pair
         of_peer = [] if _refused(state, peer) else [one for one in logs if one.robot == peer]
-        pair = self._pair.decide(before, of_peer)
+        pair = self.pair_planner.decide(before, of_peer)
         silence = state.silence + 1 if pair.in_contact and not of_peer else 0
         state = replace(state, pair=pair, silence=silence)
         if isinstance(pair.verdict, Localised) and before.verdict is None:
@@ -193,7 +187,7 @@ class GroupPlanner(Planner[GroupState, Report]):
             known = replace(state.other(peer), localised=True)
             verdict = pair.verdict if state.verdict is None else state.verdict
             state = replace(state.with_other(peer, known), frame=frame, verdict=verdict)
-        refusals = [one for one in reports if exchange.is_without_log(one) and one.robot == peer]
+        refusals = [one for one in reports if one.robot == peer and not one.has_log]
         if (
             pair.verdict is None
             and not _refused(state, peer)
@@ -204,7 +198,7 @@ class GroupPlanner(Planner[GroupState, Report]):
 
     def command(self, state: GroupState) -> Command:
         """Return the command for the next tick, with the phase, the mode and the robot's verdict."""
-        return replace(self._pair.command(state.pair), verdict=state.verdict)
+        return replace(self.pair_planner.command(state.pair), verdict=state.verdict)
 
     def estimate(self, state: GroupState) -> Estimate:
         """Return all poses that the robot considers possible in its anchor's frame and in <W>.
@@ -227,19 +221,19 @@ class GroupPlanner(Planner[GroupState, Report]):
 
     def malformed(self, body: Report) -> str | None:
         """Return the reason why the log in a report is malformed, or None."""
-        return self._pair.malformed(body)
+        return self.pair_planner.malformed(body)
 
     def summary(self, state: GroupState) -> Summary:
         """Return the numbers of the latest meeting, but those of ranges and reports for all of them."""
-        return replace(self._pair.summary(state.pair), mutual_ranges=None, reports_heard=None)
+        return replace(self.pair_planner.summary(state.pair), mutual_ranges=None, reports_heard=None)
 
     def misreport(self, body: Report, observations: Sequence[Observation]) -> str | None:
         """Return how the manoeuvres and ranges in a report differ from the robot's own; None if not."""
-        return self._pair.misreport(body, observations)
+        return self.pair_planner.misreport(body, observations)
 
     def required_mutual_ranges(self, mission: Mission) -> int:
         """Return the minimum number of noisy mutual ranges before a claim."""
-        return self._pair.required_mutual_ranges(mission)
+        return self.pair_planner.required_mutual_ranges(mission)
 
 
 # --- meetings -----------------------------------------------------------------------------------------
@@ -378,15 +372,17 @@ def _next_visit(state: GroupState) -> GroupState:
 
 
 def _is_late(state: GroupState, member: Member) -> bool:
-    """Return whether `member` should be localised by now, and may still wait for a visitor.
+    """Return whether `member`, which should be localised by now, may still wait for a visitor.
 
     A robot that was not there is visited again after as long as the whole plan takes.
     """
-    known, now, config = state.other(member.robot), _now(state.pair), state.config
-    if known.localised or known.failed or now <= member.ends:
+    known, config = state.other(member.robot), state.config
+    if known.localised or known.failed:
         return False
-    period = config.mission.period
-    return known.missed is None or now - known.missed * period > max(one.ends for one in config.members)
+    if known.missed is None:
+        return True
+    ago = (state.pair.tick - known.missed) * config.mission.period
+    return ago > max(one.ends for one in config.members)
 
 
 def _on_visit(state: GroupState, peer: str) -> GroupState:

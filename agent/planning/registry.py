@@ -21,16 +21,13 @@ class Assured(AssuredExact):
         return AssuredExact() if mission.noise.exact else AccuracySeeking()
 
 
-GROUPS: dict[str, type[Assured]] = {"assured": Assured}
-"""The classes of the shipped planners with which robots can form a group."""
-
 SHIPPED: dict[str, type[Planner[Any, Any]]] = {"assured": Assured, "paper": Paper}
 """The classes of the shipped planners."""
 
 
-def group_planner(name: str, mission: Mission) -> Planner[Any, Any]:
-    """Return the shipped planner `name` for a robot in a group. Raises KeyError if there is none."""
-    return GroupPlanner(GROUPS[name]().suited(mission))
+def group_planner(mission: Mission) -> Planner[Any, Any]:
+    """Return the planner `assured` for a robot in a group."""
+    return GroupPlanner(Assured().suited(mission))
 
 
 def planner(name: str, mission: Mission) -> Planner[Any, Any]:

@@ -29,8 +29,8 @@ class AgentLink:
 
     def __init__(self, config: RobotConfig, run: str, inbox: Inbox) -> None:
         self._id = config.robot
-        in_group = isinstance(config, RobotConfigInGroup)
-        self._senders = "*" if in_group else config.peer
+        self._peer = config.peer
+        self._senders = "*" if isinstance(config, RobotConfigInGroup) else config.peer
         """The robots whose Reports are received: the peer, or in a group all robots."""
         self._run = run
         self._inbox = inbox
@@ -43,7 +43,7 @@ class AgentLink:
         me, run = self._id, self._run
         self._session = link
         self._command = session.publisher(link, keys.command(run, me))
-        self._reports: dict[str, zenoh.Publisher] = {}
+        self._reports = {self._peer: session.publisher(link, keys.report(run, me, self._peer))}
         self._estimate = session.publisher(link, keys.estimate(run, me))
         session.on_matching(self._estimate, self._want_estimate)
         session.subscribe_directly(link, keys.observation(run, me), self._inbox, "observation")

@@ -32,6 +32,10 @@ _trusted: set[str] = set()
 """The names that the user of this process has given."""
 
 
+GROUP_PLANNER = "assured"
+"""The planner with which robots can form a group."""
+
+
 class UntrustedPlanner(UserError):
     """A recording or a world names a planner that the user of this process has not named."""
 
@@ -91,9 +95,11 @@ def planner_copy(name: str, options: Mapping[str, Any], mission: Mission) -> Pla
 def planner_of(config: RobotConfig) -> Planner[Any, Any]:
     """Return the planner of the robot with this configuration. Raises like `planner`."""
     if isinstance(config, RobotConfigInGroup):
+        if config.planner_name != GROUP_PLANNER:
+            raise UserError(f"robots with the planner {config.planner_name} meet in pairs, not in a group")
         from agent.planning import registry  # noqa: PLC0415  # it imports numpy
 
-        return registry.group_planner(config.planner_name, config.mission)
+        return registry.group_planner(config.mission)
     return planner(config.planner_name, config.planner_options, config.mission)
 
 

@@ -57,7 +57,7 @@ class PastMeeting(msgspec.Struct, frozen=True):
 
 def has_log(report: PeerReport) -> bool:
     """Return whether `report` is to a robot with which its sender is in a meeting."""
-    return isinstance(report, Report) and (report.start is not None or report.through > 0)
+    return isinstance(report, Report) and report.has_log
 
 
 def senders(observation: Observation) -> list[str]:

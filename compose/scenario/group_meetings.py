@@ -15,9 +15,6 @@ from protocol.mission import Mission, Role
 from protocol.orbits import Rendezvous, meeting_ticks, pair_ticks, visiting
 from world.scenario import PlannedMeeting, PlannedRetry
 
-PLANNERS = ("assured",)
-"""The planners with which robots can form a group."""
-
 NEIGHBOURS = 3
 """The number of nearest anchors among which a robot's first peer is chosen, in a large group."""
 
@@ -66,7 +63,7 @@ def group_meetings(robots: Sequence[RobotTable], mission: Mission, planner: Plan
 
     Raises Unworkable if the planner is not made for groups.
     """
-    if planner.name not in PLANNERS:
+    if planner.name != planner_loader.GROUP_PLANNER:
         raise Unworkable(
             f"planner.name: robots with the planner {planner.name} meet in pairs: set robot.peer"
         )

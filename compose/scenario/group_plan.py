@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from math import inf, sqrt
 
 import msgspec
@@ -25,18 +26,25 @@ class PlannedVisit(msgspec.Struct, frozen=True, array_like=True):
     """The visitor is not localised before: a seed pair."""
 
 
-class GroupPlan(msgspec.Struct, frozen=True):
+class GroupPlan(msgspec.Struct, frozen=True, dict=True):
     """The meetings that localise a group, each robot's in order."""
 
     meetings: tuple[PlannedVisit, ...]
     """The meetings in the order of their ends."""
     bound: float
     """The bound in s of the time at which all are localised."""
-    travel_lower_bound: float
-    """A lower bound in s of the bound of any plan: of seed pairs and travel alone, with no time for meetings.
+    travel: MeetingTimes
+    """The bounds of seed pairs, and of travel alone."""
 
-    The least bound of such plans up to MOST_OPTIMAL robots; beyond, that of the robot that is reached last.
-    """
+    @cached_property
+    def travel_lower_bound(self) -> float:
+        """A lower bound in s of the bound of any plan: of seed pairs and travel, with no time for meetings.
+
+        The least bound of such plans up to MOST_OPTIMAL robots; beyond, that of the robot reached last.
+        """
+        if len(self.travel.robots) <= MOST_OPTIMAL:
+            return max(optimal_forest(self.travel).ends(self.travel).values())
+        return self.travel.earliest_end()
 
 
 def group_plan(
@@ -68,7 +76,7 @@ def group_plan(
         msgspec.structs.replace(each, visitor=order[each.visitor], visited=order[each.visited])
         for each in planned_meetings(forest, times)
     )
-    return GroupPlan(meetings, meetings[-1].ends, _travel_lower_bound(MeetingTimes(seed, travel)))
+    return GroupPlan(meetings, meetings[-1].ends, MeetingTimes(seed, travel))
 
 
 def planned_meetings(forest: WakeUpForest, times: MeetingTimes) -> list[PlannedVisit]:
@@ -87,13 +95,6 @@ def planned_meetings(forest: WakeUpForest, times: MeetingTimes) -> list[PlannedV
         visitors[robot] = place if robot == max(branches, key=last.__getitem__) else visitors[place]
         meetings.append(PlannedVisit(visitors[robot], robot, ends[robot]))
     return sorted(meetings, key=lambda meeting: meeting.ends)
-
-
-def _travel_lower_bound(times: MeetingTimes) -> float:
-    """Return the least last end for `times` up to MOST_OPTIMAL robots, and a lower bound of it beyond."""
-    if len(times.robots) <= MOST_OPTIMAL:
-        return max(optimal_forest(times).ends(times).values())
-    return times.earliest_end()
 
 
 def _distance(a: tuple[float, float], b: tuple[float, float]) -> float:
