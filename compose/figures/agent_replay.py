@@ -6,7 +6,8 @@ from typing import Any
 
 import msgspec
 
-from agent.planning.group import GroupPlanner, GroupState
+from agent.planning.group import GroupPlanner
+from agent.planning.group_state import GroupState
 from agent.planning.planner import Planner
 from agent.planning.state import RobotState
 from agent.process.agent_journal import AgentHistory

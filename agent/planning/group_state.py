@@ -1,0 +1,66 @@
+"""The state of a robot of a group: its present meeting, and its knowledge about the other robots."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import msgspec
+from msgspec.structs import replace
+
+from agent.planning.state import RobotState
+from protocol.messages import Ranged, RobotConfigInGroup, Verdict
+from protocol.motion import ORIGIN, Pose
+
+
+class Other(msgspec.Struct, frozen=True):
+    """The knowledge of a robot about another one of its group, besides the logs of their present meeting."""
+
+    mutual: tuple[Ranged, ...] = ()
+    """The ranges to it."""
+    localised: bool = False
+    """True once it has reported that it is localised."""
+    failed: bool = False
+    """True once a meeting with it has failed: this robot does not meet it again."""
+    missed: int | None = None
+    """The latest tick in which this robot has not found it where it should wait; None if there is none."""
+
+
+class GroupState(msgspec.Struct, frozen=True):
+    """The state of a robot of a group."""
+
+    pair: RobotState
+    """The state in the present meeting. Its configuration names the peer and the role."""
+    visits: int = 0
+    """The number of planned visits that the robot has begun or left out."""
+    retries: int = 0
+    """The number of retries whose time has come."""
+    until: float | None = None
+    """The time in s at which the search of a retry ends; None if there is none."""
+    visiting: bool = False
+    """True if the present meeting is a visit: the robot knows its pose already."""
+    verdict: Verdict | None = None
+    """The verdict of the robot: that of the meeting which localised it."""
+    failure: Verdict | None = None
+    """The verdict of the latest meeting that has failed before the robot was localised."""
+    frame: Pose = ORIGIN
+    """The pose in <W> of the odometry's frame, from the latest meeting in which the robot was localised."""
+    others: Mapping[str, Other] = {}
+    """The knowledge about each robot that this one has been in range of, or heard of."""
+    unmet: int = 0
+    """The number of consecutive ticks out of range of the peer since this robot's verdict in the meeting."""
+    silence: int = 0
+    """The number of consecutive ticks in range of the peer without a log of it."""
+
+    @property
+    def config(self) -> RobotConfigInGroup:
+        """The configuration, with the peer and the role of the present meeting."""
+        assert isinstance(self.pair.config, RobotConfigInGroup)
+        return self.pair.config
+
+    def other(self, robot: str) -> Other:
+        """Return what the robot knows of `robot`."""
+        return self.others.get(robot, Other())
+
+    def with_other(self, robot: str, known: Other) -> GroupState:
+        """Return this state with what the robot now knows of `robot`."""
+        return replace(self, others={**self.others, robot: known})

@@ -1,0 +1,258 @@
+"""The transitions of a robot in a group: from one meeting to the next, and on the way to a visit.
+
+All functions are pure. `GroupPlanner` calls them; within a meeting, the planner of a pair decides.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from msgspec.structs import replace
+
+from agent.estimation.knowledge import Belief
+from agent.planning import phase2_orbit, transitions
+from agent.planning.group_state import GroupState
+from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Travelling
+from agent.planning.state import Done, RobotState
+from protocol.messages import Localised, Member, Undecided
+from protocol.mission import Role
+from protocol.motion import Pose, compose, inverse
+from protocol.orbits import Rendezvous
+
+SHORT_OF_ANCHOR = 0.5
+"""The distance from the visited robot's anchor at which a visitor stops, as a fraction of R.
+
+The robot waits R / 8 from its anchor, so it is in range there; and on the anchor, the ranges to it would not
+depend on where it waits.
+"""
+
+PARTED_AFTER = 8
+"""The ticks out of range of a peer after which a robot whose meeting has ended goes on.
+
+As long as it has not heard of the peer's verdict, it waits for it. A peer that goes on has heard this
+robot's verdict before.
+"""
+
+SILENT_AFTER = 200
+"""The ticks in contact without a report after which a robot takes its peer for lost."""
+
+SIDES = 12
+"""The number of sides of the square spiral on which a visitor searches. Its radius is then three times R.
+
+With exact sensors, a robot that is not in range at the end of the way is not there.
+"""
+
+
+# --- meetings -----------------------------------------------------------------------------------------
+
+
+def answering(state: GroupState, visitors: Sequence[str]) -> GroupState:
+    """Return `state` in a meeting with one of `visitors`, which have come to it, if it waits for one."""
+    pair = state.pair
+    if state.verdict is not None or pair.belief.phase1_done_tick is None or pair.config.peer in visitors:
+        return state
+    if pair.in_contact and not refused(state, pair.config.peer) and state.silence <= SILENT_AFTER:
+        return state
+    for visitor in visitors:
+        if not refused(state, visitor):
+            return _waiting(state, visitor)
+    return state
+
+
+def refused(state: GroupState, robot: str) -> bool:
+    """Return whether this robot, which is not localised, has had a meeting with `robot` that failed."""
+    return state.verdict is None and state.other(robot).failed
+
+
+def after_refusal(state: GroupState) -> GroupState:
+    """Return `state` of a robot whose peer has ended their meeting, because it contradicts what it knows."""
+    if state.visiting:
+        return _next_visit(_after_meeting(state))
+    peer = state.config.peer
+    failure = Undecided(f"{peer} does not go on with the meeting")
+    return _waiting(_after_meeting(replace(state, failure=failure)), peer)
+
+
+def onward(state: GroupState) -> GroupState:
+    """Return `state` in the next meeting if the present one is over."""
+    pair, peer = state.pair, state.pair.config.peer
+    if not isinstance(state.verdict, Localised):
+        return _after_failure(state)
+    if state.visiting and pair.verdict is None:
+        if state.other(peer).localised:  # by another robot
+            return _next_visit(state)
+        if _has_searched(state):
+            known = replace(state.other(peer), missed=pair.tick)
+            return _next_visit(state.with_other(peer, known))
+        if state.silence > SILENT_AFTER:
+            return _next_visit(_after_meeting(state))
+        return state
+    if not isinstance(pair.mode, Done):
+        return state
+    if not isinstance(pair.verdict, Localised):
+        return _next_visit(_after_meeting(state))
+    over = pair.peer_state.verdict is not None or state.unmet >= PARTED_AFTER
+    return _next_visit(state) if over else state
+
+
+def _after_failure(state: GroupState) -> GroupState:
+    """Return `state`, of a robot that is not localised: if its meeting has failed, it waits for another one.
+
+    It gives up in the end, with the verdict of its latest meeting; at once if its own phase 1 has failed.
+    """
+    pair, config = state.pair, state.config
+    if pair.belief.phase1_done_tick is None:
+        return replace(state, verdict=pair.verdict)
+    now = _now(pair)
+    if now >= config.gives_up:
+        late = Undecided(f"not localised after {now:g} s")
+        return replace(state, verdict=pair.verdict or state.failure or late)
+    if pair.verdict is not None:
+        state = _waiting(_after_meeting(replace(state, failure=pair.verdict)), config.peer)
+    elif state.until is not None and now >= state.until and not pair.in_contact:
+        state = _waiting(replace(state, until=None), config.peer)
+    return _trying_again(state)
+
+
+def _trying_again(state: GroupState) -> GroupState:
+    """Return `state` of a robot that is not localised, in the retry whose time has come."""
+    pair, config = state.pair, state.config
+    if state.retries >= len(config.retries) or _now(pair) < config.retries[state.retries].begins:
+        return state
+    retry = config.retries[state.retries]
+    state = replace(state, retries=state.retries + 1)
+    if (pair.in_contact and not refused(state, config.peer)) or refused(state, retry.peer):
+        return state
+    if retry.role == "b":
+        return _waiting(state, retry.peer, retry.rendezvous)
+    until = _now(pair) + retry.lasts
+    return replace(_aligned(_in_meeting(state, retry.peer, "a", retry.rendezvous)), until=until)
+
+
+def _now(pair: RobotState) -> float:
+    """Return the time since tick 0 in s."""
+    return pair.tick * pair.config.mission.period
+
+
+def _after_meeting(state: GroupState) -> GroupState:
+    """Return `state` of a robot whose meeting has failed, and which does not meet its peer again."""
+    peer = state.config.peer
+    return state.with_other(peer, replace(state.other(peer), failed=True))
+
+
+def _waiting(state: GroupState, peer: str, orbits: Rendezvous | None = None) -> GroupState:
+    """Return `state` of a robot that waits beside its anchor, in a meeting with `peer`."""
+    before = state.pair.mode
+    state = _in_meeting(state, peer, "b", orbits)
+    pair = state.pair
+    if isinstance(before, Orbiting | Aligning | Radial):
+        return replace(state, pair=replace(pair, mode=before))
+    return _aligned(state)
+
+
+def _aligned(state: GroupState) -> GroupState:
+    """Return `state` on the way to its orbit or its waiting place."""
+    pair = state.pair
+    mu = phase2_orbit.orientation(pair.local_pose)
+    return replace(state, pair=transitions.continue_phase2(pair, Aligning(pair.odometry.heading - mu)))
+
+
+def _next_visit(state: GroupState) -> GroupState:
+    """Return `state` on the way to the next robot; as it is if there is none.
+
+    After the planned visits, it is the nearest one that should be localised by now, and has not reported it.
+    """
+    visits, config = state.visits, state.config
+    while visits < len(config.visits):
+        peer = config.visits[visits]
+        visits += 1
+        if not (state.other(peer).localised or state.other(peer).failed):
+            return _on_visit(replace(state, visits=visits), peer)
+    here, now = compose(state.frame, state.pair.odometry), _now(state.pair)
+    late = [
+        (math.hypot(one.anchor.x - here.x, one.anchor.y - here.y), one.robot)
+        for one in config.members
+        if one.ends < now and one.robot != config.robot and _is_late(state, one)  # few are
+    ]
+    state = replace(state, visits=visits)
+    return _on_visit(state, min(late)[1]) if late else state
+
+
+def _is_late(state: GroupState, member: Member) -> bool:
+    """Return whether `member`, which should be localised by now, may still wait for a visitor.
+
+    A robot that was not there is visited again after as long as the whole plan takes.
+    """
+    known, config = state.other(member.robot), state.config
+    if known.localised or known.failed:
+        return False
+    if known.missed is None:
+        return True
+    ago = (state.pair.tick - known.missed) * config.mission.period
+    return ago > max(one.ends for one in config.members)
+
+
+def _on_visit(state: GroupState, peer: str) -> GroupState:
+    """Return `state` of a localised robot that drives to `peer`."""
+    state = _in_meeting(state, peer, "a")
+    pair = replace(state.pair, mode=Travelling(stop(state.frame, state.pair)))
+    return replace(state, pair=pair, visiting=True)
+
+
+def _in_meeting(state: GroupState, peer: str, role: Role, orbits: Rendezvous | None = None) -> GroupState:
+    """Return `state` in a new meeting with `peer`, of which the robot knows only its ranges to it."""
+    pair = state.pair
+    before = state.other(pair.config.peer)
+    state = state.with_other(pair.config.peer, replace(before, mutual=pair.mutual))
+    belief = pair.belief
+    fresh = RobotState(
+        state.config.in_meeting(peer, role, orbits),
+        tick=pair.tick,
+        odometry=pair.odometry,
+        log=pair.log,
+        leg=pair.leg,
+        mutual=state.other(peer).mutual,
+        in_contact=bool(state.other(peer).mutual) and state.other(peer).mutual[-1].tick == pair.tick,
+        belief=Belief(
+            possible=belief.possible,
+            branch=belief.branch,
+            branch_kind=belief.branch_kind,
+            phase1_done_tick=belief.phase1_done_tick,
+            own_anchor=belief.own_anchor,
+            own=belief.own,
+            branches=belief.branches,
+            ranges_at_last_fit=belief.ranges_at_last_fit,
+        ),
+    )
+    return replace(state, pair=fresh, visiting=False, unmet=0, silence=0)
+
+
+# --- visits -------------------------------------------------------------------------------------------
+
+
+def searching(pair: RobotState) -> RobotState:
+    """Return `pair`, a visitor out of range; if it has arrived, on the next side of the search."""
+    assert isinstance(pair.mode, Travelling)
+    mission, tolerance = pair.config.mission, pair.estimator.pose_tolerance
+    if phase2_orbit.travel_controls(pair.mode, pair.odometry, mission, tolerance) is not None:
+        return pair
+    return replace(pair, mode=phase2_orbit.next_side(pair.mode, mission))
+
+
+def _has_searched(state: GroupState) -> bool:
+    """Return whether the robot has searched for its peer in vain."""
+    assert isinstance(state.verdict, Localised)
+    mode = state.pair.mode
+    return isinstance(mode, Travelling) and mode.side > (0 if state.verdict.covariance is None else SIDES)
+
+
+def stop(frame: Pose, pair: RobotState) -> tuple[float, float]:
+    """Return the place of a visit, in m in the odometry's frame: on the way to the anchor, short of it."""
+    peer_anchor = pair.config.peer_anchor
+    anchor = compose(inverse(frame), Pose(peer_anchor.x, peer_anchor.y, 0.0))
+    dx, dy = anchor.x - pair.odometry.x, anchor.y - pair.odometry.y
+    distance = math.hypot(dx, dy)
+    short = SHORT_OF_ANCHOR * pair.config.mission.sensing_range
+    share = 1.0 - short / distance if distance > short else 0.0
+    return pair.odometry.x + share * dx, pair.odometry.y + share * dy
