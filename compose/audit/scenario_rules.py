@@ -9,8 +9,8 @@ from compose.audit.findings import Checks, Violation, difference
 from compose.errors import Unworkable
 from compose.launch import planner_loader
 from compose.recording.run import Run
+from compose.scenario.first_meetings import NEAREST_ANCHORS
 from compose.scenario.group_meetings import FirstMeeting, GroupMeetings, group_meetings
-from compose.scenario.scenario_file import NEAREST_ANCHORS
 from compose.scenario.scenario_tables import PlannerTable, RobotTable
 from protocol.attack import OF_THE_START
 from protocol.messages import RobotConfig, RobotConfigInGroup

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 import random
-from collections import Counter
 from collections.abc import Mapping, Sequence
-from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,8 @@ from msgspec.structs import asdict
 from compose.errors import BadFault, BadKill, BadScenario, Unworkable, UserError
 from compose.launch import model_loader, planner_loader
 from compose.scenario.fault_syntax import FaultTable, added, table_of
-from compose.scenario.group_meetings import FirstMeeting, GroupMeetings, group_meetings
+from compose.scenario.first_meetings import linked, meetings_of, pair_meetings
+from compose.scenario.group_meetings import GroupMeetings
 from compose.scenario.kills import WORLD, Kill, drawn
 from compose.scenario.scenario_tables import MAX_TICKS, PlannerTable, RobotTable, ScenarioFile
 from compose.scenario.shipped_files import misplaced, shipped, unknown
@@ -26,14 +25,12 @@ from protocol.messages import AnyRobotConfig
 from protocol.mission import (
     Anchor,
     Mission,
-    infeasibility,
     noise_infeasibility,
     safety_infeasibility,
 )
 from protocol.motion import TAU, Pose, wrap
 from protocol.noise import with_profile
-from protocol.orbits import Rendezvous, tick_budget
-from protocol.rounding import TOLERANCE
+from protocol.orbits import tick_budget
 from protocol.spelling import did_you_mean
 from protocol.wire import MalformedFrame, decode, encode
 from world.faults import Fault, delivery_time_bound
@@ -49,8 +46,6 @@ from world.world_noise import world_noise_infeasibility, world_noise_mistake
 
 EXCHANGES = 20
 """The number of reports for each of which `max_ticks` allows the full `delivery_time_bound`."""
-NEAREST_ANCHORS = TOLERANCE
-"""The minimum distance in m of two anchors: nearer ones coincide at the accuracy of exact claims."""
 WITHIN = 1.0 - 1e-9
 """The part of R within which starts are drawn, so that rounding cannot move one outside."""
 
@@ -211,10 +206,10 @@ def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scena
     """Return the scenario of `file`, with the faults of the `--fault` options added to its own."""
     _check_noise(file.mission, source)
     _check_planner(file.planner, source)
-    meetings = _meetings(file, source)
-    first = meetings.first if meetings is not None else _first_meetings(file, source)
-    linked = _linked(file.robot, first, in_group=meetings is not None)
-    _check_world_noise(file, linked, source)
+    meetings = meetings_of(file, source)
+    first = meetings.first if meetings is not None else pair_meetings(file, source)
+    links = linked(file.robot, first, in_group=meetings is not None)
+    _check_world_noise(file, links, source)
     _check_models(file, source)
     placed: list[RobotSpec] = []
     for i, robot in enumerate(file.robot):
@@ -232,7 +227,7 @@ def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scena
             )
         peer, role, orbits = first[robot.id]
         placed.append(RobotSpec(robot.id, peer, role, Anchor(*robot.anchor), start, orbits, robot.attack))
-    faults = _faults(file, options, linked, source)
+    faults = _faults(file, options, links, source)
     if meetings is not None:
         budget = math.ceil(meetings.latest / file.mission.period)
     else:
@@ -282,49 +277,6 @@ def _with_world(scenario: Scenario, file: ScenarioFile, meetings: GroupMeetings 
     if not file.world.noise.changes_nothing(file.mission.noise):
         return ScenarioWithWorldNoise(**asdict(scenario), world_noise=file.world.noise)
     return scenario
-
-
-def _meetings(file: ScenarioFile, source: str) -> GroupMeetings | None:
-    """Return the meetings of the group that the robots form; None if they form pairs.
-
-    Raises BadScenario and Unworkable.
-    """
-    robots = file.robot
-    if len(robots) == 2 or any(robot.peer is not None for robot in robots):
-        return None
-    _check_ids(robots, source)
-    for j, robot in enumerate(robots):
-        for other in robots[:j]:
-            _check_distance(file, other, robot, f"{source}: robot[{j}].anchor", f"'{other.id}'", source)
-    try:
-        return group_meetings(robots, file.mission, file.planner)
-    except Unworkable as error:
-        raise Unworkable(f"{source}: {error}") from None
-
-
-def _first_meetings(file: ScenarioFile, source: str) -> dict[str, FirstMeeting]:
-    """Return the meeting of each robot with its peer. Raises BadScenario and Unworkable."""
-    peers = _peers(file.robot, source)
-    place = {robot.id: i for i, robot in enumerate(file.robot)}
-    found: dict[str, FirstMeeting] = {}
-    for i, robot in enumerate(file.robot):
-        peer = peers[robot.id]
-        if i < place[peer]:
-            orbits = _plan(file, i, place[peer], source)
-            found[robot.id], found[peer] = (
-                FirstMeeting(peer, "a", orbits),
-                FirstMeeting(robot.id, "b", orbits),
-            )
-    return found
-
-
-def _linked(
-    robots: Sequence[RobotTable], first: Mapping[str, FirstMeeting], *, in_group: bool
-) -> list[tuple[str, str]]:
-    """Return the pairs of robots that can exchange reports, each in both orders."""
-    if in_group:
-        return list(permutations([robot.id for robot in robots], 2))
-    return [(robot.id, first[robot.id].peer) for robot in robots]
 
 
 def _faults(
@@ -396,71 +348,6 @@ def _check_models(file: ScenarioFile, source: str) -> None:
             f"{source}: world.range: the robots are told that all sensors are exact, and cannot localise "
             "themselves with others: set mission.noise"
         )
-
-
-def _plan(file: ScenarioFile, first: int, second: int, source: str) -> Rendezvous:
-    """Return the rendezvous orbits of the pair of robots at the places `first` and `second` in the file."""
-    one, other = file.robot[first], file.robot[second]
-    distance = _check_distance(
-        file, one, other, f"{source}: robot[{second}].anchor", f"its peer '{one.id}'", source
-    )
-    return planner_loader.orbits(file.planner.name, file.planner.options, file.mission, distance)
-
-
-def _check_distance(
-    file: ScenarioFile, one: RobotTable, other: RobotTable, field: str, whose: str, source: str
-) -> float:
-    """Return the distance in m of the anchors of two robots that may meet.
-
-    Raises BadScenario if it is too small, Unworkable if they could not localise themselves.
-    """
-    distance = math.dist(one.anchor, other.anchor)
-    if distance < NEAREST_ANCHORS:
-        raise BadScenario(f"{field}: less than {NEAREST_ANCHORS:g} m from the anchor of {whose}")
-    why = infeasibility(file.mission, distance)
-    if why is not None:
-        raise Unworkable(f"{source}: mission: {why}")
-    if not file.mission.noise.exact:
-        # imports numpy, which scenarios with exact sensors do not need
-        from agent.estimation.gaussian.reachable_accuracy import forbidding_prior  # noqa: PLC0415
-
-        why = forbidding_prior(file.mission, distance)
-        if why is not None:
-            raise Unworkable(f"{source}: mission.{why}")
-    return distance
-
-
-def _check_ids(robots: Sequence[RobotTable], source: str) -> None:
-    """Raise BadScenario if two robots have the same id."""
-    for name, count in Counter(robot.id for robot in robots).items():
-        if count > 1:
-            raise BadScenario(f"{source}: robot.id: {count} robots have the id '{name}'")
-
-
-def _peers(robots: list[RobotTable], source: str) -> dict[str, str]:
-    """Return the peer of each robot. With two robots, each is the peer of the other by default."""
-    _check_ids(robots, source)
-    ids = [robot.id for robot in robots]
-    if len(robots) == 2 and all(robot.peer is None for robot in robots):
-        return {ids[0]: ids[1], ids[1]: ids[0]}
-    peers = {}
-    for i, robot in enumerate(robots):
-        if robot.peer is None:
-            raise BadScenario(
-                f"{source}: robot[{i}].peer: '{robot.id}' needs a peer, because other robots have one; "
-                "robots form a group if none of them has"
-            )
-        if robot.peer not in ids:
-            near = did_you_mean(robot.peer, ids)
-            raise BadScenario(f"{source}: robot[{i}].peer: there is no robot '{robot.peer}'{near}")
-        peers[robot.id] = robot.peer
-    for i, robot in enumerate(robots):
-        if peers[robot.id] == robot.id or peers[peers[robot.id]] != robot.id:
-            raise BadScenario(
-                f"{source}: robot[{i}].peer: '{robot.id}' names '{robot.peer}', whose peer is "
-                f"'{peers[peers[robot.id]]}'; robots must form pairs"
-            )
-    return peers
 
 
 def _start(robot: RobotTable, sensing_range: float, seed: int) -> Pose:

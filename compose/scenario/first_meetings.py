@@ -1,0 +1,128 @@
+"""The first meeting of each robot of a scenario file: with its peer, or as the group's plan has it."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from itertools import permutations
+
+from compose.errors import BadScenario, Unworkable
+from compose.launch import planner_loader
+from compose.scenario.group_meetings import FirstMeeting, GroupMeetings, group_meetings
+from compose.scenario.scenario_tables import RobotTable, ScenarioFile
+from protocol.mission import infeasibility
+from protocol.orbits import Rendezvous
+from protocol.rounding import TOLERANCE
+from protocol.spelling import did_you_mean
+
+NEAREST_ANCHORS = TOLERANCE
+"""The minimum distance in m of two anchors: nearer ones coincide at the accuracy of exact claims."""
+
+
+def meetings_of(file: ScenarioFile, source: str) -> GroupMeetings | None:
+    """Return the meetings of the group that the robots form; None if they form pairs.
+
+    Raises BadScenario and Unworkable.
+    """
+    robots = file.robot
+    if len(robots) == 2 or any(robot.peer is not None for robot in robots):
+        return None
+    _check_ids(robots, source)
+    for j in range(len(robots)):
+        for i in range(j):
+            _checked_distance(file, i, j, source)
+    try:
+        return group_meetings(robots, file.mission, file.planner)
+    except Unworkable as error:
+        raise Unworkable(f"{source}: {error}") from None
+
+
+def pair_meetings(file: ScenarioFile, source: str) -> dict[str, FirstMeeting]:
+    """Return the meeting of each robot with its peer. Raises BadScenario and Unworkable."""
+    peers = _peers(file.robot, source)
+    place = {robot.id: i for i, robot in enumerate(file.robot)}
+    found: dict[str, FirstMeeting] = {}
+    for i, robot in enumerate(file.robot):
+        peer = peers[robot.id]
+        if i < place[peer]:
+            orbits = _plan(file, i, place[peer], source)
+            found[robot.id], found[peer] = (
+                FirstMeeting(peer, "a", orbits),
+                FirstMeeting(robot.id, "b", orbits),
+            )
+    return found
+
+
+def linked(
+    robots: Sequence[RobotTable], first: Mapping[str, FirstMeeting], *, in_group: bool
+) -> list[tuple[str, str]]:
+    """Return the pairs of robots that can exchange reports, each in both orders."""
+    if in_group:
+        return list(permutations([robot.id for robot in robots], 2))
+    return [(robot.id, first[robot.id].peer) for robot in robots]
+
+
+def _plan(file: ScenarioFile, first: int, second: int, source: str) -> Rendezvous:
+    """Return the rendezvous orbits of the pair of robots at the places `first` and `second` in the file."""
+    distance = _checked_distance(file, first, second, source, "its peer ")
+    return planner_loader.orbits(file.planner.name, file.planner.options, file.mission, distance)
+
+
+def _checked_distance(file: ScenarioFile, first: int, second: int, source: str, whose: str = "") -> float:
+    """Return the distance in m of the anchors of two robots that may meet, given by their places in the file.
+
+    `whose` says what the first robot is to the second. Raises BadScenario if the distance is too small, and
+    Unworkable if they could not localise themselves.
+    """
+    one, other = file.robot[first], file.robot[second]
+    distance = math.dist(one.anchor, other.anchor)
+    if distance < NEAREST_ANCHORS:
+        raise BadScenario(
+            f"{source}: robot[{second}].anchor: less than {NEAREST_ANCHORS:g} m from the anchor of "
+            f"{whose}'{one.id}'"
+        )
+    why = infeasibility(file.mission, distance)
+    if why is not None:
+        raise Unworkable(f"{source}: mission: {why}")
+    if not file.mission.noise.exact:
+        # imports numpy, which scenarios with exact sensors do not need
+        from agent.estimation.gaussian.reachable_accuracy import forbidding_prior  # noqa: PLC0415
+
+        why = forbidding_prior(file.mission, distance)
+        if why is not None:
+            raise Unworkable(f"{source}: mission.{why}")
+    return distance
+
+
+def _check_ids(robots: Sequence[RobotTable], source: str) -> None:
+    """Raise BadScenario if two robots have the same id."""
+    for name, count in Counter(robot.id for robot in robots).items():
+        if count > 1:
+            raise BadScenario(f"{source}: robot.id: {count} robots have the id '{name}'")
+
+
+def _peers(robots: list[RobotTable], source: str) -> dict[str, str]:
+    """Return the peer of each robot. With two robots, each is the peer of the other by default."""
+    _check_ids(robots, source)
+    ids = [robot.id for robot in robots]
+    if len(robots) == 2 and all(robot.peer is None for robot in robots):
+        return {ids[0]: ids[1], ids[1]: ids[0]}
+    peers = {}
+    for i, robot in enumerate(robots):
+        if robot.peer is None:
+            raise BadScenario(
+                f"{source}: robot[{i}].peer: '{robot.id}' needs a peer, because other robots have one; "
+                "robots form a group if none of them has"
+            )
+        if robot.peer not in ids:
+            near = did_you_mean(robot.peer, ids)
+            raise BadScenario(f"{source}: robot[{i}].peer: there is no robot '{robot.peer}'{near}")
+        peers[robot.id] = robot.peer
+    for i, robot in enumerate(robots):
+        if peers[robot.id] == robot.id or peers[peers[robot.id]] != robot.id:
+            raise BadScenario(
+                f"{source}: robot[{i}].peer: '{robot.id}' names '{robot.peer}', whose peer is "
+                f"'{peers[peers[robot.id]]}'; robots must form pairs"
+            )
+    return peers
