@@ -14,7 +14,7 @@ from scipy import stats  # type: ignore[import-untyped]
 
 from agent.estimation.gaussian.consistency import beta_binomial_tail, f_tail, fisher, sigmas
 from agent.estimation.gaussian.least_squares import fit
-from agent.estimation.gaussian.noise_level import noise_level, residual_correlation
+from agent.estimation.gaussian.noise_level import LEAST_LEVEL, noise_level, residual_correlation
 from agent.estimation.gaussian.odometry_noise import (
     Errors,
     Track,
@@ -189,14 +189,24 @@ def test_small_residuals_that_are_alike_do_not_make_a_robot_sure() -> None:
     alike, alternating = np.full(21, 0.01), 0.01 * np.resize([1.0, -1.0], 21)
     weights = np.ones(21)
     by_chance = 2.0 / math.sqrt(21.0)
-    assert residual_correlation(alike, weights, ranges) == pytest.approx(20 / 21 - by_chance)
-    assert residual_correlation(alternating, weights, ranges) == 0.0
+    assert residual_correlation(alike, weights, ranges, 1.0) == pytest.approx(20 / 21 - by_chance)
+    assert residual_correlation(alternating, weights, ranges, 1.0) == 0.0
     assert noise_level(1.0, 19, noise, 0.5) > 2.0 * noise_level(1.0, 19, noise)
     assert noise_level(1.0, 19, noise) < 0.6
     white = np.random.default_rng(1).normal(size=21)
-    assert residual_correlation(white, weights, ranges) == 0.0
+    assert residual_correlation(white, weights, ranges, 1.0) == 0.0
     of_two_kinds = ranges._replace(counts=(10, 11, 0))
-    assert residual_correlation(alike, weights, of_two_kinds) == pytest.approx(19 / 21 - by_chance)
+    assert residual_correlation(alike, weights, of_two_kinds, 1.0) == pytest.approx(19 / 21 - by_chance)
+
+
+def test_residuals_that_are_too_small_count_only_as_far_as_they_are_white() -> None:
+    """Slow errors look like a constant one: 3 of 1 000 claims of robots with AR(1) errors were wrong."""
+    noise, ranges = Noise(0.05, 0.05), own(0.0)[1]
+    alike, weights = np.full(21, 0.01), np.ones(21)
+    less_by_chance = 0.4 * 2.0 / math.sqrt(21.0)
+    assert residual_correlation(alike, weights, ranges, 0.4) == pytest.approx(20 / 21 - less_by_chance)
+    assert residual_correlation(alike, weights, ranges, 3.0) < 20 / 21 - less_by_chance
+    assert noise_level(0.0, 100, noise) == LEAST_LEVEL
 
 
 def test_a_bias_of_all_ranges_is_no_correlation_of_their_errors() -> None:
