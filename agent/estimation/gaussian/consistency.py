@@ -22,11 +22,13 @@ CLAIM_P_VALUE = 1e-3
 EARLY_CLAIM_P_VALUE = 1e-2
 """The CLAIM_P_VALUE of a robot with fewer than twice the mutual ranges that a claim requires."""
 
-INCONSISTENT_P_VALUE = 1e-5
-"""The p-value below which a search counts towards INCONSISTENT_SEARCHES.
+INCONSISTENT_P_VALUE, INCONSISTENT_P_VALUE_UNTOLD = 2e-4, 3e-6
+"""The p-values below which a search counts towards INCONSISTENT_SEARCHES.
 
+The first is for a robot that was told its noise, the second for one that was not; see `rejecting_p_value`.
 Most ranges of a search are those of the search before, so several in a row are little rarer by chance than
-one. With 2e-4, 9 of 1 000 honest peers were rejected if 5 % of the ranges were too short and nobody had told.
+one. With 2e-4 for ranges of 0.05 m, 9 of 1 000 honest peers were rejected if 5 % of the ranges were too short
+and nobody had told. With 1e-5 for ranges of 0.01 m, 2 to 5 of 100 more false reports were never rejected.
 """
 
 INCONSISTENT_SEARCHES = 5
@@ -60,6 +62,12 @@ LEAST_SHARE = 1e-3
 
 TOLD_BEFORE = 200.0
 """The number of ranges that the rate of outliers that was told is worth."""
+
+
+def rejecting_p_value(noise: Noise) -> float:
+    """Return the p-value below which a search counts against the peer, by how well the noise was told."""
+    share = noise.untold_share
+    return float(INCONSISTENT_P_VALUE ** (1.0 - share) * INCONSISTENT_P_VALUE_UNTOLD**share)
 
 
 class Inconsistency(NamedTuple):
