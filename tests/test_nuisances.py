@@ -26,6 +26,7 @@ from agent.estimation.gaussian.odometry_noise import (
 from agent.estimation.gaussian.own_sensors import doubt
 from agent.estimation.gaussian.range_covariance import range_covariance
 from agent.estimation.gaussian.range_model import Ranges, inlier_probability, mixture
+from agent.estimation.gaussian.reachable_accuracy import reference_sigma
 from agent.peer.peer_state import PeerState
 from agent.planning.accuracy_seeking import AccuracySeeking
 from agent.planning.plausibility import objection
@@ -168,6 +169,16 @@ def drawn(seed: int, noise: Noise, level: float = 1.0) -> tuple[float, float]:
     found = fit(np.array((*anchor, 0.0)), [measured], ranges, noise)
     error = found.guess[:2] - anchor
     return float(error @ found.information @ error), found.level
+
+
+@pytest.mark.parametrize("noise", ['"uwb"', '"uwb-calibrated"', "{anchor_sigma = 0.05, mutual_sigma = 0.05}"])
+def test_no_distance_between_the_smallest_and_the_largest_is_less_accurate_than_both(noise: str) -> None:
+    """Therefore these two decide whether a prior forbids the accuracy of a group."""
+    mission = parsed(noise, 1.0).mission
+    found = [reference_sigma(mission, distance, mission.noise) for distance in np.geomspace(0.5, 100.0, 25)]
+    for i in range(len(found)):
+        for j in range(i + 1, len(found)):
+            assert max(found[i : j + 1]) <= 1.05 * max(found[i], found[j])
 
 
 def test_errors_from_the_priors_are_in_the_covariance() -> None:
