@@ -154,11 +154,11 @@ def _strays_test(fitted: Fit, own: Fit, pair: PairRanges, robot: int) -> Inconsi
     latest: a false hypothesis that drops a few of them may fit the rest, and every further range that fits
     would hide them.
     """
-    seen, rate = len(own.residuals) - own.inliers, pair.noise.outliers
-    worth, before = (TOLD_BEFORE if rate else 0.0), RANGES_BEFORE / max(pair.noise.untold_share, LEAST_SHARE)
-    known = before - RANGES_BEFORE  # with the rate of strays that was told
-    strays = STRAYS_BEFORE + known * pair.noise.strays + worth * rate + seen
-    ranges = before + worth * (1.0 - rate) + own.inliers
+    told, seen = pair.noise.strays + pair.noise.outliers, len(own.residuals) - own.inliers
+    known = RANGES_BEFORE / max(pair.noise.untold_share, LEAST_SHARE) - RANGES_BEFORE
+    known += TOLD_BEFORE if pair.noise.outliers else 0.0
+    strays = STRAYS_BEFORE + known * told + seen
+    ranges = RANGES_BEFORE + known * (1.0 - told) + own.inliers
     stray = fitted.weights <= INLIER
     tested = [(int(np.count_nonzero(stray)) - seen, len(stray) - pair.ranges.counts[robot])]
     for kind in (1 - robot, 2):
