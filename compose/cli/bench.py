@@ -10,12 +10,12 @@ import argparse
 
 from rich.console import Console
 
-from compose.bench.commands import many_robots, start_of_a_command
-from compose.bench.groups import missions_of_groups
-from compose.bench.in_process import missions_per_second
-from compose.bench.noisy import noisy_missions
-from compose.bench.over_zenoh import ticks_per_second
 from compose.cli.arguments import add_closing, count
+from compose.cli.benchmark.exact_missions import missions_per_second
+from compose.cli.benchmark.group_missions import missions_of_groups
+from compose.cli.benchmark.noisy_missions import noisy_missions
+from compose.cli.benchmark.over_zenoh import ticks_per_second
+from compose.cli.benchmark.whole_commands import many_robots, start_of_a_command
 from compose.errors import LOCALISED
 from compose.extras import need
 from compose.terminal.outcome import counting

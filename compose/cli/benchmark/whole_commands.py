@@ -12,8 +12,8 @@ from pathlib import Path
 
 from rich.table import Table
 
-from compose.bench.in_process import SEED
-from compose.bench.tables import add_row, new_table
+from compose.cli.benchmark.bench_table import add_row, new_table
+from compose.cli.benchmark.exact_missions import SEED
 
 ROBOTS = 200
 """The number of robots in the scenario of many pairs."""

@@ -9,8 +9,8 @@ from statistics import median
 
 from rich.table import Table
 
-from compose.bench.in_process import SEED
-from compose.bench.tables import add_row, new_table
+from compose.cli.benchmark.bench_table import add_row, new_table
+from compose.cli.benchmark.exact_missions import SEED
 from compose.launch import in_process
 from compose.scenario import scenario_file
 from compose.scenario.shipped_files import shipped

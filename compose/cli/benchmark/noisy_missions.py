@@ -10,8 +10,8 @@ from msgspec.structs import replace
 from rich.table import Table
 
 from agent.process.robot import Robot
-from compose.bench.in_process import SEED
-from compose.bench.tables import add_row, new_table
+from compose.cli.benchmark.bench_table import add_row, new_table
+from compose.cli.benchmark.exact_missions import SEED
 from compose.launch.planner_loader import planner_of
 from compose.scenario import scenario_file
 from protocol.messages import RobotConfig

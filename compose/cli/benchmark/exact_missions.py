@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from rich.table import Table
 
-from compose.bench.tables import add_row, new_table
+from compose.cli.benchmark.bench_table import add_row, new_table
 from compose.launch import in_process
 from compose.recording import run
 from compose.scenario import scenario_file

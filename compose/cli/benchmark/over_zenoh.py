@@ -10,7 +10,7 @@ from statistics import median
 
 from rich.table import Table
 
-from compose.bench.tables import add_row, new_table
+from compose.cli.benchmark.bench_table import add_row, new_table
 from compose.launch import in_process, processes, zenoh_baseline
 from compose.launch.supervisor import COMMAND, STOP_S, Supervisor
 from compose.launch.viewers import page, viewing
