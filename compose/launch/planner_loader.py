@@ -33,7 +33,7 @@ _trusted: set[str] = set()
 
 
 GROUP_PLANNER = "assured"
-"""The planner with which robots can form a group."""
+"""The shipped planner with which robots can form a group. Those of users are subclasses of its classes."""
 
 
 class UntrustedPlanner(UserError):
@@ -67,40 +67,65 @@ def check(name: str, options: Mapping[str, Any]) -> None:
     _created(name, options)
 
 
-def planner(name: str, options: Mapping[str, Any], mission: Mission) -> Planner[Any, Any]:
-    """Return a new planner for the noise of `mission`.
+def planner(
+    name: str, options: Mapping[str, Any], mission: Mission, *, in_group: bool = False
+) -> Planner[Any, Any]:
+    """Return a new planner for the noise of `mission`, for a robot of a pair or of a group.
 
-    Raises UserError if it cannot be loaded or created, and UntrustedPlanner if the user has not named it.
+    Raises UserError if it cannot be loaded or created, or is not for groups, and UntrustedPlanner if the user
+    has not named it.
     """
     if is_shipped(name):
-        from agent.planning import registry  # noqa: PLC0415  # it imports numpy
-
-        return registry.planner(name, mission)
+        return _unguarded(name, options, mission, in_group=in_group)
     if ":" in name and name not in _trusted:
         raise UntrustedPlanner(f"the planner is {name}; to run its code, add --planner {name}")
     from compose.launch.planner_guard import GuardedPlanner  # noqa: PLC0415  # it imports numpy
 
-    created = _created(name, options)
-    try:
-        return GuardedPlanner(name, created.suited(mission))
-    except Exception as error:  # noqa: BLE001  # the user's code may raise anything
-        raise UserError(f"{name}: suited() raised {type(error).__name__}: {error}") from None
-
-
-def planner_copy(name: str, options: Mapping[str, Any], mission: Mission) -> Planner[Any, Any]:
-    """Return a new planner for the noise of `mission`, without a guard. Raises UserError."""
-    return _created(name, options).suited(mission)
+    return GuardedPlanner(name, _unguarded(name, options, mission, in_group=in_group))
 
 
 def planner_of(config: RobotConfig) -> Planner[Any, Any]:
     """Return the planner of the robot with this configuration. Raises like `planner`."""
-    if isinstance(config, RobotConfigInGroup):
-        if config.planner_name != GROUP_PLANNER:
-            raise UserError(f"robots with the planner {config.planner_name} meet in pairs, not in a group")
+    in_group = isinstance(config, RobotConfigInGroup)
+    return planner(config.planner_name, config.planner_options, config.mission, in_group=in_group)
+
+
+def unguarded_planner_of(config: RobotConfig) -> Planner[Any, Any]:
+    """Return a new planner of the robot with this configuration, without a guard. Raises UserError."""
+    in_group = isinstance(config, RobotConfigInGroup)
+    return _unguarded(config.planner_name, config.planner_options, config.mission, in_group=in_group)
+
+
+def is_for_groups(name: str) -> bool:
+    """Return whether robots with the planner `name` can form a group. Raises UserError if there is none."""
+    if is_shipped(name):
+        return name == GROUP_PLANNER
+    from agent.planning.assured import AssuredExact  # noqa: PLC0415  # it imports numpy
+
+    return issubclass(planner_class(name), AssuredExact)
+
+
+def _unguarded(
+    name: str, options: Mapping[str, Any], mission: Mission, *, in_group: bool
+) -> Planner[Any, Any]:
+    if is_shipped(name):
         from agent.planning import registry  # noqa: PLC0415  # it imports numpy
 
-        return registry.group_planner(config.mission)
-    return planner(config.planner_name, config.planner_options, config.mission)
+        found = registry.planner(name, mission)
+    else:
+        created = _created(name, options)
+        try:
+            found = created.suited(mission)
+        except Exception as error:  # noqa: BLE001  # the user's code may raise anything
+            raise UserError(f"{name}: suited() raised {type(error).__name__}: {error}") from None
+    if not in_group:
+        return found
+    from agent.planning.assured import AssuredExact  # noqa: PLC0415  # it imports numpy
+    from agent.planning.group import GroupPlanner  # noqa: PLC0415  # likewise
+
+    if not isinstance(found, AssuredExact):
+        raise UserError(f"robots with the planner {name} meet in pairs, not in a group")
+    return GroupPlanner(found)
 
 
 def orbits(name: str, options: Mapping[str, Any], mission: Mission, distance: float) -> Rendezvous:
