@@ -293,6 +293,9 @@ def test_robots_with_a_subclass_of_the_shipped_planner_form_a_group(tmp_path: Pa
         assert ended.status == 0, ended
     assert journals(tmp_path / "processes") == journals(tmp_path / "one")
     assert command("audit", tmp_path / "one", "--planner", name).status == 0
+    refused = command("audit", tmp_path / "one")
+    assert (refused.status, refused.out) == (2, "")
+    assert refused.err == f"tandem audit: the planner is {name}; to run its code, add --planner {name}\n"
     run, shipped = read(tmp_path / "one"), run_mission(group_of(3, 4))
     assert len(run.robots) == 3
     for robot in run.robots:

@@ -77,8 +77,7 @@ def planner(
     """
     if is_shipped(name):
         return _unguarded(name, options, mission, in_group=in_group)
-    if ":" in name and name not in _trusted:
-        raise UntrustedPlanner(f"the planner is {name}; to run its code, add --planner {name}")
+    _check_trust(name)
     from compose.launch.planner_guard import GuardedPlanner  # noqa: PLC0415  # it imports numpy
 
     return GuardedPlanner(name, _unguarded(name, options, mission, in_group=in_group))
@@ -97,12 +96,19 @@ def unguarded_planner_of(config: RobotConfig) -> Planner[Any, Any]:
 
 
 def is_for_groups(name: str) -> bool:
-    """Return whether robots with the planner `name` can form a group. Raises UserError if there is none."""
+    """Return whether robots with the planner `name` can form a group. Raises like `planner`."""
     if is_shipped(name):
         return name == GROUP_PLANNER
+    _check_trust(name)
     from agent.planning.assured import AssuredExact  # noqa: PLC0415  # it imports numpy
 
     return issubclass(planner_class(name), AssuredExact)
+
+
+def _check_trust(name: str) -> None:
+    """Raise UntrustedPlanner if `name` is a class of a user that the user of this process has not named."""
+    if ":" in name and name not in _trusted:
+        raise UntrustedPlanner(f"the planner is {name}; to run its code, add --planner {name}")
 
 
 def _unguarded(
