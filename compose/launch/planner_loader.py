@@ -67,32 +67,33 @@ def check(name: str, options: Mapping[str, Any]) -> None:
     _created(name, options)
 
 
-def planner(
-    name: str, options: Mapping[str, Any], mission: Mission, *, in_group: bool = False
-) -> Planner[Any, Any]:
-    """Return a new planner for the noise of `mission`, for a robot of a pair or of a group.
+def planner(name: str, options: Mapping[str, Any], mission: Mission) -> Planner[Any, Any]:
+    """Return a new planner for the noise of `mission`.
 
-    Raises UserError if it cannot be loaded or created, or is not for groups, and UntrustedPlanner if the user
-    has not named it.
+    Raises UserError if it cannot be loaded or created, and UntrustedPlanner if the user has not named it.
     """
-    if is_shipped(name):
-        return _unguarded(name, options, mission, in_group=in_group)
     _check_trust(name)
-    from compose.launch.planner_guard import GuardedPlanner  # noqa: PLC0415  # it imports numpy
-
-    return GuardedPlanner(name, _unguarded(name, options, mission, in_group=in_group))
+    return _guarded(name, _suited(name, options, mission))
 
 
 def planner_of(config: RobotConfig) -> Planner[Any, Any]:
     """Return the planner of the robot with this configuration. Raises like `planner`."""
-    in_group = isinstance(config, RobotConfigInGroup)
-    return planner(config.planner_name, config.planner_options, config.mission, in_group=in_group)
+    _check_trust(config.planner_name)
+    return _guarded(config.planner_name, unguarded_planner_of(config))
 
 
 def unguarded_planner_of(config: RobotConfig) -> Planner[Any, Any]:
     """Return a new planner of the robot with this configuration, without a guard. Raises UserError."""
-    in_group = isinstance(config, RobotConfigInGroup)
-    return _unguarded(config.planner_name, config.planner_options, config.mission, in_group=in_group)
+    name = config.planner_name
+    found = _suited(name, config.planner_options, config.mission)
+    if not isinstance(config, RobotConfigInGroup):
+        return found
+    from agent.planning.assured import AssuredExact  # noqa: PLC0415  # it imports numpy
+    from agent.planning.group import GroupPlanner  # noqa: PLC0415  # likewise
+
+    if not isinstance(found, AssuredExact):
+        raise UserError(f"robots with the planner {name} meet in pairs, not in a group")
+    return GroupPlanner(found)
 
 
 def is_for_groups(name: str) -> bool:
@@ -111,27 +112,25 @@ def _check_trust(name: str) -> None:
         raise UntrustedPlanner(f"the planner is {name}; to run its code, add --planner {name}")
 
 
-def _unguarded(
-    name: str, options: Mapping[str, Any], mission: Mission, *, in_group: bool
-) -> Planner[Any, Any]:
+def _suited(name: str, options: Mapping[str, Any], mission: Mission) -> Planner[Any, Any]:
     if is_shipped(name):
         from agent.planning import registry  # noqa: PLC0415  # it imports numpy
 
-        found = registry.planner(name, mission)
-    else:
-        created = _created(name, options)
-        try:
-            found = created.suited(mission)
-        except Exception as error:  # noqa: BLE001  # the user's code may raise anything
-            raise UserError(f"{name}: suited() raised {type(error).__name__}: {error}") from None
-    if not in_group:
-        return found
-    from agent.planning.assured import AssuredExact  # noqa: PLC0415  # it imports numpy
-    from agent.planning.group import GroupPlanner  # noqa: PLC0415  # likewise
+        return registry.planner(name, mission)
+    created = _created(name, options)
+    try:
+        return created.suited(mission)
+    except Exception as error:  # noqa: BLE001  # the user's code may raise anything
+        raise UserError(f"{name}: suited() raised {type(error).__name__}: {error}") from None
 
-    if not isinstance(found, AssuredExact):
-        raise UserError(f"robots with the planner {name} meet in pairs, not in a group")
-    return GroupPlanner(found)
+
+def _guarded(name: str, found: Planner[Any, Any]) -> Planner[Any, Any]:
+    """Return `found` in a guard, unless it is shipped with Tandem."""
+    if is_shipped(name):
+        return found
+    from compose.launch.planner_guard import GuardedPlanner  # noqa: PLC0415  # it imports numpy
+
+    return GuardedPlanner(name, found)
 
 
 def orbits(name: str, options: Mapping[str, Any], mission: Mission, distance: float) -> Rendezvous:

@@ -1,4 +1,4 @@
-"""The speed of groups in one process, beside as many robots in pairs."""
+"""The speed of groups in one process, beside random pairs."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from compose.cli.benchmark.bench_table import add_row, new_table
 from compose.cli.benchmark.exact_missions import SEED
 from compose.launch import in_process
 from compose.scenario import scenario_file
-from compose.scenario.shipped_files import shipped
-from compose.scenario.toml_file import table_in
 from world.scenario import Scenario
 
 SIZES = (8, 32)
@@ -49,7 +47,7 @@ def missions_of_groups(rounds: int, done: Callable[[], None]) -> Table:
 
 def _group(robots: int, seed: int) -> Scenario:
     """Return a random group of so many robots."""
-    table = table_in(shipped()["random-group"].read_text(), "random-group")
+    table = scenario_file.scenario_table("random-group")
     table["group"]["robots"] = robots
     return scenario_file.validate(table, "random-group").seeded(seed)
 
