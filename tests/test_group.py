@@ -194,7 +194,7 @@ def test_an_accuracy_that_a_prior_forbids_for_any_two_robots_is_refused(third: t
         robot["anchor"] = list(anchor)
     validate(table, "group.toml")
     table["robot"][2]["anchor"] = list(third)
-    with pytest.raises(Unworkable, match="group.toml: mission.accuracy: the prior noise"):
+    with pytest.raises(Unworkable, match=r"mission\.accuracy: the prior noise"):
         validate(table, "group.toml")
 
 
