@@ -190,7 +190,8 @@ def _with_robots(file: ScenarioFile) -> ScenarioFile:
     robots = []
     for i in range(1, file.group.robots + 1):
         draw = random.Random(f"{file.seed}/anchor/r{i}").random
-        robots.append(RobotTable(f"r{i}", (side * draw(), side * draw())))
+        attack = file.group.attack if i == 1 else None
+        robots.append(RobotTable(f"r{i}", (side * draw(), side * draw()), attack=attack))
     return msgspec.structs.replace(file, robot=robots)
 
 

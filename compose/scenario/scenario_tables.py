@@ -69,6 +69,8 @@ class GroupTable(_Table, frozen=True):
     """The number n of robots, which are r1 to rn."""
     spacing: Annotated[float, Meta(gt=0.0, le=1e5)]
     """The anchors are uniform in a square, whose side in m is this times the square root of n."""
+    attack: Attack | None = None
+    """False data injection by the robot r1."""
 
 
 LONGEST_NAME = 48
