@@ -38,7 +38,7 @@ class GroupPlan(msgspec.Struct, frozen=True, dict=True):
 
     @cached_property
     def travel_lower_bound(self) -> float:
-        """A lower bound in s of the bound of any plan: of seed pairs and travel, with no time for meetings."""
+        """A lower bound in s of the bound of any plan: of seed pairs and of travel alone."""
         return least_makespan(self.travel)
 
 
