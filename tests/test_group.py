@@ -24,6 +24,7 @@ from compose.scenario.scenario_file import validate
 from protocol.messages import Localised, Report, RobotConfigInGroup
 from protocol.mission import Mission
 from protocol.motion import Pose, step
+from protocol.wire import MAX_REPORT_BYTES, encode
 from tests.groups import R, group_of, localised, table_of
 from tests.series import series
 from world.referee import mistake
@@ -149,6 +150,26 @@ def test_the_configuration_of_a_robot_names_its_group_and_its_visits() -> None:
             for other in config.members
         ]
         assert config.widest_distance == max(apart)
+
+
+def test_the_configuration_of_a_robot_of_a_hundred_fits_in_the_largest_report() -> None:
+    scenario = group_of(100, 1)
+    sizes = [len(encode(scenario.config(robot.id))) for robot in scenario.robots]
+    assert max(sizes) <= MAX_REPORT_BYTES
+
+
+@given(
+    st.floats(1e-3, 1e4), st.sampled_from([0.1, 0.3, 1.0, 1 / 3]) | st.floats(0.01, 100.0), st.integers(0, 5)
+)
+def test_a_robot_is_late_in_the_tick_in_which_its_bound_in_seconds_is_over(
+    bound: float, period: float, ticks: int
+) -> None:
+    scenario = group_of(3, 1)
+    mission = replace(scenario.mission, period=period)
+    for ends in (bound, ticks * period):
+        meetings = tuple([replace(one, ends=ends) for one in scenario.meetings])
+        (last,) = {one.ends for one in replace(scenario, mission=mission, meetings=meetings).members}
+        assert last * period <= ends < (last + 1) * period
 
 
 @pytest.mark.parametrize(

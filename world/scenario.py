@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from functools import cached_property
 from itertools import combinations
@@ -222,11 +223,22 @@ class Scenario(
     @cached_property
     def members(self) -> tuple[Member, ...]:
         """The robots of the group, as they know each other; empty for pairs."""
-        ends: dict[str, float] = {}
+        ends: dict[str, int] = {}
         for meeting in self.meetings:
-            ends.setdefault(meeting.visitor, meeting.ends)
-            ends.setdefault(meeting.visited, meeting.ends)
+            last = _last_tick(meeting.ends, self.mission.period)
+            ends.setdefault(meeting.visitor, last)
+            ends.setdefault(meeting.visited, last)
         return tuple([Member(one.id, one.anchor, ends[one.id]) for one in self.robots]) if ends else ()
+
+
+def _last_tick(time: float, period: float) -> int:
+    """Return the last tick that begins at `time` or before; `time` and `period` in s."""
+    tick = math.floor(time / period)  # the quotient is rounded, which can move it over a tick
+    while (tick + 1) * period <= time:
+        tick += 1
+    while tick * period > time:
+        tick -= 1
+    return tick
 
 
 class ScenarioWithWorldNoise(

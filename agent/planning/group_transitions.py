@@ -169,11 +169,11 @@ def _next_visit(state: GroupState) -> GroupState:
         visits += 1
         if not (state.other(peer).localised or state.other(peer).failed):
             return _on_visit(replace(state, visits=visits), peer)
-    here, now = compose(state.frame, state.pair.odometry), _now(state.pair)
+    here, tick = compose(state.frame, state.pair.odometry), state.pair.tick
     late = [
         (math.hypot(one.anchor.x - here.x, one.anchor.y - here.y), one.robot)
         for one in config.members
-        if one.ends < now and one.robot != config.robot and _is_late(state, one)  # few are
+        if one.ends < tick and one.robot != config.robot and _is_late(state, one)  # few are
     ]
     state = replace(state, visits=visits)
     return _on_visit(state, min(late)[1]) if late else state
@@ -189,8 +189,7 @@ def _is_late(state: GroupState, member: Member) -> bool:
         return False
     if known.missed is None:
         return True
-    ago = (state.pair.tick - known.missed) * config.mission.period
-    return ago > max(one.ends for one in config.members)
+    return state.pair.tick - known.missed > max(one.ends for one in config.members)
 
 
 def _on_visit(state: GroupState, peer: str) -> GroupState:
