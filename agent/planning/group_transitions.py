@@ -110,9 +110,22 @@ def _after_failure(state: GroupState) -> GroupState:
         return replace(state, verdict=pair.verdict or state.failure or late)
     if pair.verdict is not None:
         state = _waiting(_after_meeting(replace(state, failure=pair.verdict)), config.peer)
-    elif state.until is not None and now >= state.until and not pair.in_contact:
+    elif _has_orbited(state) and not pair.in_contact:
         state = _waiting(replace(state, until=None), config.peer)
     return _trying_again(state)
+
+
+def _has_orbited(state: GroupState) -> bool:
+    """Return whether this robot of role a searches for its peer in vain: the bound of their meeting is over.
+
+    Beside its anchor, where it waits from then on, others find it.
+    """
+    pair, config = state.pair, state.config
+    if config.role != "a":
+        return False
+    if state.until is not None:
+        return _now(pair) >= state.until
+    return pair.tick > config.member(config.robot).ends
 
 
 def _trying_again(state: GroupState) -> GroupState:
@@ -143,10 +156,10 @@ def _after_meeting(state: GroupState) -> GroupState:
 
 def _waiting(state: GroupState, peer: str, orbits: Rendezvous | None = None) -> GroupState:
     """Return `state` of a robot that waits beside its anchor, in a meeting with `peer`."""
-    before = state.pair.mode
+    before, waits = state.pair.mode, state.config.role == "b"
     state = _in_meeting(state, peer, "b", orbits)
     pair = state.pair
-    if isinstance(before, Orbiting | Aligning | Radial):
+    if waits and isinstance(before, Orbiting | Aligning | Radial):
         return replace(state, pair=replace(pair, mode=before))
     return _aligned(state)
 
