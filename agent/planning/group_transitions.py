@@ -195,14 +195,16 @@ def _next_visit(state: GroupState) -> GroupState:
 def _is_late(state: GroupState, member: Member) -> bool:
     """Return whether `member`, which should be localised by now, may still wait for a visitor.
 
-    A robot that was not there is visited again after as long as the whole plan takes.
+    A robot that was not there is visited again after the time of the longest way: it may have been on its way
+    back from its orbit.
     """
     known, config = state.other(member.robot), state.config
     if known.localised or known.failed:
         return False
     if known.missed is None:
         return True
-    return state.pair.tick - known.missed > max(one.ends for one in config.members)
+    mission = config.mission
+    return (state.pair.tick - known.missed) * mission.period * mission.max_speed > config.widest_distance
 
 
 def _on_visit(state: GroupState, peer: str) -> GroupState:

@@ -61,7 +61,8 @@ class RobotTable(_Table, frozen=True):
     attack: Attack | None = None
     """False data injection: the falsification of the reports that this robot sends to its peer."""
     dies: Tick | None = None
-    """The tick from which on it is dead: it stands still, and measures, sends and receives nothing. Groups only."""
+    """The tick from which on it is dead, in a group: it stands still, and measures, sends and receives
+    nothing."""
 
 
 class GroupTable(_Table, frozen=True):

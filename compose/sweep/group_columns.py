@@ -7,6 +7,7 @@ import math
 import msgspec
 
 from compose.recording.claim import Claim
+from compose.recording.corrected_bounds import corrected_bounds
 from compose.recording.group_localisation import meeting_results
 from compose.recording.meetings import has_log
 from compose.recording.run import Run
@@ -21,6 +22,7 @@ class GroupColumns(msgspec.Struct, frozen=True):
     """The columns of TrialRow that only trials of groups have; see there."""
 
     bound_ticks: int
+    corrected_ticks: int | None
     travel_ticks: float | None
     honest_tick: int | None
     honest_localised: int
@@ -39,12 +41,15 @@ def group_columns(run: Run) -> GroupColumns | None:
     scenario = run.scenario
     if not scenario.meetings:
         return None
-    honest = [robot.id for robot in scenario.robots if robot.attack is None]
+    dead = {death.robot for death in scenario.deaths}
+    honest = [robot.id for robot in scenario.robots if robot.attack is None and robot.id not in dead]
     claims = {robot: claim for robot in honest if (claim := run.claim(robot)) is not None}
     right = sum([_is_right(run, robot, claim) for robot, claim in claims.items()])
+    corrected = corrected_bounds(run)
     met, found = _met_and_found(run, honest) if run.agents else (None, None)
     return GroupColumns(
         bound_ticks=max([one.bound_ticks for one in meeting_results(run)]),
+        corrected_ticks=corrected[-1].bound_ticks if corrected else None,
         travel_ticks=_travel_ticks(run),
         honest_tick=max([claim.tick for claim in claims.values()]) if len(claims) == len(honest) else None,
         honest_localised=right,

@@ -28,11 +28,9 @@ NOTES = (
     ("p50", "p50, p95, max: ticks of trials that localised"),
     ("error p50", "error: position error in m of the worse robot"),
     ("share p50", "share: tick of the last claim / the computed bound of the group"),
+    ("corrected", "corrected: largest share of the corrected bound, where a robot was late"),
     ("travel p50", "travel: tick of the last claim / the tick by the real first meetings and travel alone"),
-    (
-        "honest",
-        "honest: robots without an attack whose claims are right / that make none / whose claims are wrong",
-    ),
+    ("honest", "honest: robots, but attackers and dead ones, with a right claim / none / a wrong claim"),
     ("found", "found: meetings with an attacker in which it was found / all of them"),
     ("within", "within: claims within 3 x accuracy"),
     ("nees low", "nees: mean, and the 99 % band for consistent covariances"),
@@ -48,7 +46,7 @@ CHOICES = (
     ("trials", "rate"),
 )
 """The possible choices of columns. The first that fits the terminal is used."""
-OF_GROUP = ("share p50", "share max", "travel p50", "travel p95", "honest")
+OF_GROUP = ("share p50", "share max", "corrected", "travel p50", "travel p95", "honest")
 """The additional columns of sweeps of groups."""
 OF_ATTACKED_GROUP = ("found",)
 """The additional column of sweeps of groups with an attacker."""
@@ -232,6 +230,7 @@ def _figures(figures: CellSummary) -> dict[str, str]:
         "nees high": _number(figures.nees_high, ".3g"),
         "share p50": _number(figures.bound_share_p50, ".2f"),
         "share max": _number(figures.bound_share_max, ".2f"),
+        "corrected": _number(figures.corrected_share_max, ".2f"),
         "travel p50": _number(figures.makespan_p50, ".2f"),
         "travel p95": _number(figures.makespan_p95, ".2f"),
         "honest": f"{figures.honest_localised}/{figures.honest_undecided}/{figures.honest_wrong}",

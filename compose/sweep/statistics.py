@@ -33,7 +33,7 @@ NEES_CONFIDENCE = 0.99
 WORSE = ("wrong", "inconsistent", "failed", "undecided")
 """The outcomes that need a look, the worst first."""
 FIGURES_OF_GROUP = (
-    *("bound_share_p50", "bound_share_max", "makespan_p50", "makespan_p95"),
+    *("bound_share_p50", "bound_share_max", "corrected_share_max", "makespan_p50", "makespan_p95"),
     *("honest_localised", "honest_undecided", "honest_wrong", "attacker_met", "attacker_found"),
 )
 """The fields of a CellSummary that only groups have."""
@@ -107,12 +107,14 @@ class CellSummary(msgspec.Struct, frozen=True):
     """only for groups: median over trials in which all honest robots claimed of honest_tick / bound_ticks"""
     bound_share_max: float | None
     """only for groups: the largest of these"""
+    corrected_share_max: float | None
+    """only for groups: the largest honest_tick / corrected_ticks, of trials with a corrected bound"""
     makespan_p50: float | None
     """only for groups: median over the same trials of honest_tick / travel_ticks"""
     makespan_p95: float | None
     """only for groups: the 95th percentile of these"""
     honest_localised: int | None
-    """only for groups: number of robots without an attack, of all trials, whose claims are right"""
+    """only for groups: number of honest robots, of all trials, whose claims are right"""
     honest_undecided: int | None
     """only for groups: number of those that made no claim"""
     honest_wrong: int | None
@@ -151,7 +153,9 @@ def counted(table: pa.Table, refused: str | None = None) -> CellSummary:
     claims, nees = int(_known(column(table, "claims")).sum()), _known(column(right, "nees"))
     nees_low, nees_high = nees_band(len(nees))
     violations = _known(column(table, "violations"))
-    shares, makespans = [_shares(right, name) for name in ("bound_ticks", "travel_ticks")]
+    shares, makespans, corrected = [
+        _shares(right, name) for name in ("bound_ticks", "travel_ticks", "corrected_ticks")
+    ]
     return CellSummary(
         trials=n,
         **counts,
@@ -187,6 +191,7 @@ def counted(table: pa.Table, refused: str | None = None) -> CellSummary:
         refused=refused,
         bound_share_p50=_percentile(shares, 50),
         bound_share_max=_percentile(shares, 100),
+        corrected_share_max=_percentile(corrected, 100),
         makespan_p50=_percentile(makespans, 50),
         makespan_p95=_percentile(makespans, 95),
         honest_localised=_sum_of_known(table, "honest_localised"),

@@ -122,20 +122,23 @@ class TrialRow(msgspec.Struct, frozen=True, array_like=True):
     """T_max in ticks, rounded up"""
     bound_ticks: int | None = None
     """only for a group: the computed bound in ticks until all its robots are localised"""
+    corrected_ticks: int | None = None
+    """only for a group: the last of the bounds that correct it, if a robot was late"""
     travel_ticks: float | None = None
     """only for a group: a lower bound of these ticks, in which robots only travel after the first meetings,
     which end when they did"""
     honest_tick: int | None = None
-    """only for a group: tick of the last claim of a robot without an attack; None if one made no claim"""
+    """only for a group: tick of the last claim of an honest robot: one without an attack that does not die;
+    None if one made no claim"""
     honest_localised: int | None = None
-    """only for a group: number of robots without an attack whose claims are right"""
+    """only for a group: number of honest robots whose claims are right"""
     honest_undecided: int | None = None
-    """only for a group: number of robots without an attack that made no claim"""
+    """only for a group: number of honest robots that made no claim"""
     honest_wrong: int | None = None
-    """only for a group: number of robots without an attack whose claims are wrong"""
+    """only for a group: number of honest robots whose claims are wrong"""
     attacker_met: int | None = None
-    """only for a group: number of meetings of robots without an attack with one that has one; None if the
-    trial was not audited"""
+    """only for a group: number of meetings of honest robots with one that has an attack; None if the trial
+    was not audited"""
     attacker_found: int | None = None
     """only for a group: number of these in which the robot reported that the other's data are inconsistent"""
     candidates: int | None = None
