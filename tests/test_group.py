@@ -118,6 +118,35 @@ def test_a_pair_tries_again_with_another_robot_when_its_first_meeting_has_failed
     assert claim.tick * scenario.mission.period > scenario.retries[0].begins
 
 
+ROTATED = {"kind": "rotate", "part": "encounter", "size": 0.0872664626}
+SHIFTED = {"kind": "shift", "part": "all", "size": 0.3}
+
+
+@pytest.mark.parametrize(
+    ("robots", "seed", "attacker", "attack"),
+    [
+        pytest.param(3, 13, 1, SCALED, id="the attacker stays where the retry takes place"),
+        pytest.param(3, 14, 2, SHIFTED, id="the attacker is found in phase 1"),
+        pytest.param(3, 18, 2, ROTATED, id="the attacker interrupts a retry"),
+        pytest.param(4, 5, 2, ROTATED, id="the attacker interrupts the retry of four"),
+    ],
+)
+def test_an_attacker_cannot_end_the_meeting_of_two_honest_robots(
+    robots: int, seed: int, attacker: int, attack: dict[str, Any]
+) -> None:
+    run = run_mission(group_of(robots, seed, attacker=attacker, attack=attack))
+    assert localised(run) >= set(run.robots) - {f"r{attacker}"}
+
+
+def test_a_robot_whose_meetings_with_all_others_have_failed_gives_up_at_once() -> None:
+    scenario = group_of(3, 14, attacker=2, attack=SHIFTED)
+    run = run_mission(scenario)
+    assert run.end is not None
+    claims = [claim.tick for robot in ("r0", "r1") if (claim := run.claim(robot)) is not None]
+    assert run.end.tick < max(claims) + 20
+    assert run.end.tick < 0.5 * scenario.max_ticks
+
+
 def test_a_robot_sends_its_log_only_to_the_robot_that_it_meets(tmp_path: Path) -> None:
     scenario = group_of(8, 1)
     run_mission(scenario, tmp_path)
