@@ -127,7 +127,7 @@ def _has_nobody(state: GroupState) -> bool:
 
 
 def _resumed(state: GroupState) -> GroupState:
-    """Return `state` of a robot whose meeting has failed: in the retry that it has left for it, or waiting."""
+    """Return `state` of a robot whose meeting has failed: in the retry that it has left, or waiting."""
     config = state.config
     if state.retries:
         retry = config.retries[state.retries - 1]
