@@ -284,8 +284,11 @@ def passing_others(state: GroupState, contacts: Sequence[Contact]) -> GroupState
     if not mission.safety_distance:
         return state
     free = passing.leeway(contacts, pair.config.peer, mission)
-    now = passing.passed(state.passing, pair.mode, pair.odometry, free, mission)
     mode = pair.mode
+    if isinstance(mode, Travelling) and passing.yielding(state.passing, _leading(state, contacts), mission):
+        now = replace(state.passing, leeway=0.0, blocked=0, yielded=state.passing.yielded + 1)
+        return replace(state, passing=now)
+    now = passing.passed(state.passing, mode, pair.odometry, free, mission)
     if isinstance(mode, Travelling) and (now.places or state.passing.places):
         places, tolerance = now.places, pair.estimator.pose_tolerance
         if places and phase2_orbit.arrived(Travelling(places[0]), pair.odometry, mission, tolerance):
@@ -293,6 +296,12 @@ def passing_others(state: GroupState, contacts: Sequence[Contact]) -> GroupState
         now = replace(now, places=places)
         mode = Travelling(places[0] if places else stop(state.frame, pair))
     return replace(state, pair=replace(pair, mode=mode), passing=now)
+
+
+def _leading(state: GroupState, contacts: Sequence[Contact]) -> list[Contact]:
+    """Return those of `contacts` that travel, too, and go first: those with smaller ids."""
+    own = state.config.robot
+    return [one for one in contacts if one.peer < own and state.other(one.peer).travels]
 
 
 def _must_linger(state: GroupState) -> bool:

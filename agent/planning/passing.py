@@ -26,7 +26,10 @@ BLOCKED_AFTER = 4
 """The ticks with so little way after which it drives aside. A robot that drives away has more way after them."""
 
 CLEARANCE = 0.25
-"""The distance by which a way aside is longer than needed, as a fraction of R."""
+"""The distance by which a way aside is longer than needed, and within which robots yield, as a fraction of R."""
+
+YIELDS = 60
+"""The ticks after which a robot does not yield any longer, because the other one does not drive away."""
 
 
 class Passing(msgspec.Struct, frozen=True):
@@ -36,6 +39,8 @@ class Passing(msgspec.Struct, frozen=True):
     """The length in m that the robot may drive in the next tick."""
     blocked: int = 0
     """The number of consecutive ticks in which it has hardly moved on its way."""
+    yielded: int = 0
+    """The number of consecutive ticks in which it has stood still, to let another one go first."""
     detours: int = 0
     """The number of times that it has driven aside."""
     places: tuple[tuple[float, float], ...] = ()
@@ -52,12 +57,19 @@ def leeway(contacts: Sequence[Contact], peer: str, mission: Mission) -> float:
     return min(free, default=math.inf)
 
 
+def yielding(passing: Passing, leading: Sequence[Contact], mission: Mission) -> bool:
+    """Return whether a robot stands still, because one of those that travel and go first is near."""
+    near = CLEARANCE * mission.sensing_range
+    close = any(one.range is None or separation.leeway(one.range, mission) < near for one in leading)
+    return close and passing.yielded < YIELDS
+
+
 def passed(passing: Passing, mode: object, odometry: Pose, free: float, mission: Mission) -> Passing:
     """Return `passing` after a tick that led to `odometry` in `mode`, where `free` m may be driven next."""
     if not isinstance(mode, Travelling):
         return Passing(free, detours=passing.detours)
     blocked = passing.blocked + 1 if free < BLOCKED * mission.first_straight else 0
-    passing = replace(passing, leeway=free, blocked=blocked)
+    passing = replace(passing, leeway=free, blocked=blocked, yielded=passing.yielded if math.isfinite(free) else 0)
     if passing.places or blocked < BLOCKED_AFTER:
         return passing
     places = _aside(odometry, mode.place, mission, 1.0 if passing.detours % 2 == 0 else -1.0)
