@@ -283,7 +283,7 @@ def passing_others(state: GroupState, contacts: Sequence[Contact]) -> GroupState
     pair, mission = state.pair, state.config.mission
     if not mission.safety_distance:
         return state
-    free = passing.leeway(contacts, pair.config.peer, mission)
+    free = passing.leeway(contacts, pair.config.peer if pair.in_contact else None, mission)
     mode = pair.mode
     if isinstance(mode, Travelling) and passing.yielding(state.passing, _leading(state, contacts), mission):
         now = replace(state.passing, leeway=0.0, blocked=0, yielded=state.passing.yielded + 1)

@@ -23,10 +23,10 @@ BLOCKED = 0.1
 """The way that is left in a tick, as a fraction of A_0, below which a robot may be blocked."""
 
 BLOCKED_AFTER = 4
-"""The ticks with so little way after which it drives aside. A robot that drives away has more way after them."""
+"""The ticks with so little way after which it drives aside. One that drives away has more way by then."""
 
 CLEARANCE = 0.25
-"""The distance by which a way aside is longer than needed, and within which robots yield, as a fraction of R."""
+"""The distance by which a way aside is longer than needed, and within which one yields, as a fraction of R."""
 
 YIELDS = 60
 """The ticks after which a robot does not yield any longer, because the other one does not drive away."""
@@ -47,8 +47,11 @@ class Passing(msgspec.Struct, frozen=True):
     """The ends of the straights of the way aside, in m in the frame of the odometry."""
 
 
-def leeway(contacts: Sequence[Contact], peer: str, mission: Mission) -> float:
-    """Return how far in m a robot may drive in the next tick, for all robots in contact but its `peer`."""
+def leeway(contacts: Sequence[Contact], peer: str | None, mission: Mission) -> float:
+    """Return how far in m a robot may drive in the next tick, for all robots in contact but its `peer`.
+
+    `peer` is None if it does not go on with the meeting: then the robot passes it like any other.
+    """
     free = [
         0.0 if one.range is None else separation.SHARE_OF_EACH * separation.leeway(one.range, mission)
         for one in contacts
@@ -69,7 +72,9 @@ def passed(passing: Passing, mode: object, odometry: Pose, free: float, mission:
     if not isinstance(mode, Travelling):
         return Passing(free, detours=passing.detours)
     blocked = passing.blocked + 1 if free < BLOCKED * mission.first_straight else 0
-    passing = replace(passing, leeway=free, blocked=blocked, yielded=passing.yielded if math.isfinite(free) else 0)
+    passing = replace(
+        passing, leeway=free, blocked=blocked, yielded=passing.yielded if math.isfinite(free) else 0
+    )
     if passing.places or blocked < BLOCKED_AFTER:
         return passing
     places = _aside(odometry, mode.place, mission, 1.0 if passing.detours % 2 == 0 else -1.0)
