@@ -253,12 +253,12 @@ class Scenario(
         return tuple([Member(one.id, one.anchor, ends[one.id]) for one in self.robots]) if ends else ()
 
 
-def _last_tick(time: float, period: float) -> int:
-    """Return the last tick that begins at `time` or before; `time` and `period` in s."""
-    tick = math.floor(time / period)  # the quotient is rounded, which can move it over a tick
-    while (tick + 1) * period <= time:
+def _last_tick(moment: float, period: float) -> int:
+    """Return the last tick that begins at `moment` or before; both times are in s."""
+    tick = math.floor(moment / period)  # the quotient is rounded, which can move it over a tick
+    while (tick + 1) * period <= moment:
         tick += 1
-    while tick * period > time:
+    while tick * period > moment:
         tick -= 1
     return tick
 
