@@ -26,7 +26,7 @@ BLOCKED_AFTER = 4
 """The ticks with so little way after which it drives aside. One that drives away has more way by then."""
 
 CLEARANCE = 0.25
-"""The distance by which a way aside is longer than needed, and within which one yields, as a fraction of R."""
+"""The distance by which a way aside is longer than needed, and at which robots yield, as a fraction of R."""
 
 YIELDS = 60
 """The ticks after which a robot does not yield any longer, because the other one does not drive away."""
