@@ -293,6 +293,7 @@ def test_the_anchors_and_the_plan_of_a_drawn_group_follow_from_the_seed() -> Non
         ({"group": {"robots": 2, "spacing": 30.0}}, "group.robots: "),
         ({"group": {"robots": 201, "spacing": 30.0}}, "group.robots: "),
         ({"group": {"robots": 4}}, "group: missing field 'spacing'"),
+        ({"group": {"robots": 4, "spacing": 30.0, "dies": [9, 5]}}, "group.dies: the lower bound 9 is above"),
         ({"robot": [{"id": "a", "anchor": [0.0, 0.0]}] * 2}, "group: its robots are drawn"),
         ({"planner": {"name": "paper"}}, "planner.name: robots with the planner paper meet in pairs"),
     ],
