@@ -25,7 +25,8 @@ GroundTruth    world -> viewers                       every tick with a subscrib
 MissionEnd     world -> robot                         once, after the last tick
 FinalReport    robot -> world, and back as an         once, in answer to MissionEnd
                acknowledgement
-TickStart      driver -> driver of the peer           every tick, in hardware mode
+TickStart      driver -> driver of the peer; in a     every tick, in hardware mode
+               group, its own kind, to all drivers
 DeadlineMissed journals only                          each missed deadline, in real time
 Environment    journals only                          once, as the first frame
 ============== ====================================== ==========================================
@@ -551,6 +552,15 @@ class TickStart(Message, frozen=True):
     """The tick k."""
     robot: RobotId
     """The robot of the sending driver."""
+
+
+class TickStartInGroup(TickStart, frozen=True):
+    """The start of tick k at the driver of a robot in a group, with what the others need to end the mission."""
+
+    verdict: Verdict | None = None
+    """The final result of the robot; None until it has one."""
+    complete: bool = False
+    """True if the robot has its result, and waits for no other robot."""
 
 
 OfRobot = (
