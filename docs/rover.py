@@ -1,4 +1,4 @@
-"""A simulated robot as a driver to copy from, and a process that measures the ranges between several of them.
+"""A simulated robot as a driver to copy from, and a process that measures the ranges between such robots.
 
     uv run docs/rover.py --port 4747 --reach 3                # the beacon: measures mutual ranges
     uv run tandem robot a --mission paper-1 --driver docs.rover:Rover --rate 4 --listen tcp/127.0.0.1:7447 \
@@ -115,7 +115,7 @@ class Rover:
     def stop(self) -> None:
         """Stop, and stay available for mutual ranges of others once the mission has ended.
 
-        After a restart the others have to wait instead: they must not pass ticks in which this robot moves on.
+        After a restart others have to wait instead: they must not pass ticks in which this robot moves on.
         """
         self._settle()
         if self._done < 1.0:
@@ -222,7 +222,7 @@ class Beacon:
 
 
 def main() -> None:
-    """Run the beacon: it answers a robot once all others stand in the same tick, have left it, or are parked."""
+    """Run the beacon: it answers a robot once all others are in its tick, have left it, or are parked."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--port", type=int, default=0)
     parser.add_argument("--reach", type=float, required=True, help="the sensing range R, in m")

@@ -555,7 +555,7 @@ class TickStart(Message, frozen=True):
 
 
 class TickStartInGroup(TickStart, frozen=True):
-    """The start of tick k at the driver of a robot in a group, with what the others need to end the mission."""
+    """The start of tick k at the driver of a robot in a group, with what ends the mission of others."""
 
     verdict: Verdict | None = None
     """The final result of the robot; None until it has one."""

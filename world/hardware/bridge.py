@@ -5,8 +5,8 @@ driver. The agent is the same program as with a simulator. It runs in a process 
 robot stops after the current manoeuvre.
 
 A tick is a manoeuvre of T_s and a rest, for measurements, Reports and the decision. All robots of a mission
-count the same ticks. Each sends a TickStart at the start of each tick, and sets its clock from those of another
-robot (see `tick_source`). If none arrives, it uses its own clock.
+count the same ticks. Each sends a TickStart at the start of each tick, and sets its clock from those of
+another robot (see `tick_source`). If none arrives, it uses its own clock.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from protocol.messages import (
 from protocol.network import keys, session
 from protocol.network.inbox import NOTHING, Arrival, Inbox
 from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode, encode
-from world.hardware.driver import THINKING, Driver, Reading
+from world.hardware.driver import THINKING, Driver
 from world.hardware.driver_journal import DriverHistory
 from world.hardware.group_termination import GroupEnding
 from world.hardware.measurements import InvalidReading, mark_frames, observation_frame, others_of
@@ -193,12 +193,12 @@ class Field:
     # --- a tick ---
 
     def _gather(self, give_up: float) -> None:
-        """Wait until tick 0 can begin: for the first robot when all agents are connected, then for the others.
+        """Wait until tick 0 can begin: for the first robot when all agents are connected, then for the rest.
 
-        A resumed process only waits for its own agent, because the mission of others may have ended. One that
-        was killed before tick 0 may have missed the TickStart of a robot that now waits for it. It therefore
-        begins after UNHEARD ticks without one. A robot of a group begins at `give_up` without those that are
-        missing, if there is any other. Raises NoStart.
+        A resumed process only waits for its own agent, because the mission of others may have ended. One
+        that was killed before tick 0 may have missed the TickStart of a robot that now waits for it. It
+        therefore begins after UNHEARD ticks without one. A robot of a group begins at `give_up` without those
+        that are missing, if any other is there. Raises NoStart.
         """
         unheard = time.monotonic() + UNHEARD * self._tick_s
         while not self._may_begin():
@@ -350,8 +350,8 @@ class Field:
         """Set the time of the next tick from a TickStart of the robot that this one follows.
 
         The next tick begins as many ticks later as its number is higher, and at once if it is lower. A robot
-        that is behind sets its clock from any other one: if it was restarted, and in a group also if it begins
-        late or is more than AHEAD ticks behind.
+        that is behind sets its clock from any other one: if it was restarted, and in a group also if it
+        begins late or is more than AHEAD ticks behind.
         """
         start: TickStart | None = self._accepted(arrival, TickStart | TickStartInGroup)
         if start is None:

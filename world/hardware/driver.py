@@ -40,8 +40,8 @@ class Reading(msgspec.Struct, frozen=True):
     mutual_ranges: Mapping[str, float | None] = {}
     """The range to each robot within range, in m, by its id; None for a contact without a measured range.
 
-    A driver for groups returns these; one for pairs may, in place of `mutual_range` and `contact`. The peer of
-    these two is that of the RobotConfig.
+    A driver for groups returns these; one for pairs may, in place of `mutual_range` and `contact`, which are
+    about the peer in the RobotConfig.
     """
 
 

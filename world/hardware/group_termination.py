@@ -1,12 +1,12 @@
 """The end of the mission of a robot in a group, in hardware mode.
 
-In a group, a Report contains the verdict of a meeting, and robots are seldom in contact. Therefore the drivers
-send each other the results of their robots with every TickStart.
+In a group, a Report contains the verdict of a meeting, and robots are seldom in contact. Therefore the
+drivers send each other the results of their robots, with every TickStart.
 
 A robot's own result does not end its mission, because others may need it: it stays until all robots have a
-result, and know it of each other. It does not wait for a robot that has been silent for the timeout once that
-one's planned time is over, and it has nothing to do itself: no planned visit, and no way to that robot, which
-its planner takes if it should be localised by then. In any case, its mission ends at max_ticks.
+result, and know of each other's. It does not wait for a robot that has been silent for the timeout, once that
+robot should be localised by the plan and this one has nothing to do: no planned visit, and no way to the
+silent robot, which its planner takes then. In any case, its mission ends at max_ticks.
 """
 
 from __future__ import annotations

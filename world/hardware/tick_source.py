@@ -1,8 +1,8 @@
 """The robot whose ticks another one counts, in hardware mode.
 
-All robots must count the same ticks. Each sets its clock from the first robot, in the order of the mission, that
-it hears: in a pair, b from a. So a robot that falls silent is replaced by the next one without an agreement, and
-no robot waits for it.
+All robots must count the same ticks. Each sets its clock from the first robot, in the order of the mission,
+that it hears: in a pair, b from a. If a robot falls silent, the next one takes its place without an
+agreement, and no robot waits.
 """
 
 from __future__ import annotations
