@@ -4,9 +4,9 @@ In a group, a Report contains the verdict of a meeting, and robots are seldom in
 drivers send each other the results of their robots, with every TickStart.
 
 A robot's own result does not end its mission, because others may need it: it stays until all robots have a
-result, and know of each other's. It does not wait for a robot that has been silent for the timeout, once that
-robot should be localised by the plan and this one has nothing to do: no planned visit, and no way to the
-silent robot, which its planner takes then. In any case, its mission ends at max_ticks.
+result, and know of each other's. It does not wait for ever for a robot that has been silent for the timeout.
+Once that robot should be localised by the plan, its planner goes there. The mission ends when the planner has
+nothing to do any more, or when this takes as long as the whole plan. In any case, it ends at max_ticks.
 """
 
 from __future__ import annotations
@@ -50,6 +50,8 @@ class GroupEnding(Termination):
         self._timeout = timeout
         self._others = {one.robot: one for one in config.members if one.robot != config.robot}
         self._order = [one.robot for one in config.members]
+        self._plan = max(one.ends for one in config.members)
+        """The bound in s of the time until all are localised, by the plan."""
         self._results: dict[str, Verdict] = {}
         """The results that have been received, by robot."""
         self._complete: set[str] = set()
@@ -94,10 +96,11 @@ class GroupEnding(Termination):
         return None
 
     def _is_lost(self, robot: str, tick: int) -> bool:
-        """Return whether this robot does not wait for `robot` any more, in which it has heard nothing."""
-        late = tick * self._mission.period > self._others[robot].ends
-        silent = time.monotonic() - self._heard[robot] > self._timeout
-        return late and silent and self._resting > RESTING_TICKS
+        """Return whether this robot does not wait for `robot` any more, of which it has heard nothing."""
+        if time.monotonic() - self._heard[robot] <= self._timeout:
+            return False
+        late = tick * self._mission.period - self._others[robot].ends
+        return late > self._plan or (late > 0.0 and self._resting > RESTING_TICKS)
 
     def _end(self, tick: int) -> MissionEnd:
         if self.verdict is None:
