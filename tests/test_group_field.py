@@ -150,6 +150,25 @@ def test_a_killed_robot_of_a_group_resumes(tmp_path: Path, killed: str) -> None:
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("amount", range(500, 9000, 1700))
+@pytest.mark.parametrize("killed", ["a", "bd", "abcd"])
+def test_robots_of_a_group_that_are_killed_at_any_moment_resume(
+    tmp_path: Path, killed: str, amount: int
+) -> None:
+    with group(tmp_path, FAR) as four:
+        four.start("a", "b", "c", "d")
+        for name in killed:
+            path, robot = tmp_path / name / f"agent-{name}.journal", four.robots[name]
+            until(lambda path=path, robot=robot: size(path) >= amount or not robot.running, four.said)  # type: ignore[misc]
+        for name in killed:
+            four.robots[name].tell(SIGKILL)
+        for name in killed:
+            four.kill(name)
+        four.start(*killed)
+        all_are_localised(tmp_path, four.robots)
+
+
+@pytest.mark.long
 def test_a_robot_that_is_dead_for_good_keeps_the_others_from_nothing(tmp_path: Path) -> None:
     """Robot a, whose ticks the others count, dies on the way to c: another one visits c later."""
     with group(tmp_path, FAR, "--lost", "2") as four:
