@@ -24,7 +24,7 @@ from typing import Any
 
 import msgspec
 
-from protocol.messages import RobotConfig, RobotConfigInGroup
+from protocol.messages import RobotConfig
 from protocol.motion import REST, Controls, Pose, step, wrap
 from world.hardware.driver import Reading
 
@@ -52,8 +52,6 @@ class Rover:
         After it the driver raises: this robot has no drop-outs, so it must not report a missing range.
         """
         self._config = config
-        group = [one.robot for one in config.members] if isinstance(config, RobotConfigInGroup) else []
-        self._others = [one for one in group if one != config.robot] or [config.peer]
         self._manoeuvre_s = manoeuvre_s
         anchor = config.anchor
         self.pose = (
@@ -172,7 +170,7 @@ class Rover:
         raise TimeoutError(f"no answer of the beacon for {self._give_up_s:g} s")
 
     def _send(self, tick: int, *, parked: bool = False) -> None:
-        where = {"robot": self._config.robot, "others": self._others, "tick": tick, "parked": parked}
+        where = {"robot": self._config.robot, "others": self._config.others, "tick": tick, "parked": parked}
         if self._radio is not None:
             with suppress(ConnectionRefusedError):  # of an earlier datagram: there is no beacon
                 self._radio.send(json.dumps(where | {"x": self.pose.x, "y": self.pose.y}).encode())

@@ -260,6 +260,11 @@ class RobotConfig(Message, frozen=True, dict=True):
         return math.hypot(self.anchor.x - self.peer_anchor.x, self.anchor.y - self.peer_anchor.y)
 
     @property
+    def others(self) -> tuple[str, ...]:
+        """The robots that this one may be in contact with, in the order of the mission; here, its peer."""
+        return (self.peer,)
+
+    @property
     def widest_distance(self) -> float:
         """The largest distance in m between the anchors of two robots that may meet; here, D."""
         return self.anchor_distance
@@ -317,6 +322,11 @@ class RobotConfigInGroup(RobotConfigWithOptions, frozen=True, dict=True):
     """The meetings in which it tries again if it is not localised by then, in their order."""
     gives_up: Time = 0.0
     """The time in s after which it gives up if it is not localised."""
+
+    @property
+    def others(self) -> tuple[str, ...]:
+        """All other robots of the group."""
+        return tuple([one.robot for one in self.members if one.robot != self.robot])
 
     @cached_property
     def widest_distance(self) -> float:

@@ -37,7 +37,7 @@ from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode, encode
 from world.hardware.driver import THINKING, Driver
 from world.hardware.driver_journal import DriverHistory
 from world.hardware.group_termination import GroupEnding
-from world.hardware.measurements import InvalidReading, mark_frames, observation_frame, others_of
+from world.hardware.measurements import InvalidReading, mark_frames, observation_frame
 from world.hardware.termination import Ending, Termination
 from world.hardware.tick_source import UNHEARD, TickSource
 
@@ -89,7 +89,7 @@ class Field:
         """
         self._driver = driver
         self._config = config
-        self._id, self._others = config.robot, others_of(config)
+        self._id, self._others = config.robot, config.others
         self.run = run
         self._inbox = inbox
         self._manoeuvre_s = manoeuvre_s

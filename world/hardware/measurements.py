@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from protocol.messages import Contact, Message, Observation, RobotConfig, RobotConfigInGroup
+from protocol.messages import Contact, Message, Observation, RobotConfig
 from protocol.wire import MalformedFrame, decode, encode
 from world.hardware.driver import Reading
 from world.hardware.driver_journal import Mark
@@ -15,13 +15,6 @@ from world.hardware.driver_journal import Mark
 
 class InvalidReading(Exception):
     """The reading of a driver is invalid. The text of the error says why."""
-
-
-def others_of(config: RobotConfig) -> tuple[str, ...]:
-    """Return the robots that the one with `config` may be in contact with, in the order of the mission."""
-    if not isinstance(config, RobotConfigInGroup):
-        return (config.peer,)
-    return tuple([one.robot for one in config.members if one.robot != config.robot])
 
 
 def observation_frame(reading: Any, tick: int, config: RobotConfig) -> bytes:
@@ -52,10 +45,10 @@ def _contacts(reading: Reading, config: RobotConfig) -> tuple[Contact, ...]:
         if peer in ranges:
             raise InvalidReading(f"both mutual_ranges and the other fields have a contact with {peer}")
         ranges[peer] = reading.mutual_range
-    found = tuple([Contact(one, ranges.pop(one), None) for one in others_of(config) if one in ranges])
+    found = tuple([Contact(one, ranges.pop(one), None) for one in config.others if one in ranges])
     if ranges:
         stranger = next(iter(ranges))
-        raise InvalidReading(f"mutual_ranges: {stranger!r} is none of {', '.join(others_of(config))}")
+        raise InvalidReading(f"mutual_ranges: {stranger!r} is none of {', '.join(config.others)}")
     return found
 
 

@@ -23,7 +23,6 @@ from protocol.motion import ORIGIN, Controls, Pose, wrap
 from protocol.network import session
 from protocol.network.endpoints import at
 from world.hardware.driver import SENSING, Reading
-from world.hardware.measurements import others_of
 
 TWIST, ODOMETRY, RANGE = "geometry_msgs/msg/Twist", "nav_msgs/msg/Odometry", "sensor_msgs/msg/Range"
 CONNECT_S = 10.0
@@ -115,7 +114,7 @@ class Ros2:
         self._command.set()  # there is no manoeuvre yet
         in_group = isinstance(config, RobotConfigInGroup)
         self._anchor = anchor_range
-        self._peers = {one: f"{peer_range}/{one}" if in_group else peer_range for one in others_of(config)}
+        self._peers = {one: f"{peer_range}/{one}" if in_group else peer_range for one in config.others}
         """The topic of the range to each other robot."""
         self._open = ExitStack()
         give_up = time.monotonic() + CONNECT_S
