@@ -97,6 +97,8 @@ class GroupPlanner(Planner[GroupState, Report]):
         peer, before = state.pair.config.peer, state.pair
         of_peer = [] if group_transitions.refused(state, peer) else [one for one in logs if one.robot == peer]
         pair = self.pair_planner.decide(before, of_peer)
+        if before.verdict is None and pair.verdict is not None and pair.belief.phase1_done_tick is None:
+            return group_transitions.without_peer(state, pair.verdict)
         silence = state.silence + 1 if pair.in_contact and not of_peer else 0
         state = replace(state, pair=pair, silence=silence)
         if isinstance(pair.verdict, Localised) and before.verdict is None:

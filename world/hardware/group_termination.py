@@ -51,7 +51,7 @@ class GroupEnding(Termination):
         self._others = {one.robot: one for one in config.members if one.robot != config.robot}
         self._order = [one.robot for one in config.members]
         self._plan = max(one.ends for one in config.members)
-        """The bound in s of the time until all are localised, by the plan."""
+        """The tick until which all are localised, by the plan."""
         self._results: dict[str, Verdict] = {}
         """The results that have been received, by robot."""
         self._complete: set[str] = set()
@@ -99,8 +99,8 @@ class GroupEnding(Termination):
         """Return whether this robot does not wait for `robot` any more, of which it has heard nothing."""
         if time.monotonic() - self._heard[robot] <= self._timeout:
             return False
-        late = tick * self._mission.period - self._others[robot].ends
-        return late > self._plan or (late > 0.0 and self._resting > RESTING_TICKS)
+        late = tick - self._others[robot].ends
+        return late > self._plan or (late > 0 and self._resting > RESTING_TICKS)
 
     def _end(self, tick: int) -> MissionEnd:
         if self.verdict is None:
