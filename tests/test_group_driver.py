@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from compose.launch.driver_loader import config_of
+from compose.errors import UserError
+from compose.launch.driver_loader import config_of, mission
 from compose.scenario.scenario_file import parse
 from protocol.journal.journal_file import CorruptJournal
 from protocol.messages import (
@@ -345,3 +346,9 @@ def test_a_reading_with_invalid_ranges_is_refused(ranges: Any, said: str) -> Non
 def test_a_reading_with_two_contacts_with_the_peer_is_refused() -> None:
     with pytest.raises(InvalidReading, match="both mutual_ranges and the other fields have a contact with d"):
         contacts(Reading(REST, 2.0, 1.0, mutual_ranges={"d": 1.0}))
+
+
+def test_a_robot_that_dies_by_the_scenario_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "dies.toml").write_text(f"{FAR}dies = 5\n")
+    with pytest.raises(UserError, match="dies: not available in hardware mode"):
+        mission(str(tmp_path / "dies.toml"), "a")
