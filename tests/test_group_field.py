@@ -16,7 +16,7 @@ from compose.launch.processes import free_endpoint
 from compose.scenario.scenario_file import parse
 from protocol.messages import RobotConfigInGroup
 from protocol.motion import REST, Pose, step
-from tests.commands import SECTION_IV, Ended, TandemProcess, processes_of, size, tandem, until
+from tests.commands import BOUND_S, SECTION_IV, Ended, TandemProcess, processes_of, size, tandem, until
 from tests.test_field import beacon, pose, told
 
 
@@ -91,9 +91,10 @@ def pose_at_end(agent: AgentHistory) -> Pose:
     return step(agent.path[-1], last.v, last.omega, agent.config.mission.period)
 
 
-def all_are_localised(out: Path, robots: dict[str, TandemProcess]) -> dict[str, Ended]:
+def all_are_localised(out: Path, four: Group) -> dict[str, Ended]:
     """Assert that all robots end localised, correctly, and that audit and replay find nothing."""
-    ends = {name: robot.ended(120.0) for name, robot in robots.items()}
+    until(lambda: not any(robot.running for robot in four.robots.values()), four.said, 3.0 * BOUND_S)
+    ends = {name: robot.ended() for name, robot in four.robots.items()}
     both = out / "all"
     both.mkdir()
     for name, ended in ends.items():
@@ -120,7 +121,7 @@ def test_four_robots_localise_in_hardware_mode(tmp_path: Path, text: str, encryp
         assert tandem("keys", tmp_path / "keys", "--robots", "a,b,c,d").status == 0
     with group(tmp_path, text, keys=keys) as four:
         four.start("d", "b", "a", "c")  # in any order
-        ends = all_are_localised(tmp_path, four.robots)
+        ends = all_are_localised(tmp_path, four)
     agents = {name: told(tmp_path, name) for name in four.robots}
     near = any(len(one.observation.contacts) > 1 for agent in agents.values() for one in agent.steps)
     assert near or text == FAR
@@ -144,7 +145,7 @@ def test_a_killed_robot_of_a_group_resumes(tmp_path: Path, killed: str) -> None:
         four.kill(killed)
         before = len(told(tmp_path, killed).steps)
         four.start(killed)
-        all_are_localised(tmp_path, four.robots)
+        all_are_localised(tmp_path, four)
         assert f"{killed}: in run four, resumed at tick {before - 1}" in four.robots[killed].out
     assert len(told(tmp_path, killed).steps) > before
 
@@ -165,7 +166,7 @@ def test_robots_of_a_group_that_are_killed_at_any_moment_resume(
         for name in killed:
             four.kill(name)
         four.start(*killed)
-        all_are_localised(tmp_path, four.robots)
+        all_are_localised(tmp_path, four)
 
 
 @pytest.mark.long
@@ -175,7 +176,7 @@ def test_a_robot_that_is_dead_for_good_keeps_the_others_from_nothing(tmp_path: P
         four.start("a", "b", "c", "d")
         four.robots["a"].until(lambda: claims(tmp_path, "a"), "a is localised")
         four.kill("a")
-        until(lambda: all(claims(tmp_path, name) for name in "bcd"), four.said, 120.0)
+        until(lambda: all(claims(tmp_path, name) for name in "bcd"), four.said, 3.0 * BOUND_S)
         for name in "bcd":
             four.robots[name].tell(SIGINT)
         for name in "bcd":
@@ -193,7 +194,7 @@ def test_a_robot_that_comes_late_joins_its_group(tmp_path: Path) -> None:
         four.robots["b"].until(lambda: len(steps(tmp_path, "b")) > 3, "the mission has begun")
         assert "a: not connected; the mission begins" in four.said()
         four.start("a")
-        all_are_localised(tmp_path, four.robots)
+        all_are_localised(tmp_path, four)
 
 
 def steps(out: Path, robot: str) -> Sequence[Step]:
