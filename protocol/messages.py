@@ -324,9 +324,14 @@ class RobotConfigInGroup(RobotConfigWithOptions, frozen=True, dict=True):
     """The time in s after which it gives up if it is not localised."""
 
     @property
+    def group(self) -> tuple[str, ...]:
+        """All robots of the group, in the order of the mission."""
+        return tuple([one.robot for one in self.members])
+
+    @property
     def others(self) -> tuple[str, ...]:
-        """All other robots of the group."""
-        return tuple([one.robot for one in self.members if one.robot != self.robot])
+        """All other robots of the group, in the order of the mission."""
+        return tuple([one for one in self.group if one != self.robot])
 
     @cached_property
     def widest_distance(self) -> float:

@@ -48,10 +48,11 @@ class GroupEnding(Termination):
         self._mission = config.mission
         self._max_ticks = max_ticks
         self._timeout = timeout
-        self._others = {one.robot: one for one in config.members if one.robot != config.robot}
-        self._order = [one.robot for one in config.members]
-        self._plan = max(one.ends for one in config.members)
-        """The tick until which all are localised, by the plan."""
+        self._group, self._others = config.group, {*config.others}
+        self._ends = {one.robot: one.ends for one in config.members}
+        """The tick until which each robot is localised, by the plan."""
+        self._plan = max(self._ends.values())
+        """The tick until which all are."""
         self._results: dict[str, Verdict] = {}
         """The results that have been received, by robot."""
         self._complete: set[str] = set()
@@ -87,9 +88,9 @@ class GroupEnding(Termination):
             self.verdict = self.verdict or command.verdict
             self._resting = self._resting + 1 if command.state in RESTING_STATES else 0
         lost = [robot for robot in self._others if self._is_lost(robot, tick)]
-        self._is_complete = self.verdict is not None and self._results.keys() | lost >= self._others.keys()
+        self._is_complete = self.verdict is not None and self._results.keys() | {*lost} >= self._others
         ended = {robot for robot in self._results if robot not in alive}
-        if self._known is None and self._is_complete and self._complete | ended | {*lost} >= {*self._others}:
+        if self._known is None and self._is_complete and self._complete | ended | {*lost} >= self._others:
             self._known = tick
         if tick >= self._max_ticks or (self._known is not None and tick >= self._known + LAST_WORDS):
             return self._end(tick)
@@ -99,14 +100,14 @@ class GroupEnding(Termination):
         """Return whether this robot does not wait for `robot` any more, of which it has heard nothing."""
         if time.monotonic() - self._heard[robot] <= self._timeout:
             return False
-        late = tick - self._others[robot].ends
+        late = tick - self._ends.get(robot, self._plan)
         return late > self._plan or (late > 0 and self._resting > RESTING_TICKS)
 
     def _end(self, tick: int) -> MissionEnd:
         if self.verdict is None:
             return MissionEnd(tick, "undecided", f"max_ticks: {self._me} not localised by then")
         results = {**self._results, self._me: self.verdict}
-        known = [(robot, results[robot]) for robot in self._order if robot in results]
+        known = [(robot, results[robot]) for robot in self._group if robot in results]
         for robot, verdict in known:
             if isinstance(verdict, Inconsistent):
                 return MissionEnd(tick, "inconsistent", f"{robot}: its peer reports {verdict.claim}")
@@ -116,7 +117,7 @@ class GroupEnding(Termination):
                     return MissionEnd(tick, "undecided", f"{robot}: {reason}")
                 case Localised() if (vague := inaccuracy(verdict, self._mission)) is not None:
                     return MissionEnd(tick, "undecided", f"{robot} {vague}")
-        missing = [robot for robot in self._order if robot not in results]
+        missing = [robot for robot in self._group if robot not in results]
         if missing:
             what = f"{self._me} is localised; no result of {', '.join(missing)} received"
             return MissionEnd(tick, "undecided", what)

@@ -22,9 +22,10 @@ class TickSource:
         """`tick_s` is the duration of a tick in s of wall time."""
         self.joins = isinstance(config, RobotConfigInGroup)
         """True if a robot that has not begun does so in the tick of any other one that has: in a group."""
-        order = [one.robot for one in config.members] if isinstance(config, RobotConfigInGroup) else []
-        pair = [config.peer] if config.role == "b" else []
-        self._before = order[: order.index(config.robot)] if order else pair
+        if isinstance(config, RobotConfigInGroup):
+            self._before = config.group[: config.group.index(config.robot)]
+        else:
+            self._before = (config.peer,) if config.role == "b" else ()
         self._unheard_s = UNHEARD * tick_s
         self._heard: dict[str, float] = {}
         """The time at which each of them was heard last, on the monotonic clock."""
