@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from compose.errors import UserError
 from compose.launch.driver_loader import config_of, mission
 from compose.scenario.scenario_file import parse
-from protocol.journal.journal_file import CorruptJournal
+from protocol.journal.journal_file import CorruptJournal, MemoryJournal, Sink
 from protocol.messages import (
     Command,
     Contact,
@@ -58,12 +58,25 @@ def stage(monkeypatch: pytest.MonkeyPatch) -> Stage:
 class Member:
     """A robot of the group on a stage, whose agent answers each Observation at once."""
 
-    def __init__(self, stage: Stage, robot: str, max_ticks: int, verdict: Verdict | None = None) -> None:
+    def __init__(
+        self,
+        stage: Stage,
+        robot: str,
+        max_ticks: int,
+        verdict: Verdict | None = None,
+        journal: Sink | None = None,
+    ) -> None:
         self.driver = Recorded()
         self.driver.clock = stage.monotonic
         self._stage, self._robot, self._verdict = stage, robot, verdict
         self.field = Field(
-            self.driver, config_in_group(robot), "r", stage, max_ticks=max_ticks, manoeuvre_s=MANOEUVRE_S
+            self.driver,
+            config_in_group(robot),
+            "r",
+            stage,
+            max_ticks=max_ticks,
+            manoeuvre_s=MANOEUVRE_S,
+            journal=journal,
         )
         stage.answer = self._answer
 
@@ -154,6 +167,15 @@ def test_the_first_robot_does_not_count_the_ticks_of_others(stage: Stage) -> Non
     begins(stage, "b", {tick: (tick - 1.5) * TICK_S + 0.05 for tick in range(2, 10)})
     a.play()
     assert a.times[9] - a.times[0] == pytest.approx(9 * TICK_S)
+
+
+def test_a_robot_begins_when_any_other_one_does(stage: Stage) -> None:
+    """Here d, whose connection timeout was over first. It is after c in the mission."""
+    c = Member(stage, "c", 3)
+    stage.alive("c", "d")
+    begins(stage, "d", {0: 0.5})
+    assert c.play().tick == 3
+    assert c.times[0] == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("robot", ["a", "c"])
@@ -287,6 +309,19 @@ def test_a_robot_without_a_result_ends_at_max_ticks(ending: GroupEnding) -> None
     moving = [ending.after(tick, command(tick), "abcd") for tick in range(801)]
     assert moving[:800] == [None] * 800
     assert moving[800] == MissionEnd(800, "undecided", "max_ticks: a not localised by then")
+
+
+def test_results_are_journaled_once_when_they_are_received(stage: Stage) -> None:
+    journal = MemoryJournal()
+    a = Member(stage, "a", 9, LOCALISED, journal)
+    stage.alive("a", "b", "c", "d")
+    for tick in range(3):
+        for robot in "bc":
+            start = encode(replace(result(robot), tick=tick))
+            stage.comes("tick-start", keys.tick_start("r", robot), start, (0.5 + tick) * TICK_S)
+    assert a.play().tick == 9
+    history = driver_history([encode(config_in_group("a")), *journal.frames], config_in_group("a"), Path("a"))
+    assert [one.robot for tick in history.ticks for one in tick.received] == ["b", "c"]
 
 
 def test_results_that_were_received_are_known_after_a_restart(stage: Stage, tmp_path: Path) -> None:
