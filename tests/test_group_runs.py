@@ -24,7 +24,6 @@ from agent.process.agent_journal import Step
 from compose.audit.replay import replayed
 from compose.audit.rules import audit_run
 from compose.errors import UserError
-from compose.launch.driver_loader import mission
 from compose.launch.in_process import run_mission
 from compose.launch.processes import free_endpoint
 from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
@@ -439,8 +438,3 @@ def test_a_group_that_is_stopped_leaves_no_process(tmp_path: Path) -> None:
         run.tell(Signals.SIGINT)
         assert run.ended().status == 130
     until(lambda: not processes_of(out), "no process is left")
-
-
-def test_a_robot_of_a_group_is_refused_in_hardware_mode(three: Path) -> None:
-    with pytest.raises(UserError, match="robot: in hardware mode, robots meet in pairs"):
-        mission(str(three), "a")
