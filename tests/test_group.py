@@ -138,6 +138,15 @@ def test_an_attacker_cannot_end_the_meeting_of_two_honest_robots(
     assert localised(run) >= set(run.robots) - {f"r{attacker}"}
 
 
+def test_an_attacker_in_six_robots_hears_that_each_has_found_it_and_gives_up() -> None:
+    attack = {"kind": "scale", "size": 0.5, "part": "phase-1"}
+    scenario = group_of(6, 3, attacker=3, attack=attack)
+    run = run_mission(scenario)
+    assert localised(run) == set(run.robots) - {"r3"}
+    assert run.end is not None
+    assert run.end.tick < 0.25 * scenario.max_ticks
+
+
 def test_a_robot_whose_meetings_with_all_others_have_failed_gives_up_at_once() -> None:
     scenario = group_of(3, 14, attacker=2, attack=SHIFTED)
     run = run_mission(scenario)

@@ -165,6 +165,17 @@ def test_no_bound_is_corrected_where_no_robot_is_late() -> None:
     assert corrected_bounds(run_mission(load("paper-1"))) == ()
 
 
+def test_the_bound_is_corrected_when_the_localised_robot_is_an_attacker_and_no_help() -> None:
+    attack = {"kind": "scale", "size": 0.5, "part": "encounter"}
+    run = run_mission(group_of(3, 1, attacker=0, attack=attack))
+    corrected = corrected_bounds(run)
+    honest = [claim.tick for robot in ("r1", "r2") if (claim := run.claim(robot)) is not None]
+    assert len(honest) == 2
+    assert min(one.bound_ticks for one in corrected) < max(honest) <= corrected[-1].bound_ticks
+    for one, other in pairwise(corrected):
+        assert other.tick <= one.bound_ticks + 1
+
+
 # --- results ------------------------------------------------------------------------------------------
 
 

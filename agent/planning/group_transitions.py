@@ -98,7 +98,8 @@ def onward(state: GroupState) -> GroupState:
     if not isinstance(pair.mode, Done) or _must_linger(state):
         return state
     if not isinstance(pair.verdict, Localised):
-        return _next_visit(_after_meeting(state))
+        told = state.lingering > 0 or not pair.in_contact  # the peer hears of it before this robot leaves
+        return _next_visit(_after_meeting(state)) if told else state
     over = pair.peer_state.verdict is not None or state.unmet >= PARTED_AFTER
     return _next_visit(state) if over else state
 

@@ -36,8 +36,9 @@ class CorrectedBound(msgspec.Struct, frozen=True):
 def corrected_bounds(run: Run) -> tuple[CorrectedBound, ...]:
     """Return the bounds that correct the planned one of the group in `run`, in their order; none for pairs.
 
-    Each depends on the plan and on the claims until its tick only. As long as no robot is localised, there is
-    a new one whenever the time of a pair that could have localised itself is over.
+    Each depends on the plan and on the claims until its tick only. As long as pairs are left that try again,
+    there is a new one whenever the time of a pair is over without any claim, and when a bound is over: then
+    those that are localised are of no help to the others, as an attacker is.
     """
     if run.world is None or not run.scenario.meetings:
         return ()
@@ -49,16 +50,20 @@ def corrected_bounds(run: Run) -> tuple[CorrectedBound, ...]:
     stages = [max(ends.values())]
     stages += [math.ceil((one.begins + one.lasts) / scenario.mission.period) for one in scenario.retries]
     found: list[CorrectedBound] = []
-    for stage in stages:
+    while tick < last:
         localised = {robot for robot, claimed in claims.items() if claimed <= tick}
-        if tick >= last or (localised and found):
+        left = [stage for stage in stages if stage >= tick]
+        if localised and not found:
+            begins = max(tick, stages[0])
+        elif left:
+            begins = left[0]
+        else:
             break
-        if localised or tick <= stage:
-            late = tuple([robot for robot in run.robots if ends[robot] < tick and robot not in localised])
-            waiting = [robot for robot in run.robots if robot not in localised]
-            begins = max(tick, stage) + _return_ticks(scenario, waiting)
-            found.append(CorrectedBound(tick, late, begins + _tour_ticks(scenario, waiting)))
-            tick = stage + 1
+        late = tuple([robot for robot in run.robots if ends[robot] < tick and robot not in localised])
+        waiting = [robot for robot in run.robots if robot not in localised]
+        bound = begins + _return_ticks(scenario, waiting) + _tour_ticks(scenario, waiting)
+        found.append(CorrectedBound(tick, late, bound))
+        tick = (bound if min(claims.values(), default=last) <= begins else begins) + 1
     return tuple(found)
 
 

@@ -92,9 +92,11 @@ def _travel_ticks(run: Run) -> float | None:
     """Return a lower bound of the ticks until all are localised, from the first meetings as they went.
 
     They are those of the plan, and end when they did; then robots travel from anchor to anchor, and meetings
-    take no time. None if a first meeting has not localised both of its robots.
+    take no time. None if a first meeting has not localised both of its robots, and if one of the robots dies.
     """
     scenario = run.scenario
+    if scenario.deaths:
+        return None
     place = {robot.id: i for i, robot in enumerate(scenario.robots)}
     hop = tuple(tuple(_way(scenario, i, j) for j in place.values()) for i in place.values())
     seed = [[math.inf] * len(place) for _ in place]
