@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import math
 import random
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
+from agent.estimation.host_pose import host_estimate
 from agent.estimation.resection import RangedPlace, is_certain, poses, positions
 from agent.peer.facts import TO_ROBOT, Fact, FactSet, facts_of
 from compose.errors import BadScenario
 from compose.launch.in_process import run_mission
-from compose.recording.run import Run
+from compose.recording.run import Run, read
 from compose.scenario.scenario_file import validate
 from compose.scenario.sweep_strips import STEP, split, strips, sweep_time
+from protocol.messages import Inconsistent, Localised, Report, RobotConfig
 from protocol.mission import Mission
 from protocol.motion import ORIGIN, Pose, compose
 from tests.groups import R, group_of, table_of
@@ -88,6 +92,58 @@ def test_facts_in_any_order_and_echoed_round_a_ring_give_the_same_bits() -> None
         ring[(step + 1) % 4] = ring[(step + 1) % 4].merged(ring[step % 4])
     assert ring == [known] * 4
     assert [ring[2].log("r0"), ring[2].log("r1"), ring[2].ranges("r0", f"{TO_ROBOT}r1")] == expected
+
+
+def helper_of(run: Run) -> tuple[RobotConfig, tuple[Pose, Pose], int]:
+    """Return the first visitor, the starts that it and its peer have reported, and the tick of its claim."""
+    meeting = run.scenario.meetings[0]
+    starts = [
+        next(
+            framed.report.start
+            for step in run.agents[robot].steps
+            for framed in step.reports
+            if isinstance(framed.report, Report) and framed.report.start is not None
+        )
+        for robot in (meeting.visitor, meeting.visited)
+    ]
+    claim = run.claim(meeting.visitor)
+    assert claim is not None
+    return run.scenario.config(meeting.visitor), (starts[0], starts[1]), claim.tick
+
+
+def test_the_pose_of_a_helper_follows_from_two_logs_to_the_bit_in_any_order(tmp_path: Path) -> None:
+    run_mission(group_of(3, 1), tmp_path)
+    run = read(tmp_path)
+    config, starts, tick = helper_of(run)
+    known = facts_of_run(run)
+    found = host_estimate(known, config, starts, tick)
+    assert found is not None
+    assert isinstance(found.verdict, Localised)
+    true = run.truth(config.robot)[tick]
+    assert math.dist((found.verdict.pose.x, found.verdict.pose.y), (true.x, true.y)) < 1e-6
+    assert abs(math.remainder(found.verdict.pose.heading - true.heading, math.tau)) < 1e-6
+    single = [FactSet(frozenset([one])) for one in sorted(known.facts)]
+    for order in range(100):
+        random.Random(order).shuffle(single)
+        gathered = FactSet()
+        for one in single:
+            gathered = gathered.merged(one)
+        assert host_estimate(gathered, config, starts, tick) == found
+
+
+def test_the_facts_of_a_helper_that_scales_its_path_are_inconsistent(tmp_path: Path) -> None:
+    run_mission(group_of(3, 1), tmp_path)
+    run = read(tmp_path)
+    config, starts, tick = helper_of(run)
+    forged = [
+        replace(one, values=(1.05 * one.values[0], one.values[1]))
+        if one.robot == config.robot and one.kind == "drove"
+        else one
+        for one in facts_of_run(run).facts
+    ]
+    found = host_estimate(FactSet(frozenset(forged)), config, starts, tick)
+    assert found is not None
+    assert isinstance(found.verdict, Inconsistent)
 
 
 def test_a_robot_that_reports_two_values_of_one_measurement_is_found_in_any_order() -> None:

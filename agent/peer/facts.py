@@ -1,6 +1,7 @@
 """Measured facts about several robots, as sets: merging is a union, in any order and any number of times.
 
-A fact is a measurement of one robot in one tick. Conclusions are no facts: each robot draws its own. Everything that is computed from a set is a function of its facts in the order of their keys, so two robots
+A fact is a measurement of one robot in one tick. Conclusions are no facts: each robot draws its own.
+Everything that is computed from a set is a function of its facts in the order of their keys, so two robots
 with the same facts compute the same numbers to the bit.
 """
 
