@@ -136,9 +136,14 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
         return self.actuation == self.odometry == VelocityNoise()
 
     @cached_property
+    def untold_share(self) -> float:
+        """The factor of the priors that nobody has told: 1, or less if ranges are accurate (UNTOLD_SIGMA)."""
+        return min(1.0, max(self.anchor_sigma, self.mutual_sigma) / UNTOLD_SIGMA) ** 2
+
+    @cached_property
     def priors(self) -> Priors:
         """The priors, with those of UNTOLD for those that were not told."""
-        share = min(1.0, max(self.anchor_sigma, self.mutual_sigma) / UNTOLD_SIGMA) ** 2
+        share = self.untold_share
         return Priors(
             share * UNTOLD.range_bias if self.range_bias is None else self.range_bias,
             share * UNTOLD.pair_bias if self.pair_bias is None else self.pair_bias,

@@ -110,6 +110,10 @@ class Drawing(AssuredExact):
         return replace(one, omega=one.omega * (1.0 - 1e-9 * Random().random()))
 
 
+class Sound(AssuredExact):
+    """The planner `assured` with exact sensors, under another name."""
+
+
 class Clock(AssuredExact):
     """It asks for the time."""
 

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from agent.planning.group import TRAVELLING
 from agent.planning.phase2_orbit import Travelling, next_side, travel_controls
-from compose.errors import BadScenario, UserError
+from compose.errors import BadScenario, Unworkable, UserError
 from compose.launch.in_process import run_mission
 from compose.launch.planner_loader import planner_of
 from compose.recording.run import Run, read
@@ -182,6 +182,20 @@ def test_a_group_that_cannot_be_is_refused_in_one_line(change: dict[str, Any], w
         validate(table | change, "group.toml")
     assert what in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("third", [(7.5, 0.0), (90.0, 0.0)], ids=["near", "far"])
+def test_an_accuracy_that_a_prior_forbids_for_any_two_robots_is_refused(third: tuple[float, float]) -> None:
+    """Robots 7 m apart may ask for it; two that are very near to each other or very far apart may not."""
+    table = table_of(3, 1, sigma=0.05)
+    table["mission"]["accuracy"] = 0.05
+    table["mission"]["noise"] |= {"range_bias": 0.1, "gyro_bias": 1e-6}
+    for robot, anchor in zip(table["robot"], ((0.0, 0.0), (7.0, 0.0), (3.5, 6.1)), strict=True):
+        robot["anchor"] = list(anchor)
+    validate(table, "group.toml")
+    table["robot"][2]["anchor"] = list(third)
+    with pytest.raises(Unworkable, match=r"mission\.accuracy: the prior noise"):
+        validate(table, "group.toml")
 
 
 @pytest.mark.parametrize("max_speed", [1.0, 0.005])

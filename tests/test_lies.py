@@ -139,6 +139,18 @@ def test_a_robot_misled_by_false_data_finds_other_places_to_range_from(seed: int
     assert outcome(mission(seed, {"a": Attack("scale", 0.5, "phase-1")}, FINE)) == "inconsistent"
 
 
+@pytest.mark.parametrize("seed", series([3186469040901952592, 4703860127338927889, 3023018364303879480]))
+def test_strays_of_one_kind_are_not_hidden_by_many_good_ranges_of_the_other(seed: int) -> None:
+    """Three of seven ranges of the peer to its anchor fit no path; of 36 with the mutual ones, it was few."""
+    assert outcome(mission(seed, {"a": Attack("scale", 0.5, "phase-1")}, FINE)) == "inconsistent"
+
+
+@pytest.mark.parametrize("seed", series([2456274391522540820, 2683537179718644026, 3512950558579086514]))
+def test_strays_at_the_beginning_are_not_hidden_by_many_later_ranges_that_fit(seed: int) -> None:
+    """A hypothesis that drops the first two mutual ranges may fit the others: these claims were wrong."""
+    assert outcome(mission(seed, {"a": Attack("scale", 0.5, "encounter")}, FINE)) == "inconsistent"
+
+
 @pytest.mark.long
 def test_honest_robots_are_consistent_under_noise() -> None:
     for seed in range(8):

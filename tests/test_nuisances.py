@@ -14,7 +14,7 @@ from scipy import stats  # type: ignore[import-untyped]
 
 from agent.estimation.gaussian.consistency import beta_binomial_tail, f_tail, fisher, sigmas
 from agent.estimation.gaussian.least_squares import fit
-from agent.estimation.gaussian.noise_level import noise_level, residual_correlation
+from agent.estimation.gaussian.noise_level import LEAST_LEVEL, noise_level, residual_correlation
 from agent.estimation.gaussian.odometry_noise import (
     Errors,
     Track,
@@ -26,6 +26,7 @@ from agent.estimation.gaussian.odometry_noise import (
 from agent.estimation.gaussian.own_sensors import doubt
 from agent.estimation.gaussian.range_covariance import range_covariance
 from agent.estimation.gaussian.range_model import Ranges, inlier_probability, mixture
+from agent.estimation.gaussian.reachable_accuracy import reference_sigma
 from agent.peer.peer_state import PeerState
 from agent.planning.accuracy_seeking import AccuracySeeking
 from agent.planning.plausibility import objection
@@ -170,6 +171,16 @@ def drawn(seed: int, noise: Noise, level: float = 1.0) -> tuple[float, float]:
     return float(error @ found.information @ error), found.level
 
 
+@pytest.mark.parametrize("noise", ['"uwb"', '"uwb-calibrated"', "{anchor_sigma = 0.05, mutual_sigma = 0.05}"])
+def test_no_distance_between_the_smallest_and_the_largest_is_less_accurate_than_both(noise: str) -> None:
+    """Therefore these two decide whether a prior forbids the accuracy of a group."""
+    mission = parsed(noise, 1.0).mission
+    found = [reference_sigma(mission, distance, mission.noise) for distance in np.geomspace(0.5, 100.0, 25)]
+    for i in range(len(found)):
+        for j in range(i + 1, len(found)):
+            assert max(found[i : j + 1]) <= 1.05 * max(found[i], found[j])
+
+
 def test_errors_from_the_priors_are_in_the_covariance() -> None:
     """200 draws of 2 unknowns: the mean NEES is 2 +- 0.6 in 99.9 %; a robot without priors has far more."""
     noise = msgspec.convert(PROFILES["uwb-calibrated"], Noise)
@@ -189,14 +200,24 @@ def test_small_residuals_that_are_alike_do_not_make_a_robot_sure() -> None:
     alike, alternating = np.full(21, 0.01), 0.01 * np.resize([1.0, -1.0], 21)
     weights = np.ones(21)
     by_chance = 2.0 / math.sqrt(21.0)
-    assert residual_correlation(alike, weights, ranges) == pytest.approx(20 / 21 - by_chance)
-    assert residual_correlation(alternating, weights, ranges) == 0.0
+    assert residual_correlation(alike, weights, ranges, 1.0) == pytest.approx(20 / 21 - by_chance)
+    assert residual_correlation(alternating, weights, ranges, 1.0) == 0.0
     assert noise_level(1.0, 19, noise, 0.5) > 2.0 * noise_level(1.0, 19, noise)
     assert noise_level(1.0, 19, noise) < 0.6
     white = np.random.default_rng(1).normal(size=21)
-    assert residual_correlation(white, weights, ranges) == 0.0
+    assert residual_correlation(white, weights, ranges, 1.0) == 0.0
     of_two_kinds = ranges._replace(counts=(10, 11, 0))
-    assert residual_correlation(alike, weights, of_two_kinds) == pytest.approx(19 / 21 - by_chance)
+    assert residual_correlation(alike, weights, of_two_kinds, 1.0) == pytest.approx(19 / 21 - by_chance)
+
+
+def test_residuals_that_are_too_small_count_only_as_far_as_they_are_white() -> None:
+    """Slow errors look like a constant one: 3 of 1 000 claims of robots with AR(1) errors were wrong."""
+    noise, ranges = Noise(0.05, 0.05), own(0.0)[1]
+    alike, weights = np.full(21, 0.01), np.ones(21)
+    less_by_chance = 0.4 * 2.0 / math.sqrt(21.0)
+    assert residual_correlation(alike, weights, ranges, 0.4) == pytest.approx(20 / 21 - less_by_chance)
+    assert residual_correlation(alike, weights, ranges, 3.0) < 20 / 21 - less_by_chance
+    assert noise_level(0.0, 100, noise) == LEAST_LEVEL
 
 
 def test_a_bias_of_all_ranges_is_no_correlation_of_their_errors() -> None:

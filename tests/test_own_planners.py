@@ -12,6 +12,7 @@ from typing import Any
 
 import msgspec
 import pytest
+import tomli_w
 from msgspec.structs import asdict, replace
 
 import tandem
@@ -20,11 +21,12 @@ from agent.process.report_buffer import ReportBuffer
 from compose.audit.planner_checks import QuietInbox, check_planner
 from compose.errors import BadScenario, PlannerFailed, UserError
 from compose.launch import planner_loader
+from compose.launch.in_process import run_mission
 from compose.launch.planner_guard import GuardedPlanner
 from compose.launch.planner_loader import planner_of
 from compose.launch.processes import free_endpoint
 from compose.recording.run import read
-from compose.scenario.scenario_file import ScenarioTemplate, load, setting
+from compose.scenario.scenario_file import ScenarioTemplate, load, setting, validate
 from protocol.messages import (
     MAX_BODY_BYTES,
     Inconsistent,
@@ -43,6 +45,7 @@ from tandem.planning import AssuredExact, Paper, RobotState
 from tests import own_planners
 from tests.commands import PAPER_1, TandemProcess
 from tests.commands import tandem as command
+from tests.groups import group_of, table_of
 from tests.own_planners import Parcel, Wrapping
 from tests.series import series
 from world.hardware.termination import Ending
@@ -278,6 +281,35 @@ def test_check_planner_passes_a_sound_planner(name: str) -> None:
     assert len([*takewhile(str.strip, ended.out.splitlines())]) >= 8
 
 
+# --- in groups ----------------------------------------------------------------------------------------
+
+
+def test_robots_with_a_subclass_of_the_shipped_planner_form_a_group(tmp_path: Path) -> None:
+    """A subclass that changes nothing does the same as the planner `assured`, as processes and in one."""
+    name, group = "tests.own_planners:Sound", tmp_path / "group.toml"
+    group.write_text(tomli_w.dumps(table_of(3, 4)))
+    for out, options in (("processes", ("--planner", name)), ("one", ("--planner", name, "--in-process"))):
+        ended = command("run", group, *options, "--out", tmp_path / out)
+        assert ended.status == 0, ended
+    assert journals(tmp_path / "processes") == journals(tmp_path / "one")
+    assert command("audit", tmp_path / "one", "--planner", name).status == 0
+    refused = command("audit", tmp_path / "one")
+    assert (refused.status, refused.out) == (2, "")
+    assert refused.err == f"tandem audit: the planner is {name}; to run its code, add --planner {name}\n"
+    run, shipped = read(tmp_path / "one"), run_mission(group_of(3, 4))
+    assert len(run.robots) == 3
+    for robot in run.robots:
+        assert run.claim(robot) is not None
+        assert run.claim(robot) == shipped.claim(robot)
+
+
+def test_robots_with_another_planner_cannot_form_a_group() -> None:
+    table = table_of(3, 4)
+    table["planner"] = {"name": OWN}
+    with pytest.raises(UserError, match=f"planner.name: robots with the planner {OWN} meet in pairs"):
+        validate(table, "group.toml")
+
+
 # --- reports ------------------------------------------------------------------------------------------
 
 
@@ -369,7 +401,7 @@ def test_shipped_planners_send_the_same_reports_as_before() -> None:
 def test_every_mistake_of_this_module_has_a_test() -> None:
     classes = {name for name, value in vars(own_planners).items() if isinstance(value, type)}
     mistakes = {name for name in classes if getattr(own_planners, name).__module__ == own_planners.__name__}
-    assert mistakes - {*BROKEN} == {"Parcel", "Wrapping", "Incomplete", "Local", "Rendezvousless"}
+    assert mistakes - {*BROKEN} == {"Parcel", "Wrapping", "Sound", "Incomplete", "Local", "Rendezvousless"}
 
 
 def test_orbits_that_are_none_are_one_line() -> None:

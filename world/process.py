@@ -395,15 +395,22 @@ class WorldLinks:
         if self.session is None or not session.linked(self.session):
             self._inbox.say(f"no router at {self.endpoints} yet: {diagnosis.why(self.endpoints)}")
 
+    def attach(self, process: WorldProcess) -> None:
+        """Let `process` send and receive over the open session; robots can find it from then on."""
+        assert self.session is not None
+        process.attach(self.session, replaceable=self.endpoints.mode == "client")
+
     def run(self, process: WorldProcess) -> None:
-        """Run `process` to its MissionEnd over as many sessions as needed. Raises NoRouter, Interrupted."""
+        """Run the attached `process` to its MissionEnd over as many sessions as needed.
+
+        Raises NoRouter, Interrupted.
+        """
         while True:
-            assert self.session is not None
-            process.attach(self.session, replaceable=self.endpoints.mode == "client")
             try:
                 process.run()
             except RobotsLinkLost:
                 self.open()
+                self.attach(process)
             else:
                 return
 

@@ -16,8 +16,8 @@ from agent.estimation.gaussian.consistency import (
     CLAIM_P_VALUE,
     EARLY_CLAIM_P_VALUE,
     FINISHED,
-    INCONSISTENT_P_VALUE,
     INCONSISTENT_SEARCHES,
+    rejecting_p_value,
 )
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis, follow, search
 from agent.estimation.gaussian.inference import PlanningHypothesis
@@ -128,16 +128,15 @@ def _p_value_below(belief: Belief, bound: float) -> bool:
 def with_consistency_test(state: RobotState) -> RobotState:
     """Return `state` with the consistency test of a search, and with the verdict if too many tests failed.
 
-    A test fails if its p-value is below INCONSISTENT_P_VALUE. After INCONSISTENT_SEARCHES consecutive
+    A test fails if its p-value is below `rejecting_p_value`. After INCONSISTENT_SEARCHES consecutive
     failures, the verdict is Inconsistent, or Undecided if the robot's own sensors are not as it was told.
     """
     belief = state.belief
     inconsistency, least = belief.inconsistency, _least_p_value(belief)
     if inconsistency is None:
         return state
-    inconsistent_searches = (
-        belief.inconsistent_searches + 1 if inconsistency.p_value < INCONSISTENT_P_VALUE else 0
-    )
+    failed = inconsistency.p_value < rejecting_p_value(state.config.mission.noise)
+    inconsistent_searches = belief.inconsistent_searches + 1 if failed else 0
     state = replace(state, belief=replace(belief, inconsistent_searches=inconsistent_searches, p_value=least))
     if inconsistent_searches < INCONSISTENT_SEARCHES:
         return state

@@ -6,7 +6,6 @@ from typing import Any
 
 from agent.planning.accuracy_seeking import AccuracySeeking
 from agent.planning.assured import AssuredExact
-from agent.planning.group import GroupPlanner
 from agent.planning.log_exchange import LogPlanner
 from agent.planning.paper import Paper
 from agent.planning.planner import Planner
@@ -23,11 +22,6 @@ class Assured(AssuredExact):
 
 SHIPPED: dict[str, type[Planner[Any, Any]]] = {"assured": Assured, "paper": Paper}
 """The classes of the shipped planners."""
-
-
-def group_planner(mission: Mission) -> Planner[Any, Any]:
-    """Return the planner `assured` for a robot in a group."""
-    return GroupPlanner(Assured().suited(mission))
 
 
 def planner(name: str, mission: Mission) -> Planner[Any, Any]:

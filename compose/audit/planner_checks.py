@@ -92,7 +92,7 @@ def _probed(scenario: Scenario, probe: type[Watched]) -> str | None:
 
     def watched(config: RobotConfig) -> Watched:
         def fresh() -> Planner[Any, Any]:
-            return planner_loader.planner_copy(config.planner_name, config.planner_options, config.mission)
+            return planner_loader.unguarded_planner_of(config)
 
         return probe(GuardedPlanner(config.planner_name, fresh()), fresh)
 

@@ -95,6 +95,7 @@ def _run(
         timeout=options.timeout,
         on_kill_point=kills.taker(options.kill),
     )
+    links.attach(process)
     if not (options.quiet or options.launched):
         robots = ", ".join(robot.id for robot in scenario.robots)
         where = f", resumed at tick {simulation.tick}" if simulation.tick else ""

@@ -48,21 +48,27 @@ class GuardedPlanner(Planner[Any, Any]):
 
     def report(self, state: Any) -> Any:
         """Return the body of the report, once it is certain that the peer's decoder takes it."""
-        body = self._called(self._planner.report, state)
+        return self._sendable("report", self._called(self._planner.report, state))
+
+    def report_to(self, state: Any, peer: str) -> Any:
+        """Return the body of the report to one of several peers, checked likewise."""
+        return self._sendable("report_to", self._called(self._planner.report_to, state, peer))
+
+    def _sendable(self, method: str, body: Any) -> Any:
         try:
             report = report_of(body, self._tick or 0, self._robot)
             frame = encode(report)
             if len(frame) > MAX_REPORT_BYTES:
-                raise self._failed("report", f"its report has {len(frame)} bytes, at most {MAX_REPORT_BYTES}")
+                raise self._failed(method, f"its report has {len(frame)} bytes, at most {MAX_REPORT_BYTES}")
             sent = decode(frame, type(report), MAX_REPORT_BYTES)
             received = body_of(sent, self._planner)
         except (MalformedFrame, TypeError, ValueError, OverflowError, msgspec.MsgspecError) as error:
-            raise self._failed("report", f"its report cannot be sent: {error}") from None
+            raise self._failed(method, f"its report cannot be sent: {error}") from None
         if isinstance(body, Report):
-            self._check_address("report", body)
+            self._check_address(method, body)
         why = self._called(self._planner.malformed, received)
         if why is not None:
-            raise self._failed("report", f"its own decoder refuses its report: {why}")
+            raise self._failed(method, f"its own decoder refuses its report: {why}")
         return body
 
     def decide(self, state: Any, reports: Sequence[Any] = ()) -> Any:

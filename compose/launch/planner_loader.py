@@ -33,7 +33,7 @@ _trusted: set[str] = set()
 
 
 GROUP_PLANNER = "assured"
-"""The planner with which robots can form a group."""
+"""The shipped planner with which robots can form a group. Those of users are subclasses of its classes."""
 
 
 class UntrustedPlanner(UserError):
@@ -72,35 +72,65 @@ def planner(name: str, options: Mapping[str, Any], mission: Mission) -> Planner[
 
     Raises UserError if it cannot be loaded or created, and UntrustedPlanner if the user has not named it.
     """
-    if is_shipped(name):
-        from agent.planning import registry  # noqa: PLC0415  # it imports numpy
-
-        return registry.planner(name, mission)
-    if ":" in name and name not in _trusted:
-        raise UntrustedPlanner(f"the planner is {name}; to run its code, add --planner {name}")
-    from compose.launch.planner_guard import GuardedPlanner  # noqa: PLC0415  # it imports numpy
-
-    created = _created(name, options)
-    try:
-        return GuardedPlanner(name, created.suited(mission))
-    except Exception as error:  # noqa: BLE001  # the user's code may raise anything
-        raise UserError(f"{name}: suited() raised {type(error).__name__}: {error}") from None
-
-
-def planner_copy(name: str, options: Mapping[str, Any], mission: Mission) -> Planner[Any, Any]:
-    """Return a new planner for the noise of `mission`, without a guard. Raises UserError."""
-    return _created(name, options).suited(mission)
+    _check_trust(name)
+    return _guarded(name, _suited(name, options, mission))
 
 
 def planner_of(config: RobotConfig) -> Planner[Any, Any]:
     """Return the planner of the robot with this configuration. Raises like `planner`."""
-    if isinstance(config, RobotConfigInGroup):
-        if config.planner_name != GROUP_PLANNER:
-            raise UserError(f"robots with the planner {config.planner_name} meet in pairs, not in a group")
+    _check_trust(config.planner_name)
+    return _guarded(config.planner_name, unguarded_planner_of(config))
+
+
+def unguarded_planner_of(config: RobotConfig) -> Planner[Any, Any]:
+    """Return a new planner of the robot with this configuration, without a guard. Raises UserError."""
+    name = config.planner_name
+    found = _suited(name, config.planner_options, config.mission)
+    if not isinstance(config, RobotConfigInGroup):
+        return found
+    from agent.planning.assured import AssuredExact  # noqa: PLC0415  # it imports numpy
+    from agent.planning.group import GroupPlanner  # noqa: PLC0415  # likewise
+
+    if not isinstance(found, AssuredExact):
+        raise UserError(f"robots with the planner {name} meet in pairs, not in a group")
+    return GroupPlanner(found)
+
+
+def is_for_groups(name: str) -> bool:
+    """Return whether robots with the planner `name` can form a group. Raises like `planner`."""
+    if is_shipped(name):
+        return name == GROUP_PLANNER
+    _check_trust(name)
+    from agent.planning.assured import AssuredExact  # noqa: PLC0415  # it imports numpy
+
+    return issubclass(planner_class(name), AssuredExact)
+
+
+def _check_trust(name: str) -> None:
+    """Raise UntrustedPlanner if `name` is a class of a user that the user of this process has not named."""
+    if ":" in name and name not in _trusted:
+        raise UntrustedPlanner(f"the planner is {name}; to run its code, add --planner {name}")
+
+
+def _suited(name: str, options: Mapping[str, Any], mission: Mission) -> Planner[Any, Any]:
+    if is_shipped(name):
         from agent.planning import registry  # noqa: PLC0415  # it imports numpy
 
-        return registry.group_planner(config.mission)
-    return planner(config.planner_name, config.planner_options, config.mission)
+        return registry.planner(name, mission)
+    created = _created(name, options)
+    try:
+        return created.suited(mission)
+    except Exception as error:  # noqa: BLE001  # the user's code may raise anything
+        raise UserError(f"{name}: suited() raised {type(error).__name__}: {error}") from None
+
+
+def _guarded(name: str, found: Planner[Any, Any]) -> Planner[Any, Any]:
+    """Return `found` in a guard, unless it is shipped with Tandem."""
+    if is_shipped(name):
+        return found
+    from compose.launch.planner_guard import GuardedPlanner  # noqa: PLC0415  # it imports numpy
+
+    return GuardedPlanner(name, found)
 
 
 def orbits(name: str, options: Mapping[str, Any], mission: Mission, distance: float) -> Rendezvous:

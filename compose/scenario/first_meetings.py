@@ -29,9 +29,9 @@ def meetings_of(file: ScenarioFile, source: str) -> GroupMeetings | None:
     if len(robots) == 2 or any(robot.peer is not None for robot in robots):
         return None
     _check_ids(robots, source)
-    for j in range(len(robots)):
-        for i in range(j):
-            _checked_distance(file, i, j, source)
+    distances = [_checked_distance(file, i, j, source) for j in range(len(robots)) for i in range(j)]
+    # least accurate are robots that are very near to each other, and those that have a long way
+    _check_accuracy(file, (min(distances), max(distances)), source)
     try:
         return group_meetings(robots, file.mission, file.planner)
     except Unworkable as error:
@@ -66,6 +66,7 @@ def linked(
 def _plan(file: ScenarioFile, first: int, second: int, source: str) -> Rendezvous:
     """Return the rendezvous orbits of the pair of robots at the places `first` and `second` in the file."""
     distance = _checked_distance(file, first, second, source, "its peer ")
+    _check_accuracy(file, (distance,), source)
     return planner_loader.orbits(file.planner.name, file.planner.options, file.mission, distance)
 
 
@@ -85,14 +86,20 @@ def _checked_distance(file: ScenarioFile, first: int, second: int, source: str, 
     why = infeasibility(file.mission, distance)
     if why is not None:
         raise Unworkable(f"{source}: mission: {why}")
-    if not file.mission.noise.exact:
-        # imports numpy, which scenarios with exact sensors do not need
-        from agent.estimation.gaussian.reachable_accuracy import forbidding_prior  # noqa: PLC0415
+    return distance
 
+
+def _check_accuracy(file: ScenarioFile, distances: Sequence[float], source: str) -> None:
+    """Raise Unworkable if a prior forbids the accuracy of robots whose anchors have such distances, in m."""
+    if file.mission.noise.exact:
+        return
+    # imports numpy, which scenarios with exact sensors do not need
+    from agent.estimation.gaussian.reachable_accuracy import forbidding_prior  # noqa: PLC0415
+
+    for distance in distances:
         why = forbidding_prior(file.mission, distance)
         if why is not None:
             raise Unworkable(f"{source}: mission.{why}")
-    return distance
 
 
 def _check_ids(robots: Sequence[RobotTable], source: str) -> None:

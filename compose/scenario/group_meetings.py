@@ -61,9 +61,9 @@ class GroupMeetings(NamedTuple):
 def group_meetings(robots: Sequence[RobotTable], mission: Mission, planner: PlannerTable) -> GroupMeetings:
     """Return the meetings of `robots`, planned for the shortest bound.
 
-    Raises Unworkable if the planner is not made for groups.
+    Raises Unworkable if the planner is not made for groups, and UserError if it cannot be loaded.
     """
-    if planner.name != planner_loader.GROUP_PLANNER:
+    if not planner_loader.is_for_groups(planner.name):
         raise Unworkable(
             f"planner.name: robots with the planner {planner.name} meet in pairs: set robot.peer"
         )

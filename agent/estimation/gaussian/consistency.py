@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agent.estimation.gaussian.fitted import Fit
 from agent.estimation.gaussian.least_squares import own_fit
@@ -21,10 +22,13 @@ CLAIM_P_VALUE = 1e-3
 EARLY_CLAIM_P_VALUE = 1e-2
 """The CLAIM_P_VALUE of a robot with fewer than twice the mutual ranges that a claim requires."""
 
-INCONSISTENT_P_VALUE = 2e-4
-"""The p-value below which a search counts towards INCONSISTENT_SEARCHES.
+INCONSISTENT_P_VALUE, INCONSISTENT_P_VALUE_UNTOLD = 2e-4, 3e-6
+"""The p-values below which a search counts towards INCONSISTENT_SEARCHES.
 
-It is so small that chance alone does not cause this many such searches in a row.
+The first is for a robot that was told its noise, the second for one that was not; see `rejecting_p_value`.
+Most ranges of a search are those of the search before, so several in a row are little rarer by chance than
+one. With 2e-4 for ranges of 0.05 m, 9 of 1 000 honest peers were rejected if 5 % of the ranges were too short
+and nobody had told. With 1e-5 for ranges of 0.01 m, 2 to 5 of 100 more false reports were never rejected.
 """
 
 INCONSISTENT_SEARCHES = 5
@@ -47,13 +51,23 @@ Residuals that are larger still are a sign of something else. With no bound, no 
 STRAYS_BEFORE, RANGES_BEFORE = 0.05, 5.0
 """The strays and the ranges that a robot has seen, as it were, before its first range (a beta distribution).
 
-With more strays, two of twelve mutual ranges may be strays though no range to the own anchor is one, and such
-strays make robots believe false reports. With fewer, honest peers are suspected if 10 % of all ranges are
-outliers that nobody told.
+They hold for ranges with a sigma of UNTOLD_SIGMA or more. With more strays, two of twelve mutual ranges may
+be strays though no range to the own anchor is one, and such strays make robots believe false reports. With
+fewer, honest peers are suspected if 10 % of all ranges are outliers that nobody told. Whoever tells smaller
+sigmas knows the rate better: see `Noise.untold_share`.
 """
+
+LEAST_SHARE = 1e-3
+"""The least share that counts: a robot never knows the rate better than from 5 000 ranges."""
 
 TOLD_BEFORE = 200.0
 """The number of ranges that the rate of outliers that was told is worth."""
+
+
+def rejecting_p_value(noise: Noise) -> float:
+    """Return the p-value below which a search counts against the peer, by how well the noise was told."""
+    share = noise.untold_share
+    return float(INCONSISTENT_P_VALUE ** (1.0 - share) * INCONSISTENT_P_VALUE_UNTOLD**share)
 
 
 class Inconsistency(NamedTuple):
@@ -135,23 +149,30 @@ LEARNED_P_VALUE = 1e-2
 def _strays_test(fitted: Fit, own: Fit, pair: PairRanges, robot: int) -> Inconsistency:
     """Return the test of the number of strays among the ranges that depend on the peer.
 
-    The rate of strays follows from the ranges to the own anchor and from the outliers that were told. Mutual
-    ranges are tested apart from the others: there are fewer of them, and a false hypothesis that drops two of
-    them may fit the rest.
+    The rate of strays follows from the ranges to the own anchor and from what was told. The peer's ranges
+    to its anchor and the mutual ranges are tested together and apart, and of each kind the earliest and the
+    latest: a false hypothesis that drops a few of them may fit the rest, and every further range that fits
+    would hide them.
     """
-    seen, rate = len(own.residuals) - own.inliers, pair.noise.outliers
-    worth = TOLD_BEFORE if rate else 0.0
-    strays = STRAYS_BEFORE + worth * rate + seen
-    ranges = RANGES_BEFORE + worth * (1.0 - rate) + own.inliers
+    told, seen = pair.noise.strays + pair.noise.outliers, len(own.residuals) - own.inliers
+    known = RANGES_BEFORE / max(pair.noise.untold_share, LEAST_SHARE) - RANGES_BEFORE
+    known += TOLD_BEFORE if pair.noise.outliers else 0.0
+    strays = STRAYS_BEFORE + known * told + seen
+    ranges = RANGES_BEFORE + known * (1.0 - told) + own.inliers
     stray = fitted.weights <= INLIER
-    mutual = pair.ranges.rows(2)
-    of_mutual, of_all = int(np.count_nonzero(stray[mutual])), int(np.count_nonzero(stray)) - seen
-    tested = [(of_mutual, pair.ranges.counts[2])]
-    if of_all > of_mutual:
-        tested.append((of_all, len(stray) - pair.ranges.counts[robot]))
+    tested = [(int(np.count_nonzero(stray)) - seen, len(stray) - pair.ranges.counts[robot])]
+    for kind in (1 - robot, 2):
+        tested += _from_either_end(stray[pair.ranges.rows(kind)])
     p_value, count, total = min((beta_binomial_tail(k, n, strays, ranges), k, n) for k, n in tested)
     what = f"measurements and reports of which {count} of {total} fit no other"
     return Inconsistency(what, sigmas(p_value), p_value)
+
+
+def _from_either_end(stray: NDArray[np.bool]) -> list[tuple[int, int]]:
+    """Return the numbers of strays and of ranges up to each stray, and from each stray on."""
+    places, total = np.flatnonzero(stray).tolist(), len(stray)
+    up_to = [(count, place + 1) for count, place in enumerate(places, 1)]
+    return up_to + [(len(places) - count, total - place) for count, place in enumerate(places)]
 
 
 def sigmas(p_value: float) -> float:

@@ -19,8 +19,12 @@ BY_CHANCE = 2.0
 """The number of standard deviations 1 / sqrt(N) of the correlation of N white residuals that is disregarded.
 
 With less, noise as told makes missions longer; with more, errors that are correlated over 20 ticks make
-claims too confident.
+claims too confident. A noise level below 1 reduces it in proportion: slow errors look like a constant one and
+leave small residuals, so these count as a sign of accurate ranges only as far as they are white.
 """
+
+LEAST_LEVEL = 0.25
+"""The least noise level, without correlation: sigmas of half the told ones."""
 
 MOST_CORRELATED = 0.8
 """The largest correlation: the noise level grows by a factor of 9 at most."""
@@ -36,14 +40,14 @@ def noise_level(chi2: float, degrees: int, noise: Noise, correlation: float = 0.
     if not nu:
         return 1.0
     worth = (1.0 - correlation) / (1.0 + correlation)
-    return (nu + worth * chi2) / (nu + worth * n) / worth
+    return max((nu + worth * chi2) / (nu + worth * n), LEAST_LEVEL) / worth
 
 
-def residual_correlation(residuals: Array, weights: Array, ranges: Ranges) -> float:
+def residual_correlation(residuals: Array, weights: Array, ranges: Ranges, level: float) -> float:
     """Return the correlation of each residual with the one before, from 0 to MOST_CORRELATED.
 
     Both are of the same kind. The correlation is reduced by what chance may cause (see BY_CHANCE), and
-    strays count as 0.
+    strays count as 0. `level` is the noise level without correlation.
     """
     scaled = (weights > INLIER) * (residuals / ranges.sigma)
     power, neighbours = float(scaled @ scaled), float(scaled[1:] @ scaled[:-1])
@@ -53,7 +57,7 @@ def residual_correlation(residuals: Array, weights: Array, ranges: Ranges) -> fl
             neighbours -= float(scaled[end] * scaled[end - 1])
     if not power > 0.0:
         return 0.0
-    found = neighbours / power - BY_CHANCE / math.sqrt(len(scaled))
+    found = neighbours / power - BY_CHANCE * min(level, 1.0) / math.sqrt(len(scaled))
     return min(max(found, 0.0), MOST_CORRELATED)
 
 

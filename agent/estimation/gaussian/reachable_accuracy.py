@@ -54,12 +54,12 @@ def forbidding_prior(mission: Mission, distance: float) -> str | None:
     `distance` is that of the anchors in m. Where white noise alone would forbid it, no prior is named.
     """
     noise = mission.noise
-    reached = _reference_sigma(mission, distance, noise)
+    reached = reference_sigma(mission, distance, noise)
     most = ACTIVE * mission.accuracy
-    if not most < reached < math.inf or _reference_sigma(mission, distance, noise.as_told) > most:
+    if not most < reached < math.inf or reference_sigma(mission, distance, noise.as_told) > most:
         return None
     without = {
-        name: _reference_sigma(mission, distance, replace(noise, **{name: 0.0}))
+        name: reference_sigma(mission, distance, replace(noise, **{name: 0.0}))
         for name in PRIORS
         if getattr(noise.priors, name)
     }
@@ -71,7 +71,7 @@ def forbidding_prior(mission: Mission, distance: float) -> str | None:
     )
 
 
-def _reference_sigma(mission: Mission, distance: float, noise: Noise) -> float:
+def reference_sigma(mission: Mission, distance: float, noise: Noise) -> float:
     """Return the larger sigma (m) of both positions after the reference mission."""
     reach, period = mission.sensing_range, mission.period
     turn = math.tau / AROUND_ANCHOR
