@@ -7,18 +7,18 @@ import random
 from pathlib import Path
 
 import pytest
+from agent.estimation.host_pose import host_estimate
+from agent.peer.facts import TO_ROBOT, Fact, FactSet, facts_of
+from compose.scenario.sweep_strips import STEP, split, strips, sweep_time
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from agent.estimation.host_pose import host_estimate
 from agent.estimation.resection import RangedPlace, is_certain, poses, positions
-from agent.peer.facts import TO_ROBOT, Fact, FactSet, facts_of
 from compose.errors import BadScenario
 from compose.launch.in_process import run_mission
 from compose.recording.run import Run, read
 from compose.scenario.scenario_file import validate
-from compose.scenario.sweep_strips import STEP, split, strips, sweep_time
 from protocol.messages import Inconsistent, Localised, Report, RobotConfig
 from protocol.mission import Mission
 from protocol.motion import ORIGIN, Pose, compose

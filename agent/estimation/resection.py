@@ -19,6 +19,18 @@ STEPS = 12
 REDUNDANT = 1
 """The number of ranges more than unknowns that a pose needs, so that a false report is found."""
 
+SPREAD = 0.02
+"""The least root of the information about a position in its worst direction, for ranges with sigma 1 m.
+
+From four corners of a square with a side of 0.05 R, 0.85 R away, it is about 0.05; from a line, about 0.
+"""
+
+LEVER = 0.25
+"""The least information about the heading, in units of the squared distance driven.
+
+It is 1 if a robot drives across the line to the other one, and 0 along it.
+"""
+
 PARALLEL = 1e-9
 """The squared sine of the angle between two directions below which they are treated as parallel."""
 
@@ -108,8 +120,42 @@ def poses(standing: Sequence[RangedPlace], moved: Sequence[RangedPlace], floor: 
 
 
 def is_certain(standing: Sequence[RangedPlace], moved: Sequence[RangedPlace], found: Sequence[Pose]) -> bool:
-    """Return whether one pose is left, and redundant ranges have confirmed its position and its heading."""
-    return len(found) == 1 and len(standing) >= 2 + REDUNDANT and len(moved) >= 1 + REDUNDANT
+    """Return whether one pose is left that redundant ranges have confirmed, and that they determine well.
+
+    A rounding error of the ranges is amplified by at most 1 / SPREAD, in position and heading.
+    """
+    if len(found) != 1 or len(moved) < 1 + REDUNDANT or not is_fixed(standing, (found[0].x, found[0].y)):
+        return False
+    least = math.sqrt(LEVER) * _reach(moved)
+    return sum([_slope(found[0], one) ** 2 for one in moved]) >= least * least
+
+
+def is_fixed(standing: Sequence[RangedPlace], place: Point) -> bool:
+    """Return whether redundant ranges determine the position `place` well."""
+    if len(standing) < 2 + REDUNDANT:
+        return False
+    xx, xy, yy = _information(place, standing)
+    least = 0.5 * (xx + yy) - math.hypot(0.5 * (xx - yy), xy)
+    return least >= SPREAD * SPREAD
+
+
+def _information(place: Point, standing: Sequence[RangedPlace]) -> tuple[float, float, float]:
+    """Return the sum of u u^T over the directions u from the other robot to `place`: xx, xy and yy."""
+    xx = xy = yy = 0.0
+    for (x, y), _, _ in standing:
+        dx, dy = place[0] - x, place[1] - y
+        squared = dx * dx + dy * dy
+        if squared > 0.0:
+            xx, xy, yy = xx + dx * dx / squared, xy + dx * dy / squared, yy + dy * dy / squared
+    return xx, xy, yy
+
+
+def _slope(pose: Pose, one: RangedPlace) -> float:
+    """Return the derivative in m / rad of the range of `one` by the heading of `pose`."""
+    here = compose(pose, one.odometry)
+    x, y = here.x - one.there[0], here.y - one.there[1]
+    apart = math.hypot(x, y)
+    return (y * (here.x - pose.x) - x * (here.y - pose.y)) / apart if apart > 0.0 else 0.0
 
 
 def _headings(place: Point, moved: Sequence[RangedPlace]) -> tuple[float, ...]:

@@ -8,6 +8,7 @@ import msgspec
 from msgspec.structs import replace
 
 from agent.planning.state import RobotState
+from agent.planning.sweep import Looping, Sweeping
 from protocol.messages import Ranged, RobotConfigInGroup, Verdict
 from protocol.motion import ORIGIN, Pose
 
@@ -34,6 +35,8 @@ class GroupState(msgspec.Struct, frozen=True):
     """The number of planned visits that the robot has begun or left out."""
     retries: int = 0
     """The number of retries whose time has come."""
+    parts: int = 0
+    """The number of parts of an area that the robot has begun to sweep for robots without an anchor."""
     until: float | None = None
     """The time in s at which the search of a retry ends; None if there is none."""
     visiting: bool = False
@@ -50,6 +53,11 @@ class GroupState(msgspec.Struct, frozen=True):
     """The number of consecutive ticks out of range of the peer since this robot's verdict in the meeting."""
     silence: int = 0
     """The number of consecutive ticks in range of the peer without a log of it."""
+
+    @property
+    def sweeps(self) -> bool:
+        """Return whether the robot sweeps an area, or has stopped for a robot without an anchor."""
+        return isinstance(self.pair.mode, Sweeping | Looping)
 
     @property
     def config(self) -> RobotConfigInGroup:

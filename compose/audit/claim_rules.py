@@ -13,7 +13,7 @@ from agent.process.agent_journal import AgentHistory
 from compose.audit.findings import Checks, Violation, between
 from compose.launch.planner_loader import planner_of
 from compose.recording.run import Run
-from protocol.messages import Localised, MissionEnd, PeerReport, Report
+from protocol.messages import Localised, MissionEnd, PeerReport, Report, ReportWithPose
 from protocol.motion import Pose, travelled
 from world.referee import inaccuracy, mistake
 from world.scenario import RobotSpec
@@ -63,7 +63,9 @@ def _redundant(run: Run, placed: RobotSpec, agent: AgentHistory, tick: int) -> V
     ranged = {peer: _ranged(agent, peer, _known_until(agent, peer, tick, planner)) for peer in peers}
     if mission.noise.exact:
         least = planner.REQUIRED_PLACES
-        places = max([_places(run, placed.id, peer, ranged[peer]) for peer in peers]) if least else 0
+        counts = [_places(run, placed.id, peer, ranged[peer]) for peer in peers] if least else [0]
+        # a robot without an anchor believes the poses of all, so ranges to several robots add up
+        places = sum(counts) if placed.given_anchor is None else max(counts)
         return _too_few(tick, placed, "relative placements with a mutual range", places, least)
     least = planner.required_mutual_ranges(mission)
     return _too_few(tick, placed, "mutual ranges", max(map(len, ranged.values())), least)
@@ -87,6 +89,8 @@ def _known_until(agent: AgentHistory, peer: str, tick: int, planner: Planner[Any
 
 def _through(report: PeerReport) -> int:
     """Return the tick up to which a report contains the sender's manoeuvres."""
+    if isinstance(report, ReportWithPose):  # the pose stands for a log
+        return report.tick
     return report.through if isinstance(report, Report) else report.tick
 
 

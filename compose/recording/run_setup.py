@@ -11,7 +11,7 @@ import msgspec
 from msgspec.structs import replace
 
 from protocol.attack import Attack
-from protocol.messages import RobotConfig, RobotConfigInGroup
+from protocol.messages import RobotConfig, RobotConfigInGroup, RobotConfigWithoutAnchor
 from protocol.mission import Anchor, Mission, PlannerName, Role
 from protocol.motion import Pose
 from protocol.orbits import Orbit
@@ -26,7 +26,8 @@ class RobotSetup(msgspec.Struct, frozen=True):
     id: RobotId
     peer: RobotId
     role: Role
-    anchor: Anchor
+    given_anchor: Anchor | None
+    """Its anchor; None if it has none, as some robots of a group."""
     orbit: Orbit
     attack: Attack | None = None
     """The false data injection that the scenario configures for this robot."""
@@ -36,6 +37,13 @@ class RobotSetup(msgspec.Struct, frozen=True):
     The x-axis points from the anchor to the robot's start. None if the start is not known. A robot does
     not know this heading before it is localised, so a picture of its belief may use any heading.
     """
+
+    @property
+    def anchor(self) -> Anchor:
+        """The position of its anchor in <W>, in m. Raises LookupError if it has none."""
+        if self.given_anchor is None:
+            raise LookupError(f"{self.id} has no anchor")
+        return self.given_anchor
 
 
 class Visit(msgspec.Struct, frozen=True):
@@ -167,25 +175,32 @@ def of_scenario(scenario: Scenario, mode: str | None = None, tick_s: float | Non
                     robot.id,
                     robot.peer,
                     robot.role,
-                    robot.anchor,
+                    robot.given_anchor,
                     robot.rendezvous.of(robot.role),
                     robot.attack,
-                    frame(robot.anchor, robot.start),
+                    frame(robot.anchor, robot.start) if robot.given_anchor is not None else None,
                 )
                 for robot in scenario.robots
             ]
         ),
         mission=scenario.mission,
         planner_name=scenario.planner_name,
-        t_max_s=max(
-            [one.ends for one in scenario.meetings] or [robot.rendezvous.bound for robot in scenario.robots]
-        ),
+        t_max_s=_bound(scenario),
         max_ticks=scenario.max_ticks,
         seed=scenario.seed,
         mode=mode,
         tick_s=tick_s,
         faults=scenario.faults,
         visits=tuple([Visit(one.visitor, one.visited, one.ends) for one in scenario.meetings]),
+    )
+
+
+def _bound(scenario: Scenario) -> float:
+    """Return the bound T_max in s: that of the group, or the largest of all pairs."""
+    if scenario.planned_sweep is not None:
+        return scenario.planned_sweep.ends
+    return max(
+        [one.ends for one in scenario.meetings] or [robot.rendezvous.bound for robot in scenario.robots]
     )
 
 
@@ -200,7 +215,14 @@ def of_configs(name: str, configs_by_robot: Mapping[str, RobotConfig]) -> RunSet
         name=name,
         robots=tuple(
             [
-                RobotSetup(one.robot, one.peer, one.role, one.anchor, one.rendezvous.of(one.role), one.attack)
+                RobotSetup(
+                    one.robot,
+                    one.peer,
+                    one.role,
+                    None if isinstance(one, RobotConfigWithoutAnchor) else one.anchor,
+                    one.rendezvous.of(one.role),
+                    one.attack,
+                )
                 for one in configs
             ]
         ),

@@ -1,0 +1,108 @@
+"""The search of a group for its robots without an anchor: who sweeps which part, and until when."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from compose.errors import BadScenario, Unworkable
+from compose.scenario.group_meetings import FirstMeeting, GroupMeetings
+from compose.scenario.scenario_tables import Area, RobotTable, ScenarioFile
+from protocol.mission import Mission
+from protocol.orbits import Orbit, Rendezvous
+from protocol.sweep_strips import HALF_WIDTH, Sweep, helping_ticks, sweep_speed, sweep_ticks
+from world.scenario import PlannedSweep
+
+LEAVING = 10
+"""The ticks after a meeting until a robot goes on (`group_transitions.PARTED_AFTER`)."""
+
+ASIDE = 2.0
+"""The largest distance from the anchor of its last meeting at which a robot goes on, in units of R."""
+
+PARTS = 3.0
+"""The time allowed for sweeps in `max_ticks`, in units of the planned bound."""
+
+MOST_STRIPS = 10_000
+"""The largest number of strips of an area."""
+
+
+def check_unanchored(file: ScenarioFile, source: str) -> None:
+    """Raise BadScenario or Unworkable if the robots without an anchor in a group cannot be localised."""
+    missing = [i for i, robot in enumerate(file.robot) if robot.anchor is None]
+    if not missing:
+        return
+    where = f"{source}: robot[{missing[0]}]"
+    if len(file.robot) - len(missing) < 2:
+        raise BadScenario(f"{where}: missing field 'anchor': at least two robots of a group need one")
+    if not file.mission.noise.exact:
+        raise Unworkable(
+            f"{where}: missing field 'anchor': with mission.noise, each robot needs one, because the odometry "
+            "of a robot that searches for others becomes too inaccurate"
+        )
+    for i, robot in enumerate(file.robot):
+        if robot.attack is not None:
+            raise Unworkable(
+                f"{source}: robot[{i}].attack: there is a robot without an anchor, which must believe the "
+                "poses that others report"
+            )
+    area, reach = file.mission.area, file.mission.sensing_range
+    if area is None:
+        raise BadScenario(f"{source}: mission: missing field 'area': robots without an anchor are in it")
+    x_min, y_min, x_max, y_max = area
+    if x_min > x_max or y_min > y_max:
+        raise BadScenario(f"{source}: mission.area: it must be [x_min, y_min, x_max, y_max]")
+    if min(x_max - x_min, y_max - y_min) > MOST_STRIPS * 2.0 * HALF_WIDTH * reach:
+        raise Unworkable(
+            f"{source}: mission.area: it has more than {MOST_STRIPS} strips of 1.6 sensing_range"
+        )
+    for i in missing:
+        start = file.robot[i].start
+        if start is not None and not (x_min <= start[0] <= x_max and y_min <= start[1] <= y_max):
+            raise BadScenario(f"{source}: robot[{i}].start: '{file.robot[i].id}' is outside mission.area")
+
+
+def with_sweep(
+    robots: Sequence[RobotTable], area: Area | None, mission: Mission, meetings: GroupMeetings
+) -> GroupMeetings:
+    """Return `meetings` with the search for those of `robots` that have no anchor, which are in `area`.
+
+    The latest time allows for robots that sweep the parts of others, which have failed.
+    """
+    unanchored = [robot.id for robot in robots if robot.anchor is None]
+    if not unanchored or area is None:
+        return meetings
+    planned = _planned_sweep(robots, len(unanchored), area, mission, meetings)
+    still = Orbit(0.0, 0.0, 0.0)
+    waiting = FirstMeeting(planned.sweepers[0], "b", Rendezvous(still, still, planned.ends))
+    return meetings._replace(
+        first={**meetings.first, **dict.fromkeys(unanchored, waiting)},
+        bound=planned.ends,
+        latest=meetings.latest + PARTS * planned.ends,
+        sweep=planned,
+    )
+
+
+def _planned_sweep(
+    robots: Sequence[RobotTable], unanchored: int, area: Area, mission: Mission, meetings: GroupMeetings
+) -> PlannedSweep:
+    """Return the search for `unanchored` robots in `area`, in m, after `meetings`.
+
+    Each robot with an anchor sweeps a part after its last meeting. Parts and robots are in the same order
+    across the strips, so that their ways do not cross.
+    """
+    anchors = {one.id: one.anchor for one in robots if one.anchor is not None}
+    places, free = dict(anchors), dict.fromkeys(anchors, 0.0)
+    for meeting in meetings.planned:
+        for robot in (meeting.visitor, meeting.visited):
+            places[robot], free[robot] = anchors[meeting.visited], meeting.ends
+    sweep = Sweep(*area, len(anchors))
+    sweepers = sorted(places, key=lambda robot: places[robot][sweep.across])
+    aside = math.ceil(ASIDE * mission.sensing_range / (sweep_speed(mission) * mission.period))
+    latest = 0.0
+    for part, robot in enumerate(sweepers):
+        path = sweep.path(part, mission.sensing_range)
+        if path:
+            ticks = LEAVING + aside + sweep_ticks([places[robot], *path], mission)
+            ticks += unanchored * helping_ticks(mission)
+            latest = max(latest, free[robot] + ticks * mission.period)
+    return PlannedSweep(sweep, tuple(sweepers), latest)
