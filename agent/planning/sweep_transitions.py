@@ -17,7 +17,7 @@ from protocol.sweep_strips import NEAR
 
 def wanted(state: GroupState) -> bool:
     """Return whether there are robots without an anchor that have not reported that they are localised."""
-    return any([is_helped(state, robot) for robot in _unanchored(state)])
+    return any(is_helped(state, robot) for robot in _unanchored(state))
 
 
 def is_helped(state: GroupState, robot: str) -> bool:

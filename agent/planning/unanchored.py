@@ -65,7 +65,7 @@ class UnanchoredState(msgspec.Struct, frozen=True):
     """The odometry at the beginning of the last segment of `log`."""
     log: MotionLog = MotionLog()
     ranges: Mapping[tuple[str, int], tuple[float, Pose]] = {}
-    """The ranges to other robots, and the odometry then, by robot and tick, of which the pose is not known."""
+    """The ranges to other robots whose pose then is not known, and the odometry, by robot and tick."""
     places: Mapping[tuple[int, str], RangedPlace] = {}
     """The ranges to robots whose poses are known, by tick and robot."""
     possible: tuple[Pose, ...] = ()
@@ -75,8 +75,8 @@ class UnanchoredState(msgspec.Struct, frozen=True):
 
     @property
     def phase(self) -> int:
-        """Return 1 until the first range to a localised robot, then 3."""
-        return 3 if self.places else 1
+        """Return 2 until the first range to a localised robot, then 3."""
+        return 3 if self.places else 2
 
     @property
     def mode_name(self) -> str:

@@ -15,6 +15,7 @@ from protocol.messages import RobotConfig, RobotConfigInGroup, RobotConfigWithou
 from protocol.mission import Anchor, Mission, PlannerName, Role
 from protocol.motion import Pose
 from protocol.orbits import Orbit
+from protocol.sweep_strips import Sweep
 from protocol.units import RobotId, Tick
 from world.faults import Fault
 from world.scenario import Scenario
@@ -26,7 +27,7 @@ class RobotSetup(msgspec.Struct, frozen=True):
     id: RobotId
     peer: RobotId
     role: Role
-    given_anchor: Anchor | None
+    given_anchor: Anchor | None = msgspec.field(name="anchor")
     """Its anchor; None if it has none, as some robots of a group."""
     orbit: Orbit
     attack: Attack | None = None
@@ -85,6 +86,13 @@ class RunSetup(msgspec.Struct, frozen=True, dict=True):
     faults: tuple[Fault, ...] = ()
     visits: tuple[Visit, ...] = ()
     """The meetings of a group, in the order in which they are planned to end; empty for pairs."""
+    sweep: Sweep | None = None
+    """The area in which robots without an anchor are; None if all robots have one."""
+
+    @property
+    def anchored(self) -> tuple[RobotSetup, ...]:
+        """The robots that have an anchor."""
+        return tuple([robot for robot in self.robots if robot.given_anchor is not None])
 
     @property
     def ids(self) -> tuple[str, ...]:
@@ -128,6 +136,8 @@ class RunSetup(msgspec.Struct, frozen=True, dict=True):
     def bounds_s(self) -> dict[RobotId, float]:
         """The planned bound in s of the time at which each robot of a group is localised; empty for pairs."""
         found: dict[RobotId, float] = {}
+        if self.sweep is not None:
+            found = {robot.id: self.t_max_s for robot in self.robots if robot.given_anchor is None}
         for visit in self.visits:
             for robot in (visit.visitor, visit.visited):
                 found.setdefault(robot, visit.ends_s)
@@ -192,6 +202,7 @@ def of_scenario(scenario: Scenario, mode: str | None = None, tick_s: float | Non
         tick_s=tick_s,
         faults=scenario.faults,
         visits=tuple([Visit(one.visitor, one.visited, one.ends) for one in scenario.meetings]),
+        sweep=scenario.planned_sweep.sweep if scenario.planned_sweep is not None else None,
     )
 
 
@@ -211,6 +222,7 @@ def of_configs(name: str, configs_by_robot: Mapping[str, RobotConfig]) -> RunSet
     """
     configs = list(configs_by_robot.values())
     visits = _visits(configs)
+    unanchored = [one for one in configs if isinstance(one, RobotConfigWithoutAnchor)]
     return RunSetup(
         name=name,
         robots=tuple(
@@ -228,16 +240,19 @@ def of_configs(name: str, configs_by_robot: Mapping[str, RobotConfig]) -> RunSet
         ),
         mission=configs[0].mission,
         planner_name=configs[0].planner_name,
-        t_max_s=max([one.ends_s for one in visits] or [one.rendezvous.bound for one in configs]),
+        t_max_s=max([one.rendezvous.bound for one in unanchored])
+        if unanchored
+        else max([one.ends_s for one in visits] or [one.rendezvous.bound for one in configs]),
         tick_s=configs[0].tick_s,
         visits=tuple(visits),
+        sweep=unanchored[0].sweep if unanchored else None,
     )
 
 
 def _visits(configs: Sequence[RobotConfig]) -> list[Visit]:
     """Return the planned meetings in the configurations of a group."""
     grouped = [one for one in configs if isinstance(one, RobotConfigInGroup)]
-    found = [(one, one.peer) for one in grouped if one.role == "a"]
+    found = [(one, one.peer) for one in grouped if one.role == "a"]  # none without an anchor
     found += [(one, visited) for one in grouped for visited in one.visits]
     visits = [Visit(one.robot, visited, one.member(visited).ends) for one, visited in found]
     return sorted(visits, key=lambda visit: visit.ends_s)

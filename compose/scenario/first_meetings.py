@@ -84,7 +84,8 @@ def _checked_distance(file: ScenarioFile, first: int, second: int, source: str, 
     Unworkable if they could not localise themselves.
     """
     one, other = file.robot[first], file.robot[second]
-    assert one.anchor is not None and other.anchor is not None
+    assert one.anchor is not None
+    assert other.anchor is not None
     distance = math.dist(one.anchor, other.anchor)
     if distance < NEAREST_ANCHORS:
         raise BadScenario(

@@ -31,13 +31,13 @@ def check_unanchored(file: ScenarioFile, source: str) -> None:
     missing = [i for i, robot in enumerate(file.robot) if robot.anchor is None]
     if not missing:
         return
-    where = f"{source}: robot[{missing[0]}]"
+    where = f"{source}: robot[{missing[0]}]: missing field 'anchor'"
     if len(file.robot) - len(missing) < 2:
-        raise BadScenario(f"{where}: missing field 'anchor': at least two robots of a group need one")
+        raise BadScenario(f"{where}: at least two robots of a group need one")
     if not file.mission.noise.exact:
         raise Unworkable(
-            f"{where}: missing field 'anchor': with mission.noise, each robot needs one, because the odometry "
-            "of a robot that searches for others becomes too inaccurate"
+            f"{where}: with mission.noise, each robot needs one, because the odometry of a robot that "
+            "searches for others becomes too inaccurate"
         )
     for i, robot in enumerate(file.robot):
         if robot.attack is not None:
@@ -45,13 +45,17 @@ def check_unanchored(file: ScenarioFile, source: str) -> None:
                 f"{source}: robot[{i}].attack: there is a robot without an anchor, which must believe the "
                 "poses that others report"
             )
-    area, reach = file.mission.area, file.mission.sensing_range
-    if area is None:
+    _check_area(file, missing, source)
+
+
+def _check_area(file: ScenarioFile, missing: Sequence[int], source: str) -> None:
+    """Raise BadScenario or Unworkable if the area of the robots at the places `missing` is unsuitable."""
+    if file.mission.area is None:
         raise BadScenario(f"{source}: mission: missing field 'area': robots without an anchor are in it")
-    x_min, y_min, x_max, y_max = area
+    x_min, y_min, x_max, y_max = file.mission.area
     if x_min > x_max or y_min > y_max:
         raise BadScenario(f"{source}: mission.area: it must be [x_min, y_min, x_max, y_max]")
-    if min(x_max - x_min, y_max - y_min) > MOST_STRIPS * 2.0 * HALF_WIDTH * reach:
+    if min(x_max - x_min, y_max - y_min) > MOST_STRIPS * 2.0 * HALF_WIDTH * file.mission.sensing_range:
         raise Unworkable(
             f"{source}: mission.area: it has more than {MOST_STRIPS} strips of 1.6 sensing_range"
         )

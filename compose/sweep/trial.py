@@ -13,7 +13,7 @@ from compose.launch.model_loader import trust_all
 from compose.launch.planner_loader import trust
 from compose.recording.claim import Claim
 from compose.recording.closest_approach import nearest
-from compose.recording.group_localisation import meeting_results
+from compose.recording.group_localisation import meeting_results, search_results
 from compose.recording.run import Run
 from compose.recording.summary_json import first_contact
 from compose.scenario.kills import Kill
@@ -233,7 +233,9 @@ def row(trial: Trial, run: Run, wall_s: float, findings: Findings | None = None)
         period_s=scenario.mission.period,
         t_max_s=t_max_s,
         t_max_ticks=math.ceil(t_max_s / scenario.mission.period - ROUNDING),
-        bound_ticks=max([one.bound_ticks for one in meeting_results(run)], default=None),
+        bound_ticks=max(
+            [one.bound_ticks for one in (*meeting_results(run), *search_results(run))], default=None
+        ),
         candidates=_most([robot.candidates for robot in robots.values()]),
         candidates_left=_most([robot.candidates_left for robot in robots.values()]),
         position_error_m=_most([robot.position_error_m for robot in robots.values()]),

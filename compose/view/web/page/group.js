@@ -58,7 +58,7 @@ export function task(player, robot) {
   if (state === TRAVELLING) return `to ${robot.peer}`;
   if (state === "localised" || (verdict && verdict[0] !== "localised")) return verdict?.[0] ?? state;
   if (waits(player)) return "waiting";
-  return phase === 3 ? `meets ${robot.peer}` : state;
+  return phase === 3 && robot.anchor && state !== "looping" ? `meets ${robot.peer}` : state;
 }
 
 /** Returns whether a robot waits beside its anchor for another one. */
