@@ -360,6 +360,15 @@ class RobotConfigWithSweep(RobotConfigInGroup, frozen=True, dict=True):
     part: Count = 0
     """The part that this robot sweeps first."""
 
+    @cached_property
+    def widest_distance(self) -> float:
+        """The largest distance between two anchors of the group or corners of the area, in m.
+
+        The poses of robots in the area follow from those of robots with an anchor.
+        """
+        places = [(one.anchor.x, one.anchor.y) for one in self.members] + list(self.sweep.corners)
+        return max([math.dist(*two) for two in combinations(places, 2)])
+
 
 class RobotConfigWithoutAnchor(RobotConfigWithSweep, frozen=True, dict=True):
     """The configuration of a robot without an anchor, which waits until a localised robot finds it.

@@ -62,6 +62,11 @@ class Sweep(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=
         return self.x_min <= x <= self.x_max and self.y_min <= y <= self.y_max
 
     @property
+    def corners(self) -> tuple[Place, ...]:
+        """The corners of the area, in m in <W>."""
+        return tuple([(x, y) for x in (self.x_min, self.x_max) for y in (self.y_min, self.y_max)])
+
+    @property
     def across(self) -> int:
         """The axis across the strips: 0 for x, 1 for y."""
         return 1 if self.x_max - self.x_min >= self.y_max - self.y_min else 0

@@ -25,7 +25,7 @@ SPREAD = 0.02
 From four corners of a square with a side of 0.05 R, 0.85 R away, it is about 0.05; from a line, about 0.
 """
 
-LEVER = 0.25
+LEVER = 0.02
 """The least information about the heading, in units of the squared distance driven.
 
 It is 1 if a robot drives across the line to the other one, and 0 along it.

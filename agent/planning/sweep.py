@@ -12,6 +12,9 @@ from protocol.mission import Mission
 from protocol.motion import Controls, Pose
 from protocol.sweep_strips import SIDE, Place, sweep_speed
 
+LOOPS_FOR = 200
+"""The ticks after which robots stop driving squares that have localised nobody: the other one may be dead."""
+
 
 class Sweeping(msgspec.Struct, frozen=True):
     """A localised robot of a group drives along the strips in which it looks for robots without an anchor."""
@@ -27,15 +30,17 @@ class Looping(msgspec.Struct, frozen=True):
     """The corners that are left, in m in the frame of the odometry. The last one is where it began."""
     then: tuple[Place, ...] = ()
     """The ends of the straights of a sweep that are left after it."""
+    since: int = 0
+    """The tick in which the first square began; it is repeated until a robot is localised."""
 
 
-def looping(odometry: Pose, mission: Mission, then: tuple[Place, ...] = ()) -> Looping:
-    """Return a square that begins ahead of `odometry`, to its left."""
+def looping(odometry: Pose, mission: Mission, since: int, then: tuple[Place, ...] = ()) -> Looping:
+    """Return a square that begins ahead of `odometry` and goes to the left, with these `since` and `then`."""
     side = SIDE * mission.sensing_range
     x, y = side * math.cos(odometry.heading), side * math.sin(odometry.heading)
     corners = [(0.0, 0.0), (x, y), (x - y, y + x), (-y, x)]
     places = [(odometry.x + dx, odometry.y + dy) for dx, dy in corners]
-    return Looping((*places[1:], places[0]), then)
+    return Looping((*places[1:], places[0]), then, since)
 
 
 def controls(mode: Sweeping | Looping, odometry: Pose, mission: Mission, tolerance: float) -> Controls | None:

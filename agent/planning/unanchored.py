@@ -1,13 +1,12 @@
 """A robot of a group without an anchor: it waits until a localised robot finds it, and believes its pose.
 
 The other robot drives a square while this one stands still; that determines this robot's position. Then this
-one drives a square, too; that determines its heading. All ranges to localised robots count, in the order of
-their ticks, so the result does not depend on the order in which reports arrive.
+one drives a square, too; that determines its heading. A claim rests on the ranges to one other robot, in the
+order of their ticks, so it does not depend on the order in which reports arrive.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 import msgspec
@@ -20,11 +19,10 @@ from agent.planning import sweep
 from agent.planning.phase3_last_manoeuvre import Standing
 from agent.planning.planner import Planner, Summary
 from agent.planning.state import MODE_NAMES
-from agent.planning.sweep import Looping
+from agent.planning.sweep import LOOPS_FOR, Looping
 from protocol.messages import (
     Command,
     Estimate,
-    Inconsistent,
     Localised,
     Observation,
     Report,
@@ -32,10 +30,9 @@ from protocol.messages import (
     RobotConfig,
     RobotConfigWithoutAnchor,
     Undecided,
-    Verdict,
 )
 from protocol.mission import Mission
-from protocol.motion import ORIGIN, REST, Pose, compose, step
+from protocol.motion import ORIGIN, REST, Pose, compose, inverse, step
 from protocol.rounding import SURE
 
 POSE_TOLERANCE = 1e-9
@@ -64,14 +61,16 @@ class UnanchoredState(msgspec.Struct, frozen=True):
     leg: Pose = ORIGIN
     """The odometry at the beginning of the last segment of `log`."""
     log: MotionLog = MotionLog()
+    base: Pose = ORIGIN
+    """The odometry at the place where it stands, or stood before its square."""
     ranges: Mapping[tuple[str, int], tuple[float, Pose]] = {}
-    """The ranges to other robots whose pose then is not known, and the odometry, by robot and tick."""
-    places: Mapping[tuple[int, str], RangedPlace] = {}
-    """The ranges to robots whose poses are known, by tick and robot."""
+    """The ranges to robots whose pose then is not known, and the own one from `base`, by robot and tick."""
+    places: Mapping[tuple[str, int], RangedPlace] = {}
+    """The ranges to robots whose poses are known, by robot and tick."""
     possible: tuple[Pose, ...] = ()
-    """The poses at tick 0 in <W> that agree with all ranges; empty before the heading can be determined."""
+    """The poses of `base` in <W> that agree with the ranges; empty before the heading can be determined."""
     mode: Standing | Looping = Standing()
-    verdict: Verdict | None = None
+    verdict: Localised | Undecided | None = None
 
     @property
     def phase(self) -> int:
@@ -86,8 +85,6 @@ class UnanchoredState(msgspec.Struct, frozen=True):
                 return "localised"
             case Undecided():
                 return "undecided"
-            case Inconsistent():
-                return "inconsistent"
         return MODE_NAMES[type(self.mode)]
 
 
@@ -114,7 +111,7 @@ class UnanchoredPlanner(Planner[UnanchoredState, Report]):
         if state.verdict is not None:
             return state
         new = {
-            (one.peer, observation.tick): (one.range, odometry)
+            (one.peer, observation.tick): (one.range, compose(inverse(state.base), odometry))
             for one in observation.contacts
             if one.range is not None
         }
@@ -151,17 +148,10 @@ class UnanchoredPlanner(Planner[UnanchoredState, Report]):
         for one in reports:
             known = ranges.pop((one.robot, one.tick), None) if isinstance(one, ReportWithPose) else None
             if known is not None and isinstance(one, ReportWithPose):
-                rho, odometry = known
-                places[one.tick, one.robot] = RangedPlace((one.pose.x, one.pose.y), odometry, rho)
+                places[one.robot, one.tick] = RangedPlace((one.pose.x, one.pose.y), known[1], known[0])
         if len(places) > len(state.places):
             state = _resected(replace(state, ranges=ranges, places=places))
-        if isinstance(state.mode, Looping) and state.verdict is None:
-            mode = sweep.onward(state.mode, state.odometry, state.config.mission, POSE_TOLERANCE)
-            if not mode.places:
-                mode = sweep.looping(state.odometry, state.config.mission)
-            assert isinstance(mode, Looping)
-            state = replace(state, mode=mode)
-        return state
+        return _moved_on(state) if isinstance(state.mode, Looping) and state.verdict is None else state
 
     def command(self, state: UnanchoredState) -> Command:
         """Return the command for the next tick, with the phase, the mode and the verdict."""
@@ -185,7 +175,7 @@ class UnanchoredPlanner(Planner[UnanchoredState, Report]):
             tick=state.tick,
             robot=state.config.robot,
             local=(),
-            world=tuple([compose(one, state.odometry) for one in state.possible]),
+            world=tuple([_now(state, one) for one in state.possible]),
             localised=isinstance(state.verdict, Localised),
         )
 
@@ -199,23 +189,39 @@ class UnanchoredPlanner(Planner[UnanchoredState, Report]):
         return Summary(hypotheses=len(state.possible) or None)
 
 
+def _now(state: UnanchoredState, base: Pose) -> Pose:
+    """Return the present pose in <W> if that of `state.base` is `base`."""
+    return compose(base, compose(inverse(state.base), state.odometry))
+
+
 def _resected(state: UnanchoredState) -> UnanchoredState:
-    """Return `state` with what follows from its ranges: a square to drive, or a verdict."""
-    known = [state.places[key] for key in sorted(state.places)]
-    standing = [one for one in known if one.odometry == ORIGIN]
-    moved = [one for one in known if one.odometry != ORIGIN]
-    if not moved:
-        found = resection.positions(standing, EXPLAINED)
-        if len(found) == 1 and resection.is_fixed(standing, found[0]) and isinstance(state.mode, Standing):
-            state = replace(state, mode=sweep.looping(state.odometry, state.config.mission))
-        spread = [one for one in standing if math.dist(one.there, standing[0].there) > EXPLAINED]
-        contradicted = bool(spread) and not found
-    else:
-        possible = resection.poses(standing, moved, EXPLAINED)
-        state = replace(state, possible=possible)
-        if resection.is_certain(standing, moved, possible):
-            return replace(state, verdict=Localised(compose(possible[0], state.odometry)))
-        contradicted = not possible
-    if contradicted:
-        return replace(state, verdict=Inconsistent("poses that contradict the mutual ranges"))
+    """Return `state` with what follows from its ranges to each robot: a square to drive, or a verdict."""
+    for robot in sorted({robot for robot, _ in state.places}):
+        known = [state.places[key] for key in sorted(state.places) if key[0] == robot]
+        standing = [one for one in known if one.odometry == ORIGIN]
+        moved = [one for one in known if one.odometry != ORIGIN]
+        if isinstance(state.mode, Standing):
+            found = resection.positions(standing, EXPLAINED)
+            if len(found) == 1 and resection.is_fixed(standing, found[0]):
+                return replace(state, mode=sweep.looping(state.odometry, state.config.mission, state.tick))
+        elif moved and (possible := resection.poses(standing, moved, EXPLAINED)):
+            state = replace(state, possible=possible)
+            if resection.is_certain(standing, moved, possible):
+                return replace(state, verdict=Localised(_now(state, possible[0])))
     return state
+
+
+def _moved_on(state: UnanchoredState) -> UnanchoredState:
+    """Return `state` after a tick of a square. It is repeated until the pose is known.
+
+    If nobody has reported a pose for KEPT ticks, the robot stands still again, and forgets all ranges: those
+    to the next robot that comes begin where it is then.
+    """
+    assert isinstance(state.mode, Looping)
+    mission, since = state.config.mission, state.mode.since
+    mode = sweep.onward(state.mode, state.odometry, mission, POSE_TOLERANCE)
+    if mode.places:
+        return replace(state, mode=mode)
+    if max(tick for _, tick in state.places) > state.tick - KEPT and since > state.tick - LOOPS_FOR:
+        return replace(state, mode=sweep.looping(state.odometry, mission, since))
+    return replace(state, mode=Standing(), base=state.odometry, ranges={}, places={}, possible=())

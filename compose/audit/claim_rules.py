@@ -63,9 +63,7 @@ def _redundant(run: Run, placed: RobotSpec, agent: AgentHistory, tick: int) -> V
     ranged = {peer: _ranged(agent, peer, _known_until(agent, peer, tick, planner)) for peer in peers}
     if mission.noise.exact:
         least = planner.REQUIRED_PLACES
-        counts = [_places(run, placed.id, peer, ranged[peer]) for peer in peers] if least else [0]
-        # a robot without an anchor believes the poses of all, so ranges to several robots add up
-        places = sum(counts) if placed.given_anchor is None else max(counts)
+        places = max([_places(run, placed.id, peer, ranged[peer]) for peer in peers]) if least else 0
         return _too_few(tick, placed, "relative placements with a mutual range", places, least)
     least = planner.required_mutual_ranges(mission)
     return _too_few(tick, placed, "mutual ranges", max(map(len, ranged.values())), least)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import combinations
 
 from compose.errors import BadScenario, Unworkable
 from compose.scenario.group_meetings import FirstMeeting, GroupMeetings
 from compose.scenario.scenario_tables import Area, RobotTable, ScenarioFile
-from protocol.mission import Mission
+from protocol.mission import Mission, infeasibility
 from protocol.orbits import Orbit, Rendezvous
 from protocol.sweep_strips import HALF_WIDTH, Sweep, helping_ticks, sweep_speed, sweep_ticks
 from world.scenario import PlannedSweep
@@ -59,6 +60,11 @@ def _check_area(file: ScenarioFile, missing: Sequence[int], source: str) -> None
         raise Unworkable(
             f"{source}: mission.area: it has more than {MOST_STRIPS} strips of 1.6 sensing_range"
         )
+    places = [one.anchor for one in file.robot if one.anchor is not None]
+    places += Sweep(*file.mission.area, 1).corners
+    why = infeasibility(file.mission, max([math.dist(*two) for two in combinations(places, 2)]))
+    if why is not None:
+        raise Unworkable(f"{source}: mission.area: {why}")
     for i in missing:
         start = file.robot[i].start
         if start is not None and not (x_min <= start[0] <= x_max and y_min <= start[1] <= y_max):

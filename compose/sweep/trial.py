@@ -215,6 +215,8 @@ def row(trial: Trial, run: Run, wall_s: float, findings: Findings | None = None)
         bounded = _bounded(robots, run, pair)
         robots |= {name: one for name, one in bounded.items() if robots[name].bound_m is None}
     t_max_s = max(robot.rendezvous.bound for robot in scenario.robots)
+    bound_ticks = [one.bound_ticks for one in meeting_results(run)]
+    bound_ticks += [one.bound_ticks for one in search_results(run)]
     encounters = [_meeting(run, a, b, in_group=bool(scenario.meetings)) for a, b in run.pairs]
     final_reports = run.final_reports.values()
     errors = [robot.position_error_m for robot in robots.values() if robot.position_error_m is not None]
@@ -233,9 +235,7 @@ def row(trial: Trial, run: Run, wall_s: float, findings: Findings | None = None)
         period_s=scenario.mission.period,
         t_max_s=t_max_s,
         t_max_ticks=math.ceil(t_max_s / scenario.mission.period - ROUNDING),
-        bound_ticks=max(
-            [one.bound_ticks for one in (*meeting_results(run), *search_results(run))], default=None
-        ),
+        bound_ticks=max(bound_ticks, default=None),
         candidates=_most([robot.candidates for robot in robots.values()]),
         candidates_left=_most([robot.candidates_left for robot in robots.values()]),
         position_error_m=_most([robot.position_error_m for robot in robots.values()]),
