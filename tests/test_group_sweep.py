@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from msgspec.structs import replace
+from playwright.sync_api import expect
 
 from agent.planning.unanchored import UnanchoredPlanner
 from compose.audit.replay import replayed
@@ -22,6 +23,7 @@ from compose.scenario.scenario_file import parse, validate
 from protocol.messages import ReportWithPose, RobotConfigWithoutAnchor
 from protocol.motion import Pose
 from protocol.wire import decode, encode
+from tests.browser import Open, scrub_to, shot, watching
 from tests.commands import tandem as tandem_command
 from tests.groups import R, localised, table_of
 from tests.test_audit import kept
@@ -278,7 +280,7 @@ def test_processes_write_the_same_journals_and_each_command_shows_the_recording(
     for command in (["audit"], ["replay"], ["figures"], ["export"], ["export", "--rerun"]):
         done = tandem_command(command[0], str(folder), *command[1:])
         assert done.status == 0, done.err
-    assert "start-u" in (folder / "meetings.svg").read_text(encoding="utf-8")
+    assert "start-u" in (folder / "figures" / "meetings.svg").read_text(encoding="utf-8")
 
 
 @pytest.mark.long
@@ -298,3 +300,23 @@ def test_a_run_of_frames_has_the_robots_without_an_anchor() -> None:
     assert run.setup is not None
     assert [one.id for one in run.setup.anchored] == ["a", "b"]
     assert run.setup.bounds_s["u"] == run.setup.t_max_s
+
+
+@pytest.mark.long
+def test_the_page_shows_the_sweep_and_the_robots_that_it_finds(opened: Open, tmp_path: Path) -> None:
+    run = run_mission(parse(FILE, "four"), tmp_path)
+    assert run.end is not None
+    claims = [run.claim(robot) for robot in ("u", "v")]
+    found = min([one.tick for one in claims if one is not None])
+    with watching(tmp_path) as (_, address):
+        page = opened(address)
+        scrub_to(page, 0)
+        labels = page.evaluate("document.getElementById('canvas').labels.map((one) => one.text)")
+        assert {"u", "anchor of a"} <= set(labels)
+        assert "anchor of u" not in labels
+        scrub_to(page, found - 1)
+        expect(page.locator("#caption")).to_have_text("a and b sweep the area for robots without an anchor.")
+        expect(page.locator("body")).to_contain_text("no anchor")
+        shot(page, "without-anchor")
+        page.keyboard.press("t")  # without the ground truth
+        scrub_to(page, run.end.tick)
