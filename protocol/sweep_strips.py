@@ -19,17 +19,17 @@ Place = tuple[float, float]
 HALF_WIDTH = 0.8
 """The largest distance of a robot from the middle of its strip, as a fraction of R."""
 
-NEAR = 0.85
+NEAR = 0.9
 """The largest range at which a sweeping robot stops for another one, as a fraction of R."""
 
 STEP = 0.5
 """The largest distance driven in a tick of a sweep, as a fraction of R.
 
-At HALF_WIDTH, 0.57 R of the middle line are within NEAR R, and at the end of a strip, half of that are. So a
-tick is, or the end of the strip, where the robot turns.
+Of the middle line, 0.63 R are within NEAR R of a robot that is 0.84 R away, at HALF_WIDTH and on a square of
+its own. At the end of a strip, half of that are. So a tick is, or the end of the strip, where robots turn.
 """
 
-SIDE = 0.05
+SIDE = 0.03
 """The side of the square that a robot drives in range of another one, as a fraction of R.
 
 If both drive one, their range grows from NEAR R by at most the two diagonals, and stays within R.

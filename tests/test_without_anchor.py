@@ -106,7 +106,8 @@ def test_a_sweep_comes_near_each_place_of_the_area_in_a_tick(
     area = Sweep(5.0, -3.0, 5.0 + wide, -3.0 + high, 1)
     path = driven(area.path(0, R), Pose(0.0, 0.0, 1.0), Mission(R, 1.0, speed, 0.7))
     place = (5.0 + x * wide, -3.0 + y * high)
-    assert min(math.dist((pose.x, pose.y), place) for pose in path) <= NEAR * R
+    # the robot may be on a square of its own, because another one has passed
+    assert min(math.dist((pose.x, pose.y), place) for pose in path) <= NEAR * R - math.sqrt(2.0) * FAR
 
 
 @given(LENGTHS, LENGTHS, st.floats(0.1, 7.0), st.floats(0.1, 7.0))

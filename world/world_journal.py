@@ -196,6 +196,8 @@ def _unpaired(scenario: Scenario) -> str | None:
         return "its scenario has no robots, or several of the same name"
     if scenario.meetings:
         return _unplanned(scenario)
+    if scenario.unanchored:
+        return f"in its scenario {scenario.unanchored[0]} has no anchor"
     for robot in scenario.robots:
         peer = robots.get(robot.peer)
         if peer is None or peer.peer != robot.id or peer.role == robot.role:

@@ -22,7 +22,7 @@ REDUNDANT = 1
 SPREAD = 0.02
 """The least root of the information about a position in its worst direction, for ranges with sigma 1 m.
 
-From four corners of a square with a side of 0.05 R, 0.85 R away, it is about 0.05; from a line, about 0.
+From four corners of a square with a side of 0.03 R, 0.9 R away, it is 0.033; from a line, about 0.
 """
 
 LEVER = 0.02

@@ -40,9 +40,9 @@ def meetings_of(file: ScenarioFile, source: str) -> GroupMeetings | None:
     _check_accuracy(file, (min(distances), max(distances)), source)
     try:
         meetings = group_meetings([robots[i] for i in anchored], file.mission, file.planner)
+        return with_sweep(robots, file.mission.area, file.mission, meetings)
     except Unworkable as error:
         raise Unworkable(f"{source}: {error}") from None
-    return with_sweep(robots, file.mission.area, file.mission, meetings)
 
 
 def pair_meetings(file: ScenarioFile, source: str) -> dict[str, FirstMeeting]:

@@ -11,7 +11,7 @@ from compose.scenario.group_meetings import FirstMeeting, GroupMeetings
 from compose.scenario.scenario_tables import Area, RobotTable, ScenarioFile
 from protocol.mission import Mission, infeasibility
 from protocol.orbits import Orbit, Rendezvous
-from protocol.sweep_strips import HALF_WIDTH, Sweep, helping_ticks, sweep_speed, sweep_ticks
+from protocol.sweep_strips import Sweep, helping_ticks, sweep_speed, sweep_ticks
 from world.scenario import PlannedSweep
 
 LEAVING = 10
@@ -23,9 +23,6 @@ ASIDE = 2.0
 PARTS = 3.0
 """The time allowed for sweeps in `max_ticks`, in units of the planned bound."""
 
-MOST_STRIPS = 10_000
-"""The largest number of strips of an area."""
-
 
 def check_unanchored(file: ScenarioFile, source: str) -> None:
     """Raise BadScenario or Unworkable if the robots without an anchor in a group cannot be localised."""
@@ -33,6 +30,8 @@ def check_unanchored(file: ScenarioFile, source: str) -> None:
     if not missing:
         return
     where = f"{source}: robot[{missing[0]}]: missing field 'anchor'"
+    if file.group is not None:
+        where = f"{source}: group.without_anchor"
     if len(file.robot) - len(missing) < 2:
         raise BadScenario(f"{where}: at least two robots of a group need one")
     if not file.mission.noise.exact:
@@ -50,21 +49,12 @@ def check_unanchored(file: ScenarioFile, source: str) -> None:
 
 
 def _check_area(file: ScenarioFile, missing: Sequence[int], source: str) -> None:
-    """Raise BadScenario or Unworkable if the area of the robots at the places `missing` is unsuitable."""
+    """Raise BadScenario if the area is missing or malformed, or if one of `missing` is not in it."""
     if file.mission.area is None:
         raise BadScenario(f"{source}: mission: missing field 'area': robots without an anchor are in it")
     x_min, y_min, x_max, y_max = file.mission.area
     if x_min > x_max or y_min > y_max:
         raise BadScenario(f"{source}: mission.area: it must be [x_min, y_min, x_max, y_max]")
-    if min(x_max - x_min, y_max - y_min) > MOST_STRIPS * 2.0 * HALF_WIDTH * file.mission.sensing_range:
-        raise Unworkable(
-            f"{source}: mission.area: it has more than {MOST_STRIPS} strips of 1.6 sensing_range"
-        )
-    places = [one.anchor for one in file.robot if one.anchor is not None]
-    places += Sweep(*file.mission.area, 1).corners
-    why = infeasibility(file.mission, max([math.dist(*two) for two in combinations(places, 2)]))
-    if why is not None:
-        raise Unworkable(f"{source}: mission.area: {why}")
     for i in missing:
         start = file.robot[i].start
         if start is not None and not (x_min <= start[0] <= x_max and y_min <= start[1] <= y_max):
@@ -76,11 +66,17 @@ def with_sweep(
 ) -> GroupMeetings:
     """Return `meetings` with the search for those of `robots` that have no anchor, which are in `area`.
 
-    The latest time allows for robots that sweep the parts of others, which have failed.
+    The latest time allows for robots that sweep the parts of others, which have failed. Raises Unworkable if
+    the area is too large for rounding errors.
     """
     unanchored = [robot.id for robot in robots if robot.anchor is None]
     if not unanchored or area is None:
         return meetings
+    places = [robot.anchor for robot in robots if robot.anchor is not None]
+    places += Sweep(*area, 1).corners
+    why = infeasibility(mission, max([math.dist(*two) for two in combinations(places, 2)]))
+    if why is not None:
+        raise Unworkable(f"mission.area: {why}")
     planned = _planned_sweep(robots, len(unanchored), area, mission, meetings)
     still = Orbit(0.0, 0.0, 0.0)
     waiting = FirstMeeting(planned.sweepers[0], "b", Rendezvous(still, still, planned.ends))
