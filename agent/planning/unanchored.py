@@ -110,8 +110,10 @@ class UnanchoredPlanner(Planner[UnanchoredState, Report]):
         state = replace(state, tick=observation.tick, odometry=odometry, leg=leg, log=log)
         if state.verdict is not None:
             return state
+        # where it stands, rounding must not look like a motion
+        moved = compose(inverse(state.base), odometry) if odometry != state.base else ORIGIN
         new = {
-            (one.peer, observation.tick): (one.range, compose(inverse(state.base), odometry))
+            (one.peer, observation.tick): (one.range, moved)
             for one in observation.contacts
             if one.range is not None
         }
