@@ -147,11 +147,13 @@ class UnanchoredPlanner(Planner[UnanchoredState, Report]):
         if state.tick * state.config.mission.period >= state.config.gives_up:
             return replace(state, verdict=Undecided("no localised robot has found it"))
         ranges, places = dict(state.ranges), dict(state.places)
+        if isinstance(state.mode, Standing):  # a robot that comes again may have another pose since a meeting
+            places = {key: one for key, one in places.items() if key[1] > state.tick - LOOPS_FOR}
         for one in reports:
             known = ranges.pop((one.robot, one.tick), None) if isinstance(one, ReportWithPose) else None
             if known is not None and isinstance(one, ReportWithPose):
                 places[one.robot, one.tick] = RangedPlace((one.pose.x, one.pose.y), known[1], known[0])
-        if len(places) > len(state.places):
+        if places.keys() != state.places.keys():
             state = _resected(replace(state, ranges=ranges, places=places))
         return _moved_on(state) if isinstance(state.mode, Looping) and state.verdict is None else state
 
