@@ -18,6 +18,20 @@ settings.register_profile("tandem", derandomize=True, deadline=None, database=No
 settings.load_profile("tandem")
 
 
+LONG_TIMEOUT_S = 600.0
+"""The time in s after which a long test is taken to hang.
+
+Some compute for half a minute on a core of their own, and the workers share the cores, also with other work.
+"""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Give long tests a time limit of their own."""
+    for item in items:
+        if item.get_closest_marker("long"):
+            item.add_marker(pytest.mark.timeout(LONG_TIMEOUT_S))
+
+
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:  # noqa: ARG001  # the hook requires the name
     """Return two workers per core: tests that start processes spend much of their time waiting."""
     return 2 * (os.cpu_count() or 1)

@@ -152,8 +152,9 @@ def _strays_test(fitted: Fit, own: Fit, pair: PairRanges, robot: int) -> Inconsi
     The rate of strays follows from the ranges to the own anchor and from what was told. The peer's ranges
     to its anchor and the mutual ranges are tested together and apart, and of each kind the earliest and the
     latest: a false hypothesis that drops a few of them may fit the rest, and every further range that fits
-    would hide them. The p-value is the least of these tests, times their number (Bonferroni): a test of the
-    earliest ranges stays as it is, however many ranges follow.
+    would hide them. There is a test from either end for each stray, and both overlap, so the p-value is the
+    least of all tests, times the number of strays: a test of the earliest ranges stays as it is, however many
+    ranges follow, and among many strays some are close together by chance.
     """
     told, seen = pair.noise.strays + pair.noise.outliers, len(own.residuals) - own.inliers
     known = RANGES_BEFORE / max(pair.noise.untold_share, LEAST_SHARE) - RANGES_BEFORE
@@ -165,7 +166,7 @@ def _strays_test(fitted: Fit, own: Fit, pair: PairRanges, robot: int) -> Inconsi
     for kind in (1 - robot, 2):
         tested += _from_either_end(stray[pair.ranges.rows(kind)])
     p_value, count, total = min((beta_binomial_tail(k, n, strays, ranges), k, n) for k, n in tested)
-    p_value = min(p_value * len(tested), 1.0)
+    p_value = min(p_value * max(tested[0][0], 1), 1.0)
     what = f"measurements and reports of which {count} of {total} fit no other"
     return Inconsistency(what, sigmas(p_value), p_value)
 
