@@ -21,15 +21,17 @@ from compose.recording.recording_files import agent_journal
 from compose.recording.run import Run, of_frames, read
 from compose.scenario.scenario_change import file_table
 from compose.scenario.scenario_file import parse, validate
+from protocol.journal.journal_file import CorruptJournal
 from protocol.messages import Contact, Localised, Observation, ReportWithPose, RobotConfigWithoutAnchor
 from protocol.motion import Controls, Pose, step
 from protocol.wire import decode, encode
 from tests.browser import Open, scrub_to, shot, watching
+from tests.commands import SECTION_IV
 from tests.commands import tandem as tandem_command
 from tests.groups import R, localised, table_of
 from tests.test_audit import kept
-from tests.test_group_runs import audited
-from world.scenario import Scenario
+from tests.test_group_runs import audited, with_scenario
+from world.scenario import Scenario, ScenarioWithSweep
 
 AREA = [-4.0, -4.0, 14.0, 12.0]
 
@@ -295,6 +297,18 @@ def test_the_audit_and_the_replay_find_nothing_where_nothing_is_wrong(tmp_path: 
     assert replayed(read(tmp_path)).differences == ()
 
 
+SECTION_IV_PAIR = f"""
+name = "pair"
+{SECTION_IV}
+[[robot]]
+id = "a"
+anchor = [0.0, 0.0]
+[[robot]]
+id = "b"
+anchor = [10.0, 0.0]
+"""
+
+
 def _with_pose(frames: list[bytes]) -> list[int]:
     """Return the places of the reports with a pose."""
     return [i for i, frame in enumerate(frames) if b"report-with-pose" in frame]
@@ -309,6 +323,33 @@ def test_the_audit_finds_a_reported_pose_that_is_not_the_computed_one() -> None:
     shifted = replace(report, pose=replace(report.pose, x=report.pose.x + 0.5))
     frames[place] = encode(shifted)
     assert (report.tick, finder, "decision") in audited(journals)
+
+
+def test_the_audit_finds_a_sweep_that_is_not_the_planned_one() -> None:
+    journals = kept(parse(FILE, "four"))
+    scenario = of_frames(journals).scenario
+    assert isinstance(scenario, ScenarioWithSweep)
+    assert scenario.planned_sweep is not None
+    later = replace(scenario.planned_sweep, ends=scenario.planned_sweep.ends + 1.0)
+    found = audited(with_scenario(journals, replace(scenario, planned_sweep=later)))
+    assert (None, None, "scenario") in found
+    away = [replace(one, start=Pose(90.0, 0.0, 0.0)) if one.id == "u" else one for one in scenario.robots]
+    found = audited(with_scenario(journals, replace(scenario, robots=tuple(away))))
+    assert (None, "u", "scenario") in found
+
+
+def test_a_recording_whose_searching_robots_are_not_those_with_an_anchor_is_refused() -> None:
+    journals = kept(parse(FILE, "four"))
+    scenario = of_frames(journals).scenario
+    assert isinstance(scenario, ScenarioWithSweep)
+    assert scenario.planned_sweep is not None
+    for planned in (None, replace(scenario.planned_sweep, sweepers=("a", "u"))):
+        with pytest.raises(CorruptJournal, match="the robots that search are not those with an anchor"):
+            of_frames(with_scenario(journals, replace(scenario, planned_sweep=planned)))
+    pairs = replace(parse(SECTION_IV_PAIR, "pair"), robots=())
+    lacking = [replace(one, given_anchor=None) for one in parse(SECTION_IV_PAIR, "pair").robots]
+    with pytest.raises(CorruptJournal, match="in its scenario a has no anchor"):
+        of_frames(with_scenario(journals, replace(pairs, robots=tuple(lacking))))
 
 
 @pytest.mark.long

@@ -36,8 +36,8 @@ def check_unanchored(file: ScenarioFile, source: str) -> None:
         raise BadScenario(f"{where}: at least two robots of a group need one")
     if not file.mission.noise.exact:
         raise Unworkable(
-            f"{where}: with mission.noise, each robot needs one, because the odometry of a robot that "
-            "searches for others becomes too inaccurate"
+            f"{where}: with mission.noise, each robot needs one, because robots do not compute how "
+            "inaccurate their poses become on the way to others"
         )
     for i, robot in enumerate(file.robot):
         if robot.attack is not None:
