@@ -52,7 +52,7 @@ from protocol.attack import Attack
 from protocol.mission import Anchor, Mission, Options, PlannerName, Role
 from protocol.motion import ORIGIN, Controls, Covariance, Pose, Segment
 from protocol.orbits import Orbit, Rendezvous, visiting
-from protocol.sweep_strips import Sweep
+from protocol.sweep_strips import SweptArea
 from protocol.units import (
     Angle,
     AngularVelocity,
@@ -290,7 +290,7 @@ class Member(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields
     """The planned bound in s of the time at which it is localised."""
 
 
-NO_SWEEP = Sweep(0.0, 0.0, 0.0, 0.0, 1)
+NO_SWEEP = SweptArea(0.0, 0.0, 0.0, 0.0, 1)
 """The sweep of an area without any extent."""
 
 
@@ -355,7 +355,7 @@ class RobotConfigWithSweep(RobotConfigInGroup, frozen=True, dict=True):
 
     unanchored: Annotated[tuple[RobotId, ...], Meta(max_length=MAX_MEMBERS)] = ()
     """The robots without an anchor, in the order of the scenario."""
-    sweep: Sweep = NO_SWEEP
+    sweep: SweptArea = NO_SWEEP
     """The area in which they are, and the number of its parts."""
     part: Count = 0
     """The part that this robot sweeps first."""

@@ -43,7 +43,7 @@ left for reports, turns and ticks that are only partly used.
 """
 
 
-class Sweep(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+class SweptArea(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """The parts of an area that robots sweep, one each."""
 
     x_min: Coordinate

@@ -13,7 +13,7 @@ from agent.planning import sweep
 from agent.planning.sweep import Looping, Sweeping
 from protocol.mission import Mission
 from protocol.motion import ORIGIN, Pose, compose, step
-from protocol.sweep_strips import NEAR, SIDE, Sweep, sweep_ticks
+from protocol.sweep_strips import NEAR, SIDE, SweptArea, sweep_ticks
 from tests.groups import R
 
 FLOOR = 1e-9
@@ -103,7 +103,7 @@ def driven(places: tuple[tuple[float, float], ...], start: Pose, mission: Missio
 def test_a_sweep_comes_near_each_place_of_the_area_in_a_tick(
     wide: float, high: float, x: float, y: float, speed: float
 ) -> None:
-    area = Sweep(5.0, -3.0, 5.0 + wide, -3.0 + high, 1)
+    area = SweptArea(5.0, -3.0, 5.0 + wide, -3.0 + high, 1)
     path = driven(area.path(0, R), Pose(0.0, 0.0, 1.0), Mission(R, 1.0, speed, 0.7))
     place = (5.0 + x * wide, -3.0 + y * high)
     # the robot may be on a square of its own, because another one has passed
@@ -115,14 +115,14 @@ def test_a_sweep_takes_no_more_ticks_than_its_bound(
     wide: float, high: float, speed: float, turn_rate: float
 ) -> None:
     mission = Mission(R, 1.0, speed, turn_rate)
-    places = Sweep(5.0, -3.0, 5.0 + wide, -3.0 + high, 1).path(0, R)
+    places = SweptArea(5.0, -3.0, 5.0 + wide, -3.0 + high, 1).path(0, R)
     path = driven(places, Pose(0.0, 0.0, 1.0), mission)
     assert len(path) - 1 <= sweep_ticks([(0.0, 0.0), *places], mission)
 
 
 @pytest.mark.parametrize("parts", [1, 2, 3, 7, 30])
 def test_the_strips_are_split_into_parts_without_a_gap(parts: int) -> None:
-    whole = Sweep(0.0, 0.0, 30.0, 25.0, 1).path(0, R)
-    split = [Sweep(0.0, 0.0, 30.0, 25.0, parts).path(part, R) for part in range(parts)]
+    whole = SweptArea(0.0, 0.0, 30.0, 25.0, 1).path(0, R)
+    split = [SweptArea(0.0, 0.0, 30.0, 25.0, parts).path(part, R) for part in range(parts)]
     assert [place for part in split for place in part] == list(whole)
     assert max(map(len, split)) - min(map(len, split)) <= 2

@@ -23,7 +23,7 @@ from protocol.messages import (
 from protocol.mission import Anchor, Mission, Options, PlannerName, Role
 from protocol.motion import Pose
 from protocol.orbits import Rendezvous
-from protocol.sweep_strips import Sweep
+from protocol.sweep_strips import SweptArea
 from protocol.units import RobotId, Tick, Time
 from world.faults import Fault
 from world.radio_models import RADIO_MODELS
@@ -105,7 +105,7 @@ class PlannedRetry(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_
 class PlannedSweep(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """The search of localised robots for those without an anchor."""
 
-    sweep: Sweep
+    sweep: SweptArea
     """The area, and the number of its parts."""
     sweepers: tuple[RobotId, ...]
     """The robots that sweep it, in the order of the parts that they sweep first."""

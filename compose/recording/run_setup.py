@@ -15,7 +15,7 @@ from protocol.messages import RobotConfig, RobotConfigInGroup, RobotConfigWithou
 from protocol.mission import Anchor, Mission, PlannerName, Role
 from protocol.motion import Pose
 from protocol.orbits import Orbit
-from protocol.sweep_strips import Sweep
+from protocol.sweep_strips import SweptArea
 from protocol.units import RobotId, Tick
 from world.faults import Fault
 from world.scenario import Scenario
@@ -86,7 +86,7 @@ class RunSetup(msgspec.Struct, frozen=True, dict=True):
     faults: tuple[Fault, ...] = ()
     visits: tuple[Visit, ...] = ()
     """The meetings of a group, in the order in which they are planned to end; empty for pairs."""
-    sweep: Sweep | None = None
+    sweep: SweptArea | None = None
     """The area in which robots without an anchor are; None if all robots have one."""
 
     @property

@@ -11,7 +11,7 @@ from compose.scenario.group_meetings import FirstMeeting, GroupMeetings
 from compose.scenario.scenario_tables import Area, RobotTable, ScenarioFile
 from protocol.mission import Mission, infeasibility
 from protocol.orbits import Orbit, Rendezvous
-from protocol.sweep_strips import Sweep, helping_ticks, sweep_speed, sweep_ticks
+from protocol.sweep_strips import SweptArea, helping_ticks, sweep_speed, sweep_ticks
 from world.scenario import PlannedSweep
 
 LEAVING = 10
@@ -73,7 +73,7 @@ def with_sweep(
     if not unanchored or area is None:
         return meetings
     places = [robot.anchor for robot in robots if robot.anchor is not None]
-    places += Sweep(*area, 1).corners
+    places += SweptArea(*area, 1).corners
     why = infeasibility(mission, max([math.dist(*two) for two in combinations(places, 2)]))
     if why is not None:
         raise Unworkable(f"mission.area: {why}")
@@ -101,7 +101,7 @@ def _planned_sweep(
     for meeting in meetings.planned:
         for robot in (meeting.visitor, meeting.visited):
             places[robot], free[robot] = anchors[meeting.visited], meeting.ends
-    sweep = Sweep(*area, len(anchors))
+    sweep = SweptArea(*area, len(anchors))
     sweepers = sorted(places, key=lambda robot: places[robot][sweep.across])
     aside = math.ceil(ASIDE * mission.sensing_range / (sweep_speed(mission) * mission.period))
     latest = 0.0
