@@ -286,8 +286,8 @@ class Member(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields
     """The robot."""
     anchor: Anchor
     """The position of its anchor in <W>, in m."""
-    ends: Time
-    """The planned bound in s of the time at which it is localised."""
+    ends: Tick
+    """The last tick within the planned bound of the time at which it is localised."""
 
 
 NO_SWEEP = SweptArea(0.0, 0.0, 0.0, 0.0, 1)

@@ -172,6 +172,17 @@ def test_a_claim_waits_for_the_accuracy_that_is_asked_for(sample: RangeRecording
     assert re.match(r"the sigma of [AB]'s position is .* m, required 0.01", strict.summary.blocking_reason)
 
 
+def test_no_nees_stands_beside_a_pose_that_the_robot_may_not_claim(sample: RangeRecording) -> None:
+    strict, claimed = [sample_estimates(sample, accuracy=one).summary for one in (0.01, 0.3)]
+    for name, robot in strict.robots.items():
+        assert robot.final is not None
+        assert robot.final.position_error_m is not None
+        assert robot.final.nees is None
+        other = claimed.robots[name].final
+        assert other is not None
+        assert other.nees is not None
+
+
 @pytest.mark.long
 def test_a_bias_of_all_ranges_is_learned_with_the_profile_of_raw_radios(sample: RangeRecording) -> None:
     found = sample_estimates(with_ranges(sample, sample.ranges.range + 0.35), "uwb")

@@ -10,7 +10,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
@@ -24,6 +24,7 @@ from compose.scenario.scenario_file import validate
 from protocol.messages import Localised, Report, RobotConfigInGroup
 from protocol.mission import Mission
 from protocol.motion import Pose, step
+from protocol.wire import MAX_REPORT_BYTES, encode
 from tests.groups import R, group_of, localised, table_of
 from tests.series import series
 from world.referee import mistake
@@ -117,6 +118,35 @@ def test_a_pair_tries_again_with_another_robot_when_its_first_meeting_has_failed
     assert claim.tick * scenario.mission.period > scenario.retries[0].begins
 
 
+ROTATED = {"kind": "rotate", "part": "encounter", "size": 0.0872664626}
+SHIFTED = {"kind": "shift", "part": "all", "size": 0.3}
+
+
+@pytest.mark.parametrize(
+    ("robots", "seed", "attacker", "attack"),
+    [
+        pytest.param(3, 13, 1, SCALED, id="the attacker stays where the retry takes place"),
+        pytest.param(3, 14, 2, SHIFTED, id="the attacker is found in phase 1"),
+        pytest.param(3, 18, 2, ROTATED, id="the attacker interrupts a retry"),
+        pytest.param(4, 5, 2, ROTATED, id="the attacker interrupts the retry of four"),
+    ],
+)
+def test_an_attacker_cannot_end_the_meeting_of_two_honest_robots(
+    robots: int, seed: int, attacker: int, attack: dict[str, Any]
+) -> None:
+    run = run_mission(group_of(robots, seed, attacker=attacker, attack=attack))
+    assert localised(run) >= set(run.robots) - {f"r{attacker}"}
+
+
+def test_a_robot_whose_meetings_with_all_others_have_failed_gives_up_at_once() -> None:
+    scenario = group_of(3, 14, attacker=2, attack=SHIFTED)
+    run = run_mission(scenario)
+    assert run.end is not None
+    claims = [claim.tick for robot in ("r0", "r1") if (claim := run.claim(robot)) is not None]
+    assert run.end.tick < max(claims) + 20
+    assert run.end.tick < 0.5 * scenario.max_ticks
+
+
 def test_a_robot_sends_its_log_only_to_the_robot_that_it_meets(tmp_path: Path) -> None:
     scenario = group_of(8, 1)
     run_mission(scenario, tmp_path)
@@ -149,6 +179,26 @@ def test_the_configuration_of_a_robot_names_its_group_and_its_visits() -> None:
             for other in config.members
         ]
         assert config.widest_distance == max(apart)
+
+
+def test_the_configuration_of_a_robot_of_a_hundred_fits_in_the_largest_report() -> None:
+    scenario = group_of(100, 1)
+    sizes = [len(encode(scenario.config(robot.id))) for robot in scenario.robots]
+    assert max(sizes) <= MAX_REPORT_BYTES
+
+
+@given(
+    st.floats(1e-3, 1e4), st.sampled_from([0.1, 0.3, 1.0, 1 / 3]) | st.floats(0.01, 100.0), st.integers(0, 5)
+)
+def test_a_robot_is_late_in_the_tick_in_which_its_bound_in_seconds_is_over(
+    bound: float, period: float, ticks: int
+) -> None:
+    scenario = group_of(3, 1)
+    mission = replace(scenario.mission, period=period)
+    for ends in (bound, ticks * period):
+        meetings = tuple([replace(one, ends=ends) for one in scenario.meetings])
+        (last,) = {one.ends for one in replace(scenario, mission=mission, meetings=meetings).members}
+        assert last * period <= ends < (last + 1) * period
 
 
 @pytest.mark.parametrize(
@@ -250,6 +300,7 @@ def test_a_visitor_reaches_its_place_by_a_turn_and_straights(
 
 
 @given(st.floats(0.0, 3.0 * R), st.floats(-math.pi, math.pi))
+@example(2.0 * R, 0.75)  # beside a corner
 def test_the_square_spiral_passes_every_place_near_its_begin_within_range(
     away: float, bearing: float
 ) -> None:
@@ -260,7 +311,7 @@ def test_the_square_spiral_passes_every_place_near_its_begin_within_range(
         mode = next_side(mode, MISSION)
         places.append(mode.place)
     nearest = min(_distance(target, one, other) for one, other in pairwise(places))
-    assert nearest <= 0.5 * R + 1e-9
+    assert nearest <= math.sqrt(0.5) * R + 1e-9
 
 
 def _distance(target: tuple[float, float], one: tuple[float, float], other: tuple[float, float]) -> float:

@@ -177,8 +177,12 @@ def test_configurations_alone_have_the_same_plan_of_meetings(run: Run) -> None:
     agents_only = Run(None, run.agents, {name: one for name, one in run.journals.items() if "agent" in name})
     assert run.setup is not None
     assert agents_only.setup is not None
-    assert agents_only.setup.visits == run.setup.visits
-    assert agents_only.setup.t_max_s == run.setup.t_max_s == max(one.ends_s for one in run.setup.visits)
+    told, planned = agents_only.setup.visits, run.setup.visits
+    assert [(one.visitor, one.visited) for one in told] == [(one.visitor, one.visited) for one in planned]
+    for one, other in zip(told, planned, strict=True):  # robots are told the last tick within the bound
+        assert other.ends_s - run.setup.mission.period < one.ends_s <= other.ends_s
+    assert agents_only.setup.t_max_s == max(one.ends_s for one in told)
+    assert run.setup.t_max_s == max(one.ends_s for one in planned)
     assert [(one.a, one.b, one.first) for one in past_meetings(agents_only)] == [
         (one.a, one.b, one.first) for one in past_meetings(run)
     ]

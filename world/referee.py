@@ -80,13 +80,15 @@ def decide_outcome(
 
     A claim is compared with the true pose at the tick of the claim, which is in `claimed`, or with the
     current one if `claimed` is None. The run does not wait for a robot whose peer is undecided or
-    inconsistent, because it can no longer be localised; in a group, another robot may still come. A claim
+    inconsistent, because it can no longer be localised; in a group, another robot may still come. It does not
+    wait for a dead robot, which leaves it undecided. A claim
     below the required accuracy does not count as localised.
     """
     open_cases = [
         robot.id
         for robot in scenario.robots
         if robot.id not in verdicts
+        and not scenario.is_dead(robot.id, truth.tick)
         and (scenario.meetings or not isinstance(verdicts.get(robot.peer), Undecided | Inconsistent))
     ]
     if open_cases and truth.tick < scenario.max_ticks:
@@ -116,4 +118,7 @@ def _no_better(
                 return MissionOutcome("undecided", f"{robot.id} {vague}")
     if open_cases:
         return MissionOutcome("undecided", f"max_ticks: {', '.join(open_cases)} not localised by then")
+    for death in scenario.deaths:
+        if death.robot not in verdicts:
+            return MissionOutcome("undecided", f"{death.robot} is dead from tick {death.tick} on")
     return MissionOutcome("localised")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from functools import cached_property
 from itertools import combinations
@@ -113,6 +114,15 @@ class PlannedSweep(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_
     """The bound in s of the time at which all robots without an anchor are localised."""
 
 
+class Death(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """A robot that is dead for good: it stands still, and measures, sends and receives nothing."""
+
+    robot: RobotId
+    """The robot."""
+    tick: Tick
+    """The tick from which on it is dead."""
+
+
 class Scenario(
     msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="scenario", dict=True
 ):
@@ -185,6 +195,19 @@ class Scenario(
     def unanchored(self) -> tuple[str, ...]:
         """The robots without an anchor, in the order of the scenario."""
         return tuple([robot.id for robot in self.robots if robot.given_anchor is None])
+
+    @property
+    def deaths(self) -> tuple[Death, ...]:
+        """The robots of a group that die; here, none."""
+        return ()
+
+    @cached_property
+    def _dead_from(self) -> dict[str, int]:
+        return {one.robot: one.tick for one in self.deaths}
+
+    def is_dead(self, robot: str, tick: int) -> bool:
+        """Return whether `robot` is dead at `tick`."""
+        return tick >= self._dead_from.get(robot, tick + 1)
 
     def pairs(self) -> tuple[tuple[int, int], ...]:
         """Return the pairs that meet as indices into `robots`, with robot a first.
@@ -280,12 +303,23 @@ class Scenario(
     @cached_property
     def members(self) -> tuple[Member, ...]:
         """The robots of the group with an anchor, as they know each other; empty for pairs."""
-        ends: dict[str, float] = {}
+        ends: dict[str, int] = {}
         for meeting in self.meetings:
-            ends.setdefault(meeting.visitor, meeting.ends)
-            ends.setdefault(meeting.visited, meeting.ends)
+            last = _last_tick(meeting.ends, self.mission.period)
+            ends.setdefault(meeting.visitor, last)
+            ends.setdefault(meeting.visited, last)
         anchored = [one for one in self.robots if one.id in ends]
         return tuple([Member(one.id, one.anchor, ends[one.id]) for one in anchored])
+
+
+def _last_tick(moment: float, period: float) -> int:
+    """Return the last tick that begins at `moment` or before; both times are in s."""
+    tick = math.floor(moment / period)  # the quotient is rounded, which can move it over a tick
+    while (tick + 1) * period <= moment:
+        tick += 1
+    while tick * period > moment:
+        tick -= 1
+    return tick
 
 
 class ScenarioWithWorldNoise(
@@ -323,6 +357,8 @@ class ScenarioOfGroup(
     """The meetings, in the order in which they end."""
     retries: tuple[PlannedRetry, ...] = ()
     """The meetings with which the group tries again, in the order in which they begin."""
+    deaths: tuple[Death, ...] = ()
+    """The robots that die, in the order of the scenario."""
 
 
 class ScenarioWithSweep(

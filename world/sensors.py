@@ -65,10 +65,14 @@ def in_contact(
 ) -> dict[tuple[int, int], Mutual]:
     """Return the measurements of those of `pairs` whose robots are in range of each other, in their order.
 
-    `pairs` are all that may measure each other. In a group, those that are too far apart are not tried.
+    `pairs` are all that may measure each other. In a group, those that are too far apart are not tried, and
+    none with a dead robot.
     """
     if scenario.meetings and scenario.range_model is None:
         pairs = near_pairs([(pose.x, pose.y) for pose in truth.local], scenario.sensors.reach)
+    if scenario.deaths:
+        dead = [scenario.is_dead(robot.id, truth.tick) for robot in scenario.robots]
+        pairs = [pair for pair in pairs if not (dead[pair[0]] or dead[pair[1]])]
     mutuals = mutual_ranges(truth, scenario, pairs)
     return {pair: mutual for pair, mutual in zip(pairs, mutuals, strict=True) if mutual is not None}
 

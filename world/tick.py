@@ -75,18 +75,29 @@ def observations(world: World) -> list[Observation]:
         contacts[one] += (Contact(robots[other].id, mutual.range, to_one.heard, to_one.damaged),)
         contacts[other] += (Contact(robots[one].id, mutual.range, to_other.heard, to_other.damaged),)
     ranges = anchor_ranges(truth, scenario)
+    if scenario.deaths:
+        ranges = [
+            None if scenario.is_dead(robot.id, tick) else rho
+            for robot, rho in zip(robots, ranges, strict=True)
+        ]
     return [
         Observation(tick, robot.id, measured[i], ranges[i], contacts[i]) for i, robot in enumerate(robots)
     ]
 
 
 def advance(world: World, commands: Mapping[str, Command]) -> World | MissionOutcome:
-    """Return the world one tick later, or the outcome of the run. A robot without a Command rests."""
+    """Return the world one tick later, or the outcome of the run.
+
+    A robot without a Command rests, and so does a dead one.
+    """
     scenario, truth = world.scenario, world.truth
     verdicts, claimed = world.verdicts, world.claimed
     driven = []
     exact = scenario.sensors.exact
     for place, robot in enumerate(scenario.robots):
+        if scenario.is_dead(robot.id, truth.tick):
+            driven.append(REST)
+            continue
         command = commands.get(robot.id)
         controls = limited_controls(command, scenario.mission)
         driven.append(controls if exact else executed(controls, scenario, robot.id, truth.tick))

@@ -104,6 +104,8 @@ class GroupPlanner(Planner[GroupState, Report]):
         alone = state.sweeps or group_transitions.refused(state, peer)
         of_peer = [] if alone else [one for one in logs if one.robot == peer]
         pair = self.pair_planner.decide(before, of_peer)
+        if before.verdict is None and pair.verdict is not None and pair.belief.phase1_done_tick is None:
+            return group_transitions.without_peer(state, pair.verdict)
         silence = state.silence + 1 if pair.in_contact and not of_peer else 0
         state = replace(state, pair=pair, silence=silence)
         if isinstance(pair.verdict, Localised) and before.verdict is None:

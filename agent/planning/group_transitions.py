@@ -15,7 +15,7 @@ from agent.planning import phase2_orbit, sweep_transitions, transitions
 from agent.planning.group_state import GroupState
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Travelling
 from agent.planning.state import Done, RobotState
-from protocol.messages import Localised, Member, Undecided
+from protocol.messages import Localised, Member, Retry, Undecided, Verdict
 from protocol.mission import Role
 from protocol.motion import Pose, compose, inverse
 from protocol.orbits import Rendezvous
@@ -69,9 +69,13 @@ def after_refusal(state: GroupState) -> GroupState:
     """Return `state` of a robot whose peer has ended their meeting, because it contradicts what it knows."""
     if state.visiting:
         return _next_visit(_after_meeting(state))
-    peer = state.config.peer
-    failure = Undecided(f"{peer} does not go on with the meeting")
-    return _waiting(_after_meeting(replace(state, failure=failure)), peer)
+    failure = Undecided(f"{state.config.peer} does not go on with the meeting")
+    return _resumed(_after_meeting(replace(state, failure=failure)))
+
+
+def without_peer(state: GroupState, failure: Verdict) -> GroupState:
+    """Return `state` of a robot in phase 1 that goes on with it: the reports of its peer have failed."""
+    return _after_meeting(replace(state, failure=failure))
 
 
 def onward(state: GroupState) -> GroupState:
@@ -103,20 +107,50 @@ def onward(state: GroupState) -> GroupState:
 def _after_failure(state: GroupState) -> GroupState:
     """Return `state`, of a robot that is not localised: if its meeting has failed, it waits for another one.
 
-    It gives up in the end, with the verdict of its latest meeting; at once if its own phase 1 has failed.
+    It gives up in the end, with the verdict of its latest meeting; at once if its own phase 1 has failed, or
+    if its meetings with all others have.
     """
     pair, config = state.pair, state.config
     if pair.belief.phase1_done_tick is None:
         return replace(state, verdict=pair.verdict)
     now = _now(pair)
-    if now >= config.gives_up:
+    if now >= config.gives_up or (pair.verdict is None and _has_nobody(state)):
         late = Undecided(f"not localised after {now:g} s")
         return replace(state, verdict=pair.verdict or state.failure or late)
     if pair.verdict is not None:
-        state = _waiting(_after_meeting(replace(state, failure=pair.verdict)), config.peer)
-    elif state.until is not None and now >= state.until and not pair.in_contact:
+        state = _resumed(_after_meeting(replace(state, failure=pair.verdict)))
+    elif _has_orbited(state) and not pair.in_contact:
         state = _waiting(replace(state, until=None), config.peer)
     return _trying_again(state)
+
+
+def _has_nobody(state: GroupState) -> bool:
+    """Return whether the meetings of this robot with all others have failed."""
+    others = [one.robot for one in state.config.members if one.robot != state.config.robot]
+    return len(state.others) >= len(others) and all(state.other(robot).failed for robot in others)
+
+
+def _resumed(state: GroupState) -> GroupState:
+    """Return `state` of a robot whose meeting has failed: in the retry that it has left, or waiting."""
+    config = state.config
+    if state.retries:
+        retry = config.retries[state.retries - 1]
+        if not refused(state, retry.peer) and _now(state.pair) < retry.begins + retry.lasts:
+            return _in_retry(state, retry)
+    return _waiting(state, config.peer)
+
+
+def _has_orbited(state: GroupState) -> bool:
+    """Return whether this robot of role a searches for its peer in vain: the bound of their meeting is over.
+
+    Beside its anchor, where it waits from then on, others find it.
+    """
+    pair, config = state.pair, state.config
+    if config.role != "a":
+        return False
+    if state.until is not None:
+        return _now(pair) >= state.until
+    return pair.tick > config.member(config.robot).ends
 
 
 def _trying_again(state: GroupState) -> GroupState:
@@ -128,9 +162,14 @@ def _trying_again(state: GroupState) -> GroupState:
     state = replace(state, retries=state.retries + 1)
     if (pair.in_contact and not refused(state, config.peer)) or refused(state, retry.peer):
         return state
+    return _in_retry(state, retry)
+
+
+def _in_retry(state: GroupState, retry: Retry) -> GroupState:
+    """Return `state` in the meeting of `retry`, which has begun."""
     if retry.role == "b":
         return _waiting(state, retry.peer, retry.rendezvous)
-    until = _now(pair) + retry.lasts
+    until = retry.begins + retry.lasts
     return replace(_aligned(_in_meeting(state, retry.peer, "a", retry.rendezvous)), until=until)
 
 
@@ -147,10 +186,10 @@ def _after_meeting(state: GroupState) -> GroupState:
 
 def _waiting(state: GroupState, peer: str, orbits: Rendezvous | None = None) -> GroupState:
     """Return `state` of a robot that waits beside its anchor, in a meeting with `peer`."""
-    before = state.pair.mode
+    before, waits = state.pair.mode, state.config.role == "b"
     state = _in_meeting(state, peer, "b", orbits)
     pair = state.pair
-    if isinstance(before, Orbiting | Aligning | Radial):
+    if waits and isinstance(before, Orbiting | Aligning | Radial):
         return replace(state, pair=replace(pair, mode=before))
     return _aligned(state)
 
@@ -166,7 +205,8 @@ def _next_visit(state: GroupState) -> GroupState:
     """Return `state` on the way to the next robot; as it is if there is none.
 
     After the planned visits, and after its part of a sweep, it is the nearest one that should be localised by
-    now, and has not reported it. After all these, the robot sweeps the parts of others.
+    now, and has not reported it; of those that were not beside their anchors, the one for which that was
+    longest ago. After all these, the robot sweeps the parts of others.
     """
     visits, config = state.visits, state.config
     while visits < len(config.visits):
@@ -178,29 +218,37 @@ def _next_visit(state: GroupState) -> GroupState:
     seeks = sweep_transitions.wanted(state)
     if seeks and state.parts == 0:
         return sweep_transitions.next_part(state)
-    here, now = compose(state.frame, state.pair.odometry), _now(state.pair)
+    here, tick = compose(state.frame, state.pair.odometry), state.pair.tick
     late = [
-        (math.hypot(one.anchor.x - here.x, one.anchor.y - here.y), one.robot)
+        (_missed(state, one), math.hypot(one.anchor.x - here.x, one.anchor.y - here.y), one.robot)
         for one in config.members
-        if one.ends < now and one.robot != config.robot and _is_late(state, one)  # few are
+        if one.ends < tick and one.robot != config.robot and _is_late(state, one)  # few are
+        if not seeks or _missed(state, one) < state.swept  # one tour after each part
     ]
     if late:
-        return _on_visit(state, min(late)[1])
+        return _on_visit(state, min(late)[2])
     return sweep_transitions.next_part(state) if seeks else state
+
+
+def _missed(state: GroupState, member: Member) -> int:
+    """Return the latest tick in which this robot has not found `member`; -1 if there is none."""
+    missed = state.other(member.robot).missed
+    return -1 if missed is None else missed
 
 
 def _is_late(state: GroupState, member: Member) -> bool:
     """Return whether `member`, which should be localised by now, may still wait for a visitor.
 
-    A robot that was not there is visited again after as long as the whole plan takes.
+    A robot that was not there is visited again after the time of the longest way: it may have been on its way
+    back from its orbit.
     """
     known, config = state.other(member.robot), state.config
     if known.localised or known.failed:
         return False
     if known.missed is None:
         return True
-    ago = (state.pair.tick - known.missed) * config.mission.period
-    return ago > max(one.ends for one in config.members)
+    mission = config.mission
+    return (state.pair.tick - known.missed) * mission.period * mission.max_speed > config.widest_distance
 
 
 def _on_visit(state: GroupState, peer: str) -> GroupState:

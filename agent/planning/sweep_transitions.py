@@ -44,7 +44,13 @@ def next_part(state: GroupState) -> GroupState:
     ends = [compose(into, Pose(x, y, 0.0)) for x, y in config.sweep.path(part, config.mission.sensing_range)]
     mode = Sweeping(tuple([(end.x, end.y) for end in ends]))
     return replace(
-        state, pair=replace(state.pair, mode=mode), parts=state.parts + 1, visiting=False, unmet=0, silence=0
+        state,
+        pair=replace(state.pair, mode=mode),
+        parts=state.parts + 1,
+        swept=state.pair.tick,
+        visiting=False,
+        unmet=0,
+        silence=0,
     )
 
 

@@ -254,7 +254,9 @@ def _visits(configs: Sequence[RobotConfig]) -> list[Visit]:
     grouped = [one for one in configs if isinstance(one, RobotConfigInGroup)]
     found = [(one, one.peer) for one in grouped if one.role == "a"]  # none without an anchor
     found += [(one, visited) for one in grouped for visited in one.visits]
-    visits = [Visit(one.robot, visited, one.member(visited).ends) for one, visited in found]
+    visits = [
+        Visit(one.robot, visited, one.member(visited).ends * one.mission.period) for one, visited in found
+    ]
     return sorted(visits, key=lambda visit: visit.ends_s)
 
 

@@ -14,6 +14,7 @@ import msgspec
 
 from compose.extras import version
 from compose.recording.claim import matrix
+from compose.recording.corrected_bounds import corrected_bounds
 from compose.recording.group_localisation import (
     MeetingResult,
     SearchResult,
@@ -80,6 +81,8 @@ def _group(run: Run) -> dict[str, Any]:
         "bound_s": max(one.bound_s for one in results),
         "bound_ticks": max(one.bound_ticks for one in results),
         "localised_tick": max(tick for tick in ticks if tick is not None) if None not in ticks else None,
+        "corrected_bounds": msgspec.to_builtins(list(corrected_bounds(run))),
+        "deaths": {one.robot: one.tick for one in run.scenario.deaths},
         "meetings": msgspec.to_builtins(meetings),
         **({"without_anchor": msgspec.to_builtins(searches)} if searches else {}),
     }

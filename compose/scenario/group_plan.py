@@ -38,13 +38,18 @@ class GroupPlan(msgspec.Struct, frozen=True, dict=True):
 
     @cached_property
     def travel_lower_bound(self) -> float:
-        """A lower bound in s of the bound of any plan: of seed pairs and travel, with no time for meetings.
+        """A lower bound in s of the bound of any plan: of seed pairs and of travel alone."""
+        return least_makespan(self.travel)
 
-        The least bound of such plans up to MOST_OPTIMAL robots; beyond, that of the robot reached last.
-        """
-        if len(self.travel.robots) <= MOST_OPTIMAL:
-            return max(optimal_forest(self.travel).ends(self.travel).values())
-        return self.travel.earliest_end()
+
+def least_makespan(times: MeetingTimes) -> float:
+    """Return a lower bound in s of the time until all are localised by meetings that take `times`.
+
+    It is the optimum up to MOST_OPTIMAL robots; beyond, the earliest end for the robot reached last.
+    """
+    if len(times.robots) <= MOST_OPTIMAL:
+        return max(optimal_forest(times).ends(times).values())
+    return times.earliest_end()
 
 
 def group_plan(

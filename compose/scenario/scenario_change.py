@@ -174,6 +174,7 @@ def file_table(scenario: Scenario) -> dict[str, Any]:
         "range": msgspec.to_builtins(scenario.range_model),
         "radio": msgspec.to_builtins(scenario.radio_model),
     }
+    dies = {one.robot: one.tick for one in scenario.deaths}
     planner = {"name": scenario.planner_name, "options": msgspec.to_builtins(scenario.planner_options)}
     table = {
         "name": scenario.name,
@@ -189,6 +190,7 @@ def file_table(scenario: Scenario) -> dict[str, Any]:
                 **({"anchor": [at.x, at.y]} if (at := one.given_anchor) is not None else {}),
                 "start": [one.start.x, one.start.y, one.start.heading],
                 **({"attack": _given(one.attack)} if one.attack is not None else {}),
+                **({"dies": dies[one.id]} if one.id in dies else {}),
             }
             for one in scenario.robots
         ],

@@ -35,6 +35,7 @@ from protocol.spelling import did_you_mean
 from protocol.wire import MalformedFrame, decode, encode
 from world.faults import Fault, delivery_time_bound
 from world.scenario import (
+    Death,
     RecordedScenario,
     RobotSpec,
     Scenario,
@@ -193,6 +194,11 @@ def _with_robots(file: ScenarioFile) -> ScenarioFile:
     for i in range(1, file.group.robots + 1):
         draw = random.Random(f"{file.seed}/anchor/r{i}").random
         robots.append(RobotTable(f"r{i}", (side * draw(), side * draw()) if i <= anchored else None))
+    robots[0] = msgspec.structs.replace(robots[0], attack=file.group.attack)
+    dies = file.group.dies
+    if isinstance(dies, list):
+        dies = random.Random(f"{file.seed}/dies").randint(min(dies), max(dies))
+    robots[1] = msgspec.structs.replace(robots[1], dies=dies)
     area = file.mission.area or (0.0, 0.0, side, side)
     return msgspec.structs.replace(
         file, robot=robots, mission=msgspec.structs.replace(file.mission, area=area)
@@ -230,6 +236,8 @@ def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scena
                 f"{source}: robot[{i}].attack.part: an attack of kind {robot.attack.kind} changes "
                 "the start, so part must be 'all'"
             )
+        if robot.dies is not None and meetings is None:
+            raise BadScenario(f"{source}: robot[{i}].dies: robots die in groups only")
         peer, role, orbits = first[robot.id]
         anchor = Anchor(*robot.anchor) if robot.anchor is not None else None
         placed.append(RobotSpec(robot.id, peer, role, anchor, start, orbits, robot.attack))
@@ -271,6 +279,7 @@ def _with_world(scenario: Scenario, file: ScenarioFile, meetings: GroupMeetings 
             radio_model=file.world.radio,
             meetings=meetings.planned,
             retries=meetings.retries,
+            deaths=tuple([Death(one.id, one.dies) for one in file.robot if one.dies is not None]),
         )
         if meetings.sweep is None:
             return of_group

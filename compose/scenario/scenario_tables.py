@@ -11,7 +11,7 @@ from compose.scenario.fault_syntax import FaultTable
 from compose.scenario.kills import KillTable
 from protocol.attack import Attack
 from protocol.mission import Mission, Options, PlannerName
-from protocol.units import NAME, RobotId
+from protocol.units import NAME, RobotId, Tick
 from world.world_models import ModelSpec
 from world.world_noise import WorldNoise
 
@@ -79,6 +79,9 @@ class RobotTable(_Table, frozen=True):
     """Id of the peer. More than two robots without one form a group, which meets in turn."""
     attack: Attack | None = None
     """False data injection: the falsification of the reports that this robot sends to its peer."""
+    dies: Tick | None = None
+    """The tick from which on it is dead, in a group: it stands still, and measures, sends and receives
+    nothing."""
 
 
 class GroupTable(_Table, frozen=True):
@@ -90,6 +93,10 @@ class GroupTable(_Table, frozen=True):
     """The anchors are uniform in a square, whose side in m is this times the square root of n."""
     without_anchor: Annotated[int, Meta(ge=0, le=MAX_ROBOTS)] = 0
     """The number of robots without an anchor, the last ones. By default, `mission.area` is the square."""
+    attack: Attack | None = None
+    """False data injection by the robot r1."""
+    dies: Tick | Annotated[list[Tick], Meta(min_length=2, max_length=2)] | None = None
+    """The tick from which on the robot r2 is dead, or the bounds between which it is drawn, both included."""
 
 
 LONGEST_NAME = 48

@@ -27,7 +27,11 @@ NOTES = (
     ("rate_low", "rate: 95 % interval (Wilson)"),
     ("p50", "p50, p95, max: ticks of trials that localised"),
     ("error p50", "error: position error in m of the worse robot"),
-    ("share p50", "share: ticks / the computed bound of the group"),
+    ("share p50", "share: tick of the last claim / the computed bound of the group"),
+    ("corrected", "corrected: largest share of the corrected bound, where a robot was late"),
+    ("travel p50", "travel: tick of the last claim / the tick by the real first meetings and travel alone"),
+    ("honest", "honest: robots, but attackers and dead ones, with a right claim / none / a wrong claim"),
+    ("found", "found: meetings with an attacker in which it was found / all of them"),
     ("within", "within: claims within 3 x accuracy"),
     ("nees low", "nees: mean, and the 99 % band for consistent covariances"),
 )
@@ -42,8 +46,10 @@ CHOICES = (
     ("trials", "rate"),
 )
 """The possible choices of columns. The first that fits the terminal is used."""
-OF_GROUP = ("share p50", "share max")
-"""The additional columns of sweeps of groups: the duration over the computed bound."""
+OF_GROUP = ("share p50", "share max", "corrected", "travel p50", "travel p95", "honest")
+"""The additional columns of sweeps of groups."""
+OF_ATTACKED_GROUP = ("found",)
+"""The additional column of sweeps of groups with an attacker."""
 OF_NOISE = ("within", "nees", "nees low", "nees high")
 """The additional columns of sweeps in which robots claim covariances."""
 MOST_ROWS = 100
@@ -181,7 +187,11 @@ def _noisy(results: Results) -> bool:
 
 def _choices(results: Results) -> tuple[tuple[str, ...], ...]:
     """Return the possible choices of columns, the widest first."""
-    more = (*(OF_GROUP if results.sweep.of_group else ()), *(OF_NOISE if _noisy(results) else ()))
+    more = (
+        *(OF_GROUP if results.sweep.of_group else ()),
+        *(OF_ATTACKED_GROUP if any(one.attacker_met for one in results.figures.values()) else ()),
+        *(OF_NOISE if _noisy(results) else ()),
+    )
     if not more:
         return CHOICES
     return tuple((*columns, *more) for columns in CHOICES) + CHOICES[-1:]
@@ -220,6 +230,11 @@ def _figures(figures: CellSummary) -> dict[str, str]:
         "nees high": _number(figures.nees_high, ".3g"),
         "share p50": _number(figures.bound_share_p50, ".2f"),
         "share max": _number(figures.bound_share_max, ".2f"),
+        "corrected": _number(figures.corrected_share_max, ".2f"),
+        "travel p50": _number(figures.makespan_p50, ".2f"),
+        "travel p95": _number(figures.makespan_p95, ".2f"),
+        "honest": f"{figures.honest_localised}/{figures.honest_undecided}/{figures.honest_wrong}",
+        "found": f"{figures.attacker_found}/{figures.attacker_met}" if figures.attacker_met else "-",
     }
 
 

@@ -21,7 +21,6 @@ from compose.recording.claim import DEGREES_OF_FREEDOM
 from compose.sweep.cells import Cell
 from compose.sweep.field_paths import canonical
 from compose.sweep.spec import Sweep
-from compose.sweep.table import OF_GROUP
 from compose.sweep.trial import TrialOutcome
 from protocol.messages import Outcome
 
@@ -33,6 +32,11 @@ NEES_CONFIDENCE = 0.99
 """The probability with which a mean NEES lies in its band if the covariances are consistent."""
 WORSE = ("wrong", "inconsistent", "failed", "undecided")
 """The outcomes that need a look, the worst first."""
+FIGURES_OF_GROUP = (
+    *("bound_share_p50", "bound_share_max", "corrected_share_max", "makespan_p50", "makespan_p95"),
+    *("honest_localised", "honest_undecided", "honest_wrong", "attacker_met", "attacker_found"),
+)
+"""The fields of a CellSummary that only groups have."""
 
 
 class CellSummary(msgspec.Struct, frozen=True):
@@ -100,9 +104,25 @@ class CellSummary(msgspec.Struct, frozen=True):
     refused: str | None
     """reason why the scenario of this cell is infeasible"""
     bound_share_p50: float | None
-    """only for groups: median over trials that localised of ticks / bound_ticks"""
+    """only for groups: median over trials in which all honest robots claimed of honest_tick / bound_ticks"""
     bound_share_max: float | None
     """only for groups: the largest of these"""
+    corrected_share_max: float | None
+    """only for groups: the largest honest_tick / corrected_ticks, of trials with a corrected bound"""
+    makespan_p50: float | None
+    """only for groups: median over the same trials of honest_tick / travel_ticks"""
+    makespan_p95: float | None
+    """only for groups: the 95th percentile of these"""
+    honest_localised: int | None
+    """only for groups: number of honest robots, of all trials, whose claims are right"""
+    honest_undecided: int | None
+    """only for groups: number of those that made no claim"""
+    honest_wrong: int | None
+    """only for groups: number of those whose claims are wrong"""
+    attacker_met: int | None
+    """only for groups: number of their meetings with a robot that has an attack, of audited trials"""
+    attacker_found: int | None
+    """only for groups: number of these in which they found its data inconsistent"""
 
 
 class NotableTrial(msgspec.Struct, frozen=True):
@@ -133,7 +153,9 @@ def counted(table: pa.Table, refused: str | None = None) -> CellSummary:
     claims, nees = int(_known(column(table, "claims")).sum()), _known(column(right, "nees"))
     nees_low, nees_high = nees_band(len(nees))
     violations = _known(column(table, "violations"))
-    shares = _shares_of_bound(table, outcomes)
+    shares, makespans, corrected = [
+        _shares(right, name) for name in ("bound_ticks", "travel_ticks", "corrected_ticks")
+    ]
     return CellSummary(
         trials=n,
         **counts,
@@ -169,16 +191,28 @@ def counted(table: pa.Table, refused: str | None = None) -> CellSummary:
         refused=refused,
         bound_share_p50=_percentile(shares, 50),
         bound_share_max=_percentile(shares, 100),
+        corrected_share_max=_percentile(corrected, 100),
+        makespan_p50=_percentile(makespans, 50),
+        makespan_p95=_percentile(makespans, 95),
+        honest_localised=_sum_of_known(table, "honest_localised"),
+        honest_undecided=_sum_of_known(table, "honest_undecided"),
+        honest_wrong=_sum_of_known(table, "honest_wrong"),
+        attacker_met=_sum_of_known(table, "attacker_met"),
+        attacker_found=_sum_of_known(table, "attacker_found"),
     )
 
 
-def _shares_of_bound(table: pa.Table, outcomes: Sequence[str]) -> Floats:
-    """Return the duration of each trial that localised over the bound of its group; none for pairs."""
-    if OF_GROUP not in table.schema.names:
+def _shares(right: pa.Table, bound: str) -> Floats:
+    """Return the tick of the last claim of an honest robot over the column `bound`; none for pairs."""
+    if bound not in right.schema.names:
         return np.zeros(0)
-    localised = np.array([outcome == "localised" for outcome in outcomes], bool)
-    shares: Floats = (column(table, "ticks") / column(table, OF_GROUP))[localised]
-    return shares
+    return _known(column(right, "honest_tick") / column(right, bound))
+
+
+def _sum_of_known(table: pa.Table, name: str) -> int | None:
+    """Return the sum of a column of groups; None for pairs, and if no trial has a value."""
+    known = _known(column(table, name)) if name in table.schema.names else np.zeros(0)
+    return int(known.sum()) if len(known) else None
 
 
 def _rmse_over_bound(table: pa.Table) -> float | None:
@@ -274,9 +308,7 @@ def header(sweep: Sweep) -> list[str]:
 
 def columns_of(sweep: Sweep) -> list[str]:
     """Return the fields of a CellSummary that `sweep` has."""
-    return [
-        name for name in CellSummary.__struct_fields__ if sweep.of_group or not name.startswith("bound_share")
-    ]
+    return [name for name in CellSummary.__struct_fields__ if sweep.of_group or name not in FIGURES_OF_GROUP]
 
 
 def _not_refused(table: pa.Table) -> pa.Table:

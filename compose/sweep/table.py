@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 from compose.scenario.scenario_tables import MAX_ROBOTS
 from compose.sweep.cells import Cell
 from compose.sweep.field_paths import canonical
+from compose.sweep.group_columns import OF_GROUP
 from compose.sweep.spec import Sweep
 from compose.sweep.trial import RobotRow, TrialRow
 from protocol.files import open_file
@@ -24,7 +25,9 @@ _KINDS: dict[str, pa.DataType] = {
     "seed": pa.int64(),
     **dict.fromkeys(("outcome", "reason", "error", "branch", "first_violation"), pa.string()),
     **dict.fromkeys(("ticks", "first_contact_tick", "orbiting_tick", "meeting_tick"), pa.int64()),
-    **dict.fromkeys(("t_max_ticks", "bound_ticks", "candidates", "candidates_left"), pa.int64()),
+    **dict.fromkeys(("t_max_ticks", "candidates", "candidates_left"), pa.int64()),
+    **dict.fromkeys(OF_GROUP, pa.int64()),
+    "travel_ticks": pa.float64(),
     **dict.fromkeys(("hypotheses", "claims", "claims_within", "violations"), pa.int64()),
     **dict.fromkeys(("reports_sent", "reports_heard", "reports_refused"), pa.int64()),
     **dict.fromkeys(("reports_lost", "bytes_sent", "kills"), pa.int64()),
@@ -37,8 +40,6 @@ _KINDS: dict[str, pa.DataType] = {
     **dict.fromkeys([f"cov_{name}" for name in Covariance.__struct_fields__], pa.float64()),
 }
 _OF_ALL = [field for field in TrialRow.__struct_fields__ if field not in ("cell", "trial", "robots", "drawn")]
-OF_GROUP = "bound_ticks"
-"""The column that only sweeps of groups have."""
 
 
 def schema_of(sweep: Sweep, cells: Sequence[Cell]) -> pa.Schema:
@@ -51,7 +52,7 @@ def schema_of(sweep: Sweep, cells: Sequence[Cell]) -> pa.Schema:
             fields.append(pa.field(field, _kind([one[i] for one in axis.values if one[i] is not None])))
     fields += [pa.field(draw.field, pa.float64()) for draw in sweep.draws.fields]
     fields.append(pa.field("trial", _KINDS["trial"]))
-    fields += [pa.field(name, _KINDS[name]) for name in _OF_ALL if name != OF_GROUP or sweep.of_group]
+    fields += [pa.field(name, _KINDS[name]) for name in _OF_ALL if name not in OF_GROUP or sweep.of_group]
     for robot in _robots(cells):
         fields += [pa.field(f"{robot}_{name}", _KINDS[name]) for name in RobotRow.__struct_fields__]
     return pa.schema(fields)
@@ -104,7 +105,7 @@ def of_rows(rows: Sequence[TrialRow], sweep: Sweep, cells: Mapping[int, Cell], s
     for draw in sweep.draws.fields:
         columns[draw.field] = [row.drawn.get(draw.field) for row in rows]
     columns["trial"] = [row.trial for row in rows]
-    for name in _OF_ALL if sweep.of_group else [name for name in _OF_ALL if name != OF_GROUP]:
+    for name in _OF_ALL if sweep.of_group else [name for name in _OF_ALL if name not in OF_GROUP]:
         columns[name] = [getattr(row, name) for row in rows]
     nothing = RobotRow()
     for robot in _robots(list(cells.values())):

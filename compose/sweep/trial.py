@@ -6,17 +6,17 @@ import math
 from typing import Literal, TypeVar
 
 import msgspec
-from msgspec.structs import replace
+from msgspec.structs import asdict, replace
 
 from compose.audit.findings import Findings
 from compose.launch.model_loader import trust_all
 from compose.launch.planner_loader import trust
 from compose.recording.claim import Claim
 from compose.recording.closest_approach import nearest
-from compose.recording.group_localisation import meeting_results, search_results
 from compose.recording.run import Run
 from compose.recording.summary_json import first_contact
 from compose.scenario.kills import Kill
+from compose.sweep.group_columns import group_columns
 from compose.sweep.trial_mission import as_processes, run_in_process
 from protocol.messages import FinalReport
 from protocol.motion import Covariance
@@ -122,6 +122,25 @@ class TrialRow(msgspec.Struct, frozen=True, array_like=True):
     """T_max in ticks, rounded up"""
     bound_ticks: int | None = None
     """only for a group: the computed bound in ticks until all its robots are localised"""
+    corrected_ticks: int | None = None
+    """only for a group: the last of the bounds that correct it, if a robot was late"""
+    travel_ticks: float | None = None
+    """only for a group: a lower bound of these ticks, in which robots only travel after the first meetings,
+    which end when they did"""
+    honest_tick: int | None = None
+    """only for a group: tick of the last claim of an honest robot: one without an attack that does not die;
+    None if one made no claim"""
+    honest_localised: int | None = None
+    """only for a group: number of honest robots whose claims are right"""
+    honest_undecided: int | None = None
+    """only for a group: number of honest robots that made no claim"""
+    honest_wrong: int | None = None
+    """only for a group: number of honest robots whose claims are wrong"""
+    attacker_met: int | None = None
+    """only for a group: number of meetings of honest robots with one that has an attack; None if the trial
+    was not audited"""
+    attacker_found: int | None = None
+    """only for a group: number of these in which the robot reported that the other's data are inconsistent"""
     candidates: int | None = None
     """largest number of solutions of eq. (7) of any robot"""
     candidates_left: int | None = None
@@ -215,10 +234,9 @@ def row(trial: Trial, run: Run, wall_s: float, findings: Findings | None = None)
         bounded = _bounded(robots, run, pair)
         robots |= {name: one for name, one in bounded.items() if robots[name].bound_m is None}
     t_max_s = max(robot.rendezvous.bound for robot in scenario.robots)
-    bound_ticks = [one.bound_ticks for one in meeting_results(run)]
-    bound_ticks += [one.bound_ticks for one in search_results(run)]
     encounters = [_meeting(run, a, b, in_group=bool(scenario.meetings)) for a, b in run.pairs]
     final_reports = run.final_reports.values()
+    group = group_columns(run)
     errors = [robot.position_error_m for robot in robots.values() if robot.position_error_m is not None]
     nees = [robot.nees for robot in robots.values() if robot.nees is not None]
     held = [robot.truth_held for robot in robots.values() if robot.truth_held is not None]
@@ -235,7 +253,7 @@ def row(trial: Trial, run: Run, wall_s: float, findings: Findings | None = None)
         period_s=scenario.mission.period,
         t_max_s=t_max_s,
         t_max_ticks=math.ceil(t_max_s / scenario.mission.period - ROUNDING),
-        bound_ticks=max(bound_ticks, default=None),
+        **(asdict(group) if group is not None else {}),
         candidates=_most([robot.candidates for robot in robots.values()]),
         candidates_left=_most([robot.candidates_left for robot in robots.values()]),
         position_error_m=_most([robot.position_error_m for robot in robots.values()]),

@@ -48,7 +48,10 @@ def run_in_process(scenario: Scenario, *, audit: bool) -> Played:
     messages = EncodedMessages()
     run = in_process.played(scenario, journals, encode=messages.encode)
     recorded = of_frames({name: journal.frames for name, journal in journals.items()}, messages=messages)
-    return Played(run, rules.audit_run(recorded), time.perf_counter() - began)
+    findings = rules.audit_run(recorded)
+    if scenario.meetings:  # their reports say who has met whom
+        run = msgspec.structs.replace(run, agents=recorded.agents)
+    return Played(run, findings, time.perf_counter() - began)
 
 
 def as_processes(scenario: Scenario, *, audit: bool, kills: Sequence[Kill] | None = None) -> Played:

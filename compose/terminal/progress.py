@@ -68,17 +68,26 @@ def result(summary: Mapping[str, Any], rate: float | None = None) -> None:
         lines = tables.lines(made, text_width.room())
     say(f"{summary['scenario']}: {outcome_line(summary)}", "", *lines, "", *text_width.notes(NOTES, columns))
     if group is not None:
-        say(*text_width.wrapped(_bound(group)))
+        say(*text_width.wrapped(_bound(group, robots)))
     if late:
         say(*text_width.wrapped(_missed(late, summary["ticks"], rate)))
 
 
-def _bound(group: Mapping[str, Any]) -> str:
-    """Return the sentence on the computed bound of a group, and the tick in which it was localised."""
-    tick, bound = group["localised_tick"], group["bound_ticks"]
-    if tick is None:
-        return f"the group's bound is {bound} ticks; not all robots are localised"
-    return f"all robots were localised by tick {tick}; the computed bound is {bound} ticks"
+def _bound(group: Mapping[str, Any], robots: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the sentence on when robots of a group were localised, its computed bound and corrections."""
+    bound = f"the computed bound is {group['bound_ticks']} ticks"
+    for one in group["corrected_bounds"]:
+        late = f", as {', '.join(one['late'])} were late" if len(one["late"]) <= NAMED else ""
+        bound += f", corrected in tick {one['tick']} to {one['bound_ticks']}{late}"
+    ticks = {name: one["localised_tick"] for name, one in robots.items()}
+    left = [name for name, tick in ticks.items() if tick is None]
+    last = max([tick for tick in ticks.values() if tick is not None], default=None)
+    if not left:
+        return f"all robots were localised by tick {last}; {bound}"
+    if last is None:
+        return f"no robot is localised; {bound}"
+    names = ", ".join(left[:NAMED]) + (f" and {len(left) - NAMED} more" if len(left) > NAMED else "")
+    return f"all robots but {names} were localised by tick {last}; {bound}"
 
 
 def _missed(late: Mapping[str, int], ticks: int, rate: float | None) -> str:

@@ -77,7 +77,7 @@ class PoseEstimate(msgspec.Struct, frozen=True):
     heading_error_rad: float | None = None
     """The error of the heading in rad; null without truth."""
     nees: float | None = None
-    """The normalised error squared; null without truth."""
+    """The normalised error squared; null without truth, and for a pose that the robot may not claim."""
 
 
 class RobotEstimate(msgspec.Struct, frozen=True):
@@ -261,5 +261,5 @@ def _pose(row: PoseEstimateRow) -> PoseEstimate:
         row.probability,
         row.position_error_m,
         row.heading_error_rad,
-        row.nees,
+        row.nees if row.claim else None,  # hypotheses that are not settled are often all false
     )

@@ -1,0 +1,131 @@
+"""The bounds of a group that are announced in place of the planned one, once a robot is late.
+
+A robot is late if it is not localised by its bound in the plan: it may be dead, or the robot that was to
+visit it. Localised robots then go to robots of which they have not heard that they are localised, the nearest
+first. Without any localised robot, the next pair of the plan tries again. A corrected bound is the time by
+which one localised robot has been everywhere, so that all are localised that still can be.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+
+import msgspec
+
+from compose.recording.run import Run
+from protocol.motion import TAU
+from protocol.orbits import meeting_ticks
+from protocol.sweep_strips import helping_ticks, sweep_speed, sweep_ticks
+from world.scenario import Scenario
+
+SEARCHED = 42.0
+"""The length of the way on which a visitor with noisy sensors searches a robot in vain, in units of R."""
+
+
+class CorrectedBound(msgspec.Struct, frozen=True):
+    """A bound that is announced while robots of a group are late."""
+
+    tick: int
+    """The tick in which it is announced."""
+    late: tuple[str, ...]
+    """The robots that should be localised by then, and are not."""
+    bound_ticks: int
+    """The tick by which all robots are localised that can be."""
+
+
+def corrected_bounds(run: Run) -> tuple[CorrectedBound, ...]:
+    """Return the bounds that correct the planned one of the group in `run`, in their order; none for pairs.
+
+    Each depends on the plan and on the claims until its tick only. As long as no robot is localised, there is
+    a new one whenever the time of a pair that could have localised itself is over.
+    """
+    if run.world is None or not run.scenario.meetings:
+        return ()
+    scenario, last = run.scenario, run.length - 1
+    claims = {robot: claim.tick for robot in run.robots if (claim := run.claim(robot)) is not None}
+    ends = {one.robot: one.ends for one in scenario.members}
+    if (planned := scenario.planned_sweep) is not None:
+        ends |= dict.fromkeys(scenario.unanchored, math.ceil(planned.ends / scenario.mission.period))
+    overdue = [end + 1 for robot, end in ends.items() if claims.get(robot, end + 1) > end]
+    tick = min(overdue, default=last)
+    stages = [max(ends.values())]
+    stages += [math.ceil((one.begins + one.lasts) / scenario.mission.period) for one in scenario.retries]
+    found: list[CorrectedBound] = []
+    for stage in stages:
+        localised = {robot for robot, claimed in claims.items() if claimed <= tick}
+        if tick >= last or (localised and found):
+            break
+        if localised or tick <= stage:
+            late = tuple([robot for robot in run.robots if ends[robot] < tick and robot not in localised])
+            waiting = [robot for robot in run.robots if robot not in localised]
+            begins = max(tick, stage) + _return_ticks(scenario, waiting)
+            tour = _tour_ticks(scenario, waiting)
+            found.append(CorrectedBound(tick, late, begins + tour + _sweeps_ticks(scenario, tour)))
+            tick = stage + 1
+    return tuple(found)
+
+
+def _sweeps_ticks(scenario: Scenario, tour: int) -> int:
+    """Return the ticks in which one robot sweeps all parts of the area; 0 if all robots have an anchor.
+
+    After each part, it makes a tour of at most `tour` ticks to robots that are late.
+    """
+    if scenario.planned_sweep is None:
+        return 0
+    area, mission = scenario.planned_sweep.sweep, scenario.mission
+    places = [*_anchors(scenario), *area.corners]
+    way = max([math.dist(one, other) for one in places for other in places])
+    step = sweep_speed(mission) * mission.period
+    ticks = math.ceil(way / step) + tour + len(scenario.unanchored) * helping_ticks(mission)
+    parts = [area.path(part, mission.sensing_range) for part in range(area.parts)]
+    return sum([ticks + sweep_ticks(path, mission) for path in parts])
+
+
+def _anchors(scenario: Scenario) -> list[tuple[float, float]]:
+    """Return the places of all anchors, in m."""
+    return [(at.x, at.y) for one in scenario.robots if (at := one.given_anchor) is not None]
+
+
+def _return_ticks(scenario: Scenario, waiting: Collection[str]) -> int:
+    """Return the ticks within which all of `waiting` are back from their orbits, and are visited again.
+
+    A visitor that did not find a robot beside its anchor returns after the time of the longest way.
+    """
+    step = scenario.mission.max_speed * scenario.mission.period
+    radii = [one.rendezvous.a.radius for one in scenario.robots if one.id in waiting and one.role == "a"]
+    if not radii:
+        return 0
+    return math.ceil((max(radii) + _longest_way(scenario)) / step)
+
+
+def _tour_ticks(scenario: Scenario, waiting: Collection[str]) -> int:
+    """Return the ticks in which a robot that begins at any anchor goes to all others, the nearest first.
+
+    It meets those of `waiting`. With noisy sensors, it searches each of them.
+    """
+    mission = scenario.mission
+    step = mission.max_speed * mission.period
+    turn = math.ceil(TAU / 2.0 / (mission.max_turn_rate * mission.period))
+    search = 0 if mission.noise.exact else math.ceil(SEARCHED * mission.sensing_range / step) + 12 * turn
+    anchors = len(_anchors(scenario))
+    ways = [_way_to_all(scenario, begin) for begin in range(anchors)]
+    visits = anchors - 1
+    return math.ceil(max(ways) / step) + visits * (turn + 1 + search) + len(waiting) * meeting_ticks(mission)
+
+
+def _way_to_all(scenario: Scenario, begin: int) -> float:
+    """Return the length in m of the way from one anchor to all others, the nearest first."""
+    left = _anchors(scenario)
+    here, way = left.pop(begin), 0.0
+    while left:
+        nearest = min(left, key=lambda place: math.dist(place, here))
+        way += math.dist(nearest, here)
+        left.remove(nearest)
+        here = nearest
+    return way
+
+
+def _longest_way(scenario: Scenario) -> float:
+    places = _anchors(scenario)
+    return max([math.dist(one, other) for one in places for other in places])

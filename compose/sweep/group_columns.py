@@ -1,0 +1,119 @@
+"""The columns of a trial whose robots form a group: its bounds, and how its honest robots ended."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+
+from compose.recording.claim import Claim
+from compose.recording.corrected_bounds import corrected_bounds
+from compose.recording.group_localisation import meeting_results, search_results
+from compose.recording.meetings import has_log
+from compose.recording.run import Run
+from compose.scenario.group_plan import least_makespan
+from compose.scenario.wake_up_tree import MeetingTimes
+from protocol.messages import Inconsistent, Localised, Report
+from world.referee import mistake
+from world.scenario import Scenario
+
+
+class GroupColumns(msgspec.Struct, frozen=True):
+    """The columns of TrialRow that only trials of groups have; see there."""
+
+    bound_ticks: int
+    corrected_ticks: int | None
+    travel_ticks: float | None
+    honest_tick: int | None
+    honest_localised: int
+    honest_undecided: int
+    honest_wrong: int
+    attacker_met: int | None
+    attacker_found: int | None
+
+
+OF_GROUP = GroupColumns.__struct_fields__
+"""The names of these columns."""
+
+
+def group_columns(run: Run) -> GroupColumns | None:
+    """Return the columns of the group in `run`; None for pairs."""
+    scenario = run.scenario
+    if not scenario.meetings:
+        return None
+    dead = {death.robot for death in scenario.deaths}
+    honest = [robot.id for robot in scenario.robots if robot.attack is None and robot.id not in dead]
+    claims = {robot: claim for robot in honest if (claim := run.claim(robot)) is not None}
+    right = sum([_is_right(run, robot, claim) for robot, claim in claims.items()])
+    corrected = corrected_bounds(run)
+    bounds = [one.bound_ticks for one in meeting_results(run)]
+    bounds += [one.bound_ticks for one in search_results(run)]
+    met, found = _met_and_found(run, honest) if run.agents else (None, None)
+    return GroupColumns(
+        bound_ticks=max(bounds),
+        corrected_ticks=corrected[-1].bound_ticks if corrected else None,
+        travel_ticks=_travel_ticks(run),
+        honest_tick=max([claim.tick for claim in claims.values()]) if len(claims) == len(honest) else None,
+        honest_localised=right,
+        honest_undecided=len(honest) - len(claims),
+        honest_wrong=len(claims) - right,
+        attacker_met=met,
+        attacker_found=found,
+    )
+
+
+def _is_right(run: Run, robot: str, claim: Claim) -> bool:
+    """Return whether `claim` of `robot` is right, by the tolerances of the referee."""
+    truth = run.truth(robot)[claim.tick]
+    return mistake(Localised(claim.pose, claim.covariance), truth, run.scenario.mission) is None
+
+
+def _met_and_found(run: Run, honest: list[str]) -> tuple[int, int]:
+    """Return how many meetings `honest` robots had with attackers, and in how many they rejected these.
+
+    A robot is in a meeting with another one to which it reports its log, and rejects it by a report with the
+    verdict that its data are inconsistent.
+    """
+    attackers = {robot.id for robot in run.scenario.robots if robot.attack is not None}
+    met: set[tuple[str, str]] = set()
+    found: set[tuple[str, str]] = set()
+    for robot in honest:
+        for step in run.agents[robot].steps if robot in run.agents else ():
+            for contact, framed in zip(step.observation.contacts, step.reports, strict=False):
+                report = framed.report
+                if contact.peer not in attackers or not isinstance(report, Report):
+                    continue
+                if has_log(report):
+                    met.add((robot, contact.peer))
+                if isinstance(report.verdict, Inconsistent):
+                    found.add((robot, contact.peer))
+    return len(met), len(found)
+
+
+def _travel_ticks(run: Run) -> float | None:
+    """Return a lower bound of the ticks until all are localised, from the first meetings as they went.
+
+    They are those of the plan, and end when they did; then robots travel from anchor to anchor, and meetings
+    take no time. None if a first meeting has not localised both of its robots, or if robots are searched for.
+    """
+    scenario = run.scenario
+    if scenario.planned_sweep is not None:
+        return None
+    place = {robot.id: i for i, robot in enumerate(scenario.robots)}
+    hop = tuple(tuple(_way(scenario, i, j) for j in place.values()) for i in place.values())
+    seed = [[math.inf] * len(place) for _ in place]
+    seen: set[str] = set()
+    for one in meeting_results(run):
+        if one.visitor not in seen:
+            if one.localised_tick is None:
+                return None
+            seed[place[one.visitor]][place[one.visited]] = one.localised_tick
+        seen |= {one.visitor, one.visited}
+    return least_makespan(MeetingTimes(tuple(map(tuple, seed)), hop))
+
+
+def _way(scenario: Scenario, i: int, j: int) -> float:
+    """Return the ticks that the straight between two anchors takes."""
+    one, other = scenario.robots[i].anchor, scenario.robots[j].anchor
+    mission = scenario.mission
+    return math.hypot(one.x - other.x, one.y - other.y) / (mission.max_speed * mission.period)
