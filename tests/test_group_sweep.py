@@ -17,6 +17,7 @@ from compose.audit.replay import replayed
 from compose.audit.rules import audit_run
 from compose.errors import UserError
 from compose.launch.in_process import run_mission
+from compose.recording.corrected_bounds import corrected_bounds
 from compose.recording.recording_files import agent_journal
 from compose.recording.run import Run, of_frames, read
 from compose.scenario.scenario_change import file_table
@@ -113,6 +114,19 @@ def test_a_robot_that_does_not_hear_its_finder_is_localised_by_another_one() -> 
         if isinstance(framed.report, ReportWithPose)
     ]
     assert {one.robot for one in reports} == {"b"}
+
+
+@pytest.mark.parametrize(("seed", "late"), [(8, ("r5",)), (12, ("r3", "r5"))])
+def test_the_part_of_a_dead_finder_is_swept_by_others_within_the_corrected_bound(
+    seed: int, late: tuple[str, ...]
+) -> None:
+    table = table_with(6, 3, seed)
+    table["robot"][0]["dies"] = 150
+    run = run_mission(scenario_of(table))
+    assert len(localised(run)) == 6
+    (corrected,) = corrected_bounds(run)
+    assert corrected.late == late
+    assert bound(run.scenario) < last_claim(run) <= corrected.bound_ticks
 
 
 @pytest.mark.parametrize("fault", [{"loss": 0.8}, {"delay": 20}], ids=["loss", "delay"])
