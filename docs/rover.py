@@ -1,13 +1,14 @@
-"""A simulated robot as a driver to copy from, and a process that measures the range between two of them.
+"""A simulated robot as a driver to copy from, and a process that measures the ranges between such robots.
 
-    uv run docs/rover.py --port 4747 --reach 3                # the beacon: measures the mutual range
+    uv run docs/rover.py --port 4747 --reach 3                # the beacon: measures mutual ranges
     uv run tandem robot a --mission paper-1 --driver docs.rover:Rover --rate 4 --listen tcp/127.0.0.1:7447 \
         --option start=2.4,-1.2,4.8 --option beacon=127.0.0.1:4747
     uv run tandem robot b --mission paper-1 --driver docs.rover:Rover --rate 4 --connect tcp/127.0.0.1:7447 \
         --option start=11.3,-0.4,3.6 --option beacon=127.0.0.1:4747
 
 There is no simulator process: each robot moves by its own kinematics. Only the beacon, which takes the place
-of an ultra-wideband exchange between the two, receives both positions. The agents receive neither.
+of ultra-wideband exchanges between them, receives their positions. The agents receive none. The robots may be
+those of a group.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import socket
 import time
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -46,7 +48,7 @@ class Rover:
         """Place the robot at `start`, "x,y,heading" in <W>, and connect to the `beacon` at "HOST:PORT".
 
         No agent receives `start`. `state` is a file with the pose and the wheels' motion, which outlast this
-        process like a robot's body. `timeout` (s) bounds the wait until the peer stands in the same tick.
+        process like a robot's body. `timeout` (s) bounds the wait until all others stand in the same tick.
         After it the driver raises: this robot has no drop-outs, so it must not report a missing range.
         """
         self._config = config
@@ -89,7 +91,7 @@ class Rover:
         self._save()
         anchor, reach = self._config.anchor, self._config.mission.sensing_range
         rho = math.hypot(self.pose.x - anchor.x, self.pose.y - anchor.y)
-        return Reading(executed, rho if rho <= reach else None, self._mutual_range(tick))
+        return Reading(executed, rho if rho <= reach else None, mutual_ranges=self._mutual_ranges(tick))
 
     def drive(self, v: float, omega: float) -> None:
         """Hold `v` and `omega` for a manoeuvre. The rest of the previous manoeuvre is not driven."""
@@ -109,9 +111,9 @@ class Rover:
             self._controls, self._done = REST, 1.0  # the beacon has the pose of that reading already
 
     def stop(self) -> None:
-        """Stop, and stay available for the peer's mutual ranges once the mission has ended.
+        """Stop, and stay available for mutual ranges of others once the mission has ended.
 
-        After a restart the peer has to wait instead: it must not pass ticks in which this robot moves on.
+        After a restart others have to wait instead: they must not pass ticks in which this robot moves on.
         """
         self._settle()
         if self._done < 1.0:
@@ -149,62 +151,98 @@ class Rover:
         body = msgspec.json.decode(state.read_bytes(), type=kinds)
         self.pose, self._controls, self._began, self._done, self._driven, self._executed, self._tick = body
 
-    def _mutual_range(self, tick: int) -> float | None:
-        """Return the range (m) to the peer in the same tick; None out of range. Raises TimeoutError."""
+    def _mutual_ranges(self, tick: int) -> dict[str, float | None]:
+        """Return the range (m) to each robot within R in the same tick. Raises TimeoutError."""
         give_up = time.monotonic() + self._give_up_s
         while self._radio is not None and time.monotonic() < give_up:
             self._send(tick)
             try:
-                answer = json.loads(self._radio.recv(1024))
+                answer = json.loads(self._radio.recv(65536))
             except TimeoutError:
                 continue
             except ConnectionRefusedError:  # there is no beacon, and the refusal came at once
                 time.sleep(ASK_AGAIN_S)
                 continue
             if answer["tick"] == tick:
-                return None if answer["range"] is None else float(answer["range"])
+                return dict(answer["ranges"])
         if self._radio is None:
-            return None
+            return {}
         raise TimeoutError(f"no answer of the beacon for {self._give_up_s:g} s")
 
     def _send(self, tick: int, *, parked: bool = False) -> None:
-        where = {"robot": self._config.robot, "peer": self._config.peer, "tick": tick, "parked": parked}
+        where = {"robot": self._config.robot, "others": self._config.others, "tick": tick, "parked": parked}
         if self._radio is not None:
             with suppress(ConnectionRefusedError):  # of an earlier datagram: there is no beacon
                 self._radio.send(json.dumps(where | {"x": self.pose.x, "y": self.pose.y}).encode())
 
 
+class Beacon:
+    """The positions of all robots, by tick: what is measured depends on no robot's process."""
+
+    def __init__(self, reach: float, lost_s: float) -> None:
+        """`reach` is R in m. A robot that has sent nothing for `lost_s` has no radio any more."""
+        self._reach = reach
+        self._lost_s = lost_s
+        self._began = time.monotonic()
+        self._positions: dict[tuple[str, int | None], tuple[float, float]] = {}
+        """The position of a robot in each tick; under None, where it is parked."""
+        self._latest: dict[str, int] = {}
+        """The latest tick of each robot."""
+        self._heard: dict[str, float] = {}
+        """The time at which each robot was heard last."""
+
+    def take(self, message: Any) -> None:
+        """Note where the robot of `message` is."""
+        robot, tick = message["robot"], message["tick"]
+        self._heard[robot] = time.monotonic()
+        self._positions.pop((robot, None), None)  # it moves again, or is parked elsewhere
+        for again in range(tick, self._latest.get(robot, tick)):  # it starts from an earlier tick again
+            self._positions.pop((robot, again + 1), None)
+            self._positions.pop((robot, again), None)
+        self._latest[robot] = tick
+        self._positions.setdefault((robot, None if message["parked"] else tick), (message["x"], message["y"]))
+
+    def ranges(self, message: Any) -> dict[str, float] | None:
+        """Return the ranges within R of the robot of `message`; None while another may come to its tick."""
+        found: dict[str, float] = {}
+        robot, tick = message["robot"], message["tick"]
+        for other in message["others"]:
+            place = self._positions.get((other, tick), self._positions.get((other, None)))
+            if place is None and self._latest.get(other, -1) <= tick and not self._is_lost(other):
+                return None
+            if place is not None:
+                rho = math.dist(self._positions[robot, tick], place)
+                found |= {other: rho} if rho <= self._reach else {}
+        return found
+
+    def _is_lost(self, robot: str) -> bool:
+        return time.monotonic() - self._heard.get(robot, self._began) > self._lost_s
+
+
 def main() -> None:
-    """Run the beacon: it answers a robot once its peer stands in the same tick, or is parked."""
+    """Run the beacon: it answers a robot once all others are in its tick, have left it, or are parked."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--port", type=int, default=0)
     parser.add_argument("--reach", type=float, required=True, help="the sensing range R, in m")
+    parser.add_argument("--lost", type=float, default=math.inf, help="s after which a silent robot is lost")
     options = parser.parse_args()
     radio = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     radio.bind(("127.0.0.1", options.port))
     print(f"ranging at 127.0.0.1:{radio.getsockname()[1]}", flush=True)
-    positions: dict[tuple[str, str], tuple[float, float]] = {}
-    senders: dict[str, tuple[str, int]] = {}
-    latest: dict[str, int] = {}
+    beacon = Beacon(options.reach, options.lost)
+    asked: dict[str, tuple[Any, tuple[str, int]]] = {}
     while True:
-        message, sender = radio.recvfrom(1024)
+        message, sender = radio.recvfrom(65536)
         one = json.loads(message)
-        robot, peer, tick = one["robot"], one["peer"], one["tick"]
-        senders[robot] = sender
-        positions.pop((robot, "parked"), None)  # it moves again, or is parked elsewhere
-        for again in range(tick, latest.get(robot, tick)):  # it starts from an earlier tick again
-            positions.pop((robot, str(again + 1)), None)
-            positions.pop((robot, str(again)), None)
-        latest[robot] = tick
-        place = positions.setdefault((robot, "parked" if one["parked"] else str(tick)), (one["x"], one["y"]))
-        other = positions.get((peer, str(tick)), positions.get((peer, "parked")))
-        if other is not None and not one["parked"]:
-            rho = math.dist(place, other)
-            answer = json.dumps({"tick": tick, "range": rho if rho <= options.reach else None}).encode()
-            for name in {robot, peer} & senders.keys():
-                radio.sendto(answer, senders[name])
-        elif latest.get(peer, tick) > tick:  # the peer has left this tick
-            radio.sendto(json.dumps({"tick": tick, "range": None}).encode(), sender)
+        beacon.take(one)
+        asked.pop(one["robot"], None)
+        if not one["parked"]:
+            asked[one["robot"]] = one, sender
+        for robot, (waiting, where) in list(asked.items()):
+            ranges = beacon.ranges(waiting)
+            if ranges is not None:
+                radio.sendto(json.dumps({"tick": waiting["tick"], "ranges": ranges}).encode(), where)
+                asked.pop(robot)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,8 @@ GroundTruth    world -> viewers                       every tick with a subscrib
 MissionEnd     world -> robot                         once, after the last tick
 FinalReport    robot -> world, and back as an         once, in answer to MissionEnd
                acknowledgement
-TickStart      driver -> driver of the peer           every tick, in hardware mode
+TickStart      driver -> driver of the peer; in a     every tick, in hardware mode
+               group, its own kind, to all drivers
 DeadlineMissed journals only                          each missed deadline, in real time
 Environment    journals only                          once, as the first frame
 ============== ====================================== ==========================================
@@ -262,6 +263,11 @@ class RobotConfig(Message, frozen=True, dict=True):
         return math.hypot(self.anchor.x - self.peer_anchor.x, self.anchor.y - self.peer_anchor.y)
 
     @property
+    def others(self) -> tuple[str, ...]:
+        """The robots that this one may be in contact with, in the order of the mission; here, its peer."""
+        return (self.peer,)
+
+    @property
     def widest_distance(self) -> float:
         """The largest distance in m between the anchors of two robots that may meet; here, D."""
         return self.anchor_distance
@@ -324,6 +330,16 @@ class RobotConfigInGroup(RobotConfigWithOptions, frozen=True, dict=True):
     gives_up: Time = 0.0
     """The time in s after which it gives up if it is not localised."""
 
+    @property
+    def group(self) -> tuple[str, ...]:
+        """All robots of the group, in the order of the mission."""
+        return tuple([one.robot for one in self.members])
+
+    @property
+    def others(self) -> tuple[str, ...]:
+        """All other robots of the group, in the order of the mission."""
+        return tuple([one for one in self.group if one != self.robot])
+
     @cached_property
     def widest_distance(self) -> float:
         """The largest distance between two anchors of the group, in m."""
@@ -359,6 +375,11 @@ class RobotConfigWithSweep(RobotConfigInGroup, frozen=True, dict=True):
     """The area in which they are, and the number of its parts."""
     part: Count = 0
     """The part that this robot sweeps first."""
+
+    @property
+    def group(self) -> tuple[str, ...]:
+        """All robots of the group: those with an anchor, then those without one."""
+        return (*super().group, *self.unanchored)
 
     @cached_property
     def widest_distance(self) -> float:
@@ -602,6 +623,15 @@ class TickStart(Message, frozen=True):
     """The tick k."""
     robot: RobotId
     """The robot of the sending driver."""
+
+
+class TickStartInGroup(TickStart, frozen=True):
+    """The start of tick k at the driver of a robot in a group, with what ends the mission of others."""
+
+    verdict: Verdict | None = None
+    """The final result of the robot; None until it has one."""
+    complete: bool = False
+    """True if the robot has its result, and waits for no other robot."""
 
 
 OfRobot = (

@@ -49,6 +49,18 @@ class RangesBeyondReach(Rover):
         return replace(reading, anchor_range=rho)
 
 
+class RangesToOthersBeyondReach(Rover):
+    """A driver of a robot in a group."""
+
+    def sense(self, tick: int) -> Reading:
+        return replace(super().sense(tick), mutual_ranges={"c": 3.5} if tick == 4 else {})
+
+
+class RangesToStrangers(Rover):
+    def sense(self, tick: int) -> Reading:
+        return replace(super().sense(tick), mutual_ranges={"x": 1.5})
+
+
 class RepeatsStaleRanges(Rover):
     _stale: float | None = None
 

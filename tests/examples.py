@@ -24,6 +24,7 @@ from protocol.messages import (
     ReportWithPose,
     RobotConfigWithOptions,
     TickStart,
+    TickStartInGroup,
     Undecided,
 )
 from protocol.motion import Controls, Covariance, Pose, Segment
@@ -71,6 +72,7 @@ EXAMPLES: tuple[Message, ...] = (
     Mark(4, "a", (0.5, -1.0)),
     ProcessStart("6f1c2a", synced=True),
     TickStart(7, "a"),
+    TickStartInGroup(7, "a", Localised(POSE), complete=True),
     Command(
         4, "b", 0.0, 0.0, 3, "inconsistent", Inconsistent("a start that it told otherwise before", 0.5, 0.25)
     ),

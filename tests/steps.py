@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import NamedTuple
 
+from msgspec.structs import replace
+
 from agent.planning.planner import Planner
 from agent.planning.registry import planner
 from agent.planning.state import RobotState
@@ -29,8 +31,11 @@ def planner_of(state: RobotState) -> Planner[RobotState, Report]:
     return planner(state.config.planner_name, state.config.mission)
 
 
-def steps(name: str) -> Iterator[Step]:
-    """Yield the ticks of the scenario `name`, and check that it ends localised."""
+def steps(name: str, *, at_rest: int = 0) -> Iterator[Step]:
+    """Yield the ticks of the scenario `name`, and check that it ends localised.
+
+    In the first `at_rest` ticks, all robots miss the deadline.
+    """
     world = release(load(name))
     play = planner(world.scenario.planner_name, world.scenario.mission)
     states = {robot.id: play.start(world.scenario.config(robot.id)) for robot in world.scenario.robots}
@@ -49,7 +54,11 @@ def steps(name: str) -> Iterator[Step]:
         )
         commands = {robot: play.command(state) for robot, state in states.items()}
         yield Step(world, sensed, before, observed, heard, commands)
-        onward = advance(world, commands)
+        late = world.truth.tick < at_rest
+        onward = advance(
+            world,
+            {robot: replace(one, v=0.0, omega=0.0) for robot, one in commands.items()} if late else commands,
+        )
         if not isinstance(onward, World):
             assert onward.outcome == "localised"
             return

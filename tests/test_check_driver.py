@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from compose.hardware.conformance import check_results
-from compose.hardware.exercise import ExerciseRun
+from compose.hardware.exercise import Broken, ExerciseRun
 from compose.launch.driver_loader import config_of
-from compose.scenario.scenario_file import load
+from compose.scenario.scenario_file import load, parse
 from tests import broken_drivers, virtual_time
 from tests.commands import tandem
+from tests.test_group_field import FAR
 
 MANOEUVRE_S = 0.1
 CONFIG = config_of(load("paper-1"), "a", MANOEUVRE_S)
@@ -52,6 +55,25 @@ def test_a_broken_driver_is_reported_with_what_it_violates(
     trial = ExerciseRun(driver, CONFIG, MANOEUVRE_S)
     trial.go_through()
     assert said in "; ".join([one.wrong for one in check_results(trial) if one.wrong is not None])
+
+
+def test_a_driver_of_a_group_is_checked_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = virtual_time.Clock()
+    for module in virtual_time.MODULES:
+        monkeypatch.setattr(module, "time", clock)
+    config = config_of(parse(FAR, "four"), "a", MANOEUVRE_S)
+    driver = broken_drivers.RangesToOthersBeyondReach(config, MANOEUVRE_S)
+    trial = ExerciseRun(driver, config, MANOEUVRE_S)
+    trial.go_through()
+    found = [one.wrong for one in check_results(trial) if one.wrong is not None]
+    assert found == ["tick 4: 3.5 m to c, beyond R = 3 m"]
+
+
+def test_a_range_to_a_robot_that_is_not_in_the_group_ends_the_exercise() -> None:
+    config = config_of(parse(FAR, "four"), "a", MANOEUVRE_S)
+    trial = ExerciseRun(broken_drivers.RangesToStrangers(config, MANOEUVRE_S), config, MANOEUVRE_S)
+    with pytest.raises(Broken, match=re.escape("sense(0): mutual_ranges: 'x' is none of b, c, d")):
+        trial.go_through()
 
 
 @pytest.mark.parametrize(

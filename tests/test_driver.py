@@ -30,10 +30,11 @@ from protocol.network import keys
 from protocol.wire import decode, encode
 from tests.commands import ASSURED, PAPER_1
 from tests.stage import Stage
-from world.hardware.bridge import UNHEARD, Field
+from world.hardware.bridge import Field
 from world.hardware.driver import THINKING, Reading
 from world.hardware.driver_journal import DrivenTick, DriverHistory
 from world.hardware.termination import LAST_WORDS, Ending
+from world.hardware.tick_source import UNHEARD
 
 Answer = Callable[[int], Iterable[bytes]]
 """The frames that are sent in answer to the Observation of a tick."""
@@ -228,7 +229,7 @@ def ended(
         if tick == 12 and said is not None:
             ending.receive(said)
         verdict = own if tick >= 10 else None
-        end = ending.after(tick, command(tick, verdict=verdict), peer_there=True)
+        end = ending.after(tick, command(tick, verdict=verdict), {"b"})
         if end is not None:
             return end
     return None

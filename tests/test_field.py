@@ -34,9 +34,9 @@ ASSURED = "max_ticks = 120\n" + PAPER_1.replace('"paper"', '"assured"').replace(
 
 
 @contextmanager
-def beacon() -> Iterator[str]:
-    """Yield the endpoint of a simulated body of both robots, in a third process."""
-    command = [sys.executable, "-P", "docs/rover.py", "--reach", "3"]
+def beacon(*more: str) -> Iterator[str]:
+    """Yield the endpoint of a process that measures the ranges between simulated robots."""
+    command = [sys.executable, "-P", "docs/rover.py", "--reach", "3", *more]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": "."}
     ) as process:

@@ -296,8 +296,8 @@ def test_a_rover_is_parked_for_its_peer_only_at_the_end_of_its_mission() -> None
         reading = pool.submit(rover.sense, 0)
         message, sender = air.recvfrom(1024)
         assert not json.loads(message)["parked"]
-        air.sendto(json.dumps({"tick": 0, "range": None}).encode(), sender)
-        assert reading.result(BOUND_S).mutual_range is None
+        air.sendto(json.dumps({"tick": 0, "ranges": {}}).encode(), sender)
+        assert reading.result(BOUND_S).mutual_ranges == {}
         rover.stop()
         until(lambda: json.loads(air.recv(1024))["parked"], "it is parked")
         rover.close()

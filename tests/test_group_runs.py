@@ -24,7 +24,6 @@ from agent.process.agent_journal import Step
 from compose.audit.replay import replayed
 from compose.audit.rules import audit_run
 from compose.errors import UserError
-from compose.launch.driver_loader import mission
 from compose.launch.in_process import run_mission
 from compose.launch.processes import free_endpoint
 from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
@@ -293,6 +292,7 @@ def test_the_anchors_and_the_plan_of_a_drawn_group_follow_from_the_seed() -> Non
         ({"group": {"robots": 2, "spacing": 30.0}}, "group.robots: "),
         ({"group": {"robots": 201, "spacing": 30.0}}, "group.robots: "),
         ({"group": {"robots": 4}}, "group: missing field 'spacing'"),
+        ({"group": {"robots": 4, "spacing": 30.0, "dies": [9, 5]}}, "group.dies: the lower bound 9 is above"),
         ({"robot": [{"id": "a", "anchor": [0.0, 0.0]}] * 2}, "group: its robots are drawn"),
         ({"planner": {"name": "paper"}}, "planner.name: robots with the planner paper meet in pairs"),
     ],
@@ -438,8 +438,3 @@ def test_a_group_that_is_stopped_leaves_no_process(tmp_path: Path) -> None:
         run.tell(Signals.SIGINT)
         assert run.ended().status == 130
     until(lambda: not processes_of(out), "no process is left")
-
-
-def test_a_robot_of_a_group_is_refused_in_hardware_mode(three: Path) -> None:
-    with pytest.raises(UserError, match="robot: in hardware mode, robots meet in pairs"):
-        mission(str(three), "a")

@@ -16,6 +16,7 @@ from agent.planning.unanchored import UnanchoredPlanner
 from compose.audit.replay import replayed
 from compose.audit.rules import audit_run
 from compose.errors import UserError
+from compose.launch.driver_loader import mission
 from compose.launch.in_process import run_mission
 from compose.recording.corrected_bounds import corrected_bounds
 from compose.recording.recording_files import agent_journal
@@ -254,6 +255,10 @@ def test_a_changed_scenario_keeps_its_robots_without_an_anchor() -> None:
             r"robot\[2\]: missing field 'anchor': with mission.noise, each robot needs one",
         ),
         (
+            lambda table: table["mission"].update(safety_distance=0.3),
+            r"mission.safety_distance: there is a robot without an anchor",
+        ),
+        (
             lambda table: table["robot"][0].update(attack={"kind": "scale", "size": 1.1}),
             r"robot\[0\].attack: there is a robot without an anchor",
         ),
@@ -272,6 +277,19 @@ def test_what_cannot_be_localised_is_refused_in_one_line(change: Any, message: s
     change(table)
     with pytest.raises(UserError, match=f"^group.toml: {message}"):
         scenario_of(table)
+
+
+def test_hardware_mode_refuses_robots_without_an_anchor(tmp_path: Path) -> None:
+    scenario = tmp_path / "four.toml"
+    scenario.write_text(FILE, encoding="utf-8")
+    with pytest.raises(UserError, match="robot: u has no anchor, which is not available in hardware mode"):
+        mission(str(scenario), "a")
+
+
+def test_each_robot_knows_all_others_of_its_group() -> None:
+    scenario = scenario_of(four())
+    for robot in ("a", "b", "u", "v"):
+        assert {robot, *scenario.config(robot).others} == {"a", "b", "u", "v"}
 
 
 def test_a_robot_of_a_pair_needs_an_anchor() -> None:

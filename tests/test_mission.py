@@ -367,3 +367,10 @@ def test_where_in_the_plane_the_anchors_stand_costs_no_digit() -> None:
         return [(d.v, d.omega, d.state) for moment in moments for d in moment.commands.values()]
 
     assert driven(2.0**19) == driven(0.0)
+
+
+@pytest.mark.parametrize("at_rest", [5, 12])
+def test_robots_that_stand_still_at_first_are_localised_as_much_later(at_rest: int) -> None:
+    """Ranges of a robot that has not moved say nothing new, and must not count as if they did."""
+    usual, late = (sum(1 for _ in steps("paper-2", at_rest=ticks)) for ticks in (0, at_rest))
+    assert late == usual + at_rest

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import struct
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -11,7 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from compose.launch.processes import free_endpoint
+from compose.scenario.scenario_file import parse
 from protocol.motion import Controls, Pose, step, wrap
+from protocol.network import session
+from protocol.network.endpoints import listening
 from tests import ros_base
 from tests.commands import BOUND_S, TandemProcess, tandem
 from world.hardware import ros2
@@ -164,6 +169,26 @@ def test_a_base_behind_a_bridge_fulfils_the_driver_contract(tmp_path: Path) -> N
         assert ended.out.count("ok     ") == 8
         assert math.dist((base.pose.x, base.pose.y), (0.3, -0.4)) > 3.0
         assert base.pose.heading != wrap(base.pose.heading) or abs(base.pose.heading) < math.pi
+
+
+def test_a_robot_of_a_group_reads_a_topic_for_each_other_robot() -> None:
+    config = parse(f'{SCENARIO}[[robot]]\nid = "c"\nanchor = [1.0, 12.0]\n', "ros").config("a")
+    endpoint = free_endpoint()
+    with (
+        session.open_router(listening(endpoint)) as link,
+        closing(ros2.Ros2(config, 60.0, connect=endpoint)) as driver,
+    ):
+        topics = {"anchor_range": 1.5, "peer_range/b": 2.5, "peer_range/c": math.inf}
+        publishers = {topic: session.publisher(link, topic) for topic in (*topics, "odom")}
+        with ThreadPoolExecutor(1) as pool:
+            reading = pool.submit(driver.sense, 1)
+            while not reading.done():
+                publishers["odom"].put(ros_base.odometry(Pose(0.0, 0.0, 0.0)))
+                for topic, rho in topics.items():
+                    publishers[topic].put(ros_base.ranged(rho))
+                wait([reading], 0.01)
+        found = reading.result()
+    assert (found.anchor_range, found.mutual_ranges) == (1.5, {"b": 2.5})
 
 
 @pytest.mark.long

@@ -78,23 +78,26 @@ def anchor(knowledge: Knowledge, start: Pose, log: MotionLog) -> Known:
     mission, extent = knowledge.config.mission, size(knowledge)
     enough = required_anchor_error(extent, knowledge.config.widest_distance, mission.sensing_range)
     known = least = error = math.inf
-    ranges = 0
+    ranges = used = 0
+    least_floor = 0.0
     ranged: list[tuple[Pose, float, float]] = []
-    for one in log.ranges:
+    for count, one in enumerate(log.ranges, 1):
         if one.tick > log.through:
             break
         runs = log.until(one.tick)
-        floor = _path_rounding(extent, runs, mission.period)
-        ranged.append((follow(ORIGIN, runs, mission.period), one.range, floor))
+        pose, floor = follow(ORIGIN, runs, mission.period), _path_rounding(extent, runs, mission.period)
+        if ranged and (pose, one.range) == ranged[-1][:2]:
+            continue  # The robot has not moved, as after a missed deadline.
+        ranged.append((pose, one.range, floor))
         if len(ranged) == 1 and start.x > enough:
             continue  # The range at the start does not depend on the heading.
         before, error = error, anchor_error(start, ranged)
         if error < least or len(ranged) <= FITTED:
-            least, ranges = error, len(ranged)
+            least, ranges, used, least_floor = error, count, len(ranged), floor
         # Branches that `weigh_branches` merged later differ by its larger floor.
-        known = least + SAME * (floor - ranged[ranges - 1][2])
+        known = least + SAME * (floor - least_floor)
         stalled = len(ranged) >= FITTED and error > BETTER * before
-        spent = len(ranged) - ranges == OUT_AND_BACK
+        spent = len(ranged) - used == OUT_AND_BACK
         if known <= WELL * enough or (stalled and known <= enough) or spent:
             return Known(known, ranges, enough=True)
     return Known(known, ranges)

@@ -11,6 +11,7 @@ first pair has failed, another one meets in its place.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from msgspec.structs import asdict, replace
@@ -20,6 +21,7 @@ from agent.planning.group_state import GroupState
 from agent.planning.log_exchange import LogPlanner
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Travelling
 from agent.planning.planner import Planner, Summary
+from agent.planning.separation import slowed
 from agent.planning.state import MODE_NAMES, Done
 from protocol.messages import (
     Command,
@@ -34,7 +36,7 @@ from protocol.messages import (
     Undecided,
 )
 from protocol.mission import Mission
-from protocol.motion import compose, inverse
+from protocol.motion import Controls, compose, inverse
 
 TRAVELLING = MODE_NAMES[Travelling]
 """The mode of a robot that is localised, and drives to another one."""
@@ -68,10 +70,17 @@ class GroupPlanner(Planner[GroupState, Report]):
                 state = state.with_other(contact.peer, replace(known, mutual=ranges))
         if state.visiting and isinstance(pair.mode, Aligning | Radial | Orbiting):  # out of range again
             pair = replace(pair, mode=Travelling(group_transitions.stop(state.frame, pair)))
-        if isinstance(pair.mode, Travelling) and not pair.in_contact:
+        state = group_transitions.passing_others(replace(state, pair=pair), observation.contacts)
+        pair = state.pair
+        if isinstance(pair.mode, Travelling) and not pair.in_contact and not state.passing.places:
             pair = group_transitions.searching(pair)
-        ended = isinstance(pair.mode, Done) and not pair.in_contact
-        return replace(state, pair=pair, unmet=state.unmet + 1 if ended else 0)
+        ended = isinstance(pair.mode, Done)
+        return replace(
+            state,
+            pair=pair,
+            unmet=state.unmet + 1 if ended and not pair.in_contact else 0,
+            lingering=state.lingering + 1 if ended and pair.in_contact else 0,
+        )
 
     def report(self, state: GroupState) -> Report:
         """Return the report to the peer of the present meeting."""
@@ -96,6 +105,9 @@ class GroupPlanner(Planner[GroupState, Report]):
     def decide(self, state: GroupState, reports: Sequence[Report] = ()) -> GroupState:
         """Return `state` with the `reports` of others, and in the next meeting if this one has ended."""
         for one in reports:
+            if state.config.mission.safety_distance:
+                travels = replace(state.other(one.robot), travels=one.state == TRAVELLING)
+                state = state.with_other(one.robot, travels)
             if one.state == TRAVELLING or (not one.has_log and isinstance(one.verdict, Localised)):
                 state = state.with_other(one.robot, replace(state.other(one.robot), localised=True))
         logs = [one for one in reports if one.has_log]
@@ -124,7 +136,11 @@ class GroupPlanner(Planner[GroupState, Report]):
 
     def command(self, state: GroupState) -> Command:
         """Return the command for the next tick, with the phase, the mode and the robot's verdict."""
-        return replace(self.pair_planner.command(state.pair), verdict=state.verdict)
+        command = replace(self.pair_planner.command(state.pair), verdict=state.verdict)
+        if state.passing.leeway == math.inf:
+            return command
+        controls = slowed(Controls(command.v, command.omega), state.passing.leeway, state.config.mission)
+        return replace(command, v=controls.v, omega=controls.omega)
 
     def estimate(self, state: GroupState) -> Estimate:
         """Return all poses that the robot considers possible in its anchor's frame and in <W>.

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import msgspec
 from msgspec.structs import replace
 
+from agent.planning.passing import Passing
 from agent.planning.state import RobotState
 from agent.planning.sweep import Looping, Sweeping
 from protocol.messages import Ranged, RobotConfigInGroup, Verdict
@@ -22,6 +23,8 @@ class Other(msgspec.Struct, frozen=True):
     """True once it has reported that it is localised."""
     failed: bool = False
     """True once a meeting with it has failed: this robot does not meet it again."""
+    travels: bool = False
+    """True if it drives to another robot, by its latest report."""
     missed: int | None = None
     """The latest tick in which this robot has not found it where it should wait; None if there is none."""
 
@@ -53,6 +56,10 @@ class GroupState(msgspec.Struct, frozen=True):
     """The knowledge about each robot that this one has been in range of, or heard of."""
     unmet: int = 0
     """The number of consecutive ticks out of range of the peer since this robot's verdict in the meeting."""
+    passing: Passing = Passing()
+    """How it passes robots of other meetings, if the mission has a safety distance."""
+    lingering: int = 0
+    """The number of consecutive ticks in range of the peer since the end of their meeting."""
     silence: int = 0
     """The number of consecutive ticks in range of the peer without a log of it."""
 

@@ -11,11 +11,11 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from agent.estimation.knowledge import Belief
-from agent.planning import phase2_orbit, sweep_transitions, transitions
+from agent.planning import passing, phase2_orbit, sweep_transitions, transitions
 from agent.planning.group_state import GroupState
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Travelling
 from agent.planning.state import Done, RobotState
-from protocol.messages import Localised, Member, Retry, Undecided, Verdict
+from protocol.messages import Contact, Localised, Member, Retry, Undecided, Verdict
 from protocol.mission import Role
 from protocol.motion import Pose, compose, inverse
 from protocol.orbits import Rendezvous
@@ -36,6 +36,9 @@ robot's verdict before.
 
 SILENT_AFTER = 200
 """The ticks in contact without a report after which a robot takes its peer for lost."""
+
+LINGERING = 6
+"""The ticks in contact for which a visited robot waits for its visitor to leave, with a safety distance."""
 
 SIDES = 12
 """The number of sides of the square spiral on which a visitor searches. Its radius is then three times R.
@@ -96,7 +99,7 @@ def onward(state: GroupState) -> GroupState:
         if state.silence > SILENT_AFTER:
             return _next_visit(_after_meeting(state))
         return state
-    if not isinstance(pair.mode, Done):
+    if not isinstance(pair.mode, Done) or _must_linger(state):
         return state
     if not isinstance(pair.verdict, Localised):
         return _next_visit(_after_meeting(state))
@@ -284,6 +287,45 @@ def _in_meeting(state: GroupState, peer: str, role: Role, orbits: Rendezvous | N
         ),
     )
     return replace(state, pair=fresh, visiting=False, unmet=0, silence=0)
+
+
+def passing_others(state: GroupState, contacts: Sequence[Contact]) -> GroupState:
+    """Return `state` on its way past the robots in contact that it does not meet, after a tick."""
+    pair, mission = state.pair, state.config.mission
+    if not mission.safety_distance:
+        return state
+    free = passing.leeway(contacts, pair.config.peer if pair.in_contact else None, mission)
+    mode = pair.mode
+    if isinstance(mode, Travelling) and passing.yielding(state.passing, _leading(state, contacts), mission):
+        now = replace(state.passing, leeway=0.0, blocked=0, yielded=state.passing.yielded + 1)
+        return replace(state, passing=now)
+    now = passing.passed(state.passing, mode, pair.odometry, free, mission)
+    if isinstance(mode, Travelling) and (now.places or state.passing.places):
+        places, tolerance = now.places, pair.estimator.pose_tolerance
+        if places and phase2_orbit.arrived(Travelling(places[0]), pair.odometry, mission, tolerance):
+            places = places[1:]
+        now = replace(now, places=places)
+        mode = Travelling(places[0] if places else stop(state.frame, pair))
+    return replace(state, pair=replace(pair, mode=mode), passing=now)
+
+
+def _leading(state: GroupState, contacts: Sequence[Contact]) -> list[Contact]:
+    """Return those of `contacts` that travel, too, and go first: those with smaller ids."""
+    own = state.config.robot
+    return [one for one in contacts if one.peer < own and state.other(one.peer).travels]
+
+
+def _must_linger(state: GroupState) -> bool:
+    """Return whether a robot whose meeting is over lets its peer leave first, as the visited one does.
+
+    If both left at once, they could be in each other's way.
+    """
+    pair = state.pair
+    if not state.config.mission.safety_distance or state.config.role == "a" or not pair.in_contact:
+        return False
+    if state.other(state.config.peer).travels:
+        return state.lingering < SILENT_AFTER
+    return state.lingering < LINGERING
 
 
 # --- visits -------------------------------------------------------------------------------------------

@@ -122,6 +122,11 @@ def travel_controls(mode: Travelling, odometry: Pose, mission: Mission, toleranc
     return straight(distance, mission)
 
 
+def arrived(mode: Travelling, odometry: Pose, mission: Mission, tolerance: float) -> bool:
+    """Return whether the robot is at the end of the straight of `mode`; see `travel_controls`."""
+    return travel_controls(mode, odometry, mission, tolerance) is None
+
+
 def next_side(mode: Travelling, mission: Mission) -> Travelling:
     """Return the next side of the spiral after `mode`. Each second one is longer, by R."""
     length = (mode.side // 2 + 1) * mission.sensing_range

@@ -1,4 +1,7 @@
-"""`tandem robot`: one robot in hardware mode: its driver in this process, its agent in another."""
+"""`tandem robot`: one robot in hardware mode: its driver in this process, its agent in another.
+
+The other robots of the mission, its peer or all others of its group, run in the same way.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ from compose.network import reach
 from compose.recording.recording_files import folder_for
 from compose.recording.run import ended
 from compose.scenario.run_settings import check_rate
-from protocol.messages import Localised, MissionEnd
+from protocol.messages import Localised, MissionEnd, RobotConfig, RobotConfigInGroup
 from protocol.motion import wrap
 from protocol.network import access_control, session
 from protocol.network.endpoints import Endpoints
@@ -45,8 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="scenario of the mission: a name or a TOML file; start poses are not used",
     )
     add_driver_options(parser)
-    add_participation(parser, "the scenario's name", "endpoint on which the peer can reach this robot")
-    add_connect_timeout(parser, "the peer")
+    add_participation(parser, "the scenario's name", "endpoint on which other robots can reach this one")
+    add_connect_timeout(parser, "the other robots")
     add_closing(
         parser,
         "tandem robot a --mission paper-1 --driver docs.rover:Rover --listen tcp/0.0.0.0:7447",
@@ -82,7 +85,7 @@ def main(options: argparse.Namespace) -> int:
                 journal=recording.journal,
             )
             recording.take_up(driver, options.driver, field)
-            end = _run(options, field, config.planner_name, reached, folder, inbox)
+            end = _run(options, field, config, reached, folder, inbox)
         if not options.quiet and isinstance(field.verdict, Localised):
             pose = field.verdict.pose
             say(f"{options.id}: claims {pose.x:.9f} {pose.y:.9f} {wrap(pose.heading):+.9f} (m, m, rad)")
@@ -99,7 +102,7 @@ def main(options: argparse.Namespace) -> int:
 def _run(
     options: argparse.Namespace,
     field: Field,
-    planner_name: str,
+    config: RobotConfig,
     reached: Endpoints,
     folder: Path,
     inbox: Inbox,
@@ -119,14 +122,15 @@ def _run(
             *("agent", options.id, "--connect", own, "--launched", "--run", field.run, *keys),
             *("--out", str(folder.resolve()), "--timeout", str(options.timeout)),
             *(["--fsync"] if options.fsync else []),
-            *([] if is_shipped(planner_name) else ["--planner", planner_name]),
+            *([] if is_shipped(config.planner_name) else ["--planner", config.planner_name]),
         ]
         children.start(agent, *arguments)
         try:
             field.attach(link)
             if not options.quiet:
-                where = f", resumed at tick {field.tick}" if field.tick >= 0 else ", waiting for its peer"
-                say(f"{options.id}: in run {field.run}{where}")
+                whom = "the others" if isinstance(config, RobotConfigInGroup) else "its peer"
+                where = f"resumed at tick {field.tick}" if field.tick >= 0 else f"waiting for {whom}"
+                say(f"{options.id}: in run {field.run}, {where}")
             end = field.run_mission(
                 options.connect_timeout, lambda: _restart(children, agent, arguments, inbox)
             )

@@ -164,7 +164,7 @@ def _mission(link: zenoh.Session, latest: _LatestFrames, run: str, alive: frozen
     frames += answers.values()
     configs = [one for frame in answers.values() if (one := _decoded(frame, AnyRobotConfig)) is not None]
     named = alive - {""} | latest.named(run, keys.observation) | latest.named(run, keys.command)
-    named |= {one.peer for one in configs}
+    named |= {robot for one in configs for robot in one.others}
     messages = [
         latest.message(Key(keys.observation, run, robot), Observation | MissionEnd | FinalReport)
         for robot in named
@@ -190,9 +190,9 @@ def _mission(link: zenoh.Session, latest: _LatestFrames, run: str, alive: frozen
 
 
 def _configs(link: zenoh.Session, run: str, robots: set[str]) -> dict[str, bytes]:
-    """Return the frame of one RobotConfig of each pair, by robot.
+    """Return the frame of one RobotConfig of each pair or group, by robot.
 
-    The RobotConfig names the peer. In hardware mode, no other message does.
+    The RobotConfig names the other robots. In hardware mode, no other message does.
     """
     found: dict[str, bytes] = {}
     paired: set[str] = set()
@@ -208,7 +208,7 @@ def _configs(link: zenoh.Session, run: str, robots: set[str]) -> dict[str, bytes
             if isinstance(answer, bytes):
                 found[robot] = answer
                 config = _decoded(answer, AnyRobotConfig)
-                paired |= {config.peer} if config is not None else set()
+                paired.update(config.others if config is not None else ())
     return found
 
 

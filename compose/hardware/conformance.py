@@ -141,9 +141,10 @@ def reach(mission: Mission, tries: Sequence[Try]) -> str | None:
     path, tolerance = _path(tries, mission)
     most = mission.sensing_range + tolerance
     for tick, one in enumerate(tries):
-        for what, rho in (("anchor", one.reading.anchor_range), ("peer", one.reading.mutual_range)):
+        ranged = {"the anchor": one.reading.anchor_range, "the peer": one.reading.mutual_range}
+        for what, rho in (ranged | dict(one.reading.mutual_ranges)).items():
             if rho is not None and rho > most and not mission.noise.outliers:
-                return f"tick {tick}: {rho:.6g} m to the {what}, beyond R = {mission.sensing_range:g} m"
+                return f"tick {tick}: {rho:.6g} m to {what}, beyond R = {mission.sensing_range:g} m"
     some = [
         (pose, one.reading.anchor_range)
         for pose, one in zip(path, tries, strict=True)

@@ -9,10 +9,10 @@ import math
 import time
 from typing import NamedTuple
 
-from protocol.messages import Observation, RobotConfig
+from protocol.messages import RobotConfig
 from protocol.motion import REST, Controls
-from protocol.wire import MalformedFrame, decode, encode
 from world.hardware.driver import Driver, Reading
+from world.hardware.measurements import InvalidReading, mark_frames, observation_frame
 
 SETTLED = 0.1
 """The part of a manoeuvre to wait after its end before sensing."""
@@ -116,16 +116,10 @@ class ExerciseRun:
         tick, began = len(self.tries), time.monotonic()
         reading = self._driver.sense(tick)
         took = time.monotonic() - began
-        if not isinstance(reading, Reading):
-            raise Broken(f"sense({tick}) returns {type(reading).__name__}, expected a Reading")
         try:
-            decode(
-                encode(Observation(tick, self.config.robot, reading.executed, reading.anchor_range)),
-                Observation,
-            )
-            if reading.mutual_range is not None:
-                decode(encode(Observation(tick, self.config.robot, None, reading.mutual_range)), Observation)
-        except (MalformedFrame, TypeError) as error:
+            observation_frame(reading, tick, self.config)
+            mark_frames(reading, tick, self.config.robot)
+        except InvalidReading as error:
             raise Broken(f"sense({tick}): {error}") from None
         manoeuvre_s = self._manoeuvre_s
         self.tries.append(Try(what, asked, share, reading, driving_s / manoeuvre_s, took / manoeuvre_s))

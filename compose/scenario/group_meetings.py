@@ -69,10 +69,6 @@ def group_meetings(robots: Sequence[RobotTable], mission: Mission, planner: Plan
         raise Unworkable(
             f"planner.name: robots with the planner {planner.name} meet in pairs: set robot.peer"
         )
-    if mission.safety_distance:
-        raise Unworkable(
-            "mission.safety_distance: it is not kept in a group: set robot.peer, or leave it out"
-        )
     anchors = [robot.anchor for robot in robots if robot.anchor is not None]
     ids = [robot.id for robot in robots]
     near = _neighbours(anchors)

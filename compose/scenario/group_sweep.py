@@ -39,12 +39,17 @@ def check_unanchored(file: ScenarioFile, source: str) -> None:
             f"{where}: with mission.noise, each robot needs one, because robots do not compute how "
             "inaccurate their poses become on the way to others"
         )
-    for i, robot in enumerate(file.robot):
-        if robot.attack is not None:
-            raise Unworkable(
-                f"{source}: robot[{i}].attack: there is a robot without an anchor, which must believe the "
-                "poses that others report"
-            )
+    if file.mission.safety_distance:
+        raise Unworkable(
+            f"{source}: mission.safety_distance: there is a robot without an anchor, and robots that sweep "
+            "for it do not keep it"
+        )
+    attacks = [i for i, robot in enumerate(file.robot) if robot.attack is not None]
+    if attacks:
+        raise Unworkable(
+            f"{source}: robot[{attacks[0]}].attack: there is a robot without an anchor, which must believe the "
+            "poses that others report"
+        )
     _check_area(file, missing, source)
 
 

@@ -175,6 +175,11 @@ def validate(table: Mapping[str, Any], source: str, faults: Sequence[str] = ()) 
         raise BadScenario(f"{source}: missing field 'robot'")
     if file.group is not None and file.robot:
         raise BadScenario(f"{source}: group: its robots are drawn, so there can be no [[robot]]")
+    dies = file.group.dies if file.group is not None else None
+    if isinstance(dies, list) and dies[0] > dies[1]:
+        raise BadScenario(
+            f"{source}: group.dies: the lower bound {dies[0]} is above the upper bound {dies[1]}"
+        )
     file = _with_robots(file)
     found = ScenarioTemplate(file, _validated(file, source, faults), source, tuple(faults))
     try:
@@ -197,7 +202,7 @@ def _with_robots(file: ScenarioFile) -> ScenarioFile:
     robots[0] = msgspec.structs.replace(robots[0], attack=file.group.attack)
     dies = file.group.dies
     if isinstance(dies, list):
-        dies = random.Random(f"{file.seed}/dies").randint(min(dies), max(dies))
+        dies = random.Random(f"{file.seed}/dies").randint(dies[0], dies[1])
     robots[1] = msgspec.structs.replace(robots[1], dies=dies)
     area = file.mission.area or (0.0, 0.0, side, side)
     return msgspec.structs.replace(

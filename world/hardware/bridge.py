@@ -4,9 +4,9 @@ It sends Observations made from the driver's readings to the agent, and executes
 driver. The agent is the same program as with a simulator. It runs in a process of its own, so if it ends, the
 robot stops after the current manoeuvre.
 
-A tick is a manoeuvre of T_s and a rest, for measurements, Reports and the decision. The robots of a pair
-count the same ticks. Robot a sends a TickStart at the start of each, from which b sets its clock. If none
-arrives, b uses its own clock.
+A tick is a manoeuvre of T_s and a rest, for measurements, Reports and the decision. All robots of a mission
+count the same ticks. Each sends a TickStart at the start of each tick, and sets its clock from those of
+another robot (see `tick_source`). If none arrives, it uses its own clock.
 """
 
 from __future__ import annotations
@@ -17,45 +17,46 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-import msgspec
 import zenoh
 
 from protocol.journal.journal_file import Sink
 from protocol.messages import (
     Command,
-    Contact,
     FinalReport,
     MissionEnd,
-    Observation,
     PeerReport,
     RobotConfig,
+    RobotConfigInGroup,
     TickStart,
+    TickStartInGroup,
     Verdict,
 )
 from protocol.network import keys, session
 from protocol.network.inbox import NOTHING, Arrival, Inbox
 from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode, encode
-from world.hardware.driver import THINKING, Driver, Reading
-from world.hardware.driver_journal import DriverHistory, Mark
-from world.hardware.termination import Ending
+from world.hardware.driver import THINKING, Driver
+from world.hardware.driver_journal import DriverHistory
+from world.hardware.group_termination import GroupEnding
+from world.hardware.measurements import InvalidReading, mark_frames, observation_frame
+from world.hardware.termination import Ending, Termination
+from world.hardware.tick_source import UNHEARD, TickSource
 
 REPEAT_S = 0.25
 """The period in s in which the MissionEnd is repeated."""
 FINAL_REPORT_TIMEOUT_S = 2.0
 """The time in s to wait for the agent's FinalReport."""
 ASTRAY = 64
-"""The maximum number of ticks by which a TickStart of a may differ from b's tick.
+"""The maximum number of ticks by which a TickStart may differ from the tick of a robot that follows it.
 
-One of a much earlier tick was sent by an a that has been restarted without its journal.
+One of a much earlier tick was sent by a robot that has been restarted without its journal.
 """
+AHEAD = 2
+"""The maximum number of ticks by which a robot may be ahead of the one that it follows, and wait for it."""
 
 AT_ONCE = 1000
 """The maximum number of messages that are processed without checking the time."""
 UNKNOWN = -math.inf
 """An unknown time. It is less than any time, because monotonic clocks may start at 0."""
-
-UNHEARD = 4.0
-"""The number of ticks within which a running robot sends a TickStart."""
 
 
 class NoStart(TimeoutError):
@@ -88,7 +89,7 @@ class Field:
         """
         self._driver = driver
         self._config = config
-        self._id, self._peer = config.robot, config.peer
+        self._id, self._others = config.robot, config.others
         self.run = run
         self._inbox = inbox
         self._manoeuvre_s = manoeuvre_s
@@ -97,15 +98,20 @@ class Field:
         self._ended: Callable[[], None] = lambda: None
         self._journal = journal
         self._max_ticks = max_ticks
-        self._ending = Ending(config, max_ticks, self._timeout)
+        self._ending: Termination = (
+            GroupEnding(config, max_ticks, self._timeout)
+            if isinstance(config, RobotConfigInGroup)
+            else Ending(config, max_ticks, self._timeout)
+        )
+        self._source = TickSource(config, self._tick_s)
         self._end: MissionEnd | None = None
         """The journaled end of the mission; None before."""
         self._restarted = False
         """True if this process is a restarted one, even if it was killed before tick 0."""
         self._resumed = False
-        """True if this process is a restarted one that was killed after tick 0."""
-        self._astray = ASTRAY
-        """The number of ticks by which the peer's next TickStart may be ahead."""
+        """True if others may be ahead: this process was killed after tick 0, or has begun after others."""
+        self._astray = max_ticks + 1 if self._source.joins else ASTRAY
+        """The number of ticks by which the next TickStart may be ahead."""
         self._alive: set[str] = set()
         """The robots with a liveliness token."""
         self._unanswered: deque[tuple[int, bytes]] = deque()
@@ -121,13 +127,13 @@ class Field:
     def resume(self, history: DriverHistory, known: int) -> None:
         """Continue at the end of the driver's journal. `known` is the latest tick in the agent's journal.
 
-        The robot rested while this process was down, so the peer may be any number of ticks ahead.
+        The robot rested while this process was down, so the others may be any number of ticks ahead.
         """
         self._restarted = True
         for one in history.ticks:
-            for report in one.reports:
-                self._ending.receive(report)
-            self._end = self._ending.after(one.observation.tick, one.command, peer_there=True)
+            for message in one.received:
+                self._ending.receive(message)
+            self._end = self._ending.after(one.observation.tick, one.command, self._others)
             self.missed += one.command is None
         self._end = history.end or self._end
         self._tick, self._resumed, self._astray = history.tick, history.tick >= 0, self._max_ticks + 1
@@ -144,13 +150,15 @@ class Field:
         return self._ending.verdict
 
     def attach(self, link: zenoh.Session) -> None:
-        """Use the session `link` to communicate with the agent and the peer."""
+        """Use the session `link` to communicate with the agent and the other robots."""
         me, run, inbox = self._id, self.run, self._inbox
         self._observation = session.publisher(link, keys.observation(run, me))
         self._tick_start = session.publisher(link, keys.tick_start(run, me))
         session.subscribe(link, keys.command(run, me), inbox, "command")
-        session.subscribe(link, keys.tick_start(run, self._peer), inbox, "tick-start")
-        session.subscribe(link, keys.report(run, self._peer, me), inbox, "report")
+        for robot in self._others:
+            session.subscribe(link, keys.tick_start(run, robot), inbox, "tick-start")
+        for robot in self._ending.reporters:
+            session.subscribe(link, keys.report(run, robot, me), inbox, "report")
         session.watch_liveliness(link, keys.robot_alive(run, "*"), inbox)
         session.answer(link, keys.config(run, me), lambda _: self._config)
         self._token = session.show_alive(link, keys.world_alive(run))
@@ -158,7 +166,7 @@ class Field:
     def run_mission(self, wait: float, ended: Callable[[], None]) -> MissionEnd:
         """Run the whole mission, stop the robot, and return the MissionEnd.
 
-        `wait` is the time in s to wait for both agents to connect. `ended` is called when the agent's process
+        `wait` is the time in s to wait for all agents to connect. `ended` is called when the agent's process
         has ended. It may restart the process, or raise an error. Raises NoStart; the errors of `ended`;
         Interrupted by a signal; CannotRecord.
         """
@@ -185,42 +193,48 @@ class Field:
     # --- a tick ---
 
     def _gather(self, give_up: float) -> None:
-        """Wait until tick 0 can begin: for a when both agents are connected, for b when a has begun.
+        """Wait until tick 0 can begin: for the first robot when all agents are connected, then for the rest.
 
-        A resumed process only waits for its own agent, because the peer's mission may have ended. If b was
-        killed before tick 0, it may have missed the TickStart of an a that now waits for it. It therefore
-        begins after UNHEARD ticks without one. Raises NoStart.
+        A resumed process only waits for its own agent, because the mission of others may have ended. One
+        that was killed before tick 0 may have missed the TickStart of a robot that now waits for it. It
+        therefore begins after UNHEARD ticks without one. A robot of a group begins at `give_up` without those
+        that are missing, if any other is there. Raises NoStart.
         """
         unheard = time.monotonic() + UNHEARD * self._tick_s
         while not self._may_begin():
-            if self._restarted and {self._id, self._peer} <= self._alive and time.monotonic() >= unheard:
+            missing = [one for one in (self._id, *self._others) if one not in self._alive]
+            if self._restarted and not missing and time.monotonic() >= unheard:
                 self._next = time.monotonic()
                 break
             if time.monotonic() >= give_up:
-                missing = [one for one in (self._id, self._peer) if one not in self._alive]
+                if self._source.joins and self._id not in missing and self._alive > {self._id}:
+                    what = f"{' and '.join(missing)}: not connected" if missing else "no TickStart received"
+                    self._inbox.say(f"{what}; the mission begins")
+                    break
                 moved = "" if self._resumed else "; no robot has moved"
-                raise NoStart(f"{' and '.join(missing) or self._peer}: not connected{moved}")
+                raise NoStart(f"{' and '.join(missing or self._others)}: not connected{moved}")
             until = min(give_up, unheard) if self._restarted and unheard > time.monotonic() else give_up
             self._take(self._inbox.next(until - time.monotonic()))
+        if self._next == UNKNOWN and not self._restarted:  # it follows nobody yet
+            self._astray = ASTRAY
         self._answered = time.monotonic()
 
     def _may_begin(self) -> bool:
         if self._id not in self._alive:
             return False
-        if self._resumed:
+        if self._resumed or self._next != UNKNOWN:
             return True
-        return self._next != UNKNOWN if self._config.role == "b" else self._peer in self._alive
+        return self._source.is_first and self._alive.issuperset(self._others)
 
     def _play_tick(self) -> MissionEnd | None:
         self._tick += 1
         tick = self._tick
         now = time.monotonic()
         self._next = (now if self._next == UNKNOWN else self._next) + self._tick_s
-        if not self._resumed or self._next > now:  # none while catching up: the peer would wait
-            self._tick_start.put(encode(TickStart(tick, self._id)))
-        reading = self._reading(tick)
-        observation = _observation(reading, tick, self._config)
-        self._write(*_mark(reading, tick, self._id), observation)
+        if not self._resumed or self._next > now:  # none while catching up: others would wait
+            self._tick_start.put(encode(self._ending.tick_start(tick)))
+        observation, *marks = self._measured(tick)
+        self._write(*marks, observation)
         self._unanswered.append((tick, observation))
         self._observation.put(observation)
         command = self._wait_for_command(tick)
@@ -236,16 +250,22 @@ class Field:
         self._take_waiting()
         if self._unanswered and now - self._answered > self._timeout:
             return MissionEnd(tick, "failed", f"no answer from {self._id}'s agent for {self._timeout:g} s")
-        return self._ending.after(tick, command, peer_there=self._peer in self._alive)
+        return self._ending.after(tick, command, self._alive)
 
-    def _reading(self, tick: int) -> Reading:
+    def _measured(self, tick: int) -> list[bytes]:
+        """Return the frame of the Observation of `tick`, and that of its mark if it has one.
+
+        Raises DriverFailed.
+        """
         try:
             reading = self._driver.sense(tick)
         except Exception as error:  # a driver of the user may raise anything
             raise DriverFailed(f"sense({tick}): {type(error).__name__}: {error}") from error
-        if not isinstance(reading, Reading):
-            raise DriverFailed(f"sense({tick}): returns {type(reading).__name__}, expected a Reading")
-        return reading
+        try:
+            observation = observation_frame(reading, tick, self._config)
+            return [observation, *mark_frames(reading, tick, self._id)]
+        except InvalidReading as error:
+            raise DriverFailed(f"sense({tick}): {error}") from None
 
     def _stop(self) -> None:
         try:
@@ -327,22 +347,31 @@ class Field:
         return command
 
     def _on_tick_start(self, arrival: Arrival) -> None:
-        """Set the time of b's next tick from a TickStart of a.
+        """Set the time of the next tick from a TickStart of the robot that this one follows.
 
-        b's next tick begins as many ticks later as its number is higher, and at once if it is lower. A
-        restarted a sets its clock from b in the same way, as long as it is behind.
+        The next tick begins as many ticks later as its number is higher, and at once if it is lower. A robot
+        that is behind sets its clock from any other one: if it was restarted, and in a group also if it
+        begins late or is more than AHEAD ticks behind.
         """
-        tick_start: TickStart | None = self._accepted(arrival, TickStart)
-        if tick_start is None:
+        start: TickStart | None = self._accepted(arrival, TickStart | TickStartInGroup)
+        if start is None:
             return
-        left = self._tick + 1 - tick_start.tick
-        if self._config.role == "a" and (left >= 0 or not self._resumed):
+        if self._tick >= 0 and self._ending.receive(start):
+            self._write(arrival.frame)
+        left, now, in_group = self._tick + 1 - start.tick, time.monotonic(), self._source.joins
+        fits = -self._astray <= left <= (AHEAD if self._resumed or self._astray == ASTRAY else ASTRAY)
+        begins = in_group and self._next == UNKNOWN
+        behind = left < 0 and (self._resumed or (in_group and left < -AHEAD))
+        if fits:
+            self._source.hear(start.robot, now)
+        if not (begins or behind or self._source.leads(start.robot, now)):
             return
-        if -self._astray <= left <= (2 if self._resumed or self._astray == ASTRAY else ASTRAY):
-            self._astray = ASTRAY
-            self._next = time.monotonic() + left * self._tick_s
-        else:
-            self._inbox.refuse(arrival, f"it is of tick {tick_start.tick}, this is tick {max(self._tick, 0)}")
+        if not fits:
+            self._inbox.refuse(arrival, f"it is of tick {start.tick}, this is tick {max(self._tick, 0)}")
+            return
+        self._resumed |= in_group and (behind or (begins and left < 0))
+        self._astray = ASTRAY
+        self._next = now + left * self._tick_s
 
     def _on_report(self, arrival: Arrival) -> None:
         report: PeerReport | None = self._accepted(arrival, PeerReport)
@@ -366,31 +395,6 @@ class Field:
                     return
         why = "no answer to the MissionEnd" if self._id in self._alive else "its agent has ended"
         self._inbox.say(f"no FinalReport of {self._id}: {why}")
-
-
-def _observation(reading: Reading, tick: int, config: RobotConfig) -> bytes:
-    """Return the frame of the Observation with `reading`. Raises DriverFailed if a value is invalid."""
-    ranged = reading.mutual_range is not None
-    contacts = (Contact(config.peer, reading.mutual_range, None),) if ranged or reading.contact else ()
-    executed = reading.executed if tick > 0 else None
-    try:
-        frame = encode(Observation(tick, config.robot, executed, reading.anchor_range, contacts))
-        decode(frame, Observation)
-    except (MalformedFrame, TypeError, msgspec.MsgspecError) as error:
-        raise DriverFailed(f"sense({tick}): {error}") from None
-    return frame
-
-
-def _mark(reading: Reading, tick: int, robot: str) -> list[bytes]:
-    """Return the frame of the mark of `reading`, if it has one. Raises DriverFailed if it is invalid."""
-    if not reading.mark:
-        return []
-    try:
-        frame = encode(Mark(tick, robot, reading.mark))
-        decode(frame, Mark)
-    except (MalformedFrame, TypeError, msgspec.MsgspecError) as error:
-        raise DriverFailed(f"sense({tick}): mark: {error}") from None
-    return [frame]
 
 
 def _is_final_report(frame: bytes, robot: str) -> bool:

@@ -7,6 +7,7 @@ docs/driver.md for a guide. `tandem check-driver` tests a driver against this co
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Protocol
 
 import msgspec
@@ -36,6 +37,12 @@ class Reading(msgspec.Struct, frozen=True):
     """True if the peer is within range without a measured range. A measured range always is a contact."""
     mark: tuple[float, ...] = ()
     """The numbers that `resume` gets after a restart, such as the odometer's values at this reading."""
+    mutual_ranges: Mapping[str, float | None] = {}
+    """The range to each robot within range, in m, by its id; None for a contact without a measured range.
+
+    A driver for groups returns these; one for pairs may, in place of `mutual_range` and `contact`, which are
+    about the peer in the RobotConfig.
+    """
 
 
 class Driver(Protocol):
@@ -53,7 +60,7 @@ class Driver(Protocol):
     def sense(self, tick: int) -> Reading:
         """Return the measurements at `tick` (0, 1, 2, ...), within SENSING of a manoeuvre's duration.
 
-        A range within R may only be None if the mission has drop-outs: without them, None means out of range.
+        A range within R may only be missing if the mission has drop-outs: otherwise it means out of range.
         Raise any exception if a measurement fails. This ends the mission of this robot.
         """
 

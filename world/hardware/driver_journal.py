@@ -25,6 +25,7 @@ from protocol.messages import (
     PlannerReport,
     Report,
     RobotConfig,
+    TickStartInGroup,
 )
 from protocol.units import Finite, RobotId, Tick
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
@@ -74,8 +75,8 @@ class DrivenTick(msgspec.Struct, frozen=True):
     """The frame of the Observation."""
     command: Command | None = None
     """The Command of the agent; None if it missed the deadline."""
-    reports: tuple[PeerReport, ...] = ()
-    """The peer's Reports that affect when the mission ends."""
+    received: tuple[PeerReport | TickStartInGroup, ...] = ()
+    """The messages of other robots that affect when the mission ends."""
 
 
 class DriverHistory(msgspec.Struct, frozen=True):
@@ -100,7 +101,9 @@ class DriverHistory(msgspec.Struct, frozen=True):
         return self.end is None and start is not None and not start.synced and start.boot != boot()
 
 
-OfDriver = AnyRobotConfig | ProcessStart | Mark | Observation | Command | PeerReport | MissionEnd
+OfDriver = (
+    AnyRobotConfig | ProcessStart | Mark | Observation | Command | PeerReport | TickStartInGroup | MissionEnd
+)
 """The kinds of messages in the journal of a driver."""
 
 
@@ -131,8 +134,8 @@ def driver_history(frames: Sequence[bytes], config: RobotConfig, path: Path) -> 
                 ticks and message.tick == ticks[-1].observation.tick and ticks[-1].command is None
             ):
                 ticks[-1] = msgspec.structs.replace(ticks[-1], command=message)
-            case Report() | PlannerReport() if ticks:
-                ticks[-1] = msgspec.structs.replace(ticks[-1], reports=(*ticks[-1].reports, message))
+            case Report() | PlannerReport() | TickStartInGroup() if ticks:
+                ticks[-1] = msgspec.structs.replace(ticks[-1], received=(*ticks[-1].received, message))
             case MissionEnd() if end is None:
                 end = message
             case _:

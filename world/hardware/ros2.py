@@ -18,7 +18,7 @@ from typing import Any
 import zenoh
 from rosbags.typesys import Stores, get_typestore
 
-from protocol.messages import RobotConfig
+from protocol.messages import RobotConfig, RobotConfigInGroup
 from protocol.motion import ORIGIN, Controls, Pose, wrap
 from protocol.network import session
 from protocol.network.endpoints import at
@@ -94,6 +94,8 @@ class Ros2:
     ) -> None:
         """Connect to the bridge at the Zenoh endpoint `connect`. The other options are names of topics.
 
+        In a group, the range to robot ID is on the topic `peer_range`/ID.
+
         Raises TimeoutError if there is no bridge within CONNECT_S.
         """
         self._mission = config.mission
@@ -110,7 +112,10 @@ class Ros2:
         self._command = threading.Event()
         """The event that ends the current manoeuvre."""
         self._command.set()  # there is no manoeuvre yet
-        self._anchor, self._peer = anchor_range, peer_range
+        in_group = isinstance(config, RobotConfigInGroup)
+        self._anchor = anchor_range
+        self._peers = {one: f"{peer_range}/{one}" if in_group else peer_range for one in config.others}
+        """The topic of the range to each other robot."""
         self._open = ExitStack()
         give_up = time.monotonic() + CONNECT_S
 
@@ -122,7 +127,7 @@ class Ros2:
         link = self._open.enter_context(session.open_client(at(connect), unanswered))
         self._cmd_vel = session.publisher(link, cmd_vel)
         link.declare_subscriber(odom, lambda sample: self._on_odometry(sample.payload.to_bytes()))
-        for topic in (anchor_range, peer_range):
+        for topic in (anchor_range, *self._peers.values()):
             link.declare_subscriber(topic, self._on_range(topic))
 
     def sense(self, tick: int) -> Reading:
@@ -140,8 +145,14 @@ class Ros2:
             pose, _ = self._pose
             driven = executed(self._last or pose, pose, self._mission.period)
             self._last = pose
-            ranges = self._fresh(self._anchor, since), self._fresh(self._peer, since)
-            return Reading(driven, *ranges, mark=(pose.x, pose.y, pose.heading))
+            anchor_range = self._fresh(self._anchor, since)
+            mutual = [(robot, self._fresh(topic, since)) for robot, topic in self._peers.items()]
+            return Reading(
+                driven,
+                anchor_range,
+                mark=(pose.x, pose.y, pose.heading),
+                mutual_ranges={robot: rho for robot, rho in mutual if rho is not None},
+            )
 
     def drive(self, v: float, omega: float) -> None:
         """Start to publish the velocities repeatedly for the duration of a manoeuvre, and then zero."""
@@ -213,8 +224,9 @@ class Ros2:
 
     def _is_all_here(self, since: float) -> bool:
         came = [self._pose[1] if self._pose else 0.0]
-        came += [self._ranges[topic][1] for topic in (self._anchor, self._peer) if topic in self._ranges]
-        return len(came) == 3 and min(came) >= since
+        topics = (self._anchor, *self._peers.values())
+        came += [self._ranges[topic][1] for topic in topics if topic in self._ranges]
+        return len(came) == 1 + len(topics) and min(came) >= since
 
     def _fresh(self, topic: str, since: float) -> float | None:
         """Return the range in m that arrived on `topic` since then; None if it is out of range, or missing.

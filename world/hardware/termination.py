@@ -1,4 +1,4 @@
-"""The end of a mission in hardware mode, for one robot, from its own result and the peer's Reports.
+"""The end of a pair's mission in hardware mode, for one robot, from its own result and the peer's Reports.
 
 The true poses are unknown, so the outcome is never `wrong`. A robot stays until the peer has acknowledged its
 result. It then continues to send Reports for LAST_WORDS ticks, which contain its own acknowledgement.
@@ -7,6 +7,8 @@ result. It then continues to send Reports for LAST_WORDS ticks, which contain it
 from __future__ import annotations
 
 import time
+from collections.abc import Collection
+from typing import Protocol
 
 from protocol.messages import (
     Command,
@@ -16,6 +18,7 @@ from protocol.messages import (
     PeerReport,
     Report,
     RobotConfig,
+    TickStart,
     Undecided,
     Verdict,
 )
@@ -25,17 +28,38 @@ LAST_WORDS = 4
 """The number of ticks in which a robot still sends Reports after both results are known and acknowledged."""
 
 
-class Ending:
+class Termination(Protocol):
+    """The contract of the end of a mission: the results of the robots, as far as they are known to one."""
+
+    verdict: Verdict | None
+    """The robot's own result; None until it has one."""
+    reporters: tuple[str, ...]
+    """The robots whose Reports contribute to what is known."""
+
+    def receive(self, message: PeerReport | TickStart) -> bool:
+        """Add the message of another robot, and return whether it changes what is known."""
+
+    def tick_start(self, tick: int) -> TickStart:
+        """Return the TickStart of `tick`, with what the others have to know."""
+
+    def after(self, tick: int, command: Command | None, alive: Collection[str]) -> MissionEnd | None:
+        """Return the MissionEnd if `tick`, in which the agent sent `command`, was the last; None otherwise.
+
+        `alive` are the robots whose agent has a liveliness token.
+        """
+
+
+class Ending(Termination):
     """The results of both robots, as far as they are known to this one."""
 
     def __init__(self, config: RobotConfig, max_ticks: int, timeout: float) -> None:
         self._peer = config.peer
+        self.reporters = (config.peer,)
         self._me = config.robot
         self._mission = config.mission
         self._max_ticks = max_ticks
         self._timeout = timeout
         self.verdict: Verdict | None = None
-        """The robot's own result; None until it has one."""
         self._at = 0
         """The tick of the result."""
         self._since = 0.0
@@ -47,15 +71,18 @@ class Ending:
         self._known: int | None = None
         """The tick in which both results were known and acknowledged."""
 
-    def receive(self, report: PeerReport) -> bool:
-        """Add the peer's `report`, and return whether it changes what is known."""
+    def receive(self, message: PeerReport | TickStart) -> bool:
+        """Add the peer's Report, and return whether it changes what is known."""
         before = self._peers, self._is_acknowledged
-        if isinstance(report, Report):
-            heard = report.heard
-        else:  # of a PlannerReport, the one after the result contains it
-            heard = -1 if report.heard is None else report.heard - 1
+        match message:
+            case TickStart():
+                return False
+            case Report(heard=heard):
+                pass
+            case _:  # of a PlannerReport, the one after the result contains it
+                heard = -1 if message.heard is None else message.heard - 1
         self._acknowledged = max(self._acknowledged, heard)
-        self._peers = self._peers or report.verdict
+        self._peers = self._peers or message.verdict
         return (self._peers, self._is_acknowledged) != before
 
     @property
@@ -63,18 +90,19 @@ class Ending:
         """True if the peer has received this robot's result."""
         return self.verdict is not None and self._acknowledged >= self._at
 
-    def after(self, tick: int, command: Command | None, *, peer_there: bool) -> MissionEnd | None:
-        """Return the MissionEnd if `tick`, in which the agent sent `command`, was the last; None otherwise.
+    def tick_start(self, tick: int) -> TickStart:
+        """Return the TickStart of `tick`. The results are in the Reports."""
+        return TickStart(tick, self._me)
 
-        `peer_there` is whether the peer's agent has a liveliness token.
-        """
+    def after(self, tick: int, command: Command | None, alive: Collection[str]) -> MissionEnd | None:
+        """Return the MissionEnd if `tick` was the last; None otherwise. See `Termination.after`."""
         if self.verdict is None and command is not None and command.verdict is not None:
             self.verdict, self._at, self._since = command.verdict, tick, time.monotonic()
         if self.verdict is None:
             if tick >= self._max_ticks:
                 return MissionEnd(tick, "undecided", f"max_ticks: {self._me} not localised by then")
             return None
-        gone = not peer_there and self._peers is not None
+        gone = self._peer not in alive and self._peers is not None
         if self._known is None and self._peers is not None and (self._is_acknowledged or gone):
             self._known = tick
         if self._known is not None and tick >= self._known + LAST_WORDS:

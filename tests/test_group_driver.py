@@ -1,0 +1,389 @@
+"""A robot of a group in hardware mode: whose ticks it counts, when it ends, and what its driver reads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from compose.errors import UserError
+from compose.launch.driver_loader import config_of, mission
+from compose.scenario.scenario_file import parse
+from protocol.journal.journal_file import CorruptJournal, MemoryJournal, Sink
+from protocol.messages import (
+    Command,
+    Contact,
+    FinalReport,
+    Inconsistent,
+    Localised,
+    MissionEnd,
+    Observation,
+    RobotConfigInGroup,
+    TickStartInGroup,
+    Undecided,
+    Verdict,
+)
+from protocol.motion import ORIGIN, REST
+from protocol.network import keys
+from protocol.wire import decode, encode
+from tests.stage import Stage
+from tests.test_driver import FINAL_REPORT, LINK, MANOEUVRE_S, Recorded, command
+from tests.test_group_field import FAR
+from world.hardware.bridge import Field, NoStart
+from world.hardware.driver import THINKING, Reading
+from world.hardware.driver_journal import driver_history
+from world.hardware.group_termination import RESTING_TICKS, GroupEnding
+from world.hardware.measurements import InvalidReading, observation_frame
+from world.hardware.termination import LAST_WORDS
+from world.hardware.tick_source import UNHEARD, TickSource
+
+TICK_S = (1.0 + THINKING) * MANOEUVRE_S
+LOCALISED = Localised(ORIGIN)
+
+
+def config_in_group(robot: str) -> RobotConfigInGroup:
+    config = config_of(parse(FAR, "four"), robot, MANOEUVRE_S)
+    assert isinstance(config, RobotConfigInGroup)
+    return config
+
+
+@pytest.fixture
+def stage(monkeypatch: pytest.MonkeyPatch) -> Stage:
+    return Stage(monkeypatch)
+
+
+class Member:
+    """A robot of the group on a stage, whose agent answers each Observation at once."""
+
+    def __init__(
+        self,
+        stage: Stage,
+        robot: str,
+        max_ticks: int,
+        verdict: Verdict | None = None,
+        journal: Sink | None = None,
+    ) -> None:
+        self.driver = Recorded()
+        self.driver.clock = stage.monotonic
+        self._stage, self._robot, self._verdict = stage, robot, verdict
+        self.field = Field(
+            self.driver,
+            config_in_group(robot),
+            "r",
+            stage,
+            max_ticks=max_ticks,
+            manoeuvre_s=MANOEUVRE_S,
+            journal=journal,
+        )
+        stage.answer = self._answer
+
+    def _answer(self, key: str, frame: bytes) -> None:
+        if key == keys.observation("r", self._robot):
+            message = decode(frame, Observation | MissionEnd | FinalReport)
+            said = (
+                command(message.tick, self._robot, verdict=self._verdict)
+                if isinstance(message, Observation)
+                else replace(FINAL_REPORT, robot=self._robot)
+            )
+            self._stage.comes("command", keys.command("r", self._robot), encode(said), 0.001)
+
+    def play(self, wait: float = 10.0) -> MissionEnd:
+        self.field.attach(LINK)
+        return self.field.run_mission(wait, lambda: None)
+
+    @property
+    def times(self) -> dict[int, float]:
+        """The time of each tick."""
+        return dict(self.driver.ticks)
+
+    def started(self) -> list[int]:
+        """Return the ticks of the TickStarts that it has sent."""
+        key = keys.tick_start("r", self._robot)
+        return [decode(frame, TickStartInGroup).tick for to, frame in self._stage.put_frames if to == key]
+
+
+def begins(stage: Stage, robot: str, ticks: Mapping[int, float]) -> None:
+    """Let the driver of `robot` send the TickStart of each of `ticks` at its time."""
+    for tick, at in ticks.items():
+        stage.comes("tick-start", keys.tick_start("r", robot), encode(TickStartInGroup(tick, robot)), at)
+
+
+# --- whose ticks --------------------------------------------------------------------------------------
+
+
+def test_each_robot_counts_the_ticks_of_the_first_one_that_it_hears() -> None:
+    source, later = TickSource(config_in_group("c"), 1.0), 1.0 + UNHEARD
+    assert source.leads("b", 0.0)
+    source.hear("a", 1.0)
+    source.hear("b", 1.0)
+    assert [source.leads(robot, 2.0) for robot in "abd"] == [True, False, False]
+    assert [source.leads(robot, later) for robot in "abd"] == [True, True, False]
+    assert not source.is_first
+    assert TickSource(config_in_group("a"), 1.0).is_first
+
+
+def test_a_robot_whose_source_falls_silent_counts_the_ticks_of_the_next_one(stage: Stage) -> None:
+    """Robot a is dead after tick 4. Until c has missed it, it uses its own clock."""
+    c = Member(stage, "c", 14)
+    stage.alive("a", "b", "c", "d")
+    begins(stage, "a", {tick: 0.1 + tick * TICK_S for tick in range(5)})
+    late = 0.4 * TICK_S
+    begins(stage, "b", {tick: 0.1 + tick * TICK_S + late for tick in range(15)})
+    assert c.play().tick == 14
+    assert c.times[4] == pytest.approx(0.1 + 4 * TICK_S)
+    assert c.times[8] == pytest.approx(0.1 + 8 * TICK_S)
+    assert c.times[13] == pytest.approx(0.1 + 13 * TICK_S + late)
+    assert c.started() == list(range(15))
+
+
+def test_a_robot_that_comes_late_catches_up_at_rest_though_it_is_the_first(stage: Stage) -> None:
+    """Others do not receive its TickStarts while it is behind, or they would wait for it."""
+    a = Member(stage, "a", 104)
+    stage.alive("a", "c")
+    begins(stage, "c", {tick: 0.5 + (tick - 100) * TICK_S for tick in range(100, 105)})
+    assert a.play().tick == 104
+    assert a.times[100] == pytest.approx(0.5)
+    assert a.times[104] == pytest.approx(0.5 + 4 * TICK_S)
+    assert a.field.missed == 100
+    assert a.started() == [100, 101, 102, 103, 104]
+
+
+def test_the_first_robot_catches_up_if_it_is_behind_the_others(stage: Stage) -> None:
+    """As after a link between two parts of a group that began without each other."""
+    a = Member(stage, "a", 45)
+    stage.alive("a", "b", "c", "d")
+    begins(stage, "d", {tick: (tick - 30) * TICK_S + 0.05 for tick in range(33, 46)})
+    assert a.play().tick == 45
+    assert a.times[45] == pytest.approx(15 * TICK_S + 0.05)
+    assert a.times[2] == pytest.approx(2 * TICK_S, abs=0.01)
+
+
+def test_the_first_robot_does_not_count_the_ticks_of_others(stage: Stage) -> None:
+    a = Member(stage, "a", 9)
+    stage.alive("a", "b", "c", "d")
+    begins(stage, "b", {tick: (tick - 1.5) * TICK_S + 0.05 for tick in range(2, 10)})
+    a.play()
+    assert a.times[9] - a.times[0] == pytest.approx(9 * TICK_S)
+
+
+def test_a_robot_begins_when_any_other_one_does(stage: Stage) -> None:
+    """Here d, whose connection timeout was over first. It is after c in the mission."""
+    c = Member(stage, "c", 3)
+    stage.alive("c", "d")
+    begins(stage, "d", {0: 0.5})
+    assert c.play().tick == 3
+    assert c.times[0] == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("robot", ["a", "c"])
+def test_a_group_begins_without_those_that_do_not_come(
+    robot: str, stage: Stage, capsys: pytest.CaptureFixture[str]
+) -> None:
+    member = Member(stage, robot, 3)
+    stage.alive("a", "c")
+    assert member.play(2.0).tick == 3
+    assert member.times[0] == pytest.approx(2.0)
+    assert "b and d: not connected; the mission begins" in capsys.readouterr().err
+
+
+def test_a_robot_of_a_group_that_is_alone_does_not_begin(stage: Stage) -> None:
+    member = Member(stage, "b", 3)
+    stage.alive("b")
+    with pytest.raises(NoStart, match="a and c and d: not connected; no robot has moved"):
+        member.play(2.0)
+    assert member.driver.commands == []
+
+
+# --- the end ------------------------------------------------------------------------------------------
+
+
+def result(robot: str, verdict: Verdict | None = LOCALISED, *, complete: bool = True) -> TickStartInGroup:
+    return TickStartInGroup(7, robot, verdict, complete)
+
+
+@pytest.fixture
+def ending(stage: Stage) -> GroupEnding:  # noqa: ARG001  # its clock is that of the stage
+    return GroupEnding(config_in_group("a"), 800, 30.0)
+
+
+def ends(
+    ending: GroupEnding, ticks: range, state: str = "localised", alive: str = "abcd"
+) -> MissionEnd | None:
+    """Return the first MissionEnd in `ticks`, in which a is localised."""
+    for tick in ticks:
+        end = ending.after(tick, Command(tick, "a", 0.0, 0.0, 3, state, LOCALISED), alive)
+        if end is not None:
+            return end
+    return None
+
+
+def test_the_own_result_of_a_robot_does_not_end_its_mission_while_others_have_none(
+    ending: GroupEnding,
+) -> None:
+    for robot in "bc":
+        assert ending.receive(result(robot))
+    assert ends(ending, range(10, 700)) is None
+    start = ending.tick_start(700)
+    assert isinstance(start, TickStartInGroup)
+    assert (start.verdict, start.complete) == (LOCALISED, False)
+
+
+def test_the_mission_ends_when_all_know_that_all_have_results(ending: GroupEnding) -> None:
+    for robot in "bcd":
+        ending.receive(result(robot, complete=robot != "c"))
+    assert ends(ending, range(10, 50)) is None
+    assert ending.tick_start(50) == TickStartInGroup(50, "a", LOCALISED, complete=True)
+    assert ending.receive(result("c"))
+    assert not ending.receive(result("c"))
+    assert ends(ending, range(50, 90)) == MissionEnd(50 + LAST_WORDS, "localised", None)
+
+
+def test_a_robot_whose_mission_has_ended_before_is_not_waited_for(ending: GroupEnding) -> None:
+    for robot in "bcd":
+        ending.receive(result(robot, complete=robot != "c"))
+    assert ends(ending, range(10, 50), alive="abd") == MissionEnd(10 + LAST_WORDS, "localised", None)
+
+
+PLAN = 164
+"""The tick before which all are localised, by the plan."""
+
+
+@pytest.mark.parametrize(
+    ("state", "silent_s", "tick"),
+    [
+        ("localised", 31.0, PLAN + LAST_WORDS),
+        ("travelling", 31.0, 2 * PLAN - 1 + LAST_WORDS),
+        ("localised", 29.0, 800),
+    ],
+)
+def test_a_silent_robot_is_given_up_after_its_planned_time_and_a_visit(
+    state: str, silent_s: float, tick: int, stage: Stage, ending: GroupEnding
+) -> None:
+    """The timeout is 30 s. The bound of the plan is 163.3 s, at which b is localised."""
+    ending.receive(result("c"))
+    ending.receive(result("d"))
+    stage.now += silent_s
+    ending.receive(result("c"))
+    why = "a is localised; no result of b received"
+    assert ends(ending, range(10, 1000), state) == MissionEnd(tick, "undecided", why)
+
+
+def test_a_robot_that_has_just_been_localised_does_not_give_up_a_silent_one(
+    stage: Stage, ending: GroupEnding
+) -> None:
+    """Its planner may still wait for the verdict of its peer before it goes there."""
+    stage.now += 31.0
+    for robot in "cd":
+        ending.receive(result(robot))
+    end = ends(ending, range(200, 300))
+    assert end is not None
+    assert end.tick == 200 + RESTING_TICKS + LAST_WORDS
+
+
+@pytest.mark.parametrize(
+    ("verdict", "outcome", "reason"),
+    [
+        (LOCALISED, "localised", None),
+        (Undecided("why"), "undecided", "c: why"),
+        (Inconsistent("x"), "inconsistent", "c: its peer reports x"),
+        (None, "undecided", "a is localised; no result of c received"),
+    ],
+)
+def test_the_outcome_is_that_of_all_robots(
+    verdict: Verdict | None, outcome: str, reason: str | None, ending: GroupEnding
+) -> None:
+    for robot in "bd":
+        ending.receive(result(robot))
+    ending.receive(result("c", verdict))
+    end = ends(ending, range(10, 801))
+    assert end is not None
+    assert (end.outcome, end.reason) == (outcome, reason)
+
+
+def test_a_robot_without_a_result_ends_at_max_ticks(ending: GroupEnding) -> None:
+    for robot in "bcd":
+        ending.receive(result(robot))
+    moving = [ending.after(tick, command(tick), "abcd") for tick in range(801)]
+    assert moving[:800] == [None] * 800
+    assert moving[800] == MissionEnd(800, "undecided", "max_ticks: a not localised by then")
+
+
+def test_results_are_journaled_once_when_they_are_received(stage: Stage) -> None:
+    journal = MemoryJournal()
+    a = Member(stage, "a", 9, LOCALISED, journal)
+    stage.alive("a", "b", "c", "d")
+    for tick in range(3):
+        for robot in "bc":
+            start = encode(replace(result(robot), tick=tick))
+            stage.comes("tick-start", keys.tick_start("r", robot), start, (0.5 + tick) * TICK_S)
+    assert a.play().tick == 9
+    history = driver_history([encode(config_in_group("a")), *journal.frames], config_in_group("a"), Path("a"))
+    assert [one.robot for tick in history.ticks for one in tick.received] == ["b", "c"]
+
+
+def test_results_that_were_received_are_known_after_a_restart(stage: Stage, tmp_path: Path) -> None:
+    config = config_in_group("a")
+    frames = [encode(config), encode(Observation(0, "a", None, 2.0)), encode(command(0, verdict=LOCALISED))]
+    frames += [encode(result(robot)) for robot in "bcd"]
+    history = driver_history(frames, config, tmp_path)
+    assert [one.robot for one in history.ticks[0].received] == ["b", "c", "d"]
+    a = Member(stage, "a", 100, LOCALISED)
+    a.field.resume(history, known=0)
+    stage.alive("a", "b", "c", "d")
+    assert a.play() == MissionEnd(LAST_WORDS, "localised", None)
+    with pytest.raises(CorruptJournal, match="it belongs to another mission"):
+        driver_history(frames, config_in_group("b"), tmp_path)
+
+
+# --- readings -----------------------------------------------------------------------------------------
+
+
+def contacts(reading: Reading, robot: str = "a") -> tuple[Contact, ...]:
+    return decode(observation_frame(reading, 3, config_in_group(robot)), Observation).contacts
+
+
+def test_a_reading_may_have_ranges_to_several_robots() -> None:
+    found = contacts(Reading(REST, 2.0, mutual_ranges={"d": 1.0, "b": None}))
+    assert found == (Contact("b", None, None), Contact("d", 1.0, None))
+    assert contacts(Reading(REST, 2.0)) == ()
+
+
+def test_a_driver_of_a_pair_ranges_to_its_peer_in_both_ways() -> None:
+    pair = config_of(parse(FAR, "four"), "a", MANOEUVRE_S)
+    assert pair.peer == "d"
+    both = Reading(REST, 2.0, 1.5), Reading(REST, 2.0, mutual_ranges={"d": 1.5})
+    assert contacts(both[0]) == contacts(both[1]) == (Contact("d", 1.5, None),)
+    assert contacts(Reading(REST, 2.0, contact=True)) == (Contact("d", None, None),)
+    assert contacts(Reading(REST, 2.0, 1.5, mutual_ranges={"b": 1.0}))[1] == Contact("d", 1.5, None)
+
+
+@pytest.mark.parametrize(
+    ("ranges", "said"),
+    [
+        ({"a": 1.0}, "mutual_ranges: 'a' is none of b, c, d"),
+        ({"x": 1.0}, "mutual_ranges: 'x' is none of b, c, d"),
+        ({3: 1.0}, "mutual_ranges: 3 is none of b, c, d"),
+        ({"b": -1.0}, "Expected `float` >= 0.0"),
+        ({"b": float("nan")}, "Expected `float`"),
+        ({"b": "1"}, "Expected `float"),
+        ([("b", 1.0)], "mutual_ranges is a list, expected a mapping"),
+        (None, "mutual_ranges is a NoneType, expected a mapping"),
+    ],
+)
+def test_a_reading_with_invalid_ranges_is_refused(ranges: Any, said: str) -> None:
+    with pytest.raises(InvalidReading, match=said):
+        contacts(Reading(REST, 2.0, mutual_ranges=ranges))
+
+
+def test_a_reading_with_two_contacts_with_the_peer_is_refused() -> None:
+    with pytest.raises(InvalidReading, match="both mutual_ranges and the other fields have a contact with d"):
+        contacts(Reading(REST, 2.0, 1.0, mutual_ranges={"d": 1.0}))
+
+
+def test_a_robot_that_dies_by_the_scenario_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "dies.toml").write_text(f"{FAR}dies = 5\n")
+    with pytest.raises(UserError, match="dies: not available in hardware mode"):
+        mission(str(tmp_path / "dies.toml"), "a")

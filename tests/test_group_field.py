@@ -1,0 +1,208 @@
+"""A group in hardware mode: one `tandem robot` each, with the drivers of simulated robots."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from signal import SIGINT, SIGKILL
+
+import pytest
+
+from agent.process.agent_journal import AgentHistory, Step
+from compose.launch.in_process import run_mission
+from compose.launch.processes import free_endpoint
+from compose.scenario.scenario_file import parse
+from protocol.messages import RobotConfigInGroup
+from protocol.motion import REST, Pose, step
+from tests.commands import BOUND_S, SECTION_IV, Ended, TandemProcess, processes_of, size, tandem, until
+from tests.test_field import beacon, pose, told
+
+
+def four(seed: int, *anchors: tuple[float, float]) -> str:
+    """Return a scenario of four robots."""
+    placed = [
+        f'[[robot]]\nid = "{name}"\nanchor = {[*at]}\n' for name, at in zip("abcd", anchors, strict=True)
+    ]
+    return f'name = "four"\nseed = {seed}\n{SECTION_IV}\n{"".join(placed)}'
+
+
+FAR = four(22, (17.2, 2.5), (0.4, 18.0), (3.3, 2.2), (11.7, 6.2))
+"""A group in which a and d meet first; then a visits c, and d visits b. All are localised after 41 ticks."""
+NEAR = four(275, (11.4, 12.4), (8.6, 5.6), (4.4, 2.7), (5.0, 9.4))
+"""A group in which more than two robots are within range of each other at once."""
+RATE = 4
+
+
+class Group:
+    """The robots of a group, each of which connects to all earlier ones."""
+
+    def __init__(
+        self, out: Path, text: str, open_ones: ExitStack, lost: Sequence[str], keys: Path | None
+    ) -> None:
+        """`text` is the scenario, `lost` are options of the beacon, and `keys` is the folder of the keys."""
+        self._out, self._open, self._keys = out, open_ones, keys
+        self._air = open_ones.enter_context(beacon(*lost))
+        self.scenario = parse(text, "four")
+        self._endpoints = [free_endpoint("tls" if keys else "tcp") for _ in self.scenario.robots]
+        self._patience = "8" if lost else "60"
+        (out / "four.toml").write_text(text)
+        self.robots: dict[str, TandemProcess] = {}
+
+    def start(self, *names: str) -> None:
+        """Start these robots, with the same commands each time."""
+        for name in names:
+            start, place = self.scenario.robot(name).start, "abcd".index(name)
+            connect = [word for one in self._endpoints[:place] for word in ("--connect", one)]
+            self.robots[name] = self._open.enter_context(
+                TandemProcess(
+                    *("robot", name, "--mission", self._out / "four.toml", "--driver", "docs.rover:Rover"),
+                    *("--rate", str(RATE), "--out", self._out / name, "--listen", self._endpoints[place]),
+                    *connect,
+                    *(("--keys", self._keys / "world") if self._keys else ()),
+                    *("--connect-timeout", self._patience),
+                    *("--option", f"start={start.x!r},{start.y!r},{start.heading!r}"),
+                    *("--option", f"beacon={self._air}", "--option", f"state={self._out / f'body-{name}'}"),
+                    *("--option", "timeout=60"),
+                )
+            )
+
+    def kill(self, name: str) -> None:
+        """Kill all processes of a robot."""
+        self.robots[name].tell(SIGKILL)
+        self.robots[name].ended()
+        until(lambda: not processes_of((self._out / name).resolve()), f"{name}'s agent has ended")
+
+    def said(self) -> str:
+        """Return what all robots have printed."""
+        return "\n".join([f"{name}: {one.out}{one.err}" for name, one in self.robots.items()])
+
+
+@contextmanager
+def group(out: Path, text: str, *lost: str, keys: Path | None = None) -> Iterator[Group]:
+    with ExitStack() as open_ones:
+        yield Group(out, text, open_ones, lost, keys)
+
+
+def pose_at_end(agent: AgentHistory) -> Pose:
+    """Return the final pose of a robot by its claim and its odometry."""
+    last = agent.steps[-1].command or REST
+    return step(agent.path[-1], last.v, last.omega, agent.config.mission.period)
+
+
+def all_are_localised(out: Path, four: Group) -> dict[str, Ended]:
+    """Assert that all robots end localised, correctly, and that audit and replay find nothing."""
+    until(lambda: not any(robot.running for robot in four.robots.values()), four.said, 3.0 * BOUND_S)
+    ends = {name: robot.ended() for name, robot in four.robots.items()}
+    both = out / "all"
+    both.mkdir()
+    for name, ended in ends.items():
+        assert ended.status == 0, ended.out + ended.err
+        assert f"{name}: localised after" in ended.out
+        agent = told(out, name)
+        assert isinstance(agent.config, RobotConfigInGroup)
+        found = pose_at_end(agent)
+        assert (found.x, found.y) == pytest.approx(pose(ended, name, "truly at")[:2], abs=1e-6)
+        assert [one.observation.tick for one in agent.steps] == list(range(len(agent.steps)))
+        assert tandem("replay", out / name).status == 0
+        shutil.copy(out / name / f"agent-{name}.journal", both)
+    audited = tandem("audit", both)
+    assert audited.status == 0, audited.out
+    return ends
+
+
+@pytest.mark.parametrize(("text", "encrypted"), [(FAR, False), (NEAR, True)])
+@pytest.mark.long
+def test_four_robots_localise_in_hardware_mode(tmp_path: Path, text: str, encrypted: bool) -> None:
+    """If all Commands and Reports are in time, each is localised in the same tick as in simulation."""
+    keys = tmp_path / "keys" if encrypted else None
+    if encrypted:
+        assert tandem("keys", tmp_path / "keys", "--robots", "a,b,c,d").status == 0
+    with group(tmp_path, text, keys=keys) as four:
+        four.start("d", "b", "a", "c")  # in any order
+        ends = all_are_localised(tmp_path, four)
+    agents = {name: told(tmp_path, name) for name in four.robots}
+    near = any(len(one.observation.contacts) > 1 for agent in agents.values() for one in agent.steps)
+    assert near or text == FAR
+    late = any(f"{name}: missed the deadline in 0 of" not in ended.out for name, ended in ends.items())
+    late = late or any(one.missed for agent in agents.values() for one in agent.steps)
+    simulated = run_mission(four.scenario)
+    for name, agent in agents.items():
+        claim, expected = agent.claim, simulated.claim(name)
+        assert claim is not None
+        assert expected is not None
+        assert late or claim[0] == expected.tick
+
+
+@pytest.mark.parametrize("killed", ["a", "c"])
+@pytest.mark.long
+def test_a_killed_robot_of_a_group_resumes(tmp_path: Path, killed: str) -> None:
+    """The first one, whose ticks the others count, or one that waits to be visited."""
+    with group(tmp_path, FAR) as four:
+        four.start("a", "b", "c", "d")
+        four.robots[killed].until(lambda: len(steps(tmp_path, killed)) > 15, "some ticks are over")
+        four.kill(killed)
+        before = len(told(tmp_path, killed).steps)
+        four.start(killed)
+        all_are_localised(tmp_path, four)
+        assert f"{killed}: in run four, resumed at tick {before - 1}" in four.robots[killed].out
+    assert len(told(tmp_path, killed).steps) > before
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("amount", range(500, 9000, 1700))
+@pytest.mark.parametrize("killed", ["a", "bd", "abcd"])
+def test_robots_of_a_group_that_are_killed_at_any_moment_resume(
+    tmp_path: Path, killed: str, amount: int
+) -> None:
+    with group(tmp_path, FAR) as four:
+        four.start("a", "b", "c", "d")
+        for name in killed:
+            path, robot = tmp_path / name / f"agent-{name}.journal", four.robots[name]
+            until(lambda path=path, robot=robot: size(path) >= amount or not robot.running, four.said)  # type: ignore[misc]
+        for name in killed:
+            four.robots[name].tell(SIGKILL)
+        for name in killed:
+            four.kill(name)
+        four.start(*killed)
+        all_are_localised(tmp_path, four)
+
+
+@pytest.mark.long
+def test_a_robot_that_is_dead_for_good_keeps_the_others_from_nothing(tmp_path: Path) -> None:
+    """Robot a, whose ticks the others count, dies on the way to c: another one visits c later."""
+    with group(tmp_path, FAR, "--lost", "2") as four:
+        four.start("a", "b", "c", "d")
+        four.robots["a"].until(lambda: claims(tmp_path, "a"), "a is localised")
+        four.kill("a")
+        until(lambda: all(claims(tmp_path, name) for name in "bcd"), four.said, 3.0 * BOUND_S)
+        for name in "bcd":
+            four.robots[name].tell(SIGINT)
+        for name in "bcd":
+            ended = four.robots[name].ended()
+            assert ended.status == 130
+            found = pose_at_end(told(tmp_path, name))
+            assert (found.x, found.y) == pytest.approx(pose(ended, name, "truly at")[:2], abs=1.0)
+
+
+@pytest.mark.long
+def test_a_robot_that_comes_late_joins_its_group(tmp_path: Path) -> None:
+    """The others begin without it after the connection timeout."""
+    with group(tmp_path, NEAR, "--lost", "1") as four:
+        four.start("b", "c", "d")
+        four.robots["b"].until(lambda: len(steps(tmp_path, "b")) > 3, "the mission has begun")
+        assert "a: not connected; the mission begins" in four.said()
+        four.start("a")
+        all_are_localised(tmp_path, four)
+
+
+def steps(out: Path, robot: str) -> Sequence[Step]:
+    """Return the ticks in the journal of `robot`; none if there is no journal yet."""
+    path = out / robot / f"agent-{robot}.journal"
+    return told(out, robot).steps if path.exists() and size(path) else ()
+
+
+def claims(out: Path, robot: str) -> bool:
+    """Return whether `robot` has claimed a pose."""
+    return bool(steps(out, robot)) and told(out, robot).claim is not None

@@ -1,0 +1,123 @@
+"""The safety distance between all robots of a group, of which most do not meet each other."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from agent.planning.passing import BLOCKED_AFTER, YIELDS, Passing, leeway, passed, yielding
+from agent.planning.phase2_orbit import Orbiting, Travelling
+from compose.audit.rules import audit_run
+from compose.launch.in_process import run_mission
+from compose.recording.closest_approach import nearest
+from compose.recording.run import of_frames
+from compose.scenario.scenario_file import validate
+from protocol.messages import Contact
+from protocol.mission import Mission
+from protocol.motion import Pose
+from tests.groups import localised, table_of
+from tests.series import series
+from tests.test_audit import kept
+from world.scenario import Scenario
+
+MISSION = Mission(3.0, 1.0, 1.0, math.pi, safety_distance=0.5)
+
+
+def group_apart(robots: int, seed: int, distance: float, sigma: float = 0.0) -> Scenario:
+    """Return a group with a safety distance."""
+    table = table_of(robots, seed, sigma=sigma)
+    table["mission"]["safety_distance"] = distance
+    return validate(table, "group.toml").scenario
+
+
+def contact(peer: str, rho: float | None) -> Contact:
+    return Contact(peer, rho, ())
+
+
+# --- one tick -----------------------------------------------------------------------------------------
+
+
+@given(st.floats(0.5, 3.0), st.floats(-math.pi, math.pi), st.floats(-math.pi, math.pi))
+def test_two_robots_that_drive_their_leeway_keep_the_distance(
+    rho: float, bearing: float, other: float
+) -> None:
+    free = leeway([contact("b", rho)], None, MISSION)
+    x = rho + free * (math.cos(other) - math.cos(bearing))
+    y = free * (math.sin(other) - math.sin(bearing))
+    assert math.hypot(x, y) >= MISSION.safety_distance - 1e-12
+
+
+def test_the_peer_of_the_meeting_and_robots_out_of_range_limit_nothing() -> None:
+    assert leeway([], "b", MISSION) == math.inf
+    assert leeway([contact("b", 0.6)], "b", MISSION) == math.inf
+    assert leeway([contact("b", 0.6), contact("c", 2.5)], "b", MISSION) == pytest.approx(1.0)
+
+
+def test_a_robot_stands_still_where_a_range_is_missing() -> None:
+    assert leeway([contact("c", None), contact("d", 2.5)], "b", MISSION) == 0.0
+
+
+def test_a_blocked_robot_drives_back_and_aside_and_the_next_time_to_the_other_side() -> None:
+    mode, passing = Travelling((9.0, 0.0)), Passing()
+    for _ in range(BLOCKED_AFTER):
+        assert passing.places == ()
+        passing = passed(passing, mode, Pose(0.0, 0.0, 0.0), 0.01, MISSION)
+    back, aside = passing.places
+    assert back[0] == aside[0] < -MISSION.safety_distance
+    assert back[1] == 0.0
+    assert aside[1] > 2.0 * MISSION.safety_distance
+    again = Passing(detours=passing.detours, blocked=BLOCKED_AFTER)
+    assert passed(again, mode, Pose(0.0, 0.0, 0.0), 0.01, MISSION).places[1][1] == -aside[1]
+
+
+def test_a_robot_that_is_free_or_does_not_travel_drives_no_way_aside() -> None:
+    here = Pose(0.0, 0.0, 0.0)
+    nearly = Passing(blocked=BLOCKED_AFTER)
+    assert passed(nearly, Travelling((9.0, 0.0)), here, 0.5, MISSION).blocked == 0
+    assert passed(nearly, Orbiting(), here, 0.01, MISSION).places == ()
+
+
+def test_a_robot_yields_to_a_near_one_that_goes_first_but_not_for_ever() -> None:
+    assert yielding(Passing(), [contact("a", 0.6)], MISSION)
+    assert not yielding(Passing(), [contact("a", 2.0)], MISSION)
+    assert not yielding(Passing(), [], MISSION)
+    assert not yielding(Passing(yielded=YIELDS), [contact("a", 0.6)], MISSION)
+
+
+# --- missions -----------------------------------------------------------------------------------------
+
+CASES = [(4, 20, 1.0), (8, 28, 0.5), (4, 10, 1.0), (8, 34, 0.5), (8, 39, 0.5), (4, 43, 1.0), (16, 1, 0.5)]
+"""Groups in which robots blocked each other before visited robots let their visitors leave, before blocked
+ones drove aside, or before one of two yielded."""
+
+
+@pytest.mark.parametrize("case", series(CASES, 2))
+def test_all_robots_keep_the_distance_and_are_localised_within_the_bound(
+    case: tuple[int, int, float],
+) -> None:
+    scenario = group_apart(*case)
+    run = run_mission(scenario)
+    assert localised(run) == set(run.robots)
+    least = nearest(run)
+    assert least is not None
+    assert least >= case[2] - 1e-9
+    assert run.end is not None
+    assert run.end.tick * scenario.mission.period <= scenario.meetings[-1].ends
+
+
+@pytest.mark.long
+def test_the_audit_of_a_group_with_a_safety_distance_is_clean() -> None:
+    found = audit_run(of_frames(kept(group_apart(4, 10, 1.0))))
+    assert found.violations == ()
+
+
+@pytest.mark.long
+def test_robots_with_noisy_ranges_keep_the_distance() -> None:
+    run = run_mission(group_apart(4, 3, 0.5, sigma=0.05))
+    assert localised(run) == set(run.robots)
+    least = nearest(run)
+    assert least is not None
+    assert least >= 0.5

@@ -1,0 +1,124 @@
+"""The end of the mission of a robot in a group, in hardware mode.
+
+In a group, a Report contains the verdict of a meeting, and robots are seldom in contact. Therefore the
+drivers send each other the results of their robots, with every TickStart.
+
+A robot's own result does not end its mission, because others may need it: it stays until all robots have a
+result, and know of each other's. It does not wait for ever for a robot that has been silent for the timeout.
+Once that robot should be localised by the plan, its planner goes there. The mission ends when the planner has
+nothing to do any more, or when this takes as long as the whole plan. In any case, it ends at max_ticks.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection
+
+from protocol.messages import (
+    Command,
+    Inconsistent,
+    Localised,
+    MissionEnd,
+    PeerReport,
+    RobotConfigInGroup,
+    TickStart,
+    TickStartInGroup,
+    Undecided,
+    Verdict,
+)
+from world.hardware.termination import LAST_WORDS, Termination
+from world.referee import inaccuracy
+
+RESTING_STATES = ("localised", "undecided", "inconsistent")
+"""The states of a planner whose meeting is over."""
+RESTING_TICKS = 16
+"""The ticks in such a state after which the robot has no visit to make.
+
+A planner that waits for the verdict of its peer goes on 8 ticks after it has left it.
+"""
+
+
+class GroupEnding(Termination):
+    """The results of all robots of a group, as far as they are known to one of them."""
+
+    def __init__(self, config: RobotConfigInGroup, max_ticks: int, timeout: float) -> None:
+        self.verdict: Verdict | None = None
+        self.reporters = ()
+        self._me = config.robot
+        self._mission = config.mission
+        self._max_ticks = max_ticks
+        self._timeout = timeout
+        self._group, self._others = config.group, {*config.others}
+        self._ends = {one.robot: one.ends for one in config.members}
+        """The tick until which each robot is localised, by the plan."""
+        self._plan = max(self._ends.values())
+        """The tick until which all are."""
+        self._results: dict[str, Verdict] = {}
+        """The results that have been received, by robot."""
+        self._complete: set[str] = set()
+        """The robots that wait for no other one."""
+        self._heard = dict.fromkeys(self._others, time.monotonic())
+        """The time at which each robot was heard last, on the monotonic clock."""
+        self._is_complete = False
+        """True if this robot has its result, and waits for no other one."""
+        self._resting = 0
+        """The number of consecutive ticks in which the planner had nothing to do."""
+        self._known: int | None = None
+        """The tick in which no robot waited for another one any more."""
+
+    def receive(self, message: PeerReport | TickStart) -> bool:
+        """Add the TickStart of another robot, and return whether it changes what is known."""
+        if not isinstance(message, TickStartInGroup) or message.robot not in self._others:
+            return False
+        robot = message.robot
+        self._heard[robot] = time.monotonic()
+        before = robot in self._results, robot in self._complete
+        if message.verdict is not None:
+            self._results.setdefault(robot, message.verdict)
+        (self._complete.add if message.complete else self._complete.discard)(robot)
+        return (robot in self._results, robot in self._complete) != before
+
+    def tick_start(self, tick: int) -> TickStart:
+        """Return the TickStart of `tick`, with this robot's result."""
+        return TickStartInGroup(tick, self._me, self.verdict, self._is_complete)
+
+    def after(self, tick: int, command: Command | None, alive: Collection[str]) -> MissionEnd | None:
+        """Return the MissionEnd if `tick` was the last; None otherwise. See `Termination.after`."""
+        if command is not None:
+            self.verdict = self.verdict or command.verdict
+            self._resting = self._resting + 1 if command.state in RESTING_STATES else 0
+        lost = [robot for robot in self._others if self._is_lost(robot, tick)]
+        self._is_complete = self.verdict is not None and self._results.keys() | {*lost} >= self._others
+        ended = {robot for robot in self._results if robot not in alive}
+        if self._known is None and self._is_complete and self._complete | ended | {*lost} >= self._others:
+            self._known = tick
+        if tick >= self._max_ticks or (self._known is not None and tick >= self._known + LAST_WORDS):
+            return self._end(tick)
+        return None
+
+    def _is_lost(self, robot: str, tick: int) -> bool:
+        """Return whether this robot does not wait for `robot` any more, of which it has heard nothing."""
+        if time.monotonic() - self._heard[robot] <= self._timeout:
+            return False
+        late = tick - self._ends.get(robot, self._plan)
+        return late > self._plan or (late > 0 and self._resting > RESTING_TICKS)
+
+    def _end(self, tick: int) -> MissionEnd:
+        if self.verdict is None:
+            return MissionEnd(tick, "undecided", f"max_ticks: {self._me} not localised by then")
+        results = {**self._results, self._me: self.verdict}
+        known = [(robot, results[robot]) for robot in self._group if robot in results]
+        for robot, verdict in known:
+            if isinstance(verdict, Inconsistent):
+                return MissionEnd(tick, "inconsistent", f"{robot}: its peer reports {verdict.claim}")
+        for robot, verdict in known:
+            match verdict:
+                case Undecided(reason):
+                    return MissionEnd(tick, "undecided", f"{robot}: {reason}")
+                case Localised() if (vague := inaccuracy(verdict, self._mission)) is not None:
+                    return MissionEnd(tick, "undecided", f"{robot} {vague}")
+        missing = [robot for robot in self._group if robot not in results]
+        if missing:
+            what = f"{self._me} is localised; no result of {', '.join(missing)} received"
+            return MissionEnd(tick, "undecided", what)
+        return MissionEnd(tick, "localised", None)

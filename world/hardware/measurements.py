@@ -1,0 +1,62 @@
+"""The messages that are made from the readings of a driver, which may contain anything."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+
+from protocol.messages import Contact, Message, Observation, RobotConfig
+from protocol.wire import MalformedFrame, decode, encode
+from world.hardware.driver import Reading
+from world.hardware.driver_journal import Mark
+
+
+class InvalidReading(Exception):
+    """The reading of a driver is invalid. The text of the error says why."""
+
+
+def observation_frame(reading: Any, tick: int, config: RobotConfig) -> bytes:
+    """Return the frame of the Observation with `reading`. Raises InvalidReading."""
+    if not isinstance(reading, Reading):
+        raise InvalidReading(f"returns {type(reading).__name__}, expected a Reading")
+    executed = reading.executed if tick > 0 else None
+    contacts = _contacts(reading, config)
+    return _checked(Observation(tick, config.robot, executed, reading.anchor_range, contacts))
+
+
+def mark_frames(reading: Reading, tick: int, robot: str) -> list[bytes]:
+    """Return the frame of the mark of `reading`, if it has one. Raises InvalidReading."""
+    if not reading.mark:
+        return []
+    try:
+        return [_checked(Mark(tick, robot, reading.mark))]
+    except InvalidReading as error:
+        raise InvalidReading(f"mark: {error}") from None
+
+
+def _contacts(reading: Reading, config: RobotConfig) -> tuple[Contact, ...]:
+    """Return the contacts in `reading`. Raises InvalidReading."""
+    if not isinstance(reading.mutual_ranges, Mapping):
+        raise InvalidReading(f"mutual_ranges is a {type(reading.mutual_ranges).__name__}, expected a mapping")
+    ranges, peer = dict(reading.mutual_ranges), config.peer
+    if reading.mutual_range is not None or reading.contact:
+        if peer in ranges:
+            raise InvalidReading(f"both mutual_ranges and the other fields have a contact with {peer}")
+        ranges[peer] = reading.mutual_range
+    found = tuple([Contact(one, ranges.pop(one), None) for one in config.others if one in ranges])
+    if ranges:
+        stranger = next(iter(ranges))
+        raise InvalidReading(f"mutual_ranges: {stranger!r} is none of {', '.join(config.others)}")
+    return found
+
+
+def _checked(message: Message) -> bytes:
+    """Return the frame of `message` if it can be decoded. Raises InvalidReading."""
+    try:
+        frame = encode(message)
+        decode(frame, type(message))
+    except (MalformedFrame, TypeError, msgspec.MsgspecError) as error:
+        raise InvalidReading(str(error)) from None
+    return frame
