@@ -282,7 +282,7 @@ def test_what_cannot_be_localised_is_refused_in_one_line(change: Any, message: s
 def test_hardware_mode_refuses_robots_without_an_anchor(tmp_path: Path) -> None:
     scenario = tmp_path / "four.toml"
     scenario.write_text(FILE, encoding="utf-8")
-    with pytest.raises(UserError, match="robot: u has no anchor, which is not available in hardware mode"):
+    with pytest.raises(UserError, match="robot: u has no anchor: not available in hardware mode"):
         mission(str(scenario), "a")
 
 

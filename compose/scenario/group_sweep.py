@@ -47,8 +47,8 @@ def check_unanchored(file: ScenarioFile, source: str) -> None:
     attacks = [i for i, robot in enumerate(file.robot) if robot.attack is not None]
     if attacks:
         raise Unworkable(
-            f"{source}: robot[{attacks[0]}].attack: there is a robot without an anchor, which must believe the "
-            "poses that others report"
+            f"{source}: robot[{attacks[0]}].attack: there is a robot without an anchor, which must believe "
+            "the poses that others report"
         )
     _check_area(file, missing, source)
 
