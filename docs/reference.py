@@ -32,13 +32,19 @@ from compose.recording.ticks_csv import TickRow
 from compose.scenario.fault_syntax import FaultTable
 from compose.scenario.json_schema import described
 from compose.scenario.kills import KillTable
-from compose.scenario.scenario_tables import GroupTable, PlannerTable, RobotTable, ScenarioFile, WorldTable
+from compose.scenario.scenario_tables import (
+    GroupTable,
+    MissionTable,
+    PlannerTable,
+    RobotTable,
+    ScenarioFile,
+    WorldTable,
+)
 from compose.sweep.draws import DrawTable, StartsTable
 from compose.sweep.spec import AxisTable, RowTable, SpecFile
 from compose.sweep.trial import RobotRow, TrialRow
 from protocol import messages, wire
 from protocol.attack import Attack
-from protocol.mission import Mission
 from protocol.network import keys
 from protocol.noise import Noise, VelocityNoise
 from tandem import rows
@@ -55,7 +61,7 @@ PARTS = (
 )
 """structs that messages contain, and that have no tables on other pages"""
 NAMES = {
-    "Mission": "table `[mission]`",
+    "MissionTable": "table `[mission]`",
     "RobotTable": "`[[robot]]`",
     "GroupTable": "`[group]`",
     "PlannerTable": "table `[planner]`",
@@ -264,7 +270,7 @@ def _help(action: argparse.Action) -> str:
 
 TABLES: dict[str, Callable[[], str]] = {
     "scenario": partial(fields_of, ScenarioFile),
-    "mission": partial(fields_of, Mission),
+    "mission": partial(fields_of, MissionTable),
     "planner": partial(fields_of, PlannerTable),
     "robot": partial(fields_of, RobotTable),
     "group": partial(fields_of, GroupTable),

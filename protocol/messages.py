@@ -15,9 +15,11 @@ Decoding checks the type and the bounds of every field, which are part of the ty
 Message        Direction                              When
 ============== ====================================== ==========================================
 RobotConfig    world -> robot                         once, in answer to the robot's query; with
-                                                      options of the planner, its own kind
+                                                      options of the planner, or in a group, its
+                                                      own kind
 Observation    world -> robot                         every tick
-Report         robot -> its peer                      every tick in which the two are in contact
+Report         robot -> its peer                      every tick in which the two are in contact; with a
+                                                      pose, its own kind
 PlannerReport  robot -> its peer                      in place of Report, by planners with own reports
 Command        robot -> world                         every tick
 Estimate       robot -> viewers                       every tick
@@ -49,8 +51,9 @@ from msgspec.structs import force_setattr
 
 from protocol.attack import Attack
 from protocol.mission import Anchor, Mission, Options, PlannerName, Role
-from protocol.motion import Controls, Covariance, Pose, Segment
+from protocol.motion import ORIGIN, Controls, Covariance, Pose, Segment
 from protocol.orbits import Orbit, Rendezvous, visiting
+from protocol.sweep_strips import SweptArea
 from protocol.units import (
     Angle,
     AngularVelocity,
@@ -293,6 +296,10 @@ class Member(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields
     """The last tick within the planned bound of the time at which it is localised."""
 
 
+NO_SWEEP = SweptArea(0.0, 0.0, 0.0, 0.0, 1)
+"""The sweep of an area without any extent."""
+
+
 class Retry(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """A meeting of a pair that is only needed if earlier ones have failed."""
 
@@ -315,7 +322,7 @@ class RobotConfigInGroup(RobotConfigWithOptions, frozen=True, dict=True):
     """
 
     members: Annotated[tuple[Member, ...], Meta(max_length=MAX_MEMBERS)] = ()
-    """All robots of the group, in the order of the scenario."""
+    """All robots of the group that have an anchor, in the order of the scenario."""
     visits: Annotated[tuple[RobotId, ...], Meta(max_length=MAX_MEMBERS)] = ()
     """The robots that this one visits after its first meeting, in their order."""
     retries: Annotated[tuple[Retry, ...], Meta(max_length=MAX_MEMBERS)] = ()
@@ -359,7 +366,46 @@ class RobotConfigInGroup(RobotConfigWithOptions, frozen=True, dict=True):
         return msgspec.structs.replace(self, peer=peer, role=role, peer_anchor=anchor, rendezvous=orbits)
 
 
-AnyRobotConfig = RobotConfig | RobotConfigWithOptions | RobotConfigInGroup
+class RobotConfigWithSweep(RobotConfigInGroup, frozen=True, dict=True):
+    """The configuration of a robot that sweeps an area for robots without an anchor, after its visits."""
+
+    unanchored: Annotated[tuple[RobotId, ...], Meta(max_length=MAX_MEMBERS)] = ()
+    """The robots without an anchor, in the order of the scenario."""
+    sweep: SweptArea = NO_SWEEP
+    """The area in which they are, and the number of its parts."""
+    part: Count = 0
+    """The part that this robot sweeps first."""
+
+    @property
+    def group(self) -> tuple[str, ...]:
+        """All robots of the group: those with an anchor, then those without one."""
+        return (*super().group, *self.unanchored)
+
+    @cached_property
+    def widest_distance(self) -> float:
+        """The largest distance between two anchors of the group or corners of the area, in m.
+
+        The poses of robots in the area follow from those of robots with an anchor.
+        """
+        places = [(one.anchor.x, one.anchor.y) for one in self.members] + list(self.sweep.corners)
+        return max([math.dist(*two) for two in combinations(places, 2)])
+
+
+class RobotConfigWithoutAnchor(RobotConfigWithSweep, frozen=True, dict=True):
+    """The configuration of a robot without an anchor, which waits until a localised robot finds it.
+
+    `anchor` and `peer_anchor` are the centre of the area in which it is. `peer` is the first of the robots
+    that sweep it. There are no visits and retries.
+    """
+
+
+AnyRobotConfig = (
+    RobotConfig
+    | RobotConfigWithOptions
+    | RobotConfigInGroup
+    | RobotConfigWithSweep
+    | RobotConfigWithoutAnchor
+)
 """The kinds of configurations."""
 
 
@@ -435,6 +481,16 @@ class Report(Message, frozen=True):
         return self.start is not None or self.through > 0
 
 
+class ReportWithPose(Report, frozen=True):
+    """The report of a localised robot to one without an anchor, with exact sensors. It has no log.
+
+    The other robot believes the pose: it cannot compute it itself.
+    """
+
+    pose: Pose = ORIGIN
+    """The sender's pose at tick k in <W>: m, m and rad."""
+
+
 class PlannerReport(Message, frozen=True):
     """A report whose content only the planners of the two robots understand."""
 
@@ -450,7 +506,7 @@ class PlannerReport(Message, frozen=True):
     """The content, in msgpack: the value that `Planner.report` returns."""
 
 
-PeerReport = Report | PlannerReport
+PeerReport = Report | ReportWithPose | PlannerReport
 """The messages from a robot to its peer."""
 
 
@@ -583,8 +639,11 @@ OfRobot = (
     | RobotConfig
     | RobotConfigWithOptions
     | RobotConfigInGroup
+    | RobotConfigWithSweep
+    | RobotConfigWithoutAnchor
     | Observation
     | Report
+    | ReportWithPose
     | PlannerReport
     | Command
     | Estimate

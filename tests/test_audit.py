@@ -494,7 +494,7 @@ def test_a_robot_that_starts_outside_the_range_of_its_anchor_is_found(tmp_path: 
             lambda told: replace(told, mission=replace(told.mission, max_speed=1e-5)),
             "mission: a robot moves at most",
         ),
-        (with_robots(anchor=Anchor(0.0, 0.0)), "its anchor is 0 m from its peer's"),
+        (with_robots(given_anchor=Anchor(0.0, 0.0)), "its anchor is 0 m from its peer's"),
         (with_robots(attack=Attack("heading", 0.1, "orbit")), "its attack changes the start"),
         (lambda told: replace(told, robots=told.robots[::-1]), "role is a, expected b"),
     ],

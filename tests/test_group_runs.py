@@ -40,7 +40,7 @@ from tests.commands import OVER, SECTION_IV, TandemProcess, journals, processes_
 from tests.commands import tandem as tandem_command
 from tests.test_audit import kept
 from world.near_pairs import near_pairs
-from world.scenario import PlannedMeeting, ScenarioOfGroup
+from world.scenario import PlannedMeeting, Scenario, ScenarioOfGroup
 
 places = st.lists(st.tuples(*[st.floats(-50.0, 50.0) | st.integers(-9, 9).map(float)] * 2), max_size=30)
 
@@ -153,7 +153,7 @@ def test_a_missing_report_is_found(group: Journals) -> None:
     assert (step.observation.tick, lonely, "report") in found
 
 
-def with_scenario(journals: Journals, scenario: ScenarioOfGroup) -> Journals:
+def with_scenario(journals: Journals, scenario: Scenario) -> Journals:
     """Return `journals` with another scenario in the world's."""
     world = list(journals[WORLD_JOURNAL])
     world[1] = encode(scenario)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agent.planning.passing import BLOCKED_AFTER, YIELDS, Passing, leeway, passed, yielding
+from agent.planning.passing import BLOCKED_AFTER, YIELDS, Bypass, leeway, passed, yielding
 from agent.planning.phase2_orbit import Orbiting, Travelling
 from compose.audit.rules import audit_run
 from compose.launch.in_process import run_mission
@@ -61,7 +61,7 @@ def test_a_robot_stands_still_where_a_range_is_missing() -> None:
 
 
 def test_a_blocked_robot_drives_back_and_aside_and_the_next_time_to_the_other_side() -> None:
-    mode, passing = Travelling((9.0, 0.0)), Passing()
+    mode, passing = Travelling((9.0, 0.0)), Bypass()
     for _ in range(BLOCKED_AFTER):
         assert passing.places == ()
         passing = passed(passing, mode, Pose(0.0, 0.0, 0.0), 0.01, MISSION)
@@ -69,22 +69,22 @@ def test_a_blocked_robot_drives_back_and_aside_and_the_next_time_to_the_other_si
     assert back[0] == aside[0] < -MISSION.safety_distance
     assert back[1] == 0.0
     assert aside[1] > 2.0 * MISSION.safety_distance
-    again = Passing(detours=passing.detours, blocked=BLOCKED_AFTER)
+    again = Bypass(detours=passing.detours, blocked=BLOCKED_AFTER)
     assert passed(again, mode, Pose(0.0, 0.0, 0.0), 0.01, MISSION).places[1][1] == -aside[1]
 
 
 def test_a_robot_that_is_free_or_does_not_travel_drives_no_way_aside() -> None:
     here = Pose(0.0, 0.0, 0.0)
-    nearly = Passing(blocked=BLOCKED_AFTER)
+    nearly = Bypass(blocked=BLOCKED_AFTER)
     assert passed(nearly, Travelling((9.0, 0.0)), here, 0.5, MISSION).blocked == 0
     assert passed(nearly, Orbiting(), here, 0.01, MISSION).places == ()
 
 
 def test_a_robot_yields_to_a_near_one_that_goes_first_but_not_for_ever() -> None:
-    assert yielding(Passing(), [contact("a", 0.6)], MISSION)
-    assert not yielding(Passing(), [contact("a", 2.0)], MISSION)
-    assert not yielding(Passing(), [], MISSION)
-    assert not yielding(Passing(yielded=YIELDS), [contact("a", 0.6)], MISSION)
+    assert yielding(Bypass(), [contact("a", 0.6)], MISSION)
+    assert not yielding(Bypass(), [contact("a", 2.0)], MISSION)
+    assert not yielding(Bypass(), [], MISSION)
+    assert not yielding(Bypass(yielded=YIELDS), [contact("a", 0.6)], MISSION)
 
 
 # --- missions -----------------------------------------------------------------------------------------

@@ -207,7 +207,13 @@ def test_an_outlier_or_a_drop_out_shifts_no_other_draw() -> None:
 def test_other_robots_shift_no_draw() -> None:
     two = near("anchor_sigma = 0.1\nmutual_sigma = 0.1")
     far = [
-        replace(one, id=name, peer=peer, anchor=replace(one.anchor, y=90.0), start=replace(one.start, y=90.0))
+        replace(
+            one,
+            id=name,
+            peer=peer,
+            given_anchor=replace(one.anchor, y=90.0),
+            start=replace(one.start, y=90.0),
+        )
         for one, name, peer in zip(two.robots, "cd", "dc", strict=True)
     ]
     four = replace(two, robots=(*far, *two.robots))

@@ -12,10 +12,19 @@ import msgspec
 from msgspec.structs import asdict
 
 from protocol.attack import Attack
-from protocol.messages import Member, Retry, RobotConfig, RobotConfigInGroup, RobotConfigWithOptions
+from protocol.messages import (
+    Member,
+    Retry,
+    RobotConfig,
+    RobotConfigInGroup,
+    RobotConfigWithOptions,
+    RobotConfigWithoutAnchor,
+    RobotConfigWithSweep,
+)
 from protocol.mission import Anchor, Mission, Options, PlannerName, Role
 from protocol.motion import Pose
 from protocol.orbits import Rendezvous
+from protocol.sweep_strips import SweptArea
 from protocol.units import RobotId, Tick, Time
 from world.faults import Fault
 from world.radio_models import RADIO_MODELS
@@ -42,14 +51,26 @@ class RobotSpec(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fie
     """The robot that it has to meet."""
     role: Role
     """The role of the robot in the pair."""
-    anchor: Anchor
-    """The position of its anchor in <W>, in m."""
+    given_anchor: Anchor | None
+    """The position of its anchor in <W>, in m; None if it has none, as some robots of a group."""
     start: Pose
     """The true pose at tick 0 in <W>, which is unknown to the robot: m, m and rad."""
     rendezvous: Rendezvous
     """The orbits of the pair."""
     attack: Attack | None = None
     """The false data that the robot injects into its Reports; None for an honest robot."""
+
+    @property
+    def anchor(self) -> Anchor:
+        """The position of its anchor in <W>, in m. Raises LookupError if it has none."""
+        if self.given_anchor is None:
+            raise LookupError(f"{self.id} has no anchor")
+        return self.given_anchor
+
+    @property
+    def home(self) -> Anchor:
+        """The position of its anchor, or of the start of a robot that has none, in <W>, in m."""
+        return self.given_anchor or Anchor(self.start.x, self.start.y)
 
 
 GIVES_UP = 0.97
@@ -80,6 +101,17 @@ class PlannedRetry(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_
     """The time in s at which it begins."""
     lasts: Time
     """The bound in s of the time until both are localised."""
+
+
+class PlannedSweep(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """The search of localised robots for those without an anchor."""
+
+    sweep: SweptArea
+    """The area, and the number of its parts."""
+    sweepers: tuple[RobotId, ...]
+    """The robots that sweep it, in the order of the parts that they sweep first."""
+    ends: Time
+    """The bound in s of the time at which all robots without an anchor are localised."""
 
 
 class Death(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
@@ -146,13 +178,23 @@ class Scenario(
     @cached_property
     def sensors(self) -> SensorModel:
         """The sensors of all robots, with everything that is drawn once for the mission."""
-        robots = [(robot.id, robot.anchor) for robot in self.robots]
-        return sensor_model(self.mission, self.world_noise, robots, self.radio_pairs(), self.seed)
+        ids = [robot.id for robot in self.robots]
+        return sensor_model(self.mission, self.world_noise, ids, self.radio_pairs(), self.seed)
 
     @property
     def meetings(self) -> tuple[PlannedMeeting, ...]:
         """The meetings of a group, in the order in which they end; here, none: the robots form pairs."""
         return ()
+
+    @property
+    def planned_sweep(self) -> PlannedSweep | None:
+        """The search for robots without an anchor; here, None: all robots have one."""
+        return None
+
+    @property
+    def unanchored(self) -> tuple[str, ...]:
+        """The robots without an anchor, in the order of the scenario."""
+        return tuple([robot.id for robot in self.robots if robot.given_anchor is None])
 
     @property
     def deaths(self) -> tuple[Death, ...]:
@@ -203,8 +245,8 @@ class Scenario(
             robot=own.id,
             peer=own.peer,
             role=own.role,
-            anchor=own.anchor,
-            peer_anchor=self.robot(own.peer).anchor,
+            anchor=own.given_anchor or self._centre,
+            peer_anchor=self._centre if own.given_anchor is None else self.robot(own.peer).anchor,
             mission=self.mission,
             planner_name=self.planner_name,
             rendezvous=own.rendezvous,
@@ -215,7 +257,7 @@ class Scenario(
             visits = [
                 one.visited for one in self.meetings if one.visitor == own.id and one.visited != own.peer
             ]
-            return RobotConfigInGroup(
+            in_group = RobotConfigInGroup(
                 **asdict(config),
                 planner_options=self.planner_options,
                 members=self.members,
@@ -223,9 +265,25 @@ class Scenario(
                 retries=self._retries_of(own.id),
                 gives_up=self.max_ticks * self.mission.period * GIVES_UP,
             )
+            return in_group if self.planned_sweep is None else self._sweeping(in_group, self.planned_sweep)
         if not self.planner_options:
             return config
         return RobotConfigWithOptions(**asdict(config), planner_options=self.planner_options)
+
+    @property
+    def _centre(self) -> Anchor:
+        """The centre of the area in which robots without an anchor are."""
+        assert self.planned_sweep is not None
+        area = self.planned_sweep.sweep
+        return Anchor(0.5 * (area.x_min + area.x_max), 0.5 * (area.y_min + area.y_max))
+
+    def _sweeping(self, config: RobotConfigInGroup, planned: PlannedSweep) -> RobotConfigWithSweep:
+        """Return `config` with what the robot knows about robots without an anchor, or as one of these."""
+        unanchored = self.unanchored
+        if config.robot in unanchored:
+            return RobotConfigWithoutAnchor(**asdict(config), unanchored=unanchored, sweep=planned.sweep)
+        part = planned.sweepers.index(config.robot)
+        return RobotConfigWithSweep(**asdict(config), unanchored=unanchored, sweep=planned.sweep, part=part)
 
     @property
     def retries(self) -> tuple[PlannedRetry, ...]:
@@ -244,13 +302,14 @@ class Scenario(
 
     @cached_property
     def members(self) -> tuple[Member, ...]:
-        """The robots of the group, as they know each other; empty for pairs."""
+        """The robots of the group with an anchor, as they know each other; empty for pairs."""
         ends: dict[str, int] = {}
         for meeting in self.meetings:
             last = _last_tick(meeting.ends, self.mission.period)
             ends.setdefault(meeting.visitor, last)
             ends.setdefault(meeting.visited, last)
-        return tuple([Member(one.id, one.anchor, ends[one.id]) for one in self.robots]) if ends else ()
+        anchored = [one for one in self.robots if one.id in ends]
+        return tuple([Member(one.id, one.anchor, ends[one.id]) for one in anchored])
 
 
 def _last_tick(moment: float, period: float) -> int:
@@ -302,5 +361,16 @@ class ScenarioOfGroup(
     """The robots that die, in the order of the scenario."""
 
 
-RecordedScenario = Scenario | ScenarioWithWorldNoise | ScenarioWithOptions | ScenarioOfGroup
+class ScenarioWithSweep(
+    ScenarioOfGroup, frozen=True, array_like=True, forbid_unknown_fields=True, tag="scenario-with-sweep"
+):
+    """A mission of a group in which some robots have no anchor: others find them in an area."""
+
+    planned_sweep: PlannedSweep | None = None
+    """The search for robots without an anchor."""
+
+
+RecordedScenario = (
+    Scenario | ScenarioWithWorldNoise | ScenarioWithOptions | ScenarioOfGroup | ScenarioWithSweep
+)
 """The kinds of scenario in a world's journal."""

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from protocol.mission import Anchor, Mission
+from protocol.mission import Mission
 from protocol.motion import REST, Controls
 from protocol.noise import Noise
 from world.random_streams import correlated, gaussian, random_walk, uniform
@@ -183,17 +183,15 @@ class SensorModel(msgspec.Struct, frozen=True):
 def sensor_model(
     mission: Mission,
     world: WorldNoise,
-    robots: Sequence[tuple[str, Anchor]],
+    ids: Sequence[str],
     pairs: Sequence[tuple[int, int]],
     seed: int,
 ) -> SensorModel:
     """Return the sensors of a mission.
 
-    `robots` are the ids and the anchors of the robots; `pairs` are pairs of places in it, those that may
-    measure each other.
+    `ids` are those of the robots; `pairs` are pairs of places in it, those that may measure each other.
     """
     noise = world.shared(mission.noise)
-    ids = [robot for robot, _ in robots]
     # A robot with one partner keys the errors of their ranges; in a group, both robots do.
     alone = len(dict(pairs)) == len(pairs)
     keys = [ids[i] if alone else f"{ids[i]}-{ids[j]}" for i, j in pairs]

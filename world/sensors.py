@@ -24,13 +24,18 @@ def anchor_ranges(truth: Truth, scenario: Scenario) -> list[float | None]:
     sensors, model, radios = scenario.sensors, scenario.ranging, None
     if sensors.exact and model is None:
         return [
-            _exact_range(pose.x - (robot.anchor.x - at.x), pose.y - (robot.anchor.y - at.y), sensors.reach)
+            None
+            if (anchor := robot.given_anchor) is None
+            else _exact_range(pose.x - (anchor.x - at.x), pose.y - (anchor.y - at.y), sensors.reach)
             for pose, at, robot in zip(truth.local, truth.origins, scenario.robots, strict=True)
         ]
     lobed = sensors.world.lobe_depth
     ranges: list[float | None] = []
     for i, (pose, origin, robot) in enumerate(zip(truth.local, truth.origins, scenario.robots, strict=True)):
-        anchor, (off_x, off_y) = robot.anchor, sensors.survey[i]
+        if robot.given_anchor is None:
+            ranges.append(None)
+            continue
+        anchor, (off_x, off_y) = robot.given_anchor, sensors.survey[i]
         x, y = pose.x - (anchor.x - origin.x) - off_x, pose.y - (anchor.y - origin.y) - off_y
         rho = math.hypot(x, y)
         pattern = sensors.anchor_lobes[i].reach(math.atan2(y, x)) if lobed else 1.0

@@ -44,7 +44,7 @@ class World(msgspec.Struct, frozen=True):
 def release(scenario: Scenario) -> World:
     """Return the world at tick 0."""
     pairs = scenario.radio_pairs()
-    origins = {place: scenario.robots[i].anchor for i, j in reversed(pairs) for place in (i, j)}
+    origins = {place: scenario.robots[i].home for i, j in reversed(pairs) for place in (i, j)}
     local = tuple(
         Pose(robot.start.x - origins[i].x, robot.start.y - origins[i].y, robot.start.heading)
         for i, robot in enumerate(scenario.robots)

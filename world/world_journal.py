@@ -196,6 +196,8 @@ def _unpaired(scenario: Scenario) -> str | None:
         return "its scenario has no robots, or several of the same name"
     if scenario.meetings:
         return _unplanned(scenario)
+    if scenario.unanchored:
+        return f"in its scenario {scenario.unanchored[0]} has no anchor"
     for robot in scenario.robots:
         peer = robots.get(robot.peer)
         if peer is None or peer.peer != robot.id or peer.role == robot.role:
@@ -211,13 +213,17 @@ def _unplanned(scenario: Scenario) -> str | None:
         if one.visited in first:
             return f"in its scenario {one.visited} is visited after it has met another robot"
         first[one.visited] = (one.visitor, "b")
-    if first.keys() != {robot.id for robot in scenario.robots}:
+    unanchored = scenario.unanchored
+    if first.keys() != {robot.id for robot in scenario.robots} - set(unanchored):
         return "in its scenario the meetings are not those of its robots"
     for retry in scenario.retries:
         if retry.visitor == retry.visited or not {retry.visitor, retry.visited} <= first.keys():
             return "in its scenario the retries are not those of its robots"
+    sweep = scenario.planned_sweep
+    if bool(unanchored) != (sweep is not None) or (sweep is not None and set(sweep.sweepers) != first.keys()):
+        return "in its scenario the robots that search are not those with an anchor"
     for robot in scenario.robots:
-        if first[robot.id] != (robot.peer, robot.role):
+        if robot.id in first and first[robot.id] != (robot.peer, robot.role):
             return f"in its scenario {robot.id} has another peer than in its first meeting"
     return None
 

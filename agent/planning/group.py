@@ -14,9 +14,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from msgspec.structs import replace
+from msgspec.structs import asdict, replace
 
-from agent.planning import exchange, group_transitions
+from agent.planning import exchange, group_transitions, sweep_transitions
 from agent.planning.group_state import GroupState
 from agent.planning.log_exchange import LogPlanner
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Travelling
@@ -31,6 +31,7 @@ from protocol.messages import (
     Observation,
     Ranged,
     Report,
+    ReportWithPose,
     RobotConfig,
     Undecided,
 )
@@ -88,13 +89,18 @@ class GroupPlanner(Planner[GroupState, Report]):
     def report_to(self, state: GroupState, peer: str) -> Report:
         """Return the report to `peer`: the log, or outside a meeting only this robot's verdict.
 
+        A robot without an anchor gets the pose of one that is localised until it is localised itself.
         A robot that is not localised tells one that it refuses the verdict of their meeting.
         """
         if group_transitions.refused(state, peer):
             return exchange.report_without_log(state.pair, state.failure)
-        if peer == state.pair.config.peer:
+        if peer == state.pair.config.peer and not state.sweeps:
             return exchange.report(state.pair)
-        return exchange.report_without_log(state.pair, state.verdict)
+        without_log = exchange.report_without_log(state.pair, state.verdict)
+        if not (sweep_transitions.is_helped(state, peer) and isinstance(state.verdict, Localised)):
+            return without_log
+        pose = compose(state.frame, state.pair.odometry)
+        return ReportWithPose(**asdict(without_log), pose=pose)
 
     def decide(self, state: GroupState, reports: Sequence[Report] = ()) -> GroupState:
         """Return `state` with the `reports` of others, and in the next meeting if this one has ended."""
@@ -107,7 +113,8 @@ class GroupPlanner(Planner[GroupState, Report]):
         logs = [one for one in reports if one.has_log]
         state = group_transitions.answering(state, [one.robot for one in logs if one.state == TRAVELLING])
         peer, before = state.pair.config.peer, state.pair
-        of_peer = [] if group_transitions.refused(state, peer) else [one for one in logs if one.robot == peer]
+        alone = state.sweeps or group_transitions.refused(state, peer)
+        of_peer = [] if alone else [one for one in logs if one.robot == peer]
         pair = self.pair_planner.decide(before, of_peer)
         if before.verdict is None and pair.verdict is not None and pair.belief.phase1_done_tick is None:
             return group_transitions.without_peer(state, pair.verdict)
@@ -121,7 +128,7 @@ class GroupPlanner(Planner[GroupState, Report]):
         refusals = [one for one in reports if one.robot == peer and not one.has_log]
         if (
             pair.verdict is None
-            and not group_transitions.refused(state, peer)
+            and not alone
             and any(isinstance(one.verdict, Inconsistent | Undecided) for one in refusals)
         ):
             return group_transitions.after_refusal(state)

@@ -7,8 +7,9 @@ from collections.abc import Mapping
 import msgspec
 from msgspec.structs import replace
 
-from agent.planning.passing import Passing
+from agent.planning.passing import Bypass
 from agent.planning.state import RobotState
+from agent.planning.sweep import Looping, Sweeping
 from protocol.messages import Ranged, RobotConfigInGroup, Verdict
 from protocol.motion import ORIGIN, Pose
 
@@ -37,6 +38,10 @@ class GroupState(msgspec.Struct, frozen=True):
     """The number of planned visits that the robot has begun or left out."""
     retries: int = 0
     """The number of retries whose time has come."""
+    parts: int = 0
+    """The number of parts of an area that the robot has begun to sweep for robots without an anchor."""
+    swept: int = -1
+    """The tick in which it began the latest of them."""
     until: float | None = None
     """The time in s at which the search of a retry ends; None if there is none."""
     visiting: bool = False
@@ -51,12 +56,17 @@ class GroupState(msgspec.Struct, frozen=True):
     """The knowledge about each robot that this one has been in range of, or heard of."""
     unmet: int = 0
     """The number of consecutive ticks out of range of the peer since this robot's verdict in the meeting."""
-    passing: Passing = Passing()
+    passing: Bypass = Bypass()
     """How it passes robots of other meetings, if the mission has a safety distance."""
     lingering: int = 0
     """The number of consecutive ticks in range of the peer since the end of their meeting."""
     silence: int = 0
     """The number of consecutive ticks in range of the peer without a log of it."""
+
+    @property
+    def sweeps(self) -> bool:
+        """Return whether the robot sweeps an area, or has stopped for a robot without an anchor."""
+        return isinstance(self.pair.mode, Sweeping | Looping)
 
     @property
     def config(self) -> RobotConfigInGroup:

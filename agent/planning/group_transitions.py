@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from agent.estimation.knowledge import Belief
-from agent.planning import passing, phase2_orbit, transitions
+from agent.planning import passing, phase2_orbit, sweep_transitions, transitions
 from agent.planning.group_state import GroupState
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Travelling
 from agent.planning.state import Done, RobotState
@@ -86,6 +86,10 @@ def onward(state: GroupState) -> GroupState:
     pair, peer = state.pair, state.pair.config.peer
     if not isinstance(state.verdict, Localised):
         return _after_failure(state)
+    if state.sweeps:
+        swept = sweep_transitions.onward(state)
+        done = Done(pair.phase, state.verdict)
+        return swept or _next_visit(replace(state, pair=replace(pair, mode=done)))
     if state.visiting and pair.verdict is None:
         if state.other(peer).localised:  # by another robot
             return _next_visit(state)
@@ -204,8 +208,9 @@ def _aligned(state: GroupState) -> GroupState:
 def _next_visit(state: GroupState) -> GroupState:
     """Return `state` on the way to the next robot; as it is if there is none.
 
-    After the planned visits, it is the nearest one that should be localised by now, and has not reported it;
-    of those that were not beside their anchors, the one for which that was longest ago.
+    After the planned visits, and after its part of a sweep, it is the nearest one that should be localised by
+    now, and has not reported it; of those that were not beside their anchors, the one for which that was
+    longest ago. After all these, the robot sweeps the parts of others.
     """
     visits, config = state.visits, state.config
     while visits < len(config.visits):
@@ -213,14 +218,20 @@ def _next_visit(state: GroupState) -> GroupState:
         visits += 1
         if not (state.other(peer).localised or state.other(peer).failed):
             return _on_visit(replace(state, visits=visits), peer)
+    state = replace(state, visits=visits)
+    seeks = sweep_transitions.wanted(state)
+    if seeks and state.parts == 0:
+        return sweep_transitions.next_part(state)
     here, tick = compose(state.frame, state.pair.odometry), state.pair.tick
     late = [
         (_missed(state, one), math.hypot(one.anchor.x - here.x, one.anchor.y - here.y), one.robot)
         for one in config.members
         if one.ends < tick and one.robot != config.robot and _is_late(state, one)  # few are
+        if not seeks or _missed(state, one) < state.swept  # one tour after each part
     ]
-    state = replace(state, visits=visits)
-    return _on_visit(state, min(late)[2]) if late else state
+    if late:
+        return _on_visit(state, min(late)[2])
+    return sweep_transitions.next_part(state) if seeks else state
 
 
 def _missed(state: GroupState, member: Member) -> int:

@@ -32,7 +32,7 @@ YIELDS = 60
 """The ticks after which a robot does not yield any longer, because the other one does not drive away."""
 
 
-class Passing(msgspec.Struct, frozen=True):
+class Bypass(msgspec.Struct, frozen=True):
     """The passing of robots of other meetings."""
 
     leeway: float = math.inf
@@ -60,17 +60,17 @@ def leeway(contacts: Sequence[Contact], peer: str | None, mission: Mission) -> f
     return min(free, default=math.inf)
 
 
-def yielding(passing: Passing, leading: Sequence[Contact], mission: Mission) -> bool:
+def yielding(passing: Bypass, leading: Sequence[Contact], mission: Mission) -> bool:
     """Return whether a robot stands still, because one of those that travel and go first is near."""
     near = CLEARANCE * mission.sensing_range
     close = any(one.range is None or separation.leeway(one.range, mission) < near for one in leading)
     return close and passing.yielded < YIELDS
 
 
-def passed(passing: Passing, mode: object, odometry: Pose, free: float, mission: Mission) -> Passing:
+def passed(passing: Bypass, mode: object, odometry: Pose, free: float, mission: Mission) -> Bypass:
     """Return `passing` after a tick that led to `odometry` in `mode`, where `free` m may be driven next."""
     if not isinstance(mode, Travelling):
-        return Passing(free, detours=passing.detours)
+        return Bypass(free, detours=passing.detours)
     blocked = passing.blocked + 1 if free < BLOCKED * mission.first_straight else 0
     passing = replace(
         passing, leeway=free, blocked=blocked, yielded=passing.yielded if math.isfinite(free) else 0
@@ -78,7 +78,7 @@ def passed(passing: Passing, mode: object, odometry: Pose, free: float, mission:
     if passing.places or blocked < BLOCKED_AFTER:
         return passing
     places = _aside(odometry, mode.place, mission, 1.0 if passing.detours % 2 == 0 else -1.0)
-    return Passing(free, detours=passing.detours + 1, places=places)
+    return Bypass(free, detours=passing.detours + 1, places=places)
 
 
 def _aside(

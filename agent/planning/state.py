@@ -14,6 +14,7 @@ from agent.planning.phase1_anchor import ThirdPoint
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent, Travelling
 from agent.planning.phase3_last_manoeuvre import LastManoeuvre, Plan, Returning, Standing, Waiting
 from agent.planning.range_seeking import Backing, Circling, Homing, Seeking, Straight, Turning
+from agent.planning.sweep import Looping, Sweeping
 from protocol import messages
 from protocol.messages import Inconsistent, Localised, Undecided
 from protocol.mission import Mission
@@ -38,8 +39,8 @@ class Done(msgspec.Struct, frozen=True):
 
 
 Phase1 = Straight | Backing | Turning | Circling | ThirdPoint | Surveying | Homing
-Phase2 = Aligning | Radial | Tangent | Orbiting | Travelling
-Phase3 = Straight | Backing | Turning | Circling | Standing | Waiting | LastManoeuvre | Returning
+Phase2 = Aligning | Radial | Tangent | Orbiting | Travelling | Sweeping
+Phase3 = Straight | Backing | Turning | Circling | Standing | Waiting | LastManoeuvre | Returning | Looping
 Noisy3 = Surveying | Listening | Retreating
 Mode = Asleep | Phase1 | Phase2 | Phase3 | Noisy3 | Done
 
@@ -58,6 +59,8 @@ MODE_NAMES: dict[type, str] = {
     Tangent: "tangent",
     Orbiting: "orbiting",
     Travelling: "travelling",
+    Sweeping: "sweeping",
+    Looping: "looping",
     Standing: "standing",
     Waiting: "waiting",
     LastManoeuvre: "last-manoeuvre",
@@ -75,6 +78,8 @@ PHASES: dict[type, int] = {
     Tangent: 2,
     Orbiting: 2,
     Travelling: 2,
+    Sweeping: 2,
+    Looping: 3,
     Standing: 3,
     Waiting: 3,
     LastManoeuvre: 3,

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from msgspec.structs import replace
 
 from agent.estimation.estimator import AnchorEstimate, FittedBranch, PairEstimate
-from agent.planning import phase1_anchor, phase2_orbit, phase3_last_manoeuvre, range_seeking
+from agent.planning import phase1_anchor, phase2_orbit, phase3_last_manoeuvre, range_seeking, sweep
 from agent.planning.active_sensing import Retreating, Surveying
 from agent.planning.manoeuvres import Manoeuvres
 from agent.planning.phase1_anchor import ThirdPoint
@@ -31,6 +31,7 @@ from agent.planning.range_seeking import (
     step_length,
 )
 from agent.planning.state import Asleep, Done, RobotState
+from agent.planning.sweep import Looping, Sweeping
 from protocol.messages import BranchKind
 from protocol.mission import SHORTEST_STEP, Mission
 from protocol.motion import REST, Controls
@@ -265,5 +266,8 @@ def controls(state: RobotState) -> Controls:
         case Travelling():
             tolerance = state.estimator.pose_tolerance
             return phase2_orbit.travel_controls(mode, state.odometry, state.config.mission, tolerance) or REST
+        case Sweeping() | Looping():
+            tolerance = state.estimator.pose_tolerance
+            return sweep.controls(mode, state.odometry, state.config.mission, tolerance) or REST
         case _:
             return REST

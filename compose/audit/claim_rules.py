@@ -13,7 +13,7 @@ from agent.process.agent_journal import AgentHistory
 from compose.audit.findings import Checks, Violation, between
 from compose.launch.planner_loader import planner_of
 from compose.recording.run import Run
-from protocol.messages import Localised, MissionEnd, PeerReport, Report
+from protocol.messages import Localised, MissionEnd, PeerReport, Report, ReportWithPose
 from protocol.motion import Pose, travelled
 from world.referee import inaccuracy, mistake
 from world.scenario import RobotSpec
@@ -87,6 +87,8 @@ def _known_until(agent: AgentHistory, peer: str, tick: int, planner: Planner[Any
 
 def _through(report: PeerReport) -> int:
     """Return the tick up to which a report contains the sender's manoeuvres."""
+    if isinstance(report, ReportWithPose):  # the pose stands for a log
+        return report.tick
     return report.through if isinstance(report, Report) else report.tick
 
 

@@ -11,6 +11,7 @@ from compose.launch import planner_loader
 from compose.recording.run import Run
 from compose.scenario.first_meetings import NEAREST_ANCHORS
 from compose.scenario.group_meetings import FirstMeeting, GroupMeetings, group_meetings
+from compose.scenario.group_sweep import with_sweep
 from compose.scenario.scenario_tables import PlannerTable, RobotTable
 from protocol.attack import OF_THE_START
 from protocol.messages import RobotConfig, RobotConfigInGroup
@@ -49,7 +50,8 @@ def scenario(run: Run) -> Checks:
 
 def _group(found: Scenario) -> Checks:
     """Check that the meetings of a group are those that are planned for its anchors."""
-    for one, other in combinations(found.robots, 2):
+    unanchored = found.unanchored
+    for one, other in combinations([robot for robot in found.robots if robot.id not in unanchored], 2):
         yield _violation(other.id, _off_distance(found.mission, one.anchor, other.anchor, one.id))
     try:
         planned = planned_meetings(found)
@@ -69,11 +71,14 @@ def _group(found: Scenario) -> Checks:
         for i, (given, expected) in enumerate(zip(some, others, strict=False)):
             off = None if given == expected else f"{name}[{i}].{difference(given, expected)}"
             yield _violation(None, off)
+    if found.planned_sweep is not None and planned.sweep is not None:
+        given, expected = found.planned_sweep, planned.sweep
+        yield _violation(None, None if given == expected else f"planned_sweep.{difference(given, expected)}")
     for robot in found.robots:
         first = planned.first[robot.id]
         for why in (
             _off_first(robot, first),
-            _off_range(robot, found.mission),
+            _off_area(robot, found) if robot.given_anchor is None else _off_range(robot, found.mission),
             _off_attack(robot),
         ):
             yield _violation(robot.id, why)
@@ -81,9 +86,13 @@ def _group(found: Scenario) -> Checks:
 
 def planned_meetings(found: Scenario) -> GroupMeetings:
     """Return the meetings of the group in a scenario. Raises Unworkable if its planner has none."""
-    robots = [RobotTable(robot.id, (robot.anchor.x, robot.anchor.y)) for robot in found.robots]
+    anchors = [(robot.id, robot.given_anchor) for robot in found.robots]
+    robots = [RobotTable(robot, (at.x, at.y) if at is not None else None) for robot, at in anchors]
     planner = PlannerTable(found.planner_name, found.planner_options)
-    return group_meetings(robots, found.mission, planner)
+    meetings = group_meetings([one for one in robots if one.anchor is not None], found.mission, planner)
+    sweep = found.planned_sweep.sweep if found.planned_sweep is not None else None
+    area = (sweep.x_min, sweep.y_min, sweep.x_max, sweep.y_max) if sweep is not None else None
+    return with_sweep(robots, area, found.mission, meetings)
 
 
 def _off_first(robot: RobotSpec, first: FirstMeeting) -> str | None:
@@ -126,6 +135,13 @@ def _off_range(robot: RobotSpec, mission: Mission) -> str | None:
     rho0 = math.dist((robot.start.x, robot.start.y), (robot.anchor.x, robot.anchor.y))
     reach = mission.sensing_range
     return f"it starts {rho0:.12g} m from its anchor, outside R = {reach:.12g} m" if rho0 > reach else None
+
+
+def _off_area(robot: RobotSpec, found: Scenario) -> str | None:
+    """Return why a robot without an anchor may not start where it does; None if it may."""
+    assert found.planned_sweep is not None
+    inside = found.planned_sweep.sweep.contains(robot.start.x, robot.start.y)
+    return None if inside else "it has no anchor, and starts outside the area that is swept"
 
 
 def _off_attack(robot: RobotSpec) -> str | None:

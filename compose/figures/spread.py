@@ -51,7 +51,8 @@ class GroupRobot(msgspec.Struct, frozen=True):
     """One robot of a group, with one entry per tick in each sequence."""
 
     id: str
-    anchor: tuple[float, float]
+    anchor: tuple[float, float] | None
+    """Its anchor in m; None if it has none."""
     path: tuple[Pose, ...]
     """The true poses."""
     commands: tuple[Command | None, ...]
@@ -75,10 +76,10 @@ def draw(run: Run, medium: Medium = SCREEN) -> Figure | Absent:
     axes = sheet.panel()
     reach = setup.mission.sensing_range
     for one in robots:
-        _anchor(axes, one, reach, ticks=len(robots) <= MOST_TICKS)
+        _home(axes, one, reach, ticks=len(robots) <= MOST_TICKS)
         _path(axes, one)
     _tree(axes, setup, robots)
-    _key(axes, reach)
+    _key(axes, reach, any(one.anchor is None for one in robots))
     sheet.plane(axes, _window(robots, reach), TALLEST)
     lanes = sheet.panel()
     _lanes(lanes, setup, robots)
@@ -97,7 +98,7 @@ def group_robots(run: Run, setup: RunSetup) -> list[GroupRobot]:
         robots.append(
             GroupRobot(
                 id=one.id,
-                anchor=(one.anchor.x, one.anchor.y),
+                anchor=None if one.given_anchor is None else (one.given_anchor.x, one.given_anchor.y),
                 path=run.truth(one.id),
                 commands=tuple([run.command(one.id, tick) for tick in range(run.length)]),
                 localised=claim.tick if claim is not None else None,
@@ -110,20 +111,28 @@ def group_robots(run: Run, setup: RunSetup) -> list[GroupRobot]:
 def _window(robots: list[GroupRobot], reach: float) -> Window:
     points = [(pose.x, pose.y) for one in robots for pose in one.path]
     for one in robots:
-        points += [
-            (one.anchor[0] + dx, one.anchor[1] + dy) for dx in (-reach, reach) for dy in (-reach, reach)
-        ]
+        if one.anchor is not None:
+            x, y = one.anchor
+            points += [(x + dx, y + dy) for dx in (-reach, reach) for dy in (-reach, reach)]
     return around(points, 0.03)
 
 
-def _anchor(axes: Axes, one: GroupRobot, reach: float, *, ticks: bool) -> None:
-    """Draw the anchor of a robot, its sensing range, and with `ticks`, when the robot is localised."""
+def _home(axes: Axes, one: GroupRobot, reach: float, *, ticks: bool) -> None:
+    """Draw the anchor of a robot, its sensing range, and with `ticks`, when the robot is localised.
+
+    A robot without an anchor has a triangle where it starts.
+    """
     hue = COLOURS[HUES[one.localised is not None]]
-    axes.plot(*one.anchor, "x", color="k", ms=4, mew=1.2, ls="", zorder=4, gid=f"anchor-{one.id}")
-    circle(axes, one.anchor, reach, ls="-", lw=0.8, color=hue, gid=f"range-{one.id}")
+    if one.anchor is not None:
+        axes.plot(*one.anchor, "x", color="k", ms=4, mew=1.2, ls="", zorder=4, gid=f"anchor-{one.id}")
+        circle(axes, one.anchor, reach, ls="-", lw=0.8, color=hue, gid=f"range-{one.id}")
+        x, y = one.anchor[0], one.anchor[1] + reach
+    else:
+        x, y = one.path[0].x, one.path[0].y
+        axes.plot(x, y, "^", color=hue, ms=5, ls="", zorder=4, gid=f"start-{one.id}")
     name = one.id if one.localised is None or not ticks else f"{one.id}, $k$ = {one.localised}"
     axes.annotate(
-        name, (one.anchor[0], one.anchor[1] + reach), xytext=(0, 2), textcoords="offset points", ha="center",
+        name, (x, y), xytext=(0, 2), textcoords="offset points", ha="center",
         zorder=7, bbox=LABEL,
         gid=f"localised-{one.id}",
     )  # fmt: skip
@@ -146,6 +155,8 @@ def _tree(axes: Axes, setup: RunSetup, robots: list[GroupRobot]) -> None:
     reach = setup.mission.sensing_range
     for visit in setup.visits:
         start, end = known[visit.visitor].anchor, known[visit.visited].anchor
+        assert start is not None
+        assert end is not None
         length = math.dist(start, end)
         if length <= 2.0 * reach:
             continue
@@ -160,8 +171,10 @@ def _tree(axes: Axes, setup: RunSetup, robots: list[GroupRobot]) -> None:
         )  # fmt: skip
 
 
-def _key(axes: Axes, reach: float) -> None:
+def _key(axes: Axes, reach: float, unanchored: bool) -> None:
     axes.plot([], [], "x", color="k", ms=4, mew=1.2, ls="", label="anchor")
+    if unanchored:
+        axes.plot([], [], "^", color=COLOURS["a"], ms=5, ls="", label="start of a robot without an anchor")
     axes.plot([], [], "-", lw=0.8, color=COLOURS["a"], label=f"sensing range, {reach:g} m")
     for known in (False, True):
         axes.plot([], [], "-", lw=1.4, color=COLOURS[HUES[known]], label=f"true path, {NAMED[known]}")

@@ -16,6 +16,7 @@ import msgspec
 from compose.recording.run import Run
 from protocol.motion import TAU
 from protocol.orbits import meeting_ticks
+from protocol.sweep_strips import helping_ticks, sweep_speed, sweep_ticks
 from world.scenario import Scenario
 
 SEARCHED = 42.0
@@ -45,6 +46,8 @@ def corrected_bounds(run: Run) -> tuple[CorrectedBound, ...]:
     scenario, last = run.scenario, run.length - 1
     claims = {robot: claim.tick for robot in run.robots if (claim := run.claim(robot)) is not None}
     ends = {one.robot: one.ends for one in scenario.members}
+    if (planned := scenario.planned_sweep) is not None:
+        ends |= dict.fromkeys(scenario.unanchored, math.ceil(planned.ends / scenario.mission.period))
     overdue = [end + 1 for robot, end in ends.items() if claims.get(robot, end + 1) > end]
     tick = min(overdue, default=last)
     stages = [max(ends.values())]
@@ -61,10 +64,32 @@ def corrected_bounds(run: Run) -> tuple[CorrectedBound, ...]:
             break
         late = tuple([robot for robot in run.robots if ends[robot] < tick and robot not in localised])
         waiting = [robot for robot in run.robots if robot not in localised]
-        bound = begins + _return_ticks(scenario, waiting) + _tour_ticks(scenario, waiting)
+        tour = _tour_ticks(scenario, waiting)
+        bound = begins + _return_ticks(scenario, waiting) + tour + _sweeps_ticks(scenario, tour)
         found.append(CorrectedBound(tick, late, bound))
         tick = (bound if min(claims.values(), default=last) <= begins else begins) + 1
     return tuple(found)
+
+
+def _sweeps_ticks(scenario: Scenario, tour: int) -> int:
+    """Return the ticks in which one robot sweeps all parts of the area; 0 if all robots have an anchor.
+
+    After each part, it makes a tour of at most `tour` ticks to robots that are late.
+    """
+    if scenario.planned_sweep is None:
+        return 0
+    area, mission = scenario.planned_sweep.sweep, scenario.mission
+    places = [*_anchors(scenario), *area.corners]
+    way = max([math.dist(one, other) for one in places for other in places])
+    step = sweep_speed(mission) * mission.period
+    ticks = math.ceil(way / step) + tour + len(scenario.unanchored) * helping_ticks(mission)
+    parts = [area.path(part, mission.sensing_range) for part in range(area.parts)]
+    return sum([ticks + sweep_ticks(path, mission) for path in parts])
+
+
+def _anchors(scenario: Scenario) -> list[tuple[float, float]]:
+    """Return the places of all anchors, in m."""
+    return [(at.x, at.y) for one in scenario.robots if (at := one.given_anchor) is not None]
 
 
 def _return_ticks(scenario: Scenario, waiting: Collection[str]) -> int:
@@ -88,14 +113,15 @@ def _tour_ticks(scenario: Scenario, waiting: Collection[str]) -> int:
     step = mission.max_speed * mission.period
     turn = math.ceil(TAU / 2.0 / (mission.max_turn_rate * mission.period))
     search = 0 if mission.noise.exact else math.ceil(SEARCHED * mission.sensing_range / step) + 12 * turn
-    ways = [_way_to_all(scenario, begin) for begin in range(len(scenario.robots))]
-    visits = len(scenario.robots) - 1
+    anchors = len(_anchors(scenario))
+    ways = [_way_to_all(scenario, begin) for begin in range(anchors)]
+    visits = anchors - 1
     return math.ceil(max(ways) / step) + visits * (turn + 1 + search) + len(waiting) * meeting_ticks(mission)
 
 
 def _way_to_all(scenario: Scenario, begin: int) -> float:
     """Return the length in m of the way from one anchor to all others, the nearest first."""
-    left = [(one.anchor.x, one.anchor.y) for one in scenario.robots]
+    left = _anchors(scenario)
     here, way = left.pop(begin), 0.0
     while left:
         nearest = min(left, key=lambda place: math.dist(place, here))
@@ -106,5 +132,5 @@ def _way_to_all(scenario: Scenario, begin: int) -> float:
 
 
 def _longest_way(scenario: Scenario) -> float:
-    places = [(one.anchor.x, one.anchor.y) for one in scenario.robots]
+    places = _anchors(scenario)
     return max([math.dist(one, other) for one in places for other in places])

@@ -28,6 +28,30 @@ class MeetingResult(msgspec.Struct, frozen=True):
     """The first tick in which both claimed their poses; missing if one never did."""
 
 
+class SearchResult(msgspec.Struct, frozen=True):
+    """A robot without an anchor, and when it was localised."""
+
+    robot: str
+    """The robot."""
+    bound_s: float
+    """The computed bound in s of the time at which it is localised."""
+    bound_ticks: int
+    """That bound in ticks, rounded up."""
+    localised_tick: int | None
+    """The first tick in which it claimed its pose; missing if it never did."""
+
+
+def search_results(run: Run) -> Iterator[SearchResult]:
+    """Yield the robots without an anchor, in the order of the scenario."""
+    planned = run.scenario.planned_sweep
+    for robot in run.scenario.unanchored if planned is not None else ():
+        assert planned is not None
+        claim, ticks = run.claim(robot), planned.ends / run.scenario.mission.period
+        yield SearchResult(
+            robot, planned.ends, math.ceil(ticks - ROUNDING), claim.tick if claim is not None else None
+        )
+
+
 def meeting_results(run: Run) -> Iterator[MeetingResult]:
     """Yield the meetings of a group, in the order of their bounds; none for pairs and in hardware mode."""
     if run.world is None:

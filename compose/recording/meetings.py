@@ -113,7 +113,7 @@ def _next(setup: RunSetup, robot: str, peer: str | None, now: GroupTick, known: 
     here, time = now.place(robot), now.commands[robot].tick * setup.mission.period
     late = [
         one
-        for one in setup.robots
+        for one in setup.anchored
         if one.id != robot and one.id not in known and setup.bounds_s.get(one.id, time) < time
     ]
     if here is None or not late:
@@ -147,7 +147,7 @@ def past_meetings(run: Run) -> tuple[PastMeeting, ...]:
     begun = _begun(run, setup)
     found = [
         PastMeeting(one.id, one.peer, 0, _last(begun, one.id, one.peer, 0, run.length))
-        for one in setup.robots
+        for one in setup.anchored
         if one.role == "a" and begun[one.peer][0][1].peer == one.id
     ]
     found += [
@@ -164,7 +164,7 @@ Begun = Mapping[str, list[tuple[int, PresentMeeting]]]
 
 
 def _begun(run: Run, setup: RunSetup) -> Begun:
-    begun = {robot: [(0, PresentMeeting(setup.partners[robot][0], False))] for robot in setup.ids}
+    begun = {robot: [(0, PresentMeeting(setup.partners[robot][0], False))] for robot in setup.partners}
     meetings: Meetings = {}
     latest: dict[str, Command] = {}
     paths = {robot: run.truth(robot) for robot in setup.ids}

@@ -11,10 +11,11 @@ import msgspec
 from msgspec.structs import replace
 
 from protocol.attack import Attack
-from protocol.messages import RobotConfig, RobotConfigInGroup
+from protocol.messages import RobotConfig, RobotConfigInGroup, RobotConfigWithoutAnchor
 from protocol.mission import Anchor, Mission, PlannerName, Role
 from protocol.motion import Pose
 from protocol.orbits import Orbit
+from protocol.sweep_strips import SweptArea
 from protocol.units import RobotId, Tick
 from world.faults import Fault
 from world.scenario import Scenario
@@ -26,7 +27,8 @@ class RobotSetup(msgspec.Struct, frozen=True):
     id: RobotId
     peer: RobotId
     role: Role
-    anchor: Anchor
+    given_anchor: Anchor | None = msgspec.field(name="anchor")
+    """Its anchor; None if it has none, as some robots of a group."""
     orbit: Orbit
     attack: Attack | None = None
     """The false data injection that the scenario configures for this robot."""
@@ -36,6 +38,13 @@ class RobotSetup(msgspec.Struct, frozen=True):
     The x-axis points from the anchor to the robot's start. None if the start is not known. A robot does
     not know this heading before it is localised, so a picture of its belief may use any heading.
     """
+
+    @property
+    def anchor(self) -> Anchor:
+        """The position of its anchor in <W>, in m. Raises LookupError if it has none."""
+        if self.given_anchor is None:
+            raise LookupError(f"{self.id} has no anchor")
+        return self.given_anchor
 
 
 class Visit(msgspec.Struct, frozen=True):
@@ -77,6 +86,13 @@ class RunSetup(msgspec.Struct, frozen=True, dict=True):
     faults: tuple[Fault, ...] = ()
     visits: tuple[Visit, ...] = ()
     """The meetings of a group, in the order in which they are planned to end; empty for pairs."""
+    sweep: SweptArea | None = None
+    """The area in which robots without an anchor are; None if all robots have one."""
+
+    @property
+    def anchored(self) -> tuple[RobotSetup, ...]:
+        """The robots that have an anchor."""
+        return tuple([robot for robot in self.robots if robot.given_anchor is not None])
 
     @property
     def ids(self) -> tuple[str, ...]:
@@ -120,6 +136,8 @@ class RunSetup(msgspec.Struct, frozen=True, dict=True):
     def bounds_s(self) -> dict[RobotId, float]:
         """The planned bound in s of the time at which each robot of a group is localised; empty for pairs."""
         found: dict[RobotId, float] = {}
+        if self.sweep is not None:
+            found = {robot.id: self.t_max_s for robot in self.robots if robot.given_anchor is None}
         for visit in self.visits:
             for robot in (visit.visitor, visit.visited):
                 found.setdefault(robot, visit.ends_s)
@@ -167,25 +185,33 @@ def of_scenario(scenario: Scenario, mode: str | None = None, tick_s: float | Non
                     robot.id,
                     robot.peer,
                     robot.role,
-                    robot.anchor,
+                    robot.given_anchor,
                     robot.rendezvous.of(robot.role),
                     robot.attack,
-                    frame(robot.anchor, robot.start),
+                    frame(robot.anchor, robot.start) if robot.given_anchor is not None else None,
                 )
                 for robot in scenario.robots
             ]
         ),
         mission=scenario.mission,
         planner_name=scenario.planner_name,
-        t_max_s=max(
-            [one.ends for one in scenario.meetings] or [robot.rendezvous.bound for robot in scenario.robots]
-        ),
+        t_max_s=_bound(scenario),
         max_ticks=scenario.max_ticks,
         seed=scenario.seed,
         mode=mode,
         tick_s=tick_s,
         faults=scenario.faults,
         visits=tuple([Visit(one.visitor, one.visited, one.ends) for one in scenario.meetings]),
+        sweep=scenario.planned_sweep.sweep if scenario.planned_sweep is not None else None,
+    )
+
+
+def _bound(scenario: Scenario) -> float:
+    """Return the bound T_max in s: that of the group, or the largest of all pairs."""
+    if scenario.planned_sweep is not None:
+        return scenario.planned_sweep.ends
+    return max(
+        [one.ends for one in scenario.meetings] or [robot.rendezvous.bound for robot in scenario.robots]
     )
 
 
@@ -196,26 +222,37 @@ def of_configs(name: str, configs_by_robot: Mapping[str, RobotConfig]) -> RunSet
     """
     configs = list(configs_by_robot.values())
     visits = _visits(configs)
+    unanchored = [one for one in configs if isinstance(one, RobotConfigWithoutAnchor)]
     return RunSetup(
         name=name,
         robots=tuple(
             [
-                RobotSetup(one.robot, one.peer, one.role, one.anchor, one.rendezvous.of(one.role), one.attack)
+                RobotSetup(
+                    one.robot,
+                    one.peer,
+                    one.role,
+                    None if isinstance(one, RobotConfigWithoutAnchor) else one.anchor,
+                    one.rendezvous.of(one.role),
+                    one.attack,
+                )
                 for one in configs
             ]
         ),
         mission=configs[0].mission,
         planner_name=configs[0].planner_name,
-        t_max_s=max([one.ends_s for one in visits] or [one.rendezvous.bound for one in configs]),
+        t_max_s=max([one.rendezvous.bound for one in unanchored])
+        if unanchored
+        else max([one.ends_s for one in visits] or [one.rendezvous.bound for one in configs]),
         tick_s=configs[0].tick_s,
         visits=tuple(visits),
+        sweep=unanchored[0].sweep if unanchored else None,
     )
 
 
 def _visits(configs: Sequence[RobotConfig]) -> list[Visit]:
     """Return the planned meetings in the configurations of a group."""
     grouped = [one for one in configs if isinstance(one, RobotConfigInGroup)]
-    found = [(one, one.peer) for one in grouped if one.role == "a"]
+    found = [(one, one.peer) for one in grouped if one.role == "a"]  # none without an anchor
     found += [(one, visited) for one in grouped for visited in one.visits]
     visits = [
         Visit(one.robot, visited, one.member(visited).ends * one.mission.period) for one, visited in found

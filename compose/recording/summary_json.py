@@ -15,7 +15,12 @@ import msgspec
 from compose.extras import version
 from compose.recording.claim import matrix
 from compose.recording.corrected_bounds import corrected_bounds
-from compose.recording.group_localisation import meeting_results
+from compose.recording.group_localisation import (
+    MeetingResult,
+    SearchResult,
+    meeting_results,
+    search_results,
+)
 from compose.recording.run import Run, ended
 from compose.recording.ticks_csv import ticks_csv
 from protocol import files
@@ -68,16 +73,18 @@ def summary(run: Run, mode: Mode | None, wall_s: float | None) -> dict[str, Any]
 
 
 def _group(run: Run) -> dict[str, Any]:
-    """Return the bound until all robots of the group are localised, and its meetings."""
-    meetings = list(meeting_results(run))
-    ticks = [one.localised_tick for one in meetings]
+    """Return the bound until all robots of the group are localised, its meetings, and its searches."""
+    meetings, searches = list(meeting_results(run)), list(search_results(run))
+    results: list[MeetingResult | SearchResult] = [*meetings, *searches]
+    ticks = [one.localised_tick for one in results]
     return {
-        "bound_s": max(one.bound_s for one in meetings),
-        "bound_ticks": max(one.bound_ticks for one in meetings),
+        "bound_s": max(one.bound_s for one in results),
+        "bound_ticks": max(one.bound_ticks for one in results),
         "localised_tick": max(tick for tick in ticks if tick is not None) if None not in ticks else None,
         "corrected_bounds": msgspec.to_builtins(list(corrected_bounds(run))),
         "deaths": {one.robot: one.tick for one in run.scenario.deaths},
         "meetings": msgspec.to_builtins(meetings),
+        **({"without_anchor": msgspec.to_builtins(searches)} if searches else {}),
     }
 
 

@@ -10,6 +10,7 @@ from itertools import permutations
 from compose.errors import BadScenario, Unworkable
 from compose.launch import planner_loader
 from compose.scenario.group_meetings import FirstMeeting, GroupMeetings, group_meetings
+from compose.scenario.group_sweep import check_unanchored, with_sweep
 from compose.scenario.scenario_tables import RobotTable, ScenarioFile
 from protocol.mission import infeasibility
 from protocol.orbits import Rendezvous
@@ -27,13 +28,19 @@ def meetings_of(file: ScenarioFile, source: str) -> GroupMeetings | None:
     """
     robots = file.robot
     if len(robots) == 2 or any(robot.peer is not None for robot in robots):
+        for i, robot in enumerate(robots):
+            if robot.anchor is None:
+                raise BadScenario(f"{source}: robot[{i}]: missing field 'anchor'")
         return None
     _check_ids(robots, source)
-    distances = [_checked_distance(file, i, j, source) for j in range(len(robots)) for i in range(j)]
+    check_unanchored(file, source)
+    anchored = [i for i, robot in enumerate(robots) if robot.anchor is not None]
+    distances = [_checked_distance(file, i, j, source) for j in anchored for i in anchored if i < j]
     # least accurate are robots that are very near to each other, and those that have a long way
     _check_accuracy(file, (min(distances), max(distances)), source)
     try:
-        return group_meetings(robots, file.mission, file.planner)
+        meetings = group_meetings([robots[i] for i in anchored], file.mission, file.planner)
+        return with_sweep(robots, file.mission.area, file.mission, meetings)
     except Unworkable as error:
         raise Unworkable(f"{source}: {error}") from None
 
@@ -77,6 +84,8 @@ def _checked_distance(file: ScenarioFile, first: int, second: int, source: str, 
     Unworkable if they could not localise themselves.
     """
     one, other = file.robot[first], file.robot[second]
+    assert one.anchor is not None
+    assert other.anchor is not None
     distance = math.dist(one.anchor, other.anchor)
     if distance < NEAREST_ANCHORS:
         raise BadScenario(

@@ -13,7 +13,7 @@ from compose.scenario.group_plan import group_plan
 from compose.scenario.scenario_tables import PlannerTable, RobotTable
 from protocol.mission import Mission, Role
 from protocol.orbits import Rendezvous, meeting_ticks, pair_ticks, visiting
-from world.scenario import PlannedMeeting, PlannedRetry
+from world.scenario import PlannedMeeting, PlannedRetry, PlannedSweep
 
 NEIGHBOURS = 3
 """The number of nearest anchors among which a robot's first peer is chosen, in a large group."""
@@ -56,10 +56,12 @@ class GroupMeetings(NamedTuple):
     """The meetings with which the group tries again if a first meeting has failed."""
     latest: float
     """The bound in s of the time at which the last of these has localised all robots that can be."""
+    sweep: PlannedSweep | None = None
+    """The search for robots without an anchor; None if all have one."""
 
 
 def group_meetings(robots: Sequence[RobotTable], mission: Mission, planner: PlannerTable) -> GroupMeetings:
-    """Return the meetings of `robots`, planned for the shortest bound.
+    """Return the meetings of `robots`, which have anchors, planned for the shortest bound.
 
     Raises Unworkable if the planner is not made for groups, and UserError if it cannot be loaded.
     """
@@ -67,7 +69,8 @@ def group_meetings(robots: Sequence[RobotTable], mission: Mission, planner: Plan
         raise Unworkable(
             f"planner.name: robots with the planner {planner.name} meet in pairs: set robot.peer"
         )
-    anchors, ids = [robot.anchor for robot in robots], [robot.id for robot in robots]
+    anchors = [robot.anchor for robot in robots if robot.anchor is not None]
+    ids = [robot.id for robot in robots]
     near = _neighbours(anchors)
 
     def rendezvous(i: int, j: int) -> Rendezvous:

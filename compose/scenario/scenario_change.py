@@ -45,7 +45,7 @@ class ScenarioChange(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The values of a scenario that can be changed."""
 
     robots: dict[RobotId, RobotChange]
-    """The starts and anchors by robot. A robot that is left out keeps its own."""
+    """The starts and anchors by robot. A robot that is left out, or has no anchor, keeps its own start."""
     sensing_range: Finite
     """The sensing range R, in m."""
     sigma: Finite
@@ -70,6 +70,7 @@ def values_of(scenario: Scenario) -> ScenarioChange:
         robots={
             one.id: RobotChange(one.start.x, one.start.y, one.start.heading, one.anchor.x, one.anchor.y)
             for one in scenario.robots
+            if one.given_anchor is not None
         },
         sensing_range=scenario.mission.sensing_range,
         sigma=max(noise.anchor_sigma, noise.mutual_sigma),
@@ -162,6 +163,9 @@ def _has_default_ticks(scenario: Scenario) -> bool:
 def file_table(scenario: Scenario) -> dict[str, Any]:
     """Return the content of a scenario file that describes `scenario`, with all starts and the last tick."""
     mission = _given(scenario.mission)
+    if scenario.planned_sweep is not None:
+        area = scenario.planned_sweep.sweep
+        mission["area"] = [area.x_min, area.y_min, area.x_max, area.y_max]
     if scenario.mission.noise.profile is not None:  # a default would have the value of the profile
         noise = msgspec.to_builtins(scenario.mission.noise)
         mission["noise"] = {name: value for name, value in noise.items() if value is not None}
@@ -183,7 +187,7 @@ def file_table(scenario: Scenario) -> dict[str, Any]:
             {
                 "id": one.id,
                 **({"peer": one.peer} if not scenario.meetings else {}),
-                "anchor": [one.anchor.x, one.anchor.y],
+                **({"anchor": [at.x, at.y]} if (at := one.given_anchor) is not None else {}),
                 "start": [one.start.x, one.start.y, one.start.heading],
                 **({"attack": _given(one.attack)} if one.attack is not None else {}),
                 **({"dies": dies[one.id]} if one.id in dies else {}),

@@ -17,7 +17,7 @@ from compose.scenario.fault_syntax import FaultTable, added, table_of
 from compose.scenario.first_meetings import linked, meetings_of, pair_meetings
 from compose.scenario.group_meetings import GroupMeetings
 from compose.scenario.kills import WORLD, Kill, drawn
-from compose.scenario.scenario_tables import MAX_TICKS, PlannerTable, RobotTable, ScenarioFile
+from compose.scenario.scenario_tables import MAX_TICKS, MissionTable, PlannerTable, RobotTable, ScenarioFile
 from compose.scenario.shipped_files import misplaced, shipped, unknown
 from compose.scenario.toml_file import field_first, read_text, table_in
 from protocol.attack import OF_THE_START
@@ -41,6 +41,7 @@ from world.scenario import (
     Scenario,
     ScenarioOfGroup,
     ScenarioWithOptions,
+    ScenarioWithSweep,
     ScenarioWithWorldNoise,
 )
 from world.world_noise import world_noise_infeasibility, world_noise_mistake
@@ -74,13 +75,13 @@ class ScenarioTemplate(msgspec.Struct, frozen=True):
         if self.file.group is not None:
             file = _with_robots(msgspec.structs.replace(self.file, seed=seed))
             return _validated(file, self.source, self.faults)
-        reach = self.file.mission.sensing_range
+        mission = self.file.mission
         return msgspec.structs.replace(
             self.scenario,
             seed=seed,
             robots=tuple(
                 [
-                    msgspec.structs.replace(placed, start=_start(robot, reach, seed))
+                    msgspec.structs.replace(placed, start=_start(robot, mission, seed))
                     for placed, robot in zip(self.scenario.robots, self.file.robot, strict=True)
                 ]
             ),
@@ -194,15 +195,19 @@ def _with_robots(file: ScenarioFile) -> ScenarioFile:
         return file
     side = file.group.spacing * math.sqrt(file.group.robots)
     robots = []
+    anchored = file.group.robots - file.group.without_anchor
     for i in range(1, file.group.robots + 1):
         draw = random.Random(f"{file.seed}/anchor/r{i}").random
-        robots.append(RobotTable(f"r{i}", (side * draw(), side * draw())))
+        robots.append(RobotTable(f"r{i}", (side * draw(), side * draw()) if i <= anchored else None))
     robots[0] = msgspec.structs.replace(robots[0], attack=file.group.attack)
     dies = file.group.dies
     if isinstance(dies, list):
         dies = random.Random(f"{file.seed}/dies").randint(dies[0], dies[1])
     robots[1] = msgspec.structs.replace(robots[1], dies=dies)
-    return msgspec.structs.replace(file, robot=robots)
+    area = file.mission.area or (0.0, 0.0, side, side)
+    return msgspec.structs.replace(
+        file, robot=robots, mission=msgspec.structs.replace(file.mission, area=area)
+    )
 
 
 def _with_profile(table: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -224,8 +229,8 @@ def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scena
     _check_models(file, source)
     placed: list[RobotSpec] = []
     for i, robot in enumerate(file.robot):
-        start = _start(robot, file.mission.sensing_range, file.seed)
-        rho0 = math.dist((start.x, start.y), robot.anchor)
+        start = _start(robot, file.mission, file.seed)
+        rho0 = math.dist((start.x, start.y), robot.anchor) if robot.anchor is not None else 0.0
         if rho0 > file.mission.sensing_range:
             raise BadScenario(
                 f"{source}: robot[{i}].start: '{robot.id}' is {rho0:.9g} m from its anchor, "
@@ -239,7 +244,8 @@ def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scena
         if robot.dies is not None and meetings is None:
             raise BadScenario(f"{source}: robot[{i}].dies: robots die in groups only")
         peer, role, orbits = first[robot.id]
-        placed.append(RobotSpec(robot.id, peer, role, Anchor(*robot.anchor), start, orbits, robot.attack))
+        anchor = Anchor(*robot.anchor) if robot.anchor is not None else None
+        placed.append(RobotSpec(robot.id, peer, role, anchor, start, orbits, robot.attack))
     faults = _faults(file, options, links, source)
     if meetings is not None:
         budget = math.ceil(meetings.latest / file.mission.period)
@@ -253,7 +259,7 @@ def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scena
         name=file.name,
         seed=file.seed,
         max_ticks=file.max_ticks if file.max_ticks is not None else budget + delay,
-        mission=file.mission,
+        mission=file.mission.plain,
         planner_name=file.planner.name,
         robots=tuple(placed),
         faults=faults,
@@ -270,7 +276,7 @@ def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scena
 def _with_world(scenario: Scenario, file: ScenarioFile, meetings: GroupMeetings | None) -> Scenario:
     """Return `scenario` with what its file says about the group and the world, if that is anything."""
     if meetings is not None:
-        return ScenarioOfGroup(
+        of_group = ScenarioOfGroup(
             **asdict(scenario),
             world_noise=file.world.noise,
             planner_options=file.planner.options,
@@ -280,6 +286,9 @@ def _with_world(scenario: Scenario, file: ScenarioFile, meetings: GroupMeetings 
             retries=meetings.retries,
             deaths=tuple([Death(one.id, one.dies) for one in file.robot if one.dies is not None]),
         )
+        if meetings.sweep is None:
+            return of_group
+        return ScenarioWithSweep(**asdict(of_group), planned_sweep=meetings.sweep)
     if file.planner.options or file.world.range is not None or file.world.radio is not None:
         return ScenarioWithOptions(
             **asdict(scenario),
@@ -364,17 +373,21 @@ def _check_models(file: ScenarioFile, source: str) -> None:
         )
 
 
-def _start(robot: RobotTable, sensing_range: float, seed: int) -> Pose:
+def _start(robot: RobotTable, mission: MissionTable, seed: int) -> Pose:
     """Return the start pose in the file, or one drawn uniformly from the disc of its anchor's range.
 
-    A drawn heading is uniform in [0, 2 pi).
+    Without an anchor, it is drawn from the area of the mission. A drawn heading is uniform in [0, 2 pi).
     """
     if robot.start is not None:
         x, y, heading = robot.start
         # many turns are removed here, because trigonometric functions of large angles lose digits
         return Pose(x, y, heading if abs(heading) <= TAU else wrap(heading))
     draw = random.Random(f"{seed}/start/{robot.id}").random
-    radius = WITHIN * sensing_range * math.sqrt(draw())
+    if robot.anchor is None:
+        assert mission.area is not None
+        x_min, y_min, x_max, y_max = mission.area
+        return Pose(x_min + (x_max - x_min) * draw(), y_min + (y_max - y_min) * draw(), TAU * draw())
+    radius = WITHIN * mission.sensing_range * math.sqrt(draw())
     bearing, heading = TAU * draw(), TAU * draw()
     return Pose(
         robot.anchor[0] + radius * math.cos(bearing), robot.anchor[1] + radius * math.sin(bearing), heading

@@ -47,15 +47,34 @@ class WorldTable(_Table, frozen=True):
     """The `[world.radio]` table: the model of the delivery of reports."""
 
 
+Area = tuple[Place, Place, Place, Place]
+"""The smallest x and y and the largest x and y of an area, in m."""
+
+
+class MissionTable(Mission, frozen=True, forbid_unknown_fields=True):
+    """The `[mission]` table."""
+
+    area: Area | None = None
+    """x_min, y_min, x_max, y_max in m: the area in which robots without an anchor are."""
+
+    @property
+    def plain(self) -> Mission:
+        """The mission without the area, which is not part of it."""
+        return Mission(*[getattr(self, field) for field in Mission.__struct_fields__])
+
+
 class RobotTable(_Table, frozen=True):
     """A `[[robot]]` table."""
 
     id: RobotId
     """The robot's name."""
-    anchor: tuple[Place, Place]
-    """x, y of the robot's anchor, in m."""
+    anchor: tuple[Place, Place] | None = None
+    """x, y of the robot's anchor, in m. Robots of a group may have none."""
     start: tuple[Place, Place, Annotated[float, Meta(ge=-1e6, le=1e6)]] | None = None
-    """Start pose x, y in m and heading in rad; None: drawn from the seed, within range of the anchor."""
+    """Start pose x, y in m and heading in rad; None: drawn from the seed, within range of the anchor.
+
+    Without an anchor, it is drawn in `mission.area`.
+    """
     peer: RobotId | None = None
     """Id of the peer. More than two robots without one form a group, which meets in turn."""
     attack: Attack | None = None
@@ -72,6 +91,8 @@ class GroupTable(_Table, frozen=True):
     """The number n of robots, which are r1 to rn."""
     spacing: Annotated[float, Meta(gt=0.0, le=1e5)]
     """The anchors are uniform in a square, whose side in m is this times the square root of n."""
+    without_anchor: Annotated[int, Meta(ge=0, le=MAX_ROBOTS)] = 0
+    """The number of robots without an anchor, the last ones. By default, `mission.area` is the square."""
     attack: Attack | None = None
     """False data injection by the robot r1."""
     dies: Tick | Annotated[list[Tick], Meta(min_length=2, max_length=2)] | None = None
@@ -87,7 +108,7 @@ class ScenarioFile(_Table, frozen=True):
 
     name: Annotated[str, Meta(pattern=NAME, max_length=LONGEST_NAME)]
     """The name of the scenario, and the beginning of the names of its runs."""
-    mission: Mission
+    mission: MissionTable
     """The `[mission]` table."""
     robot: Annotated[list[RobotTable], Meta(min_length=2, max_length=MAX_ROBOTS)] = []
     """One `[[robot]]` for each robot; required without `[group]`."""

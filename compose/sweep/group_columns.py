@@ -8,7 +8,7 @@ import msgspec
 
 from compose.recording.claim import Claim
 from compose.recording.corrected_bounds import corrected_bounds
-from compose.recording.group_localisation import meeting_results
+from compose.recording.group_localisation import meeting_results, search_results
 from compose.recording.meetings import has_log
 from compose.recording.run import Run
 from compose.scenario.group_plan import least_makespan
@@ -46,9 +46,11 @@ def group_columns(run: Run) -> GroupColumns | None:
     claims = {robot: claim for robot in honest if (claim := run.claim(robot)) is not None}
     right = sum([_is_right(run, robot, claim) for robot, claim in claims.items()])
     corrected = corrected_bounds(run)
+    bounds = [one.bound_ticks for one in meeting_results(run)]
+    bounds += [one.bound_ticks for one in search_results(run)]
     met, found = _met_and_found(run, honest) if run.agents else (None, None)
     return GroupColumns(
-        bound_ticks=max([one.bound_ticks for one in meeting_results(run)]),
+        bound_ticks=max(bounds),
         corrected_ticks=corrected[-1].bound_ticks if corrected else None,
         travel_ticks=_travel_ticks(run),
         honest_tick=max([claim.tick for claim in claims.values()]) if len(claims) == len(honest) else None,
@@ -92,10 +94,11 @@ def _travel_ticks(run: Run) -> float | None:
     """Return a lower bound of the ticks until all are localised, from the first meetings as they went.
 
     They are those of the plan, and end when they did; then robots travel from anchor to anchor, and meetings
-    take no time. None if a first meeting has not localised both of its robots, and if one of the robots dies.
+    take no time. None if a first meeting has not localised both of its robots, if a robot dies, or if one has no
+    anchor.
     """
     scenario = run.scenario
-    if scenario.deaths:
+    if scenario.deaths or scenario.planned_sweep is not None:
         return None
     place = {robot.id: i for i, robot in enumerate(scenario.robots)}
     hop = tuple(tuple(_way(scenario, i, j) for j in place.values()) for i in place.values())

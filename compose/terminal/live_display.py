@@ -125,14 +125,14 @@ class RobotMap:
 
     def _map(self, scene: Scene, rows: int) -> Text:
         drawing = Drawing(self._console.size.width - 1, rows, box(self._setup))
-        for robot in self._setup.robots:
+        for robot in self._setup.anchored:
             at = robot.anchor.x, robot.anchor.y
             drawing.dots(circle(at, self._setup.mission.sensing_range), "dim")
         for robot in self._setup.robots:
             drawing.line(self._paths[robot.id], self._hue(scene.player(robot.id)))
         for player in scene.players:
             self._lines(drawing, scene, player)
-        for robot in self._setup.robots:
+        for robot in self._setup.anchored:
             hue = self._hue(scene.player(robot.id))
             drawing.letter((robot.anchor.x, robot.anchor.y), "+", f"bold {hue}")
         for player in scene.players:

@@ -169,10 +169,13 @@ def _believing(robot_setup: RobotSetup, before: TickData | None, now: TickData) 
     previous, current = len(earlier.world), len(held.world)
     if previous == 0 < current:
         text = f"{robot} has {current} possible configuration{'s' if current > 1 else ''} of the pair"
+        if robot_setup.given_anchor is None:
+            text = f"{robot} has {current} possible pose{'s' if current > 1 else ''}"
         yield Event(tick, "candidates", robot, text)
     elif previous != current > 0:
         change = "fall" if current < previous else "rise"
-        text = f"{robot}'s possible configurations {change} from {previous} to {current}"
+        what = "configurations" if robot_setup.given_anchor is not None else "poses"
+        text = f"{robot}'s possible {what} {change} from {previous} to {current}"
         yield Event(tick, "candidates", robot, text)
 
 

@@ -36,8 +36,11 @@ class Numbers(msgspec.Struct, frozen=True):
     """The range to the peer, less the distance between the leading poses of both in the world frame."""
 
     @staticmethod
-    def of(player: Player, anchor: Anchor, peer: HeldPoses | None) -> Numbers:
-        """Return the numbers of a robot; `anchor` is its own, and `peer` the poses that its peer holds."""
+    def of(player: Player, anchor: Anchor | None, peer: HeldPoses | None) -> Numbers:
+        """Return the numbers of a robot.
+
+        `anchor` is its own, None if it has none, and `peer` the poses that its peer holds.
+        """
         held = player.held
         hypotheses = held.world or held.local if held is not None else ()
         world = held.world if held is not None else ()
@@ -48,7 +51,7 @@ class Numbers(msgspec.Struct, frozen=True):
             if contact.range is not None and player.peer in (None, contact.peer)
         ]
         expected = None
-        if world:
+        if world and anchor is not None:
             expected = math.hypot(world[0].x - anchor.x, world[0].y - anchor.y)
         elif hypotheses:
             expected = math.hypot(hypotheses[0].x, hypotheses[0].y)

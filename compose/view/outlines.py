@@ -6,6 +6,7 @@ import math
 from typing import NamedTuple
 
 from compose.recording.run_setup import RunSetup
+from protocol.mission import Anchor
 from protocol.motion import Covariance, Pose, compose
 
 CORNERS = 72
@@ -49,8 +50,10 @@ class Box(NamedTuple):
 
 
 def box(setup: RunSetup) -> Box:
-    """Return the box about all sensing ranges and orbits."""
-    reach = [(one.anchor, max(setup.mission.sensing_range, one.orbit.radius)) for one in setup.robots]
+    """Return the box about all sensing ranges and orbits, and the area of robots without an anchor."""
+    reach = [(one.anchor, max(setup.mission.sensing_range, one.orbit.radius)) for one in setup.anchored]
+    if (area := setup.sweep) is not None:
+        reach += [(Anchor(area.x_min, area.y_min), 0.0), (Anchor(area.x_max, area.y_max), 0.0)]
     left, right = min(at.x - r for at, r in reach), max(at.x + r for at, r in reach)
     low, high = min(at.y - r for at, r in reach), max(at.y + r for at, r in reach)
     return Box((left + right) / 2.0, (low + high) / 2.0, right - left, high - low)

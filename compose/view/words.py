@@ -28,6 +28,8 @@ DOING = {
     "tangent": "{robot} turns from the radius onto its orbit",
     "orbiting": "{robot} drives on its orbit until {peer} is in range",
     "travelling": "{robot} drives to {peer} to localise it",
+    "sweeping": "{robot} sweeps an area for robots without an anchor",
+    "looping": "{robot} drives a small square, so that a robot without an anchor is localised",
     "standing": "{robot} stands still and waits for {peer}'s second range",
     "waiting": "{robot} stands still and waits for {peer}'s last manoeuvre",
     "last-manoeuvre": "{robot} drives to where the remaining configurations predict different ranges",
@@ -68,6 +70,8 @@ def doing(robot_setup: RobotSetup, phase: int, state: str, verdict: Verdict | No
             return f"{robot_setup.id} is undecided: {reason}"
         case Inconsistent(claim):
             return f"{robot_setup.id} found an inconsistency in the reports of {robot_setup.peer}: {claim}"
+    if robot_setup.given_anchor is None and state == "standing":
+        return f"{robot_setup.id} has no anchor, and stands still until a localised robot is in range"
     sentence = SEEKING.get(state) or DOING.get(state) or "{robot}: " + state
     if state == "orbiting" and robot_setup.orbit.v == 0.0:
         sentence = WAITING

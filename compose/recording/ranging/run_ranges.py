@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -45,15 +45,17 @@ def ranges_of_run(run: Run, given: Sequence[AnchorRow] = ()) -> RangeRecording:
     anchors: dict[Anchor, str] = {}
     for one in setup.robots:
         builder.add_robot(one.id)
+    for one in setup.anchored:
         if one.anchor not in anchors:
             anchors[one.anchor] = name = f"anchor-{one.id}"
             builder.add(AnchorRow(name, one.anchor.x, one.anchor.y), run.source)
-    anchor_of = {one.id: anchors[one.anchor] for one in setup.robots}
+    anchor_of = {one.id: anchors[one.anchor] for one in setup.anchored}
+    ids = set(setup.ids)
     for tick in range(run.length):
-        observations = {robot: one for robot, one in run.observations[tick].items() if robot in anchor_of}
+        observations = {robot: one for robot, one in run.observations[tick].items() if robot in ids}
         for row, covariance in _moved(observations, setup.mission):
             builder.add_odometry(row, covariance, run.source)
-        for ranged in _ranged(observations, anchor_of, setup.mission):
+        for ranged in _ranged(observations, anchor_of, ids, setup.mission):
             builder.add(ranged, run.source)
     for robot in setup.ids:
         for tick, pose in enumerate(run.truth(robot)):
@@ -76,7 +78,10 @@ def _moved(
 
 
 def _ranged(
-    observations: Mapping[str, Observation], anchor_of: Mapping[str, str], mission: Mission
+    observations: Mapping[str, Observation],
+    anchor_of: Mapping[str, str],
+    ids: Collection[str],
+    mission: Mission,
 ) -> Iterator[RangeRow]:
     """Yield the ranges of one tick; those between two robots once."""
     sigma = math.hypot(mission.noise.mutual_sigma, LEAST_SIGMA)
@@ -88,7 +93,7 @@ def _ranged(
             yield RangeRow(t, robot, anchor_of[robot], observation.anchor_range, anchor_sigma)
         for contact in observation.contacts:
             pair = frozenset((robot, contact.peer))
-            if contact.range is not None and contact.peer in anchor_of and pair not in seen:
+            if contact.range is not None and contact.peer in ids and pair not in seen:
                 seen.add(pair)
                 yield RangeRow(t, robot, contact.peer, contact.range, sigma)
 

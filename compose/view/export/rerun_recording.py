@@ -139,7 +139,7 @@ class _Drawing:
 
     def stand(self) -> None:
         """Draw what does not change: anchors, sensing ranges and orbits, and the style of the plots."""
-        for robot in self._setup.robots:
+        for robot in self._setup.anchored:
             colour = GREY if self._setup.visits else _colour(robot.role)
             at = (robot.anchor.x, robot.anchor.y)
             self._fixed(
@@ -179,7 +179,7 @@ class _Drawing:
             self._draw_hypotheses(robot, player)
         for robot in self._setup.robots[:PLOTTED]:
             player = scene.player(robot.id)
-            numbers = Numbers.of(player, robot.anchor, scene.held_by(player.peer or robot.peer))
+            numbers = Numbers.of(player, robot.given_anchor, scene.held_by(player.peer or robot.peer))
             for number in numbers.__struct_fields__:
                 value = getattr(numbers, number)
                 if any(number in plotted for plotted in PLOTS.values()):
@@ -218,8 +218,10 @@ class _Drawing:
         held = player.held
         if held is None:
             return
-        frame = robot.frame or Pose(robot.anchor.x, robot.anchor.y, 0.0)
-        poses = held.world or tuple([compose(frame, pose) for pose in held.local])
+        poses = held.world
+        if held.local and not poses:
+            frame = robot.frame or Pose(robot.anchor.x, robot.anchor.y, 0.0)
+            poses = tuple([compose(frame, pose) for pose in held.local])
         shares = held.probability or (1.0 / max(1, len(poses)),) * len(poses)
         arrows = rr.Arrows3D(
             origins=[(pose.x, pose.y, 0.0) for pose in poses],

@@ -116,7 +116,7 @@ class Views:
 
     def standing(self) -> Shown:
         """Return the static content: anchors, sensing ranges and orbits."""
-        entities = [self._anchor(robot_setup) for robot_setup in self.setup.robots]
+        entities = [self._anchor(robot_setup) for robot_setup in self.setup.anchored]
         if self.setup.visits:
             entities.append(self._tree())
         return Shown("/stage", fox.SceneUpdate(entities=entities))
@@ -150,7 +150,9 @@ class Views:
         yield Shown("/tf", fox.FrameTransforms(transforms=list(self._transforms(scene, at))))
         for player in scene.players:
             robot_setup = self.setup.robot_setup(player.robot)
-            numbers = Numbers.of(player, robot_setup.anchor, scene.held_by(player.peer or robot_setup.peer))
+            numbers = Numbers.of(
+                player, robot_setup.given_anchor, scene.held_by(player.peer or robot_setup.peer)
+            )
             yield Shown(f"/{player.robot}/numbers", numbers)
             yield from self._robot(player, at)
         yield Shown("/contact", fox.SceneUpdate(entities=list(self._contacts(scene, at))))
@@ -159,7 +161,10 @@ class Views:
 
     def _transforms(self, scene: Scene, at: fox.Timestamp) -> Iterator[fox.FrameTransform]:
         for player in scene.players:
-            frames = {f"{player.robot}/anchor": _frame(self.setup.robot_setup(player.robot))}
+            robot_setup = self.setup.robot_setup(player.robot)
+            frames = {}
+            if robot_setup.given_anchor is not None:
+                frames[f"{player.robot}/anchor"] = _frame(robot_setup)
             if player.pose is not None:
                 frames[player.robot] = player.pose
             for child, pose in frames.items():

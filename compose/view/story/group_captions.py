@@ -43,11 +43,16 @@ def group_captions(
 
 def _beginning(setup: RunSetup) -> Caption:
     visited = {visit.visited for visit in setup.visits}
-    first = [f"{one.id} meets {one.peer}" for one in setup.robots if one.id not in visited]
+    first = [f"{one.id} meets {one.peer}" for one in setup.anchored if one.id not in visited]
     meet = f"First, {_listed(first, 'pairs meet')}"
     meet += "; then those that are localised drive to the others." if len(first) < len(setup.visits) else "."
     number = count_word(len(setup.robots)).capitalize()
     text = f"{number} robots measure no more than the distance to their own anchor."
+    if found := len(setup.robots) - len(setup.anchored):
+        text = (
+            f"{number} robots measure no more than the distance to their own anchor, and {found} have none."
+        )
+        meet += " At last, they sweep the area for those without an anchor."
     attackers = [robot.id for robot in setup.robots if robot.attack is not None]
     truth = f"{_listed(attackers, 'robots')} will report false data." if attackers else None
     return Caption("ranging", f"{text} {meet}", truth=truth)
@@ -101,7 +106,12 @@ def _concluding(
 
 
 def _departing(setup: RunSetup, before: TickData, now: TickData) -> Iterator[Caption]:
-    """Yield the beginnings of the ways to other robots, in one caption."""
+    """Yield the beginnings of sweeps, and of the ways to other robots, in one caption each."""
+    sweeps = [one.id for one in setup.robots if _begins(one.id, "sweeping", before, now)]
+    if sweeps:
+        verb = "sweeps" if len(sweeps) == 1 else "sweep"
+        text = f"{_listed(sweeps, 'robots')} {verb} the area for robots without an anchor."
+        yield Caption("search", text, tuple(sweeps))
     found = []
     for one in setup.robots:
         command, earlier = now.commands.get(one.id), before.commands.get(one.id)
@@ -118,6 +128,14 @@ def _departing(setup: RunSetup, before: TickData, now: TickData) -> Iterator[Cap
         ways = [f"{robot} drives to {peer}" for robot, peer in found]
         text = _listed(ways, "robots drive to others")
         yield Caption("search", f"{text}, which wait beside their anchors.", robots)
+
+
+def _begins(robot: str, state: str, before: TickData, now: TickData) -> bool:
+    """Return whether `robot` begins a sweep in the tick of `now`, but not whether it goes on after a stop."""
+    command, earlier = now.commands.get(robot), before.commands.get(robot)
+    if command is None or earlier is None:
+        return False
+    return command.state == state and earlier.state not in (state, "looping")
 
 
 def _losing(

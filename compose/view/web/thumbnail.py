@@ -30,7 +30,7 @@ def thumbnail(setup: RunSetup, known: RunData) -> str:
 
     hues = _hues(setup, known)
     parts = []
-    for robot in setup.robots[:MOST_ROBOTS]:
+    for robot in setup.anchored[:MOST_ROBOTS]:
         colour = colours.COLOURS[hues[robot.id]]
         x, y = at(robot.anchor.x, robot.anchor.y)
         radius = setup.mission.sensing_range * scale

@@ -74,6 +74,7 @@ export class Backdrop {
 
   /** Draws the range of an anchor and its robot's orbit. */
   #anchor(view, robot) {
+    if (!robot.anchor) return;
     const { pen, plane } = this, { look } = view, { at: [x, y], reach, alpha } = this.#place(view, robot);
     pen.globalAlpha = alpha;
     pen.beginPath();
@@ -96,6 +97,7 @@ export class Backdrop {
 
   /** Draws an anchor, above paths and poses that are ruled out. */
   beacon(view, robot) {
+    if (!robot.anchor) return;
     const pen = this.plane.context, { at: [x, y], radius: r, alpha } = this.#place(view, robot);
     pen.globalAlpha = alpha;
     pen.beginPath();
@@ -110,6 +112,7 @@ export class Backdrop {
 
   /** Asks for the label of an anchor, and adds its target. */
   #name(view, robot) {
+    if (!robot.anchor) return;
     const { plane } = this, { at, reach, radius, alpha } = this.#place(view, robot);
     plane.targets.push({ kind: "anchor", robot: robot.id, at, radius });
     plane.context.globalAlpha = alpha;

@@ -88,7 +88,7 @@ export class Beliefs {
 
   /** Draws the circle on which the robot is, or its anchor's sensing range, before it has a pose. */
   #somewhere({ look, truth, store, moving, share }, robot, player) {
-    if (!player || (truth && player.anchor_range === undefined)) return;
+    if (!player || !robot.anchor || (truth && player.anchor_range === undefined)) return;
     this.plane.marks.add("places");
     const pen = this.plane.context, [x, y] = this.plane.at(robot.anchor);
     const range = player.anchor_range ?? store.stage.mission.sensing_range;

@@ -7,9 +7,15 @@ const AROUND = 0.25; // of the sensing range, around each pose
 /** Returns the true pose of a player and the one that it reports, as far as there are such. */
 export const true_and_reported = (player) => [player?.pose, player?.reported?.pose].filter(Boolean);
 
-/** Returns the discs [position, radius] of the scenario: the anchors of `robots` with their ranges and orbits. */
-export function scenario_discs(robots, sensing_range) {
-  return robots.map((robot) => [robot.anchor, Math.max(sensing_range, robot.orbit[0])]);
+/**
+ * Returns the discs [position, radius] of the scenario: the anchors of `robots` with their ranges and orbits.
+ *
+ * With a robot that has no anchor, these are also the corners of the area in which it is.
+ */
+export function scenario_discs(robots, { mission: { sensing_range }, sweep }) {
+  const anchored = robots.filter(({ anchor }) => anchor), discs = anchored.map(({ anchor, orbit }) => [anchor, Math.max(sensing_range, orbit[0])]);
+  if (anchored.length < robots.length) discs.push([[sweep[0], sweep[1]], 0], [[sweep[2], sweep[3]], 0]);
+  return discs;
 }
 
 /**
@@ -20,11 +26,11 @@ export function scenario_discs(robots, sensing_range) {
  */
 export function story_discs({ store, tick, focus, truth, eliminated }, pair) {
   const { robots, mission: { sensing_range } } = store.stage;
-  if (store.grouped && !focus) return scenario_discs(robots, sensing_range);
+  if (store.grouped && !focus) return scenario_discs(robots, store.stage);
   const finished = pair.every((robot) => store.player(tick - 1, robot.id)?.command?.verdict);
-  if (finished && truth && robots.length > pair.length) return scenario_discs(robots, sensing_range);
+  if (finished && truth && robots.length > pair.length) return scenario_discs(robots, store.stage);
   const shown = truth || !focus ? pair : pair.filter((robot) => robot.id === focus);
-  const discs = scenario_discs(shown, sensing_range);
+  const discs = scenario_discs(shown, store.stage);
   if (!pair.some((robot) => store.phase(tick, robot.id) === 3)) return discs;
   const poses = [];
   for (const robot of shown) {

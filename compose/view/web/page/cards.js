@@ -184,7 +184,8 @@ function attacked(store, tick, { id, peer }, { gap }) {
 function measured(player, robot) {
   if (!player.sensed) return "unknown";
   const odometry = player.executed ? `odometry ${speed(player.executed[0])}, ${turning(player.executed[1])}; ` : "";
-  const anchor = player.anchor_range === undefined ? "no range to its anchor" : `anchor ${metres(player.anchor_range)}`;
+  const none = robot.anchor ? "no range to its anchor" : "no anchor";
+  const anchor = player.anchor_range === undefined ? none : `anchor ${metres(player.anchor_range)}`;
   if (!player.contacts?.length) return `${odometry}${anchor}; ${robot.peer} is not in range`;
   const contacts = player.contacts.map(([peer, range]) => `${peer} ${range === null ? "in range, not measured" : metres(range)}`);
   return `${odometry}${anchor}; ${contacts.join(", ")}`;

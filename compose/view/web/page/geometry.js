@@ -58,5 +58,5 @@ export function between(from, to, driven, share, period) {
 
 /** Returns the robot's anchor frame. Its heading is the true one, or 0 if the ground truth is hidden. */
 export function frame_of(robot, truth) {
-  return truth && robot.frame ? robot.frame : [robot.anchor[0], robot.anchor[1], 0];
+  return truth && robot.frame ? robot.frame : [...(robot.anchor ?? [0, 0]), 0];
 }

@@ -58,17 +58,21 @@ export function task(player, robot) {
   if (state === TRAVELLING) return `to ${robot.peer}`;
   if (state === "localised" || (verdict && verdict[0] !== "localised")) return verdict?.[0] ?? state;
   if (waits(player)) return "waiting";
-  return phase === 3 ? `meets ${robot.peer}` : state;
+  return phase === 3 && robot.anchor && state !== "looping" ? `meets ${robot.peer}` : state;
 }
 
-/** Returns whether a robot waits beside its anchor for another one. */
-const waits = ({ command }) => command?.state === "orbiting" && command.v === 0 && command.omega === 0;
+/** Returns whether a robot waits for another one: beside its anchor, or without an anchor where it is. */
+const waits = ({ command }) => (
+  (command?.state === "orbiting" && command.v === 0 && command.omega === 0) || (command?.state === "standing" && command.phase === 2)
+);
 
 /** Returns how many robots are localised, travel to others, wait for them, and do something else. */
 export function counted(players) {
   const is = (kind) => players.filter((player) => player?.command?.verdict?.[0] === kind).length;
   const travelling = players.filter((player) => player?.command?.state === TRAVELLING).length;
   const waiting = players.filter((player) => player && waits(player)).length;
+  const sweeping = players.filter((player) => ["sweeping", "looping"].includes(player?.command?.state) && player.command.verdict).length;
   const others = ["inconsistent", "undecided"].filter(is).map((kind) => `${is(kind)} ${kind}`);
-  return [...others, `${is("localised")} of ${plural(players.length, "robot")} localised`, `${travelling} travelling`, `${waiting} waiting`].join(", ");
+  const ways = [`${travelling} travelling`, ...(sweeping ? [`${sweeping} sweeping`] : []), `${waiting} waiting`];
+  return [...others, `${is("localised")} of ${plural(players.length, "robot")} localised`, ...ways].join(", ");
 }

@@ -147,12 +147,12 @@ export class Plane {
     this.fitted = true;
     this.following = this.easing = false;
     const { robots, mission } = store.stage, reach = mission.sensing_range;
-    if (!truth && focus) {
-      const { anchor, orbit } = robots.find((robot) => robot.id === focus);
+    const { anchor, orbit } = robots.find((robot) => robot.id === focus) ?? {};
+    if (!truth && anchor) {
       return this.#frame([[anchor, Math.max(reach, orbit[0]) + reach]], LIST_PX - CLEAR_PX);
     }
     const chosen = focus && robots.length > 2 ? robots.filter((r) => r.id === focus || r.peer === focus) : robots;
-    return this.#frame(scenario_discs(chosen, reach), LIST_PX - CLEAR_PX);
+    return this.#frame(scenario_discs(chosen, store.stage), LIST_PX - CLEAR_PX);
   }
 
   /** Zooms to the robots and to all poses that they consider possible, or to those of the selected robot's pair. */
@@ -162,7 +162,7 @@ export class Plane {
       if (focus && robot.id !== focus && (robot.peer !== focus || !truth)) continue;
       const player = store.player(tick, robot.id);
       const poses = [...(truth ? true_and_reported(player) : []), ...(player?.held?.world ?? [])];
-      discs.push(...(poses.length ? poses.map((pose) => [pose, 0.3 * reach]) : [[robot.anchor, reach]]));
+      discs.push(...(poses.length ? poses.map((pose) => [pose, 0.3 * reach]) : scenario_discs([robot], store.stage)));
     }
     this.#frame(discs, this.#list_height());
     this.#free();

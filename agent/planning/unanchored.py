@@ -1,0 +1,231 @@
+"""A robot of a group without an anchor: it waits until a localised robot finds it, and believes its pose.
+
+The other robot drives a square while this one stands still; that determines this robot's position. Then this
+one drives a square, too; that determines its heading. A claim rests on the ranges to one other robot, in the
+order of their ticks, so it does not depend on the order in which reports arrive.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import msgspec
+from msgspec.structs import replace
+
+from agent.estimation import resection
+from agent.estimation.resection import RangedPlace
+from agent.peer.motion_log import MotionLog
+from agent.planning import sweep
+from agent.planning.phase3_last_manoeuvre import Standing
+from agent.planning.planner import Planner, Summary
+from agent.planning.state import MODE_NAMES
+from agent.planning.sweep import LOOPS_FOR, Looping
+from protocol.messages import (
+    Command,
+    Estimate,
+    Localised,
+    Observation,
+    Report,
+    ReportWithPose,
+    RobotConfig,
+    RobotConfigWithoutAnchor,
+    Undecided,
+)
+from protocol.mission import Mission
+from protocol.motion import ORIGIN, REST, Pose, compose, inverse, step
+from protocol.rounding import SURE
+
+POSE_TOLERANCE = 1e-9
+"""The rounding error of the odometry, in units of A_0 and rad."""
+
+EXPLAINED = 0.1 * SURE
+"""The largest difference in m between a measured range and the one that a possible pose predicts.
+
+It is far above the rounding errors of the poses of both robots, and far below what a wrong pose predicts.
+"""
+
+KEPT = 64
+"""The number of ticks for which a range is kept until the report of that tick arrives."""
+
+PLACES = 5
+"""The number of relative placements that a claim needs: three for a position, two for a heading."""
+
+
+class UnanchoredState(msgspec.Struct, frozen=True):
+    """The state of a robot without an anchor."""
+
+    config: RobotConfigWithoutAnchor
+    tick: int = -1
+    odometry: Pose = ORIGIN
+    """The pose by dead reckoning, in the frame of the pose at tick 0."""
+    leg: Pose = ORIGIN
+    """The odometry at the beginning of the last segment of `log`."""
+    log: MotionLog = MotionLog()
+    base: Pose = ORIGIN
+    """The odometry at the place where it stands, or stood before its square."""
+    ranges: Mapping[tuple[str, int], tuple[float, Pose]] = {}
+    """The ranges to robots whose pose then is not known, and the own one from `base`, by robot and tick."""
+    places: Mapping[tuple[str, int], RangedPlace] = {}
+    """The ranges to robots whose poses are known, by robot and tick."""
+    possible: tuple[Pose, ...] = ()
+    """The poses of `base` in <W> that agree with the ranges; empty before the heading can be determined."""
+    mode: Standing | Looping = Standing()
+    verdict: Localised | Undecided | None = None
+
+    @property
+    def phase(self) -> int:
+        """Return 2 until the first range to a localised robot, then 3."""
+        return 3 if self.places else 2
+
+    @property
+    def mode_name(self) -> str:
+        """Return the name of the mode that reports, commands and recordings use."""
+        match self.verdict:
+            case Localised():
+                return "localised"
+            case Undecided():
+                return "undecided"
+        return MODE_NAMES[type(self.mode)]
+
+
+class UnanchoredPlanner(Planner[UnanchoredState, Report]):
+    """The planner of a robot without an anchor, with exact sensors."""
+
+    BODY = Report
+    REQUIRED_PLACES = PLACES
+
+    def start(self, config: RobotConfig) -> UnanchoredState:
+        """Return the state of a robot that has measured nothing yet."""
+        assert isinstance(config, RobotConfigWithoutAnchor)
+        return UnanchoredState(config)
+
+    def observe(self, state: UnanchoredState, observation: Observation) -> UnanchoredState:
+        """Return `state` with the odometry and the ranges of one tick."""
+        log, odometry, leg = state.log, state.odometry, state.leg
+        if (driven := observation.executed) is not None:
+            log = log.drove(driven.v, driven.omega)
+            ticks = log.runs[-1].ticks
+            leg = odometry if ticks == 1 else leg
+            odometry = step(leg, driven.v, driven.omega, ticks * state.config.mission.period)
+        state = replace(state, tick=observation.tick, odometry=odometry, leg=leg, log=log)
+        if state.verdict is not None:
+            return state
+        # where it stands, rounding must not look like a motion
+        moved = compose(inverse(state.base), odometry) if odometry != state.base else ORIGIN
+        new = {
+            (one.peer, observation.tick): (one.range, moved)
+            for one in observation.contacts
+            if one.range is not None
+        }
+        if not new:
+            return state
+        recent = {key: one for key, one in state.ranges.items() if key[1] > observation.tick - KEPT}
+        return replace(state, ranges={**recent, **new})
+
+    def report(self, state: UnanchoredState) -> Report:
+        """Return a report without a log: a robot without an anchor is in no meeting."""
+        return Report(
+            tick=state.tick,
+            robot=state.config.robot,
+            phase=state.phase,
+            state=state.mode_name,
+            start=None,
+            since=0,
+            through=0,
+            runs=(),
+            ranges_since=0,
+            ranges=(),
+            heard=0,
+            ranges_heard=0,
+            verdict=state.verdict,
+        )
+
+    def decide(self, state: UnanchoredState, reports: Sequence[Report] = ()) -> UnanchoredState:
+        """Return `state` with the poses in `reports`, and with a verdict if they determine the own pose."""
+        if state.verdict is not None:
+            return state
+        if state.tick * state.config.mission.period >= state.config.gives_up:
+            return replace(state, verdict=Undecided("no localised robot has found it"))
+        ranges, places = dict(state.ranges), dict(state.places)
+        if isinstance(state.mode, Standing):  # a robot that comes again may have another pose since a meeting
+            places = {key: one for key, one in places.items() if key[1] > state.tick - LOOPS_FOR}
+        for one in reports:
+            known = ranges.pop((one.robot, one.tick), None) if isinstance(one, ReportWithPose) else None
+            if known is not None and isinstance(one, ReportWithPose):
+                places[one.robot, one.tick] = RangedPlace((one.pose.x, one.pose.y), known[1], known[0])
+        if places.keys() != state.places.keys():
+            state = _resected(replace(state, ranges=ranges, places=places))
+        return _moved_on(state) if isinstance(state.mode, Looping) and state.verdict is None else state
+
+    def command(self, state: UnanchoredState) -> Command:
+        """Return the command for the next tick, with the phase, the mode and the verdict."""
+        controls = None
+        if isinstance(state.mode, Looping) and state.verdict is None:
+            controls = sweep.controls(state.mode, state.odometry, state.config.mission, POSE_TOLERANCE)
+        driven = controls or REST
+        return Command(
+            state.tick,
+            state.config.robot,
+            driven.v,
+            driven.omega,
+            state.phase,
+            state.mode_name,
+            state.verdict,
+        )
+
+    def estimate(self, state: UnanchoredState) -> Estimate:
+        """Return the poses in <W> that agree with all ranges."""
+        return Estimate(
+            tick=state.tick,
+            robot=state.config.robot,
+            local=(),
+            world=tuple([_now(state, one) for one in state.possible]),
+            localised=isinstance(state.verdict, Localised),
+        )
+
+    def required_mutual_ranges(self, mission: Mission) -> int:
+        """Return 0: not the number of exact ranges counts, but redundant ones."""
+        del mission
+        return 0
+
+    def summary(self, state: UnanchoredState) -> Summary:
+        """Return the number of possible poses."""
+        return Summary(hypotheses=len(state.possible) or None)
+
+
+def _now(state: UnanchoredState, base: Pose) -> Pose:
+    """Return the present pose in <W> if that of `state.base` is `base`."""
+    return compose(base, compose(inverse(state.base), state.odometry))
+
+
+def _resected(state: UnanchoredState) -> UnanchoredState:
+    """Return `state` with what follows from its ranges to each robot: a square to drive, or a verdict."""
+    for robot in sorted({robot for robot, _ in state.places}):
+        known = [state.places[key] for key in sorted(state.places) if key[0] == robot]
+        standing = [one for one in known if one.odometry == ORIGIN]
+        moved = [one for one in known if one.odometry != ORIGIN]
+        if isinstance(state.mode, Standing):
+            found = resection.positions(standing, EXPLAINED)
+            if len(found) == 1 and resection.is_fixed(standing, found[0]):
+                return replace(state, mode=sweep.looping(state.odometry, state.config.mission, state.tick))
+        elif moved and (possible := resection.poses(standing, moved, EXPLAINED)):
+            state = replace(state, possible=possible)
+            if resection.is_certain(standing, moved, possible):
+                return replace(state, verdict=Localised(_now(state, possible[0])))
+    return state
+
+
+def _moved_on(state: UnanchoredState) -> UnanchoredState:
+    """Return `state` after a tick of a square. It is repeated until the pose is known.
+
+    If nobody has reported a pose for KEPT ticks, the robot stands still again, and forgets all ranges: those
+    to the next robot that comes begin where it is then.
+    """
+    assert isinstance(state.mode, Looping)
+    mission, since = state.config.mission, state.mode.since
+    mode = sweep.onward(state.mode, state.odometry, mission, POSE_TOLERANCE)
+    if mode.places:
+        return replace(state, mode=mode)
+    if max(tick for _, tick in state.places) > state.tick - KEPT and since > state.tick - LOOPS_FOR:
+        return replace(state, mode=sweep.looping(state.odometry, mission, since))
+    return replace(state, mode=Standing(), base=state.odometry, ranges={}, places={}, possible=())

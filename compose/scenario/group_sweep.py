@@ -1,0 +1,119 @@
+"""The search of a group for its robots without an anchor: who sweeps which part, and until when."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import combinations
+
+from compose.errors import BadScenario, Unworkable
+from compose.scenario.group_meetings import FirstMeeting, GroupMeetings
+from compose.scenario.scenario_tables import Area, RobotTable, ScenarioFile
+from protocol.mission import Mission, infeasibility
+from protocol.orbits import Orbit, Rendezvous
+from protocol.sweep_strips import SweptArea, helping_ticks, sweep_speed, sweep_ticks
+from world.scenario import PlannedSweep
+
+LEAVING = 10
+"""The ticks after a meeting until a robot goes on (`group_transitions.PARTED_AFTER`)."""
+
+ASIDE = 2.0
+"""The largest distance from the anchor of its last meeting at which a robot goes on, in units of R."""
+
+PARTS = 3.0
+"""The time allowed for sweeps in `max_ticks`, in units of the planned bound."""
+
+
+def check_unanchored(file: ScenarioFile, source: str) -> None:
+    """Raise BadScenario or Unworkable if the robots without an anchor in a group cannot be localised."""
+    missing = [i for i, robot in enumerate(file.robot) if robot.anchor is None]
+    if not missing:
+        return
+    where = f"{source}: robot[{missing[0]}]: missing field 'anchor'"
+    if file.group is not None:
+        where = f"{source}: group.without_anchor"
+    if len(file.robot) - len(missing) < 2:
+        raise BadScenario(f"{where}: at least two robots of a group need one")
+    if not file.mission.noise.exact:
+        raise Unworkable(
+            f"{where}: with mission.noise, each robot needs one, because robots do not compute how "
+            "inaccurate their poses become on the way to others"
+        )
+    if file.mission.safety_distance:
+        raise Unworkable(
+            f"{source}: mission.safety_distance: there is a robot without an anchor, and robots that sweep "
+            "for it do not keep it"
+        )
+    attacks = [i for i, robot in enumerate(file.robot) if robot.attack is not None]
+    if attacks:
+        raise Unworkable(
+            f"{source}: robot[{attacks[0]}].attack: there is a robot without an anchor, which must believe "
+            "the poses that others report"
+        )
+    _check_area(file, missing, source)
+
+
+def _check_area(file: ScenarioFile, missing: Sequence[int], source: str) -> None:
+    """Raise BadScenario if the area is missing or malformed, or if one of `missing` is not in it."""
+    if file.mission.area is None:
+        raise BadScenario(f"{source}: mission: missing field 'area': robots without an anchor are in it")
+    x_min, y_min, x_max, y_max = file.mission.area
+    if x_min > x_max or y_min > y_max:
+        raise BadScenario(f"{source}: mission.area: it must be [x_min, y_min, x_max, y_max]")
+    for i in missing:
+        start = file.robot[i].start
+        if start is not None and not (x_min <= start[0] <= x_max and y_min <= start[1] <= y_max):
+            raise BadScenario(f"{source}: robot[{i}].start: '{file.robot[i].id}' is outside mission.area")
+
+
+def with_sweep(
+    robots: Sequence[RobotTable], area: Area | None, mission: Mission, meetings: GroupMeetings
+) -> GroupMeetings:
+    """Return `meetings` with the search for those of `robots` that have no anchor, which are in `area`.
+
+    The latest time allows for robots that sweep the parts of others, which have failed. Raises Unworkable if
+    the area is too large for rounding errors.
+    """
+    unanchored = [robot.id for robot in robots if robot.anchor is None]
+    if not unanchored or area is None:
+        return meetings
+    places = [robot.anchor for robot in robots if robot.anchor is not None]
+    places += SweptArea(*area, 1).corners
+    why = infeasibility(mission, max([math.dist(*two) for two in combinations(places, 2)]))
+    if why is not None:
+        raise Unworkable(f"mission.area: {why}")
+    planned = _planned_sweep(robots, len(unanchored), area, mission, meetings)
+    still = Orbit(0.0, 0.0, 0.0)
+    waiting = FirstMeeting(planned.sweepers[0], "b", Rendezvous(still, still, planned.ends))
+    return meetings._replace(
+        first={**meetings.first, **dict.fromkeys(unanchored, waiting)},
+        bound=planned.ends,
+        latest=meetings.latest + PARTS * planned.ends,
+        sweep=planned,
+    )
+
+
+def _planned_sweep(
+    robots: Sequence[RobotTable], unanchored: int, area: Area, mission: Mission, meetings: GroupMeetings
+) -> PlannedSweep:
+    """Return the search for `unanchored` robots in `area`, in m, after `meetings`.
+
+    Each robot with an anchor sweeps a part after its last meeting. Parts and robots are in the same order
+    across the strips, so that their ways do not cross.
+    """
+    anchors = {one.id: one.anchor for one in robots if one.anchor is not None}
+    places, free = dict(anchors), dict.fromkeys(anchors, 0.0)
+    for meeting in meetings.planned:
+        for robot in (meeting.visitor, meeting.visited):
+            places[robot], free[robot] = anchors[meeting.visited], meeting.ends
+    sweep = SweptArea(*area, len(anchors))
+    sweepers = sorted(places, key=lambda robot: places[robot][sweep.across])
+    aside = math.ceil(ASIDE * mission.sensing_range / (sweep_speed(mission) * mission.period))
+    latest = 0.0
+    for part, robot in enumerate(sweepers):
+        path = sweep.path(part, mission.sensing_range)
+        if path:
+            ticks = LEAVING + aside + sweep_ticks([places[robot], *path], mission)
+            ticks += unanchored * helping_ticks(mission)
+            latest = max(latest, free[robot] + ticks * mission.period)
+    return PlannedSweep(sweep, tuple(sweepers), latest)

@@ -1,0 +1,110 @@
+"""Strips in which localised robots sweep an area, so that no robot that stands in it is missed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+from protocol.mission import Mission
+from protocol.units import Coordinate
+
+Place = tuple[float, float]
+"""A position in <W>, in m."""
+
+HALF_WIDTH = 0.8
+"""The largest distance of a robot from the middle of its strip, as a fraction of R."""
+
+NEAR = 0.9
+"""The largest range at which a sweeping robot stops for another one, as a fraction of R."""
+
+STEP = 0.5
+"""The largest distance driven in a tick of a sweep, as a fraction of R.
+
+Of the middle line, 0.63 R are within NEAR R of a robot that is 0.84 R away, at HALF_WIDTH and on a square of
+its own. At the end of a strip, half of that are. So a tick is, or the end of the strip, where robots turn.
+"""
+
+SIDE = 0.03
+"""The side of the square that a robot drives in range of another one, as a fraction of R.
+
+If both drive one, their range grows from NEAR R by at most the two diagonals, and stays within R.
+"""
+
+LOOPS = 3
+"""The number of squares within which a robot that has been found is localised.
+
+In the first, the robot that has found it drives alone; in the second, the other one drives, too. The third is
+left for reports, turns and ticks that are only partly used.
+"""
+
+
+class SweptArea(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """The parts of an area that robots sweep, one each."""
+
+    x_min: Coordinate
+    """The smallest x of the area, in m."""
+    y_min: Coordinate
+    """The smallest y of the area, in m."""
+    x_max: Coordinate
+    """The largest x of the area, in m."""
+    y_max: Coordinate
+    """The largest y of the area, in m."""
+    parts: Annotated[int, Meta(ge=1, le=1000)]
+    """The number of parts."""
+
+    def contains(self, x: float, y: float) -> bool:
+        """Return whether the area contains the place (x, y), in m."""
+        return self.x_min <= x <= self.x_max and self.y_min <= y <= self.y_max
+
+    @property
+    def corners(self) -> tuple[Place, ...]:
+        """The corners of the area, in m in <W>."""
+        return tuple([(x, y) for x in (self.x_min, self.x_max) for y in (self.y_min, self.y_max)])
+
+    @property
+    def across(self) -> int:
+        """The axis across the strips: 0 for x, 1 for y."""
+        return 1 if self.x_max - self.x_min >= self.y_max - self.y_min else 0
+
+    def path(self, part: int, sensing_range: float) -> tuple[Place, ...]:
+        """Return the ends of the strips of a part, in m in <W>, in the order in which they are driven.
+
+        Every point of the area is within HALF_WIDTH R of the middle line of a strip. The numbers of strips of
+        two parts differ by at most 1; a part may have none.
+        """
+        low, high = (self.x_min, self.y_min), (self.x_max, self.y_max)
+        aside, along = self.across, 1 - self.across
+        width = high[aside] - low[aside]
+        count = max(1, math.ceil(width / (2.0 * HALF_WIDTH * sensing_range)))
+        found: list[Place] = []
+        for i in range(count * part // self.parts, count * (part + 1) // self.parts):
+            middle = low[aside] + (i + 0.5) * width / count
+            ends = (low[along], high[along]) if i % 2 == 0 else (high[along], low[along])
+            found += [(end, middle) if along == 0 else (middle, end) for end in ends]
+        return tuple(found)
+
+
+def sweep_speed(mission: Mission) -> float:
+    """Return the speed in m/s of a sweep, with which no robot is passed between two ticks."""
+    return min(mission.max_speed, STEP * mission.sensing_range / mission.period)
+
+
+def sweep_ticks(places: Sequence[Place], mission: Mission) -> int:
+    """Return a bound on the ticks in which a robot drives from the first of `places` to the last.
+
+    Each place costs a turn of at most pi, and a part of a tick.
+    """
+    step = sweep_speed(mission) * mission.period
+    turn = math.ceil(math.pi / (mission.max_turn_rate * mission.period)) + 1
+    return sum([math.ceil(math.dist(*ends) / step) + turn for ends in pairwise(places)], turn)
+
+
+def helping_ticks(mission: Mission) -> int:
+    """Return a bound on the ticks for which a sweeping robot stops to localise another one."""
+    side = SIDE * mission.sensing_range
+    return LOOPS * sweep_ticks([(0.0, 0.0), (side, 0.0), (side, side), (0.0, side), (0.0, 0.0)], mission)

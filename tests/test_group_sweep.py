@@ -1,0 +1,442 @@
+"""Groups with robots without an anchor: they are found, localised, recorded, checked and shown."""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+from pathlib import Path
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+from playwright.sync_api import expect
+
+from agent.planning.unanchored import UnanchoredPlanner
+from compose.audit.replay import replayed
+from compose.audit.rules import audit_run
+from compose.errors import UserError
+from compose.launch.driver_loader import mission
+from compose.launch.in_process import run_mission
+from compose.recording.corrected_bounds import corrected_bounds
+from compose.recording.recording_files import agent_journal
+from compose.recording.run import Run, of_frames, read
+from compose.scenario.scenario_change import file_table
+from compose.scenario.scenario_file import parse, validate
+from protocol.journal.journal_file import CorruptJournal
+from protocol.messages import Contact, Localised, Observation, ReportWithPose, RobotConfigWithoutAnchor
+from protocol.motion import Controls, Pose, step
+from protocol.wire import decode, encode
+from tests.browser import Open, scrub_to, shot, watching
+from tests.commands import SECTION_IV
+from tests.commands import tandem as tandem_command
+from tests.groups import R, localised, table_of
+from tests.test_audit import kept
+from tests.test_group_runs import audited, with_scenario
+from world.scenario import Scenario, ScenarioWithSweep
+
+AREA = [-4.0, -4.0, 14.0, 12.0]
+
+
+def table_with(robots: int, unanchored: int, seed: int) -> dict[str, Any]:
+    """Return a scenario file of `robots` in a square, the last `unanchored` of which have no anchor."""
+    table = table_of(robots, seed)
+    for robot in table["robot"][robots - unanchored :]:
+        del robot["anchor"]
+    side = 10.0 * R * robots**0.5
+    table["mission"]["area"] = [0.0, 0.0, side, side]
+    return table
+
+
+def four(**fields: Any) -> dict[str, Any]:
+    """Return a scenario file of four near robots, two of which have no anchor, with other `fields`."""
+    table = table_with(4, 2, 1)
+    table["mission"]["area"] = AREA
+    table["robot"] = [
+        {"id": "a", "anchor": [0.0, 0.0]},
+        {"id": "b", "anchor": [10.0, 3.0]},
+        {"id": "u"},
+        {"id": "v"},
+    ]
+    return {**table, **fields}
+
+
+def scenario_of(table: dict[str, Any]) -> Scenario:
+    return validate(table, "group.toml").seeded(None)
+
+
+def last_claim(run: Run) -> int:
+    """Return the tick of the last claim. All robots must have one."""
+    claims = [run.claim(robot) for robot in run.robots]
+    return max([one.tick for one in claims if one is not None])
+
+
+def bound(scenario: Scenario) -> float:
+    """Return the bound in ticks until all robots are localised."""
+    assert scenario.planned_sweep is not None
+    return scenario.planned_sweep.ends / scenario.mission.period
+
+
+# --- localisation -------------------------------------------------------------------------------------
+
+
+def test_robots_without_an_anchor_are_localised_within_the_bound() -> None:
+    scenario = scenario_of(four())
+    run = run_mission(scenario)
+    assert localised(run) == {"a", "b", "u", "v"}
+    assert run.end is not None
+    assert run.end.outcome == "localised"
+    assert last_claim(run) <= bound(scenario)
+    for robot in scenario.unanchored:
+        claim = run.claim(robot)
+        assert claim is not None
+        assert max(claim.position_error, claim.heading_error) < 1e-9
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("robots", "unanchored"), [(4, 1), (4, 2), (8, 4), (8, 6)])
+def test_random_groups_are_localised_within_the_bound(robots: int, unanchored: int) -> None:
+    for seed in range(4):
+        scenario = scenario_of(table_with(robots, unanchored, seed))
+        run = run_mission(scenario)
+        assert len(localised(run)) == robots
+        assert last_claim(run) <= bound(scenario)
+
+
+def test_a_robot_that_does_not_hear_its_finder_is_localised_by_another_one() -> None:
+    deaf = [{"link": "a->u", "loss": 1.0}, {"link": "a->v", "loss": 1.0}]
+    run = of_frames(kept(scenario_of(four(fault=deaf))))
+    assert len(localised(run)) == 4
+    reports = [
+        framed.report
+        for robot in ("u", "v")
+        for one in run.agents[robot].steps
+        for framed in one.received
+        if isinstance(framed.report, ReportWithPose)
+    ]
+    assert {one.robot for one in reports} == {"b"}
+
+
+@pytest.mark.parametrize(("seed", "late"), [(8, ("r5",)), (12, ("r3", "r5"))])
+def test_the_part_of_a_dead_finder_is_swept_by_others_within_the_corrected_bound(
+    seed: int, late: tuple[str, ...]
+) -> None:
+    table = table_with(6, 3, seed)
+    table["robot"][0]["dies"] = 150
+    run = run_mission(scenario_of(table))
+    assert len(localised(run)) == 6
+    (corrected,) = corrected_bounds(run)
+    assert corrected.late == late
+    assert bound(run.scenario) < last_claim(run) <= corrected.bound_ticks
+
+
+@pytest.mark.parametrize("fault", [{"loss": 0.8}, {"delay": 20}], ids=["loss", "delay"])
+def test_lost_and_late_reports_only_cost_time(fault: dict[str, Any]) -> None:
+    run = run_mission(scenario_of(four(fault=[fault])))
+    assert len(localised(run)) == 4
+
+
+def test_reports_in_another_order_lead_to_the_same_claim_to_the_bit() -> None:
+    agent = of_frames(kept(scenario_of(four()))).agents["u"]
+    planner = UnanchoredPlanner()
+    observed = planner.start(agent.config)
+    reports: list[ReportWithPose] = []
+    for one_step in agent.steps:
+        observed = planner.observe(observed, one_step.observation)
+        reports += [one.report for one in one_step.received if isinstance(one.report, ReportWithPose)]
+        if one_step.command is not None and one_step.command.verdict is not None:
+            break
+    *early, last = reports
+    claims = []
+    for seed in range(100):
+        random.Random(seed).shuffle(early)
+        state = planner.decide(planner.decide(observed, [*early, *early]), [last])
+        claims.append(state.verdict)
+    assert isinstance(claims[0], Localised)
+    assert claims == claims[:1] * 100
+
+
+def test_a_robot_that_a_passing_one_has_left_on_a_square_is_localised_by_the_next_one() -> None:
+    """Its odometry then differs from where it stood first, by rounding."""
+    scenario = scenario_of(four())
+    config, planner = scenario.config("u"), UnanchoredPlanner()
+    pose, state, tick = Pose(5.0, 4.0, 0.7), planner.start(config), 0
+    driven: Controls | None = None
+    square = [(0.0, 0.0), (0.5, 0.0), (0.5, 0.5), (0.0, 0.5)]
+    ways = [("a", square), (None, [(0.0, 0.0)] * 150), ("b", square * 4)]
+    for finder, way in ways:
+        for x, y in way:
+            range_ = math.hypot(6.0 + x - pose.x, 5.0 + y - pose.y)
+            contacts = (Contact(finder, range_, (tick,)),) if finder is not None else ()
+            state = planner.observe(state, Observation(tick, "u", driven, None, contacts))
+            report = ReportWithPose(
+                tick,
+                finder or "a",
+                2,
+                "sweeping",
+                None,
+                0,
+                0,
+                (),
+                0,
+                (),
+                0,
+                0,
+                None,
+                Pose(6.0 + x, 5.0 + y, 0.0),
+            )
+            state = planner.decide(state, [report] if finder is not None else [])
+            command = planner.command(state)
+            driven = Controls(command.v, command.omega)
+            if isinstance(command.verdict, Localised):
+                assert finder == "b"
+                assert math.dist((command.verdict.pose.x, command.verdict.pose.y), (pose.x, pose.y)) < 1e-9
+                return
+            pose, tick = step(pose, driven.v, driven.omega, 1.0), tick + 1
+        if finder == "a":
+            assert command.state == "looping"
+    raise AssertionError("it was not localised")
+
+
+# --- the scenario -------------------------------------------------------------------------------------
+
+
+def without(table: dict[str, Any], *robots: int) -> dict[str, Any]:
+    for robot in robots:
+        del table["robot"][robot]["anchor"]
+    return table
+
+
+def test_the_configuration_of_a_robot_without_an_anchor_does_not_depend_on_where_it_is() -> None:
+    scenario = scenario_of(four())
+    config = scenario.config("u")
+    assert isinstance(config, RobotConfigWithoutAnchor)
+    assert (config.anchor.x, config.anchor.y) == (5.0, 4.0)
+    moved = [replace(one, start=Pose(1.0, 1.0, 0.0)) if one.id == "u" else one for one in scenario.robots]
+    assert replace(scenario, robots=tuple(moved)).config("u") == config
+
+
+def test_the_starts_of_robots_without_an_anchor_are_drawn_in_the_area() -> None:
+    template = validate(four(), "group.toml")
+    starts = [template.seeded(seed).robot("u").start for seed in range(200)]
+    assert all(-4.0 <= one.x <= 14.0 and -4.0 <= one.y <= 12.0 for one in starts)
+    assert max(one.x for one in starts) > 12.0
+    assert min(one.y for one in starts) < -2.0
+
+
+def test_the_last_robots_of_a_drawn_group_have_no_anchor() -> None:
+    table = four(group={"robots": 5, "spacing": 10.0, "without_anchor": 2})
+    del table["robot"], table["mission"]["area"]
+    scenario = scenario_of(table)
+    assert scenario.unanchored == ("r4", "r5")
+    assert scenario.planned_sweep is not None
+    assert scenario.planned_sweep.sweep.x_max == pytest.approx(10.0 * math.sqrt(5))
+
+
+def test_a_changed_scenario_keeps_its_robots_without_an_anchor() -> None:
+    scenario = scenario_of(four())
+    assert scenario_of(file_table(scenario)) == scenario
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda table: without(table, 1),
+            r"robot\[1\]: missing field 'anchor': at least two robots of a group need one",
+        ),
+        (lambda table: table["mission"].pop("area"), r"mission: missing field 'area'"),
+        (
+            lambda table: table["mission"].update(area=[3.0, 0.0, 2.0, 1.0]),
+            r"mission.area: it must be \[x_min, y_min, x_max, y_max\]",
+        ),
+        (
+            lambda table: table["mission"].update(noise={"anchor_sigma": 0.05}),
+            r"robot\[2\]: missing field 'anchor': with mission.noise, each robot needs one",
+        ),
+        (
+            lambda table: table["mission"].update(safety_distance=0.3),
+            r"mission.safety_distance: there is a robot without an anchor",
+        ),
+        (
+            lambda table: table["robot"][0].update(attack={"kind": "scale", "size": 1.1}),
+            r"robot\[0\].attack: there is a robot without an anchor",
+        ),
+        (
+            lambda table: table["robot"][3].update(start=[20.0, 0.0, 0.0]),
+            r"robot\[3\].start: 'v' is outside mission.area",
+        ),
+        (
+            lambda table: table["mission"].update(area=[-1e6, -1e6, 1e6, 1e6]),
+            r"mission.area: with 2.82843e\+06 m between",
+        ),
+    ],
+)
+def test_what_cannot_be_localised_is_refused_in_one_line(change: Any, message: str) -> None:
+    table = four()
+    change(table)
+    with pytest.raises(UserError, match=f"^group.toml: {message}"):
+        scenario_of(table)
+
+
+def test_hardware_mode_refuses_robots_without_an_anchor(tmp_path: Path) -> None:
+    scenario = tmp_path / "four.toml"
+    scenario.write_text(FILE, encoding="utf-8")
+    with pytest.raises(UserError, match="robot: u has no anchor: not available in hardware mode"):
+        mission(str(scenario), "a")
+
+
+def test_each_robot_knows_all_others_of_its_group() -> None:
+    scenario = scenario_of(four())
+    for robot in ("a", "b", "u", "v"):
+        assert {robot, *scenario.config(robot).others} == {"a", "b", "u", "v"}
+
+
+def test_a_robot_of_a_pair_needs_an_anchor() -> None:
+    table = four()
+    table["robot"] = table["robot"][1:3]
+    with pytest.raises(UserError, match=r"^group.toml: robot\[1\]: missing field 'anchor'$"):
+        scenario_of(table)
+
+
+# --- recordings ---------------------------------------------------------------------------------------
+
+FILE = f"""
+name = "four"
+seed = 1
+[mission]
+sensing_range = 3.0
+period = 1.0
+max_speed = 1.0
+max_turn_rate = 3.141592653589793
+area = {AREA}
+[[robot]]
+id = "a"
+anchor = [0.0, 0.0]
+[[robot]]
+id = "b"
+anchor = [10.0, 3.0]
+[[robot]]
+id = "u"
+[[robot]]
+id = "v"
+"""
+
+
+def test_the_audit_and_the_replay_find_nothing_where_nothing_is_wrong(tmp_path: Path) -> None:
+    run_mission(parse(FILE, "four"), tmp_path)
+    assert audit_run(read(tmp_path)).violations == ()
+    assert replayed(read(tmp_path)).differences == ()
+
+
+SECTION_IV_PAIR = f"""
+name = "pair"
+{SECTION_IV}
+[[robot]]
+id = "a"
+anchor = [0.0, 0.0]
+[[robot]]
+id = "b"
+anchor = [10.0, 0.0]
+"""
+
+
+def _with_pose(frames: list[bytes]) -> list[int]:
+    """Return the places of the reports with a pose."""
+    return [i for i, frame in enumerate(frames) if b"report-with-pose" in frame]
+
+
+def test_the_audit_finds_a_reported_pose_that_is_not_the_computed_one() -> None:
+    journals = kept(parse(FILE, "four"))
+    finder = next(robot for robot in ("a", "b") if _with_pose(journals[agent_journal(robot)]))
+    frames = journals[agent_journal(finder)]
+    place = _with_pose(frames)[0]
+    report = decode(frames[place], ReportWithPose)
+    shifted = replace(report, pose=replace(report.pose, x=report.pose.x + 0.5))
+    frames[place] = encode(shifted)
+    assert (report.tick, finder, "decision") in audited(journals)
+
+
+def test_the_audit_finds_a_sweep_that_is_not_the_planned_one() -> None:
+    journals = kept(parse(FILE, "four"))
+    scenario = of_frames(journals).scenario
+    assert isinstance(scenario, ScenarioWithSweep)
+    assert scenario.planned_sweep is not None
+    later = replace(scenario.planned_sweep, ends=scenario.planned_sweep.ends + 1.0)
+    found = audited(with_scenario(journals, replace(scenario, planned_sweep=later)))
+    assert (None, None, "scenario") in found
+    away = [replace(one, start=Pose(90.0, 0.0, 0.0)) if one.id == "u" else one for one in scenario.robots]
+    found = audited(with_scenario(journals, replace(scenario, robots=tuple(away))))
+    assert (None, "u", "scenario") in found
+
+
+def test_a_recording_whose_searching_robots_are_not_those_with_an_anchor_is_refused() -> None:
+    journals = kept(parse(FILE, "four"))
+    scenario = of_frames(journals).scenario
+    assert isinstance(scenario, ScenarioWithSweep)
+    assert scenario.planned_sweep is not None
+    for planned in (None, replace(scenario.planned_sweep, sweepers=("a", "u"))):
+        with pytest.raises(CorruptJournal, match="the robots that search are not those with an anchor"):
+            of_frames(with_scenario(journals, replace(scenario, planned_sweep=planned)))
+    pairs = replace(parse(SECTION_IV_PAIR, "pair"), robots=())
+    lacking = [replace(one, given_anchor=None) for one in parse(SECTION_IV_PAIR, "pair").robots]
+    with pytest.raises(CorruptJournal, match="in its scenario a has no anchor"):
+        of_frames(with_scenario(journals, replace(pairs, robots=tuple(lacking))))
+
+
+@pytest.mark.long
+def test_processes_write_the_same_journals_and_each_command_shows_the_recording(tmp_path: Path) -> None:
+    scenario = tmp_path / "four.toml"
+    scenario.write_text(FILE, encoding="utf-8")
+    for name, mode in (("processes", []), ("inline", ["--in-process"])):
+        done = tandem_command("run", str(scenario), "--out", str(tmp_path / name), *mode)
+        assert done.status == 0, done.err
+    for journal in (tmp_path / "inline").glob("*.journal"):
+        assert journal.read_bytes() == (tmp_path / "processes" / journal.name).read_bytes()
+    folder = tmp_path / "inline"
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    assert [one["robot"] for one in summary["group"]["without_anchor"]] == ["u", "v"]
+    assert summary["group"]["localised_tick"] <= summary["group"]["bound_ticks"] == summary["t_max_s"]
+    for command in (["audit"], ["replay"], ["figures"], ["export"], ["export", "--rerun"]):
+        done = tandem_command(command[0], str(folder), *command[1:])
+        assert done.status == 0, done.err
+    assert "start-u" in (folder / "figures" / "meetings.svg").read_text(encoding="utf-8")
+
+
+@pytest.mark.long
+def test_a_finder_and_a_robot_without_an_anchor_that_are_killed_resume_to_the_bit(tmp_path: Path) -> None:
+    scenario = tmp_path / "four.toml"
+    scenario.write_text(FILE, encoding="utf-8")
+    kills = ["--kill", "a@60", "--kill", "u@40", "--kill", "world@70"]
+    for name, more in (("killed", kills), ("whole", ["--in-process"])):
+        done = tandem_command("run", str(scenario), "--out", str(tmp_path / name), *more)
+        assert done.status == 0, done.err
+    for journal in (tmp_path / "whole").glob("*.journal"):
+        assert journal.read_bytes() == (tmp_path / "killed" / journal.name).read_bytes()
+
+
+def test_a_run_of_frames_has_the_robots_without_an_anchor() -> None:
+    run = of_frames(kept(parse(FILE, "four")))
+    assert run.setup is not None
+    assert [one.id for one in run.setup.anchored] == ["a", "b"]
+    assert run.setup.bounds_s["u"] == run.setup.t_max_s
+
+
+@pytest.mark.long
+def test_the_page_shows_the_sweep_and_the_robots_that_it_finds(opened: Open, tmp_path: Path) -> None:
+    run = run_mission(parse(FILE, "four"), tmp_path)
+    assert run.end is not None
+    claims = [run.claim(robot) for robot in ("u", "v")]
+    found = min([one.tick for one in claims if one is not None])
+    with watching(tmp_path) as (_, address):
+        page = opened(address)
+        scrub_to(page, 0)
+        labels = page.evaluate("document.getElementById('canvas').labels.map((one) => one.text)")
+        assert {"u", "anchor of a"} <= set(labels)
+        assert "anchor of u" not in labels
+        scrub_to(page, found - 1)
+        expect(page.locator("#caption")).to_have_text("a and b sweep the area for robots without an anchor.")
+        expect(page.locator("body")).to_contain_text("no anchor")
+        shot(page, "without-anchor")
+        page.locator("#truth").uncheck()
+        scrub_to(page, run.end.tick)
