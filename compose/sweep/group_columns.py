@@ -94,8 +94,8 @@ def _travel_ticks(run: Run) -> float | None:
     """Return a lower bound of the ticks until all are localised, from the first meetings as they went.
 
     They are those of the plan, and end when they did; then robots travel from anchor to anchor, and meetings
-    take no time. None if a first meeting has not localised both of its robots, if a robot dies, or if one has no
-    anchor.
+    take no time. None if a first meeting has not localised both of its robots, if a robot dies, or if one of
+    them has no anchor.
     """
     scenario = run.scenario
     if scenario.deaths or scenario.planned_sweep is not None:
