@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.legend import Legend
 from matplotlib.patches import Circle
+from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Bbox
 
 from compose.figures.style import INK, PAGE, PLACES, SCREEN, TEXT, Medium
@@ -46,6 +47,8 @@ NO_TRUTH = "a recording in hardware mode has no ground truth"
 NO_PLACES = "in hardware mode, positions follow from claims, and not both robots made one"
 ANCHORS: dict[Role, str] = {"a": "M_1", "b": "M_2"}
 """The anchors' names in the paper, for use between two `$`."""
+STEPS = (1, 2, 5, 10)
+"""The steps between two ticks of an axis, times a power of 10 m. Numbers such as -7.5 do not fit in LEFT."""
 LABEL = {"facecolor": "white", "alpha": 0.75, "pad": 0.6, "lw": 0}
 """The background of a text within a panel."""
 Window = tuple[float, float, float, float]
@@ -238,6 +241,8 @@ def named(axes: Axes, window: Window, *, low: bool = True) -> None:
     axes.set_xlim(*window[:2])
     axes.set_ylim(*window[2:])
     axes.set_aspect("equal", adjustable="box")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator("auto", steps=STEPS))
     axes.set_xlabel("x [m]")
     if low:
         axes.set_ylabel("y [m]")
