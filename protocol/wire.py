@@ -6,6 +6,7 @@ A frame is one version byte, the CRC-32 of the body in four bytes (big-endian), 
 from __future__ import annotations
 
 import struct
+import threading
 import zlib
 from typing import Any, TypeVar, overload
 
@@ -25,6 +26,7 @@ MAX_FRAME_BYTES = 1 << 20
 _HEAD = struct.Struct(">BI")
 _encoder = msgspec.msgpack.Encoder()
 _decoders: dict[object, msgspec.msgpack.Decoder[Any]] = {}
+_preparing = threading.Lock()
 
 M = TypeVar("M")
 
@@ -97,6 +99,10 @@ def decode(frame: bytes, kind: Any, limit: int = MAX_SENT_BYTES) -> Any:
 
 
 def prepare(kind: Any) -> msgspec.msgpack.Decoder[Any]:
-    """Return the decoder of `kind`. Creating it takes milliseconds, so it is stored for `decode`."""
-    decoder = _decoders[kind] = msgspec.msgpack.Decoder(kind)
+    """Return the decoder of `kind`. Creating it takes milliseconds, so it is stored for `decode`.
+
+    While one thread creates it, msgspec crashes if another one uses the same types.
+    """
+    with _preparing:
+        decoder = _decoders[kind] = _decoders.get(kind) or msgspec.msgpack.Decoder(kind)
     return decoder

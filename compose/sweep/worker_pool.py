@@ -18,6 +18,9 @@ from compose.sweep.trial import lost
 from compose.sweep.worker import LENGTH_BYTES, MAX_ERROR, READY, Chunk, framed
 from protocol.output import one_line
 
+_DECODER = msgspec.msgpack.Decoder(Chunk)
+"""Made before there are several threads: msgspec crashes if two use a type for the first time."""
+
 START_S = 60.0
 """The time in s within which a new process must have imported its modules."""
 
@@ -156,7 +159,7 @@ def run(sweep: str, encoded: bytes) -> list[bytes]:
 
     Raises Died or Hung if no new process for trials becomes ready.
     """
-    chunk = msgspec.msgpack.decode(encoded, type=Chunk)
+    chunk = _DECODER.decode(encoded)
     children = _children.setdefault(sweep, _Children())
     rows: list[bytes] = []
     while len(rows) < len(chunk.trials) and (taken := children.take()) is not None:

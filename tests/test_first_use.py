@@ -1,0 +1,68 @@
+"""Several threads may be the first that decode a type. By itself, msgspec then crashes the process."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import msgspec
+
+from compose.scenario.scenario_file import setting
+from compose.sweep.worker import Chunk
+
+AT_ONCE = """
+import sys, threading
+sys.setswitchinterval(1e-7)
+begin, ended = threading.Barrier(4), []
+
+def first():
+    begin.wait()
+    decode_all()
+    ended.append(True)
+
+threads = [threading.Thread(target=first) for _ in range(4)]
+for one in threads:
+    one.start()
+for one in threads:
+    one.join()
+print(len(ended))
+"""
+FRAMES = """
+from protocol.wire import decode, encode
+from tests.examples import EXAMPLES
+
+frames = [(encode(one), type(one)) for one in EXAMPLES]
+
+def decode_all():
+    for frame, kind in frames:
+        decode(frame, kind)
+"""
+CHUNKS = """
+import sys
+from compose.sweep import worker_pool
+
+chunk = sys.stdin.buffer.read()
+worker_pool.dismiss("over")  # so no process is started
+
+def decode_all():
+    worker_pool.run("over", chunk)
+"""
+
+
+def of_four_threads(code: str, given: bytes = b"") -> tuple[int, str]:
+    """Return the exit status of a new process, and how many of its threads could run `decode_all`."""
+    ended = subprocess.run(
+        [sys.executable, "-c", code + AT_ONCE], input=given, stdout=subprocess.PIPE, check=False, timeout=60.0
+    )
+    return ended.returncode, ended.stdout.decode().strip()
+
+
+def test_several_threads_can_be_the_first_that_decode_messages() -> None:
+    for _ in range(3):
+        assert of_four_threads(FRAMES) == (0, "4")
+
+
+def test_several_threads_can_be_the_first_that_decode_chunks_of_a_sweep() -> None:
+    chunk = Chunk(0, (0,), (1,), setting("paper-1"), processes=False, timeout=1.0)
+    for _ in range(3):
+        assert of_four_threads(CHUNKS, msgspec.msgpack.encode(chunk)) == (0, "4")
