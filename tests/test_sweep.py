@@ -352,6 +352,29 @@ def test_a_sweep_goes_on_after_its_machine_has_slept(folder: Path, monkeypatch: 
     assert len(rows(folder / "out")) == 80
 
 
+def test_an_answer_that_comes_after_the_machine_has_slept_is_in_time() -> None:
+    """Without it, a sweep whose machine fell asleep in this wait took its scheduler for lost."""
+    code = """
+import time
+from compose.sweep.cluster import _within
+
+def ask() -> int:
+    print("asked", flush=True)
+    for _ in range(40):  # each of them takes 10 ms, or as long as the process is suspended
+        time.sleep(0.01)
+    return 7
+
+print(_within(1.0, ask))
+"""
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "asked\n"
+        process.send_signal(SIGSTOP)
+        time.sleep(1.5)  # longer than the wait
+        process.send_signal(SIGCONT)
+        assert process.stdout.read() == "7\n"
+
+
 @pytest.mark.long
 def test_a_trial_that_hangs_does_not_outlive_whoever_ran_it(folder: Path) -> None:
     with misbehaving("endless", "both.toml", folder) as process:

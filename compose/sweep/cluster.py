@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import secrets
 import tempfile
 import threading
@@ -36,6 +37,8 @@ SCHEMES = ("tcp", "tls", "ws", "wss")
 """The schemes that the address of a scheduler may have."""
 CONNECT_S = 5.0
 """The time in s within which a scheduler must answer."""
+SLICE_S = 0.1
+"""The time in s of which a wait for the scheduler is made up."""
 RESULT_S = 60.0
 """The time in s within which a worker must deliver a result that it has; generous for busy machines."""
 LOOK_S = 1.0
@@ -191,7 +194,10 @@ def _threads(client: Client) -> int:
 
 
 def _within(seconds: float, ask: Callable[[], T]) -> T | None:
-    """Return the result of `ask`; None if it fails, or takes longer than `seconds` (a frozen host)."""
+    """Return the result of `ask`; None if it fails, or takes longer than `seconds` (a frozen host).
+
+    The time in which this process is suspended, as when the machine sleeps, counts as one SLICE_S.
+    """
     answers: SimpleQueue[T] = SimpleQueue()
 
     def wait() -> None:
@@ -199,8 +205,9 @@ def _within(seconds: float, ask: Callable[[], T]) -> T | None:
             answers.put(ask())
 
     threading.Thread(target=wait, daemon=True).start()
-    with suppress(Empty):
-        return answers.get(timeout=seconds)
+    for _ in range(math.ceil(seconds / SLICE_S)):
+        with suppress(Empty):
+            return answers.get(timeout=SLICE_S)
     return None
 
 
