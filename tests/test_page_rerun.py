@@ -25,6 +25,7 @@ from compose.view.web import changed_missions
 from compose.view.web.changed_missions import MOST_TICKS, ChangedMissions
 from compose.view.web.sources import Recorded
 from tests.browser import Open, chromium_only, shot, until_loaded, until_shown
+from tests.commands import until
 from world.scenario import Scenario
 
 PAPER_1 = load("paper-1")
@@ -244,6 +245,28 @@ def test_a_start_that_is_dragged_is_where_the_mission_begins_again(opened: Open,
     older = opened(f"{address}#tick=7")  # from when there was one mission
     expect(older.locator("#title")).to_have_text("paper-1")
     until_shown(older, 7)
+
+
+def test_a_list_that_arrives_before_the_next_frame_does_not_bring_the_old_mission_back(
+    opened: Open, address: str
+) -> None:
+    posted(address, values())  # the address names the mission if there are several
+    page = opened_form(opened, address)
+    page.evaluate("""() => {
+      Object.assign(window, { lists: 0, titles: [] });
+      const title = document.getElementById("title");
+      new MutationObserver(() => window.titles.push(title.textContent)).observe(title, { childList: true });
+      new EventSource("/api/news").onmessage = ({ data }) => { window.lists += "list" in JSON.parse(data); };
+    }""")
+    until(lambda: page.evaluate("lists"), "there is a list of missions")
+    page.evaluate("""() => {
+      window.requestAnimationFrame = () => 0;
+      document.querySelector("#changes button:not([type=button])").click();
+    }""")
+    until(lambda: page.evaluate("lists > 1 && titles.length"), "the list has the new mission")
+    for _ in range(5):  # the page gets the list at about the same time, and would then fetch the old mission
+        page.evaluate("async () => (await fetch('/api/shows/paper-1')).text()")
+    assert page.evaluate("titles") == ["paper-1-changed"]
 
 
 @chromium_only

@@ -156,6 +156,7 @@ async function open(name) {
     view.selected = selected;
     staged();
     if (look) plane.look_at(look);
+    update_address(); // at once: a list of missions that arrives before the next frame opens that of the address
     listen();
     if (listed?.sweep) play(true);
   } finally {
