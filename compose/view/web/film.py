@@ -9,10 +9,11 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import signal
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
@@ -148,9 +149,21 @@ def _temporary() -> Iterator[Path]:
             del os.environ["TMPDIR"]
         else:
             os.environ["TMPDIR"] = before
-        give_up = time.monotonic() + REMOVE_S
-        while folder.exists() and time.monotonic() < give_up:
-            shutil.rmtree(folder, ignore_errors=True)  # a process of the browser may still write into it
+        give_up, used = time.monotonic() + REMOVE_S, True
+        while (used or folder.exists()) and time.monotonic() < give_up:
+            used = _killed(folder)  # a process of the browser that is about to end may make it again
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _killed(folder: Path) -> bool:
+    """Kill the processes that have a path in `folder` in their command line; return whether there are any."""
+    name, found = os.fsencode(folder), False
+    for line in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError):  # it has ended meanwhile
+            if name in line.read_bytes():
+                found = True
+                os.kill(int(line.parent.name), signal.SIGKILL)
+    return found
 
 
 def _played(page: Page, frame_ms: int, check: Callable[[], object]) -> Iterator[bytes]:
