@@ -43,7 +43,7 @@ class Finalized:
     def __del__(self):
         signal.raise_signal(signal.SIGINT)
 
-INTERRUPTION.begin()
+INTERRUPTION.begin("tandem run")
 Finalized()
 print("went on")
 """
@@ -109,8 +109,8 @@ def test_ctrl_c_when_a_command_has_ended_does_not_change_its_exit_status() -> No
     assert program(AT_EXIT, "scenarios").status == 0
 
 
-def test_a_signal_whose_error_python_drops_ends_the_command_all_the_same() -> None:
-    assert program(LOST) == (130, "", "")
+def test_a_signal_whose_error_python_drops_ends_the_command_with_its_line_all_the_same() -> None:
+    assert program(LOST) == (130, "", "tandem run: stopped by SIGINT\n")
 
 
 @pytest.mark.parametrize("number", series([SIGINT, SIGTERM, SIGHUP]), ids=lambda number: number.name)

@@ -114,7 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     try:
         command, words = _split(sys.argv[1:] if arguments is None else arguments)
         name = f"tandem {command.name}"
-        INTERRUPTION.begin()
+        INTERRUPTION.begin(name)
         limits.need_memory(limits.START_BYTES, "Tandem")
         options = command_parser(command).parse_all(words)
         status: int = import_module(command.module).main(options)

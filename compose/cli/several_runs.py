@@ -39,7 +39,7 @@ def run_all(
         results: list[Mapping[str, Any]] = []
         out: Path | None = options.out / name if options.out is not None else None
         one = {"scenario": source, "seed": seed, "out": out, "results": results, "export": False}
-        INTERRUPTION.begin()
+        INTERRUPTION.begin("tandem run")
         statuses.append(run_one(argparse.Namespace(**{**vars(options), **one})))
         if options.quiet:
             say(*[f"{name}: {outcome_line(result)}" for result in results])

@@ -6,7 +6,9 @@ import os
 import signal
 import sys
 import time
+from contextlib import suppress
 from types import FrameType
+from typing import NoReturn
 
 from compose.errors import STOPPED
 
@@ -29,10 +31,15 @@ class Interruption:
     def __init__(self) -> None:
         self.signal_name: str | None = None
         """The name of the first signal; None until there is one."""
+        self._command = "tandem"
         self._first_s = 0.0
 
-    def begin(self) -> None:
-        """Set the handlers. A signal that was ignored stays ignored, unless it is that of Ctrl-C."""
+    def begin(self, command: str) -> None:
+        """Set the handlers for `command`, such as "tandem run".
+
+        A signal that was ignored stays ignored, unless it is that of Ctrl-C.
+        """
+        self._command = command
         sys.unraisablehook = self._unraisable
         for number in STOPPING:
             if number == signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:
@@ -49,13 +56,19 @@ class Interruption:
             self._first_s = time.monotonic()
             raise StoppedBySignal(self.signal_name)
         if time.monotonic() > self._first_s + CLEANING_S:
-            os._exit(STOPPED)
+            self._leave()
 
     def _unraisable(self, unraisable: sys.UnraisableHookArgs) -> None:
         """End the process if the error of a signal was lost, in a finalizer or in a callback from C."""
         if issubclass(unraisable.exc_type, StoppedBySignal):
-            os._exit(STOPPED)
+            self._leave()
         sys.__unraisablehook__(unraisable)
+
+    def _leave(self) -> NoReturn:
+        """Say what stopped the command, and end the process at once, whatever it is doing."""
+        with suppress(OSError):  # not through sys.stderr, which the signal may have interrupted
+            os.write(2, f"{self._command}: stopped by {self.signal_name}\n".encode())
+        os._exit(STOPPED)
 
 
 INTERRUPTION = Interruption()
