@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,6 +24,14 @@ LONG_TIMEOUT_S = 600.0
 
 Some compute for half a minute on a core of their own, and the workers share the cores, also with other work.
 """
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Let the processes of tests receive the signals that nohup, or `&` in a script, makes them ignore."""
+    if hasattr(config, "workerinput"):
+        for number, handler in ((signal.SIGHUP, signal.SIG_DFL), (signal.SIGINT, signal.default_int_handler)):
+            if signal.getsignal(number) is signal.SIG_IGN:
+                signal.signal(number, handler)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
