@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Protocol
 
 from msgspec.structs import replace
 
 from agent.peer import false_reports, peer_state
+from agent.peer.motion_log import MotionLog
 from agent.planning import phase1_anchor, plausibility, separation
 from agent.planning.active_sensing import Retreating
 from agent.planning.phase1_anchor import ThirdPoint
@@ -26,22 +28,56 @@ from protocol.messages import (
 from protocol.motion import REST, Controls, Pose, step
 
 
+class Reporting(Protocol):
+    """The state of a robot, as far as a report without a log tells of it."""
+
+    @property
+    def config(self) -> RobotConfig:
+        """The configuration of the robot."""
+
+    @property
+    def tick(self) -> int:
+        """The tick of the latest observation."""
+
+    @property
+    def log(self) -> MotionLog:
+        """The measured motion, and the ranges to the robot's anchor."""
+
+    @property
+    def phase(self) -> int:
+        """The phase of the paper: 1, 2 or 3."""
+
+    @property
+    def mode_name(self) -> str:
+        """The name of the mode that reports, commands and recordings use."""
+
+
 def start(config: RobotConfig) -> RobotState:
     """Return the state of a robot that has measured nothing yet."""
     return RobotState(config)
 
 
+def dead_reckoned(
+    log: MotionLog, odometry: Pose, leg: Pose, executed: Controls | None, period: float
+) -> tuple[MotionLog, Pose, Pose]:
+    """Return `log`, `odometry` and `leg` after a tick of `period` s that the odometry measured as `executed`.
+
+    `leg` is the odometry at the beginning of the last segment of `log`, which is one step of the motion.
+    """
+    if executed is None:
+        return log, odometry, leg
+    log = log.drove(executed.v, executed.omega)
+    ticks = log.runs[-1].ticks
+    if ticks == 1:
+        leg = odometry
+    return log, step(leg, executed.v, executed.omega, ticks * period), leg
+
+
 def observed(state: RobotState, observation: Observation) -> RobotState:
     """Return `state` with the sensor data of one tick: odometry, anchor range, contact and mutual range."""
-    log, odometry, leg = state.log, state.odometry, state.leg
-    executed = observation.executed
-    if executed is not None:
-        v, omega = executed.v, executed.omega
-        log = log.drove(v, omega)
-        ticks = log.runs[-1].ticks
-        if ticks == 1:
-            leg = odometry
-        odometry = step(leg, v, omega, ticks * state.config.mission.period)
+    log, odometry, leg = dead_reckoned(
+        state.log, state.odometry, state.leg, observation.executed, state.config.mission.period
+    )
     if observation.anchor_range is not None and state.estimator.is_informative(state, observation):
         log = log.ranged(observation.anchor_range)
     mutual, in_contact = state.mutual, False
@@ -92,8 +128,8 @@ def report(state: RobotState) -> Report:
     )
 
 
-def report_without_log(state: RobotState, verdict: Verdict | None) -> Report:
-    """Return a report to a robot with which this one is not in a meeting: its `verdict` in an earlier one."""
+def report_without_log(state: Reporting, verdict: Verdict | None) -> Report:
+    """Return a report to a robot with which this one is not in a meeting: the `verdict` that it has."""
     return Report(
         tick=state.tick,
         robot=state.config.robot,

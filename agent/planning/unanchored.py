@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from agent.estimation import resection
 from agent.estimation.resection import RangedPlace
 from agent.peer.motion_log import MotionLog
-from agent.planning import sweep
+from agent.planning import exchange, sweep
 from agent.planning.phase3_last_manoeuvre import Standing
 from agent.planning.planner import Planner, Summary
 from agent.planning.state import MODE_NAMES
@@ -32,7 +32,7 @@ from protocol.messages import (
     Undecided,
 )
 from protocol.mission import Mission
-from protocol.motion import ORIGIN, REST, Pose, compose, inverse, step
+from protocol.motion import ORIGIN, REST, Pose, compose, inverse
 from protocol.rounding import SURE
 
 POSE_TOLERANCE = 1e-9
@@ -101,12 +101,9 @@ class UnanchoredPlanner(Planner[UnanchoredState, Report]):
 
     def observe(self, state: UnanchoredState, observation: Observation) -> UnanchoredState:
         """Return `state` with the odometry and the ranges of one tick."""
-        log, odometry, leg = state.log, state.odometry, state.leg
-        if (driven := observation.executed) is not None:
-            log = log.drove(driven.v, driven.omega)
-            ticks = log.runs[-1].ticks
-            leg = odometry if ticks == 1 else leg
-            odometry = step(leg, driven.v, driven.omega, ticks * state.config.mission.period)
+        log, odometry, leg = exchange.dead_reckoned(
+            state.log, state.odometry, state.leg, observation.executed, state.config.mission.period
+        )
         state = replace(state, tick=observation.tick, odometry=odometry, leg=leg, log=log)
         if state.verdict is not None:
             return state
@@ -124,21 +121,7 @@ class UnanchoredPlanner(Planner[UnanchoredState, Report]):
 
     def report(self, state: UnanchoredState) -> Report:
         """Return a report without a log: a robot without an anchor is in no meeting."""
-        return Report(
-            tick=state.tick,
-            robot=state.config.robot,
-            phase=state.phase,
-            state=state.mode_name,
-            start=None,
-            since=0,
-            through=0,
-            runs=(),
-            ranges_since=0,
-            ranges=(),
-            heard=0,
-            ranges_heard=0,
-            verdict=state.verdict,
-        )
+        return exchange.report_without_log(state, state.verdict)
 
     def decide(self, state: UnanchoredState, reports: Sequence[Report] = ()) -> UnanchoredState:
         """Return `state` with the poses in `reports`, and with a verdict if they determine the own pose."""
