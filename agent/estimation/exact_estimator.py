@@ -28,7 +28,7 @@ class ExactEstimator(msgspec.Struct, frozen=True):
     """The closed forms of Section III. A candidate that contradicts any measurement is ruled out."""
 
     pose_tolerance: ClassVar[float] = 1e-9
-    """The rounding error of the odometry."""
+    """The rounding error of the odometry, in rad and in units of A_0."""
     corrects_poses: ClassVar[bool] = False
     """The pose follows from the end of phase 1 by dead reckoning."""
     report_tolerance: ClassVar[float] = 1e-6

@@ -48,11 +48,12 @@ def controls(mode: Sweeping | Looping, odometry: Pose, mission: Mission, toleran
 
     `tolerance` is `Estimator.pose_tolerance`.
     """
-    for place in mode.places[:1]:
-        found = phase2_orbit.travel_controls(Travelling(place), odometry, mission, tolerance)
-        if found is not None:
-            return Controls(min(found.v, sweep_speed(mission)), found.omega)
-    return None
+    if not mode.places:
+        return None
+    found = phase2_orbit.travel_controls(Travelling(mode.places[0]), odometry, mission, tolerance)
+    if found is None:
+        return None
+    return Controls(min(found.v, sweep_speed(mission)), found.omega)
 
 
 def onward(

@@ -13,6 +13,7 @@ import msgspec
 from msgspec.structs import replace
 
 from agent.estimation import resection
+from agent.estimation.exact_estimator import EXACT
 from agent.estimation.resection import RangedPlace
 from agent.peer.motion_log import MotionLog
 from agent.planning import exchange, sweep
@@ -34,9 +35,6 @@ from protocol.messages import (
 from protocol.mission import Mission
 from protocol.motion import ORIGIN, REST, Pose, compose, inverse
 from protocol.rounding import SURE
-
-POSE_TOLERANCE = 1e-9
-"""The rounding error of the odometry, in units of A_0 and rad."""
 
 EXPLAINED = 0.1 * SURE
 """The largest difference in m between a measured range and the one that a possible pose predicts.
@@ -133,9 +131,11 @@ class UnanchoredPlanner(Planner[UnanchoredState, Report]):
         if isinstance(state.mode, Standing):  # a robot that comes again may have another pose since a meeting
             places = {key: one for key, one in places.items() if key[1] > state.tick - LOOPS_FOR}
         for one in reports:
-            known = ranges.pop((one.robot, one.tick), None) if isinstance(one, ReportWithPose) else None
-            if known is not None and isinstance(one, ReportWithPose):
-                places[one.robot, one.tick] = RangedPlace((one.pose.x, one.pose.y), known[1], known[0])
+            if not isinstance(one, ReportWithPose):
+                continue
+            if (known := ranges.pop((one.robot, one.tick), None)) is not None:
+                distance, odometry = known
+                places[one.robot, one.tick] = RangedPlace((one.pose.x, one.pose.y), odometry, distance)
         if places.keys() != state.places.keys():
             state = _resected(replace(state, ranges=ranges, places=places))
         return _moved_on(state) if isinstance(state.mode, Looping) and state.verdict is None else state
@@ -144,7 +144,7 @@ class UnanchoredPlanner(Planner[UnanchoredState, Report]):
         """Return the command for the next tick, with the phase, the mode and the verdict."""
         controls = None
         if isinstance(state.mode, Looping) and state.verdict is None:
-            controls = sweep.controls(state.mode, state.odometry, state.config.mission, POSE_TOLERANCE)
+            controls = sweep.controls(state.mode, state.odometry, state.config.mission, EXACT.pose_tolerance)
         driven = controls or REST
         return Command(
             state.tick,
@@ -206,7 +206,7 @@ def _moved_on(state: UnanchoredState) -> UnanchoredState:
     """
     assert isinstance(state.mode, Looping)
     mission, since = state.config.mission, state.mode.since
-    mode = sweep.onward(state.mode, state.odometry, mission, POSE_TOLERANCE)
+    mode = sweep.onward(state.mode, state.odometry, mission, EXACT.pose_tolerance)
     if mode.places:
         return replace(state, mode=mode)
     if max(tick for _, tick in state.places) > state.tick - KEPT and since > state.tick - LOOPS_FOR:
