@@ -105,11 +105,7 @@ class GroupPlanner(Planner[GroupState, Report]):
     def decide(self, state: GroupState, reports: Sequence[Report] = ()) -> GroupState:
         """Return `state` with the `reports` of others, and in the next meeting if this one has ended."""
         for one in reports:
-            if state.config.mission.safety_distance:
-                travels = replace(state.other(one.robot), travels=one.state == TRAVELLING)
-                state = state.with_other(one.robot, travels)
-            if one.state == TRAVELLING or (not one.has_log and isinstance(one.verdict, Localised)):
-                state = state.with_other(one.robot, replace(state.other(one.robot), localised=True))
+            state = _with_sender(state, one)
         logs = [one for one in reports if one.has_log]
         state = group_transitions.answering(state, [one.robot for one in logs if one.state == TRAVELLING])
         peer, before = state.pair.config.peer, state.pair
@@ -176,3 +172,12 @@ class GroupPlanner(Planner[GroupState, Report]):
     def required_mutual_ranges(self, mission: Mission) -> int:
         """Return the minimum number of noisy mutual ranges before a claim."""
         return self.pair_planner.required_mutual_ranges(mission)
+
+
+def _with_sender(state: GroupState, report: Report) -> GroupState:
+    """Return `state` with what `report` says about its sender: whether it travels, and is localised."""
+    known, travels = state.other(report.robot), report.state == TRAVELLING
+    localised = known.localised or travels or (not report.has_log and isinstance(report.verdict, Localised))
+    if (travels, localised) == (known.travels, known.localised):
+        return state
+    return state.with_other(report.robot, replace(known, travels=travels, localised=localised))

@@ -24,7 +24,7 @@ class Other(msgspec.Struct, frozen=True):
     failed: bool = False
     """True once a meeting with it has failed: this robot does not meet it again."""
     travels: bool = False
-    """True if it drives to another robot, by its latest report."""
+    """True if it drives to another robot, by its latest report. It counts only with a safety distance."""
     missed: int | None = None
     """The latest tick in which this robot has not found it where it should wait; None if there is none."""
 

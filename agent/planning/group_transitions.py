@@ -130,8 +130,8 @@ def _after_failure(state: GroupState) -> GroupState:
 
 def _has_nobody(state: GroupState) -> bool:
     """Return whether the meetings of this robot with all others have failed."""
-    others = [one.robot for one in state.config.members if one.robot != state.config.robot]
-    return len(state.others) >= len(others) and all(state.other(robot).failed for robot in others)
+    own = state.config.robot
+    return all(state.other(one.robot).failed for one in state.config.members if one.robot != own)
 
 
 def _resumed(state: GroupState) -> GroupState:
