@@ -9,14 +9,13 @@ which one localised robot has been everywhere, so that all are localised that st
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 import msgspec
 
 from compose.recording.run import Run
-from protocol.motion import TAU
 from protocol.orbits import meeting_ticks
-from protocol.sweep_strips import helping_ticks, sweep_speed, sweep_ticks
+from protocol.sweep_strips import Place, helping_ticks, sweep_speed, sweep_ticks
 from world.scenario import Scenario
 
 SEARCHED = 42.0
@@ -79,15 +78,14 @@ def _sweeps_ticks(scenario: Scenario, tour: int) -> int:
     if scenario.planned_sweep is None:
         return 0
     area, mission = scenario.planned_sweep.sweep, scenario.mission
-    places = [*_anchors(scenario), *area.corners]
-    way = max([math.dist(one, other) for one in places for other in places])
+    way = _longest_way([*_anchors(scenario), *area.corners])
     step = sweep_speed(mission) * mission.period
     ticks = math.ceil(way / step) + tour + len(scenario.unanchored) * helping_ticks(mission)
     parts = [area.path(part, mission.sensing_range) for part in range(area.parts)]
     return sum([ticks + sweep_ticks(path, mission) for path in parts])
 
 
-def _anchors(scenario: Scenario) -> list[tuple[float, float]]:
+def _anchors(scenario: Scenario) -> list[Place]:
     """Return the places of all anchors, in m."""
     return [(at.x, at.y) for one in scenario.robots if (at := one.given_anchor) is not None]
 
@@ -101,7 +99,7 @@ def _return_ticks(scenario: Scenario, waiting: Collection[str]) -> int:
     radii = [one.rendezvous.a.radius for one in scenario.robots if one.id in waiting and one.role == "a"]
     if not radii:
         return 0
-    return math.ceil((max(radii) + _longest_way(scenario)) / step)
+    return math.ceil((max(radii) + _longest_way(_anchors(scenario))) / step)
 
 
 def _tour_ticks(scenario: Scenario, waiting: Collection[str]) -> int:
@@ -111,17 +109,17 @@ def _tour_ticks(scenario: Scenario, waiting: Collection[str]) -> int:
     """
     mission = scenario.mission
     step = mission.max_speed * mission.period
-    turn = math.ceil(TAU / 2.0 / (mission.max_turn_rate * mission.period))
+    turn = math.ceil(math.pi / (mission.max_turn_rate * mission.period))
     search = 0 if mission.noise.exact else math.ceil(SEARCHED * mission.sensing_range / step) + 12 * turn
-    anchors = len(_anchors(scenario))
-    ways = [_way_to_all(scenario, begin) for begin in range(anchors)]
-    visits = anchors - 1
+    anchors = _anchors(scenario)
+    ways = [_way_to_all(anchors, begin) for begin in range(len(anchors))]
+    visits = len(anchors) - 1
     return math.ceil(max(ways) / step) + visits * (turn + 1 + search) + len(waiting) * meeting_ticks(mission)
 
 
-def _way_to_all(scenario: Scenario, begin: int) -> float:
-    """Return the length in m of the way from one anchor to all others, the nearest first."""
-    left = _anchors(scenario)
+def _way_to_all(places: Sequence[Place], begin: int) -> float:
+    """Return the length in m of the way from the place at index `begin` to all others, the nearest first."""
+    left = list(places)
     here, way = left.pop(begin), 0.0
     while left:
         nearest = min(left, key=lambda place: math.dist(place, here))
@@ -131,6 +129,6 @@ def _way_to_all(scenario: Scenario, begin: int) -> float:
     return way
 
 
-def _longest_way(scenario: Scenario) -> float:
-    places = _anchors(scenario)
+def _longest_way(places: Sequence[Place]) -> float:
+    """Return the largest distance in m between two of `places`."""
     return max([math.dist(one, other) for one in places for other in places])
