@@ -62,6 +62,11 @@ class SweptArea(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fie
         return self.x_min <= x <= self.x_max and self.y_min <= y <= self.y_max
 
     @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """The area as x_min, y_min, x_max, y_max, in m, as scenario files have it."""
+        return self.x_min, self.y_min, self.x_max, self.y_max
+
+    @property
     def corners(self) -> tuple[Place, ...]:
         """The corners of the area, in m in <W>."""
         return tuple([(x, y) for x in (self.x_min, self.x_max) for y in (self.y_min, self.y_max)])

@@ -90,8 +90,7 @@ def planned_meetings(found: Scenario) -> GroupMeetings:
     robots = [RobotTable(robot, (at.x, at.y) if at is not None else None) for robot, at in anchors]
     planner = PlannerTable(found.planner_name, found.planner_options)
     meetings = group_meetings([one for one in robots if one.anchor is not None], found.mission, planner)
-    sweep = found.planned_sweep.sweep if found.planned_sweep is not None else None
-    area = (sweep.x_min, sweep.y_min, sweep.x_max, sweep.y_max) if sweep is not None else None
+    area = found.planned_sweep.sweep.bounds if found.planned_sweep is not None else None
     return with_sweep(robots, area, found.mission, meetings)
 
 

@@ -164,8 +164,7 @@ def file_table(scenario: Scenario) -> dict[str, Any]:
     """Return the content of a scenario file that describes `scenario`, with all starts and the last tick."""
     mission = _given(scenario.mission)
     if scenario.planned_sweep is not None:
-        area = scenario.planned_sweep.sweep
-        mission["area"] = [area.x_min, area.y_min, area.x_max, area.y_max]
+        mission["area"] = list(scenario.planned_sweep.sweep.bounds)
     if scenario.mission.noise.profile is not None:  # a default would have the value of the profile
         noise = msgspec.to_builtins(scenario.mission.noise)
         mission["noise"] = {name: value for name, value in noise.items() if value is not None}
