@@ -50,8 +50,8 @@ def scenario(run: Run) -> Checks:
 
 def _group(found: Scenario) -> Checks:
     """Check that the meetings of a group are those that are planned for its anchors."""
-    unanchored = found.unanchored
-    for one, other in combinations([robot for robot in found.robots if robot.id not in unanchored], 2):
+    anchored = [robot for robot in found.robots if robot.given_anchor is not None]
+    for one, other in combinations(anchored, 2):
         yield _violation(other.id, _off_distance(found.mission, one.anchor, other.anchor, one.id))
     try:
         planned = planned_meetings(found)

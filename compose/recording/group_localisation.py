@@ -44,8 +44,9 @@ class SearchResult(msgspec.Struct, frozen=True):
 def search_results(run: Run) -> Iterator[SearchResult]:
     """Yield the robots without an anchor, in the order of the scenario."""
     planned = run.scenario.planned_sweep
-    for robot in run.scenario.unanchored if planned is not None else ():
-        assert planned is not None
+    if planned is None:
+        return
+    for robot in run.scenario.unanchored:
         claim, ticks = run.claim(robot), planned.ends / run.scenario.mission.period
         yield SearchResult(
             robot, planned.ends, math.ceil(ticks - ROUNDING), claim.tick if claim is not None else None
