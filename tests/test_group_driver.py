@@ -274,7 +274,7 @@ def test_a_silent_robot_is_given_up_after_its_planned_time_and_a_visit(
 def test_a_robot_that_has_just_been_localised_does_not_give_up_a_silent_one(
     stage: Stage, ending: GroupEnding
 ) -> None:
-    """Its planner may still wait for the verdict of its peer before it goes there."""
+    """The planner of a may still wait for the verdict of its peer, before it goes to the silent robot."""
     stage.now += 31.0
     for robot in "cd":
         ending.receive(result(robot))

@@ -353,7 +353,7 @@ def test_a_sweep_goes_on_after_its_machine_has_slept(folder: Path, monkeypatch: 
 
 
 def test_an_answer_that_comes_after_the_machine_has_slept_is_in_time() -> None:
-    """Without it, a sweep whose machine fell asleep in this wait took its scheduler for lost."""
+    """A sweep whose machine fell asleep in this wait once took its scheduler for lost."""
     code = """
 import time
 from compose.sweep.cluster import _within

@@ -81,8 +81,8 @@ def decide_outcome(
     A claim is compared with the true pose at the tick of the claim, which is in `claimed`, or with the
     current one if `claimed` is None. The run does not wait for a robot whose peer is undecided or
     inconsistent, because it can no longer be localised; in a group, another robot may still come. It does not
-    wait for a dead robot, which leaves it undecided. A claim
-    below the required accuracy does not count as localised.
+    wait for a dead robot, which leaves it undecided. A claim below the required accuracy does not count as
+    localised.
     """
     open_cases = [
         robot.id

@@ -1,4 +1,4 @@
-"""How a robot of a group passes robots of other meetings at the safety distance, of which it has only ranges.
+"""The way of a robot of a group past robots of other meetings, at the safety distance, by ranges alone.
 
 In each tick, it drives at most half of the way that is left to the safety distance, in any direction. Two
 robots that both do so keep it. A robot on a straight way may then be blocked by one that stands there: it

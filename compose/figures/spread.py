@@ -52,7 +52,7 @@ class GroupRobot(msgspec.Struct, frozen=True):
 
     id: str
     anchor: tuple[float, float] | None
-    """Its anchor in m; None if it has none."""
+    """The place of its anchor in m; None if it has none."""
     path: tuple[Pose, ...]
     """The true poses."""
     commands: tuple[Command | None, ...]
@@ -79,7 +79,7 @@ def draw(run: Run, medium: Medium = SCREEN) -> Figure | Absent:
         _home(axes, one, reach, ticks=len(robots) <= MOST_TICKS)
         _path(axes, one)
     _tree(axes, setup, robots)
-    _key(axes, reach, any(one.anchor is None for one in robots))
+    _key(axes, reach, unanchored=any(one.anchor is None for one in robots))
     sheet.plane(axes, _window(robots, reach), TALLEST)
     lanes = sheet.panel()
     _lanes(lanes, setup, robots)
@@ -171,7 +171,8 @@ def _tree(axes: Axes, setup: RunSetup, robots: list[GroupRobot]) -> None:
         )  # fmt: skip
 
 
-def _key(axes: Axes, reach: float, unanchored: bool) -> None:
+def _key(axes: Axes, reach: float, *, unanchored: bool) -> None:
+    """Add the entries of the legend, with that of robots without an anchor if there are `unanchored` ones."""
     axes.plot([], [], "x", color="k", ms=4, mew=1.2, ls="", label="anchor")
     if unanchored:
         axes.plot([], [], "^", color=COLOURS["a"], ms=5, ls="", label="start of a robot without an anchor")

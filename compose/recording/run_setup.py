@@ -28,7 +28,7 @@ class RobotSetup(msgspec.Struct, frozen=True):
     peer: RobotId
     role: Role
     given_anchor: Anchor | None = msgspec.field(name="anchor")
-    """Its anchor; None if it has none, as some robots of a group."""
+    """The anchor of the robot; None if it has none, as some robots of a group."""
     orbit: Orbit
     attack: Attack | None = None
     """The false data injection that the scenario configures for this robot."""
