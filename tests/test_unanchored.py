@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import tomli_w
 from msgspec.structs import replace
 from playwright.sync_api import expect
 
@@ -22,13 +23,12 @@ from compose.recording.corrected_bounds import corrected_bounds
 from compose.recording.recording_files import agent_journal
 from compose.recording.run import Run, of_frames, read
 from compose.scenario.scenario_change import file_table
-from compose.scenario.scenario_file import parse, validate
+from compose.scenario.scenario_file import load, parse, validate
 from protocol.journal.journal_file import CorruptJournal
 from protocol.messages import Contact, Localised, Observation, ReportWithPose, RobotConfigWithoutAnchor
 from protocol.motion import Controls, Pose, step
 from protocol.wire import decode, encode
 from tests.browser import Open, scrub_to, shot, watching
-from tests.commands import SECTION_IV
 from tests.commands import tandem as tandem_command
 from tests.groups import R, localised, table_of
 from tests.test_audit import kept
@@ -157,7 +157,7 @@ def test_reports_in_another_order_lead_to_the_same_claim_to_the_bit() -> None:
 
 
 def test_a_robot_that_a_passing_one_has_left_on_a_square_is_localised_by_the_next_one() -> None:
-    """Its odometry then differs from where it stood first, by rounding."""
+    """The odometry of the robot then differs from where it stood first, by rounding."""
     scenario = scenario_of(four())
     config, planner = scenario.config("u"), UnanchoredPlanner()
     pose, state, tick = Pose(5.0, 4.0, 0.7), planner.start(config), 0
@@ -301,44 +301,13 @@ def test_a_robot_of_a_pair_needs_an_anchor() -> None:
 
 # --- recordings ---------------------------------------------------------------------------------------
 
-FILE = f"""
-name = "four"
-seed = 1
-[mission]
-sensing_range = 3.0
-period = 1.0
-max_speed = 1.0
-max_turn_rate = 3.141592653589793
-area = {AREA}
-[[robot]]
-id = "a"
-anchor = [0.0, 0.0]
-[[robot]]
-id = "b"
-anchor = [10.0, 3.0]
-[[robot]]
-id = "u"
-[[robot]]
-id = "v"
-"""
+FILE = tomli_w.dumps(four(name="four"))
 
 
 def test_the_audit_and_the_replay_find_nothing_where_nothing_is_wrong(tmp_path: Path) -> None:
     run_mission(parse(FILE, "four"), tmp_path)
     assert audit_run(read(tmp_path)).violations == ()
     assert replayed(read(tmp_path)).differences == ()
-
-
-SECTION_IV_PAIR = f"""
-name = "pair"
-{SECTION_IV}
-[[robot]]
-id = "a"
-anchor = [0.0, 0.0]
-[[robot]]
-id = "b"
-anchor = [10.0, 0.0]
-"""
 
 
 def _with_pose(frames: list[bytes]) -> list[int]:
@@ -378,10 +347,10 @@ def test_a_recording_whose_searching_robots_are_not_those_with_an_anchor_is_refu
     for planned in (None, replace(scenario.planned_sweep, sweepers=("a", "u"))):
         with pytest.raises(CorruptJournal, match="the robots that search are not those with an anchor"):
             of_frames(with_scenario(journals, replace(scenario, planned_sweep=planned)))
-    pairs = replace(parse(SECTION_IV_PAIR, "pair"), robots=())
-    lacking = [replace(one, given_anchor=None) for one in parse(SECTION_IV_PAIR, "pair").robots]
+    pair = load("paper-1")
+    lacking = tuple([replace(one, given_anchor=None) for one in pair.robots])
     with pytest.raises(CorruptJournal, match="in its scenario a has no anchor"):
-        of_frames(with_scenario(journals, replace(pairs, robots=tuple(lacking))))
+        of_frames(with_scenario(journals, replace(pair, robots=lacking)))
 
 
 @pytest.mark.long
