@@ -25,8 +25,9 @@ NEAR = 0.9
 STEP = 0.5
 """The largest distance driven in a tick of a sweep, as a fraction of R.
 
-Of the middle line, 0.63 R are within NEAR R of a robot that is 0.84 R away, at HALF_WIDTH and on a square of
-its own. At the end of a strip, half of that are. So a tick is, or the end of the strip, where robots turn.
+A robot at HALF_WIDTH, on a square of its own, is at most 0.84 R from the middle line, and 0.63 R of the line
+are within NEAR R of it. That is more than STEP, so a tick ends there. At the end of a strip it is half as
+much, and contains the end, where a tick ends because robots turn.
 """
 
 SIDE = 0.03

@@ -84,10 +84,10 @@ def weigh_branches(
     the motion is almost radial.
     """
     ranged: list[tuple[Pose, float]] = []
-    silent: list[Pose] = []
+    undetected: list[Pose] = []
     for pose, rho in seen:
         if rho is None:
-            silent.append(pose)
+            undetected.append(pose)
         else:
             ranged.append((pose, rho))
     left: list[Branch] = []
@@ -95,7 +95,7 @@ def weigh_branches(
         branch = polished(candidate, ranged)
         if (
             _branch_meets(branch, ranged, floor)
-            and _branch_misses(branch, silent, sensing_range - 0.5 * margin)
+            and _branch_misses(branch, undetected, sensing_range - 0.5 * margin)
             and not any(math.dist(branch.anchor, other.anchor) < SAME * floor for other in left)
         ):
             left.append(branch)
@@ -133,11 +133,11 @@ def _branch_meets(branch: Branch, ranged: Iterable[tuple[Pose, float]], floor: f
     return True
 
 
-def _branch_misses(branch: Branch, silent: Iterable[Pose], reach: float) -> bool:
-    """Return whether `branch` is farther than `reach` m from the anchor at each pose of `silent`."""
+def _branch_misses(branch: Branch, undetected: Iterable[Pose], reach: float) -> bool:
+    """Return whether `branch` is farther than `reach` m from the anchor at each pose of `undetected`."""
     rho0 = branch.start.x
     c, s = math.cos(branch.start.heading), math.sin(branch.start.heading)
-    for pose in silent:
+    for pose in undetected:
         x, y = rho0 + c * pose.x - s * pose.y, s * pose.x + c * pose.y
         if math.hypot(x, y) <= reach:
             return False
@@ -196,11 +196,11 @@ def weigh_placements(
     """
     left: list[Placement] = []
     ranged: list[tuple[Positions, float]] = []
-    silent: list[Positions] = []
+    undetected: list[Positions] = []
     for seen in pair_observations:
         a, b, rho = seen.a, seen.b, seen.range
         if rho is None:
-            silent.append((a.x, a.y, b.x, b.y))
+            undetected.append((a.x, a.y, b.x, b.y))
         else:
             ranged.append(((a.x, a.y, b.x, b.y), rho))
     for candidate in candidates:
@@ -208,7 +208,7 @@ def weigh_placements(
         same = same_turn(math.hypot(placement.x, placement.y) + sensing_range)
         if (
             _explains_ranges(placement, ranged, floor)
-            and _explains_silence(placement, silent, sensing_range - floor)
+            and _explains_no_detection(placement, undetected, sensing_range - floor)
             and not any(same_placement(placement, other, same) for other in left)
         ):
             left.append(placement)
@@ -224,11 +224,11 @@ def _explains_ranges(placement: Placement, ranged: Iterable[tuple[Positions, flo
     return True
 
 
-def _explains_silence(placement: Placement, silent: Iterable[Positions], reach: float) -> bool:
+def _explains_no_detection(placement: Placement, undetected: Iterable[Positions], reach: float) -> bool:
     x, y = placement.x, placement.y
     c, s = math.cos(placement.phi), math.sin(placement.phi)
     hypot = math.hypot
-    for ax, ay, bx, by in silent:
+    for ax, ay, bx, by in undetected:
         along = x + c * ax - s * ay - bx  # a distance is at least as long as its part along an axis
         if -reach <= along <= reach and hypot(along, y + s * ax + c * ay - by) <= reach:
             return False

@@ -52,7 +52,7 @@ def margin(mission: Mission, floor: float) -> float:
 
 
 class Known(msgspec.Struct, frozen=True):
-    """The anchor error after the first of a robot's anchor ranges."""
+    """The smallest anchor error of a robot, and the number of its first anchor ranges that give it."""
 
     error: float
     """The bound in m on the error of the anchor's position."""

@@ -28,7 +28,7 @@ From four corners of a square with a side of 0.03 R, 0.9 R away, it is 0.033; fr
 LEVER = 0.02
 """The least information about the heading, in units of the squared distance driven.
 
-It is 1 if a robot drives across the line to the other one, and 0 along it.
+A range contains 1 if the robot has driven across the line to the other one, and 0 if along it.
 """
 
 PARALLEL = 1e-9
@@ -159,7 +159,10 @@ def _slope(pose: Pose, one: RangedPlace) -> float:
 
 
 def _headings(place: Point, moved: Sequence[RangedPlace]) -> tuple[float, ...]:
-    """Return the headings of the odometry's frame with the range from the place farthest from its origin."""
+    """Return the headings of the odometry's frame that agree with one range, with this robot at `place`.
+
+    It is the range that was measured farthest from the origin of the odometry.
+    """
     if not moved:
         return ()
     one = max(moved, key=lambda each: math.hypot(each.odometry.x, each.odometry.y))

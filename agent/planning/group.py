@@ -90,7 +90,7 @@ class GroupPlanner(Planner[GroupState, Report]):
         """Return the report to `peer`: the log, or outside a meeting only this robot's verdict.
 
         A robot without an anchor gets the pose of one that is localised until it is localised itself.
-        A robot that is not localised tells one that it refuses the verdict of their meeting.
+        Until this robot is localised, one with which its meeting has failed gets the verdict of that meeting.
         """
         if group_transitions.refused(state, peer):
             return exchange.report_without_log(state.pair, state.failure)

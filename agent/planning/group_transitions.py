@@ -30,8 +30,8 @@ depend on where it waits.
 PARTED_AFTER = 8
 """The ticks out of range of a peer after which a robot whose meeting has ended goes on.
 
-As long as it has not heard of the peer's verdict, it waits for it. A peer that goes on has heard this
-robot's verdict before.
+In range, it waits for the verdict of the peer. Out of range, it may have missed it; the peer, which has left,
+has received that of this robot before.
 """
 
 SILENT_AFTER = 200
@@ -102,8 +102,8 @@ def onward(state: GroupState) -> GroupState:
     if not isinstance(pair.mode, Done) or _must_linger(state):
         return state
     if not isinstance(pair.verdict, Localised):
-        told = state.lingering > 0 or not pair.in_contact  # the peer hears of it before this robot leaves
-        return _next_visit(_after_meeting(state)) if told else state
+        reported = state.lingering > 0 or not pair.in_contact  # to the peer, before this robot leaves
+        return _next_visit(_after_meeting(state)) if reported else state
     over = pair.peer_state.verdict is not None or state.unmet >= PARTED_AFTER
     return _next_visit(state) if over else state
 

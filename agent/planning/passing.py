@@ -61,7 +61,10 @@ def leeway(contacts: Sequence[Contact], peer: str | None, mission: Mission) -> f
 
 
 def yielding(passing: Bypass, leading: Sequence[Contact], mission: Mission) -> bool:
-    """Return whether a robot stands still, because one of those that travel and go first is near."""
+    """Return whether a robot stands still, because one of the robots in `leading`, which go first, is near.
+
+    It does so for YIELDS ticks at most.
+    """
     near = CLEARANCE * mission.sensing_range
     close = any(one.range is None or separation.leeway(one.range, mission) < near for one in leading)
     return close and passing.yielded < YIELDS

@@ -1,4 +1,4 @@
-"""The planners that are shipped with Tandem, by name. They are classes like those of anybody else."""
+"""The planners that are shipped with Tandem, by name. They are classes like those of users."""
 
 from __future__ import annotations
 

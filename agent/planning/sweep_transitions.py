@@ -55,7 +55,11 @@ def next_part(state: GroupState) -> GroupState:
 
 
 def onward(state: GroupState) -> GroupState | None:
-    """Return `state` after a tick of a sweep; None at its end."""
+    """Return `state` after a tick of a sweep; None at its end.
+
+    Near robots without an anchor, it drives squares until they are localised or LOOPS_FOR ticks are over, and
+    then returns to where it has left its strip.
+    """
     pair, mission = state.pair, state.config.mission
     mode, tolerance = pair.mode, pair.estimator.pose_tolerance
     assert isinstance(mode, Sweeping | Looping)

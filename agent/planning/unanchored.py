@@ -62,9 +62,9 @@ class UnanchoredState(msgspec.Struct, frozen=True):
     base: Pose = ORIGIN
     """The odometry at the place where it stands, or stood before its square."""
     ranges: Mapping[tuple[str, int], tuple[float, Pose]] = {}
-    """The ranges to robots whose pose then is not known, and the own one from `base`, by robot and tick."""
+    """The ranges without a reported pose yet, with the own pose relative to `base`, by robot and tick."""
     places: Mapping[tuple[str, int], RangedPlace] = {}
-    """The ranges to robots whose poses are known, by robot and tick."""
+    """The ranges to robots that have reported their poses in those ticks, by robot and tick."""
     possible: tuple[Pose, ...] = ()
     """The poses of `base` in <W> that agree with the ranges; empty before the heading can be determined."""
     mode: Standing | Looping = Standing()
@@ -128,7 +128,7 @@ class UnanchoredPlanner(Planner[UnanchoredState, Report]):
         if state.tick * state.config.mission.period >= state.config.gives_up:
             return replace(state, verdict=Undecided("no localised robot has found it"))
         ranges, places = dict(state.ranges), dict(state.places)
-        if isinstance(state.mode, Standing):  # a robot that comes again may have another pose since a meeting
+        if isinstance(state.mode, Standing):  # a robot that comes back may have corrected its pose
             places = {key: one for key, one in places.items() if key[1] > state.tick - LOOPS_FOR}
         for one in reports:
             if not isinstance(one, ReportWithPose):
@@ -199,7 +199,7 @@ def _resected(state: UnanchoredState) -> UnanchoredState:
 
 
 def _moved_on(state: UnanchoredState) -> UnanchoredState:
-    """Return `state` after a tick of a square. It is repeated until the pose is known.
+    """Return `state` after a tick of a square. The square is repeated until the pose is known.
 
     If nobody has reported a pose for KEPT ticks, the robot stands still again, and forgets all ranges: those
     to the next robot that comes begin where it is then.

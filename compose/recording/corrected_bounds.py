@@ -36,9 +36,10 @@ class CorrectedBound(msgspec.Struct, frozen=True):
 def corrected_bounds(run: Run) -> tuple[CorrectedBound, ...]:
     """Return the bounds that correct the planned one of the group in `run`, in their order; none for pairs.
 
-    Each depends on the plan and on the claims until its tick only. As long as pairs are left that try again,
-    there is a new one whenever the time of a pair is over without any claim, and when a bound is over: then
-    those that are localised are of no help to the others, as an attacker is.
+    Each depends on the plan and on the claims until its tick only. The first is announced when a robot is
+    late. As long as pairs are left that try again, another follows: if nobody is localised, when the time of
+    a pair is over; otherwise when the bound is over, because those that are localised, such as an attacker,
+    have then not helped the others.
     """
     if run.world is None or not run.scenario.meetings:
         return ()

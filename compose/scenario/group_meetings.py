@@ -26,7 +26,7 @@ The search for hypotheses takes the measured path for nearly right. With 0.003 r
 """
 
 RETRIES = 2
-"""The number of pairs that try again, one after the other. For three robots, there are no others."""
+"""The number of pairs that try again, one after the other. With three robots, they are all other pairs."""
 
 SLOWER = 2.0
 """The time for the visits after them, in units of the planned one: robots are not where they were planned."""
@@ -121,9 +121,9 @@ def _rounded_down(value: float) -> float:
 def _retried(
     seeds: Sequence[tuple[int, int]], robots: int, pair_time: Callable[[int, int], float]
 ) -> list[tuple[int, int]]:
-    """Return the pairs that try again one after the other: robots that have been in few, then quick ones.
+    """Return the pairs that try again in their order: robots that have been in few pairs, then quick pairs.
 
-    After one failure, one of the first two of them has two robots without it.
+    If one robot is the reason why a first pair has failed, one of the next two pairs is without it.
     """
     uses = [sum([robot in pair for pair in seeds]) for robot in range(robots)]
     tried = {frozenset(pair) for pair in seeds}

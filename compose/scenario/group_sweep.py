@@ -15,7 +15,7 @@ from protocol.sweep_strips import SweptArea, helping_ticks, sweep_speed, sweep_t
 from world.scenario import PlannedSweep
 
 LEAVING = 10
-"""The ticks after a meeting until a robot goes on (`group_transitions.PARTED_AFTER`)."""
+"""The bound on the ticks after a meeting until a robot goes on (see `group_transitions.PARTED_AFTER`)."""
 
 ASIDE = 2.0
 """The largest distance from the anchor of its last meeting at which a robot goes on, in units of R."""

@@ -79,7 +79,7 @@ class OpenForest:
         return sorted(parts)
 
     def insert(self, parts: list[int], skip: Callable[[], bool]) -> None:
-        """Put in `parts`, the last first, each where the last end of what it changes is least.
+        """Insert `parts`, the last one first, each where the meetings that it changes end earliest.
 
         A place or a seed pair for which `skip` returns True is not considered.
         """

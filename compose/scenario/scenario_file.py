@@ -274,7 +274,7 @@ def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scena
 
 
 def _with_world(scenario: Scenario, file: ScenarioFile, meetings: GroupMeetings | None) -> Scenario:
-    """Return `scenario` with what its file says about the group and the world, if that is anything."""
+    """Return `scenario` with what its file says about the group and the world, if it says anything."""
     if meetings is not None:
         of_group = ScenarioOfGroup(
             **asdict(scenario),

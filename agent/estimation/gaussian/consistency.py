@@ -49,7 +49,7 @@ Residuals that are larger still are a sign of something else. With no bound, no 
 """
 
 STRAYS_BEFORE, RANGES_BEFORE = 0.05, 5.0
-"""The strays and the ranges that a robot has seen, as it were, before its first range (a beta distribution).
+"""The prior of the rate of strays, as numbers of strays and of other ranges (a beta distribution).
 
 They hold for ranges with a sigma of UNTOLD_SIGMA or more. With more strays, two of twelve mutual ranges may
 be strays though no range to the own anchor is one, and such strays make robots believe false reports. With
@@ -61,7 +61,7 @@ LEAST_SHARE = 1e-3
 """The least share that counts: a robot never knows the rate better than from 5 000 ranges."""
 
 TOLD_BEFORE = 200.0
-"""The number of ranges that the rate of outliers that was told is worth."""
+"""The weight of the rate of outliers that was told, as a number of ranges."""
 
 
 def rejecting_p_value(noise: Noise) -> float:
@@ -91,7 +91,8 @@ def consistency_test(fitted: Fit, pair: PairRanges, robot: int) -> Inconsistency
 
     The motion of a robot between its anchor and the encounter affects no single range. It is tested only by
     the distance between the anchors that the fit implies, because this distance is known. The tests of the
-    residuals and of the strays know those of the own ranges of `robot` (0 or 1), without the peer's reports.
+    residuals and of the strays compare them with those of the own ranges of `robot` (0 or 1), on which the
+    peer's reports have no influence.
     """
     count, free = len(fitted.residuals), max(fitted.inliers - 6, 1)
     misfit = _normal(fitted.chi2, free)
@@ -194,7 +195,7 @@ HALVINGS = 50
 """The number of halvings of an interval that lead to the precision of a float."""
 
 LEAST_P_VALUE = 1e-300
-"""The smallest p-value that is told from 0."""
+"""The smallest p-value that is distinguished from 0."""
 
 
 def beta_binomial_tail(least: int, count: int, alpha: float, beta: float) -> float:

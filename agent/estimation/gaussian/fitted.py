@@ -44,9 +44,9 @@ class Fit(NamedTuple):
     system: NormalEquations
     """The last linear model. Directions and covariances are those of the point where it was computed."""
     linear: Point
-    """That point, before the last step, among those of other fits."""
+    """The point of that model, before the last step, with those of other fits."""
     row: int
-    """The row of this fit in that."""
+    """The row of this fit in `linear`."""
     level: float
     """The estimate of the noise level tau^2: the factor by which all variances differ from the told ones."""
 

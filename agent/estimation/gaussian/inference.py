@@ -121,7 +121,7 @@ def is_fit_due(knowledge: Knowledge) -> bool:
 
 
 FEW_MORE, MANY_MORE = 0.25, 5
-"""The ranges that are due for such a fit: a fraction of those fitted, and their number at the most.
+"""The number of new ranges for such a fit: a fraction of those fitted last, and at the most MANY_MORE.
 
 A further range hardly moves a pose that follows from 20, and each search fits all of them. With more, a robot
 whose odometry is noisy strays from its place; with less, the fits take most of the time of phase 2.
@@ -344,7 +344,7 @@ def with_convergence_check(belief: Belief, scored: Sequence[ScoredHypothesis]) -
 def with_doubt_check(belief: Belief, scored: Sequence[ScoredHypothesis], pair: PairRanges) -> Belief:
     """Return `belief` with a blocking reason if a profile contradicts the claim that would follow.
 
-    The profile explains the ranges of both robots much better. After DOUBTFUL_CLAIMS of them, more ranges
+    The profile explains the ranges of both robots much better. After DOUBTFUL_CLAIMS such claims, more ranges
     have not helped, and `belief.doubtful_claims` says so.
     """
     if belief.blocking_reason is not None:
