@@ -200,14 +200,14 @@ def test_small_residuals_that_are_alike_do_not_make_a_robot_sure() -> None:
     alike, alternating = np.full(21, 0.01), 0.01 * np.resize([1.0, -1.0], 21)
     weights = np.ones(21)
     by_chance = 2.0 / math.sqrt(21.0)
-    assert residual_correlation(alike, weights, ranges, 1.0) == pytest.approx(20 / 21 - by_chance)
-    assert residual_correlation(alternating, weights, ranges, 1.0) == 0.0
+    assert residual_correlation(alike, weights, ranges.sigma, (), 1.0) == pytest.approx(20 / 21 - by_chance)
+    assert residual_correlation(alternating, weights, ranges.sigma, (), 1.0) == 0.0
     assert noise_level(1.0, 19, noise, 0.5) > 2.0 * noise_level(1.0, 19, noise)
     assert noise_level(1.0, 19, noise) < 0.6
     white = np.random.default_rng(1).normal(size=21)
-    assert residual_correlation(white, weights, ranges, 1.0) == 0.0
-    of_two_kinds = ranges._replace(counts=(10, 11, 0))
-    assert residual_correlation(alike, weights, of_two_kinds, 1.0) == pytest.approx(19 / 21 - by_chance)
+    assert residual_correlation(white, weights, ranges.sigma, (), 1.0) == 0.0
+    of_two_kinds = residual_correlation(alike, weights, ranges.sigma, (10,), 1.0)
+    assert of_two_kinds == pytest.approx(19 / 21 - by_chance)
 
 
 def test_residuals_that_are_too_small_count_only_as_far_as_they_are_white() -> None:
@@ -215,8 +215,11 @@ def test_residuals_that_are_too_small_count_only_as_far_as_they_are_white() -> N
     noise, ranges = Noise(0.05, 0.05), own(0.0)[1]
     alike, weights = np.full(21, 0.01), np.ones(21)
     less_by_chance = 0.4 * 2.0 / math.sqrt(21.0)
-    assert residual_correlation(alike, weights, ranges, 0.4) == pytest.approx(20 / 21 - less_by_chance)
-    assert residual_correlation(alike, weights, ranges, 3.0) < 20 / 21 - less_by_chance
+    accurate, inaccurate = (
+        residual_correlation(alike, weights, ranges.sigma, (), level) for level in (0.4, 3.0)
+    )
+    assert accurate == pytest.approx(20 / 21 - less_by_chance)
+    assert inaccurate < 20 / 21 - less_by_chance
     assert noise_level(0.0, 100, noise) == LEAST_LEVEL
 
 

@@ -185,7 +185,9 @@ def _fit(
     chi2, level = float(qualities.chi2[row]), float(qualities.level[row])
     inliers = int(qualities.inliers[row])
     if problem.noise.sigma_degrees:
-        correlation = residual_correlation(points.own[row], weights, problem.ranges, level)
+        sigma, (first, second, _) = problem.ranges.sigma, problem.ranges.counts
+        ends = {first, first + second}
+        correlation = residual_correlation(points.own[row], weights, sigma, ends, level)
         level = noise_level(chi2, inliers - len(system.change), problem.noise, correlation)
     return Fit(
         points.guess[row],

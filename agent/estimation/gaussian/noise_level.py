@@ -7,9 +7,9 @@ level integrated out, the ranges have a Student t distribution.
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 
 from agent.estimation.gaussian.odometry_noise import Array
-from agent.estimation.gaussian.range_model import Ranges
 from protocol.noise import Noise
 
 INLIER = 0.5
@@ -43,16 +43,18 @@ def noise_level(chi2: float, degrees: int, noise: Noise, correlation: float = 0.
     return max((nu + worth * chi2) / (nu + worth * n), LEAST_LEVEL) / worth
 
 
-def residual_correlation(residuals: Array, weights: Array, ranges: Ranges, level: float) -> float:
+def residual_correlation(
+    residuals: Array, weights: Array, sigma: Array, ends: Collection[int], level: float
+) -> float:
     """Return the correlation of each residual with the one before, from 0 to MOST_CORRELATED.
 
-    Both are of the same kind. The correlation is reduced by what chance may cause (see BY_CHANCE), and
-    strays count as 0. `level` is the noise level without correlation.
+    Both are of the same kind, and `ends` are the rows after the last one of each. The correlation is reduced
+    by what chance may cause (see BY_CHANCE), and strays count as 0. `level` is the noise level without
+    correlation.
     """
-    scaled = (weights > INLIER) * (residuals / ranges.sigma)
+    scaled = (weights > INLIER) * (residuals / sigma)
     power, neighbours = float(scaled @ scaled), float(scaled[1:] @ scaled[:-1])
-    first, second, _ = ranges.counts
-    for end in {first, first + second}:
+    for end in ends:
         if 0 < end < len(scaled):
             neighbours -= float(scaled[end] * scaled[end - 1])
     if not power > 0.0:

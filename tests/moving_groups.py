@@ -1,0 +1,115 @@
+"""Facts of simulated groups for tests: robots that move, with noise, ranges to anchors and to each other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.estimation.facts import (
+    Fact,
+    Facts,
+    Manoeuvre,
+    anchor,
+    anchor_range,
+    manoeuvre,
+    mutual_range,
+)
+from agent.estimation.gaussian.odometry_noise import track
+from protocol.noise import Noise, VelocityNoise
+
+Array = NDArray[np.float64]
+
+PERIOD_S = 1.0
+NOISE = Noise(
+    0.05,
+    0.05,
+    odometry=VelocityNoise(v=0.02, omega=0.02, v_floor=0.005, omega_floor=0.005),
+    gyro_bias=0.002,
+)
+
+
+class MovingGroup(NamedTuple):
+    """The facts of a group, and the truth."""
+
+    facts: Facts
+    noise: Noise
+    starts: Array
+    """The true pose of each robot at tick 0; shape (n, 3)."""
+    ends: Array
+    """The true pose of each robot at the last tick; shape (n, 3)."""
+    paths: Array
+    """The true x and y of each robot at each tick; shape (n, 2, k + 1)."""
+
+
+def moving_group(
+    robots: int,
+    seed: int,
+    *,
+    ticks: int = 40,
+    noise: Noise = NOISE,
+    unanchored: Sequence[int] = (),
+    neighbours: int | None = None,
+    outliers: float = 0.0,
+) -> MovingGroup:
+    """Return `robots` that move beside their anchors, with a range in every second tick.
+
+    Those in `unanchored` have ranges to no anchor. Each ranges with the next `neighbours`; None: with all.
+    All errors are drawn from the model that `noise` tells, and a fraction of `outliers` is 0.5 to 1.5 m long.
+    """
+    draw, priors = np.random.default_rng((robots, seed)), noise.priors
+    side = 4.0 * math.sqrt(robots)
+    names = [f"r{i:02}" for i in range(robots)]
+    centres = draw.uniform(0.0, side, (robots, 2))
+    bias, scale = priors.range_bias * draw.normal(), priors.range_scale * draw.normal()
+    pair_bias: dict[frozenset[str], float] = {}
+    known: list[Fact] = []
+    starts, ends, paths = np.empty((robots, 3)), np.empty((robots, 3)), np.empty((robots, 2, ticks + 1))
+    for i, name in enumerate(names):
+        phase = draw.uniform(0.0, math.tau)
+        v = 0.3 + 0.1 * np.sin(0.5 * np.arange(ticks) + phase)
+        omega = 0.45 * np.sign(np.sin(0.3 * np.arange(ticks) + phase)) + 0.1 * draw.normal(size=ticks)
+        starts[i] = *(centres[i] + draw.normal(0.0, 1.0, 2)), draw.uniform(-math.pi, math.pi)
+        path = track(v, omega, PERIOD_S)
+        c, s = math.cos(starts[i, 2]), math.sin(starts[i, 2])
+        paths[i] = starts[i, :2, None] + np.stack((c * path.x - s * path.y, s * path.x + c * path.y))
+        ends[i] = *paths[i, :, -1], starts[i, 2] + path.heading[-1]
+        of_v, of_omega, of_gyro = draw.normal(size=3) * (
+            priors.wheel_scale,
+            priors.wheel_scale,
+            priors.gyro_bias,
+        )
+        sigmas = np.sqrt([noise.odometry.variances(a, b) for a, b in zip(v, omega, strict=True)])
+        measured_v = v / (1.0 + of_v) + sigmas[:, 0] * draw.normal(size=ticks)
+        measured_omega = (omega - of_gyro) / (1.0 + of_omega) + sigmas[:, 1] * draw.normal(size=ticks)
+        known += [
+            manoeuvre(name, tick, Manoeuvre(a, b))
+            for tick, (a, b) in enumerate(zip(measured_v.tolist(), measured_omega.tolist(), strict=True))
+        ]
+
+    def measured(names: tuple[str, str], true: float) -> float:
+        own = pair_bias.setdefault(frozenset(names), priors.pair_bias * draw.normal())
+        more = draw.uniform(0.5, 1.5) if draw.uniform() < outliers else 0.0
+        return max(true * (1.0 + scale) + bias + own + noise.mutual_sigma * draw.normal() + more, 0.0)
+
+    for i, name in enumerate(names):
+        if i in unanchored:
+            continue
+        known.append(anchor(f"M{name}", *centres[i].tolist()))
+        for tick in range(0, ticks + 1, 2):
+            away = float(np.hypot(*(paths[i, :, tick] - centres[i])))
+            known.append(
+                anchor_range(name, f"M{name}", tick, measured((name, "anchor"), away), noise.anchor_sigma)
+            )
+    for i in range(robots):
+        for j in range(i + 1, robots):
+            if neighbours is not None and min(j - i, robots - j + i) > neighbours:
+                continue
+            for tick in range(1, ticks + 1, 2):
+                apart = float(np.hypot(*(paths[i, :, tick] - paths[j, :, tick])))
+                rho = measured((names[i], names[j]), apart)
+                known.append(mutual_range(names[i], names[j], tick, rho, noise.mutual_sigma))
+    return MovingGroup(Facts(frozenset(known)), noise, starts, ends, paths)
