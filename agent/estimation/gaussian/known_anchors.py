@@ -73,15 +73,18 @@ def search(robot: AnchoredRobot, known: Sequence[Hypothesis] = ()) -> tuple[Scor
     if len(robot.ranges.rho) < FEWEST:
         return ()
     starts = [one.start for one in known] + [Start(guess) for guess in _candidates(robot)]
-    return _fitted(robot, starts, STEPS)
+    return scored_fits(robot, starts)
 
 
 def follow(robot: AnchoredRobot, known: Sequence[Hypothesis]) -> tuple[ScoredHypothesis, ...]:
     """Return the hypotheses that follow from those `known` before the latest ranges."""
-    return _fitted(robot, [one.start for one in known], WARM_STEPS)
+    return scored_fits(robot, [one.start for one in known], WARM_STEPS)
 
 
-def _fitted(robot: AnchoredRobot, starts: Sequence[Start], steps: int) -> tuple[ScoredHypothesis, ...]:
+def scored_fits(
+    robot: AnchoredRobot, starts: Sequence[Start], steps: int = STEPS
+) -> tuple[ScoredHypothesis, ...]:
+    """Return the hypotheses of the fits that begin at `starts`, the likeliest first."""
     found = fits(starts, [robot.path], robot.ranges, robot.noise, steps=steps)
     return with_probability([(one, 0.0) for one in found])
 
@@ -100,7 +103,7 @@ def _candidates(robot: AnchoredRobot) -> list[Array]:
         c, s = np.cos(turns), np.sin(turns)
         for mx, my in anchors(robot.path, alone, robot.sensing_range, robot.noise):
             guesses.append(np.stack((mx - c * ox - s * oy, my - c * oy + s * ox, turns), 1))
-    return _refined(np.concatenate(guesses), robot) if guesses else []
+    return refined(np.concatenate(guesses), robot) if guesses else []
 
 
 def ranges_places(robot: AnchoredRobot) -> Array:
@@ -109,7 +112,7 @@ def ranges_places(robot: AnchoredRobot) -> Array:
     return robot.ranges.place
 
 
-def _refined(guesses: Array, robot: AnchoredRobot) -> list[Array]:
+def refined(guesses: Array, robot: AnchoredRobot) -> list[Array]:
     """Return the likeliest of `guesses` after Gauss-Newton steps on all ranges, with measured odometry."""
     ranges, path = robot.ranges, robot.path
     at = np.stack((path.x[ranges.tick], path.y[ranges.tick]))[None]

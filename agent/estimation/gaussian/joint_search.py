@@ -1,0 +1,323 @@
+"""Hypotheses about the poses of n robots: pairs that two anchors locate, and then one robot after another.
+
+A robot is located by its ranges to beacons, which are anchors and robots that are located already. What its
+ranges leave open (often a mirror image) becomes several hypotheses. Then all robots are fitted jointly, and
+the evidence of the joint fits determines their probabilities.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from agent.estimation.gaussian import hypotheses
+from agent.estimation.gaussian.beacon_guesses import beacon_guesses
+from agent.estimation.gaussian.hypotheses import (
+    NEGLIGIBLE_PROBABILITY,
+    SAME_SIGMAS,
+    WARM_STEPS,
+    ScoredHypothesis,
+)
+from agent.estimation.gaussian.joint_fit import JointFit, JointStart, joint_fit
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.gaussian.known_anchors import FEWEST, AnchoredRobot, scored_fits
+from agent.estimation.gaussian.linear_model import Start
+from agent.estimation.gaussian.odometry_noise import Errors, Places
+from agent.estimation.gaussian.range_model import PairRanges, Ranges
+
+MOST_JOINT = 12
+"""The largest number of joint hypotheses. With more, three robots that are each one of two mirror images
+would be complete, and every estimate would take as much longer."""
+
+FEWEST_OF_PAIR = 3
+"""The least number of ranges between two robots, and of each to its anchor, with which a pair is located."""
+
+
+class JointHypothesis(NamedTuple):
+    """One possible explanation of all ranges of the located robots."""
+
+    probability: float
+    fit: JointFit
+
+
+class JointHypotheses(NamedTuple):
+    """The hypotheses about all robots that are located."""
+
+    located: tuple[int, ...]
+    """The indices of the robots to which the fits belong, ascending."""
+    scored: tuple[JointHypothesis, ...] = ()
+    """The hypotheses, the most probable first."""
+
+
+NOTHING = JointHypotheses(())
+
+
+class Candidate(NamedTuple):
+    """Robots that may be located next."""
+
+    decisive: int
+    """The number of ranges that decide: those between a pair, or those to other beacons than the first."""
+    robots: tuple[int, ...]
+    """One robot, or a pair."""
+
+
+def search(measured: JointMeasurements, reach: float) -> JointHypotheses:
+    """Return the hypotheses of a search of the whole plane; `reach` (m) bounds the ranges."""
+    return extended(NOTHING, measured, reach)
+
+
+def follow(known: JointHypotheses, measured: JointMeasurements, steps: int = WARM_STEPS) -> JointHypotheses:
+    """Return the hypotheses that follow from those `known` before the latest facts."""
+    part = measured.some(known.located)
+    found = [joint_fit(part, one.fit.start, steps) for one in known.scored]
+    return JointHypotheses(known.located, with_probability(found))
+
+
+def extended(
+    known: JointHypotheses, measured: JointMeasurements, reach: float, failed: Sequence[Candidate] = ()
+) -> JointHypotheses:
+    """Return the hypotheses `known` with all further robots that their ranges locate.
+
+    Those in `failed` are not tried.
+    """
+    tried = set(failed)
+    while left := [one for one in candidates(known.located, measured) if one not in tried]:
+        tried.add(left[0])
+        more = _with(known, left[0], measured, reach)
+        known = more if more.scored else known
+    return known
+
+
+def candidates(located: Sequence[int], measured: JointMeasurements) -> list[Candidate]:
+    """Return which robots may be located next, those with the most decisive ranges first."""
+    found = [*_single(located, measured), *_paired(located, measured)]
+    return sorted(found, key=lambda one: (-one.decisive, -len(one.robots), one.robots))
+
+
+def _single(located: Sequence[int], measured: JointMeasurements) -> Iterator[Candidate]:
+    ranges = measured.ranges
+    for robot in range(len(measured.robots)):
+        if robot in located:
+            continue
+        rows = beacons(robot, located, measured)
+        fixed = rows[ranges.second[rows] < 0]
+        places = [tuple(one) for one in ranges.place[fixed].tolist()]
+        decisive = len(rows) - max([places.count(one) for one in set(places)], default=0)
+        if len(rows) >= FEWEST and decisive:
+            yield Candidate(decisive, (robot,))
+
+
+def beacons(robot: int, located: Sequence[int], measured: JointMeasurements) -> Places:
+    """Return the rows of the ranges of `robot` to anchors and to robots that are `located`."""
+    ranges = measured.ranges
+    other = np.where(ranges.first == robot, ranges.second, ranges.first)
+    return np.flatnonzero(ranges.of(robot) & ((other < 0) | np.isin(other, np.array(located, np.intp))))
+
+
+def _paired(located: Sequence[int], measured: JointMeasurements) -> Iterator[Candidate]:
+    ranges = measured.ranges
+    for own in ranges.pairs:
+        row = int(np.argmax(own))
+        a, b = int(ranges.first[row]), int(ranges.second[row])
+        if b < 0 or a in located or b in located:
+            continue
+        count = int(np.count_nonzero(own))
+        if count >= FEWEST_OF_PAIR and _anchors_of_pair(a, b, measured) is not None:
+            yield Candidate(count, (a, b))
+
+
+def _anchors_of_pair(a: int, b: int, measured: JointMeasurements) -> tuple[Places, Places] | None:
+    """Return the ranges of each robot to its anchor: those with the most ranges, at different places."""
+    own = [[rows for rows in _of_anchors(robot, measured) if len(rows) >= FEWEST_OF_PAIR] for robot in (a, b)]
+    place = measured.ranges.place
+    choices = [
+        (len(one) + len(other), one, other)
+        for one in own[0]
+        for other in own[1]
+        if place[one[0]].tolist() != place[other[0]].tolist()
+    ]
+    if not choices:
+        return None
+    _, one, other = max(choices, key=lambda choice: choice[0])
+    return one, other
+
+
+def _of_anchors(robot: int, measured: JointMeasurements) -> list[Places]:
+    """Return the rows of the ranges of `robot` to each of its anchors."""
+    ranges = measured.ranges
+    fixed = (ranges.first == robot) & (ranges.second < 0)
+    return [np.flatnonzero(own & fixed) for own in ranges.pairs if np.any(own & fixed)]
+
+
+# --- locating ---------------------------------------------------------------------------------------------
+
+
+class _Located(NamedTuple):
+    """The start poses of new robots under one hypothesis about the others."""
+
+    log_weight: float
+    start: JointStart
+
+
+def _with(
+    known: JointHypotheses, candidate: Candidate, measured: JointMeasurements, reach: float
+) -> JointHypotheses:
+    """Return the hypotheses with the robots of `candidate`; none if their ranges do not locate them."""
+    located = tuple(sorted((*known.located, *candidate.robots)))
+    before = known.scored or (None,)
+    found = [
+        (math.log(one.probability) if one is not None else 0.0, one, new)
+        for one in before
+        for new in _new(one, known.located, candidate, measured, reach)
+    ]
+    found.sort(key=lambda each: -(each[0] + each[2].log_weight))
+    least = found[0][0] + found[0][2].log_weight + math.log(NEGLIGIBLE_PROBABILITY) if found else 0.0
+    part, order = measured.some(located), np.argsort([*known.located, *candidate.robots])
+    fits = []
+    for probability, one, new in found[:MOST_JOINT]:
+        if probability + new.log_weight >= least:
+            begun = one.fit.start if one is not None else JointStart(np.zeros((0, 3)))
+            poses = np.concatenate((begun.poses, new.start.poses))[order]
+            errors = [*begun.errors, *new.start.errors]
+            fits.append(joint_fit(part, JointStart(poses, tuple([errors[k] for k in order]))))
+    return JointHypotheses(located, with_probability(fits))
+
+
+def _new(
+    one: JointHypothesis | None,
+    located: tuple[int, ...],
+    candidate: Candidate,
+    measured: JointMeasurements,
+    reach: float,
+) -> list[_Located]:
+    """Return the start poses of the robots of `candidate` under the hypothesis `one`."""
+    match candidate.robots:
+        case (robot,):
+            return _of_robot(among_beacons(robot, one, located, measured, reach))
+        case (a, b):
+            return _of_pair(a, b, measured, reach)
+    raise AssertionError(candidate)
+
+
+def _of_robot(robot: AnchoredRobot) -> list[_Located]:
+    guesses = beacon_guesses(robot)
+    scored = scored_fits(robot, [Start(guess) for guess in guesses]) if guesses else ()
+    return [_Located(math.log(one.hypothesis.probability), _start(one, [(0.0, 0.0)])) for one in scored]
+
+
+def among_beacons(
+    robot: int,
+    one: JointHypothesis | None,
+    located: tuple[int, ...],
+    measured: JointMeasurements,
+    reach: float,
+) -> AnchoredRobot:
+    """Return a robot with its ranges to anchors and to located robots, as if all of these were anchors.
+
+    The sigma of a position of a robot, at the end of its path, adds to that of each range to it.
+    """
+    ranges, rows = measured.ranges, beacons(robot, located, measured)
+    place, variance = ranges.place[rows].copy(), np.square(ranges.sigma[rows])
+    other = np.where(ranges.first[rows] == robot, ranges.second[rows], ranges.first[rows])
+    for k, beacon in enumerate(located):
+        own = np.flatnonzero(other == beacon)
+        if one is not None and len(own):
+            place[own] = one.fit.places(k, ranges.tick[rows[own]]).T
+            spread = one.fit.covariance[3 * k : 3 * k + 2, 3 * k : 3 * k + 2]
+            variance[own] += min(0.5 * float(np.trace(spread)), reach**2)
+    counts = (len(rows), 0, 0)
+    as_anchors = Ranges(
+        ranges.rho[rows], ranges.tick[rows], np.sqrt(variance), counts, place, ranges.radio[rows]
+    )
+    return AnchoredRobot(measured.paths[robot], as_anchors, reach, measured.noise)
+
+
+def _of_pair(a: int, b: int, measured: JointMeasurements, reach: float) -> list[_Located]:
+    own = _anchors_of_pair(a, b, measured)
+    assert own is not None
+    ranges = measured.ranges
+    mutual = np.flatnonzero((ranges.first == a) & (ranges.second == b))
+    rows = np.concatenate((*own, mutual))
+    m1, m2 = [ranges.place[one[0]].tolist() for one in own]
+    nothing = np.empty(0, np.intp)
+    pair = PairRanges(
+        (measured.paths[a], measured.paths[b]),
+        Ranges(
+            ranges.rho[rows], ranges.tick[rows], ranges.sigma[rows], (len(own[0]), len(own[1]), len(mutual))
+        ),
+        (nothing, nothing, nothing),
+        (m2[0] - m1[0], m2[1] - m1[1]),
+        reach,
+        measured.noise,
+    )
+    return [
+        _Located(math.log(one.hypothesis.probability), _start(one, [m1, m2]))
+        for one in hypotheses.search(pair)
+    ]
+
+
+def _start(one: ScoredHypothesis, anchors: Sequence[tuple[float, float]]) -> JointStart:
+    """Return the poses at tick 0 from a fit, whose guess has the places of `anchors` in each odometry."""
+    poses = []
+    for (mx, my, turn), (x, y) in zip(one.fit.guess.reshape(-1, 3).tolist(), anchors, strict=True):
+        c, s = math.cos(turn), math.sin(turn)
+        poses.append((x - (c * mx - s * my), y - (s * mx + c * my), turn))
+    nothing = [Errors(np.zeros(0), np.zeros(0), np.zeros(0))] * len(poses)
+    return JointStart(np.array(poses), one.fit.errors or tuple(nothing))
+
+
+# --- probabilities ----------------------------------------------------------------------------------------
+
+
+def with_probability(fits: Sequence[JointFit]) -> tuple[JointHypothesis, ...]:
+    """Return the hypotheses for `fits`, likeliest first, without duplicates and without improbable ones."""
+    left: list[tuple[float, JointFit]] = []
+    best = max([one.weight for one in fits], default=0.0)
+    for one in sorted(fits, key=lambda one: -one.weight):
+        if one.weight < best + math.log(NEGLIGIBLE_PROBABILITY) or len(left) == MOST_JOINT:
+            break
+        if not any(all(same(one, other)) for _, other in left):
+            left.append((math.exp(one.weight - best), one))
+    total = sum([probability for probability, _ in left])
+    return tuple([JointHypothesis(probability / total, one) for probability, one in left])
+
+
+def same(one: JointFit, other: JointFit) -> list[bool]:
+    """Return for each robot whether two fits to the same facts have the same pose, within SAME_SIGMAS."""
+    change = one.poses - other.poses
+    change[:, 2] = np.remainder(change[:, 2] + math.pi, math.tau) - math.pi
+    blocks = [slice(3 * i, 3 * i + 3) for i in range(len(change))]
+    return [
+        float(moved @ np.linalg.pinv(other.covariance[own, own], hermitian=True) @ moved) < SAME_SIGMAS**2
+        for moved, own in zip(change, blocks, strict=True)
+    ]
+
+
+class Certainty(NamedTuple):
+    """What the joint hypotheses say about one robot."""
+
+    poses: int
+    """The number of different poses."""
+    probability: float
+    """The probability of the pose in the most probable hypothesis."""
+
+
+def certainties(found: JointHypotheses) -> list[Certainty]:
+    """Return the certainty of each located robot: hypotheses that differ in others only count as one."""
+    if not found.scored:
+        return []
+    agreed = [same(one.fit, found.scored[0].fit) for one in found.scored]
+    result = []
+    for i in range(len(found.located)):
+        others: list[JointFit] = []
+        probability = 0.0
+        for one, own in zip(found.scored, agreed, strict=True):
+            if own[i]:
+                probability += one.probability
+            elif not any(same(one.fit, other)[i] for other in others):
+                others.append(one.fit)
+        result.append(Certainty(1 + len(others), min(probability, 1.0)))
+    return result
