@@ -36,7 +36,7 @@ DEFAULTS = ClaimRule()
 
 
 class PoseEstimates(msgspec.Struct, frozen=True, dict=True, eq=False):
-    """The estimated poses of one or two recorded robots over time, as `tandem estimate` writes them.
+    """The estimated poses of recorded robots over time, as `tandem estimate` writes them.
 
     `tandem.estimate` returns one.
     """
@@ -112,11 +112,12 @@ def estimate(
     """Return the poses of recorded robots over time, estimated from their odometry and ranges.
 
     `recording` is the path of a range recording (a .pyfg or .mcap file, a folder of CSV files, or a
-    recording of Tandem), or a Run. `robots` are one or two of its robots, by default all. `noise` is the
-    assumed noise: the name of a profile or the path of a TOML file, by default what the recording states.
-    `window` is the part that is used, in s from the first odometry on. `anchors` is a CSV file of further
-    anchors. Two robots use one anchor each unless `all_anchors` is set; one robot uses all. A claim needs the
-    standard deviation `accuracy` in m and the probability `confidence`.
+    recording of Tandem), or a Run. `robots` are some of its robots, by default all; three or more are
+    estimated in one fit. `noise` is the assumed noise: the name of a profile or the path of a TOML file, by
+    default what the recording states. `window` is the part that is used, in s from the first odometry on.
+    `anchors` is a CSV file of further anchors. Two robots use one anchor each unless `all_anchors` is set;
+    one robot, and three or more, use all. A claim needs the standard deviation `accuracy` in m and the
+    probability `confidence`.
 
     Raises UserError for invalid arguments, and if the recording cannot be read.
 

@@ -180,6 +180,7 @@ def window(request: pytest.FixtureRequest) -> Compared:
     assert last.fitted is not None
     ours, pair = last.fitted
     assert isinstance(pair, PairRanges)
+    assert isinstance(ours, Fit)
     starts = nudged(ours, (np.zeros(2), np.array(pair.apart)), np.random.default_rng(request.param))
     ends = [pose_of(robot, len(path.v)) for robot, path in enumerate(pair.paths)]
     return Compared(pair, ours, optimum(graph_of(pair, ours), begun(pair, starts), ends))

@@ -39,8 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--robots",
         type=names,
-        metavar="A,B",
-        help="one or two robots whose poses are estimated [default: all of a recording of one or two]",
+        metavar="A,B,...",
+        help="robots whose poses are estimated; three or more in one fit [default: all of the recording]",
     )
     parser.add_argument(
         "--noise",
@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--all-anchors",
         action="store_true",
         help="use the ranges of two robots to all anchors [default: for each robot, the ranges to one "
-        "anchor; a single robot always uses all]",
+        "anchor; one robot, and three or more, always use all]",
     )
     parser.add_argument(
         "--accuracy",
@@ -174,7 +174,10 @@ def _lines(summary: EstimateSummary) -> list[str]:
     rows = [_row(name, one, summary.begin_s) for name, one in summary.robots.items()]
     right = ("first claim s", "x", "y", "heading", "sigma m", "error m", "NEES")
     found = lines(table(("robot", "anchors"), right, rows))
-    found.append(f"noise: {summary.noise}; last pose in m and rad; time from the first odometry of both on")
+    every = "both" if len(summary.robots) < 3 else "all"
+    found.append(
+        f"noise: {summary.noise}; last pose in m and rad; time from the first odometry of {every} on"
+    )
     if summary.blocking_reason:
         found.append(f"no claim at the end: {summary.blocking_reason}")
     for why, count in summary.unused_ranges.items():

@@ -7,8 +7,10 @@ from collections.abc import Iterator
 from itertools import cycle
 from typing import Any, NamedTuple
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
@@ -16,6 +18,7 @@ from compose.figures.sheet import EDGE, FOOT, GAP, Sheet, around
 from compose.figures.style import INK, MARKS, PALE, SCREEN, Medium
 from compose.recording.estimating.estimate_rows import PoseEstimateRow
 from compose.recording.estimating.estimate_run import EstimationProblem, RecordingEstimate
+from compose.recording.estimating.pair_measurements import listed
 from compose.recording.ranging.range_recording import Numbers, TruePath
 from compose.view.colours import COLOURS
 from protocol.mission import Role
@@ -38,8 +41,21 @@ TOO_WIDE = 1.0
 """The sigma (m) of a position above which no ellipse is drawn: it would cover all others."""
 
 
+MOST_PAIRS = 16
+"""The largest number of pairs of radios of a group whose residuals are drawn."""
 ANCHOR_MARKS = "sDPX"
 """The markers of anchors; they differ from those of robots."""
+
+
+TEN = "o^vs<>pdh8"
+"""The markers of the robots of a group, which repeat after ten."""
+
+
+class Look(NamedTuple):
+    """How a robot is drawn."""
+
+    colour: str
+    marks: dict[str, Any]
 
 
 class Drawn(NamedTuple):
@@ -49,9 +65,14 @@ class Drawn(NamedTuple):
     estimates: RecordingEstimate
 
     @property
-    def roles(self) -> tuple[Role, ...]:
-        """The roles, and so the colours, of the robots."""
-        return ROLES[: len(self.problem.robots)]
+    def looks(self) -> list[Look]:
+        """The colour and the marker of each robot; those of one and of two are those of the paper's roles."""
+        count = len(self.problem.robots)
+        if count <= len(ROLES):
+            return [Look(COLOURS[role], MARKS[role]) for role in ROLES[:count]]
+        colours = matplotlib.colormaps["tab10" if count <= len(TEN) else "turbo"]
+        hues = [colours(i if count <= len(TEN) else (i + 0.5) / count) for i in range(count)]
+        return [Look(to_hex(hue), {"marker": TEN[i % len(TEN)], "color": hue}) for i, hue in enumerate(hues)]
 
     def rows(self, i: int) -> list[PoseEstimateRow]:
         """Return the rows of the robot with index `i`."""
@@ -60,9 +81,10 @@ class Drawn(NamedTuple):
 
     @property
     def ranged(self) -> list[tuple[str, str]]:
-        """The pairs of radios that have ranges at the end."""
+        """The pairs of radios that have ranges at the end; of a group, the first MOST_PAIRS."""
         counts = self.estimates.epochs[-1].ranges
-        return [pair for pair, count in zip(self.problem.measured.pairs, counts, strict=True) if count]
+        found = [pair for pair, count in zip(self.problem.measured.pairs, counts, strict=True) if count]
+        return found if len(self.problem.robots) <= len(ROLES) else found[:MOST_PAIRS]
 
     def truth(self, i: int) -> TruePath | None:
         """Return the true path of the robot with index `i`, if there is one."""
@@ -98,7 +120,8 @@ def estimate_figures(
 
 
 def _title(drawn: Drawn) -> str:
-    names = " and ".join([one.id for one in drawn.problem.robots])
+    robots = [one.id for one in drawn.problem.robots]
+    names = " and ".join(robots) if len(robots) < 3 else listed(robots)
     return f"{names} in {drawn.problem.source.rpartition('/')[2]}, noise {drawn.problem.noise}"
 
 
@@ -106,13 +129,15 @@ def _path(drawn: Drawn, medium: Medium) -> Figure:
     sheet = Sheet(medium, narrow=False, title=[_title(drawn)])
     axes = sheet.panel()
     points: list[tuple[float, float]] = []
-    for i, role in enumerate(drawn.roles):
-        colour, name = COLOURS[role], drawn.problem.robots[i].id
+    for i, (colour, marks) in enumerate(drawn.looks):
+        name = drawn.problem.robots[i].id
         truth = drawn.truth(i)
         if truth is not None:
             axes.plot(*truth.poses[:, :2].T, color=colour, lw=2.6, alpha=0.3, label=f"{name}, truth")
             points += [(float(x), float(y)) for x, y in truth.poses[:, :2]]
         rows = drawn.from_claim(i)
+        if not rows:
+            continue
         claimed = any(row.claim for row in rows)
         since = "from its first claim on" if claimed else "never claimed"
         axes.plot(
@@ -124,7 +149,7 @@ def _path(drawn: Drawn, medium: Medium) -> Figure:
                 axes.add_patch(_ellipse(row, colour))
                 reach = [SIGMAS * math.sqrt(max(variance, 0.0)) for variance in (row.xx, row.yy)]
                 points += [(row.x + sign * reach[0], row.y + sign * reach[1]) for sign in (-1.0, 1.0)]
-        axes.plot(rows[0].x, rows[0].y, ls="", ms=5, **MARKS[role])
+        axes.plot(rows[0].x, rows[0].y, ls="", ms=5, **marks)
     for anchor, marker in zip(drawn.problem.measured.anchors, cycle(ANCHOR_MARKS), strict=False):
         axes.plot(anchor.x, anchor.y, ls="", marker=marker, ms=5, color=INK, label=f"anchor {anchor.id}")
         points.append((anchor.x, anchor.y))
@@ -174,40 +199,40 @@ def _times(drawn: Drawn, i: int) -> Numbers:
     return times
 
 
-def _claim_line(axes: Axes, drawn: Drawn, i: int, role: Role) -> None:
+def _claim_line(axes: Axes, drawn: Drawn, i: int, colour: str) -> None:
     claimed = next((row for row in drawn.rows(i) if row.claim), None)
     if claimed is not None:
         at = float(drawn.since_begin(claimed.t_s))
-        axes.axvline(at, color=COLOURS[role], lw=0.8, ls=":", zorder=0)
+        axes.axvline(at, color=colour, lw=0.8, ls=":", zorder=0)
 
 
 def _sigmas(axes: Axes, drawn: Drawn) -> None:
-    for i, role in enumerate(drawn.roles):
+    for i, (colour, _) in enumerate(drawn.looks):
         name = drawn.problem.robots[i].id
         bounds = [SIGMAS * math.sqrt(max(row.xx + row.yy, 0.0)) for row in drawn.rows(i)]
-        axes.plot(_times(drawn, i), bounds, color=COLOURS[role], ls="--", lw=1.0, label=f"{name}, 3 sigma")
-        _claim_line(axes, drawn, i, role)
+        axes.plot(_times(drawn, i), bounds, color=colour, ls="--", lw=1.0, label=f"{name}, 3 sigma")
+        _claim_line(axes, drawn, i, colour)
     axes.set_yscale("log")
     axes.set_ylabel("position [m]")
 
 
 def _errors(axes: Axes, drawn: Drawn) -> None:
-    for i, role in enumerate(drawn.roles):
+    for i, (colour, _) in enumerate(drawn.looks):
         name = drawn.problem.robots[i].id
         errors = [
             math.nan if row.position_error_m is None else max(row.position_error_m, LEAST_ERROR)
             for row in drawn.rows(i)
         ]
-        axes.plot(_times(drawn, i), errors, color=COLOURS[role], lw=1.2, label=f"{name}, error")
+        axes.plot(_times(drawn, i), errors, color=colour, lw=1.2, label=f"{name}, error")
     _sigmas(axes, drawn)
 
 
 def _nees(axes: Axes, drawn: Drawn) -> None:
-    for i, role in enumerate(drawn.roles):
+    for i, (colour, _) in enumerate(drawn.looks):
         name = drawn.problem.robots[i].id
         values = [math.nan if row.nees is None else row.nees for row in drawn.rows(i)]
-        axes.plot(_times(drawn, i), values, color=COLOURS[role], lw=1.2, label=f"{name}, NEES")
-        _claim_line(axes, drawn, i, role)
+        axes.plot(_times(drawn, i), values, color=colour, lw=1.2, label=f"{name}, NEES")
+        _claim_line(axes, drawn, i, colour)
     axes.axhline(NEES_BOUND, color=PALE, lw=0.8, ls="--", label="99 % of right covariances are below")
     axes.set_yscale("log")
     axes.set_ylabel("NEES")

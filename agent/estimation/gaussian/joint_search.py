@@ -23,7 +23,7 @@ from agent.estimation.gaussian.hypotheses import (
 )
 from agent.estimation.gaussian.joint_fit import JointFit, JointStart, joint_fit
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
-from agent.estimation.gaussian.known_anchors import FEWEST, AnchoredRobot, scored_fits
+from agent.estimation.gaussian.known_anchors import AnchoredRobot, scored_fits
 from agent.estimation.gaussian.linear_model import Start
 from agent.estimation.gaussian.odometry_noise import Errors, Places
 from agent.estimation.gaussian.range_model import PairRanges, Ranges
@@ -33,7 +33,15 @@ MOST_JOINT = 12
 would be complete, and every estimate would take as much longer."""
 
 FEWEST_OF_PAIR = 3
-"""The least number of ranges between two robots, and of each to its anchor, with which a pair is located."""
+"""The least number of ranges of each robot of a pair to its anchor."""
+
+
+FEWEST_DECISIVE = 6
+"""The least number of decisive ranges with which a robot or a pair is located; see `Candidate`.
+
+With 4, the least that determine a pose, a robot often begins with eight hypotheses, and each is a joint fit.
+A claim needs 8.
+"""
 
 
 class JointHypothesis(NamedTuple):
@@ -91,6 +99,18 @@ def extended(
     return known
 
 
+def merged(found: JointHypotheses, other: JointHypotheses) -> JointHypotheses:
+    """Return the hypotheses of both, or those of `other` alone if it locates more robots.
+
+    Both are fitted to the same facts. If `other` does not locate all robots, `found` is returned.
+    """
+    if found.located == other.located:
+        return JointHypotheses(
+            found.located, with_probability([one.fit for one in (*found.scored, *other.scored)])
+        )
+    return other if set(found.located) < set(other.located) else found
+
+
 def candidates(located: Sequence[int], measured: JointMeasurements) -> list[Candidate]:
     """Return which robots may be located next, those with the most decisive ranges first."""
     found = [*_single(located, measured), *_paired(located, measured)]
@@ -106,7 +126,7 @@ def _single(located: Sequence[int], measured: JointMeasurements) -> Iterator[Can
         fixed = rows[ranges.second[rows] < 0]
         places = [tuple(one) for one in ranges.place[fixed].tolist()]
         decisive = len(rows) - max([places.count(one) for one in set(places)], default=0)
-        if len(rows) >= FEWEST and decisive:
+        if decisive >= FEWEST_DECISIVE:
             yield Candidate(decisive, (robot,))
 
 
@@ -125,7 +145,7 @@ def _paired(located: Sequence[int], measured: JointMeasurements) -> Iterator[Can
         if b < 0 or a in located or b in located:
             continue
         count = int(np.count_nonzero(own))
-        if count >= FEWEST_OF_PAIR and _anchors_of_pair(a, b, measured) is not None:
+        if count >= FEWEST_DECISIVE and _anchors_of_pair(a, b, measured) is not None:
             yield Candidate(count, (a, b))
 
 

@@ -139,7 +139,7 @@ class AnchoredEstimator:
         self._known = tuple([one.hypothesis for one in scored])
         self._claimed = self._claimed or not reason
         found = [(one.hypothesis.probability, *poses(one.fit, (0.0, 0.0))) for one in scored]
-        hypotheses = tuple([of_centres(*one, measured.sides) for one in found])
+        hypotheses = tuple([of_centres(*one, measured.sides, measured.origin) for one in found])
         return EstimateEpoch(t, counts, hypotheses, (not reason,), reason, EpochFit(scored[0].fit, robot))
 
     def _reason(self, robot: AnchoredRobot, scored: tuple[ScoredHypothesis, ...]) -> str:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from agent.estimation.gaussian.fitted import Fit
+from agent.estimation.gaussian.joint_fit import JointFit
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.gaussian.joint_search import Certainty
 from agent.estimation.gaussian.known_anchors import AnchoredRobot
 from agent.estimation.gaussian.range_model import PairRanges
 from compose.recording.estimating.prepared_steps import OneRobot
@@ -27,8 +31,8 @@ class PosesHypothesis(NamedTuple):
 class EpochFit(NamedTuple):
     """The fit of the first hypothesis, and what it was fitted to."""
 
-    fit: Fit
-    used: PairRanges | AnchoredRobot
+    fit: Fit | JointFit
+    used: PairRanges | AnchoredRobot | JointMeasurements
     """The measurements up to the end of the epoch."""
 
 
@@ -47,6 +51,10 @@ class EstimateEpoch(NamedTuple):
     """The condition for a claim that is not met; empty if all are."""
     fitted: EpochFit | None
     """The fit of the first hypothesis; None without one, and if there is a later epoch."""
+    certainties: tuple[Certainty, ...] = ()
+    """What the hypotheses say about each robot of a group; empty for one robot and for two."""
+    undetermined: Mapping[str, str] = {}
+    """The robots of a group that have no pose, with the reason."""
 
 
 def add_epoch(epochs: list[EstimateEpoch], epoch: EstimateEpoch) -> None:
@@ -66,15 +74,19 @@ class ClaimRule(NamedTuple):
 
 
 def of_centres(
-    probability: float, mean: Numbers, covariance: Numbers, robots: tuple[OneRobot, ...]
+    probability: float,
+    mean: Numbers,
+    covariance: Numbers,
+    robots: tuple[OneRobot, ...],
+    origin: tuple[float, float],
 ) -> PosesHypothesis:
     """Return a hypothesis about the centres of `robots`, in <W>.
 
-    `mean` and `covariance` are about their antennas, relative to the anchor of the first one.
+    `mean` and `covariance` are about their antennas, relative to `origin` (m), mostly an anchor.
     """
     poses = mean.reshape(-1, 3).copy()
-    poses[:, 0] += robots[0].anchor.x
-    poses[:, 1] += robots[0].anchor.y
+    poses[:, 0] += origin[0]
+    poses[:, 1] += origin[1]
     centred = np.eye(len(mean))
     for i, robot in enumerate(robots):
         forward, left, _ = robot.antenna

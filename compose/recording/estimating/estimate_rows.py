@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from compose.recording.estimating.anchored_estimate import AnchoredMeasurements
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from compose.recording.estimating.estimate_epoch import ClaimRule, EstimateEpoch
 from compose.recording.estimating.learned_errors import LearnedErrors, learned_errors
-from compose.recording.estimating.pair_measurements import PairMeasurements
+from compose.recording.estimating.prepared_steps import Measurements
 from compose.recording.ranging.range_recording import Numbers, RecordedRobot
 from protocol.motion import wrap
 
@@ -24,7 +24,7 @@ class PoseEstimateRow(msgspec.Struct, frozen=True):
     robot: str
     """The robot."""
     hypotheses: int
-    """The number of hypotheses."""
+    """The number of hypotheses; of three or more robots, those that differ in the pose of this one."""
     probability: float
     """The probability of the most probable one."""
     x: float
@@ -131,6 +131,13 @@ class EstimateSummary(msgspec.Struct, frozen=True):
     """The condition for a claim that is not met at the end; empty if all are."""
 
 
+class GroupEstimateSummary(EstimateSummary, frozen=True):
+    """The content of `estimate.json` for three or more robots."""
+
+    undetermined: dict[str, str] = {}
+    """The robots without a pose at the end, with the reason."""
+
+
 def true_pose(robot: RecordedRobot, t: float) -> Numbers | None:
     """Return the true pose at `t` s, interpolated; None without truth around that time; shape (3,)."""
     truth = robot.truth
@@ -159,16 +166,19 @@ def rows_of(epoch: EstimateEpoch, robots: Sequence[RecordedRobot]) -> list[PoseE
     """Return the rows of all robots at one epoch; none without hypotheses."""
     rows = []
     for i, robot in enumerate(robots):
-        if not epoch.hypotheses:
+        if not epoch.hypotheses or robot.id in epoch.undetermined:
             continue
         best = epoch.hypotheses[0]
         pose, covariance = best.poses[i], best.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
         x, y, heading = pose.tolist()
+        count, probability = len(epoch.hypotheses), best.probability
+        if epoch.certainties:
+            count, probability = epoch.certainties[i]
         row = PoseEstimateRow(
             t_s=epoch.t,
             robot=robot.id,
-            hypotheses=len(epoch.hypotheses),
-            probability=best.probability,
+            hypotheses=count,
+            probability=probability,
             x=x,
             y=y,
             heading=heading,
@@ -201,7 +211,7 @@ def _with_truth(row: PoseEstimateRow, pose: Numbers, covariance: Numbers, true: 
 
 
 def summary_of(
-    measured: PairMeasurements | AnchoredMeasurements,
+    measured: Measurements,
     rows: Sequence[PoseEstimateRow],
     last: EstimateEpoch | None,
     rule: ClaimRule,
@@ -225,15 +235,17 @@ def summary_of(
     calibration = None
     if last is not None and last.fitted is not None:
         ranged = [name for name, count in zip(pairs, last.ranges, strict=True) if count]
-        calibration = learned_errors(last.fitted.fit, [side.id for side in sides], ranged)
+        fit, used = last.fitted
+        names = used.robots if isinstance(used, JointMeasurements) else [side.id for side in sides]
+        calibration = learned_errors(fit, names, ranged)
     hypotheses = [
         FinalHypothesis(
             one.probability,
-            {side.id: _triple(one.poses[i]) for i, side in enumerate(sides)},
+            {side.id: _triple(one.poses[i]) for i, side in enumerate(sides) if not np.isnan(one.poses[i, 0])},
         )
         for one in (last.hypotheses if last is not None else ())
     ]
-    return EstimateSummary(
+    content = (
         source,
         noise,
         measured.t0,
@@ -246,6 +258,9 @@ def summary_of(
         measured.unused,
         last.blocking_reason if last is not None else "there is no epoch",
     )
+    if len(sides) < 3:
+        return EstimateSummary(*content)
+    return GroupEstimateSummary(*content, dict(last.undetermined) if last is not None else {})
 
 
 def _triple(values: Numbers) -> tuple[float, float, float]:

@@ -13,17 +13,21 @@ from compose.recording.estimating.anchored_estimate import (
 )
 from compose.recording.estimating.estimate_epoch import ClaimRule, EstimateEpoch, add_epoch
 from compose.recording.estimating.estimate_rows import EstimateSummary, PoseEstimateRow, rows_of, summary_of
+from compose.recording.estimating.group_estimate import GroupEstimator
+from compose.recording.estimating.group_measurements import GroupMeasurements, group_measurements
 from compose.recording.estimating.noise_files import ToldNoise, told_noise
 from compose.recording.estimating.pair_estimate import PairEstimator
 from compose.recording.estimating.pair_measurements import PairMeasurements, pair_measurements
 from compose.recording.estimating.recorded_noise import recorded_noise
 from compose.recording.ranging.range_recording import RangeRecording, RecordedRobot
 
+AnyMeasurements = PairMeasurements | AnchoredMeasurements | GroupMeasurements
+
 
 class EstimationProblem(NamedTuple):
-    """The measurements of one or two robots, and what is known of their source."""
+    """The measurements of some robots, and what is known of their source."""
 
-    measured: PairMeasurements | AnchoredMeasurements
+    measured: AnyMeasurements
     robots: tuple[RecordedRobot, ...]
     """The robots, with their truth if there is one."""
     source: str
@@ -82,9 +86,11 @@ def measurements_with(
     assumed = recorded_noise(part, told.noise if told is not None else None, name)
     if told is not None and told.correction is not None:
         part = told.correction.corrected(part)
-    measured: PairMeasurements | AnchoredMeasurements
+    measured: AnyMeasurements
     if len(chosen) == 1:
         measured = anchored_measurements(part, chosen[0], assumed, ticks=ticks)
+    elif len(chosen) > 2:
+        measured = group_measurements(part, chosen, assumed, ticks=ticks)
     else:
         measured = pair_measurements(
             part, chosen, assumed, ticks=ticks, anchors=anchors, all_anchors=all_anchors
@@ -93,32 +99,32 @@ def measurements_with(
 
 
 def _chosen(recording: RangeRecording, robots: Sequence[str] | None) -> Sequence[str]:
-    """Return the robots to be estimated; raise UserError unless there are one or two."""
+    """Return the robots to be estimated. Raises UserError."""
     known = [one.id for one in recording.robots]
     names = known if robots is None else robots
     for name in names:
         if name not in known:
             raise UserError(f"--robots: {recording.source} has no robot {name}; it has {', '.join(known)}")
-    if len(names) > 2:
-        raise UserError(
-            f"--robots: one or two robots are estimated at once; {recording.source} has {', '.join(known)}"
-        )
     return names
 
 
 class RecordingEstimator:
-    """The estimate of one or two robots, which goes on from epoch to epoch."""
+    """The estimate of any number of robots, which goes on from epoch to epoch."""
 
     def __init__(self, rule: ClaimRule) -> None:
         self._of_pair, self._of_one = PairEstimator(rule), AnchoredEstimator(rule)
+        self._of_group = GroupEstimator(rule)
 
-    def epoch(self, measured: PairMeasurements | AnchoredMeasurements, number: int) -> EstimateEpoch:
+    def epoch(self, measured: AnyMeasurements, number: int) -> EstimateEpoch:
         """Return the estimate at the end of the epoch with this `number`, from 1 on, in their order.
 
         `measured` may have grown since the last call, and is otherwise the same.
         """
-        if isinstance(measured, PairMeasurements):
-            return self._of_pair.epoch(measured, number)
+        match measured:
+            case PairMeasurements():
+                return self._of_pair.epoch(measured, number)
+            case GroupMeasurements():
+                return self._of_group.epoch(measured, number)
         return self._of_one.epoch(measured, number)
 
 

@@ -78,6 +78,8 @@ class StreamEstimate:
     def _due(self) -> Iterator[PoseEstimateRow]:
         """Yield the estimates of all epochs whose odometry is complete."""
         names = list(self._begins) if self._robots is None else self._robots
+        if len(names) > 2:
+            raise UserError(f"{self._builder.source}: --follow: a stream is estimated for one or two robots")
         if not names or not all(name in self._begins for name in names):
             return
         begin = max(self._begins[name] for name in names)

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 
 from agent.estimation.gaussian.fitted import Fit
+from agent.estimation.gaussian.joint_fit import JointFit
 from agent.estimation.gaussian.odometry_noise import Array, Projection, Ticks, constant_effects
 from compose.recording.ranging.range_recording import Numbers
 
@@ -48,13 +49,17 @@ class _Posterior(NamedTuple):
     sigma: Numbers
 
 
-def learned_errors(fit: Fit, names: Sequence[str], pairs: Sequence[str]) -> LearnedErrors:
+def learned_errors(fit: Fit | JointFit, names: Sequence[str], pairs: Sequence[str]) -> LearnedErrors:
     """Return the errors that `fit` has learned.
 
     `names` are those of the robots, and `pairs` those of the pairs of radios that have ranges, in order.
     """
     priors = fit.problem.noise.priors
-    posterior = _posterior(fit, _effects(fit))
+    posterior = (
+        _Posterior(fit.constants, fit.constant_sigmas)
+        if isinstance(fit, JointFit)
+        else _posterior(fit, _effects(fit))
+    )
     taken = iter(zip(posterior.mean.tolist(), posterior.sigma.tolist(), strict=True))
 
     def next_of(prior: float) -> LearnedError:

@@ -62,7 +62,7 @@ class PairEstimator:
         return EstimateEpoch(
             t,
             measured.counts(pair.ranges),
-            tuple([of_centres(*one, measured.sides) for one in _second_order(found, pair)]),
+            tuple([of_centres(*one, measured.sides, measured.origin) for one in _second_order(found, pair)]),
             (claims[0], claims[1]),
             reasons[0] if reasons else "" if all(claims) else "few ranges, and a small p-value",
             EpochFit(found.scored[0].fit, pair),

@@ -93,9 +93,19 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
         return EPOCH_S / self.ticks_per_epoch
 
     @property
+    def origin(self) -> tuple[float, float]:
+        """The position (m) to which estimates are relative: that of the first anchor."""
+        return self.sides[0].anchor.x, self.sides[0].anchor.y
+
+    @property
     def epochs(self) -> int:
         """The number of epochs with odometry of all robots."""
         return len(self.sides[0].path.v) // self.ticks_per_epoch
+
+    @property
+    def pairs(self) -> tuple[tuple[str, str], ...]:
+        """The names of each pair of radios."""
+        raise NotImplementedError
 
     @property
     def sides(self) -> tuple[OneRobot, ...]:

@@ -1,0 +1,146 @@
+"""The conditions for the claim of a robot among n, and the reasons why a robot has no pose."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, HIGHEST_LEVEL
+from agent.estimation.gaussian.fitted_poses import deviation
+from agent.estimation.gaussian.inference import MUTUAL_RANGES, MUTUAL_RANGES_WITH_OUTLIERS
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.gaussian.joint_search import (
+    FEWEST_DECISIVE,
+    Certainty,
+    JointHypotheses,
+    beacons,
+)
+from agent.estimation.gaussian.known_anchors import MOST_STRAYS, chi2_p_value
+from agent.estimation.gaussian.noise_level import INLIER
+from agent.estimation.gaussian.odometry_noise import Places
+from agent.estimation.gaussian.range_model import ELSEWHERE
+from protocol.mission import HEADING_ACCURACY
+
+OPEN = 0.5
+"""The sigma of a position from which on a robot has no pose, as a fraction of the longest range."""
+
+
+def blocking_reason(
+    robot: int,
+    found: JointHypotheses,
+    certainty: Certainty,
+    used: JointMeasurements,
+    reach: float,
+    accuracy: float,
+    sure: float,
+) -> str:
+    """Return the first condition for a claim of the robot that is not met, or an empty text.
+
+    `robot` is its place among those that are located, and `used` are the measurements of these. The
+    conditions are those of other estimates: enough ranges from different places, the probability `sure`, a
+    fit that has converged, its consistency, and the `accuracy` (m) of the position.
+    """
+    fit, ranges = found.scored[0].fit, used.ranges
+    required = MUTUAL_RANGES_WITH_OUTLIERS if used.noise.outliers else MUTUAL_RANGES
+    count = decisive_ranges(robot, used, reach)
+    if count < required:
+        return f"{count} of {required} required ranges from different places"
+    if certainty.probability < sure:
+        many = f"the most probable of {certainty.poses} poses"
+        return f"{many} has probability {certainty.probability:.6f}, required {sure:g}"
+    if fit.last_step > FINISHED:
+        return "the fit of the most probable hypothesis has not converged"
+    free = max(fit.inliers - fit.poses.size, 1)
+    if chi2_p_value(fit.chi2 / HIGHEST_LEVEL, free) < CLAIM_P_VALUE:
+        return f"the residuals are too large: chi-square {fit.chi2:.3g} for {free} degrees of freedom"
+    own = ranges.of(robot)
+    total, strays = int(np.count_nonzero(own)), int(np.count_nonzero(fit.weights[own] <= INLIER))
+    if strays > (MOST_STRAYS + used.noise.outliers) * total:
+        return f"{strays} of {total} ranges fit no other"
+    covariance = fit.covariance[3 * robot : 3 * robot + 3, 3 * robot : 3 * robot + 3]
+    position = deviation(float(covariance[0, 0] + covariance[1, 1]))
+    if not position <= accuracy:
+        return f"the sigma of the position is {position:.3g} m, required {accuracy:g}"
+    heading = deviation(float(covariance[2, 2]))
+    if not heading <= HEADING_ACCURACY:
+        return f"the sigma of the heading is {heading:.3g} rad, required {HEADING_ACCURACY:g}"
+    return ""
+
+
+def decisive_ranges(robot: int, used: JointMeasurements, reach: float) -> int:
+    """Return the number of ranges of a robot from different places, without those to its first anchor.
+
+    That is the anchor to which it has the most. A range counts if one of the two has moved since the last.
+    """
+    ranges, total, of_anchor = used.ranges, 0, 0
+    for pair in ranges.pairs:
+        rows = np.flatnonzero(pair)
+        ends = int(ranges.first[rows[0]]), int(ranges.second[rows[0]])
+        if robot in ends:
+            count = _places(ends, ranges.tick[rows], used, reach)
+            total += count
+            of_anchor = max(of_anchor, count if ends[1] < 0 else 0)
+    return total - of_anchor
+
+
+def _places(ends: tuple[int, int], ticks: Places, used: JointMeasurements, reach: float) -> int:
+    """Return the number of ranges at `ticks` that are the first, or follow a motion of one of both `ends`."""
+    moved = np.zeros(len(ticks), bool)
+    moved[:1] = True
+    for end in ends:
+        if end >= 0:
+            x, y = used.paths[end].x[ticks], used.paths[end].y[ticks]
+            moved[1:] |= np.hypot(np.diff(x), np.diff(y)) > ELSEWHERE * reach
+    return int(np.count_nonzero(moved))
+
+
+def undetermined(robot: int, located: tuple[int, ...], measured: JointMeasurements) -> str:
+    """Return why a robot that is not among those `located` has no pose."""
+    ranges, linked = measured.ranges, _linked(robot, measured)
+    anchored = (ranges.second < 0) & np.isin(ranges.first, linked)
+    places = {tuple(one) for one in ranges.place[anchored].tolist()}
+    if len(places) < 2:
+        others = [measured.robots[one] for one in linked if one != robot]
+        with_others = (
+            f"it and the robots with which it has ranges ({_listed(others)}) have" if others else "it has"
+        )
+        ranged = "ranges to one anchor" if places else "no range to an anchor"
+        return f"{with_others} {ranged}; two at different places are needed"
+    rows = beacons(robot, located, measured)
+    if len(rows) < FEWEST_DECISIVE:
+        return f"{len(rows)} of {FEWEST_DECISIVE} required ranges to anchors and located robots"
+    if len(set(ranges.radio[rows].tolist())) < 2 and bool(np.all(ranges.second[rows] < 0)):
+        return "its ranges are to one anchor, and to no robot that is located"
+    return "too few of its ranges are from different places, or no pose explains them"
+
+
+def open_position(robot: int, found: JointHypotheses, reach: float) -> str:
+    """Return why a located robot has no pose: its ranges leave its position open; else an empty text."""
+    covariance = found.scored[0].fit.covariance
+    sigma = deviation(float(covariance[3 * robot, 3 * robot] + covariance[3 * robot + 1, 3 * robot + 1]))
+    if sigma <= OPEN * reach:
+        return ""
+    how = f"to a sigma of {sigma:.3g} m" if math.isfinite(sigma) else "without a bound"
+    return f"its ranges leave its position open {how}"
+
+
+def _linked(robot: int, measured: JointMeasurements) -> list[int]:
+    """Return the robots that are connected with `robot` by ranges, itself among them, ascending."""
+    ranges, found, left = measured.ranges, {robot}, [robot]
+    mutual = ranges.rows(ranges.second >= 0)
+    while left:
+        one = left.pop()
+        others = {*mutual.second[mutual.first == one].tolist(), *mutual.first[mutual.second == one].tolist()}
+        left += sorted(others - found)
+        found |= others
+    return sorted(found)
+
+
+MOST_LISTED = 6
+"""The largest number of robots that a reason names."""
+
+
+def _listed(names: list[str]) -> str:
+    more = len(names) - MOST_LISTED
+    return ", ".join(names[:MOST_LISTED]) + (f" and {more} more" if more > 0 else "")

@@ -1,0 +1,157 @@
+"""The estimates of three or more robots over time, by one fit to everything that is known of them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from agent.estimation.gaussian.consistency import FINISHED
+from agent.estimation.gaussian.joint_claims import blocking_reason, open_position, undetermined
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.gaussian.joint_search import (
+    NOTHING,
+    Certainty,
+    JointHypotheses,
+    JointHypothesis,
+    candidates,
+    certainties,
+    extended,
+    follow,
+    merged,
+    search,
+)
+from agent.estimation.gaussian.least_squares import STEPS
+from compose.recording.estimating.estimate_epoch import (
+    ClaimRule,
+    EpochFit,
+    EstimateEpoch,
+    PosesHypothesis,
+    of_centres,
+)
+from compose.recording.estimating.group_measurements import GroupMeasurements
+from compose.recording.estimating.prepared_steps import EPOCH_S
+
+SEARCH_AT = tuple(8 * 2**n for n in range(16))
+"""The numbers of ranges at which the whole plane is searched again."""
+
+MORE_RANGES = 1.5
+"""The factor by which the decisive ranges of a robot must have grown before it is tried again."""
+
+
+class GroupEstimator:
+    """The estimate of several robots, which goes on from epoch to epoch.
+
+    Robots that are located are followed. The whole plane is searched at the numbers of ranges SEARCH_AT, and
+    before the first claim of each robot.
+    """
+
+    def __init__(self, rule: ClaimRule) -> None:
+        self._rule = rule
+        self._known: JointHypotheses = NOTHING
+        self._searched = 0
+        self._failed: dict[tuple[int, ...], int] = {}
+        self._claimed: set[str] = set()
+
+    def epoch(self, measured: GroupMeasurements, number: int) -> EstimateEpoch:
+        """Return the estimate at the end of the epoch with this `number`, from 1 on, in their order."""
+        t, (used, reach) = measured.t0 + number * EPOCH_S, measured.until(number)
+        found = self._extended(self._followed(used), used, reach)
+        count = len(used.ranges.rho)
+        due = found.scored and any(self._searched < at <= count for at in SEARCH_AT)
+        reasons = self._reasons(found, used, reach)
+        claiming = {name for name, reason in reasons.items() if not reason} - self._claimed
+        if due or claiming:
+            found, self._searched = merged(found, search(used, reach)), count
+            reasons = self._reasons(found, used, reach)
+        self._known = found
+        self._claimed |= {name for name, reason in reasons.items() if not reason}
+        return _epoch(t, measured, used, found, reasons, reach)
+
+    def _followed(self, used: JointMeasurements) -> JointHypotheses:
+        """Return the known hypotheses with the latest ranges; a fit that still moves takes more steps."""
+        if not self._known.scored:
+            return NOTHING
+        found = follow(self._known, used)
+        moving = found.scored[0].fit.last_step > FINISHED
+        return follow(found, used, STEPS) if moving else found
+
+    def _extended(self, found: JointHypotheses, used: JointMeasurements, reach: float) -> JointHypotheses:
+        """Return `found` with further robots; those that failed are tried again with more ranges."""
+        possible = candidates(found.located, used)
+        failed = [one for one in possible if one.decisive < MORE_RANGES * self._failed.get(one.robots, 0)]
+        if len(failed) == len(possible):
+            return found
+        more = extended(found, used, reach, failed)
+        for one in candidates(more.located, used):
+            if one not in failed:
+                self._failed[one.robots] = one.decisive
+        return more
+
+    def _reasons(self, found: JointHypotheses, used: JointMeasurements, reach: float) -> dict[str, str]:
+        """Return what blocks the claim of each located robot; an empty text if nothing does."""
+        part, rule, reasons = used.some(found.located), self._rule, {}
+        for i, certainty in enumerate(certainties(found)):
+            reasons[part.robots[i]] = open_position(i, found, reach) or blocking_reason(
+                i, found, certainty, part, reach, rule.accuracy, rule.confidence
+            )
+        return reasons
+
+
+def _epoch(
+    t: float,
+    measured: GroupMeasurements,
+    used: JointMeasurements,
+    found: JointHypotheses,
+    reasons: dict[str, str],
+    reach: float,
+) -> EstimateEpoch:
+    names = [one.id for one in measured.sides]
+    part = used.some(found.located)
+    place = {used.robots[robot]: i for i, robot in enumerate(found.located)}
+    without = {
+        name: open_position(place[name], found, reach)
+        if name in place
+        else undetermined(used.robots.index(name), found.located, used)
+        for name in names
+    }
+    without = {name: why for name, why in without.items() if why}
+    sure = certainties(found)
+    blocked = [f"{name}: {reasons[name]}" for name in names if reasons.get(name) and name not in without]
+    blocked += [f"{name} is undetermined: {why}" for name, why in without.items()]
+    more = f"; and {len(blocked) - 1} more" if len(blocked) > 1 else ""
+    counts = np.bincount(part.ranges.radio, minlength=len(measured.pairs)).tolist()
+    return EstimateEpoch(
+        t,
+        tuple(counts),
+        tuple([_of_all(one, names, place, without, measured) for one in found.scored]),
+        tuple([name in reasons and not reasons[name] for name in names]),
+        blocked[0] + more if blocked else "",
+        EpochFit(found.scored[0].fit, part) if found.scored else None,
+        tuple([sure[place[name]] if name in place else Certainty(0, 0.0) for name in names]),
+        without,
+    )
+
+
+def _of_all(
+    one: JointHypothesis,
+    names: list[str],
+    place: dict[str, int],
+    without: dict[str, str],
+    measured: GroupMeasurements,
+) -> PosesHypothesis:
+    """Return the poses of the centres of all robots; NaN for those in `without`."""
+    mean = np.full((len(names), 3), np.nan)
+    covariance = np.full((len(mean) * 3, len(mean) * 3), np.nan)
+    known = [i for i, name in enumerate(names) if name not in without]
+    rows = np.array([3 * i + k for i in known for k in range(3)], np.intp)
+    own = np.array([3 * place[names[i]] + k for i in known for k in range(3)], np.intp)
+    sides = tuple([measured.sides[i] for i in known])
+    centred = of_centres(
+        one.probability,
+        one.fit.poses.ravel()[own],
+        one.fit.covariance[np.ix_(own, own)],
+        sides,
+        measured.origin,
+    )
+    mean[known] = centred.poses
+    covariance[np.ix_(rows, rows)] = centred.covariance
+    return PosesHypothesis(one.probability, mean, covariance)

@@ -1,0 +1,124 @@
+"""The measurements of three or more recorded robots: facts, and what the joint estimator makes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from agent.estimation.facts import Fact, Facts, Manoeuvre, anchor, anchor_range, manoeuvre, mutual_range
+from agent.estimation.gaussian.joint_ranges import JointMeasurements, joint_measurements
+from agent.estimation.gaussian.odometry_noise import Track
+from compose.recording.estimating.prepared_steps import (
+    EPOCH_S,
+    Measurements,
+    OneRobot,
+    PreparedSteps,
+    horizon,
+    levelled,
+    prepared_steps,
+)
+from compose.recording.estimating.recorded_noise import RecordedNoise
+from compose.recording.ranging.range_recording import FixedAnchor, RangeRecording
+
+
+class GroupMeasurements(Measurements, frozen=True, kw_only=True):
+    """All measurements of several robots."""
+
+    members: tuple[OneRobot, ...]
+    """The robots, in the order of the user; some may have no anchor."""
+    joint: JointMeasurements
+    """The same, with the robots in the order of their names."""
+
+    @property
+    def sides(self) -> tuple[OneRobot, ...]:
+        """The robots."""
+        return self.members
+
+    @property
+    def pairs(self) -> tuple[tuple[str, str], ...]:
+        """The names of each pair of radios."""
+        return self.joint.radios
+
+    @property
+    def anchors(self) -> tuple[FixedAnchor, ...]:
+        """The anchors of all robots."""
+        return tuple({one.id: one for side in self.members for one in side.anchors}.values())
+
+    @property
+    def origin(self) -> tuple[float, float]:
+        """The position (m) to which estimates are relative."""
+        return self.joint.origin
+
+    def until(self, epoch: int) -> tuple[JointMeasurements, float]:
+        """Return what was measured up to the end of `epoch`, and the assumed sensing range (m)."""
+        known = self.joint.until(epoch * self.ticks_per_epoch)
+        reach = horizon(known.ranges.single)
+        return known.thinned(reach), reach
+
+
+def group_measurements(
+    recording: RangeRecording, robots: Sequence[str], assumed: RecordedNoise, *, ticks: int | None = None
+) -> GroupMeasurements:
+    """Return the measurements of three or more `robots`, with the noise that is `assumed`.
+
+    `ticks` is the number of them in an epoch; None: by the speed of the robots.
+    """
+    prepared = prepared_steps(recording, robots, assumed, ticks)
+    part, steps = prepared.part, prepared.steps
+    members = tuple([prepared.robot(i, _anchors_of(i, prepared)) for i in range(len(robots))])
+    known = [*_anchors(part), *_ranges(prepared)]
+    for one in members:
+        known += _manoeuvres(one.id, one.path)
+    joint = joint_measurements(Facts(frozenset(known)), assumed.noise, EPOCH_S / prepared.ticks_per_epoch)
+    unused = {"within a second after another": steps.thinned, "without odometry of all robots": steps.outside}
+    t0 = float(steps.t[0])
+    return GroupMeasurements(
+        members=members,
+        joint=joint,
+        t0=t0,
+        ticks_per_epoch=prepared.ticks_per_epoch,
+        ranges=joint.ranges.single,
+        t=np.asarray(t0 + joint.period * joint.ranges.tick, np.float64),
+        noise=assumed.noise,
+        unused={why: count for why, count in unused.items() if count},
+    )
+
+
+def _anchors_of(robot: int, prepared: PreparedSteps) -> tuple[FixedAnchor, ...]:
+    """Return the anchors to which a robot has ranges, that with the most first."""
+    part, ranges = prepared.part, prepared.steps.ranges
+    seconds = ranges.second[ranges.first == robot] - len(part.robots)
+    counts = np.bincount(seconds[seconds >= 0], minlength=len(part.anchors)).tolist()
+    order = sorted([k for k, count in enumerate(counts) if count], key=lambda k: -counts[k])
+    return tuple([part.anchors[k] for k in order])
+
+
+def _anchors(part: RangeRecording) -> Iterator[Fact]:
+    for one in part.anchors:
+        yield anchor(one.id, one.x, one.y)
+
+
+def _manoeuvres(robot: str, path: Track) -> Iterator[Fact]:
+    nothing = np.zeros((2, len(path.v)))
+    slip, extra = (
+        nothing[0] if path.slip is None else path.slip,
+        nothing if path.extra is None else path.extra,
+    )
+    columns = np.stack((path.v, path.omega, slip, *extra), 1)
+    for tick, row in enumerate(columns.tolist()):
+        yield manoeuvre(robot, tick, Manoeuvre(*row))
+
+
+def _ranges(prepared: PreparedSteps) -> Iterator[Fact]:
+    """Yield the ranges in the plane, each at the nearest tick."""
+    part, ranges, noise = prepared.part, prepared.steps.ranges, prepared.assumed.noise
+    heights = np.array([*[one.antenna[2] for one in part.robots], *[one.height for one in part.anchors]])
+    rho, ratio = levelled(ranges.range, heights[ranges.first] - heights[ranges.second])
+    mutual = ranges.second < len(part.robots)
+    sigma = prepared.sigmas(np.where(mutual, noise.mutual_sigma, noise.anchor_sigma), ranges.sigma) * ratio
+    rows = zip(prepared.ticks, ranges.first, ranges.second, rho, sigma, strict=True)
+    for tick, first, second, length, own in rows:
+        names = part.radios[first], part.radios[second]
+        fact = mutual_range if second < len(part.robots) else anchor_range
+        yield fact(*names, int(tick), float(length), float(own))
