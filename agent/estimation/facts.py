@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, NamedTuple
+
+import msgspec
 
 Kind = Literal["anchor", "anchor range", "manoeuvre", "mutual range"]
 
@@ -101,8 +102,7 @@ def _text(value: Value) -> str:
     return f"({', '.join(numbers)})"
 
 
-@dataclass(frozen=True)
-class Facts:
+class Facts(msgspec.Struct, frozen=True, dict=True):
     """A set of facts without contradictions. Raises ContradictoryFacts."""
 
     known: frozenset[Fact] = frozenset()

@@ -29,17 +29,22 @@ from agent.estimation.gaussian.odometry_noise import Errors, Places
 from agent.estimation.gaussian.range_model import PairRanges, Ranges
 
 MOST_JOINT = 12
-"""The largest number of joint hypotheses. With more, three robots that are each one of two mirror images
-would be complete, and every estimate would take as much longer."""
+"""The largest number of joint hypotheses whose poses are all in more probable ones, too.
+
+Robots that are each one of two mirror images have as many joint hypotheses as there are combinations. Only
+the most probable ones are fitted; see `_representative`.
+"""
+
+MOST_POSES = 24
+"""The largest number of joint hypotheses. The time of an estimate is proportional to it."""
 
 FEWEST_OF_PAIR = 3
 """The least number of ranges of each robot of a pair to its anchor."""
 
 
-FEWEST_DECISIVE = 6
-"""The least number of decisive ranges with which a robot or a pair is located; see `Candidate`.
+FEWEST_DECISIVE = 3
+"""The least number of decisive ranges with which a robot or a pair is located, as in a pair.
 
-With 4, the least that determine a pose, a robot often begins with eight hypotheses, and each is a joint fit.
 A claim needs 8.
 """
 
@@ -189,16 +194,17 @@ def _with(
     located = tuple(sorted((*known.located, *candidate.robots)))
     before = known.scored or (None,)
     found = [
-        (math.log(one.probability) if one is not None else 0.0, one, new)
-        for one in before
-        for new in _new(one, known.located, candidate, measured, reach)
+        (min(i, k), (math.log(one.probability) if one is not None else 0.0) + new.log_weight, one, new)
+        for i, one in enumerate(before)
+        for k, new in enumerate(_new(one, known.located, candidate, measured, reach))
     ]
-    found.sort(key=lambda each: -(each[0] + each[2].log_weight))
-    least = found[0][0] + found[0][2].log_weight + math.log(NEGLIGIBLE_PROBABILITY) if found else 0.0
+    least = max([weight for _, weight, _, _ in found], default=0.0) + math.log(NEGLIGIBLE_PROBABILITY)
+    # all poses of the new robots under the first hypothesis, and the first pose under all others
+    found.sort(key=lambda each: (each[0] > 0, -each[1]))
     part, order = measured.some(located), np.argsort([*known.located, *candidate.robots])
     fits = []
-    for probability, one, new in found[:MOST_JOINT]:
-        if probability + new.log_weight >= least:
+    for rank, (others, weight, one, new) in enumerate(found[:MOST_POSES]):
+        if weight >= least and (others == 0 or rank < MOST_JOINT):
             begun = one.fit.start if one is not None else JointStart(np.zeros((0, 3)))
             poses = np.concatenate((begun.poses, new.start.poses))[order]
             errors = [*begun.errors, *new.start.errors]
@@ -294,15 +300,28 @@ def _start(one: ScoredHypothesis, anchors: Sequence[tuple[float, float]]) -> Joi
 
 def with_probability(fits: Sequence[JointFit]) -> tuple[JointHypothesis, ...]:
     """Return the hypotheses for `fits`, likeliest first, without duplicates and without improbable ones."""
-    left: list[tuple[float, JointFit]] = []
     best = max([one.weight for one in fits], default=0.0)
-    for one in sorted(fits, key=lambda one: -one.weight):
-        if one.weight < best + math.log(NEGLIGIBLE_PROBABILITY) or len(left) == MOST_JOINT:
-            break
-        if not any(all(same(one, other)) for _, other in left):
-            left.append((math.exp(one.weight - best), one))
-    total = sum([probability for probability, _ in left])
-    return tuple([JointHypothesis(probability / total, one) for probability, one in left])
+    probable = [one for one in fits if one.weight >= best + math.log(NEGLIGIBLE_PROBABILITY)]
+    left = _representative(sorted(probable, key=lambda one: -one.weight))
+    total = sum([math.exp(one.weight - best) for one in left])
+    return tuple([JointHypothesis(math.exp(one.weight - best) / total, one) for one in left])
+
+
+def _representative(fits: Sequence[JointFit]) -> list[JointFit]:
+    """Return the different ones of `fits`, the likeliest first: all in which a robot has a pose of its own.
+
+    Of the others, which combine poses of likelier fits, they are the first ones. So no ambiguity of a robot
+    is lost to the number of combinations of those of others.
+    """
+    left: list[JointFit] = []
+    for one in fits:
+        agreed = [same(one, other) for other in left]
+        if any(all(each) for each in agreed):
+            continue
+        novel = not all(any(own) for own in zip(*agreed, strict=True)) if agreed else True
+        if len(left) < (MOST_POSES if novel else MOST_JOINT):
+            left.append(one)
+    return left
 
 
 def same(one: JointFit, other: JointFit) -> list[bool]:
@@ -326,18 +345,17 @@ class Certainty(NamedTuple):
 
 
 def certainties(found: JointHypotheses) -> list[Certainty]:
-    """Return the certainty of each located robot: hypotheses that differ in others only count as one."""
-    if not found.scored:
-        return []
-    agreed = [same(one.fit, found.scored[0].fit) for one in found.scored]
+    """Return the certainty of each located robot.
+
+    Hypotheses that differ in others only count as one, the most probable of them. That is exact for
+    ambiguities that are independent of each other, of which not all combinations are known.
+    """
     result = []
     for i in range(len(found.located)):
-        others: list[JointFit] = []
-        probability = 0.0
-        for one, own in zip(found.scored, agreed, strict=True):
-            if own[i]:
-                probability += one.probability
-            elif not any(same(one.fit, other)[i] for other in others):
-                others.append(one.fit)
-        result.append(Certainty(1 + len(others), min(probability, 1.0)))
+        poses: list[JointHypothesis] = []
+        for one in found.scored:
+            if not any(same(one.fit, other.fit)[i] for other in poses):
+                poses.append(one)
+        total = sum([one.probability for one in poses])
+        result.append(Certainty(len(poses), poses[0].probability / total))
     return result
