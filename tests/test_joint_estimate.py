@@ -1,0 +1,318 @@
+"""One fit to all facts about n robots: it is the optimum, its covariance is right, and it beats pairs."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+from numpy.typing import NDArray
+from scipy.optimize import least_squares  # type: ignore[import-untyped]
+from scipy.stats import binom, chi2  # type: ignore[import-untyped]
+
+from agent.estimation.facts import Facts, Manoeuvre, anchor, anchor_range, manoeuvre, mutual_range
+from agent.estimation.gaussian.fitted_poses import poses
+from agent.estimation.gaussian.hypotheses import search as search_of_pair
+from agent.estimation.gaussian.joint_claims import blocking_reason, undetermined
+from agent.estimation.gaussian.joint_fit import JointFit, JointStart, joint_fit
+from agent.estimation.gaussian.joint_problem import JointProblem
+from agent.estimation.gaussian.joint_ranges import MOST_MUTUAL_RANGES, JointMeasurements, joint_measurements
+from agent.estimation.gaussian.joint_search import JointHypotheses, certainties, search
+from agent.estimation.gaussian.odometry_noise import constant_errors, track, variances
+from agent.estimation.gaussian.range_model import PairRanges, Ranges
+from tests.moving_groups import NOISE, PERIOD_S, MovingGroup, moving_group
+
+Array = NDArray[np.float64]
+
+REACH = 20.0
+SURE = 0.9999
+
+
+def measured_of(group: MovingGroup) -> JointMeasurements:
+    return joint_measurements(group.facts, group.noise, PERIOD_S)
+
+
+def at_truth(group: MovingGroup, measured: JointMeasurements) -> JointStart:
+    starts = group.starts.copy()
+    starts[:, :2] -= measured.origin
+    return JointStart(starts)
+
+
+def errors_of(fit: JointFit, group: MovingGroup, measured: JointMeasurements) -> Array:
+    """Return the errors of the poses at the end; shape (n, 3)."""
+    errors = fit.poses - group.ends
+    errors[:, :2] += measured.origin
+    errors[:, 2] = np.remainder(errors[:, 2] + math.pi, math.tau) - math.pi
+    return errors
+
+
+def nees_of(fit: JointFit, errors: Array) -> list[float]:
+    blocks = [fit.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(len(errors))]
+    return [float(error @ np.linalg.solve(own, error)) for error, own in zip(errors, blocks, strict=True)]
+
+
+# --- the optimum --------------------------------------------------------------------------------------------
+
+
+class Reference:
+    """The same problem with all white errors as unknowns, for scipy."""
+
+    def __init__(self, measured: JointMeasurements) -> None:
+        self.measured, self.noise = measured, measured.noise
+        v, omega = (np.stack([getattr(path, part) for path in measured.paths]) for part in ("v", "omega"))
+        self.v, self.omega = v, omega
+        self.sigmas = np.sqrt(variances(v, omega, self.noise.odometry))
+        self.patterns = constant_errors(v, omega, self.noise)
+        self.common = measured.ranges.single.common_errors(self.noise.priors)
+        self.n, self.k = v.shape
+        self.m = self.patterns.shape[1]
+
+    def split(self, x: Array) -> tuple[Array, Array, Array, Array]:
+        ends = np.cumsum([3 * self.n, self.common.shape[1], self.n * self.m])
+        starts, common, constant, white = np.split(x, ends)
+        return (
+            starts.reshape(-1, 3),
+            common,
+            constant.reshape(self.n, self.m),
+            white.reshape(self.n, 2, self.k),
+        )
+
+    def poses_at(self, x: Array) -> Array:
+        """Return the poses at all ticks; shape (n, 3, k + 1)."""
+        starts, _, constant, white = self.split(x)
+        found = []
+        for i in range(self.n):
+            more = np.einsum("m,mck->ck", constant[i], self.patterns[i]) + white[i] * self.sigmas[i]
+            path = track(self.v[i] + more[0], self.omega[i] + more[1], self.measured.period)
+            c, s = math.cos(starts[i, 2]), math.sin(starts[i, 2])
+            x_y = starts[i, 0] + c * path.x - s * path.y, starts[i, 1] + s * path.x + c * path.y
+            found.append(np.stack((*x_y, starts[i, 2] + path.heading)))
+        return np.stack(found)
+
+    def residuals(self, x: Array) -> Array:
+        ranges, at = self.measured.ranges, self.poses_at(x)
+        _, common, constant, white = self.split(x)
+        own = at[ranges.first, :2, ranges.tick]
+        other = np.where(ranges.second[:, None] < 0, ranges.place, at[ranges.second, :2, ranges.tick])
+        off = ranges.rho - np.hypot(*(own - other).T) - self.common @ common
+        return np.concatenate((off / ranges.sigma, common, constant.ravel(), white.ravel()))
+
+    def optimum(self, starts: Array) -> tuple[Array, Array]:
+        """Return the poses at the end, (n, 3), and their covariance."""
+        begin = np.zeros(3 * self.n + self.common.shape[1] + self.n * (self.m + 2 * self.k))
+        begin[: 3 * self.n] = starts.ravel()
+        found = least_squares(self.residuals, begin, "3-point", xtol=1e-14, ftol=1e-14, gtol=1e-14)
+        inverse = np.linalg.inv(found.jac.T @ found.jac)
+        ends, small = self.poses_at(found.x)[:, :, -1], 1e-6
+        turn = np.stack(
+            [
+                (self.poses_at(found.x + step)[:, :, -1] - self.poses_at(found.x - step)[:, :, -1]).ravel()
+                / (2.0 * small)
+                for step in small * np.eye(len(begin))
+            ],
+            1,
+        )
+        return ends, turn @ inverse @ turn.T
+
+
+@pytest.mark.parametrize("unanchored", [[], [2]])
+def test_the_joint_fit_is_the_optimum_that_scipy_finds(unanchored: list[int]) -> None:
+    noise = replace(NOISE, strays=0.0, sigma_degrees=0.0)
+    group = moving_group(3, 5, ticks=14, noise=noise, unanchored=unanchored)
+    measured = measured_of(group)
+    fit = joint_fit(measured, at_truth(group, measured), 20)
+    ends, covariance = Reference(measured).optimum(at_truth(group, measured).poses)
+    sigmas = np.sqrt(np.diagonal(covariance))
+    assert np.max(np.abs((fit.poses - ends).ravel()) / sigmas) < 0.01
+    assert np.max(np.abs(fit.covariance - covariance) / np.outer(sigmas, sigmas)) < 0.02
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(2, 5), st.integers(0, 1000))
+def test_the_derivatives_of_all_ranges_are_right(robots: int, seed: int) -> None:
+    group = moving_group(robots, seed, ticks=6)
+    measured = measured_of(group)
+    problem, start = JointProblem.of(measured), at_truth(group, measured)
+    point, small = problem.begin(start.poses, ()), 1e-6
+    for i in range(start.poses.size):
+        step = (small * np.eye(start.poses.size)[i]).reshape(start.poses.shape)
+        more, less = (problem.begin(start.poses + sign * step, ()).residuals for sign in (1.0, -1.0))
+        np.testing.assert_allclose((less - more) / (2.0 * small), point.jacobian[:, i], atol=1e-5)
+
+
+def test_two_robots_have_the_same_poses_as_by_the_fit_of_a_pair() -> None:
+    group = moving_group(2, 3)
+    measured, noise = measured_of(group), group.noise
+    ranges = measured.ranges
+    rows = [np.flatnonzero(own) for own in ranges.pairs]
+    counts = (len(rows[0]), len(rows[1]), len(rows[2]))
+    m1, m2 = ranges.place[rows[0][0]], ranges.place[rows[1][0]]
+    nothing = np.empty(0, np.intp)
+    pair = PairRanges(
+        (measured.paths[0], measured.paths[1]),
+        Ranges(ranges.rho, ranges.tick, ranges.sigma, counts),
+        (nothing, nothing, nothing),
+        (float(m2[0] - m1[0]), float(m2[1] - m1[1])),
+        REACH,
+        noise,
+    )
+    mean, covariance = poses(search_of_pair(pair)[0].fit, pair.apart)
+    fit = search(measured, REACH).scored[0].fit
+    sigmas = np.sqrt(np.diagonal(covariance))
+    off = (fit.poses - mean.reshape(2, 3)).ravel()
+    off[2::3] = np.remainder(off[2::3] + math.pi, math.tau) - math.pi
+    off[[0, 3]] -= m1[0]
+    off[[1, 4]] -= m1[1]
+    assert np.max(np.abs(off) / sigmas) < 0.02
+    assert np.max(np.abs(fit.covariance - covariance) / np.outer(sigmas, sigmas)) < 0.02
+
+
+# --- accuracy -----------------------------------------------------------------------------------------------
+
+
+class Scores:
+    """The errors and the NEES of many groups."""
+
+    def __init__(self, robots: int, seeds: range, unanchored: list[int], outliers: float = 0.0) -> None:
+        noise = replace(NOISE, outliers=outliers, outlier_bias=(0.3, 2.0))
+        self.nees: list[float] = []
+        self.errors: list[float] = []
+        self.wrong = 0
+        for seed in seeds:
+            group = moving_group(robots, seed, noise=noise, unanchored=unanchored, outliers=outliers)
+            measured = measured_of(group)
+            found = search(measured, REACH)
+            assert len(found.located) == robots
+            fit = found.scored[0].fit
+            errors = errors_of(fit, group, measured)
+            sure = certainties(found)
+            for i, nees in enumerate(nees_of(fit, errors)):
+                args = (i, found, sure[i], measured, REACH, 0.3, SURE)
+                if not blocking_reason(*args):
+                    self.nees.append(nees)
+                    self.errors.append(math.hypot(*errors[i, :2]))
+                    self.wrong += nees > 5.0**2 + 3.0
+
+    def assert_in_band(self) -> None:
+        """Assert that NEES has its mean and its 99 % bound, each in a band of 99.9 %."""
+        count = len(self.nees)
+        # the poses of a group are correlated: the band is that of half as many
+        low, high = chi2.ppf((0.0005, 0.9995), 1.5 * count) / (0.5 * count)
+        assert low < np.mean(self.nees) < high
+        beyond = sum(nees > chi2.ppf(0.99, 3) for nees in self.nees)
+        assert beyond <= binom.ppf(0.9995, count, 0.01)
+
+
+@pytest.mark.parametrize("unanchored", [[], [3]])
+def test_the_covariances_of_groups_are_right(unanchored: list[int]) -> None:
+    scores = Scores(4, range(20), unanchored)
+    assert len(scores.nees) >= 76
+    assert not scores.wrong
+    scores.assert_in_band()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("robots", "unanchored"), [(3, []), (3, [2]), (4, []), (4, [3]), (6, [1, 4])])
+def test_the_covariances_of_many_groups_are_right(robots: int, unanchored: list[int]) -> None:
+    scores = Scores(robots, range(1000, 1200), unanchored)
+    assert len(scores.nees) >= 0.95 * 200 * robots
+    assert not scores.wrong
+    scores.assert_in_band()
+
+
+def test_outliers_do_not_move_a_group() -> None:
+    scores = Scores(4, range(10), [3], outliers=0.1)
+    assert len(scores.nees) >= 36
+    assert not scores.wrong
+    assert np.median(scores.errors) < 0.08
+
+
+def pairwise_errors(group: MovingGroup) -> list[float]:
+    """Return the error (m) of each robot, estimated together with the next one alone."""
+    names, found = group.facts.robots, []
+    for i, name in enumerate(names):
+        j = (i + 1) % len(names)
+        two = {name, names[j]}
+        some = [
+            one
+            for one in group.facts.known
+            if one.key.kind == "anchor"
+            or {one.key.robot, one.key.other} - {f"M{each}" for each in two} <= two | {""}
+        ]
+        measured = joint_measurements(Facts(frozenset(some)), group.noise, PERIOD_S)
+        of_two = search(measured, REACH)
+        order = sorted((i, j))
+        part = group._replace(ends=group.ends[order])
+        errors = errors_of(of_two.scored[0].fit, part, measured)
+        found.append(math.hypot(*errors[order.index(i), :2]))
+    return found
+
+
+def test_a_joint_fit_is_at_least_as_accurate_as_pairs() -> None:
+    joint, pairwise = [], []
+    for seed in range(12):
+        group = moving_group(4, seed)
+        measured = measured_of(group)
+        fit = search(measured, REACH).scored[0].fit
+        joint += [math.hypot(*error[:2]) for error in errors_of(fit, group, measured)]
+        pairwise += pairwise_errors(group)
+    assert np.median(joint) <= np.median(pairwise)
+
+
+# --- what is not determined ---------------------------------------------------------------------------------
+
+
+def ambiguous() -> tuple[JointMeasurements, JointHypotheses]:
+    """Return a group in which r02 drives straight, and has ranges to two anchors alone."""
+    group = moving_group(2, 7)
+    known = [*group.facts.known, anchor("P", 20.0, 0.0), anchor("Q", 26.0, 0.0)]
+    for tick in range(41):
+        x, y = 21.0 + 0.1 * tick, 3.0 + 0.02 * tick
+        known.append(manoeuvre("r02", tick, Manoeuvre(math.hypot(0.1, 0.02), 0.0)))
+        for name, at in (("P", 20.0), ("Q", 26.0)):
+            if tick % 2 == 0:
+                known.append(anchor_range("r02", name, tick, math.hypot(x - at, y), 0.05))
+    measured = joint_measurements(Facts(frozenset(known)), group.noise, PERIOD_S)
+    return measured, search(measured, REACH)
+
+
+def test_only_the_robot_with_a_mirror_image_is_uncertain() -> None:
+    measured, found = ambiguous()
+    assert found.located == (0, 1, 2)
+    assert len(found.scored) == 2
+    sure = certainties(found)
+    assert [one.poses for one in sure] == [1, 1, 2]
+    assert sure[0].probability == sure[1].probability == 1.0
+    assert 0.3 < sure[2].probability < 0.7
+    reasons = [blocking_reason(i, found, sure[i], measured, REACH, 0.3, SURE) for i in range(3)]
+    assert reasons[:2] == ["", ""]
+    assert reasons[2].startswith("the most probable of 2 poses has probability 0.")
+
+
+def test_a_component_without_two_anchors_has_no_pose_and_says_why() -> None:
+    group = moving_group(2, 7)
+    known = [*group.facts.known, anchor("P", 20.0, 0.0)]
+    for tick in range(20):
+        known += [manoeuvre(name, tick, Manoeuvre(0.2, 0.2)) for name in ("u", "v", "w")]
+        known += [mutual_range("u", "v", tick, 3.0, 0.05), anchor_range("u", "P", tick, 2.0, 0.05)]
+    measured = joint_measurements(Facts(frozenset(known)), group.noise, PERIOD_S)
+    found = search(measured, REACH)
+    assert [measured.robots[one] for one in found.located] == ["r00", "r01"]
+    u, v, w = [undetermined(measured.robots.index(name), found.located, measured) for name in "uvw"]
+    ends = "ranges to one anchor; two at different places are needed"
+    assert u == f"it and the robots with which it has ranges (v) have {ends}"
+    assert v == f"it and the robots with which it has ranges (u) have {ends}"
+    assert w == "it has no range to an anchor; two at different places are needed"
+
+
+def test_no_fit_weighs_more_ranges_between_robots_than_it_can_afford() -> None:
+    group = moving_group(12, 1, ticks=60)
+    measured = measured_of(group)
+    thinned = measured.thinned(REACH)
+    mutual = int(np.count_nonzero(thinned.ranges.second >= 0))
+    assert np.count_nonzero(measured.ranges.second >= 0) == 66 * 30
+    assert MOST_MUTUAL_RANGES // 2 < mutual <= MOST_MUTUAL_RANGES
+    assert thinned.ranges.of_anchors == measured.ranges.of_anchors
