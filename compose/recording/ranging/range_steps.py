@@ -1,4 +1,4 @@
-"""Asynchronous stamps to steps: odometry of one or two robots at common times, with ranges in between.
+"""Asynchronous stamps to steps: odometry of robots at common times, with ranges in between.
 
 Within an increment, a robot is assumed to turn and move at constant speeds.
 """
@@ -90,7 +90,7 @@ DEFAULT_OPTIONS = StepOptions()
 def steps_of(
     recording: RangeRecording, robots: Sequence[str], options: StepOptions = DEFAULT_OPTIONS
 ) -> RangeSteps:
-    """Return the steps of one or two `robots`, over the time in which all of them have odometry.
+    """Return the steps of `robots`, over the time in which all of them have odometry.
 
     The ranges are those between these robots, and between one of them and an anchor. Raises BadRecording if
     there is no such time.

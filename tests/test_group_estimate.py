@@ -1,0 +1,178 @@
+"""`tandem estimate` of three or more robots: recordings of groups, robots without an anchor, reasons."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tandem as api
+from compose.errors import ENDED, NOT_LOCALISED
+from compose.recording.estimating.estimate_epoch import ClaimRule
+from compose.recording.estimating.estimate_files import estimate_csv
+from compose.recording.estimating.estimate_rows import GroupEstimateSummary
+from compose.recording.estimating.estimate_run import RecordingEstimate, estimated, measurements
+from compose.recording.estimating.group_measurements import GroupMeasurements
+from compose.recording.ranging.range_recording import (
+    FixedAnchor,
+    RangeRecording,
+    RangeSeries,
+    RecordedRobot,
+    RobotOdometry,
+    TruePath,
+)
+from compose.recording.ranging.range_steps import relative
+from tests.commands import tandem
+from tests.moving_groups import moving_group
+from tests.test_estimate import NEES_99_9
+
+SIGMA = 0.05
+
+
+def recorded(robots: int, seed: int, *, unanchored: tuple[int, ...] = (), alone: int = 0) -> RangeRecording:
+    """Return a recording of a moving group, and of `alone` more robots without any range.
+
+    Of the true poses, the headings are left at 0.
+    """
+    group = moving_group(robots, seed, unanchored=unanchored)
+    names = [*group.facts.robots, *[f"x{i}" for i in range(alone)]]
+    found = []
+    for name in names:
+        own = name if name in group.facts.robots else "r00"
+        steps = [value for key, value in group.facts.of_kind("manoeuvre") if key.robot == own]
+        turned = np.concatenate(([0.0], np.cumsum([one[1] for one in steps])))
+        moved = np.array([one[0] for one in steps]) * np.exp(1j * (turned[:-1] + 0.5 * np.diff(turned)))
+        moved = moved * np.sinc(0.5 * np.diff(turned) / np.pi)
+        at = np.concatenate(([0.0], np.cumsum(moved)))
+        dead = np.stack((at.real, at.imag, turned), 1)
+        t = np.arange(41.0)
+        truth = None
+        if name in group.facts.robots:
+            place = group.paths[group.facts.robots.index(name)]
+            truth = TruePath(t, np.column_stack((*place, np.zeros(41))))
+        odometry = RobotOdometry(t[:-1], t[1:], relative(dead[:-1], dead[1:]), np.full((40, 3, 3), np.nan))
+        found.append(RecordedRobot(name, odometry, truth))
+    anchors = [FixedAnchor(key.robot, *value) for key, value in group.facts.of_kind("anchor")]
+    radios = [*names, *[one.id for one in anchors]]
+    rows = sorted(
+        [
+            (float(key.tick), radios.index(key.robot), radios.index(key.other), value[0])
+            for key, value in group.facts.known
+            if key.other
+        ]
+    )
+    t, first, second, rho = (np.array(column) for column in zip(*rows, strict=True))
+    series = RangeSeries(t, first.astype(np.intp), second.astype(np.intp), rho, np.full(len(t), SIGMA))
+    return RangeRecording("recorded", tuple(found), tuple(anchors), series)
+
+
+def estimate_of(recording: RangeRecording, robots: tuple[str, ...] | None = None) -> RecordingEstimate:
+    return estimated(measurements(recording, robots, None, (0.0, 36.0)), ClaimRule())
+
+
+def test_all_robots_of_a_recording_are_estimated_also_one_without_an_anchor() -> None:
+    found = estimate_of(recorded(4, 3, unanchored=(2,)))
+    assert isinstance(found.summary, GroupEstimateSummary)
+    assert list(found.summary.robots) == ["r00", "r01", "r02", "r03"]
+    assert found.summary.robots["r02"].anchors == []
+    for robot in found.summary.robots.values():
+        assert robot.first_claim is not None
+        assert robot.final is not None
+        assert robot.final.position_error_m is not None
+        assert robot.final.position_error_m < 0.3
+    assert not found.summary.undetermined
+    assert not found.summary.blocking_reason
+    assert found.summary.calibration is not None
+    assert sorted(found.summary.calibration.gyro_bias_rad_s) == ["r00", "r01", "r02", "r03"]
+
+
+def test_a_robot_without_ranges_has_no_pose_and_the_summary_says_why() -> None:
+    found = estimate_of(recorded(3, 4, alone=1))
+    summary = found.summary
+    assert isinstance(summary, GroupEstimateSummary)
+    assert summary.robots["x0"].final is None
+    assert not any(row.robot == "x0" for row in found.rows)
+    assert summary.undetermined == {"x0": "it has no range to an anchor; two at different places are needed"}
+    assert summary.blocking_reason == f"x0 is undetermined: {summary.undetermined['x0']}"
+    assert all(summary.robots[name].first_claim is not None for name in ("r00", "r01", "r02"))
+
+
+def test_the_order_of_the_robots_changes_the_order_of_the_rows_alone() -> None:
+    recording = recorded(3, 5)
+    one, other = estimate_of(recording), estimate_of(recording, ("r02", "r00", "r01"))
+    assert estimate_csv(sorted(one.rows, key=lambda row: (row.t_s, row.robot))) == estimate_csv(
+        sorted(other.rows, key=lambda row: (row.t_s, row.robot))
+    )
+    assert list(other.summary.robots) == ["r02", "r00", "r01"]
+
+
+def test_two_robots_of_a_group_are_estimated_as_a_pair() -> None:
+    recording = recorded(3, 5)
+    two = estimate_of(recording, ("r00", "r01"))
+    assert not isinstance(two.summary, GroupEstimateSummary)
+    begin, end = recording.span
+    alone = recording.part(("r00", "r01"), begin, end)
+    assert estimate_csv(two.rows) == estimate_csv(estimate_of(alone).rows)
+
+
+GROUP = """
+name = "noisy-group"
+seed = 3
+
+[mission]
+sensing_range = 3.0
+period = 1.0
+max_speed = 1.0
+max_turn_rate = 3.141592653589793
+accuracy = 0.3
+
+[mission.noise]
+anchor_sigma = 0.05
+mutual_sigma = 0.05
+gyro_bias = 0.0003
+"""
+ANCHORS = {"a": (0.0, 0.0), "b": (7.0, 2.0), "c": (-3.0, 7.0)}
+
+
+@pytest.fixture(scope="module")
+def mission(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("group")
+    robots = [f'[[robot]]\nid = "{name}"\nanchor = [{x}, {y}]\n' for name, (x, y) in ANCHORS.items()]
+    (folder / "group.toml").write_text("\n".join([GROUP, *robots]))
+    ran = tandem("run", "group.toml", "--in-process", "--out", "recording", cwd=folder)
+    assert ran.status == ENDED, ran.err
+    return folder
+
+
+def test_a_recorded_mission_of_a_group_is_estimated_by_default_with_all_robots(mission: Path) -> None:
+    ran = tandem("estimate", "recording", "--noise", "group.toml", "--out", "estimated", cwd=mission)
+    assert ran.status == ENDED, ran.out + ran.err
+    summary = json.loads((mission / "estimated" / "estimate.json").read_text())
+    assert list(summary["robots"]) == ["a", "b", "c"]
+    assert summary["undetermined"] == {}
+    for robot in summary["robots"].values():
+        assert robot["final"]["nees"] < NEES_99_9
+        assert robot["final"]["position_error_m"] < 0.3
+    assert (mission / "estimated" / "estimate-path.svg").exists()
+    assert "time from the first odometry of all on" in ran.out
+    found = api.estimate(mission / "recording", noise=mission / "group.toml")
+    assert found.robots == ("a", "b", "c")
+    lines = (mission / "estimated" / "estimate.csv").read_text().splitlines()
+    assert len(lines) - 1 == len(found.rows["robot"])
+
+
+def test_a_group_of_which_some_robot_has_no_pose_ends_with_status_1(mission: Path) -> None:
+    ran = tandem("estimate", "recording", "--noise", "group.toml", "--window", "0..15", cwd=mission)
+    assert ran.status == NOT_LOCALISED
+    assert "no claim at the end: " in ran.out
+
+
+def test_measurements_of_a_group_are_facts_in_the_order_of_names() -> None:
+    measured = measurements(recorded(3, 5), ("r02", "r00", "r01"), None, None).measured
+    assert isinstance(measured, GroupMeasurements)
+    assert measured.joint.robots == ("r00", "r01", "r02")
+    assert [one.id for one in measured.sides] == ["r02", "r00", "r01"]
+    assert measured.pairs[0] == ("r00", "Mr00")
+    assert measured.pairs[-1] == ("r01", "r02")
