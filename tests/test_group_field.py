@@ -18,6 +18,7 @@ from protocol.messages import RobotConfigInGroup
 from protocol.motion import REST, Pose, step
 from tests.commands import BOUND_S, SECTION_IV, Ended, TandemProcess, processes_of, size, tandem, until
 from tests.test_field import beacon, pose, told
+from world.hardware.termination import LAST_WORDS
 
 
 def four(seed: int, *anchors: tuple[float, float]) -> str:
@@ -166,6 +167,21 @@ def test_robots_of_a_group_that_are_killed_at_any_moment_resume(
         for name in killed:
             four.kill(name)
         four.start(*killed)
+        all_are_localised(tmp_path, four)
+
+
+@pytest.mark.long
+def test_a_robot_that_is_killed_before_it_knows_all_results_receives_them_afterwards(tmp_path: Path) -> None:
+    """The others have its result, and do not end while it is down: nobody else could tell it theirs."""
+    with group(tmp_path, FAR, "--lost", "3") as four:
+        four.start("a", "b", "c", "d")
+        four.robots["c"].until(lambda: len(steps(tmp_path, "c")) > 38, "c is localised, and has said so")
+        four.kill("c")
+        assert claims(tmp_path, "c")
+        until(lambda: all(claims(tmp_path, name) for name in "abd"), four.said)
+        end = max(len(steps(tmp_path, name)) for name in "abd") + 3 * LAST_WORDS
+        until(lambda: len(steps(tmp_path, "a")) > end or not four.robots["a"].running, four.said)
+        four.start("c")
         all_are_localised(tmp_path, four)
 
 
