@@ -13,6 +13,7 @@ as long as the whole plan. In any case, it ends at max_ticks.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Collection
 
@@ -23,11 +24,14 @@ from protocol.messages import (
     MissionEnd,
     PeerReport,
     RobotConfigInGroup,
+    RobotConfigWithoutAnchor,
+    RobotConfigWithSweep,
     TickStart,
     TickStartInGroup,
     Undecided,
     Verdict,
 )
+from protocol.sweep_strips import helping_ticks, sweep_speed, sweep_ticks
 from world.hardware.termination import LAST_WORDS, Termination
 from world.referee import inaccuracy
 
@@ -53,8 +57,10 @@ class GroupEnding(Termination):
         self._group, self._others = config.group, {*config.others}
         self._ends = {one.robot: one.ends for one in config.members}
         """The tick until which each robot is localised, by the plan."""
-        self._plan = max(self._ends.values())
-        """The tick until which all are."""
+        self._plan = max(self._ends.values()) + _sweep_ticks(config)
+        """The tick until which all are; a bound of it if some robots have no anchor."""
+        self._visits = not isinstance(config, RobotConfigWithoutAnchor)
+        """True if this robot's planner goes to robots that are late."""
         self._results: dict[str, Verdict] = {}
         """The results that have been received, by robot."""
         self._complete: set[str] = set()
@@ -113,7 +119,7 @@ class GroupEnding(Termination):
         if not self._is_silent(robot):
             return False
         late = tick - self._ends.get(robot, self._plan)
-        return late > self._plan or (late > 0 and self._resting > RESTING_TICKS)
+        return late > self._plan or (late > 0 and self._visits and self._resting > RESTING_TICKS)
 
     def _end(self, tick: int) -> MissionEnd:
         if self.verdict is None:
@@ -134,3 +140,14 @@ class GroupEnding(Termination):
             what = f"{self._me} is localised; no result of {', '.join(missing)} received"
             return MissionEnd(tick, "undecided", what)
         return MissionEnd(tick, "localised", None)
+
+
+def _sweep_ticks(config: RobotConfigInGroup) -> int:
+    """Return a bound on the ticks in which each robot with an anchor sweeps its part; 0 if all have one."""
+    if not isinstance(config, RobotConfigWithSweep):
+        return 0
+    mission, sweep = config.mission, config.sweep
+    way = math.ceil(config.widest_distance / (sweep_speed(mission) * mission.period))
+    paths = [sweep.path(part, mission.sensing_range) for part in range(sweep.parts)]
+    longest = max([sweep_ticks(path, mission) for path in paths])
+    return RESTING_TICKS + way + longest + len(config.unanchored) * helping_ticks(mission)
