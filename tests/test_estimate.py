@@ -14,6 +14,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from agent.estimation.gaussian.linear_model import Problem
 from agent.estimation.gaussian.odometry_noise import track
@@ -252,12 +253,12 @@ def test_measurements_that_differ_in_slip_variance_or_sigma_are_not_the_same(sam
     path, ranges = pair.paths[0], pair.ranges
     assert path.slip is not None
     assert path.extra is not None
-    again = pair._replace(paths=(path.until(len(path.v)), pair.paths[1]))
+    again = replace(pair, paths=(path.until(len(path.v)), pair.paths[1]))
     assert pair == again
     assert hash(pair) == hash(again)
     for other in (path._replace(slip=path.slip + 0.1), path._replace(extra=2.0 * path.extra)):
-        assert pair.content != pair._replace(paths=(other, pair.paths[1])).content
-    assert pair.content != pair._replace(ranges=ranges._replace(sigma=2.0 * ranges.sigma)).content
+        assert pair.content != replace(pair, paths=(other, pair.paths[1])).content
+    assert pair.content != replace(pair, ranges=ranges._replace(sigma=2.0 * ranges.sigma)).content
 
 
 @pytest.mark.long

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from agent.estimation import closed_forms
 from agent.estimation.closed_forms import Placement, same_placement
@@ -298,7 +299,7 @@ def test_a_search_is_repeated_only_if_a_measurement_differs_in_a_bit() -> None:
     assert search(again) is search(pair)
     rho = pair.ranges.rho.copy()
     rho[-1] = np.nextafter(rho[-1], 0.0)
-    assert search(pair._replace(ranges=pair.ranges._replace(rho=rho))) is not search(pair)
+    assert search(replace(pair, ranges=pair.ranges._replace(rho=rho))) is not search(pair)
 
 
 def test_what_follows_from_a_hypothesis_is_computed_once_for_both_robots() -> None:

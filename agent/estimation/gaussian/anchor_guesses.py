@@ -7,6 +7,7 @@ without a detection are ignored.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 
@@ -86,11 +87,20 @@ def _odometry_variance(path: Track, ranges: Ranges, noise: Noise) -> Array:
     return along
 
 
+@cache
 def spread_out(count: int) -> Places:
     """Return at most SEED_RANGES of the indices below `count`, evenly spaced."""
     # numpy.unique would import numpy.ma in the first search of a mission
     spread = np.linspace(0, count - 1, SEED_RANGES).round().astype(np.intp)
     return spread[np.diff(spread, prepend=-1) > 0]
+
+
+@cache
+def _couples(count: int) -> tuple[Places, Places]:
+    """Return the first and the second of each two of the indices `spread_out`."""
+    chosen = spread_out(count)
+    i, j = np.triu_indices(len(chosen), 1)
+    return chosen[i], chosen[j]
 
 
 def _crossings(path: Track, ranges: Ranges) -> Array:
@@ -100,9 +110,7 @@ def _crossings(path: Track, ranges: Ranges) -> Array:
     """
     if len(ranges.rho) < 2:
         return np.empty((0, 2))
-    chosen = spread_out(len(ranges.rho))
-    i, j = np.triu_indices(len(chosen), 1)
-    i, j = chosen[i], chosen[j]
+    i, j = _couples(len(ranges.rho))
     x, y, rho = path.x[ranges.tick], path.y[ranges.tick], ranges.rho
     dx, dy = x[j] - x[i], y[j] - y[i]
     apart = np.hypot(dx, dy)

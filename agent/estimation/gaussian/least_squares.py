@@ -232,7 +232,7 @@ def _quality(system: NormalEquations, weights: Array, noise: Noise) -> _Quality:
 
 def _solved(jacobian: Array, innovation: Array, covariance: RangeCovariance) -> NormalEquations:
     weighted = covariance.solve(np.concatenate((jacobian, innovation[..., None]), -1))
-    products = np.swapaxes(jacobian, -1, -2) @ weighted
+    products = jacobian.mT @ weighted
     information = products[..., :-1]
     diagonal = np.einsum("...ii->...i", information)
     diagonal += RIDGE + RIDGE * diagonal

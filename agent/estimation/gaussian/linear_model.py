@@ -201,9 +201,7 @@ class Problem(NamedTuple):
             of_white = np.square(white) / np.maximum(self.variances, LEAST_VARIANCE)
             prior_cost += np.add.reduce(of_white, (-1, -2, -3))
         path = corrected(self.measured, correction, self.period, self.slip)
-        places = np.empty((len(guess), robots, 2, len(self.ranges.rho)))
-        places[:, :, 0], places[:, :, 1] = path.x[..., self.ticks.tick], path.y[..., self.ticks.tick]
-        ranges = predicted(guess, places, self.ranges, self.apart)
+        ranges = predicted(guess, path.place[..., self.ticks.tick], self.ranges, self.apart)
         residuals = self.ranges.rho - ranges.distance
         own = residuals - constant[:, :common] @ self.common.T
         if self.slow is not None:
@@ -231,7 +229,7 @@ class Problem(NamedTuple):
         common = self.common.shape[1]
         columns = np.empty((fits, n, common + effects.shape[1] * (effects.shape[2] - 1)))
         columns[:, :, :common] = self.common
-        columns[:, :, common:] = np.swapaxes(effects[:, :, :-1].reshape(fits, -1, n), 1, 2)
+        columns[:, :, common:] = effects[:, :, :-1].reshape(fits, -1, n).mT
         return LinearModel(model, rows, dense, columns, innovation)
 
     def loosened(self, linear: LinearModel) -> Array:
@@ -244,7 +242,7 @@ class Problem(NamedTuple):
 
         It is multiplied by the inverse covariance of the ranges.
         """
-        constant = product(np.swapaxes(linear.columns, 1, 2), left)
+        constant = product(linear.columns.mT, left)
         if self.variances is None:
             return ErrorSizes(constant, left, point.sizes.white)
         return ErrorSizes(constant, left, attributed(linear.model, linear.rows, left[:, None]))

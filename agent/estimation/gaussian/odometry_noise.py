@@ -9,8 +9,10 @@ All arrays may have further axes in front, of paths that are computed at once: "
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,9 +31,8 @@ class Track(NamedTuple):
     """The angular velocity (rad/s) over each tick; shape (..., k)."""
     period: float
     """The sampling period T_s (s)."""
-    x: Array
-    """The position (m) at each tick; shape (..., k + 1)."""
-    y: Array
+    place: Array
+    """The x and y (m) at each tick; shape (..., 2, k + 1)."""
     heading: Array
     """The heading (rad, not wrapped) at each tick; shape (..., k + 1)."""
     shift: Array
@@ -43,6 +44,16 @@ class Track(NamedTuple):
     """
     extra: Array | None = None
     """The variances of v and omega at each tick beyond those of the noise model; shape (2, k). None: 0."""
+
+    @property
+    def x(self) -> Array:
+        """The x (m) at each tick; shape (..., k + 1)."""
+        return np.asarray(self.place[..., 0, :], np.float64)
+
+    @property
+    def y(self) -> Array:
+        """The y (m) at each tick; shape (..., k + 1)."""
+        return np.asarray(self.place[..., 1, :], np.float64)
 
     @property
     def content(self) -> tuple[object, ...]:
@@ -57,14 +68,12 @@ class Track(NamedTuple):
 
     def one(self, which: tuple[int, ...], ticks: int) -> Track:
         """Return the first `ticks` of the path with this index in the further axes."""
-        v, omega, x, y, heading = (part[which] for part in (self.v, self.omega, *self[3:6]))
         return Track(
-            v[:ticks],
-            omega[:ticks],
+            self.v[which][:ticks],
+            self.omega[which][:ticks],
             self.period,
-            x[: ticks + 1],
-            y[: ticks + 1],
-            heading[: ticks + 1],
+            self.place[which][:, : ticks + 1],
+            self.heading[which][: ticks + 1],
             self.shift[which][:, :ticks],
             None if self.slip is None else self.slip[which][:ticks],
         )
@@ -82,8 +91,7 @@ def track(v: Array, omega: Array, period: float, slip: Array | None = None) -> T
     shift = np.empty((*v.shape[:-1], 2, v.shape[-1]))
     np.multiply(unit, np.cos(course), out=shift[..., 0, :])
     np.multiply(unit, np.sin(course), out=shift[..., 1, :])
-    place = _summed(v[..., None, :] * shift)
-    return Track(v, omega, period, place[..., 0, :], place[..., 1, :], heading, shift, slip)
+    return Track(v, omega, period, _summed(v[..., None, :] * shift), heading, shift, slip)
 
 
 def corrected(measured: Array, correction: Array, period: float, slip: Array | None = None) -> Track:
@@ -99,8 +107,7 @@ NO_TURN = 1e-20
 
 def _summed(values: Array) -> Array:
     """Return the sums of all values before each tick, along the last axis; (..., k) -> (..., k + 1)."""
-    sums = np.empty((*values.shape[:-1], values.shape[-1] + 1))
-    sums[..., 0] = 0.0
+    sums = np.zeros((*values.shape[:-1], values.shape[-1] + 1))
     np.add.accumulate(values, -1, out=sums[..., 1:])
     return sums
 
@@ -173,17 +180,17 @@ def wander(
     period, shift = path.period, path.shift
     # omega changes the length of the chord, and rotates it by half the angle by which it rotates the robot
     slope = path.v * _shortening((0.5 * period) * path.omega, period)
-    across = (0.5 * period) * path.v
-    b = np.empty(shift.shape)
-    np.subtract(across * shift[..., 1, :], slope * shift[..., 0, :], out=b[..., 0, :])
-    np.subtract(-across * shift[..., 0, :], slope * shift[..., 1, :], out=b[..., 1, :])
-    b[..., 0, :] -= period * path.y[..., 1:]
-    b[..., 1, :] += period * path.x[..., 1:]
+    across = (0.5 * period * SIGNS) * path.v[..., None, :]
+    b = across * shift[..., ::-1, :] - slope[..., None, :] * shift
+    b -= (period * SIGNS) * path.place[..., ::-1, 1:]
     velocities = np.empty((*correction.shape[:-2], patterns.shape[-3] + 1, *correction.shape[-2:]))
     velocities[..., :-1, :, :], velocities[..., -1, :, :] = patterns, correction
-    turned = velocities[..., 1:, :]
-    moved = velocities[..., :1, :] * shift[..., None, :, :] - turned * b[..., None, :, :]
-    moves = _summed(np.concatenate((turned, moved), -2))
+    turned, moves = velocities[..., 1:, :], np.zeros((*velocities.shape[:-2], 3, shift.shape[-1] + 1))
+    rates = moves[..., 1:]
+    rates[..., :1, :] = turned
+    np.multiply(velocities[..., :1, :], shift[..., None, :, :], out=rates[..., 1:, :])
+    rates[..., 1:, :] -= turned * b[..., None, :, :]
+    np.add.accumulate(rates, -1, out=rates)
     if variances is None:
         return OdometryNoiseModel(b, shift, moves, None, None)
     q_v, q_omega = variances[..., :1, :], variances[..., 1:, :]
@@ -195,6 +202,10 @@ def wander(
     last = along[..., 1, :] * shift[..., 1, :]
     np.subtract(last, terms[..., 2, :] * b[..., 1, :], out=terms[..., 5, :])
     return OdometryNoiseModel(b, shift, moves, variances, _summed(terms))
+
+
+SIGNS = np.array(((1.0,), (-1.0,)))
+"""The signs of two components that are exchanged, or of the two robots."""
 
 
 def _shortening(half: Array, period: float) -> Array:
@@ -210,27 +221,28 @@ SLIGHT = 1e-4
 """The half turn in rad below which the series of the derivative is used."""
 
 
-class Ticks(NamedTuple):
+class Ticks(msgspec.Struct, frozen=True, eq=False, dict=True):
     """The ticks of N rows along a path."""
 
     tick: Places
     k: int
     """The number of ticks of the path."""
-    latest_first: Places
-    """The rows in the order of their ticks, the latest first; shape (N,)."""
-    later: Places
-    """The number of rows after each tick of the path; shape (k,)."""
 
     @staticmethod
     def of(tick: Places, k: int) -> Ticks:
         """Return the ticks of rows along a path of `k` ticks. Those beyond it are taken as its last one."""
-        tick = np.minimum(tick, k)
-        order = np.argsort(-tick, kind="stable")
-        return Ticks(tick, k, order, np.searchsorted(-tick[order], -np.arange(k)))
+        return Ticks(np.minimum(tick, k), k)
+
+    @cached_property
+    def _order(self) -> tuple[Places, Places]:
+        """The rows in the order of their ticks, the latest first, (N,), and the number after each tick, (k,)."""
+        order = np.argsort(-self.tick, kind="stable")
+        return order, np.searchsorted(-self.tick[order], -np.arange(self.k))
 
     def sum_after(self, values: Array) -> Array:
         """Return the sums over the rows after each tick; (..., N) -> (..., k)."""
-        return np.asarray(_summed(values[..., self.latest_first])[..., self.later], np.float64)
+        latest_first, later = self._order
+        return np.asarray(_summed(values[..., latest_first])[..., later], np.float64)
 
 
 class Projection(NamedTuple):
@@ -245,8 +257,9 @@ class Projection(NamedTuple):
     def positions(path: Track, ticks: Ticks, u: Array) -> Projection:
         """Return the rows for the robot's position at `ticks` along `u`, shape (..., 2, N)."""
         weights = np.empty((*u.shape[:-2], 3, u.shape[-1]))
-        x, y = path.x[..., ticks.tick], path.y[..., ticks.tick]
-        np.multiply(path.period, u[..., 1, :] * x - u[..., 0, :] * y, out=weights[..., 0, :])
+        place = path.place[..., ticks.tick]
+        lever = u[..., 1, :] * place[..., 0, :] - u[..., 0, :] * place[..., 1, :]
+        np.multiply(path.period, lever, out=weights[..., 0, :])
         weights[..., 1:, :] = u
         return Projection(ticks, weights)
 
@@ -291,8 +304,8 @@ MATRIX = np.array(((0, 1, 2), (1, 3, 4), (2, 4, 5)))
 
 def symmetric(left: Array, right: Array, ticks: Ticks) -> Array:
     """Return the covariance of rows from its factors (see `spread`), (..., n, N) each; shape (..., N, N)."""
-    product = np.swapaxes(left, -1, -2) @ right
-    return np.where(ticks.tick[:, None] >= ticks.tick, product, np.swapaxes(product, -1, -2))
+    product = left.mT @ right
+    return np.where(ticks.tick[:, None] >= ticks.tick, product, product.mT)
 
 
 class Errors(NamedTuple):

@@ -142,7 +142,7 @@ def _explains(name: ProfileName, pair: PairRanges, robot: int) -> bool:
 
     The priors of the profile are smaller for accurate ranges, as the default ones are.
     """
-    under = pair._replace(noise=_profile(name, pair.noise, _share(pair.noise)))
+    under = replace(pair, noise=_profile(name, pair.noise, _share(pair.noise)))
     scored = search(under)
     return bool(scored) and consistency_test(scored[0].fit, under, robot).p_value >= CLAIM_P_VALUE
 

@@ -44,7 +44,7 @@ class RangeCovariance(NamedTuple):
             return np.asarray(self.inverse @ columns, np.float64)
         solved: Array = self.inverse[..., None] * columns
         if self.columns.shape[-1]:
-            solved -= self.left @ (np.swapaxes(self.right, -1, -2) @ columns)
+            solved -= self.left @ (self.right.mT @ columns)
         return solved
 
     @property
@@ -71,14 +71,14 @@ def range_covariance(variance: Array, columns: Array, dense: Array | None) -> Ra
     noise and slow errors; None if there is neither.
     """
     if dense is not None:
-        whole = dense + columns @ np.swapaxes(columns, -1, -2)
+        whole = dense + columns @ columns.mT
         diagonal = np.einsum("...ii->...i", whole)
         diagonal += variance + GRAIN * diagonal.max(-1, keepdims=True)
         empty = columns[..., :0]
         return RangeCovariance(whole, empty, inverse_of(whole), empty, empty, empty[..., :0, :])
     inverse = 1.0 / variance
     right = inverse[..., None] * columns
-    normal = np.swapaxes(columns, -1, -2) @ right
+    normal = columns.mT @ right
     diagonal = np.einsum("...ii->...i", normal)
     diagonal += 1.0
     if diagonal.size and diagonal.max() > MOST_INFORMATION:

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cached_property
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian.odometry_noise import Array, Places, Track
+from agent.estimation.gaussian.odometry_noise import SIGNS, Array, Places, Track
 from protocol.noise import Noise, Priors, VelocityNoise
 
 SIGMA_FLOOR = 1e-6
@@ -188,7 +190,7 @@ class Ranges(NamedTuple):
         return Ranges(self.rho[some], self.tick[some], self.sigma[some], counts, place, radio)
 
 
-class PairRanges(NamedTuple):
+class PairRanges(msgspec.Struct, frozen=True, eq=False, dict=True):
     """The measurements of both robots; robot 0 is the paper's a."""
 
     paths: tuple[Track, Track]
@@ -206,18 +208,22 @@ class PairRanges(NamedTuple):
 
     def __hash__(self) -> int:
         """Return the hash of all measurements."""
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
         return hash(self.content)
 
-    @property
+    @cached_property
     def content(self) -> tuple[object, ...]:
-        """Return all measurements as values that can be compared."""
+        """All measurements as values that can be compared."""
         silent = tuple([ticks.tobytes() for ticks in self.silent])
         paths = tuple([path.content for path in self.paths])
         return paths, self.ranges.content, silent, self.apart, self.sensing_range, self.noise
 
-    @property
+    @cached_property
     def places(self) -> Places:
-        """Return the indices of the first mutual range, and of each that follows a motion of a robot."""
+        """The indices of the first mutual range, and of each that follows a motion of a robot."""
         ticks = self.ranges.tick[self.ranges.rows(2)]
         moved = np.zeros(len(ticks), bool)
         moved[:1] = True
@@ -279,7 +285,7 @@ def predicted(guess: Array, places: Array, ranges: Ranges, apart: tuple[float, f
         gap = np.maximum(np.hypot(dx, dy), TINY)
         distance[..., mutual] = gap
         nx, ny = (dx / gap)[..., None, :] * SIGNS, (dy / gap)[..., None, :] * SIGNS
-        jacobian[..., mutual, 2::3] = np.swapaxes(ny * wx - nx * wy, -1, -2)
+        jacobian[..., mutual, 2::3] = (ny * wx - nx * wy).mT
         directions[..., 0, mutual] = c * nx + s * ny
         directions[..., 1, mutual] = c * ny - s * nx
         for robot, rows in enumerate((of_a, of_b) if ranges.place is not None else ()):
@@ -288,9 +294,7 @@ def predicted(guess: Array, places: Array, ranges: Ranges, apart: tuple[float, f
             distance[..., rows], directions[..., robot, :, rows] = own.distance, own.directions[..., 0, :, :]
             jacobian[..., rows, 3 * robot + 2] = own.jacobian[..., 2]
     for robot in range(robots):
-        np.negative(
-            np.swapaxes(directions[..., robot, :, :], -1, -2), out=jacobian[..., 3 * robot : 3 * robot + 2]
-        )
+        np.negative(directions[..., robot, :, :].mT, out=jacobian[..., 3 * robot : 3 * robot + 2])
     return Predicted(distance, jacobian, directions)
 
 
@@ -311,9 +315,6 @@ def _to_places(rotation: Array, away: Array, place: Array) -> Predicted:
     jacobian = np.stack((-along, -across, ny * wx - nx * wy), -1)
     return Predicted(distance, jacobian, np.stack((along, across), -2)[..., None, :, :])
 
-
-SIGNS = np.array(((1.0,), (-1.0,)))
-"""The signs of the derivatives of a mutual range with respect to the positions of a and b."""
 
 TINY = 1e-12
 """The distance (m) below which a direction is not defined."""
