@@ -283,7 +283,7 @@ def test_a_range_looks_at_a_robot_along_its_direction(seed: int, anchors: str) -
         def moved_by(shift: Array, robot: int = robot) -> Array:
             paths = list(one.measured)
             path = paths[robot]
-            paths[robot] = path._replace(x=path.x + shift[0], y=path.y + shift[1])
+            paths[robot] = path._replace(place=path.place + shift[:, None])
             return predict(one.guess, paths, one.ranges, one.apart).distance
 
         direction = predicted.directions[robot].T

@@ -14,7 +14,6 @@ from agent.estimation.gaussian.odometry_noise import (
     Track,
     constant_effects,
     spread,
-    symmetric,
 )
 
 
@@ -51,12 +50,13 @@ def poses(fitted: Fit, apart: tuple[float, float]) -> tuple[Array, Array]:
         end = Projection.pose(path, len(path.v), fitted.linear_guess[own][2])
         rows = end.then(Projection.positions(path, Ticks.of(fitted.ticks, len(path.v)), u))
         constant = constant_effects(model, rows)[:-1]
-        both = symmetric(*spread(model, rows), rows.ticks) + constant.T @ constant
-        prior[own, own], cross[own] = both[:3, :3], both[:3, 3:]
+        left, right = spread(model, rows)
+        both = left[:, :3].T @ right + constant[:, :3].T @ constant  # no row is later than the end
+        prior[own, own], cross[own] = both[:, :3], both[:, 3:]
     gain = system.covariance.solve(cross.T).T
-    left = turn - gain @ system.jacobian
-    covariance = fitted.level * (prior - gain @ cross.T + left @ system.of_guess @ left.T)
-    return mean, covariance + _of_survey(fitted, gain + left @ to_guess)
+    unexplained = turn - gain @ system.jacobian
+    covariance = fitted.level * (prior - gain @ cross.T + unexplained @ system.of_guess @ unexplained.T)
+    return mean, covariance + _of_survey(fitted, gain + unexplained @ to_guess)
 
 
 def _of_survey(fitted: Fit, by_range: Array) -> Array | float:

@@ -235,7 +235,7 @@ class Ticks(msgspec.Struct, frozen=True, eq=False, dict=True):
 
     @cached_property
     def _order(self) -> tuple[Places, Places]:
-        """The rows in the order of their ticks, the latest first, (N,), and the number after each tick, (k,)."""
+        """The rows, the latest first, shape (N,), and the number of them after each tick, shape (k,)."""
         order = np.argsort(-self.tick, kind="stable")
         return order, np.searchsorted(-self.tick[order], -np.arange(self.k))
 
