@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -34,6 +35,8 @@ from agent.estimation.gaussian.range_model import (
     MOST_RANGES_BY_EXACT_ODOMETRY,
     PairRanges,
     Ranges,
+    placed,
+    predict,
 )
 from protocol.motion import Pose, step, wrap
 from protocol.noise import Noise, VelocityNoise
@@ -505,3 +508,21 @@ def test_nearly_exact_ranges_give_the_placements_of_eq_7(corner: bool, turn: flo
     assert len(found) == len(exact) == (2 if corner else 4)
     for placement in exact:
         assert any(same_placement(placement, one, 1e-4) for one in found), placement
+
+
+def test_the_poses_of_a_long_contact_take_memory_in_proportion_to_its_ranges() -> None:
+    noise, ticks = Noise(anchor_sigma=0.1, mutual_sigma=0.1), np.arange(1000)
+    a, b = (track(np.full(1000, 0.5), turn + 0.2 * np.sin(ticks), 1.0) for turn in (0.5, -0.35))
+    every = [(tick, 0.0) for tick in range(1001)]
+    ranges = Ranges.of_lists(every, every, every, noise)
+    truth, apart = np.array((0.4, 0.9, 0.3, -0.2, 1.0, -0.8)), (1.5, 0.0)
+    ranges = ranges._replace(rho=predict(truth, [a, b], ranges, apart).distance)
+    fitted = fit(truth, [a, b], ranges, noise, apart)
+    tracemalloc.start()
+    try:
+        mean, _ = poses(fitted, apart)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert mean[0] == pytest.approx(placed(truth[:3], a, np.array([1000]))[0][0], abs=1e-6)
+    assert peak < 0.2 * 8 * len(ranges.rho) ** 2, "as much as a matrix with a row and a column for each range"
