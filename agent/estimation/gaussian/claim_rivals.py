@@ -95,10 +95,13 @@ def _holding(pair: PairRanges, robot: int, anchor: Array, rho: float, sigma: flo
     )
     problem = Problem.of(pair.paths, held, noise, pair.apart)
     common, slow = np.insert(ranges.common_errors(noise.priors), row, 0.0, 0), problem.slow
+    scale = problem.scale
+    if scale is not None:
+        scale[row] = 0.0
     if slow is not None:
         slow = slow.copy()
         slow[row] = slow[:, row] = 0.0
-    return problem._replace(common=common, slow=slow), row
+    return problem._replace(common=common, scale=scale, slow=slow), row
 
 
 def with_rival_check(

@@ -30,6 +30,18 @@ from agent.estimation.gaussian.odometry_noise import (
 from agent.estimation.gaussian.range_model import Predicted, Ranges, predicted
 from protocol.noise import Noise, VelocityNoise
 
+MOST_MEASURED_LENGTHS = 200
+"""The most ranges of a fit whose scale error multiplies the measured ranges; of more, the predicted ones.
+
+A measured range that is too long by chance is multiplied by more, so a fit gains by shrinking all ranges, and
+gains more with each of them. Ranges as told, of 0.05 m and 300 from each robot to its anchor, had a log
+evidence of 16 for the profile `uwb`, whose scale shrank them by a quarter; with 500, it was 102. By predicted
+ranges, it is -11 to -12 with any number. Up to 200 ranges it differs by 2, which decides nothing.
+"""
+
+SCALE_AFTER_BIAS = 1
+"""The column of the scale error in `Ranges.common_errors` if there is a bias of all ranges."""
+
 
 class Start(NamedTuple):
     """The guess and the errors from which a fit begins."""
@@ -111,7 +123,12 @@ class Problem(NamedTuple):
     """The variances of v and omega at each tick; shape (robots, 2, k). None without white odometry noise."""
     ticks: Ticks
     common: Array
-    """The effects (m) of the constant errors of the ranges; shape (N, m)."""
+    """The effects (m) of the constant errors of the ranges, by the measured ones; shape (N, m)."""
+    scale: Array | None
+    """The sigma of the scale error of each range, shape (N,), if it multiplies the predicted ranges.
+
+    None: it multiplies the measured ones; see MOST_MEASURED_LENGTHS.
+    """
     slow: Array | None
     """The covariance (m^2) of the slow errors of the ranges; None without them."""
 
@@ -129,6 +146,7 @@ class Problem(NamedTuple):
                 q[:, ticks:] = 0.0
                 if path.extra is not None:
                     q[:, :ticks] += path.extra
+        scale = np.full(len(ranges.rho), noise.priors.range_scale)
         slip = None
         if any(path.slip is not None for path in paths):
             slip = np.zeros(v.shape)
@@ -146,8 +164,20 @@ class Problem(NamedTuple):
             white,
             Ticks.of(ranges.tick, measured.shape[-1]),
             ranges.common_errors(noise.priors),
+            scale if len(ranges.rho) > MOST_MEASURED_LENGTHS and noise.priors.range_scale else None,
             ranges.slow_errors(noise.priors, period),
         )
+
+    def common_at(self, distance: Array) -> Array:
+        """Return the effects (m) of the constant errors on ranges of that length (m); shape (..., N, m).
+
+        `distance` are the predicted ranges, shape (..., N).
+        """
+        if self.scale is None:
+            return self.common
+        common = np.broadcast_to(self.common, (*distance.shape, self.common.shape[1])).copy()
+        common[..., SCALE_AFTER_BIAS if self.noise.priors.range_bias else 0] = self.scale * distance
+        return common
 
     @property
     def free(self) -> slice:
@@ -203,7 +233,10 @@ class Problem(NamedTuple):
         path = corrected(self.measured, correction, self.period, self.slip)
         ranges = predicted(guess, path.place[..., self.ticks.tick], self.ranges, self.apart)
         residuals = self.ranges.rho - ranges.distance
-        own = residuals - constant[:, :common] @ self.common.T
+        if self.scale is None:
+            own = residuals - constant[:, :common] @ self.common.T
+        else:
+            own = residuals - product(self.common_at(ranges.distance), constant[:, :common])
         if self.slow is not None:
             errors = slow @ self.slow
             own -= errors
@@ -228,7 +261,7 @@ class Problem(NamedTuple):
         innovation = point.residuals + np.add.reduce(effects[:, :, -1], 1)
         common = self.common.shape[1]
         columns = np.empty((fits, n, common + effects.shape[1] * (effects.shape[2] - 1)))
-        columns[:, :, :common] = self.common
+        columns[:, :, :common] = self.common_at(point.predicted.distance)
         columns[:, :, common:] = effects[:, :, :-1].reshape(fits, -1, n).mT
         return LinearModel(model, rows, dense, columns, innovation)
 

@@ -81,7 +81,7 @@ def learned_errors(fit: Fit | JointFit, names: Sequence[str], pairs: Sequence[st
 
 def _effects(fit: Fit) -> Array:
     """Return the effects (m) of one sigma of each constant error on the ranges; shape (N, m)."""
-    columns = [fit.problem.common]
+    columns = [fit.problem.common_at(fit.linear.predicted.distance[fit.row])]
     if fit.errors:
         for robot, (path, u) in enumerate(zip(fit.paths, fit.directions, strict=True)):
             rows = Projection.positions(path, Ticks.of(fit.ticks, len(path.v)), u)
