@@ -50,7 +50,7 @@ from msgspec import Meta
 from msgspec.structs import force_setattr
 
 from protocol.attack import Attack
-from protocol.mission import Anchor, Mission, Options, PlannerName, Role
+from protocol.mission import HEADING_ACCURACY, Anchor, Mission, Options, PlannerName, Role
 from protocol.motion import ORIGIN, Controls, Covariance, Pose, Segment
 from protocol.orbits import Orbit, Rendezvous, visiting
 from protocol.sweep_strips import SweptArea
@@ -257,6 +257,11 @@ class RobotConfig(Message, frozen=True, dict=True):
         """The options of the planner; here, none."""
         return {}
 
+    @property
+    def heading_accuracy(self) -> float:
+        """The largest sigma (rad) of its heading with which this robot claims its pose."""
+        return HEADING_ACCURACY
+
     @cached_property
     def anchor_distance(self) -> float:
         """The distance D between the two anchors, in m."""
@@ -315,6 +320,13 @@ class Retry(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=
     """The bound in s of the time until both are localised."""
 
 
+MOST_ASIDE = 1.25
+"""The sigma of the place of a visitor at the end of its way, across it, in units of R.
+
+It searches within 3 R of that place, and finds a robot nearly R beyond.
+"""
+
+
 class RobotConfigInGroup(RobotConfigWithOptions, frozen=True, dict=True):
     """The configuration of a robot in a group, which meets one robot after another.
 
@@ -345,6 +357,19 @@ class RobotConfigInGroup(RobotConfigWithOptions, frozen=True, dict=True):
         """The largest distance between two anchors of the group, in m."""
         anchors = [(one.anchor.x, one.anchor.y) for one in self.members]
         return max([math.dist(*two) for two in combinations(anchors, 2)], default=self.anchor_distance)
+
+    @cached_property
+    def heading_accuracy(self) -> float:
+        """The largest sigma (rad) of its heading with which this robot claims its pose.
+
+        On the way to its next planned visit, three sigmas move it aside by no more than its search reaches.
+        """
+        left = self.visits[self.visits.index(self.peer) + 1 :] if self.peer in self.visits else self.visits
+        if not left:
+            return HEADING_ACCURACY
+        here, there = self.peer_anchor if self.role == "a" else self.anchor, self.member(left[0]).anchor
+        way = math.hypot(here.x - there.x, here.y - there.y)
+        return min(HEADING_ACCURACY, MOST_ASIDE * self.mission.sensing_range / way)
 
     def member(self, robot: str) -> Member:
         """Return the robot of the group with this id. Raises KeyError if there is none."""

@@ -128,7 +128,9 @@ class GroupPlanner(Planner[GroupState, Report]):
             and any(isinstance(one.verdict, Inconsistent | Undecided) for one in refusals)
         ):
             return group_transitions.after_refusal(state)
-        return group_transitions.onward(state)
+        # exact robots claim within a tick of each other, and wait for each other's verdict
+        left = any(isinstance(one.verdict, Localised) and one.verdict.covariance for one in refusals)
+        return group_transitions.onward(state, peer_has_left=left)
 
     def command(self, state: GroupState) -> Command:
         """Return the command for the next tick, with the phase, the mode and the robot's verdict."""

@@ -81,8 +81,11 @@ def without_peer(state: GroupState, failure: Verdict) -> GroupState:
     return _after_meeting(replace(state, failure=failure))
 
 
-def onward(state: GroupState) -> GroupState:
-    """Return `state` in the next meeting if the present one is over."""
+def onward(state: GroupState, *, peer_has_left: bool = False) -> GroupState:
+    """Return `state` in the next meeting if the present one is over.
+
+    `peer_has_left` says that the peer is localised, and has reported it from outside the meeting.
+    """
     pair, peer = state.pair, state.pair.config.peer
     if not isinstance(state.verdict, Localised):
         return _after_failure(state)
@@ -104,7 +107,7 @@ def onward(state: GroupState) -> GroupState:
     if not isinstance(pair.verdict, Localised):
         reported = state.lingering > 0 or not pair.in_contact  # to the peer, before this robot leaves
         return _next_visit(_after_meeting(state)) if reported else state
-    over = pair.peer_state.verdict is not None or state.unmet >= PARTED_AFTER
+    over = peer_has_left or pair.peer_state.verdict is not None or state.unmet >= PARTED_AFTER
     return _next_visit(state) if over else state
 
 

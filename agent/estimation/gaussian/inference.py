@@ -289,14 +289,23 @@ def blocking_reason_for(
         return f"the most probable hypothesis fails the consistency test: {inconsistency.what}"
     _, covariance = to_second_order(hypotheses[0], pair.apart)
     ids = (config.robot, config.peer) if config.role == "a" else (config.peer, config.robot)
+    of_heading = config.heading_accuracy if len(pair.places) < ENOUGH_FOR_HEADING else HEADING_ACCURACY
     for i, robot in zip((0, 3), ids, strict=True):
         position = deviation(covariance[i, i] + covariance[i + 1, i + 1])
         if not position <= mission.accuracy:
             return f"the sigma of {robot}'s position is {position:.3g} m, required {mission.accuracy:g}"
         heading = deviation(covariance[i + 2, i + 2])
-        if not heading <= HEADING_ACCURACY:
-            return f"the sigma of {robot}'s heading is {heading:.3g} rad, required {HEADING_ACCURACY:g}"
+        required = of_heading if robot == config.robot else HEADING_ACCURACY
+        if not heading <= required:
+            return f"the sigma of {robot}'s heading is {heading:.3g} rad, required {required:.3g}"
     return None
+
+
+ENOUGH_FOR_HEADING = 20
+"""The number of mutual ranges from different places after which HEADING_ACCURACY suffices for a claim.
+
+More ranges may not make the heading more accurate: then the robot searches longer at the end of its way.
+"""
 
 
 def sufficient_mutual_ranges(mission: Mission) -> int:
