@@ -377,3 +377,16 @@ def test_a_robot_searches_when_drop_outs_hardly_explain_that_it_has_no_range(
         start = AccuracySeeking().observe(start, Observation(tick, "a", REST if tick else None, None))
         modes.append(MODE_NAMES[type(start.mode)])
     assert modes == ["asleep"] * ticks + ["straight"]
+
+
+def test_many_ranges_are_not_shrunk_to_make_their_noise_smaller() -> None:
+    # a scale that multiplied the measured ranges would move the anchor by 0.4 m
+    ticks = np.arange(1000)
+    forward = np.where(ticks // 4 % 2 == 0, 0.3, -0.3)
+    path = track(forward, np.where(ticks % 8 == 0, 1.1, 0.0), 1.0)
+    noise = Noise(anchor_sigma=0.05, mutual_sigma=0.05, range_bias=0.4, range_scale=0.05, wheel_scale=0.02)
+    anchor, white = np.array((0.4, 1.5)), np.random.default_rng(1).standard_normal(1001)
+    rho = np.hypot(path.x - anchor[0], path.y - anchor[1]) + 0.05 * white
+    ranges = Ranges.of_lists(list(enumerate(rho.tolist())), (), (), noise)
+    found = fit(np.array([*anchor, 0.0]), [path], ranges, noise)
+    assert np.hypot(*(found.guess[:2] - anchor)) < 0.05
