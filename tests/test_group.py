@@ -22,7 +22,7 @@ from compose.launch.planner_loader import planner_of
 from compose.recording.run import Run, read
 from compose.scenario.scenario_file import validate
 from protocol.messages import Localised, Report, RobotConfigInGroup
-from protocol.mission import Mission
+from protocol.mission import HEADING_ACCURACY, Mission
 from protocol.motion import Pose, step
 from protocol.wire import MAX_REPORT_BYTES, encode
 from tests.groups import R, group_of, localised, table_of
@@ -340,3 +340,19 @@ def test_pairs_are_no_group() -> None:
     assert scenario.radio_pairs() == ((0, 1), (2, 3))
     assert not isinstance(scenario.config("r0"), RobotConfigInGroup)
     assert replace(scenario, seed=1).pairs() == ((0, 1), (2, 3))
+
+
+def test_a_robot_leaves_for_a_far_visit_only_with_an_accurate_heading() -> None:
+    scenario = group_of(8, 16, sigma=0.05)
+    for robot in scenario.robots:
+        config = scenario.config(robot.id)
+        assert isinstance(config, RobotConfigInGroup)
+        if not config.visits:
+            assert config.heading_accuracy == HEADING_ACCURACY
+            continue
+        begin = config.peer_anchor if config.role == "a" else config.anchor
+        to = config.member(config.visits[0]).anchor
+        aside = 3.0 * config.heading_accuracy * math.hypot(begin.x - to.x, begin.y - to.y)
+        assert aside <= 3.75 * R * (1.0 + 1e-9)  # its search finds a robot nearly 4 R aside
+        last = config.in_meeting(config.visits[-1], "a")
+        assert last.heading_accuracy == HEADING_ACCURACY
