@@ -1,4 +1,4 @@
-"""What is known of any number of robots: a set of facts, from which every joint estimate follows.
+"""A set of facts about any number of robots, from which every joint estimate follows.
 
 A fact is something that was measured or told once: the motion of a robot in a tick, a range, the position of
 an anchor. Each has a key. Knowledge is merged by the union of sets, which is idempotent, commutative and
@@ -18,7 +18,7 @@ import msgspec
 Kind = Literal["anchor", "anchor range", "manoeuvre", "mutual range"]
 
 
-class Key(NamedTuple):
+class FactKey(NamedTuple):
     """The key of a fact. There is at most one fact with each key."""
 
     robot: str
@@ -81,14 +81,14 @@ Value = Manoeuvre | MeasuredRange | AnchorPlace
 class Fact(NamedTuple):
     """A key with its value."""
 
-    key: Key
+    key: FactKey
     value: Value
 
 
 class ContradictoryFacts(ValueError):
     """Two facts with the same key have different values."""
 
-    def __init__(self, key: Key, values: Iterable[Value]) -> None:
+    def __init__(self, key: FactKey, values: Iterable[Value]) -> None:
         """Name the `key`, and the `values` in their order."""
         self.key = key
         super().__init__(f"contradiction: {key} has the values " + " and ".join(map(_text, sorted(values))))
@@ -147,7 +147,7 @@ class Facts(msgspec.Struct, frozen=True, dict=True):
 
 def _contradiction(known: Iterable[Fact]) -> ContradictoryFacts:
     """Return the error of the first key that has several values."""
-    values: dict[Key, list[Value]] = {}
+    values: dict[FactKey, list[Value]] = {}
     for key, value in known:
         values.setdefault(key, []).append(value)
     first = min(key for key, some in values.items() if len(some) > 1)
@@ -159,26 +159,26 @@ def _contradiction(known: Iterable[Fact]) -> ContradictoryFacts:
 
 def anchor(name: str, x: float, y: float) -> Fact:
     """Return the fact that an anchor is at x, y (m). Raises ValueError unless they are finite."""
-    return _fact(Key(name, 0, "anchor"), AnchorPlace(x + 0.0, y + 0.0))
+    return _fact(FactKey(name, 0, "anchor"), AnchorPlace(x + 0.0, y + 0.0))
 
 
 def anchor_range(robot: str, name: str, tick: int, rho: float, sigma: float) -> Fact:
     """Return the fact that `robot` has measured the range `rho` (m) to an anchor at a tick."""
-    return _fact(Key(robot, tick, "anchor range", name), MeasuredRange(rho + 0.0, sigma + 0.0))
+    return _fact(FactKey(robot, tick, "anchor range", name), MeasuredRange(rho + 0.0, sigma + 0.0))
 
 
 def mutual_range(robot: str, other: str, tick: int, rho: float, sigma: float) -> Fact:
     """Return the fact that two robots, in either order, have measured the range `rho` (m) between them."""
     first, second = sorted((robot, other))
-    return _fact(Key(first, tick, "mutual range", second), MeasuredRange(rho + 0.0, sigma + 0.0))
+    return _fact(FactKey(first, tick, "mutual range", second), MeasuredRange(rho + 0.0, sigma + 0.0))
 
 
 def manoeuvre(robot: str, tick: int, measured: Manoeuvre) -> Fact:
     """Return the fact that `robot` has `measured` this motion from `tick` to the next."""
-    return _fact(Key(robot, tick, "manoeuvre"), Manoeuvre(*[one + 0.0 for one in measured]))
+    return _fact(FactKey(robot, tick, "manoeuvre"), Manoeuvre(*[one + 0.0 for one in measured]))
 
 
-def _fact(key: Key, value: Value) -> Fact:
+def _fact(key: FactKey, value: Value) -> Fact:
     """Return a fact whose numbers are finite. There is no -0.0: it is equal to 0.0, and not the same."""
     if key.tick < 0 or key.robot == key.other:
         raise ValueError(f"{key}: the tick is at least 0, and no robot ranges itself")

@@ -336,7 +336,7 @@ def same(one: JointFit, other: JointFit) -> list[bool]:
 
 
 class Certainty(NamedTuple):
-    """What the joint hypotheses say about one robot."""
+    """The joint hypotheses as far as they concern one robot."""
 
     poses: int
     """The number of different poses."""

@@ -52,7 +52,7 @@ class EstimateEpoch(NamedTuple):
     fitted: EpochFit | None
     """The fit of the first hypothesis; None without one, and if there is a later epoch."""
     certainties: tuple[Certainty, ...] = ()
-    """What the hypotheses say about each robot of a group; empty for one robot and for two."""
+    """The certainty of the pose of each robot of a group; empty for one robot and for two."""
     undetermined: Mapping[str, str] = {}
     """The robots of a group that have no pose, with the reason."""
 
