@@ -58,7 +58,7 @@ def nees_of(fit: JointFit, errors: Array) -> list[float]:
 
 
 class Reference:
-    """The same problem with all white errors as unknowns, for scipy."""
+    """A joint problem with all white errors as unknowns, for scipy."""
 
     def __init__(self, measured: JointMeasurements) -> None:
         self.measured, self.noise = measured, measured.noise

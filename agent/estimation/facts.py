@@ -63,7 +63,7 @@ class MeasuredRange(NamedTuple):
     range: float
     """The range in m."""
     sigma: float
-    """Its standard deviation in m."""
+    """The standard deviation of the range in m."""
 
 
 class AnchorPlace(NamedTuple):
