@@ -16,11 +16,10 @@ from agent.estimation.gaussian.joint_search import (
     JointHypotheses,
     beacons,
 )
-from agent.estimation.gaussian.known_anchors import MOST_STRAYS, chi2_p_value
+from agent.estimation.gaussian.known_anchors import MOST_STRAYS, chi2_p_value, inaccuracy
 from agent.estimation.gaussian.noise_level import INLIER
 from agent.estimation.gaussian.odometry_noise import Places
 from agent.estimation.gaussian.range_model import ELSEWHERE
-from protocol.mission import HEADING_ACCURACY
 
 OPEN = 0.5
 """The sigma of a position from which on a robot has no pose, as a fraction of the longest range."""
@@ -58,14 +57,7 @@ def blocking_reason(
     total, strays = int(np.count_nonzero(own)), int(np.count_nonzero(fit.weights[own] <= INLIER))
     if strays > (MOST_STRAYS + used.noise.outliers) * total:
         return f"{strays} of {total} ranges fit no other"
-    covariance = fit.covariance[3 * robot : 3 * robot + 3, 3 * robot : 3 * robot + 3]
-    position = deviation(float(covariance[0, 0] + covariance[1, 1]))
-    if not position <= accuracy:
-        return f"the sigma of the position is {position:.3g} m, required {accuracy:g}"
-    heading = deviation(float(covariance[2, 2]))
-    if not heading <= HEADING_ACCURACY:
-        return f"the sigma of the heading is {heading:.3g} rad, required {HEADING_ACCURACY:g}"
-    return ""
+    return inaccuracy(fit.covariance[3 * robot : 3 * robot + 3, 3 * robot : 3 * robot + 3], accuracy)
 
 
 def decisive_ranges(robot: int, used: JointMeasurements, reach: float) -> int:

@@ -184,6 +184,14 @@ def blocking_reason(
     strays = len(ranges.rho) - best.fit.inliers
     if strays > (MOST_STRAYS + robot.noise.outliers) * len(ranges.rho):
         return f"{strays} of {len(ranges.rho)} ranges fit no other"
+    return inaccuracy(covariance, accuracy)
+
+
+def inaccuracy(covariance: Array, accuracy: float) -> str:
+    """Return which sigma in a `covariance` (3, 3) is too large for a claim, or an empty text.
+
+    That of the position may be `accuracy` (m), that of the heading HEADING_ACCURACY.
+    """
     position = deviation(float(covariance[0, 0] + covariance[1, 1]))
     if not position <= accuracy:
         return f"the sigma of the position is {position:.3g} m, required {accuracy:g}"
