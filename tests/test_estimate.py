@@ -14,6 +14,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from agent.estimation.gaussian.linear_model import Problem
@@ -39,6 +41,7 @@ from compose.recording.ranging.range_recording import (
 )
 from compose.recording.ranging.range_steps import dead_reckoned, relative
 from docs import recorded_claims
+from protocol.motion import Pose, step
 from protocol.noise import Noise, VelocityNoise
 from tests.commands import tandem
 
@@ -140,6 +143,25 @@ def test_no_estimate_is_compared_with_a_truth_of_another_time(sample: RangeRecor
     found = true_pose(robot, last)
     assert found is not None
     assert found[:2] == pytest.approx(robot.truth.poses[-1, :2])
+
+
+@given(
+    st.floats(-3.1, 3.1),
+    st.floats(-3.1, 3.1),
+    st.floats(-2.0, 2.0),
+    st.floats(0.0, 1.0),
+)
+def test_between_true_poses_a_robot_is_on_the_arc_of_its_manoeuvre(
+    heading: float, turn: float, length: float, share: float
+) -> None:
+    start = Pose(1.0, 2.0, heading)
+    end, between = (step(start, length, turn, lasts) for lasts in (1.0, share))
+    poses = np.array([(one.x, one.y, one.heading) for one in (start, end)])
+    no_odometry = RobotOdometry(np.empty(0), np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)))
+    robot = RecordedRobot("a", no_odometry, TruePath(np.array((5.0, 6.0)), poses))
+    found = true_pose(robot, 5.0 + share)
+    assert found is not None
+    assert found == pytest.approx((between.x, between.y, between.heading), abs=1e-9)
 
 
 @pytest.mark.long

@@ -139,7 +139,10 @@ class GroupEstimateSummary(EstimateSummary, frozen=True):
 
 
 def true_pose(robot: RecordedRobot, t: float) -> Numbers | None:
-    """Return the true pose at `t` s, interpolated; None without truth around that time; shape (3,)."""
+    """Return the true pose at `t` s, shape (3,); None without truth around that time.
+
+    Between two true poses, the robot moves with constant speed on one arc.
+    """
     truth = robot.truth
     if truth is None or not truth.t[0] - TRUTH_END_S <= t <= truth.t[-1] + TRUTH_END_S:
         return None
@@ -149,11 +152,12 @@ def true_pose(robot: RecordedRobot, t: float) -> Numbers | None:
     if lasts > TRUTH_GAP_S:
         return None
     share = min(max((t - float(truth.t[before])) / lasts, 0.0), 1.0) if lasts > 0.0 else 1.0
-    first, last = truth.poses[before], truth.poses[after]
-    moved = last - first
-    moved[2] = wrap(float(moved[2]))
-    pose: Numbers = first + share * moved
-    return pose
+    x, y, heading = truth.poses[before].tolist()
+    dx, dy, turned = (truth.poses[after] - truth.poses[before]).tolist()
+    half = 0.5 * wrap(turned)
+    way = math.hypot(dx, dy) * (share if half == 0.0 else math.sin(share * half) / math.sin(half))
+    course = math.atan2(dy, dx) + (share - 1.0) * half
+    return np.array((x + way * math.cos(course), y + way * math.sin(course), heading + share * 2.0 * half))
 
 
 TRUTH_GAP_S = 1.0
