@@ -214,6 +214,7 @@ def ends(
 ) -> MissionEnd | None:
     """Return the first MissionEnd in `ticks`, in which a is localised."""
     for tick in ticks:
+        ending.tick_start(tick)
         end = ending.after(tick, Command(tick, "a", 0.0, 0.0, 3, state, LOCALISED), alive)
         if end is not None:
             return end
@@ -241,10 +242,35 @@ def test_the_mission_ends_when_all_know_that_all_have_results(ending: GroupEndin
     assert ends(ending, range(50, 90)) == MissionEnd(50 + LAST_WORDS, "localised", None)
 
 
-def test_a_robot_whose_mission_has_ended_before_is_not_waited_for(ending: GroupEnding) -> None:
+def test_a_robot_that_is_killed_after_its_result_is_waited_for_until_it_knows_all_others(
+    ending: GroupEnding,
+) -> None:
+    """It has journaled which results it knows, and needs the rest when it is back."""
     for robot in "bcd":
         ending.receive(result(robot, complete=robot != "c"))
+    assert ends(ending, range(10, 50), alive="abd") is None
+    ending.receive(result("c"))
+    assert ends(ending, range(50, 90), alive="abd") == MissionEnd(50 + LAST_WORDS, "localised", None)
+
+
+def test_a_robot_with_a_result_that_stays_silent_is_not_waited_for(stage: Stage, ending: GroupEnding) -> None:
+    for robot in "bcd":
+        ending.receive(result(robot, complete=robot != "c"))
+    stage.now += 31.0
+    for robot in "bd":
+        ending.receive(result(robot))
     assert ends(ending, range(10, 50), alive="abd") == MissionEnd(10 + LAST_WORDS, "localised", None)
+
+
+def test_a_robot_that_catches_up_tells_the_others_that_it_waits_for_none_before_it_ends(
+    ending: GroupEnding,
+) -> None:
+    """While it catches up, it sends no TickStart."""
+    for robot in "bcd":
+        ending.receive(result(robot))
+    localised = Command(10, "a", 0.0, 0.0, 3, "localised", LOCALISED)
+    assert all(ending.after(tick, localised, "abcd") is None for tick in range(10, 50))
+    assert ends(ending, range(50, 90)) == MissionEnd(50 + LAST_WORDS - 1, "localised", None)
 
 
 PLAN = 164

@@ -18,6 +18,7 @@ from protocol.messages import RobotConfigInGroup
 from protocol.motion import REST, Pose, step
 from tests.commands import BOUND_S, SECTION_IV, Ended, TandemProcess, processes_of, size, tandem, until
 from tests.test_field import beacon, pose, told
+from world.hardware.termination import LAST_WORDS
 
 
 def four(seed: int, *anchors: tuple[float, float]) -> str:
@@ -32,6 +33,22 @@ FAR = four(22, (17.2, 2.5), (0.4, 18.0), (3.3, 2.2), (11.7, 6.2))
 """A group in which a and d meet first; then a visits c, and d visits b. All are localised after 41 ticks."""
 NEAR = four(275, (11.4, 12.4), (8.6, 5.6), (4.4, 2.7), (5.0, 9.4))
 """A group in which more than two robots are within range of each other at once."""
+UNANCHORED = f"""name = "four"
+seed = 24
+{SECTION_IV}
+area = [0.0, 0.0, 8.0, 6.0]
+[[robot]]
+id = "a"
+anchor = [0.0, 0.0]
+[[robot]]
+id = "b"
+anchor = [8.0, 1.0]
+[[robot]]
+id = "c"
+[[robot]]
+id = "d"
+"""
+"""A group in which a and b meet first, and find c and d, which have no anchor, after 20 ticks."""
 RATE = 4
 
 
@@ -167,6 +184,36 @@ def test_robots_of_a_group_that_are_killed_at_any_moment_resume(
             four.kill(name)
         four.start(*killed)
         all_are_localised(tmp_path, four)
+
+
+@pytest.mark.long
+def test_a_robot_that_is_killed_before_it_knows_all_results_receives_them_afterwards(tmp_path: Path) -> None:
+    """The others have its result, and do not end while it is down: nobody else could tell it theirs."""
+    with group(tmp_path, FAR, "--lost", "3") as four:
+        four.start("a", "b", "c", "d")
+        four.robots["c"].until(lambda: claims(tmp_path, "c"), "c is localised")
+        said = len(steps(tmp_path, "c")) + 2
+        four.robots["c"].until(lambda: len(steps(tmp_path, "c")) > said, "it has said so")
+        four.kill("c")
+        until(lambda: all(claims(tmp_path, name) for name in "abd"), four.said)
+        end = max(len(steps(tmp_path, name)) for name in "abd") + 3 * LAST_WORDS
+        until(lambda: len(steps(tmp_path, "a")) > end or not four.robots["a"].running, four.said)
+        four.start("c")
+        all_are_localised(tmp_path, four)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("killed", "at"), [("", 0), ("a", 16), ("c", 18), ("bd", 17)])
+def test_robots_without_an_anchor_localise_in_hardware_mode(tmp_path: Path, killed: str, at: int) -> None:
+    """Also if the robot that finds them is killed, or they are themselves, while they drive squares."""
+    with group(tmp_path, UNANCHORED) as four:
+        four.start("a", "b", "c", "d")
+        for name in killed:
+            four.robots[name].until(lambda name=name: len(steps(tmp_path, name)) > at, "some ticks are over")  # type: ignore[misc]
+            four.kill(name)
+        four.start(*killed)
+        all_are_localised(tmp_path, four)
+        assert all("resumed at tick" in four.robots[name].out for name in killed)
 
 
 @pytest.mark.long

@@ -17,7 +17,6 @@ from agent.planning.unanchored import UnanchoredPlanner
 from compose.audit.replay import replayed
 from compose.audit.rules import audit_run
 from compose.errors import UserError
-from compose.launch.driver_loader import mission
 from compose.launch.in_process import run_mission
 from compose.recording.corrected_bounds import corrected_bounds
 from compose.recording.recording_files import agent_journal
@@ -25,14 +24,25 @@ from compose.recording.run import Run, of_frames, read
 from compose.scenario.scenario_change import file_table
 from compose.scenario.scenario_file import load, parse, validate
 from protocol.journal.journal_file import CorruptJournal
-from protocol.messages import Contact, Localised, Observation, ReportWithPose, RobotConfigWithoutAnchor
-from protocol.motion import Controls, Pose, step
+from protocol.messages import (
+    Command,
+    Contact,
+    Localised,
+    Observation,
+    ReportWithPose,
+    RobotConfigWithoutAnchor,
+    TickStartInGroup,
+)
+from protocol.motion import ORIGIN, REST, Controls, Pose, step
 from protocol.wire import decode, encode
 from tests.browser import Open, scrub_to, shot, watching
 from tests.commands import tandem as tandem_command
 from tests.groups import R, localised, table_of
 from tests.test_audit import kept
 from tests.test_group_runs import audited, with_scenario
+from world.hardware.driver import Reading
+from world.hardware.group_termination import GroupEnding
+from world.hardware.measurements import observation_frame
 from world.scenario import Scenario, ScenarioWithSweep
 
 AREA = [-4.0, -4.0, 14.0, 12.0]
@@ -279,11 +289,33 @@ def test_what_cannot_be_localised_is_refused_in_one_line(change: Any, message: s
         scenario_of(table)
 
 
-def test_hardware_mode_refuses_robots_without_an_anchor(tmp_path: Path) -> None:
+def test_check_driver_refuses_a_robot_without_an_anchor(tmp_path: Path) -> None:
     scenario = tmp_path / "four.toml"
     scenario.write_text(FILE, encoding="utf-8")
-    with pytest.raises(UserError, match="robot: u has no anchor: not available in hardware mode"):
-        mission(str(scenario), "a")
+    refused = tandem_command("check-driver", "docs.rover:Rover", "--mission", scenario, "--robot", "u")
+    assert refused.status == 2
+    assert "--robot: u has no anchor, and the checks need ranges to one" in refused.err
+
+
+def test_a_driver_may_report_the_range_to_an_anchor_that_its_robot_does_not_have() -> None:
+    """The centre of the area is in its configuration in place of an anchor."""
+    frame = observation_frame(Reading(REST, 1.0), 3, scenario_of(four()).config("u"))
+    assert decode(frame, Observation).anchor_range is None
+
+
+def test_a_silent_robot_without_an_anchor_is_given_up_after_the_area_is_swept() -> None:
+    scenario = scenario_of(four())
+    ending = GroupEnding(scenario.config("a"), scenario.max_ticks, 0.0)  # type: ignore[arg-type]
+    for robot in "bv":
+        ending.receive(TickStartInGroup(1, robot, Localised(ORIGIN), complete=True))
+    localised = Localised(ORIGIN)
+    tick = 0
+    while (end := ending.after(tick, Command(tick, "a", 0.0, 0.0, 3, "sweeping", localised), "abuv")) is None:
+        tick += 1
+        ending.tick_start(tick)
+    assert scenario.planned_sweep is not None
+    assert end.reason == "a is localised; no result of u received"
+    assert 2 * scenario.planned_sweep.ends < end.tick < scenario.max_ticks
 
 
 def test_each_robot_knows_all_others_of_its_group() -> None:

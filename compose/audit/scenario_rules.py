@@ -14,7 +14,7 @@ from compose.scenario.group_meetings import FirstMeeting, GroupMeetings, group_m
 from compose.scenario.group_sweep import with_sweep
 from compose.scenario.scenario_tables import PlannerTable, RobotTable
 from protocol.attack import OF_THE_START
-from protocol.messages import RobotConfig, RobotConfigInGroup
+from protocol.messages import RobotConfig, RobotConfigInGroup, RobotConfigWithoutAnchor
 from protocol.mission import (
     Anchor,
     Mission,
@@ -22,7 +22,7 @@ from protocol.mission import (
     noise_infeasibility,
     safety_infeasibility,
 )
-from protocol.orbits import Rendezvous, visiting
+from protocol.orbits import Orbit, Rendezvous, visiting
 from world.scenario import RobotSpec, Scenario
 from world.world_noise import world_noise_infeasibility, world_noise_mistake
 
@@ -149,7 +149,13 @@ def _off_attack(robot: RobotSpec) -> str | None:
 
 
 def _off_config(found: RobotConfig) -> str | None:
-    """Return why the orbits in the configuration of a robot are not those of its first meeting."""
+    """Return why the orbits in the configuration of a robot are not those of its first meeting.
+
+    A robot without an anchor has none: it waits.
+    """
+    if isinstance(found, RobotConfigWithoutAnchor):
+        waits = found.rendezvous.a == found.rendezvous.b == Orbit(0.0, 0.0, 0.0)
+        return None if waits else "rendezvous: it has an orbit and no anchor"
     why = _off_plan(found.rendezvous, found, found.anchor, found.peer_anchor)
     visited = isinstance(found, RobotConfigInGroup) and found.role == "b"
     if visited and found.rendezvous == visiting(found.mission, found.anchor_distance):

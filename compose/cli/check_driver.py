@@ -6,7 +6,7 @@ import argparse
 from contextlib import closing
 
 from compose.cli.arguments import add_closing, add_driver_options, name
-from compose.errors import CLEAN, VIOLATED
+from compose.errors import CLEAN, VIOLATED, UserError
 from compose.hardware.conformance import check_results
 from compose.hardware.exercise import Broken, ExerciseRun
 from compose.launch.driver_loader import config_of, driver_class, made, mission, options_of
@@ -37,6 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(options: argparse.Namespace) -> int:
     """Run the exercise, print the result of each check, and return VIOLATED if one failed."""
     scenario = mission(options.mission, options.robot)
+    if options.robot in scenario.unanchored:
+        raise UserError(f"--robot: {options.robot} has no anchor, and the checks need ranges to one")
     rate = options.rate or 1.0
     check_rate(scenario, rate)
     manoeuvre_s = scenario.mission.period / rate

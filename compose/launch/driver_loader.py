@@ -78,10 +78,6 @@ def mission(source: str, robot: str) -> Scenario:
         raise UserError(f"{source}: fault: not available in hardware mode, which uses the real radio")
     if scenario.deaths:
         raise UserError(f"{source}: dies: not available in hardware mode, in which no robot is simulated")
-    if scenario.unanchored:
-        raise UserError(
-            f"{source}: robot: {scenario.unanchored[0]} has no anchor: not available in hardware mode"
-        )
     if robot not in (ids := [placed.id for placed in scenario.robots]):
         near = did_you_mean(robot, ids)
         raise UserError(f"{source}: there is no robot '{robot}'; there are {', '.join(ids)}{near}")

@@ -4,13 +4,16 @@ In a group, a Report contains the verdict of a meeting, and robots are seldom in
 drivers send each other the results of their robots, with every TickStart.
 
 A robot's own result does not end its mission, because others may need it: it stays until all robots have a
-result, and know of each other's. It does not wait for ever for a robot that has been silent for the timeout.
-Once that robot should be localised by the plan, its planner goes there. The mission ends when the planner has
-nothing to do any more, or when this takes as long as the whole plan. In any case, it ends at max_ticks.
+result, and know of each other's. A robot that is not there may have been killed, and needs the results of the
+others when it is back. So one whose result is known is waited for until it has been silent for the timeout.
+If its result is not known, it is not waited for ever, either. Once it should be localised by the plan, this
+robot's planner goes there. The mission ends when the planner has nothing to do any more, or when this takes
+as long as the whole plan. In any case, it ends at max_ticks.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Collection
 
@@ -21,11 +24,14 @@ from protocol.messages import (
     MissionEnd,
     PeerReport,
     RobotConfigInGroup,
+    RobotConfigWithoutAnchor,
+    RobotConfigWithSweep,
     TickStart,
     TickStartInGroup,
     Undecided,
     Verdict,
 )
+from protocol.sweep_strips import helping_ticks, sweep_speed, sweep_ticks
 from world.hardware.termination import LAST_WORDS, Termination
 from world.referee import inaccuracy
 
@@ -51,8 +57,10 @@ class GroupEnding(Termination):
         self._group, self._others = config.group, {*config.others}
         self._ends = {one.robot: one.ends for one in config.members}
         """The tick until which each robot is localised, by the plan."""
-        self._plan = max(self._ends.values())
-        """The tick until which all are."""
+        self._plan = max(self._ends.values()) + _sweep_ticks(config)
+        """The tick until which all are; a bound of it if some robots have no anchor."""
+        self._visits = not isinstance(config, RobotConfigWithoutAnchor)
+        """True if this robot's planner goes to robots that are late."""
         self._results: dict[str, Verdict] = {}
         """The results that have been received, by robot."""
         self._complete: set[str] = set()
@@ -63,6 +71,8 @@ class GroupEnding(Termination):
         """True if this robot has its result, and waits for no other one."""
         self._resting = 0
         """The number of consecutive ticks in which the planner had nothing to do."""
+        self._said = 0
+        """The number of TickStarts of this process that say so."""
         self._known: int | None = None
         """The tick in which no robot waited for another one any more."""
 
@@ -80,28 +90,36 @@ class GroupEnding(Termination):
 
     def tick_start(self, tick: int) -> TickStart:
         """Return the TickStart of `tick`, with this robot's result."""
+        self._said += self._is_complete
         return TickStartInGroup(tick, self._me, self.verdict, self._is_complete)
 
-    def after(self, tick: int, command: Command | None, alive: Collection[str]) -> MissionEnd | None:
-        """Return the MissionEnd if `tick` was the last; None otherwise. See `Termination.after`."""
+    def after(self, tick: int, command: Command | None, alive: Collection[str]) -> MissionEnd | None:  # noqa: ARG002
+        """Return the MissionEnd if `tick` was the last; None otherwise. See `Termination.after`.
+
+        That a robot is not `alive` does not mean that it has ended: it may have been killed, and come back.
+        A robot that catches up after a restart sends no TickStarts: it ends when it has sent enough of them.
+        """
         if command is not None:
             self.verdict = self.verdict or command.verdict
             self._resting = self._resting + 1 if command.state in RESTING_STATES else 0
         lost = [robot for robot in self._others if self._is_lost(robot, tick)]
         self._is_complete = self.verdict is not None and self._results.keys() | {*lost} >= self._others
-        ended = {robot for robot in self._results if robot not in alive}
-        if self._known is None and self._is_complete and self._complete | ended | {*lost} >= self._others:
+        gone = {robot for robot in self._results if self._is_silent(robot)}
+        if self._known is None and self._is_complete and self._complete | gone | {*lost} >= self._others:
             self._known = tick
-        if tick >= self._max_ticks or (self._known is not None and tick >= self._known + LAST_WORDS):
-            return self._end(tick)
-        return None
+        told = self._known is not None and tick >= self._known + LAST_WORDS and self._said >= LAST_WORDS
+        return self._end(tick) if told or tick >= self._max_ticks else None
+
+    def _is_silent(self, robot: str) -> bool:
+        """Return whether nothing has been heard of `robot` for the timeout."""
+        return time.monotonic() - self._heard[robot] > self._timeout
 
     def _is_lost(self, robot: str, tick: int) -> bool:
         """Return whether this robot does not wait for `robot` any more, of which it has heard nothing."""
-        if time.monotonic() - self._heard[robot] <= self._timeout:
+        if not self._is_silent(robot):
             return False
         late = tick - self._ends.get(robot, self._plan)
-        return late > self._plan or (late > 0 and self._resting > RESTING_TICKS)
+        return late > self._plan or (late > 0 and self._visits and self._resting > RESTING_TICKS)
 
     def _end(self, tick: int) -> MissionEnd:
         if self.verdict is None:
@@ -122,3 +140,14 @@ class GroupEnding(Termination):
             what = f"{self._me} is localised; no result of {', '.join(missing)} received"
             return MissionEnd(tick, "undecided", what)
         return MissionEnd(tick, "localised", None)
+
+
+def _sweep_ticks(config: RobotConfigInGroup) -> int:
+    """Return a bound on the ticks in which each robot with an anchor sweeps its part; 0 if all have one."""
+    if not isinstance(config, RobotConfigWithSweep):
+        return 0
+    mission, sweep = config.mission, config.sweep
+    way = math.ceil(config.widest_distance / (sweep_speed(mission) * mission.period))
+    paths = [sweep.path(part, mission.sensing_range) for part in range(sweep.parts)]
+    longest = max([sweep_ticks(path, mission) for path in paths])
+    return RESTING_TICKS + way + longest + len(config.unanchored) * helping_ticks(mission)

@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from protocol.messages import Contact, Message, Observation, RobotConfig
+from protocol.messages import Contact, Message, Observation, RobotConfig, RobotConfigWithoutAnchor
 from protocol.wire import MalformedFrame, decode, encode
 from world.hardware.driver import Reading
 from world.hardware.driver_journal import Mark
@@ -18,12 +18,15 @@ class InvalidReading(Exception):
 
 
 def observation_frame(reading: Any, tick: int, config: RobotConfig) -> bytes:
-    """Return the frame of the Observation with `reading`. Raises InvalidReading."""
+    """Return the frame of the Observation with `reading`. Raises InvalidReading.
+
+    It has no range to the anchor if the robot has none: drivers need not know.
+    """
     if not isinstance(reading, Reading):
         raise InvalidReading(f"returns {type(reading).__name__}, expected a Reading")
     executed = reading.executed if tick > 0 else None
-    contacts = _contacts(reading, config)
-    return _checked(Observation(tick, config.robot, executed, reading.anchor_range, contacts))
+    anchor_range = None if isinstance(config, RobotConfigWithoutAnchor) else reading.anchor_range
+    return _checked(Observation(tick, config.robot, executed, anchor_range, _contacts(reading, config)))
 
 
 def mark_frames(reading: Reading, tick: int, robot: str) -> list[bytes]:

@@ -18,7 +18,7 @@ from typing import Any
 import zenoh
 from rosbags.typesys import Stores, get_typestore
 
-from protocol.messages import RobotConfig, RobotConfigInGroup
+from protocol.messages import RobotConfig, RobotConfigInGroup, RobotConfigWithoutAnchor
 from protocol.motion import ORIGIN, Controls, Pose, wrap
 from protocol.network import session
 from protocol.network.endpoints import at
@@ -113,7 +113,8 @@ class Ros2:
         """The event that ends the current manoeuvre."""
         self._command.set()  # there is no manoeuvre yet
         in_group = isinstance(config, RobotConfigInGroup)
-        self._anchor = anchor_range
+        self._anchors = () if isinstance(config, RobotConfigWithoutAnchor) else (anchor_range,)
+        """The topic of the range to the robot's own anchor, if it has one."""
         self._peers = {one: f"{peer_range}/{one}" if in_group else peer_range for one in config.others}
         """The topic of the range to each other robot."""
         self._open = ExitStack()
@@ -127,7 +128,7 @@ class Ros2:
         link = self._open.enter_context(session.open_client(at(connect), unanswered))
         self._cmd_vel = session.publisher(link, cmd_vel)
         link.declare_subscriber(odom, lambda sample: self._on_odometry(sample.payload.to_bytes()))
-        for topic in (anchor_range, *self._peers.values()):
+        for topic in (*self._anchors, *self._peers.values()):
             link.declare_subscriber(topic, self._on_range(topic))
 
     def sense(self, tick: int) -> Reading:
@@ -145,7 +146,7 @@ class Ros2:
             pose, _ = self._pose
             driven = executed(self._last or pose, pose, self._mission.period)
             self._last = pose
-            anchor_range = self._fresh(self._anchor, since)
+            anchor_range = next((self._fresh(topic, since) for topic in self._anchors), None)
             mutual = [(robot, self._fresh(topic, since)) for robot, topic in self._peers.items()]
             return Reading(
                 driven,
@@ -224,7 +225,7 @@ class Ros2:
 
     def _is_all_here(self, since: float) -> bool:
         came = [self._pose[1] if self._pose else 0.0]
-        topics = (self._anchor, *self._peers.values())
+        topics = (*self._anchors, *self._peers.values())
         came += [self._ranges[topic][1] for topic in topics if topic in self._ranges]
         return len(came) == 1 + len(topics) and min(came) >= since
 
