@@ -30,6 +30,9 @@ from world.hardware.driver import Reading
 
 ASK_AGAIN_S = 0.05
 """s: the interval at which a datagram is repeated, because one may be lost."""
+BODY = tuple[Pose, Controls, float, float, Controls, Controls, int]
+"""The content of the file `state`: the pose; the command, when it began (s) and the fraction that is driven; the
+motion since the last reading; the motion that the last reading reported, and its tick."""
 
 
 class Rover:
@@ -147,8 +150,7 @@ class Rover:
             draft.replace(self._state)
 
     def _load(self, state: Path) -> None:
-        kinds = tuple[Pose, Controls, float, float, Controls, Controls, int]
-        body = msgspec.json.decode(state.read_bytes(), type=kinds)
+        body = msgspec.json.decode(state.read_bytes(), type=BODY)
         self.pose, self._controls, self._began, self._done, self._driven, self._executed, self._tick = body
 
     def _mutual_ranges(self, tick: int) -> dict[str, float | None]:

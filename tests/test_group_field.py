@@ -8,16 +8,21 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from signal import SIGINT, SIGKILL
 
+import msgspec
 import pytest
 
-from agent.process.agent_journal import AgentHistory, Step
+from agent.process.agent_journal import Step
 from compose.launch.in_process import run_mission
 from compose.launch.processes import free_endpoint
 from compose.scenario.scenario_file import parse
-from protocol.messages import RobotConfigInGroup
-from protocol.motion import REST, Pose, step
+from docs.rover import BODY
+from protocol.journal import journal_file
+from protocol.messages import Observation, RobotConfigInGroup
+from protocol.motion import Pose, step
+from protocol.wire import MAX_FRAME_BYTES, decode
 from tests.commands import BOUND_S, SECTION_IV, Ended, TandemProcess, processes_of, size, tandem, until
 from tests.test_field import beacon, pose, told
+from world.hardware.driver_journal import OfDriver, driver_journal
 from world.hardware.termination import LAST_WORDS
 
 
@@ -102,10 +107,23 @@ def group(out: Path, text: str, *lost: str, keys: Path | None = None) -> Iterato
         yield Group(out, text, open_ones, lost, keys)
 
 
-def pose_at_end(agent: AgentHistory) -> Pose:
-    """Return the final pose of a robot by its claim and its odometry."""
-    last = agent.steps[-1].command or REST
-    return step(agent.path[-1], last.v, last.omega, agent.config.mission.period)
+def pose_at_end(out: Path, robot: str) -> Pose:
+    """Return the final pose of a robot: that of its claim, and what its wheels have driven since.
+
+    A Command does not say that: the driver may have received it too late to execute it.
+    """
+    frames = journal_file.read(out / robot / driver_journal(robot))
+    messages = [decode(frame, OfDriver, MAX_FRAME_BYTES) for frame in frames]
+    later = [one.executed for one in messages if isinstance(one, Observation)]
+    *_, since, _, tick = msgspec.json.decode((out / f"body-{robot}").read_bytes(), type=BODY)
+    assert tick == len(later) - 1, "the state of the body is that after the last Observation"
+    agent = told(out, robot)
+    period, path = agent.config.mission.period, agent.path
+    found = path[-1]
+    for driven in (*later[len(path) :], since):
+        assert driven is not None
+        found = step(found, driven.v, driven.omega, period)
+    return found
 
 
 def all_are_localised(out: Path, four: Group) -> dict[str, Ended]:
@@ -119,7 +137,7 @@ def all_are_localised(out: Path, four: Group) -> dict[str, Ended]:
         assert f"{name}: localised after" in ended.out
         agent = told(out, name)
         assert isinstance(agent.config, RobotConfigInGroup)
-        found = pose_at_end(agent)
+        found = pose_at_end(out, name)
         assert (found.x, found.y) == pytest.approx(pose(ended, name, "truly at")[:2], abs=1e-6)
         assert [one.observation.tick for one in agent.steps] == list(range(len(agent.steps)))
         assert tandem("replay", out / name).status == 0
@@ -229,8 +247,8 @@ def test_a_robot_that_is_dead_for_good_keeps_the_others_from_nothing(tmp_path: P
         for name in "bcd":
             ended = four.robots[name].ended()
             assert ended.status == 130
-            found = pose_at_end(told(tmp_path, name))
-            assert (found.x, found.y) == pytest.approx(pose(ended, name, "truly at")[:2], abs=1.0)
+            found = pose_at_end(tmp_path, name)
+            assert (found.x, found.y) == pytest.approx(pose(ended, name, "truly at")[:2], abs=1e-6)
 
 
 @pytest.mark.long
