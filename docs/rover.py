@@ -31,8 +31,8 @@ from world.hardware.driver import Reading
 ASK_AGAIN_S = 0.05
 """s: the interval at which a datagram is repeated, because one may be lost."""
 BODY = tuple[Pose, Controls, float, float, Controls, Controls, int]
-"""The content of the file `state`: the pose; the command, when it began (s) and the fraction that is driven; the
-motion since the last reading; the motion that the last reading reported, and its tick."""
+"""The content of the file `state`: the pose; the command, when it began (s), and the fraction that is driven;
+the motion since the last reading; the motion that the last reading reported, and its tick."""
 
 
 class Rover:

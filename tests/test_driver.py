@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
+from itertools import pairwise
 from typing import cast
 
 import pytest
 import zenoh
 from msgspec.structs import replace
 
+from agent.process.link import SILENCE_S
 from compose.launch.driver_loader import config_of
 from compose.scenario.scenario_file import parse
 from protocol.messages import (
@@ -30,7 +32,7 @@ from protocol.network import keys
 from protocol.wire import decode, encode
 from tests.commands import ASSURED, PAPER_1
 from tests.stage import Stage
-from world.hardware.bridge import Field
+from world.hardware.bridge import Field, NoStart
 from world.hardware.driver import THINKING, Reading
 from world.hardware.driver_journal import DrivenTick, DriverHistory
 from world.hardware.termination import LAST_WORDS, Ending
@@ -229,7 +231,7 @@ def ended(
         if tick == 12 and said is not None:
             ending.receive(said)
         verdict = own if tick >= 10 else None
-        end = ending.after(tick, command(tick, verdict=verdict), {"b"})
+        end = ending.after(tick, command(tick, verdict=verdict))
         if end is not None:
             return end
     return None
@@ -264,6 +266,46 @@ def test_the_mission_ends_when_the_peer_sends_nothing_for_too_long() -> None:
     end = ended(LOCALISED, None, timeout=-1.0)
     assert end is not None
     assert (end.tick, end.outcome) == (10, "undecided")
+
+
+def test_a_peer_that_is_killed_between_its_claim_and_its_last_report_is_waited_for(
+    stage: Stage, played: Play
+) -> None:
+    """It needs this robot's result when it is back."""
+
+    def reports(tick: int) -> None:
+        stage.comes("report", keys.report("r", "b", "a"), encode(report(tick, tick - 1, LOCALISED)))
+
+    def answer(tick: int) -> list[bytes]:
+        if tick == 5:
+            reports(tick)
+            stage.comes("gone", keys.robot_alive("r", "b"), after=0.01)
+        if tick == 40:
+            stage.alive("b")
+            reports(tick)
+        return [encode(command(tick, verdict=LOCALISED if tick >= 5 else None))]
+
+    _, end, _ = played(Recorded(), answer, ticks=100)
+    assert end == MissionEnd(40 + LAST_WORDS, "localised", None)
+
+
+def test_an_agent_is_told_that_its_driver_waits_for_the_peer(stage: Stage) -> None:
+    """Otherwise it would take its link, and at last the driver, for lost."""
+    told: list[tuple[float, object]] = []
+
+    def said(key: str, frame: bytes) -> None:
+        if key == keys.observation("r", "a"):
+            told.append((stage.now, decode(frame, TickStart)))
+
+    stage.answer = said
+    stage.alive("a")
+    field = Field(Recorded(), CONFIG, "r", stage, max_ticks=5, manoeuvre_s=MANOEUVRE_S)
+    field.attach(LINK)
+    with pytest.raises(NoStart):
+        field.run_mission(10.0, lambda: None)
+    assert {start for _, start in told} == {TickStart(0, "a")}
+    assert max(later - before for (before, _), (later, _) in pairwise(told)) < SILENCE_S
+    assert stage.now - told[-1][0] < SILENCE_S
 
 
 # --- the clock ----------------------------------------------------------------------------------------

@@ -218,6 +218,16 @@ def test_a_robot_without_a_beacon_waits_for_it_idle_and_gives_up() -> None:
     rover.close()
 
 
+def test_the_agent_of_a_robot_waits_for_the_peer_as_long_as_its_driver(tmp_path: Path) -> None:
+    """That is `--connect-timeout`, however short the time is to wait for an answer."""
+    ended = tandem(
+        *("robot", "b", "--mission", "paper-1", "--driver", "docs.rover:Rover", "--rate", "10"),
+        *("--connect-timeout", "5", "--timeout", "1", "--out", tmp_path / "out"),
+    )
+    assert ended.status == 3
+    assert ended.err == "tandem robot b: a: not connected; no robot has moved\n"
+
+
 def test_a_robot_whose_peer_does_not_come_has_not_moved(tmp_path: Path) -> None:
     ended = tandem(
         *("robot", "a", "--mission", "paper-1", "--driver", "docs.rover:Rover", "--rate", "10"),

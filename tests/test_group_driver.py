@@ -22,6 +22,7 @@ from protocol.messages import (
     MissionEnd,
     Observation,
     RobotConfigInGroup,
+    TickStart,
     TickStartInGroup,
     Undecided,
     Verdict,
@@ -82,7 +83,7 @@ class Member:
 
     def _answer(self, key: str, frame: bytes) -> None:
         if key == keys.observation("r", self._robot):
-            message = decode(frame, Observation | MissionEnd | FinalReport)
+            message = decode(frame, Observation | TickStart | MissionEnd | FinalReport)
             said = (
                 command(message.tick, self._robot, verdict=self._verdict)
                 if isinstance(message, Observation)
@@ -209,13 +210,11 @@ def ending(stage: Stage) -> GroupEnding:  # noqa: ARG001  # its clock is that of
     return GroupEnding(config_in_group("a"), 800, 30.0)
 
 
-def ends(
-    ending: GroupEnding, ticks: range, state: str = "localised", alive: str = "abcd"
-) -> MissionEnd | None:
+def ends(ending: GroupEnding, ticks: range, state: str = "localised") -> MissionEnd | None:
     """Return the first MissionEnd in `ticks`, in which a is localised."""
     for tick in ticks:
         ending.tick_start(tick)
-        end = ending.after(tick, Command(tick, "a", 0.0, 0.0, 3, state, LOCALISED), alive)
+        end = ending.after(tick, Command(tick, "a", 0.0, 0.0, 3, state, LOCALISED))
         if end is not None:
             return end
     return None
@@ -248,9 +247,9 @@ def test_a_robot_that_is_killed_after_its_result_is_waited_for_until_it_knows_al
     """It has journaled which results it knows, and needs the rest when it is back."""
     for robot in "bcd":
         ending.receive(result(robot, complete=robot != "c"))
-    assert ends(ending, range(10, 50), alive="abd") is None
+    assert ends(ending, range(10, 50)) is None
     ending.receive(result("c"))
-    assert ends(ending, range(50, 90), alive="abd") == MissionEnd(50 + LAST_WORDS, "localised", None)
+    assert ends(ending, range(50, 90)) == MissionEnd(50 + LAST_WORDS, "localised", None)
 
 
 def test_a_robot_with_a_result_that_stays_silent_is_not_waited_for(stage: Stage, ending: GroupEnding) -> None:
@@ -259,7 +258,7 @@ def test_a_robot_with_a_result_that_stays_silent_is_not_waited_for(stage: Stage,
     stage.now += 31.0
     for robot in "bd":
         ending.receive(result(robot))
-    assert ends(ending, range(10, 50), alive="abd") == MissionEnd(10 + LAST_WORDS, "localised", None)
+    assert ends(ending, range(10, 50)) == MissionEnd(10 + LAST_WORDS, "localised", None)
 
 
 def test_a_robot_that_catches_up_tells_the_others_that_it_waits_for_none_before_it_ends(
@@ -269,7 +268,7 @@ def test_a_robot_that_catches_up_tells_the_others_that_it_waits_for_none_before_
     for robot in "bcd":
         ending.receive(result(robot))
     localised = Command(10, "a", 0.0, 0.0, 3, "localised", LOCALISED)
-    assert all(ending.after(tick, localised, "abcd") is None for tick in range(10, 50))
+    assert all(ending.after(tick, localised) is None for tick in range(10, 50))
     assert ends(ending, range(50, 90)) == MissionEnd(50 + LAST_WORDS - 1, "localised", None)
 
 
@@ -332,7 +331,7 @@ def test_the_outcome_is_that_of_all_robots(
 def test_a_robot_without_a_result_ends_at_max_ticks(ending: GroupEnding) -> None:
     for robot in "bcd":
         ending.receive(result(robot))
-    moving = [ending.after(tick, command(tick), "abcd") for tick in range(801)]
+    moving = [ending.after(tick, command(tick)) for tick in range(801)]
     assert moving[:800] == [None] * 800
     assert moving[800] == MissionEnd(800, "undecided", "max_ticks: a not localised by then")
 

@@ -375,9 +375,9 @@ def test_without_a_world_the_mission_ends_by_the_verdicts_around_the_bodies() ->
     ending = Ending(config, 100, 1e9)
     claim = Localised(Pose(0.0, 0.0, 0.0))
     sent = AssuredExact().command(first_state())
-    assert ending.after(5, replace(sent, tick=5, verdict=claim), {"b"}) is None
+    assert ending.after(5, replace(sent, tick=5, verdict=claim)) is None
     assert ending.receive(PlannerReport(6, "b", 6, claim, b"\xc0"))
-    found = [ending.after(tick, sent, {"b"}) for tick in range(6, 11)]
+    found = [ending.after(tick, sent) for tick in range(6, 11)]
     assert found[-1] == MissionEnd(10, "localised", None)
     assert found[:-1] == [None] * 4
 

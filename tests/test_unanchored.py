@@ -310,7 +310,7 @@ def test_a_silent_robot_without_an_anchor_is_given_up_after_the_area_is_swept() 
         ending.receive(TickStartInGroup(1, robot, Localised(ORIGIN), complete=True))
     localised = Localised(ORIGIN)
     tick = 0
-    while (end := ending.after(tick, Command(tick, "a", 0.0, 0.0, 3, "sweeping", localised), "abuv")) is None:
+    while (end := ending.after(tick, Command(tick, "a", 0.0, 0.0, 3, "sweeping", localised))) is None:
         tick += 1
         ending.tick_start(tick)
     assert scenario.planned_sweep is not None

@@ -130,7 +130,7 @@ def test_a_claim_below_the_required_accuracy_is_not_localised_in_hardware_mode(w
         ending = Ending(config, 100, 30.0)
         ending.receive(Report(0, "b", 3, "localised", ORIGIN, 0, 0, (), 0, (), 0, 0, other))
         command = Command(0, "a", 0.0, 0.0, 3, "localised", mine)
-        ends = [ending.after(tick, command, {"b"}) for tick in range(LAST_WORDS + 1)]
+        ends = [ending.after(tick, command) for tick in range(LAST_WORDS + 1)]
         assert ends[-1] is not None
         assert ends[-1].outcome == outcome
 

@@ -13,6 +13,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from functools import partial
+from typing import Any
 
 import zenoh
 
@@ -23,7 +24,7 @@ from agent.process.out_of_step import OutOfStep
 from agent.process.recovery import OWN_REPORTS_KEPT, REPORTS_KEPT, Memory
 from agent.process.report_bodies import malformed
 from agent.process.report_buffer import ReportBuffer
-from protocol.messages import MissionEnd, Observation, RobotConfig
+from protocol.messages import MissionEnd, Observation, RobotConfig, TickStart
 from protocol.network import session
 from protocol.network.endpoints import Endpoints
 from protocol.network.inbox import Arrival, Inbox
@@ -114,7 +115,9 @@ class AgentProcess:
                     message = self._decoded(arrival)
                     if isinstance(message, MissionEnd) and self._is_accepted(message):
                         self._conclude(message)
-                    elif isinstance(message, Observation) and self._on_observation(message, arrival.frame):
+                    elif isinstance(message, TickStart) or (
+                        isinstance(message, Observation) and self._on_observation(message, arrival.frame)
+                    ):
                         self._give_up = time.monotonic() + self._world_timeout
                 case "report":
                     self._report_buffer.take(arrival, self._latest_tick)
@@ -172,16 +175,18 @@ class AgentProcess:
 
     # --- arrivals ---
 
-    def _decoded(self, arrival: Arrival) -> Observation | MissionEnd | None:
+    def _decoded(self, arrival: Arrival) -> Observation | MissionEnd | TickStart | None:
+        """Return the message; None if it is refused. A TickStart is of a tick that cannot begin yet."""
         try:
-            message: Observation | MissionEnd = decode(arrival.frame, Observation | MissionEnd)
+            message: Any = decode(arrival.frame, Observation | MissionEnd | TickStart)
         except MalformedFrame as error:
             self._inbox.refuse(arrival, error)
             return None
-        if isinstance(message, Observation) and message.robot != self._id:
+        if not isinstance(message, MissionEnd) and message.robot != self._id:
             self._inbox.refuse(arrival, f"it is addressed to '{message.robot}'")
             return None
-        return message
+        found: Observation | MissionEnd | TickStart = message
+        return found
 
     def _is_accepted(self, end: MissionEnd) -> bool:
         return end.tick == self._latest_tick or self._out_of_step.persists(end, ENDED_S)
@@ -308,7 +313,7 @@ class AgentProcess:
                 message = self._decoded(arrival)
                 if isinstance(message, Observation):
                     self._out_of_step.observation(message, end.tick)
-                elif message is not None:
+                elif isinstance(message, MissionEnd):
                     self._out_of_step.over()
                     self._link.command(frame)
             elif arrival.topic == "alive":

@@ -43,6 +43,11 @@ from world.hardware.tick_source import UNHEARD, TickSource
 
 REPEAT_S = 0.25
 """The period in s in which the MissionEnd is repeated."""
+WAITING_S = 1.0
+"""The period in s in which the agent is told that its driver waits for other robots.
+
+It is shorter than the time after which an agent replaces its link.
+"""
 FINAL_REPORT_TIMEOUT_S = 2.0
 """The time in s to wait for the agent's FinalReport."""
 ASTRAY = 64
@@ -133,7 +138,7 @@ class Field:
         for one in history.ticks:
             for message in one.received:
                 self._ending.receive(message)
-            self._end = self._ending.after(one.observation.tick, one.command, self._others)
+            self._end = self._ending.after(one.observation.tick, one.command)
             self.missed += one.command is None
         self._end = history.end or self._end
         self._tick, self._resumed, self._astray = history.tick, history.tick >= 0, self._max_ticks + 1
@@ -198,8 +203,11 @@ class Field:
         A resumed process only waits for its own agent, because the mission of others may have ended. One
         that was killed before tick 0 may have missed the TickStart of a robot that now waits for it. It
         therefore begins after UNHEARD ticks without one. A robot of a group begins at `give_up` without those
-        that are missing, if any other is there. Raises NoStart.
+        that are missing, if any other is there. Meanwhile its agent is told every WAITING_S that it waits.
+
+        Raises NoStart.
         """
+        tell = time.monotonic() + WAITING_S
         unheard = time.monotonic() + UNHEARD * self._tick_s
         while not self._may_begin():
             missing = [one for one in (self._id, *self._others) if one not in self._alive]
@@ -213,7 +221,10 @@ class Field:
                     break
                 moved = "" if self._resumed else "; no robot has moved"
                 raise NoStart(f"{' and '.join(missing or self._others)}: not connected{moved}")
-            until = min(give_up, unheard) if self._restarted and unheard > time.monotonic() else give_up
+            if (now := time.monotonic()) >= tell:
+                self._observation.put(encode(TickStart(self._tick + 1, self._id)))
+                tell = now + WAITING_S
+            until = min(give_up, tell, unheard) if self._restarted and unheard > now else min(give_up, tell)
             self._take(self._inbox.next(until - time.monotonic()))
         if self._next == UNKNOWN and not self._restarted:  # it follows nobody yet
             self._astray = ASTRAY
@@ -250,7 +261,7 @@ class Field:
         self._take_waiting()
         if self._unanswered and now - self._answered > self._timeout:
             return MissionEnd(tick, "failed", f"no answer from {self._id}'s agent for {self._timeout:g} s")
-        return self._ending.after(tick, command, self._alive)
+        return self._ending.after(tick, command)
 
     def _measured(self, tick: int) -> list[bytes]:
         """Return the frame of the Observation of `tick`, and that of its mark if it has one.

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Collection
 
 from protocol.messages import (
     Command,
@@ -93,10 +92,9 @@ class GroupEnding(Termination):
         self._said += self._is_complete
         return TickStartInGroup(tick, self._me, self.verdict, self._is_complete)
 
-    def after(self, tick: int, command: Command | None, alive: Collection[str]) -> MissionEnd | None:  # noqa: ARG002
+    def after(self, tick: int, command: Command | None) -> MissionEnd | None:
         """Return the MissionEnd if `tick` was the last; None otherwise. See `Termination.after`.
 
-        That a robot is not `alive` does not mean that it has ended: it may have been killed, and come back.
         A robot that catches up after a restart sends no TickStarts: it ends when it has sent enough of them.
         """
         if command is not None:

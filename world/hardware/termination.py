@@ -1,13 +1,14 @@
 """The end of a pair's mission in hardware mode, for one robot, from its own result and the peer's Reports.
 
 The true poses are unknown, so the outcome is never `wrong`. A robot stays until the peer has acknowledged its
-result. It then continues to send Reports for LAST_WORDS ticks, which contain its own acknowledgement.
+result. It then continues to send Reports for LAST_WORDS ticks, which contain its own acknowledgement. A peer
+that is not there any more may have been killed, and needs the result when it is back. So it is waited for
+until the timeout after the robot's own result.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Collection
 from typing import Protocol
 
 from protocol.messages import (
@@ -42,11 +43,8 @@ class Termination(Protocol):
     def tick_start(self, tick: int) -> TickStart:
         """Return the TickStart of `tick`, with what the others have to know."""
 
-    def after(self, tick: int, command: Command | None, alive: Collection[str]) -> MissionEnd | None:
-        """Return the MissionEnd if `tick`, in which the agent sent `command`, was the last; None otherwise.
-
-        `alive` are the robots whose agent has a liveliness token.
-        """
+    def after(self, tick: int, command: Command | None) -> MissionEnd | None:
+        """Return the MissionEnd if `tick`, in which the agent sent `command`, was the last; else None."""
 
 
 class Ending(Termination):
@@ -94,7 +92,7 @@ class Ending(Termination):
         """Return the TickStart of `tick`. The results are in the Reports."""
         return TickStart(tick, self._me)
 
-    def after(self, tick: int, command: Command | None, alive: Collection[str]) -> MissionEnd | None:
+    def after(self, tick: int, command: Command | None) -> MissionEnd | None:
         """Return the MissionEnd if `tick` was the last; None otherwise. See `Termination.after`."""
         if self.verdict is None and command is not None and command.verdict is not None:
             self.verdict, self._at, self._since = command.verdict, tick, time.monotonic()
@@ -102,8 +100,7 @@ class Ending(Termination):
             if tick >= self._max_ticks:
                 return MissionEnd(tick, "undecided", f"max_ticks: {self._me} not localised by then")
             return None
-        gone = self._peer not in alive and self._peers is not None
-        if self._known is None and self._peers is not None and (self._is_acknowledged or gone):
+        if self._known is None and self._peers is not None and self._is_acknowledged:
             self._known = tick
         if self._known is not None and tick >= self._known + LAST_WORDS:
             return self._end(tick)
