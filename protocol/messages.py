@@ -642,7 +642,10 @@ class GroundTruth(Message, frozen=True):
 
 
 class TickStart(Message, frozen=True):
-    """The start of tick k at one robot's driver, from which the peer's driver sets its clock."""
+    """The start of tick k at one robot's driver, from which the peer's driver sets its clock.
+
+    A driver also sends it to its own agent, while it waits for other robots and tick k cannot begin yet.
+    """
 
     tick: Tick
     """The tick k."""

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from signal import SIGKILL, SIGTERM
@@ -17,10 +18,12 @@ import pytest
 from ruamel.yaml import YAML
 
 from compose.cli.main import parse
+from compose.hardware.compose_file import MOUNTED
 from compose.launch.processes import free_endpoint
 from protocol.journal import journal_file
-from tests.commands import TandemProcess, tandem
+from tests.commands import PAPER_1, TandemProcess, tandem
 from tests.series import series
+from tests.test_group_field import FAR
 
 HOUSE = Path(__file__).parents[1]
 DEPLOY = HOUSE / "compose" / "hardware" / "deploy"
@@ -29,13 +32,18 @@ CONTAINER = DEPLOY / "Containerfile"
 UNIT = DEPLOY / "tandem-agent@.service"
 
 
-def services(**environment: str) -> dict[str, dict[str, Any]]:
-    """Return the services of the compose file, with its variables substituted as compose does."""
+def content(file: Path, **environment: str) -> dict[str, Any]:
+    """Return the content of a compose file, with its variables substituted as compose does."""
     text = re.sub(
-        r"\$\{(\w+):-([^}]*)\}", lambda found: environment.get(found[1], found[2]), COMPOSE.read_text()
-    )
-    assert "${" not in text
-    found: dict[str, dict[str, Any]] = YAML(typ="safe", pure=True).load(text)["services"]
+        r"(?<!\$)\$\{(\w+):-([^}]*)\}", lambda found: environment.get(found[1], found[2]), file.read_text()
+    ).replace("$$", "$")
+    found: dict[str, Any] = YAML(typ="safe", pure=True).load(text)
+    return found
+
+
+def services(**environment: str) -> dict[str, dict[str, Any]]:
+    """Return the services of the compose file that ships."""
+    found: dict[str, dict[str, Any]] = content(COMPOSE, **environment)["services"]
     return found
 
 
@@ -140,10 +148,22 @@ def test_what_the_wheel_is_made_of_goes_into_the_image() -> None:
 
 @pytest.mark.parametrize("killed", series(["agent-a", "world"], 0))
 def test_the_commands_of_the_services_complete_a_mission_despite_a_kill(killed: str, tmp_path: Path) -> None:
+    complete_despite_a_kill(services(TANDEM_RATE="20"), "ab", killed, tmp_path)
+
+
+def complete_despite_a_kill(
+    found: dict[str, dict[str, Any]], robots: Sequence[str], killed: str, tmp_path: Path, **mounted: str
+) -> None:
+    """Run the commands of the services of a compose file as processes, kill one of them, and restart it.
+
+    `mounted` is the file `scenario`, if it is one in the container of the world.
+    """
     world, router = free_endpoint(), free_endpoint()
     places = {"tcp/world:7447": world, "tcp/0.0.0.0:7447": world, "tcp/zenoh:7447": router}
+    if "scenario" in mounted:
+        places[MOUNTED] = mounted["scenario"]
     commands = {}
-    for name, service in services(TANDEM_RATE="20").items():
+    for name, service in found.items():
         if name in ("page", "zenoh"):
             continue
         line = "\n".join(service["command"]).replace("/journal", str(tmp_path / name))
@@ -152,7 +172,7 @@ def test_the_commands_of_the_services_complete_a_mission_despite_a_kill(killed: 
         commands[name] = line.split("\n")
     with ExitStack() as stack:
         playing = {name: stack.enter_context(TandemProcess(*line)) for name, line in commands.items()}
-        for robot in ("a", "b"):
+        for robot in robots:
             playing[f"agent-{robot}"].until_answered(robot, tmp_path / f"agent-{robot}")
         recording = tmp_path / "world" / "world.journal"
         playing["world"].until(
@@ -163,6 +183,97 @@ def test_the_commands_of_the_services_complete_a_mission_despite_a_kill(killed: 
         ended = {name: command.ended() for name, command in playing.items()}
     assert {name: end.status for name, end in ended.items()} == dict.fromkeys(commands, 0), ended
     assert "resumed at tick " in ended[killed].out
+
+
+# --- other scenarios --------------------------------------------------------------------------------
+
+IDS = ("1", "on", "c", "D_d")
+"""Ids of robots; some are no strings in YAML unless they are quoted."""
+
+
+@pytest.fixture
+def of_a_group(tmp_path: Path) -> tuple[Path, Path]:
+    """Return the file of a scenario of a group, and the compose file made of it, in another folder."""
+    text = FAR
+    for name, other in zip("abcd", IDS, strict=True):
+        text = text.replace(f'id = "{name}"', f'id = "{other}"')
+    scenario = tmp_path / "for: $me" / "four.toml"
+    scenario.parent.mkdir()
+    scenario.write_text(text)
+    (tmp_path / "containers").mkdir()
+    made = tandem("containers", scenario, tmp_path / "containers" / "four.yaml")
+    assert made.status == 0, made.err
+    return scenario, tmp_path / "containers" / "four.yaml"
+
+
+def test_the_compose_file_of_a_pair_is_the_one_that_ships(tmp_path: Path) -> None:
+    file = tmp_path / "pair.yaml"
+    assert tandem("containers", "random", file).status == 0
+    context = content(file)["services"]["world"]["build"]["context"]
+    assert (tmp_path / context).resolve() == HOUSE
+    shipped = COMPOSE.read_text()
+    expected = shipped[shipped.index("name: tandem") :]
+    for ours, theirs in (
+        ("name: tandem", "name: tandem-random"),
+        ("${TANDEM_SCENARIO:-random}", "random"),
+        ("context: ../../..", f'context: "{context}"'),
+    ):
+        expected = expected.replace(ours, theirs)
+    assert file.read_text() == expected
+
+
+def test_the_compose_file_of_a_group_has_a_confined_service_and_a_volume_per_robot(
+    of_a_group: tuple[Path, Path],
+) -> None:
+    scenario, file = of_a_group
+    assert valid(file)
+    found = content(file)
+    assert found["name"] == "tandem-four"
+    assert list(found["services"]) == ["world", *(f"agent-{robot}" for robot in IDS), "page", "zenoh"]
+    assert list(found["volumes"]) == ["world", *(f"agent-{robot}" for robot in IDS)]
+    kept = ("image", "restart", "read_only", "tmpfs", "cap_drop", "security_opt", "networks", "healthcheck")
+    for robot in IDS:
+        service = found["services"][f"agent-{robot}"]
+        assert service["volumes"] == [f"agent-{robot}:/journal"]
+        assert parse(service["command"]).id == robot
+        assert service["command"][2:] == services()["agent-a"]["command"][2:]
+        assert [service[one] for one in kept] == [services()["agent-a"][one] for one in kept]
+    journal, mount = found["services"]["world"]["volumes"]
+    assert journal == "world:/journal"
+    assert (file.parent / mount.pop("source")).resolve() == scenario
+    assert mount == {"type": "bind", "target": MOUNTED, "read_only": True}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("killed", ["agent-on", "world"])
+def test_the_commands_of_a_group_complete_a_mission_despite_a_kill(
+    killed: str, of_a_group: tuple[Path, Path], tmp_path: Path
+) -> None:
+    scenario, file = of_a_group
+    found = content(file, TANDEM_RATE="20")["services"]
+    complete_despite_a_kill(found, IDS, killed, tmp_path, scenario=str(scenario))
+
+
+def test_what_containers_cannot_run_is_refused_in_one_line(tmp_path: Path) -> None:
+    kills = tmp_path / "kills.toml"
+    kills.write_text(f'{PAPER_1}\n[[kill]]\nwho = "a"\ntick = 3\n')
+    own = tmp_path / "own.toml"
+    own.write_text(PAPER_1.replace('"paper"', '"tests.own_planners:Wrapping"'))
+    there = tmp_path / "there.yaml"
+    there.write_text("services: {}")
+    for source, file, why in (
+        (kills, "new.yaml", "kill: a container is not killed by a scenario"),
+        (own, "new.yaml", "is not in the image, which has shipped planners only"),
+        ("nothing", "new.yaml", "neither a file nor a shipped scenario"),
+        ("random", "there.yaml", "there.yaml already exists; choose another file"),
+        ("random", "no folder/new.yaml", "cannot be written: No such file or directory"),
+    ):
+        ended = tandem("containers", source, tmp_path / file)
+        assert ended.status == 2, ended
+        assert why in ended.err
+        assert ended.err.count("\n") == 1
+    assert there.read_text() == "services: {}"
+    assert not (tmp_path / "new.yaml").exists()
 
 
 # --- without containers -----------------------------------------------------------------------------

@@ -24,7 +24,7 @@ def test_help_lists_every_command_once_under_its_group() -> None:
             group.append(line.split()[0])
     assert {name: listed[name] for name in ("Run", "Deploy", "Analyse", "Check")} == {
         "Run": ["run", "replay", "scenarios", "init", "sweep"],
-        "Deploy": ["world", "agent", "robot", "keys"],
+        "Deploy": ["world", "agent", "robot", "keys", "containers"],
         "Analyse": ["audit", "figures", "export", "estimate", "calibrate", "watch"],
         "Check": ["doctor", "ps", "check-driver", "check-planner", "bench", "completion"],
     }

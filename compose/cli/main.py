@@ -55,6 +55,7 @@ COMMANDS = (
     CommandEntry("agent", "Deploy", "Run the agent of one robot; it connects to a world."),
     CommandEntry("robot", "Deploy", "Run one robot on its own hardware, with its driver."),
     CommandEntry("keys", "Deploy", "Create certificates and access rules for networks without trust."),
+    CommandEntry("containers", "Deploy", "Write a compose file with a container for each robot."),
     CommandEntry("audit", "Analyse", "Check a recording against the rules of the system."),
     CommandEntry("figures", "Analyse", "Draw the figures of a recording."),
     CommandEntry("export", "Analyse", "Convert a recording to MCAP, CSV, Parquet or a factor graph."),

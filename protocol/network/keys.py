@@ -30,7 +30,8 @@ def config(run: str, robot: str) -> str:
 def observation(run: str, robot: str) -> str:
     """Return the key on which the world sends each Observation to that robot, and MissionEnd after the last.
 
-    The world then sends the robot's FinalReport back, once it is in the recording.
+    The world then sends the robot's FinalReport back, once it is in the recording. In hardware mode, a driver
+    that waits for other robots sends a TickStart of the tick that cannot begin yet.
     """
     return f"{ROOT}/{run}/robot/{robot}/observation"
 

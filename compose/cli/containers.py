@@ -1,0 +1,57 @@
+"""`tandem containers`: write the compose file of a scenario."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from pathlib import Path
+
+from compose.cli.arguments import SCENARIO_HELP, add_closing, folder, source
+from compose.errors import ENDED, CannotWrite, UserError
+from compose.hardware.compose_file import compose_file
+from compose.launch.planner_loader import is_shipped
+from compose.scenario.scenario_file import setting
+from protocol import files
+from protocol.output import say
+from world.scenario import Scenario
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `tandem containers`."""
+    parser.add_argument("scenario", type=source, metavar="SCENARIO", help=SCENARIO_HELP)
+    parser.add_argument(
+        "file", type=folder, metavar="FILE", help="compose file to write; an existing file is not replaced"
+    )
+    add_closing(parser, "tandem containers group-8 containers.yaml", "docs/howto-containers.md")
+
+
+def main(options: argparse.Namespace) -> int:
+    """Write the compose file, and print the command that uses it."""
+    found = setting(options.scenario)
+    if found.file.kill:
+        raise UserError(f"{options.scenario}: kill: a container is not killed by a scenario")
+    scenario = found.scenario
+    _check_code(options.scenario, scenario)
+    place: Path = options.file
+    if place.exists():
+        raise UserError(f"{place} already exists; choose another file")
+    try:
+        files.write(place, compose_file(options.scenario, scenario, place))
+    except OSError as error:
+        raise CannotWrite(place, error) from None
+    robots = ", ".join([robot.id for robot in scenario.robots])
+    say(f"{place}: a world, the agents of {robots}, and a page", "to go on:")
+    say(f"  docker compose -f {shlex.quote(str(place))} up --build")
+    return ENDED
+
+
+def _check_code(name: str, scenario: Scenario) -> None:
+    """Raise UserError if the mission needs a planner or a model that the image does not contain."""
+    planner = scenario.config(scenario.robots[0].id).planner_name
+    if not is_shipped(planner):
+        raise UserError(f"{name}: planner: {planner} is not in the image, which has shipped planners only")
+    for model in (scenario.range_model, scenario.radio_model):
+        if model is not None and ":" in model.model:
+            raise UserError(
+                f"{name}: world: {model.model} is not in the image, which has shipped models only"
+            )
