@@ -388,6 +388,45 @@ def test_a_robot_that_was_down_catches_up_with_its_peer_standing(robot: str, pee
     assert 5 <= len(driver.commands) <= 7
 
 
+def test_a_restarted_robot_whose_peer_comes_later_is_no_more_behind_than_the_peer(stage: Stage) -> None:
+    """Its driver waits for the peer in each tick, to measure the range, and the peer counts its ticks.
+
+    It has nothing to catch up with, so it says where it is. Otherwise the peer would count its own ticks, and
+    this robot would be late in all of them.
+    """
+    tick_s = (1 + THINKING) * MANOEUVRE_S
+    peer = {"starts": 3.0}
+
+    class Waits(Recorded):
+        def sense(self, tick: int) -> Reading:
+            stage.now = max(stage.now, peer["starts"])
+            peer["starts"] += tick_s
+            return super().sense(tick)
+
+    driver = Waits()
+    driver.clock = stage.monotonic
+    field = Field(driver, CONFIG, "r", stage, max_ticks=90, manoeuvre_s=MANOEUVRE_S)
+    field.resume(history_of(20, robot="a"), known=19)
+
+    def answer(key: str, frame: bytes) -> None:
+        if key == keys.tick_start("r", "a"):
+            peer["starts"] = min(peer["starts"], max(stage.now, 3.0))
+        if key == keys.observation("r", "a"):
+            observation = decode(frame, Observation | MissionEnd | FinalReport)
+            said = command(observation.tick) if isinstance(observation, Observation) else FINAL_REPORT
+            stage.comes("command", keys.command("r", "a"), encode(said), 0.001)
+
+    stage.answer = answer
+    stage.alive("a", "b")
+    field.attach(LINK)
+    field.run_mission(10.0, lambda: None)
+    starts = [
+        decode(frame, TickStart).tick for key, frame in stage.put_frames if key == keys.tick_start("r", "a")
+    ]
+    assert starts == list(range(20, 91))
+    assert len(driver.commands) > 40
+
+
 def test_an_a_that_was_not_down_does_not_go_by_its_peers_ticks(stage: Stage, played: Play) -> None:
     driver = Recorded()
     stage.comes("tick-start", keys.tick_start("r", "b"), encode(TickStart(4, "b")), 0.05)

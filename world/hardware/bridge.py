@@ -117,6 +117,8 @@ class Field:
         """True if others may be ahead: this process was killed after tick 0, or has begun after others."""
         self._astray = max_ticks + 1 if self._source.joins else ASTRAY
         """The number of ticks by which the next TickStart may be ahead."""
+        self._ahead = -1
+        """The latest tick of another robot to which this one has had to catch up; -1 if none."""
         self._alive: set[str] = set()
         """The robots with a liveliness token."""
         self._unanswered: deque[tuple[int, bytes]] = deque()
@@ -242,7 +244,7 @@ class Field:
         tick = self._tick
         now = time.monotonic()
         self._next = (now if self._next == UNKNOWN else self._next) + self._tick_s
-        if not self._resumed or self._next > now:  # none while catching up: others would wait
+        if tick >= self._ahead or self._next > now:  # none while catching up: others would wait
             self._tick_start.put(encode(self._ending.tick_start(tick)))
         observation, *marks = self._measured(tick)
         self._write(*marks, observation)
@@ -375,6 +377,8 @@ class Field:
         behind = left < 0 and (self._resumed or (in_group and left < -AHEAD))
         if fits:
             self._source.hear(start.robot, now)
+            if behind or (begins and left < 0):
+                self._ahead = max(self._ahead, start.tick)
         if not (begins or behind or self._source.leads(start.robot, now)):
             return
         if not fits:
