@@ -33,7 +33,7 @@ DRIFT = "anchor_sigma = 0.05\nmutual_sigma = 0.05\nodometry = {omega_floor = 0.0
 MISSED = (
     4555997949307862513,
     2612697425167240929,
-    754367756263857312,  # a goes round nearly twice
+    754367756263857312,
     8900357934714246900,  # b has not moved since a began again
     1723396742918998267,
     348705387925788852,  # a misses b twice
