@@ -282,6 +282,11 @@ class RobotConfig(Message, frozen=True, dict=True):
         """The orbit of this robot in phase 2."""
         return self.rendezvous.of(self.role)
 
+    @property
+    def begins_again(self) -> bool:
+        """True if a robot a that has not met b begins again at phase 1; False if the plan of a group says."""
+        return self.rendezvous.a_searches
+
 
 class RobotConfigWithOptions(RobotConfig, frozen=True, dict=True):
     """The configuration of a robot whose planner has options."""
@@ -341,6 +346,11 @@ class RobotConfigInGroup(RobotConfigWithOptions, frozen=True, dict=True):
     """The meetings in which it tries again if it is not localised by then, in their order."""
     gives_up: Time = 0.0
     """The time in s after which it gives up if it is not localised."""
+
+    @property
+    def begins_again(self) -> bool:
+        """False: the plan of the group says which robots meet after a missed encounter."""
+        return False
 
     @property
     def group(self) -> tuple[str, ...]:

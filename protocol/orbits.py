@@ -65,10 +65,19 @@ class Rendezvous(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fi
         """Return the orbit of the robot with this role."""
         return self.a if role == "a" else self.b
 
+    @property
+    def a_searches(self) -> bool:
+        """True if a orbits in search of b, which waits: then a can search again without telling b."""
+        return self.a.v != 0.0 and self.b.v == 0.0
+
 
 def tick_budget(mission: Mission, plan: Rendezvous) -> int:
-    """Return the default of `max_ticks`: twice T_max, and ample time for phases 1 and 3."""
-    return math.ceil(plan.bound / mission.period) + pair_ticks(mission, plan)
+    """Return the default of `max_ticks`: twice T_max, and ample time for phases 1 and 3.
+
+    With noise, a may miss b and begin again at phase 1, so there is ample time for a second attempt.
+    """
+    attempts = 1 if mission.noise.exact or not plan.a_searches else 2
+    return math.ceil(plan.bound / mission.period) + attempts * pair_ticks(mission, plan)
 
 
 def pair_ticks(mission: Mission, plan: Rendezvous) -> int:

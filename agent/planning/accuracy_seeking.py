@@ -35,7 +35,7 @@ from agent.planning.state import Asleep, Done, RobotState
 from agent.planning.strides import stride
 from protocol.messages import BranchKind, Localised, Observation, Report
 from protocol.mission import Mission, Role
-from protocol.motion import ORIGIN, REST, Controls
+from protocol.motion import ORIGIN, REST, Controls, Pose, inverse
 
 MANOEUVRES = AssuredExact.MANOEUVRES
 """The manoeuvres of the searches for ranges."""
@@ -128,11 +128,12 @@ def _observe(state: RobotState, observation: Observation) -> RobotState:
             return seeking if seeking is not None else _continue_phase1(state)
         case Surveying("anchor"):
             return _continue_phase1(state) if is_planning_tick(state) else state
-        case Homing():
-            if anchor_range is not None:
-                return _continue_phase1(state)
-            arrived = transitions.homing_controls(state) is None
-            return replace(state, mode=Straight("anchor", state.odometry, 0.0)) if arrived else state
+        case Homing() if anchor_range is not None:
+            return _continue_phase1(state)
+        case Homing(_, side) if transitions.homing_controls(state) is None:
+            if side is None:
+                return replace(state, mode=Straight("anchor", state.odometry, 0.0))
+            return replace(state, mode=_next_side(state.mode.place, side, state.config.mission))
         case Aligning() | Radial() | Tangent() | Orbiting():
             return _continue_phase2(state, anchor_range is not None)
         case Surveying("peer") | Listening() | Retreating():
@@ -231,6 +232,21 @@ def _return_to_anchor(state: RobotState) -> RobotState:
     return replace(state, mode=Homing(place), belief=belief)
 
 
+def _begin_again(state: RobotState) -> RobotState:
+    """Drive to where the anchor should be after a missed encounter, and measure phase 1 again there.
+
+    The place of the last range is on the rim of the anchor's range, which a robot misses more easily.
+    """
+    anchor = inverse(state.start)
+    return replace(_return_to_anchor(state), mode=Homing(Pose(anchor.x, anchor.y, 0.0), 0))
+
+
+def _next_side(place: Pose, side: int, mission: Mission) -> Homing:
+    """Return the way along the side after `side` of the spiral on which a robot searches its anchor."""
+    x, y = range_seeking.next_on_spiral((place.x, place.y), side, mission)
+    return Homing(Pose(x, y, 0.0), side + 1)
+
+
 def _start_phase2(state: RobotState) -> RobotState:
     """Start phase 2, for the first time or again."""
     mu = phase2_orbit.orientation(state.local_pose)
@@ -261,7 +277,7 @@ def _continue_phase2(state: RobotState, ranged: bool) -> RobotState:
         since = mode.since or state.tick
         timeout += state.config.rendezvous.bound / mission.period
         if state.orbit.v != 0.0 and state.tick - since > timeout and not state.in_contact:
-            return _return_to_anchor(state)
+            return _begin_again(state) if state.config.begins_again else _return_to_anchor(state)
         if state.orbit.v != 0.0:
             command = phase2_orbit.pursuit(state.local_pose, state.orbit, mission)
         elif planning and state.belief.own:

@@ -6,7 +6,7 @@ import math
 
 import msgspec
 
-from agent.planning.range_seeking import straight, turn
+from agent.planning.range_seeking import next_on_spiral, straight, turn
 from protocol.mission import Mission
 from protocol.motion import Controls, Pose, compose, wrap
 from protocol.orbits import Orbit
@@ -128,12 +128,8 @@ def arrived(mode: Travelling, odometry: Pose, mission: Mission, tolerance: float
 
 
 def next_side(mode: Travelling, mission: Mission) -> Travelling:
-    """Return the next side of the spiral after `mode`. Each second one is longer, by R."""
-    length = (mode.side // 2 + 1) * mission.sensing_range
-    along, sign = mode.side % 2, 1.0 if mode.side % 4 < 2 else -1.0
-    x, y = mode.place
-    place = (x, y + sign * length) if along else (x + sign * length, y)
-    return Travelling(place, mode.side + 1)
+    """Return the next side of the spiral after `mode`."""
+    return Travelling(next_on_spiral(mode.place, mode.side, mission), mode.side + 1)
 
 
 def pursuit(local: Pose, orbit: Orbit, mission: Mission) -> Controls:

@@ -55,9 +55,16 @@ class Circling(msgspec.Struct, frozen=True):
 
 
 class Homing(msgspec.Struct, frozen=True):
-    """The robot has lost its anchor. It drives back to the place of the last anchor range."""
+    """The robot drives back until it measures a range to its anchor, and searches if there is none.
+
+    If it has lost its anchor, it drives to the place of the last range. If it has not met its peer, it drives
+    to where its anchor should be, and searches on a square spiral.
+    """
 
     place: Pose
+    """The place, in the frame of the odometry."""
+    side: int | None = None
+    """The number of sides of the spiral up to this place; None without a spiral."""
 
 
 Seeking = Straight | Backing | Turning | Circling
@@ -143,6 +150,17 @@ def homing_controls(state: Homing, pose: Pose, mission: Mission, tolerance: floa
     if abs(remaining_turn) > tolerance:
         return turn(pose, pose.heading + remaining_turn, mission)
     return straight(distance if forward else -distance, mission)
+
+
+def next_on_spiral(place: tuple[float, float], side: int, mission: Mission) -> tuple[float, float]:
+    """Return the end of the side after `side` of a square spiral, in m, if the latter ends at `place`.
+
+    Each second side is longer, by R.
+    """
+    length = (side // 2 + 1) * mission.sensing_range
+    along, sign = side % 2, 1.0 if side % 4 < 2 else -1.0
+    x, y = place
+    return (x, y + sign * length) if along else (x + sign * length, y)
 
 
 def inside_arc(rho0: float, radius: float, reach: float) -> float:

@@ -22,7 +22,7 @@ The beacon is the robot's own anchor in phase 1 and the peer in phase 3.
 DOING = {
     "asleep": "{robot} has not received an observation yet",
     "third-point": "{robot} drives to where a third range distinguishes its two branches",
-    "homing": "{robot} has left its anchor's range and drives back to where it was last in range",
+    "homing": "{robot} drives back to its anchor, to measure again where it is",
     "aligning": "{robot} turns until it points straight away from its anchor",
     "radial": "{robot} drives along the radius to its orbit",
     "tangent": "{robot} turns from the radius onto its orbit",

@@ -154,9 +154,10 @@ def of_anchor(
     )
 
 
-def missing(ticks: Places, end: int) -> Places:
-    """Return the ticks before `end` that are not among `ticks`."""
+def missing(ticks: Places, end: int, first: int = 0) -> Places:
+    """Return the ticks from `first` on and before `end` that are not among `ticks`."""
     silent = np.ones(end, bool)
+    silent[:first] = False
     silent[ticks] = False
     return np.flatnonzero(silent)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from agent.estimation.gaussian.evidence import anchor_evidence, mutual_evidence
 from agent.estimation.gaussian.fitted import Fit
 from agent.estimation.gaussian.fitted_poses import deviation, poses
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis, missing, of_anchor
-from agent.estimation.gaussian.odometry_noise import Array, Track, track
+from agent.estimation.gaussian.odometry_noise import Array, Track, track, variances
 from agent.estimation.gaussian.own_sensors import DOUBTFUL_CLAIMS, Doubt, claim_doubt, doubt
 from agent.estimation.gaussian.placement_guesses import STARTS
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Ranges
@@ -25,6 +26,7 @@ from agent.peer.motion_log import MotionLog
 from protocol.messages import RobotConfig
 from protocol.mission import HEADING_ACCURACY, Mission
 from protocol.motion import Covariance, Pose, Segment, compose, inverse, wrap
+from protocol.noise import VelocityNoise
 
 
 class PlanningHypothesis(NamedTuple):
@@ -45,42 +47,80 @@ class PlanningHypothesis(NamedTuple):
         return self is other
 
 
-def path_of(log: MotionLog, through: int, period: float) -> Track:
-    """Return the odometry of `log` up to tick `through`."""
-    return _path_of(log.runs, through, period)
+def beginning(knowledge: Knowledge, through: int) -> int:
+    """Return the tick up to `through` from which on the measurements of robot a count: 0, or a later one.
+
+    A robot a that has had no range to its anchor for longer than T_max has searched for b in vain. With its
+    next range it begins phase 1 again. What it has measured before says next to nothing of where it is then:
+    its heading has drifted on the orbit by up to a radian, and over such an angle no fit is linear. Both
+    robots know the tick from a's log. After LEAST_RANGES mutual ranges, a does not begin again.
+    """
+    config = knowledge.config
+    if not config.begins_again:
+        return 0
+    log = knowledge.log if config.role == "a" else knowledge.peer_state.peer
+    if len(knowledge.mutual) >= LEAST_RANGES:
+        through = min(through, knowledge.mutual[LEAST_RANGES - 1].tick)
+    longest = config.rendezvous.bound / config.mission.period
+    ticks = [ranged.tick for ranged in log.ranges if ranged.tick <= through]
+    return max([tick for before, tick in pairwise(ticks) if tick - before > longest], default=0)
+
+
+def _own_beginning(knowledge: Knowledge) -> int:
+    """Return the tick from which on the robot's own measurements count; see `beginning`."""
+    return beginning(knowledge, knowledge.tick) if knowledge.config.role == "a" else 0
+
+
+def path_of(log: MotionLog, first: int, through: int, mission: Mission) -> Track:
+    """Return the odometry of `log` up to tick `through`, as if it had not moved until `first`."""
+    return _path_of(log.runs, first, through, mission.period, mission.noise.odometry)
 
 
 @lru_cache(maxsize=4)
-def _path_of(runs: tuple[Segment, ...], through: int, period: float) -> Track:
+def _path_of(
+    runs: tuple[Segment, ...], first: int, through: int, period: float, noise: VelocityNoise
+) -> Track:
     """Return the path of `path_of`, which robots ask for several times in a tick."""
     ticks = [run.ticks for run in runs]
     v, omega = (
         np.repeat(one, ticks)[:through] for one in ([run.v for run in runs], [run.omega for run in runs])
     )
+    v[:first] = omega[:first] = 0.0
     # -0.0 and 0.0 are the same to the cache
-    return track(v + 0.0, omega + 0.0, period)
+    path = track(v + 0.0, omega + 0.0, period)
+    if first == 0:
+        return path
+    extra = np.zeros((2, len(v)))
+    extra[:, :first] = -variances(v[:first], omega[:first], noise)
+    return path._replace(extra=extra)
 
 
 def own_path(knowledge: Knowledge) -> Track:
     """Return the odometry of the robot up to now."""
-    return path_of(knowledge.log, knowledge.tick, knowledge.config.mission.period)
+    return path_of(knowledge.log, 0, knowledge.tick, knowledge.config.mission)
+
+
+def _own_measurements(knowledge: Knowledge) -> tuple[Track, Ranges]:
+    """Return the odometry of the robot and its ranges to its anchor, of those that count."""
+    mission, now, first = knowledge.config.mission, knowledge.tick, _own_beginning(knowledge)
+    ranges = Ranges.of_lists(_ranges_within(knowledge.log, first, now), (), (), mission.noise)
+    return path_of(knowledge.log, first, now, mission), ranges
 
 
 def own_anchor(knowledge: Knowledge) -> tuple[ScoredHypothesis, ...]:
     """Return the hypotheses about the anchor in the frame of the odometry, the most probable first."""
     mission = knowledge.config.mission
-    path = path_of(knowledge.log, knowledge.tick, mission.period)
-    ranges = Ranges.of_lists(_ranges_until(knowledge.log, knowledge.tick), (), (), mission.noise)
+    path, ranges = _own_measurements(knowledge)
     possible = ranges.within(mission.sensing_range, mission.noise.priors).thinned(mission.noise)
     if not len(possible.rho):
         return ()
-    silent = missing(ranges.tick, knowledge.tick + 1)
+    silent = missing(ranges.tick, knowledge.tick + 1, _own_beginning(knowledge))
     return of_anchor(knowledge.belief.own, path, possible, silent, mission.sensing_range, mission.noise)
 
 
-def _ranges_until(log: MotionLog, through: int) -> list[tuple[int, float]]:
-    """Return tick and range in m of each anchor range of `log` up to tick `through`."""
-    return [(ranged.tick, ranged.range) for ranged in log.ranges if ranged.tick <= through]
+def _ranges_within(log: MotionLog, first: int, through: int) -> list[tuple[int, float]]:
+    """Return tick and range in m of each anchor range of `log` over the ticks [first, through]."""
+    return [(ranged.tick, ranged.range) for ranged in log.ranges if first <= ranged.tick <= through]
 
 
 def sensor_doubt(knowledge: Knowledge) -> Doubt | None:
@@ -90,8 +130,7 @@ def sensor_doubt(knowledge: Knowledge) -> Doubt | None:
     contradiction.
     """
     mission = knowledge.config.mission
-    path = path_of(knowledge.log, knowledge.tick, mission.period)
-    ranges = Ranges.of_lists(_ranges_until(knowledge.log, knowledge.tick), (), (), mission.noise)
+    path, ranges = _own_measurements(knowledge)
     return doubt(
         path,
         ranges.thinned(mission.noise),
@@ -166,8 +205,7 @@ def is_anchor_known(knowledge: Knowledge, scored: Sequence[ScoredHypothesis]) ->
         return False
     if mission.noise.outliers or good >= ANCHOR_RANGES:
         return good >= (ANCHOR_RANGES_WITH_OUTLIERS if mission.noise.outliers else ANCHOR_RANGES)
-    path = path_of(knowledge.log, knowledge.tick, mission.period)
-    ranges = Ranges.of_lists(_ranges_until(knowledge.log, knowledge.tick), (), (), mission.noise)
+    path, ranges = _own_measurements(knowledge)
     possible = ranges.within(mission.sensing_range, mission.noise.priors)
     evidence = anchor_evidence(best.fit, path, possible, mission.sensing_range)
     return evidence >= ANCHOR_EVIDENCE
@@ -237,15 +275,17 @@ def pair_of(knowledge: Knowledge) -> PairRanges:
     logs, ends = ((knowledge.log, peer), (knowledge.tick, last, last))
     if config.role == "b":
         logs, ends = ((peer, knowledge.log), (last, knowledge.tick, last))
-    mutual = [(ranged.tick, ranged.range) for ranged in knowledge.mutual if ranged.tick <= last]
-    lists = [_ranges_until(log, end) for log, end in zip(logs, ends, strict=False)]
+    first = beginning(knowledge, last)
+    firsts = (first, 0, first)
+    mutual = [(one.tick, one.range) for one in knowledge.mutual if first <= one.tick <= last]
+    lists = [_ranges_within(log, *within) for log, *within in zip(logs, firsts, ends, strict=False)]
     ranges = Ranges.of_lists(lists[0], lists[1], mutual, mission.noise)
-    silent = [missing(ranges.tick[ranges.rows(kind)], ends[kind] + 1) for kind in range(3)]
+    silent = [missing(ranges.tick[ranges.rows(kind)], ends[kind] + 1, firsts[kind]) for kind in range(3)]
     ranges = ranges.within(mission.sensing_range, mission.noise.priors).thinned(mission.noise)
     own, other = config.anchor, config.peer_anchor
     sign = 1.0 if config.role == "a" else -1.0
     return PairRanges(
-        (path_of(logs[0], ends[0], mission.period), path_of(logs[1], ends[1], mission.period)),
+        (path_of(logs[0], first, ends[0], mission), path_of(logs[1], 0, ends[1], mission)),
         ranges,
         (silent[0], silent[1], silent[2]),
         (sign * (other.x - own.x), sign * (other.y - own.y)),

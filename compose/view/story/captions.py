@@ -16,7 +16,14 @@ from compose.view.run_data import TickData
 from compose.view.story.caption import Caption, listed
 from compose.view.story.encounter_captions import fitting, meeting, planning
 from compose.view.story.ending_captions import concluding, ending
-from compose.view.story.search_captions import choosing_branch, mirrored, ranging, rules, searching
+from compose.view.story.search_captions import (
+    beginning_again,
+    choosing_branch,
+    mirrored,
+    ranging,
+    rules,
+    searching,
+)
 from protocol.messages import MissionEnd
 
 
@@ -39,6 +46,7 @@ def captions(
         yield from mirrored(pair)
         yield from choosing_branch(pair)
         yield from searching(pair)
+        yield from beginning_again(pair)
         yield from meeting(pair)
         yield from fitting(pair)
         yield from planning(pair)

@@ -100,6 +100,17 @@ def searching(pair: PairData) -> Iterator[Caption]:
         yield Caption("search", _search(pair.robots), pair.ids)
 
 
+def beginning_again(pair: PairData) -> Iterator[Caption]:
+    """Yield which robot has not met its peer on its circle, and drives back to its anchor."""
+    for robot in pair.robots:
+        before, now = pair.commands(robot.id)
+        if before is None or now is None or robot.orbit.v == 0.0:
+            continue
+        if (before.state, now.state) == ("orbiting", "homing"):
+            missed = f"{robot.id} has not met {robot.peer} on its circle."
+            yield Caption("search", f"{missed} It drives back to its anchor to begin again.", pair.ids)
+
+
 def _search(robots: Sequence[RobotSetup]) -> str:
     moving = [robot for robot in robots if robot.orbit.v != 0.0]
     if len(moving) > 1:
