@@ -1,0 +1,243 @@
+"""A robot of a group with noisy sensors that looks for robots without an anchor.
+
+The visitor of a last meeting sweeps a part of the area. The robot that it has visited stays where it is, and is
+its beacon: before each two strips, the sweeping robot passes its own anchor and its beacon. The ranges to both,
+and the odometry between them, are measurements of their meeting like those before its claim, so its pose and the
+covariance of it follow from the fit of that meeting (`GaussianEstimator`). Where it comes into range of a robot
+without an anchor, it reports both, and its odometry from then on, which stay fixed during the contact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from msgspec.structs import asdict, replace
+
+from agent.estimation.gaussian import inference
+from agent.estimation.gaussian.consistency import FINISHED
+from agent.estimation.gaussian.gaussian_estimator import GAUSSIAN
+from agent.estimation.gaussian.hypotheses import follow
+from agent.planning import exchange, group_transitions, sweep, sweep_transitions
+from agent.planning.group import GroupPlanner, with_sender
+from agent.planning.group_state import GroupState, Other, Reference
+from agent.planning.state import Done, RobotState
+from agent.planning.sweep import Looping, Sweeping
+from protocol.messages import Localised, Report, ReportWithReference, RobotConfigWithSweep
+from protocol.motion import Pose, compose, inverse
+from protocol.sweep_strips import CONTACT_TICKS, NEAR, surveyed_path
+
+LINGER = 10
+"""The ticks without a range to robots without an anchor after which a contact with them is over."""
+
+WORTH = 0.9
+"""The largest sigma of the own position with which a robot stops for another one, as a fraction of the accuracy.
+
+The ranges between them add to it: with a larger one, the other robot can make no claim.
+"""
+
+REFIT = 20
+"""The ticks after which the pose is estimated again without further ranges. Its odometry has errors that it knows."""
+
+REFIT_WITH_RANGES = 3
+"""The ticks after which it is estimated again with further ranges."""
+
+MOST_FITS = 4
+"""The most fits in a tick: ranges after a long way move the path further than the steps of one."""
+
+
+class NoisyGroupPlanner(GroupPlanner):
+    """The planner of a robot in a group with noisy sensors, in which some robots have no anchor."""
+
+    def report_to(self, state: GroupState, peer: str) -> Report:
+        """Return the report to `peer`: the log, this robot's verdict, or a reference with the log since then."""
+        if state.sweeps and peer == state.pair.config.peer:
+            return exchange.report(state.pair)
+        if not sweep_transitions.is_helped(state, peer):
+            return super().report_to(state, peer)
+        without_log = exchange.report_without_log(state.pair, state.verdict)
+        reference = state.reference
+        if reference is None:
+            return without_log
+        since = max(reference.tick, min(state.other(peer).acknowledged, state.pair.log.through))
+        part = state.pair.log.after(since, len(state.pair.log.ranges))
+        fields = asdict(without_log) | {"since": since, "through": part.through, "runs": part.runs}
+        return ReportWithReference(
+            **fields, reference=reference.tick, pose=reference.pose, covariance=reference.covariance
+        )
+
+    def decide(self, state: GroupState, reports: Sequence[Report] = ()) -> GroupState:
+        """Return `state` with the `reports` of others, and in the next meeting if this one has ended."""
+        if not state.sweeps:
+            state = super().decide(state, reports)
+            return _begun(state) if state.sweeps else state
+        for one in reports:
+            known = with_sender(state, one).other(one.robot)
+            known = replace(known, acknowledged=max(known.acknowledged, one.heard))
+            state = state.with_other(one.robot, known)
+        of_peer = [one for one in reports if one.has_log and one.robot == state.pair.config.peer]
+        heard = exchange.with_reports(state.pair, of_peer)
+        if heard.verdict is None:
+            state = replace(state, pair=heard)
+        return _onward(_located(state))
+
+
+def _begun(state: GroupState) -> GroupState:
+    """Return `state`, which begins a part of the sweep, on its way; or still, if it is a beacon."""
+    config, pair = state.config, state.pair
+    assert isinstance(config, RobotConfigWithSweep)
+    assert isinstance(state.verdict, Localised)
+    if config.part >= config.sweep.parts:
+        return replace(state, pair=replace(pair, mode=Done(3, state.verdict)))
+    if not pair.belief.pair and state.located is not None:  # after a visit in vain
+        same = {"tick": pair.tick, "odometry": pair.odometry, "log": pair.log, "leg": pair.leg}
+        pair = replace(state.located, **same, mode=pair.mode)
+    state = _located(replace(state, pair=pair, fitted=-1))
+    pair = state.pair
+    part = (config.part + state.parts - 1) % config.sweep.parts
+    anchor = pair.config.anchor
+    beacon = _place_of_peer(pair)
+    path = surveyed_path(
+        config.sweep, part, config.mission.sensing_range, (anchor.x, anchor.y), (beacon.x, beacon.y)
+    )
+    into = inverse(state.frame)
+    ends = [compose(into, Pose(x, y, 0.0)) for x, y in path]
+    mode = Sweeping(tuple([(end.x, end.y) for end in ends]))
+    return replace(state, pair=replace(pair, mode=mode), reference=None)
+
+
+# --- the own pose -------------------------------------------------------------------------------------
+
+
+def _located(state: GroupState) -> GroupState:
+    """Return `state` with the frame and the hypotheses of a new estimate of the pose, if one is due."""
+    pair = state.pair
+    since = pair.tick - state.fitted
+    ranged = bool(pair.log.ranges) and pair.log.ranges[-1].tick == pair.tick
+    ranged |= bool(pair.mutual) and pair.mutual[-1].tick == pair.tick
+    if state.fitted >= 0 and since < (REFIT_WITH_RANGES if ranged else REFIT):
+        return state
+    return _estimated(state)[0]
+
+
+def _estimated(state: GroupState) -> tuple[GroupState, Reference | None]:
+    """Return `state` with a new estimate of the pose, and the pose; None if no hypothesis is left."""
+    pair = state.pair
+    known = pair.belief.pair
+    measured = inference.pair_of(pair)
+    for _ in range(MOST_FITS):
+        scored = follow(known, measured)
+        known = tuple([one.hypothesis for one in scored])
+        if not scored or scored[0].fit.last_step <= FINISHED:
+            break
+    state = replace(state, fitted=pair.tick)
+    if not scored:
+        return state, None
+    hypothesis = inference.pair_planning_hypotheses(scored[:1], measured)[0]
+    m1 = pair.config.anchor if pair.config.role == "a" else pair.config.peer_anchor
+    pose, covariance = inference.claim(hypothesis, 0 if pair.config.role == "a" else 1, measured)
+    pose = Pose(m1.x + pose.x, m1.y + pose.y, pose.heading)
+    frame = compose(pose, inverse(pair.odometry))
+    mode = pair.mode
+    turn = compose(inverse(frame), state.frame)
+    if isinstance(mode, Sweeping):
+        mode = Sweeping(tuple([_moved(turn, place) for place in mode.places]))
+    elif isinstance(mode, Looping):
+        mode = replace(mode, then=tuple([_moved(turn, place) for place in mode.then]))
+    pair = replace(pair, belief=replace(pair.belief, pair=known), mode=mode)
+    return replace(state, pair=pair, frame=frame), Reference(pair.tick, pose, covariance)
+
+
+def _moved(turn: Pose, place: tuple[float, float]) -> tuple[float, float]:
+    moved = compose(turn, Pose(*place, 0.0))
+    return moved.x, moved.y
+
+
+def _place_of_peer(pair: RobotState) -> Pose:
+    """Return the pose in <W> of the peer under the most probable hypothesis."""
+    measured = inference.pair_of(pair)
+    scored = follow(pair.belief.pair, measured)
+    peer = 1 if pair.config.role == "a" else 0
+    m1 = pair.config.anchor if pair.config.role == "a" else pair.config.peer_anchor
+    if not scored:
+        return Pose(pair.config.peer_anchor.x, pair.config.peer_anchor.y, 0.0)
+    x, y, heading = (
+        inference.pair_planning_hypotheses(scored[:1], measured)[0].poses[3 * peer : 3 * peer + 3].tolist()
+    )
+    return Pose(m1.x + x, m1.y + y, heading)
+
+
+# --- contacts -----------------------------------------------------------------------------------------
+
+
+def _onward(state: GroupState) -> GroupState:
+    """Return `state` after a tick of a sweep, or of a contact with robots without an anchor."""
+    state = _with_contact(state)
+    pair, mission = state.pair, state.config.mission
+    mode = pair.mode
+    assert isinstance(mode, Sweeping | Looping)
+    mode = sweep.onward(mode, pair.odometry, mission, GAUSSIAN.pose_tolerance)
+    found = [one for one in _helped(state) if _ticks_since(state, one) <= LINGER]
+    if isinstance(mode, Looping) and pair.tick - mode.since > CONTACT_TICKS:
+        for robot in found:
+            state = state.with_other(robot, replace(state.other(robot), failed=True))
+        found = []
+    along, aside = sweep.FINDER_ALONG * mission.sensing_range, sweep.FINDER_ASIDE * mission.sensing_range
+    match mode:
+        case Sweeping(places) if any(_stops_for(state, one) for one in found):
+            here = (pair.odometry.x, pair.odometry.y)
+            mode = sweep.looping_both_ways(pair.odometry, along, aside, pair.tick, (here, *places))
+        case Looping((), then, since) if found:
+            mode = sweep.looping_both_ways(pair.odometry, along, aside, since, then)
+        case Looping(_, then) if not found:
+            mode = sweep.onward(Sweeping(then), pair.odometry, mission, GAUSSIAN.pose_tolerance)
+    if isinstance(mode, Sweeping) and not mode.places:
+        assert state.verdict is not None
+        ended = replace(state, reference=None, pair=replace(pair, mode=Done(pair.phase, state.verdict)))
+        following = group_transitions.next_visit(ended)
+        return _begun(following) if following.sweeps else following
+    return replace(state, pair=replace(pair, mode=mode))
+
+
+def _with_contact(state: GroupState) -> GroupState:
+    """Return `state` with a reference if a contact has begun in this tick, and without one at its end."""
+    ticks = [_ticks_since(state, one) for one in _helped(state)]
+    if state.reference is None and 0 in ticks:
+        state, reference = _estimated(state)
+        return replace(state, reference=reference)
+    if state.reference is not None and all(since > LINGER for since in ticks):
+        return replace(state, reference=None)
+    return state
+
+
+def _helped(state: GroupState) -> list[str]:
+    """Return the robots without an anchor that are not localised yet, and with which no contact has failed."""
+    config = state.config
+    assert isinstance(config, RobotConfigWithSweep)
+    return [
+        one
+        for one in config.unanchored
+        if sweep_transitions.is_helped(state, one) and not state.other(one).failed
+    ]
+
+
+def _ticks_since(state: GroupState, robot: str) -> int:
+    """Return the number of ticks since the latest range to `robot`; many if there is none."""
+    mutual = state.other(robot).mutual
+    return state.pair.tick - mutual[-1].tick if mutual else LINGER + 1
+
+
+def _stops_for(state: GroupState, robot: str) -> bool:
+    """Return whether this robot stops for `robot`: it has just passed it, and knows its own pose well enough."""
+    reference, mission = state.reference, state.config.mission
+    if reference is None or reference.covariance.position_sigma > WORTH * mission.accuracy:
+        return False
+    return _has_passed(state.other(robot), state.pair.tick, NEAR * mission.sensing_range)
+
+
+def _has_passed(known: Other, tick: int, near: float) -> bool:
+    """Return whether the range to a robot has been at most `near` m, and increases again or is out of reach."""
+    latest = known.mutual[-1]
+    if latest.tick < tick:
+        return latest.range <= near
+    before = [one.range for one in known.mutual[-2:-1] if one.tick == tick - 1]
+    return bool(before) and min(before) <= near and before[0] <= latest.range
