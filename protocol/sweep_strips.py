@@ -45,24 +45,37 @@ left for reports, turns and ticks that are only partly used.
 
 
 NOISY_HALF_WIDTH = 0.65
-"""HALF_WIDTH under noise: the strips are narrower, because a robot may be 0.25 R beside its strip."""
+"""HALF_WIDTH under noise: the strips are narrower, because a robot may drive 0.25 R beside its strip."""
 
-CONTACT_TICKS = 60
-"""The most ticks for which a sweeping robot stops for another one under noise.
+ALONG, ASIDE = 0.6, 0.2
+"""The sides of the rectangles that a robot drives in range of another one under noise, in units of R.
 
-A robot with sigmas of 0.05 m and R = 3 m takes 12 to 30. With less, some are left for a later part of the sweep;
-with more, a robot that cannot be localised holds the other one up for longer.
+The first is along its strip: the ranges from both ends tell where the other robot is, but not on which side
+of the strip. The second tells that.
 """
 
-STRIPS_OF_ROUND = 2
-"""The number of strips after which a robot with noisy sensors passes its anchor and its beacon again.
+OWN_SIDE = 0.2
+"""The side of the squares of a robot without an anchor under noise, in units of R."""
 
-Between them, its pose becomes less accurate. With more, it is too inaccurate at the ends of the strips; with less,
-most of the way leads to the anchor and back.
+NOISY_LOOPS = 2
+"""The pairs of rectangles within which a robot that has been found is localised under noise.
+
+A robot with sigmas of 0.05 m and R = 3 m takes 12 to 30 of their 64 ticks. With less, some are left for a later
+part of the sweep; with more, a robot that cannot be localised holds the other one up for longer.
+"""
+
+ENOUGH_SIGMA, MOST_TIMES = 1.0 / 6.0, 10.0
+"""The sigma of a range from which contacts take longer, in units of the accuracy, and the largest factor."""
+
+STRIPS_OF_ROUND = 2
+"""The number of strips after which a robot with noisy sensors passes anchor and beacon again.
+
+Between them, its pose becomes less accurate. With more, it is too inaccurate at the ends of the strips; with
+less, most of the way leads to the anchor and back.
 """
 
 BESIDE, AROUND = 0.5, 0.6
-"""How a robot passes its anchor or its beacon: so far beside it, from so far before it to as far behind, in R."""
+"""How far beside its anchor or beacon a robot passes, and from how far before to as far behind, in R."""
 
 
 class SweptArea(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
@@ -121,18 +134,21 @@ def surveyed_path(
 ) -> tuple[Place, ...]:
     """Return the way of a robot with noisy sensors through a part of `area`, in m in <W>.
 
-    It passes its `anchor` and a robot that stands at `beacon` before each STRIPS_OF_ROUND strips: from the ranges to
-    both, it knows its pose again.
+    It passes its `anchor` and a robot that stands at `beacon` before each STRIPS_OF_ROUND strips: from the
+    ranges to both, it knows its pose again. The strips nearest to its anchor come first, because its pose
+    becomes more accurate with each round.
     """
     strips = area.path(part, sensing_range, NOISY_HALF_WIDTH)
     passing = (
         *_passed(anchor, anchor, beacon, sensing_range),
         *_passed(beacon, anchor, beacon, sensing_range),
     )
-    found: list[Place] = []
-    for begin in range(0, len(strips), 2 * STRIPS_OF_ROUND):
-        found += [*passing, *strips[begin : begin + 2 * STRIPS_OF_ROUND]]
-    return tuple(found)
+    rounds = [
+        strips[begin : begin + 2 * STRIPS_OF_ROUND] for begin in range(0, len(strips), 2 * STRIPS_OF_ROUND)
+    ]
+    axis = area.across
+    rounds.sort(key=lambda ends: abs(ends[0][axis] - anchor[axis]))
+    return tuple([place for ends in rounds for place in (*passing, *ends)])
 
 
 def _passed(place: Place, begin: Place, end: Place, sensing_range: float) -> tuple[Place, ...]:
@@ -170,3 +186,14 @@ def helping_ticks(mission: Mission) -> int:
     """Return a bound on the ticks for which a sweeping robot stops to localise another one."""
     side = SIDE * mission.sensing_range
     return LOOPS * sweep_ticks([(0.0, 0.0), (side, 0.0), (side, side), (0.0, side), (0.0, 0.0)], mission)
+
+
+def contact_ticks(mission: Mission) -> int:
+    """Return the most ticks for which a sweeping robot stops for another one with noisy sensors.
+
+    The number of ranges that it takes grows with the square of their sigma over the accuracy.
+    """
+    along, aside = ALONG * mission.sensing_range, ASIDE * mission.sensing_range
+    once = sweep_ticks([(0.0, 0.0), (0.0, aside), (along, aside), (along, 0.0), (0.0, 0.0)], mission)
+    sigma = mission.noise.mutual_sigma / (ENOUGH_SIGMA * mission.accuracy)
+    return math.ceil(2 * NOISY_LOOPS * once * min(max(1.0, sigma * sigma), MOST_TIMES))

@@ -1,10 +1,11 @@
 """A robot of a group with noisy sensors that looks for robots without an anchor.
 
-The visitor of a last meeting sweeps a part of the area. The robot that it has visited stays where it is, and is
-its beacon: before each two strips, the sweeping robot passes its own anchor and its beacon. The ranges to both,
-and the odometry between them, are measurements of their meeting like those before its claim, so its pose and the
-covariance of it follow from the fit of that meeting (`GaussianEstimator`). Where it comes into range of a robot
-without an anchor, it reports both, and its odometry from then on, which stay fixed during the contact.
+The visitor of a last meeting sweeps a part of the area. The robot that it has visited stays where it is, and
+is its beacon: before each two strips, the sweeping robot passes its own anchor and its beacon. The ranges to
+both, and the odometry between them, are measurements of their meeting like those before its claim, so its
+pose and the covariance of it follow from the fit of that meeting (`GaussianEstimator`). Where it comes into
+range of a robot without an anchor, it reports both, and its odometry from then on, which stay fixed during
+the contact.
 """
 
 from __future__ import annotations
@@ -24,19 +25,19 @@ from agent.planning.state import Done, RobotState
 from agent.planning.sweep import Looping, Sweeping
 from protocol.messages import Localised, Report, ReportWithReference, RobotConfigWithSweep
 from protocol.motion import Pose, compose, inverse
-from protocol.sweep_strips import CONTACT_TICKS, NEAR, surveyed_path
+from protocol.sweep_strips import ALONG, ASIDE, NEAR, contact_ticks, surveyed_path
 
 LINGER = 10
 """The ticks without a range to robots without an anchor after which a contact with them is over."""
 
 WORTH = 0.9
-"""The largest sigma of the own position with which a robot stops for another one, as a fraction of the accuracy.
+"""The largest sigma of its position with which a robot stops for another one, in units of the accuracy.
 
 The ranges between them add to it: with a larger one, the other robot can make no claim.
 """
 
 REFIT = 20
-"""The ticks after which the pose is estimated again without further ranges. Its odometry has errors that it knows."""
+"""The ticks after which the pose is estimated again without further ranges, by what is known of odometry."""
 
 REFIT_WITH_RANGES = 3
 """The ticks after which it is estimated again with further ranges."""
@@ -49,7 +50,7 @@ class NoisyGroupPlanner(GroupPlanner):
     """The planner of a robot in a group with noisy sensors, in which some robots have no anchor."""
 
     def report_to(self, state: GroupState, peer: str) -> Report:
-        """Return the report to `peer`: the log, this robot's verdict, or a reference with the log since then."""
+        """Return the report to `peer`: the log, the verdict, or a reference with the log since then."""
         if state.sweeps and peer == state.pair.config.peer:
             return exchange.report(state.pair)
         if not sweep_transitions.is_helped(state, peer):
@@ -177,11 +178,11 @@ def _onward(state: GroupState) -> GroupState:
     assert isinstance(mode, Sweeping | Looping)
     mode = sweep.onward(mode, pair.odometry, mission, GAUSSIAN.pose_tolerance)
     found = [one for one in _helped(state) if _ticks_since(state, one) <= LINGER]
-    if isinstance(mode, Looping) and pair.tick - mode.since > CONTACT_TICKS:
+    if isinstance(mode, Looping) and pair.tick - mode.since > contact_ticks(mission):
         for robot in found:
             state = state.with_other(robot, replace(state.other(robot), failed=True))
         found = []
-    along, aside = sweep.FINDER_ALONG * mission.sensing_range, sweep.FINDER_ASIDE * mission.sensing_range
+    along, aside = ALONG * mission.sensing_range, ASIDE * mission.sensing_range
     match mode:
         case Sweeping(places) if any(_stops_for(state, one) for one in found):
             here = (pair.odometry.x, pair.odometry.y)
@@ -210,7 +211,7 @@ def _with_contact(state: GroupState) -> GroupState:
 
 
 def _helped(state: GroupState) -> list[str]:
-    """Return the robots without an anchor that are not localised yet, and with which no contact has failed."""
+    """Return the robots without an anchor that are not localised, and with which no contact has failed."""
     config = state.config
     assert isinstance(config, RobotConfigWithSweep)
     return [
@@ -227,7 +228,7 @@ def _ticks_since(state: GroupState, robot: str) -> int:
 
 
 def _stops_for(state: GroupState, robot: str) -> bool:
-    """Return whether this robot stops for `robot`: it has just passed it, and knows its own pose well enough."""
+    """Return whether this robot stops for `robot`: it has just passed it, and knows its own pose well."""
     reference, mission = state.reference, state.config.mission
     if reference is None or reference.covariance.position_sigma > WORTH * mission.accuracy:
         return False
@@ -235,7 +236,7 @@ def _stops_for(state: GroupState, robot: str) -> bool:
 
 
 def _has_passed(known: Other, tick: int, near: float) -> bool:
-    """Return whether the range to a robot has been at most `near` m, and increases again or is out of reach."""
+    """Return whether the range to a robot has been at most `near` m, and increases or is out of reach."""
     latest = known.mutual[-1]
     if latest.tick < tick:
         return latest.range <= near

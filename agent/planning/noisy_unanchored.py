@@ -1,9 +1,9 @@
 """A robot of a group without an anchor, with noisy sensors: it waits until a localised robot finds it.
 
-That robot, the finder, sends its pose at a reference tick with a covariance, and its odometry from then on. Both
-drive loops in range of each other, and the ranges between them give the pose of this robot (`contact_fit`). It
-claims it when one hypothesis is left, the fit is consistent, and the pose is as accurate as the mission asks. A
-claim rests on the ranges to one finder since one reference tick.
+That robot, the finder, sends its pose at a reference tick with a covariance, and its odometry from then on.
+Both drive loops in range of each other, and the ranges between them give the pose of this robot
+(`contact_fit`). It claims it when one hypothesis is left, the fit is consistent, and the pose is as accurate
+as the mission asks. A claim rests on the ranges to one finder since one reference tick.
 """
 
 from __future__ import annotations
@@ -40,10 +40,7 @@ from protocol.messages import (
 )
 from protocol.mission import Mission
 from protocol.motion import ORIGIN, REST, Covariance, Pose, Segment
-from protocol.sweep_strips import CONTACT_TICKS
-
-KEPT = 2 * CONTACT_TICKS
-"""The number of ticks for which a range is kept, and after which a silent finder is forgotten."""
+from protocol.sweep_strips import OWN_SIDE, contact_ticks
 
 EACH = 3
 """The number of further ranges after which the pose is estimated again.
@@ -129,7 +126,8 @@ class NoisyUnanchoredPlanner(Planner[NoisyUnanchoredState, Report]):
         ranges = dict(state.ranges)
         for one in observation.contacts:
             if one.range is not None:
-                recent = [each for each in ranges.get(one.peer, ()) if each.tick > observation.tick - KEPT]
+                first = observation.tick - _kept(state)
+                recent = [each for each in ranges.get(one.peer, ()) if each.tick > first]
                 ranges[one.peer] = (*recent, Ranged(observation.tick, one.range))
         return replace(state, ranges=ranges)
 
@@ -213,14 +211,21 @@ class NoisyUnanchoredPlanner(Planner[NoisyUnanchoredState, Report]):
         )
 
 
+def _kept(state: NoisyUnanchoredState) -> int:
+    """Return the ticks for which a range is kept, and after which a silent finder is forgotten."""
+    return 2 * contact_ticks(state.config.mission)
+
+
 def _with_reference(state: NoisyUnanchoredState, one: ReportWithReference) -> NoisyUnanchoredState:
     """Return `state` with the reference of a finder and its manoeuvres since then.
 
-    Another finder, or another reference, counts once the present one is silent or older.
+    Another reference of the same finder counts if it is later, and another finder once the present one is
+    silent or too inaccurate.
     """
     known = state.finder
     if known is not None and (known.robot, known.reference) != (one.robot, one.reference):
-        if known.robot != one.robot and known.latest > state.tick - KEPT:
+        accurate = known.covariance.position_sigma <= state.config.mission.accuracy
+        if known.robot != one.robot and accurate and known.latest > state.tick - _kept(state):
             return state
         if known.robot == one.robot and known.reference > one.reference:
             return state
@@ -240,8 +245,8 @@ def _estimated(state: NoisyUnanchoredState) -> NoisyUnanchoredState:
         return state
     sigma = finder.covariance.position_sigma
     if sigma > mission.accuracy:
-        reason = f"{finder.robot} knows its own position to {sigma:.3g} m only, required {mission.accuracy:g}"
-        return replace(state, failure=reason)
+        why = f"{finder.robot} knows its position to {sigma:.3g} m, required {mission.accuracy:g}"
+        return replace(state, failure=why)
     ends = finder.reference, min(finder.log.through, state.tick)
     ranges = tuple(
         [
@@ -279,20 +284,20 @@ def _path(runs: Sequence[Segment], mission: Mission) -> Track:
 
 
 def _moved_on(state: NoisyUnanchoredState) -> NoisyUnanchoredState:
-    """Return `state` after a tick: in a loop while a finder that is accurate enough reports, else standing."""
+    """Return `state` after a tick: in a loop while an accurate finder reports, else standing."""
     finder, mission = state.finder, state.config.mission
     if finder is None:
         return state
-    if finder.latest <= state.tick - KEPT:
+    if finder.latest <= state.tick - _kept(state):
         return replace(state, mode=Standing(), finder=None, found=None)
     if finder.covariance.position_sigma > mission.accuracy:
         return replace(state, mode=Standing())
     mode = state.mode
     if isinstance(mode, Looping):
-        mode = sweep.onward(mode, state.odometry, mission, GAUSSIAN.pose_tolerance)
-        if mode.places:
-            return replace(state, mode=mode)
-    if finder.latest <= state.tick - CONTACT_TICKS // 2:
+        moved = sweep.onward(mode, state.odometry, mission, GAUSSIAN.pose_tolerance)
+        if moved.places and isinstance(moved, Looping):
+            return replace(state, mode=moved)
+    if finder.latest <= state.tick - contact_ticks(mission) // 2:
         return replace(state, mode=Standing())
-    side = sweep.OWN_SIDE * mission.sensing_range
+    side = OWN_SIDE * mission.sensing_range
     return replace(state, mode=sweep.looping_both_ways(state.odometry, side, side, state.tick))

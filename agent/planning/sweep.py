@@ -43,21 +43,13 @@ def looping(odometry: Pose, mission: Mission, since: int, then: tuple[Place, ...
     return Looping((*places[1:], places[0]), then, since)
 
 
-OWN_SIDE = 0.2
-"""The side of the squares of a robot without an anchor under noise, as a fraction of R."""
-
-
-FINDER_ALONG, FINDER_ASIDE = 0.6, 0.2
-"""The sides of the rectangles of the robot that has found it, along its strip and across, as fractions of R."""
-
-
 def looping_both_ways(
     odometry: Pose, along: float, aside: float, since: int, then: tuple[Place, ...] = ()
 ) -> Looping:
     """Return a rectangle behind `odometry`, to its left, and then the same to its right.
 
-    Its sides are `along` and `aside`, in m. In both together, the robot turns as much to the left as to the right,
-    so an error of the scale of its gyro does not add up.
+    Its sides are `along` and `aside`, in m. In both together, the robot turns as much to the left as to the
+    right, so an error of the scale of its gyro does not add up.
     """
     c, s = math.cos(odometry.heading), math.sin(odometry.heading)
     corners = [

@@ -12,9 +12,9 @@ from compose.scenario.scenario_tables import Area, RobotTable, ScenarioFile
 from protocol.mission import Mission, infeasibility
 from protocol.orbits import Orbit, Rendezvous
 from protocol.sweep_strips import (
-    CONTACT_TICKS,
     STRIPS_OF_ROUND,
     SweptArea,
+    contact_ticks,
     helping_ticks,
     surveyed_path,
     sweep_speed,
@@ -136,8 +136,8 @@ def _noisy_sweep(
 ) -> PlannedSweep:
     """Return the search for `unanchored` robots in `area`, in m, after `meetings`, with noisy sensors.
 
-    The visitors of last meetings sweep a part each. The robots that they have visited stay, as their beacons. They
-    come last among the sweepers. Raises Unworkable if the gyros are not good enough for a round.
+    The visitors of last meetings sweep a part each. The robots that they have visited stay, as their beacons.
+    They come last among the sweepers. Raises Unworkable if the gyros are not good enough for a round.
     """
     anchors = {one.id: one.anchor for one in robots if one.anchor is not None}
     places, free = _last_meetings(anchors, meetings)
@@ -154,7 +154,7 @@ def _noisy_sweep(
         if path:
             rounds = math.ceil(len(path) / ENDS_OF_ROUND)
             ticks = LEAVING + aside + sweep_ticks([places[robot], *path], mission)
-            ticks += 2 * rounds * aside + unanchored * CONTACT_TICKS
+            ticks += 2 * rounds * aside + unanchored * contact_ticks(mission)
             _check_gyros(mission, math.ceil(ticks / rounds))
             latest = max(latest, free[robot] + ticks * mission.period)
     return PlannedSweep(sweep, (*finders, *[one for one in anchors if one not in finders]), latest)
@@ -170,8 +170,7 @@ def _check_gyros(mission: Mission, ticks: int) -> None:
     if turned > MOST_TURNED:
         enough = rounded_down(MOST_TURNED / (ticks * mission.period))
         raise Unworkable(
-            f"mission.noise.gyro_bias: within the {ticks * mission.period:.0f} s from one passage of its anchor to "
-            f"the next, a bias of {mission.noise.priors.gyro_bias:g} rad/s turns a robot that looks for robots "
-            f"without an anchor by {turned:.2g} rad, more than {MOST_TURNED:g}: calibrate the gyros to "
-            f"{enough:g} rad/s"
+            f"mission.noise.gyro_bias: within the {ticks * mission.period:.0f} s between two passages of its "
+            f"anchor, a bias of {mission.noise.priors.gyro_bias:g} rad/s turns a robot that sweeps by "
+            f"{turned:.2g} rad, more than {MOST_TURNED:g}: calibrate the gyros to {enough:g} rad/s"
         )

@@ -1,8 +1,8 @@
 """The pose of a robot without an anchor, from noisy ranges to one that is localised.
 
-The other robot, the finder, has sent its pose at a reference tick with a covariance, and its odometry from then
-on. The error of that pose is one unknown of three dimensions with this prior: the odometry of both robots, the
-errors of the ranges and the start of this robot are the other unknowns of one joint fit.
+The other robot, the finder, has sent its pose at a reference tick with a covariance, and its odometry from
+then on. The error of that pose is one unknown of three dimensions with this prior: the odometry of both
+robots, the errors of the ranges and the start of this robot are the other unknowns of one joint fit.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ SAME_LEVEL = 0.05
 
 
 class Contact(NamedTuple):
-    """The measurements of a robot without an anchor and of its finder since the reference tick, which is 0."""
+    """The measurements of a robot without an anchor and of its finder; tick 0 is the reference."""
 
     pose: Pose
     """The pose of the finder at the reference tick, as it has estimated it."""
@@ -103,7 +103,7 @@ def estimated(contact: Contact, mission: Mission) -> ContactEstimate | None:
 
 
 def _measured(contact: Contact, mission: Mission) -> JointMeasurements:
-    """Return the measurements for a joint fit, relative to the position of the finder at the reference tick."""
+    """Return the measurements for a joint fit, relative to the finder's position at the reference tick."""
     noise, ranges = mission.noise, contact.ranges
     count = len(ranges)
     information = np.zeros((6, 6))

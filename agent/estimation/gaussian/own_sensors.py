@@ -137,7 +137,7 @@ def claim_doubt(fitted: Fit, pair: PairRanges) -> Doubt | None:
 
 
 def claim_profiles(noise: Noise) -> list[tuple[ProfileName, Noise]]:
-    """Return the other profiles with which a claim is compared, with the slow errors and strays of `noise`."""
+    """Return the profiles with which a claim is compared, with the slow errors and strays of `noise`."""
     return [
         (name, replace(_profile(name, noise), slow_sigma=noise.slow_sigma, strays=noise.strays))
         for name in _others(noise)
