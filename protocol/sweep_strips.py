@@ -60,8 +60,8 @@ OWN_SIDE = 0.2
 NOISY_LOOPS = 2
 """The pairs of rectangles within which a robot that has been found is localised under noise.
 
-A robot with sigmas of 0.05 m and R = 3 m takes 12 to 30 of their 64 ticks. With less, some are left for a later
-part of the sweep; with more, a robot that cannot be localised holds the other one up for longer.
+A robot with sigmas of 0.05 m and R = 3 m takes 12 to 30 of their 65 ticks. With less, some are left for a
+later part of the sweep; with more, a robot that cannot be localised holds the other one up for longer.
 """
 
 ENOUGH_SIGMA, MOST_TIMES = 1.0 / 6.0, 10.0

@@ -64,6 +64,10 @@ class GroupState(msgspec.Struct, frozen=True):
     """The pose that it reports to robots without an anchor in range, with noisy sensors; None if none is."""
     fitted: int = -1
     """The tick of its latest estimate of its pose while it sweeps, with noisy sensors."""
+    loose: int = -6
+    """The number of its ranges at the latest of these with a large covariance."""
+    searched: int = -100
+    """The tick of the latest of these for a contact."""
     verdict: Verdict | None = None
     """The verdict of the robot: that of the meeting which localised it."""
     failure: Verdict | None = None

@@ -10,14 +10,18 @@ the contact.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from msgspec.structs import asdict, replace
 
 from agent.estimation.gaussian import inference
-from agent.estimation.gaussian.consistency import FINISHED
+from agent.estimation.gaussian.claim_rivals import likeliest_rival
+from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, consistency_test
 from agent.estimation.gaussian.gaussian_estimator import GAUSSIAN
-from agent.estimation.gaussian.hypotheses import follow
+from agent.estimation.gaussian.hypotheses import ScoredHypothesis, follow, search
+from agent.estimation.gaussian.range_model import PairRanges
 from agent.planning import exchange, group_transitions, sweep, sweep_transitions
 from agent.planning.group import GroupPlanner, with_sender
 from agent.planning.group_state import GroupState, Other, Reference
@@ -41,6 +45,12 @@ REFIT = 20
 
 REFIT_WITH_RANGES = 3
 """The ticks after which it is estimated again with further ranges."""
+
+LOOSE = 0.1
+"""The sigma of the position, in units of R, from which on the next few ranges do not determine it."""
+
+RANGES_AGAIN = 6
+"""The number of ranges after which they do: two unknowns, from several sides of the anchor or the beacon."""
 
 MOST_FITS = 4
 """The most fits in a tick: ranges after a long way move the path further than the steps of one."""
@@ -120,22 +130,59 @@ def _located(state: GroupState) -> GroupState:
     return _estimated(state)[0]
 
 
-def _estimated(state: GroupState) -> tuple[GroupState, Reference | None]:
-    """Return `state` with a new estimate of the pose, and the pose; None if no hypothesis is left."""
-    pair = state.pair
-    known = pair.belief.pair
-    measured = inference.pair_of(pair)
+class _Fitted(NamedTuple):
+    """The pose of a sweeping robot from all measurements of its latest meeting, later ones included."""
+
+    scored: tuple[ScoredHypothesis, ...]
+    measured: PairRanges
+    p_value: float
+    """The p-value of the consistency test of the most probable hypothesis; 0 if there is none."""
+
+
+def _fitted(pair: RobotState, *, searched: bool) -> _Fitted:
+    """Return the fit of the hypotheses of `pair`; with a search of the whole plane if they do not explain it.
+
+    `searched` says that it is searched in any case.
+    """
+    measured, known, own = inference.pair_of(pair), pair.belief.pair, _place(pair)
+    scored: tuple[ScoredHypothesis, ...] = ()
     for _ in range(MOST_FITS):
         scored = follow(known, measured)
         known = tuple([one.hypothesis for one in scored])
         if not scored or scored[0].fit.last_step <= FINISHED:
             break
+    found = _Fitted(scored, measured, _p_value(scored, measured, own))
+    if not searched and found.p_value >= CLAIM_P_VALUE and scored[0].fit.last_step <= FINISHED:
+        return found
+    scored = search(measured, known)
+    return _Fitted(scored, measured, _p_value(scored, measured, own))
+
+
+def _p_value(scored: Sequence[ScoredHypothesis], measured: PairRanges, own: int) -> float:
+    return consistency_test(scored[0].fit, measured, own).p_value if scored else 0.0
+
+
+def _place(pair: RobotState) -> int:
+    """Return the place of this robot in the fits of its meeting: 0 in role a, 1 in role b."""
+    return 0 if pair.config.role == "a" else 1
+
+
+def _estimated(state: GroupState, *, searched: bool = False) -> tuple[GroupState, Reference | None]:
+    """Return `state` with a new estimate of the pose, and the pose if a claim of it would be right.
+
+    The conditions are those of pairs: one hypothesis is left, its fit has converged and is consistent, and no
+    poses many sigmas away explain the ranges nearly as well. After a large sigma, the first few ranges leave
+    more than an ellipse describes: the pose does not count until there are RANGES_AGAIN.
+    """
+    pair, mission = state.pair, state.config.mission
+    fitted = _fitted(pair, searched=searched)
+    scored, measured = fitted.scored, fitted.measured
     state = replace(state, fitted=pair.tick)
     if not scored:
         return state, None
     hypothesis = inference.pair_planning_hypotheses(scored[:1], measured)[0]
     m1 = pair.config.anchor if pair.config.role == "a" else pair.config.peer_anchor
-    pose, covariance = inference.claim(hypothesis, 0 if pair.config.role == "a" else 1, measured)
+    pose, covariance = inference.claim(hypothesis, _place(pair), measured)
     pose = Pose(m1.x + pose.x, m1.y + pose.y, pose.heading)
     frame = compose(pose, inverse(pair.odometry))
     mode = pair.mode
@@ -144,8 +191,25 @@ def _estimated(state: GroupState) -> tuple[GroupState, Reference | None]:
         mode = Sweeping(tuple([_moved(turn, place) for place in mode.places]))
     elif isinstance(mode, Looping):
         mode = replace(mode, then=tuple([_moved(turn, place) for place in mode.then]))
+    known = tuple([one.hypothesis for one in scored])
     pair = replace(pair, belief=replace(pair.belief, pair=known), mode=mode)
-    return replace(state, pair=pair, frame=frame), Reference(pair.tick, pose, covariance)
+    loose = state.loose
+    if covariance.position_sigma > LOOSE * mission.sensing_range:
+        loose = len(pair.log.ranges) + len(pair.mutual)
+    state = replace(state, pair=pair, frame=frame, loose=loose)
+    sound = (
+        searched
+        and scored[0].hypothesis.probability >= mission.confidence
+        and scored[0].fit.last_step <= FINISHED
+        and fitted.p_value >= CLAIM_P_VALUE
+        and len(pair.log.ranges) + len(pair.mutual) >= loose + RANGES_AGAIN
+    )
+    if not sound:
+        return state, None
+    rival = likeliest_rival(scored[0].fit, measured, hypothesis, (_place(pair),))
+    if rival.log_likelihood_ratio > math.log1p(-mission.confidence):
+        return state, None
+    return state, Reference(pair.tick, pose, covariance)
 
 
 def _moved(turn: Pose, place: tuple[float, float]) -> tuple[float, float]:
@@ -157,7 +221,7 @@ def _place_of_peer(pair: RobotState) -> Pose:
     """Return the pose in <W> of the peer under the most probable hypothesis."""
     measured = inference.pair_of(pair)
     scored = follow(pair.belief.pair, measured)
-    peer = 1 if pair.config.role == "a" else 0
+    peer = 1 - _place(pair)
     m1 = pair.config.anchor if pair.config.role == "a" else pair.config.peer_anchor
     if not scored:
         return Pose(pair.config.peer_anchor.x, pair.config.peer_anchor.y, 0.0)
@@ -202,9 +266,9 @@ def _onward(state: GroupState) -> GroupState:
 def _with_contact(state: GroupState) -> GroupState:
     """Return `state` with a reference if a contact has begun in this tick, and without one at its end."""
     ticks = [_ticks_since(state, one) for one in _helped(state)]
-    if state.reference is None and 0 in ticks:
-        state, reference = _estimated(state)
-        return replace(state, reference=reference)
+    if state.reference is None and 0 in ticks and state.pair.tick - state.searched > LINGER:
+        state, reference = _estimated(state, searched=True)
+        return replace(state, reference=reference, searched=state.pair.tick)
     if state.reference is not None and all(since > LINGER for since in ticks):
         return replace(state, reference=None)
     return state

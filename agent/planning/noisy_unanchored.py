@@ -25,7 +25,7 @@ from agent.planning import exchange, sweep
 from agent.planning.phase3_last_manoeuvre import Standing
 from agent.planning.planner import Planner, Summary
 from agent.planning.state import MODE_NAMES
-from agent.planning.sweep import Looping
+from agent.planning.sweep import Looping, Sweeping
 from protocol.messages import (
     Command,
     Estimate,
@@ -41,6 +41,9 @@ from protocol.messages import (
 from protocol.mission import Mission
 from protocol.motion import ORIGIN, REST, Covariance, Pose, Segment
 from protocol.sweep_strips import OWN_SIDE, contact_ticks
+
+SWEEPING = MODE_NAMES[Sweeping]
+"""The mode of a localised robot that looks for robots without an anchor."""
 
 EACH = 3
 """The number of further ranges after which the pose is estimated again.
@@ -151,6 +154,9 @@ class NoisyUnanchoredPlanner(Planner[NoisyUnanchoredState, Report]):
         for one in reports:
             if isinstance(one, ReportWithReference):
                 state = _with_reference(state, one)
+            elif state.finder is None and one.state == SWEEPING:
+                why = f"{one.robot} has passed it, and does not know its own pose well enough"
+                state = replace(state, failure=why)
         state = _estimated(state)
         return _moved_on(state) if state.verdict is None else state
 
