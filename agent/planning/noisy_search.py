@@ -78,7 +78,7 @@ class NoisyGroupPlanner(GroupPlanner):
 
     def decide(self, state: GroupState, reports: Sequence[Report] = ()) -> GroupState:
         """Return `state` with the `reports` of others, and in the next meeting if this one has ended."""
-        if not state.sweeps:
+        if not (state.sweeps or _is_beacon(state)):
             state = super().decide(state, reports)
             return _begun(state) if state.sweeps else state
         for one in reports:
@@ -87,13 +87,22 @@ class NoisyGroupPlanner(GroupPlanner):
             state = state.with_other(one.robot, known)
         of_peer = [one for one in reports if one.has_log and one.robot == state.pair.config.peer]
         heard = exchange.with_reports(state.pair, of_peer)
-        if heard.verdict is None:
+        if heard.verdict == state.pair.verdict:
             state = replace(state, pair=heard)
-        return _onward(_located(state))
+        return _onward(_located(state)) if state.sweeps else state
+
+
+def _is_beacon(state: GroupState) -> bool:
+    """Return whether this robot stays where it is: it sweeps no part, and its planned meetings are over."""
+    config = state.config
+    assert isinstance(config, RobotConfigWithSweep)
+    if config.part < config.sweep.parts or state.visits < len(config.visits):
+        return False
+    return isinstance(state.pair.verdict, Localised) and isinstance(state.verdict, Localised)
 
 
 def _begun(state: GroupState) -> GroupState:
-    """Return `state`, which begins a part of the sweep, on its way; or still, if it is a beacon."""
+    """Return `state`, which begins a part of the sweep, on its way; or still, if it sweeps none."""
     config, pair = state.config, state.pair
     assert isinstance(config, RobotConfigWithSweep)
     assert isinstance(state.verdict, Localised)
