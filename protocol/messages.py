@@ -530,6 +530,11 @@ class ReportWithReference(Report, frozen=True):
     covariance: Covariance = Covariance(1.0, 0.0, 0.0, 1.0, 0.0, 1.0)
     """The covariance of the error of `pose`."""
 
+    @property
+    def has_log(self) -> bool:
+        """Return False: the two are in no meeting."""
+        return False
+
 
 class PlannerReport(Message, frozen=True):
     """A report whose content only the planners of the two robots understand."""

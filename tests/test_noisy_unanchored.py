@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import tomli_w
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
@@ -37,6 +39,7 @@ from protocol.motion import REST, Controls, Covariance, Pose, Segment, step, wra
 from protocol.noise import Noise
 from protocol.sweep_strips import SweptArea, contact_ticks, surveyed_path, sweep_speed
 from protocol.wire import MAX_REPORT_BYTES, decode, encode
+from tests.commands import tandem as tandem_command
 from tests.groups import R, localised
 from tests.test_audit import kept
 from tests.test_group_runs import audited
@@ -307,7 +310,8 @@ def met(sigma: float, ticks: int = 40) -> Any:
     """Return the state of a robot after a contact with a finder whose position has this sigma, in m."""
     planner, pose = NoisyUnanchoredPlanner(), Pose(5.0, 4.0, 0.7)
     finder, driven = Pose(6.5, 5.0, 0.2), [(v, omega) for v, omega in FINDER * 8]
-    state, executed, runs = planner.start(config()), None, []
+    state, executed = planner.start(config()), None
+    runs: list[Segment] = []
     covariance = Covariance(0.5 * sigma**2, 0.0, 0.0, 0.5 * sigma**2, 0.0, 1e-4)
     told = finder
     for tick in range(ticks):
@@ -376,3 +380,26 @@ def test_a_contact_is_longer_where_ranges_are_less_accurate() -> None:
     assert sweep_speed(MISSION) == 1.0
     noise = replace(MISSION.noise, mutual_sigma=0.1)
     assert contact_ticks(replace(MISSION, noise=noise)) >= 3.9 * contact_ticks(MISSION)
+
+
+# --- processes ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+def test_processes_that_are_killed_write_the_same_journals_and_each_command_shows_them(
+    tmp_path: Path,
+) -> None:
+    table = four(name="four")
+    table["mission"] |= {"noise": NOISE, "accuracy": 0.3}
+    scenario = tmp_path / "four.toml"
+    scenario.write_text(tomli_w.dumps(table), encoding="utf-8")
+    kills = ["--kill", "a@90", "--kill", "u@100", "--kill", "world@70"]
+    for name, more in (("processes", []), ("killed", kills), ("inline", ["--in-process"])):
+        done = tandem_command("run", str(scenario), "--out", str(tmp_path / name), *more)
+        assert done.status == 0, done.err
+    for journal in (tmp_path / "inline").glob("*.journal"):
+        for other in ("processes", "killed"):
+            assert journal.read_bytes() == (tmp_path / other / journal.name).read_bytes()
+    for command in (["audit"], ["replay"], ["figures"], ["export"], ["export", "--rerun"]):
+        done = tandem_command(command[0], str(tmp_path / "inline"), *command[1:])
+        assert done.status == 0, done.err
