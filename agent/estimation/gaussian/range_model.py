@@ -166,7 +166,10 @@ class Ranges(NamedTuple):
         It bounds the cost of a tick. Which of the older ones are left changes only when their number doubles.
         """
         correlated = noise.odometry != VelocityNoise() or noise.priors.slow_sigma > 0.0
-        most = MOST_RANGES if correlated else MOST_RANGES_BY_EXACT_ODOMETRY
+        return self.at_most(MOST_RANGES if correlated else MOST_RANGES_BY_EXACT_ODOMETRY)
+
+    def at_most(self, most: int) -> Ranges:
+        """Return at most so many of each kind: the latest half of them, and some older ones."""
         if max(self.counts) <= most:
             return self
         left = np.zeros(len(self.rho), np.bool)
