@@ -63,8 +63,8 @@ NORMAL_RATIO = -0.5 * WRONG_SIGMAS**2
 MOST_WIDENED = 2.5
 """The factor by which a covariance is widened at the most, so that it covers the likelihood of its rivals.
 
-In a group whose fit was right, it was 1.6. With less, fewer robots are found in the first sweep; with more, the
-ellipse has little to do with the likelihood.
+In a group whose fit was right, it was 1.6. With less, fewer robots are found in the first sweep; with more,
+the ellipse has little to do with the likelihood.
 """
 
 TINY = 1e-6
