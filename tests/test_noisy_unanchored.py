@@ -384,6 +384,8 @@ def test_malformed_references_are_refused() -> None:
     flat = Covariance(1.0, 2.0, 0.0, 1.0, 0.0, 1.0)
     assert not is_definite(flat)
     assert planner.malformed(replace(good, covariance=flat)) is not None
+    tiny = Covariance(1e-300, 0.0, 0.0, 1e-300, 0.0, 1e-300)
+    assert planner.malformed(replace(good, covariance=tiny)) is not None
     assert planner.malformed(replace(good, reference=good.since + 1)) is not None
 
 

@@ -42,6 +42,9 @@ FINDER, OWN = 0, 1
 HOLDING = 1e-3
 """The sigma with which a coordinate of a rival is held, as a fraction of its distance from the claim."""
 
+SMALLEST = 1e-12
+"""The smallest eigenvalue of a covariance that is accepted, as a fraction of its largest one."""
+
 SAME_LEVEL = 0.05
 """The relative change of the noise level below which a fit is not repeated with it."""
 
@@ -81,9 +84,12 @@ def matrix(covariance: Covariance) -> Array:
 
 
 def is_definite(covariance: Covariance) -> bool:
-    """Return whether the covariance of a report is one: positive definite, as far as rounding shows it."""
+    """Return whether the covariance of a report is positive definite, and can be inverted."""
     values = matrix(covariance)
-    return bool(np.all(np.isfinite(values))) and float(np.linalg.eigvalsh(values)[0]) > 0.0
+    if not np.all(np.isfinite(values)):
+        return False
+    least, _, most = np.linalg.eigvalsh(values).tolist()
+    return bool(least > max(SMALLEST * most, SMALLEST**2))
 
 
 def estimated(contact: Contact, mission: Mission) -> ContactEstimate | None:
