@@ -51,8 +51,11 @@ LOOSE = 0.1
 RANGES_AGAIN = 6
 """The number of ranges after which they do: two unknowns, from several sides of the anchor or the beacon."""
 
-MOST_WEIGHED = 64
-"""The most ranges of a kind that a fit weighs.
+MOST_WEIGHED = 48
+"""The most ranges of a kind after the claim of the meeting that a fit weighs; those before it all count.
+
+Only in the meeting both robots moved. Without its ranges, the beacon and its mirror image about the line
+between the anchors explain all others, and the pose is ambiguous again.
 
 A beacon that stands still has hundreds, which tell nothing new. With fewer, passages of an anchor count less.
 """
@@ -133,7 +136,7 @@ def _begun(state: GroupState) -> GroupState:
     pair = state.pair
     part = (config.part + state.parts - 1) % config.sweep.parts
     anchor = pair.config.anchor
-    beacon = _place_of_peer(pair)
+    beacon = _place_of_peer(state)
     path = surveyed_path(
         config.sweep, part, config.mission.sensing_range, (anchor.x, anchor.y), (beacon.x, beacon.y)
     )
@@ -166,12 +169,12 @@ class _Fitted(NamedTuple):
     """The p-value of the consistency test of the most probable hypothesis; 0 if there is none."""
 
 
-def _fitted(pair: RobotState, *, searched: bool) -> _Fitted:
-    """Return the fit of the hypotheses of `pair`; with a search of the whole plane if they do not explain it.
+def _fitted(state: GroupState, *, searched: bool) -> _Fitted:
+    """Return the fit of the latest meeting; with a search of the whole plane if they do not explain it.
 
     `searched` says that it is searched in any case.
     """
-    measured = _measured(pair)
+    pair, measured = state.pair, _measured(state)
     found = _followed(pair.belief.pair, measured, _place(pair))
     if not searched and found.p_value >= CLAIM_P_VALUE and found.scored[0].fit.last_step <= FINISHED:
         return found
@@ -192,10 +195,11 @@ def _followed(known: tuple[Hypothesis, ...], measured: PairRanges, own: int) -> 
     return _Fitted(scored, measured, p_value)
 
 
-def _measured(pair: RobotState) -> PairRanges:
-    """Return the measurements of the meeting of `pair`, later ones included, with fewer ranges."""
-    measured = inference.pair_of(pair)
-    return replace(measured, ranges=measured.ranges.at_most(MOST_WEIGHED))
+def _measured(state: GroupState) -> PairRanges:
+    """Return the measurements of the latest meeting: all until its claim, and some of the later ranges."""
+    measured = inference.pair_of(state.pair)
+    claimed = state.located.tick if state.located is not None else -1
+    return replace(measured, ranges=measured.ranges.thinned_after(claimed, MOST_WEIGHED))
 
 
 def _place(pair: RobotState) -> int:
@@ -212,7 +216,7 @@ def _estimated(state: GroupState, *, searched: bool = False) -> tuple[GroupState
     it says as much; if they are far likelier, the pose does not count either.
     """
     pair, mission = state.pair, state.config.mission
-    fitted = _fitted(pair, searched=searched)
+    fitted = _fitted(state, searched=searched)
     scored, measured = fitted.scored, fitted.measured
     state = replace(state, fitted=pair.tick)
     if not scored:
@@ -260,9 +264,9 @@ def _moved(turn: Pose, place: tuple[float, float]) -> tuple[float, float]:
     return moved.x, moved.y
 
 
-def _place_of_peer(pair: RobotState) -> Pose:
+def _place_of_peer(state: GroupState) -> Pose:
     """Return the pose in <W> of the peer under the most probable hypothesis."""
-    measured = _measured(pair)
+    pair, measured = state.pair, _measured(state)
     scored = follow(pair.belief.pair, measured)
     peer = 1 - _place(pair)
     m1 = pair.config.anchor if pair.config.role == "a" else pair.config.peer_anchor
