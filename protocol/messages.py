@@ -19,7 +19,7 @@ RobotConfig    world -> robot                         once, in answer to the rob
                                                       own kind
 Observation    world -> robot                         every tick
 Report         robot -> its peer                      every tick in which the two are in contact; with a
-                                                      pose, its own kind
+                                                      pose or a reference, its own kind
 PlannerReport  robot -> its peer                      in place of Report, by planners with own reports
 Command        robot -> world                         every tick
 Estimate       robot -> viewers                       every tick
@@ -526,6 +526,26 @@ class ReportWithPose(Report, frozen=True):
     """The sender's pose at tick k in <W>: m, m and rad."""
 
 
+class ReportWithReference(Report, frozen=True):
+    """The report of a localised robot to one without an anchor, with noisy sensors.
+
+    Its log begins at the reference tick, which stays the same while the two are in contact. So the error of
+    the pose at that tick is one unknown, which counts once.
+    """
+
+    reference: Tick = 0
+    """The tick of `pose`; `since` is not before it."""
+    pose: Pose = ORIGIN
+    """The sender's estimate of its pose at that tick in <W>: m, m and rad."""
+    covariance: Covariance = Covariance(1.0, 0.0, 0.0, 1.0, 0.0, 1.0)
+    """The covariance of the error of `pose`."""
+
+    @property
+    def has_log(self) -> bool:
+        """Return False: the two are in no meeting."""
+        return False
+
+
 class PlannerReport(Message, frozen=True):
     """A report whose content only the planners of the two robots understand."""
 
@@ -541,7 +561,7 @@ class PlannerReport(Message, frozen=True):
     """The content, in msgpack: the value that `Planner.report` returns."""
 
 
-PeerReport = Report | ReportWithPose | PlannerReport
+PeerReport = Report | ReportWithPose | ReportWithReference | PlannerReport
 """The messages from a robot to its peer."""
 
 
@@ -682,6 +702,7 @@ OfRobot = (
     | Observation
     | Report
     | ReportWithPose
+    | ReportWithReference
     | PlannerReport
     | Command
     | Estimate

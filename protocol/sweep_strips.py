@@ -44,6 +44,40 @@ left for reports, turns and ticks that are only partly used.
 """
 
 
+NOISY_HALF_WIDTH = 0.65
+"""HALF_WIDTH under noise: the strips are narrower, because a robot may drive 0.25 R beside its strip."""
+
+ALONG, ASIDE = 0.6, 0.2
+"""The sides of the rectangles that a robot drives in range of another one under noise, in units of R.
+
+The first is along its strip: the ranges from both ends tell where the other robot is, but not on which side
+of the strip. The second tells that.
+"""
+
+OWN_SIDE = 0.2
+"""The side of the squares of a robot without an anchor under noise, in units of R."""
+
+NOISY_LOOPS = 2
+"""The pairs of rectangles within which a robot that has been found is localised under noise.
+
+A robot with sigmas of 0.05 m and R = 3 m takes 12 to 30 of their 65 ticks. With less, some are left for a
+later part of the sweep; with more, a robot that cannot be localised holds the other one up for longer.
+"""
+
+ENOUGH_SIGMA, MOST_TIMES = 1.0 / 6.0, 10.0
+"""The sigma of a range from which contacts take longer, in units of the accuracy, and the largest factor."""
+
+STRIPS_OF_ROUND = 2
+"""The number of strips after which a robot with noisy sensors passes anchor and beacon again.
+
+Between them, its pose becomes less accurate. With more, it is too inaccurate at the ends of the strips; with
+less, most of the way leads to the anchor and back.
+"""
+
+BESIDE, AROUND = 0.5, 0.6
+"""How far beside its anchor or beacon a robot passes, and from how far before to as far behind, in R."""
+
+
 class SweptArea(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """The parts of an area that robots sweep, one each."""
 
@@ -77,22 +111,60 @@ class SweptArea(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fie
         """The axis across the strips: 0 for x, 1 for y."""
         return 1 if self.x_max - self.x_min >= self.y_max - self.y_min else 0
 
-    def path(self, part: int, sensing_range: float) -> tuple[Place, ...]:
+    def path(self, part: int, sensing_range: float, half_width: float = HALF_WIDTH) -> tuple[Place, ...]:
         """Return the ends of the strips of a part, in m in <W>, in the order in which they are driven.
 
-        Every point of the area is within HALF_WIDTH R of the middle line of a strip. The numbers of strips of
-        two parts differ by at most 1; a part may have none.
+        Every point of the area is within `half_width` R of the middle line of a strip. The numbers of strips
+        of two parts differ by at most 1; a part may have none.
         """
         low, high = (self.x_min, self.y_min), (self.x_max, self.y_max)
         aside, along = self.across, 1 - self.across
         width = high[aside] - low[aside]
-        count = max(1, math.ceil(width / (2.0 * HALF_WIDTH * sensing_range)))
+        count = max(1, math.ceil(width / (2.0 * half_width * sensing_range)))
         found: list[Place] = []
         for i in range(count * part // self.parts, count * (part + 1) // self.parts):
             middle = low[aside] + (i + 0.5) * width / count
             ends = (low[along], high[along]) if i % 2 == 0 else (high[along], low[along])
             found += [(end, middle) if along == 0 else (middle, end) for end in ends]
         return tuple(found)
+
+
+def surveyed_path(
+    area: SweptArea, part: int, sensing_range: float, anchor: Place, beacon: Place
+) -> tuple[Place, ...]:
+    """Return the way of a robot with noisy sensors through a part of `area`, in m in <W>.
+
+    It passes its `anchor` and a robot that stands at `beacon` before each STRIPS_OF_ROUND strips: from the
+    ranges to both, it knows its pose again. The strips nearest to its anchor come first, because its pose
+    becomes more accurate with each round.
+    """
+    strips = area.path(part, sensing_range, NOISY_HALF_WIDTH)
+    passing = (
+        *_passed(anchor, anchor, beacon, sensing_range),
+        *_passed(beacon, anchor, beacon, sensing_range),
+    )
+    rounds = [
+        strips[begin : begin + 2 * STRIPS_OF_ROUND] for begin in range(0, len(strips), 2 * STRIPS_OF_ROUND)
+    ]
+    axis = area.across
+    rounds.sort(key=lambda ends: abs(ends[0][axis] - anchor[axis]))
+    return tuple([place for ends in rounds for place in (*passing, *ends)])
+
+
+def _passed(place: Place, begin: Place, end: Place, sensing_range: float) -> tuple[Place, ...]:
+    """Return the places of a bent way past `place`, in the direction from `begin` to `end`."""
+    apart = math.dist(begin, end)
+    ux, uy = ((end[0] - begin[0]) / apart, (end[1] - begin[1]) / apart) if apart > 0.0 else (1.0, 0.0)
+    ways = ((-AROUND, 0.0), (0.0, BESIDE), (AROUND, 0.0))
+    return tuple(
+        [
+            (
+                place[0] + sensing_range * (along * ux - aside * uy),
+                place[1] + sensing_range * (along * uy + aside * ux),
+            )
+            for along, aside in ways
+        ]
+    )
 
 
 def sweep_speed(mission: Mission) -> float:
@@ -114,3 +186,14 @@ def helping_ticks(mission: Mission) -> int:
     """Return a bound on the ticks for which a sweeping robot stops to localise another one."""
     side = SIDE * mission.sensing_range
     return LOOPS * sweep_ticks([(0.0, 0.0), (side, 0.0), (side, side), (0.0, side), (0.0, 0.0)], mission)
+
+
+def contact_ticks(mission: Mission) -> int:
+    """Return the most ticks for which a sweeping robot stops for another one with noisy sensors.
+
+    The number of ranges that it takes grows with the square of their sigma over the accuracy.
+    """
+    along, aside = ALONG * mission.sensing_range, ASIDE * mission.sensing_range
+    once = sweep_ticks([(0.0, 0.0), (0.0, aside), (along, aside), (along, 0.0), (0.0, 0.0)], mission)
+    sigma = mission.noise.mutual_sigma / (ENOUGH_SIGMA * mission.accuracy)
+    return math.ceil(2 * NOISY_LOOPS * once * min(max(1.0, sigma * sigma), MOST_TIMES))

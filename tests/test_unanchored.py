@@ -261,10 +261,6 @@ def test_a_changed_scenario_keeps_its_robots_without_an_anchor() -> None:
             r"mission.area: it must be \[x_min, y_min, x_max, y_max\]",
         ),
         (
-            lambda table: table["mission"].update(noise={"anchor_sigma": 0.05}),
-            r"robot\[2\]: missing field 'anchor': with mission.noise, each robot needs one",
-        ),
-        (
             lambda table: table["mission"].update(safety_distance=0.3),
             r"mission.safety_distance: there is a robot without an anchor",
         ),

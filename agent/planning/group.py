@@ -105,7 +105,7 @@ class GroupPlanner(Planner[GroupState, Report]):
     def decide(self, state: GroupState, reports: Sequence[Report] = ()) -> GroupState:
         """Return `state` with the `reports` of others, and in the next meeting if this one has ended."""
         for one in reports:
-            state = _with_sender(state, one)
+            state = with_sender(state, one)
         logs = [one for one in reports if one.has_log]
         state = group_transitions.answering(state, [one.robot for one in logs if one.state == TRAVELLING])
         peer, before = state.pair.config.peer, state.pair
@@ -120,7 +120,7 @@ class GroupPlanner(Planner[GroupState, Report]):
             frame = compose(pair.verdict.pose, inverse(pair.odometry))
             known = replace(state.other(peer), localised=True)
             verdict = pair.verdict if state.verdict is None else state.verdict
-            state = replace(state.with_other(peer, known), frame=frame, verdict=verdict)
+            state = replace(state.with_other(peer, known), frame=frame, verdict=verdict, located=pair)
         refusals = [one for one in reports if one.robot == peer and not one.has_log]
         if (
             pair.verdict is None
@@ -176,7 +176,7 @@ class GroupPlanner(Planner[GroupState, Report]):
         return self.pair_planner.required_mutual_ranges(mission)
 
 
-def _with_sender(state: GroupState, report: Report) -> GroupState:
+def with_sender(state: GroupState, report: Report) -> GroupState:
     """Return `state` with what `report` says about its sender: whether it travels, and is localised."""
     known, travels = state.other(report.robot), report.state == TRAVELLING
     localised = known.localised or travels or (not report.has_log and isinstance(report.verdict, Localised))

@@ -11,7 +11,7 @@ from agent.planning.passing import Bypass
 from agent.planning.state import RobotState
 from agent.planning.sweep import Looping, Sweeping
 from protocol.messages import Ranged, RobotConfigInGroup, Verdict
-from protocol.motion import ORIGIN, Pose
+from protocol.motion import ORIGIN, Covariance, Pose
 
 
 class Other(msgspec.Struct, frozen=True):
@@ -27,6 +27,18 @@ class Other(msgspec.Struct, frozen=True):
     """True if it drives to another robot, by its latest report. It counts only with a safety distance."""
     missed: int | None = None
     """The latest tick in which this robot has not found it where it should wait; None if there is none."""
+    acknowledged: int = 0
+    """The last tick of this robot's manoeuvres that it has acknowledged, if it has no anchor."""
+
+
+class Reference(msgspec.Struct, frozen=True):
+    """The pose of a sweeping robot with noisy sensors as it has estimated it when a contact began."""
+
+    tick: int
+    pose: Pose
+    """The pose at `tick` in <W>."""
+    covariance: Covariance
+    """The covariance of the error of `pose`."""
 
 
 class GroupState(msgspec.Struct, frozen=True):
@@ -46,6 +58,16 @@ class GroupState(msgspec.Struct, frozen=True):
     """The time in s at which the search of a retry ends; None if there is none."""
     visiting: bool = False
     """True if the present meeting is a visit: the robot knows its pose already."""
+    located: RobotState | None = None
+    """The state in the latest meeting in which the robot was localised, at its claim."""
+    reference: Reference | None = None
+    """The pose that it reports to robots without an anchor in range, with noisy sensors; None if none is."""
+    fitted: int = -1
+    """The tick of its latest estimate of its pose while it sweeps, with noisy sensors."""
+    loose: int = -6
+    """The number of its ranges at the latest of these with a large covariance."""
+    searched: int = -100
+    """The tick of the latest of these for a contact."""
     verdict: Verdict | None = None
     """The verdict of the robot: that of the meeting which localised it."""
     failure: Verdict | None = None

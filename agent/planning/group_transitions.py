@@ -71,7 +71,7 @@ def refused(state: GroupState, robot: str) -> bool:
 def after_refusal(state: GroupState) -> GroupState:
     """Return `state` of a robot whose peer has ended their meeting, because it contradicts what it knows."""
     if state.visiting:
-        return _next_visit(_after_meeting(state))
+        return next_visit(_after_meeting(state))
     failure = Undecided(f"{state.config.peer} does not go on with the meeting")
     return _resumed(_after_meeting(replace(state, failure=failure)))
 
@@ -92,23 +92,23 @@ def onward(state: GroupState, *, peer_has_left: bool = False) -> GroupState:
     if state.sweeps:
         swept = sweep_transitions.onward(state)
         done = Done(pair.phase, state.verdict)
-        return swept or _next_visit(replace(state, pair=replace(pair, mode=done)))
+        return swept or next_visit(replace(state, pair=replace(pair, mode=done)))
     if state.visiting and pair.verdict is None:
         if state.other(peer).localised:  # by another robot
-            return _next_visit(state)
+            return next_visit(state)
         if _has_searched(state):
             known = replace(state.other(peer), missed=pair.tick)
-            return _next_visit(state.with_other(peer, known))
+            return next_visit(state.with_other(peer, known))
         if state.silence > SILENT_AFTER:
-            return _next_visit(_after_meeting(state))
+            return next_visit(_after_meeting(state))
         return state
     if not isinstance(pair.mode, Done) or _must_linger(state):
         return state
     if not isinstance(pair.verdict, Localised):
         reported = state.lingering > 0 or not pair.in_contact  # to the peer, before this robot leaves
-        return _next_visit(_after_meeting(state)) if reported else state
+        return next_visit(_after_meeting(state)) if reported else state
     over = peer_has_left or pair.peer_state.verdict is not None or state.unmet >= PARTED_AFTER
-    return _next_visit(state) if over else state
+    return next_visit(state) if over else state
 
 
 def _after_failure(state: GroupState) -> GroupState:
@@ -208,7 +208,7 @@ def _aligned(state: GroupState) -> GroupState:
     return replace(state, pair=transitions.continue_phase2(pair, Aligning(pair.odometry.heading - mu)))
 
 
-def _next_visit(state: GroupState) -> GroupState:
+def next_visit(state: GroupState) -> GroupState:
     """Return `state` on the way to the next robot; as it is if there is none.
 
     After the planned visits, and after its part of a sweep, it is the nearest one that should be localised by

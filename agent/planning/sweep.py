@@ -43,6 +43,24 @@ def looping(odometry: Pose, mission: Mission, since: int, then: tuple[Place, ...
     return Looping((*places[1:], places[0]), then, since)
 
 
+def looping_both_ways(
+    odometry: Pose, along: float, aside: float, since: int, then: tuple[Place, ...] = ()
+) -> Looping:
+    """Return a rectangle behind `odometry`, to its left, and then the same to its right.
+
+    Its sides are `along` and `aside`, in m. In both together, the robot turns as much to the left as to the
+    right, so an error of the scale of its gyro does not add up.
+    """
+    c, s = math.cos(odometry.heading), math.sin(odometry.heading)
+    corners = [
+        (x, side * aside * y)
+        for side in (1.0, -1.0)
+        for x, y in ((0.0, 1.0), (-along, 1.0), (-along, 0.0), (0.0, 0.0))
+    ]
+    places = [(odometry.x + c * x - s * y, odometry.y + s * x + c * y) for x, y in corners]
+    return Looping(tuple(places), then, since)
+
+
 def controls(mode: Sweeping | Looping, odometry: Pose, mission: Mission, tolerance: float) -> Controls | None:
     """Return the controls to the next place, at most with the speed of a sweep; None if there is no place.
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from compose.errors import UserError
 from compose.launch.class_loader import named
-from protocol.messages import RobotConfig, RobotConfigInGroup, RobotConfigWithoutAnchor
+from protocol.messages import RobotConfig, RobotConfigInGroup, RobotConfigWithoutAnchor, RobotConfigWithSweep
 from protocol.mission import Mission
 from protocol.orbits import RENDEZVOUS, Rendezvous, rendezvous
 from protocol.spelling import did_you_mean
@@ -90,13 +90,17 @@ def unguarded_planner_of(config: RobotConfig) -> Planner[Any, Any]:
         return found
     from agent.planning.assured import AssuredExact  # noqa: PLC0415  # it imports numpy
     from agent.planning.group import GroupPlanner  # noqa: PLC0415  # likewise
+    from agent.planning.noisy_search import NoisyGroupPlanner  # noqa: PLC0415  # likewise
+    from agent.planning.noisy_unanchored import NoisyUnanchoredPlanner  # noqa: PLC0415  # likewise
     from agent.planning.unanchored import UnanchoredPlanner  # noqa: PLC0415  # likewise
 
+    exact = config.mission.noise.exact
     if isinstance(config, RobotConfigWithoutAnchor):
-        return UnanchoredPlanner()
+        return UnanchoredPlanner() if exact else NoisyUnanchoredPlanner()
     if not isinstance(found, AssuredExact):
         raise UserError(f"robots with the planner {name} meet in pairs, not in a group")
-    return GroupPlanner(found)
+    searches = isinstance(config, RobotConfigWithSweep) and not exact
+    return NoisyGroupPlanner(found) if searches else GroupPlanner(found)
 
 
 def is_for_groups(name: str) -> bool:

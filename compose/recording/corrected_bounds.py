@@ -15,7 +15,15 @@ import msgspec
 
 from compose.recording.run import Run
 from protocol.orbits import meeting_ticks
-from protocol.sweep_strips import Place, helping_ticks, sweep_speed, sweep_ticks
+from protocol.sweep_strips import (
+    Place,
+    SweptArea,
+    contact_ticks,
+    helping_ticks,
+    surveyed_path,
+    sweep_speed,
+    sweep_ticks,
+)
 from world.scenario import Scenario
 
 SEARCHED = 42.0
@@ -81,9 +89,19 @@ def _sweeps_ticks(scenario: Scenario, tour: int) -> int:
     area, mission = scenario.planned_sweep.sweep, scenario.mission
     way = _longest_way([*_anchors(scenario), *area.corners])
     step = sweep_speed(mission) * mission.period
-    ticks = math.ceil(way / step) + tour + len(scenario.unanchored) * helping_ticks(mission)
-    parts = [area.path(part, mission.sensing_range) for part in range(area.parts)]
+    stop = helping_ticks(mission) if mission.noise.exact else contact_ticks(mission)
+    ticks = math.ceil(way / step) + tour + len(scenario.unanchored) * stop
+    parts = [_longest_path(area, part, scenario, way) for part in range(area.parts)]
     return sum([ticks + sweep_ticks(path, mission) for path in parts])
+
+
+def _longest_path(area: SweptArea, part: int, scenario: Scenario, way: float) -> tuple[Place, ...]:
+    """Return the way through a part of the area; with noisy sensors, with beacons as far as `way` m."""
+    reach = scenario.mission.sensing_range
+    if scenario.mission.noise.exact:
+        return area.path(part, reach)
+    x, y = area.corners[0]
+    return surveyed_path(area, part, reach, (x, y), (x + way, y))
 
 
 def _anchors(scenario: Scenario) -> list[Place]:

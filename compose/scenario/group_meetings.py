@@ -86,7 +86,7 @@ def group_meetings(robots: Sequence[RobotTable], mission: Mission, planner: Plan
     plan = group_plan(anchors, pair_time, mission.max_speed, meeting_ticks(mission) * mission.period)
     turned = mission.noise.priors.gyro_bias * plan.bound
     if not mission.noise.exact and turned > MOST_TURNED:
-        enough = _rounded_down(MOST_TURNED / plan.bound)
+        enough = rounded_down(MOST_TURNED / plan.bound)
         raise Unworkable(
             f"mission.noise.gyro_bias: within the {plan.bound:.0f} s of the plan, a bias of "
             f"{mission.noise.priors.gyro_bias:g} rad/s turns a robot by {turned:.2g} rad, more than "
@@ -112,7 +112,7 @@ def group_meetings(robots: Sequence[RobotTable], mission: Mission, planner: Plan
     return GroupMeetings(planned, first, plan.bound, tuple(retries), begins)
 
 
-def _rounded_down(value: float) -> float:
+def rounded_down(value: float) -> float:
     """Return the positive `value` rounded down to two digits."""
     unit = 10.0 ** (math.floor(math.log10(value)) - 1)
     return math.floor(value / unit) * unit

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 
 from compose.errors import BadScenario, Unworkable
-from compose.scenario.group_meetings import FirstMeeting, GroupMeetings
+from compose.scenario.group_meetings import MOST_TURNED, FirstMeeting, GroupMeetings, rounded_down
 from compose.scenario.scenario_tables import Area, RobotTable, ScenarioFile
 from protocol.mission import Mission, infeasibility
 from protocol.orbits import Orbit, Rendezvous
-from protocol.sweep_strips import SweptArea, helping_ticks, sweep_speed, sweep_ticks
-from world.scenario import PlannedSweep
+from protocol.sweep_strips import (
+    STRIPS_OF_ROUND,
+    SweptArea,
+    contact_ticks,
+    helping_ticks,
+    surveyed_path,
+    sweep_speed,
+    sweep_ticks,
+)
+from world.scenario import PlannedMeeting, PlannedSweep
 
 LEAVING = 10
 """The bound on the ticks after a meeting until a robot goes on (see `group_transitions.PARTED_AFTER`)."""
@@ -34,11 +42,6 @@ def check_unanchored(file: ScenarioFile, source: str) -> None:
         where = f"{source}: group.without_anchor"
     if len(file.robot) - len(missing) < 2:
         raise BadScenario(f"{where}: at least two robots of a group need one")
-    if not file.mission.noise.exact:
-        raise Unworkable(
-            f"{where}: with mission.noise, each robot needs one, because robots do not compute how "
-            "inaccurate their poses become on the way to others"
-        )
     if file.mission.safety_distance:
         raise Unworkable(
             f"{source}: mission.safety_distance: there is a robot without an anchor, and robots that sweep "
@@ -82,7 +85,8 @@ def with_sweep(
     why = infeasibility(mission, max([math.dist(*two) for two in combinations(places, 2)]))
     if why is not None:
         raise Unworkable(f"mission.area: {why}")
-    planned = _planned_sweep(robots, len(unanchored), area, mission, meetings)
+    plan = _planned_sweep if mission.noise.exact else _noisy_sweep
+    planned = plan(robots, len(unanchored), area, mission, meetings)
     still = Orbit(0.0, 0.0, 0.0)
     waiting = FirstMeeting(planned.sweepers[0], "b", Rendezvous(still, still, planned.ends))
     return meetings._replace(
@@ -102,10 +106,7 @@ def _planned_sweep(
     across the strips, so that their ways do not cross.
     """
     anchors = {one.id: one.anchor for one in robots if one.anchor is not None}
-    places, free = dict(anchors), dict.fromkeys(anchors, 0.0)
-    for meeting in meetings.planned:
-        for robot in (meeting.visitor, meeting.visited):
-            places[robot], free[robot] = anchors[meeting.visited], meeting.ends
+    places, free = _last_meetings(anchors, meetings)
     sweep = SweptArea(*area, len(anchors))
     sweepers = sorted(places, key=lambda robot: places[robot][sweep.across])
     aside = math.ceil(ASIDE * mission.sensing_range / (sweep_speed(mission) * mission.period))
@@ -117,3 +118,59 @@ def _planned_sweep(
             ticks += unanchored * helping_ticks(mission)
             latest = max(latest, free[robot] + ticks * mission.period)
     return PlannedSweep(sweep, tuple(sweepers), latest)
+
+
+def _last_meetings(
+    anchors: Mapping[str, tuple[float, float]], meetings: GroupMeetings
+) -> tuple[dict[str, tuple[float, float]], dict[str, float]]:
+    """Return the place (m) of the last meeting of each robot, and the time (s) at which it ends."""
+    places, free = dict(anchors), dict.fromkeys(anchors, 0.0)
+    for meeting in meetings.planned:
+        for robot in (meeting.visitor, meeting.visited):
+            places[robot], free[robot] = anchors[meeting.visited], meeting.ends
+    return places, free
+
+
+def _noisy_sweep(
+    robots: Sequence[RobotTable], unanchored: int, area: Area, mission: Mission, meetings: GroupMeetings
+) -> PlannedSweep:
+    """Return the search for `unanchored` robots in `area`, in m, after `meetings`, with noisy sensors.
+
+    The visitors of last meetings sweep a part each. The robots that they have visited stay, as their beacons.
+    They come last among the sweepers. Raises Unworkable if the gyros are not good enough for a round.
+    """
+    anchors = {one.id: one.anchor for one in robots if one.anchor is not None}
+    places, free = _last_meetings(anchors, meetings)
+    last: dict[str, PlannedMeeting] = {}
+    for meeting in meetings.planned:
+        last[meeting.visitor] = last[meeting.visited] = meeting
+    finders = [robot for robot, one in last.items() if one.visitor == robot and last[one.visited] is one]
+    sweep = SweptArea(*area, len(finders))
+    finders.sort(key=lambda robot: places[robot][sweep.across])
+    aside = math.ceil(ASIDE * mission.sensing_range / (sweep_speed(mission) * mission.period))
+    latest = 0.0
+    for part, robot in enumerate(finders):
+        path = surveyed_path(sweep, part, mission.sensing_range, anchors[robot], places[robot])
+        if path:
+            rounds = math.ceil(len(path) / ENDS_OF_ROUND)
+            ticks = LEAVING + aside + sweep_ticks([places[robot], *path], mission)
+            ticks += 2 * rounds * aside + unanchored * contact_ticks(mission)
+            _check_gyros(mission, math.ceil(ticks / rounds))
+            latest = max(latest, free[robot] + ticks * mission.period)
+    return PlannedSweep(sweep, (*finders, *[one for one in anchors if one not in finders]), latest)
+
+
+ENDS_OF_ROUND = 6 + 2 * STRIPS_OF_ROUND
+"""The number of places in a round of `surveyed_path`."""
+
+
+def _check_gyros(mission: Mission, ticks: int) -> None:
+    """Raise Unworkable if a bias of the gyros turns a robot too far within the `ticks` of a round."""
+    turned = mission.noise.priors.gyro_bias * ticks * mission.period
+    if turned > MOST_TURNED:
+        enough = rounded_down(MOST_TURNED / (ticks * mission.period))
+        raise Unworkable(
+            f"mission.noise.gyro_bias: within the {ticks * mission.period:.0f} s between two passages of its "
+            f"anchor, a bias of {mission.noise.priors.gyro_bias:g} rad/s turns a robot that sweeps by "
+            f"{turned:.2g} rad, more than {MOST_TURNED:g}: calibrate the gyros to {enough:g} rad/s"
+        )

@@ -50,7 +50,7 @@ def blocking_reason(
         return f"{many} has probability {certainty.probability:.6f}, required {sure:g}"
     if fit.last_step > FINISHED:
         return "the fit of the most probable hypothesis has not converged"
-    free = max(fit.inliers - fit.poses.size, 1)
+    free = fit.freedom
     if chi2_p_value(fit.chi2 / HIGHEST_LEVEL, free) < CLAIM_P_VALUE:
         return f"the residuals are too large: chi-square {fit.chi2:.3g} for {free} degrees of freedom"
     own = ranges.of(robot)

@@ -90,6 +90,11 @@ class JointFit(NamedTuple):
         """The number of ranges that are more probably inliers than outliers."""
         return int(np.count_nonzero(self.weights > INLIER))
 
+    @property
+    def freedom(self) -> int:
+        """The degrees of freedom of `chi2`, at least 1."""
+        return max(self.inliers - self.problem.free, 1)
+
     def places(self, robot: int, ticks: Places) -> Array:
         """Return the position (m, relative to the origin) of a robot at `ticks`; shape (2, N)."""
         x, y, heading = self.start.poses[robot]
@@ -134,7 +139,7 @@ def joint_fit(measured: JointMeasurements, start: JointStart, steps: int = STEPS
         if problem.robust and step == 0:
             weights = weights_by_errors(point.residuals, np.sqrt(problem.loosened(linear)), noise)
         variance = weighted_variance(sigma, weights)
-        system = _solved(problem, linear, problem.covariance(linear, variance))
+        system = _solved(problem, point, linear, problem.covariance(linear, variance))
         updated = _inlier_probabilities(system, weights, sigma, noise) if problem.robust else weights
         length = _length(problem, system, weights)
         before = length if step == 0 else before
@@ -149,11 +154,17 @@ def joint_fit(measured: JointMeasurements, start: JointStart, steps: int = STEPS
     raise AssertionError("the last step returns")
 
 
-def _solved(problem: JointProblem, linear: JointLinearModel, covariance: JointCovariance) -> _System:
+def _solved(
+    problem: JointProblem, point: JointPoint, linear: JointLinearModel, covariance: JointCovariance
+) -> _System:
     poses = 3 * len(problem.lengths)
     weighted = covariance.solve(np.column_stack((linear.columns, linear.innovation)))
     products = linear.columns.T @ weighted
     information, gradient = products[:, :-1], products[:, -1]
+    if (prior := problem.prior) is not None:
+        off = (prior.mean - point.poses).ravel()
+        information[:poses, :poses] += prior.information
+        gradient[:poses] += prior.information @ off
     diagonal = np.einsum("ii->i", information)
     diagonal[:poses] += RIDGE + RIDGE * diagonal[:poses]
     diagonal[poses:] += 1.0
@@ -162,6 +173,8 @@ def _solved(problem: JointProblem, linear: JointLinearModel, covariance: JointCo
     multipliers = weighted[:, -1] - weighted[:, :-1] @ solution
     of_poses = inverse_of(inverse[:poses, :poses])
     chi2 = max(float(linear.innovation @ multipliers), 0.0)
+    if prior is not None:
+        chi2 = max(chi2 + float(off @ prior.information @ (off - solution[:poses])), 0.0)
     return _System(
         covariance, weighted, information, inverse, gradient, solution, of_poses, multipliers, chi2
     )
@@ -181,7 +194,7 @@ def _length(problem: JointProblem, system: _System, weights: Array) -> float:
     """Return the length of a step of the start poses, in sigmas."""
     poses = 3 * len(problem.lengths)
     change = system.solution[:poses]
-    level = noise_level(system.chi2, int(np.count_nonzero(weights > INLIER)) - poses, problem.noise)
+    level = noise_level(system.chi2, int(np.count_nonzero(weights > INLIER)) - problem.free, problem.noise)
     return math.sqrt(abs(float(change @ system.of_poses @ change)) / level)
 
 
@@ -229,7 +242,7 @@ def _fit(
 ) -> JointFit:
     """Return the fit that has ended at `point`, with the linear model of the point `begun`."""
     robots, size = len(problem.lengths), 3 * len(problem.lengths)
-    freedom = int(np.count_nonzero(weights > INLIER)) - size
+    freedom = int(np.count_nonzero(weights > INLIER)) - problem.free
     level = noise_level(system.chi2, freedom, problem.noise)
     if problem.noise.sigma_degrees:
         ranges = problem.ranges
@@ -327,7 +340,7 @@ def _evidence(problem: JointProblem, point: JointPoint, system: _System, weights
     volume = system.covariance.log_determinant + float(np.linalg.slogdet(system.information)[1])
     volume -= float(np.sum(np.log(weighted_variance(sigma, weights)[~good])))
     weight = -0.5 * (volume + math.log(2.0 * math.pi) * count)
-    weight += misfit_log_likelihood(system.chi2, count - point.poses.size, noise)
+    weight += misfit_log_likelihood(system.chi2, count - problem.free, noise)
     if noise.outliers or noise.strays:
         weight += count * math.log1p(-noise.outliers - noise.strays)
         soft = SOFT * noise.outlier_bias[0] if noise.outliers else 0.0

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from agent.estimation.gaussian.joint_covariance import JointCovariance, joint_covariance
-from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges
+from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges, PosePrior
 from agent.estimation.gaussian.linear_model import LEAST_VARIANCE
 from agent.estimation.gaussian.odometry_noise import (
     Array,
@@ -108,6 +108,8 @@ class JointProblem(NamedTuple):
     """The covariance (m^2) of the slow errors of the ranges; None without them."""
     blocks: tuple[tuple[slice, Places], ...]
     """The rows of each robot: those of its ranges to anchors, and the others among those between robots."""
+    prior: PosePrior | None = None
+    """The prior of the start poses; None: they are unknown."""
 
     @staticmethod
     def of(measured: JointMeasurements) -> JointProblem:
@@ -143,7 +145,13 @@ class JointProblem(NamedTuple):
             ranges.single.common_errors(noise.priors),
             ranges.single.slow_errors(noise.priors, measured.period),
             tuple(blocks),
+            measured.prior,
         )
+
+    @property
+    def free(self) -> int:
+        """The number of unknowns of the start poses that only the ranges determine."""
+        return 3 * len(self.lengths) - (self.prior.rank if self.prior is not None else 0)
 
     @property
     def robust(self) -> bool:
@@ -169,6 +177,9 @@ class JointProblem(NamedTuple):
         correction = (sizes.constant[:, None, :] @ flat).reshape(robots, 2, k) + sizes.white
         of_white = np.square(sizes.white) / np.maximum(self.variances, LEAST_VARIANCE)
         cost = float(np.sum(np.square(sizes.common)) + np.sum(np.square(sizes.constant)) + np.sum(of_white))
+        if self.prior is not None:
+            off = (self.prior.mean - poses).ravel()
+            cost += float(off @ self.prior.information @ off)
         path = corrected(self.measured, correction, self.period, self.slip)
         ranges, every = self.ranges, np.arange(len(self.ranges.rho))
         two = ranges.second >= 0

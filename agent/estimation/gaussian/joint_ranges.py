@@ -74,6 +74,17 @@ class JointRanges(msgspec.Struct, frozen=True, dict=True, eq=False):
         return involved
 
 
+class PosePrior(NamedTuple):
+    """A normal prior of the poses of n robots at tick 0."""
+
+    mean: Array
+    """The expected x and y (m, relative to the origin) and heading (rad) of each robot; shape (n, 3)."""
+    information: Array
+    """The inverse covariance; 0 for what is not known; shape (3 n, 3 n)."""
+    rank: int
+    """The rank of `information`: the number of unknowns that it determines."""
+
+
 class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
     """The odometry and the ranges of n robots."""
 
@@ -90,6 +101,8 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
     origin: tuple[float, float]
     """The point of <W> (m) to which all positions are relative, so that they have small numbers."""
     noise: Noise
+    prior: PosePrior | None = None
+    """What is known of the poses at tick 0 besides the ranges; None: nothing."""
 
     def until(self, tick: int) -> JointMeasurements:
         """Return what was measured up to `tick`."""

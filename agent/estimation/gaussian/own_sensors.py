@@ -126,8 +126,7 @@ def claim_doubt(fitted: Fit, pair: PairRanges) -> Doubt | None:
     noise = pair.noise
     told = _evidence(fitted)
     others = {}
-    for name in _others(noise):
-        other = replace(_profile(name, noise), slow_sigma=noise.slow_sigma, strays=noise.strays)
+    for name, other in claim_profiles(noise):
         begun = [rescaled(errors, noise, other) for errors in fitted.errors]
         for steps in (0, STEPS):
             again = fit(fitted.guess, pair.paths, pair.ranges, other, pair.apart, steps, begun)
@@ -135,6 +134,14 @@ def claim_doubt(fitted: Fit, pair: PairRanges) -> Doubt | None:
             if others[name] < DOUBTFUL_CLAIM - ONE_MODEL_ERROR:
                 break
     return _best(BOTH, others, DOUBTFUL_CLAIM)
+
+
+def claim_profiles(noise: Noise) -> list[tuple[ProfileName, Noise]]:
+    """Return the profiles with which a claim is compared, with the slow errors and strays of `noise`."""
+    return [
+        (name, replace(_profile(name, noise), slow_sigma=noise.slow_sigma, strays=noise.strays))
+        for name in _others(noise)
+    ]
 
 
 def _explains(name: ProfileName, pair: PairRanges, robot: int) -> bool:

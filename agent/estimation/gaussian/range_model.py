@@ -167,16 +167,21 @@ class Ranges(NamedTuple):
         """
         correlated = noise.odometry != VelocityNoise() or noise.priors.slow_sigma > 0.0
         most = MOST_RANGES if correlated else MOST_RANGES_BY_EXACT_ODOMETRY
-        if max(self.counts) <= most:
-            return self
-        left = np.zeros(len(self.rho), np.bool)
+        return self if max(self.counts) <= most else self.thinned_after(-1, most)
+
+    def thinned_after(self, tick: int, most: int) -> Ranges:
+        """Return all ranges up to `tick`, and at most `most` of each kind after it, mostly recent ones."""
+        left = self.tick <= tick
         for kind in range(3):
-            rows, older = left[self.rows(kind)], self.counts[kind] - most // 2
-            if self.counts[kind] <= most:
+            rows = left[self.rows(kind)]
+            begin, count = int(np.count_nonzero(rows)), len(rows)
+            older = count - most // 2
+            if count - begin <= most:
                 rows[:] = True
                 continue
             rows[older:] = True
-            rows[: older : 2 ** math.ceil(math.log2(older / (most - most // 2)))] = True
+            step = 2 ** math.ceil(math.log2((older - begin) / (most - most // 2)))
+            rows[begin:older:step] = True
         return self._only(left)
 
     def _only(self, some: NDArray[np.bool]) -> Ranges:

@@ -1,0 +1,246 @@
+"""The pose of a robot without an anchor, from noisy ranges to one that is localised.
+
+The other robot, the finder, has sent its pose at a reference tick with a covariance, and its odometry from
+then on. The error of that pose is one unknown of three dimensions with this prior: the odometry of both
+robots, the errors of the ranges and the start of this robot are the other unknowns of one joint fit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from msgspec.structs import replace
+
+from agent.estimation.gaussian.beacon_guesses import beacon_guesses
+from agent.estimation.gaussian.claim_rivals import WRONG_SIGMAS
+from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, EARLY_CLAIM_P_VALUE
+from agent.estimation.gaussian.fitted_poses import deviation
+from agent.estimation.gaussian.joint_claims import blocking_reason
+from agent.estimation.gaussian.joint_fit import JointFit, JointStart, joint_fit
+from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges, PosePrior
+from agent.estimation.gaussian.joint_search import (
+    JointHypotheses,
+    JointHypothesis,
+    certainties,
+    with_probability,
+)
+from agent.estimation.gaussian.known_anchors import FEWEST, AnchoredRobot, chi2_p_value, scored_fits
+from agent.estimation.gaussian.linear_model import Start
+from agent.estimation.gaussian.odometry_noise import Array, Errors, Track
+from agent.estimation.gaussian.own_sensors import DOUBTFUL_CLAIM, claim_profiles
+from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges
+from protocol.messages import Ranged
+from protocol.mission import Mission
+from protocol.motion import Covariance, Pose, wrap
+
+FINDER, OWN = 0, 1
+"""The places of the two robots in a fit."""
+
+HOLDING = 1e-3
+"""The sigma with which a coordinate of a rival is held, as a fraction of its distance from the claim."""
+
+SMALLEST = 1e-12
+"""The smallest eigenvalue of a covariance that is accepted, as a fraction of its largest one."""
+
+SAME_LEVEL = 0.05
+"""The relative change of the noise level below which a fit is not repeated with it."""
+
+
+class Contact(NamedTuple):
+    """The measurements of a robot without an anchor and of its finder; tick 0 is the reference."""
+
+    pose: Pose
+    """The pose of the finder at the reference tick, as it has estimated it."""
+    covariance: Covariance
+    """The covariance of the error of `pose`."""
+    finder: Track
+    """The odometry of the finder, as far as it is known."""
+    own: Track
+    """The odometry of this robot up to now."""
+    ranges: tuple[Ranged, ...]
+    """The ranges between the two at ticks that both paths have."""
+
+
+class ContactEstimate(NamedTuple):
+    """The poses of a robot without an anchor that are possible now, the most probable first."""
+
+    poses: tuple[Pose, ...]
+    probabilities: tuple[float, ...]
+    covariance: Covariance
+    """The covariance of the first pose."""
+    blocking_reason: str
+    """The first condition for a claim that is not met; empty if all are."""
+    p_value: float
+    """The p-value of the consistency test of the most probable pose."""
+
+
+def matrix(covariance: Covariance) -> Array:
+    """Return a covariance as a matrix, (3, 3)."""
+    xx, xy, xh, yy, yh, hh = (getattr(covariance, name) for name in covariance.__struct_fields__)
+    return np.array(((xx, xy, xh), (xy, yy, yh), (xh, yh, hh)))
+
+
+def is_definite(covariance: Covariance) -> bool:
+    """Return whether the covariance of a report is positive definite, and can be inverted."""
+    values = matrix(covariance)
+    if not np.all(np.isfinite(values)):
+        return False
+    least, _, most = np.linalg.eigvalsh(values).tolist()
+    return bool(least > max(SMALLEST * most, SMALLEST**2))
+
+
+def estimated(contact: Contact, mission: Mission) -> ContactEstimate | None:
+    """Return the possible poses of this robot; None if there are too few ranges, or no pose explains them."""
+    measured = _measured(contact, mission)
+    if len(measured.ranges.rho) < FEWEST:
+        return None
+    fits = [joint_fit(measured, start) for start in _starts(measured, mission)]
+    found = with_probability(fits)
+    if not found:
+        return None
+    level = found[0].fit.level
+    if abs(level - 1.0) > SAME_LEVEL:  # the level is that of these measurements, not of the finder's pose
+        measured = _with_level(measured, level)
+        found = with_probability([joint_fit(measured, one.fit.start) for one in found])
+    return _estimate(found, measured, mission)
+
+
+def _measured(contact: Contact, mission: Mission) -> JointMeasurements:
+    """Return the measurements for a joint fit, relative to the finder's position at the reference tick."""
+    noise, ranges = mission.noise, contact.ranges
+    count = len(ranges)
+    information = np.zeros((6, 6))
+    information[:3, :3] = np.linalg.inv(matrix(contact.covariance))
+    mean = np.zeros((2, 3))
+    mean[FINDER, 2] = contact.pose.heading
+    measured = JointMeasurements(
+        ("finder", "own"),
+        (),
+        (("finder", "own"),),
+        (contact.finder, contact.own),
+        JointRanges(
+            np.array([one.range for one in ranges], np.float64),
+            np.array([one.tick for one in ranges], np.intp),
+            np.full(count, max(noise.mutual_sigma, SIGMA_FLOOR)),
+            np.zeros(count, np.intp),
+            np.ones(count, np.intp),
+            np.zeros((count, 2)),
+            np.zeros(count, np.intp),
+        ),
+        mission.period,
+        (contact.pose.x, contact.pose.y),
+        noise,
+        PosePrior(mean, information, 3),
+    )
+    return measured.thinned(mission.sensing_range)
+
+
+def _starts(measured: JointMeasurements, mission: Mission) -> list[JointStart]:
+    """Return the poses from which fits begin: intersections of the circles about the finder's places."""
+    ranges, path, prior = measured.ranges, measured.paths[FINDER], measured.prior
+    assert prior is not None
+    c, s = math.cos(prior.mean[FINDER, 2]), math.sin(prior.mean[FINDER, 2])
+    x, y = path.x[ranges.tick], path.y[ranges.tick]
+    place = np.stack((c * x - s * y, s * x + c * y), 1)
+    as_anchors = Ranges(
+        ranges.rho, ranges.tick, ranges.sigma, (len(ranges.rho), 0, 0), place, np.zeros(len(x), np.intp)
+    )
+    robot = AnchoredRobot(measured.paths[OWN], as_anchors, mission.sensing_range, measured.noise)
+    starts = []
+    for one in scored_fits(robot, [Start(guess) for guess in beacon_guesses(robot)]):
+        mx, my, turn = one.fit.guess.tolist()
+        c, s = math.cos(turn), math.sin(turn)
+        poses = np.stack((prior.mean[FINDER], (-(c * mx - s * my), -(s * mx + c * my), turn)))
+        nothing = Errors(np.zeros(0), np.zeros(0), np.zeros(0))
+        starts.append(JointStart(poses, (nothing, one.fit.errors[0] if one.fit.errors else nothing)))
+    return starts
+
+
+def _with_level(measured: JointMeasurements, level: float) -> JointMeasurements:
+    """Return `measured` with the prior in units of the noise level, by which the result is multiplied."""
+    prior = measured.prior
+    assert prior is not None
+    return replace(measured, prior=prior._replace(information=level * prior.information))
+
+
+# --- claims -----------------------------------------------------------------------------------------------
+
+
+def _estimate(
+    found: Sequence[JointHypothesis], measured: JointMeasurements, mission: Mission
+) -> ContactEstimate:
+    best = found[0].fit
+    mine = slice(3 * OWN, 3 * OWN + 3)
+    covariance = best.covariance[mine, mine]
+    poses = [one.fit.poses[OWN].tolist() for one in found]
+    p_value = chi2_p_value(best.chi2, best.freedom)
+    xx, xy, xh, yy, yh, hh = [float(covariance[i, j]) for i in range(3) for j in range(i, 3)]
+    return ContactEstimate(
+        tuple([Pose(measured.origin[0] + x, measured.origin[1] + y, wrap(turn)) for x, y, turn in poses]),
+        tuple([one.probability for one in found]),
+        Covariance(xx, xy, xh, yy, yh, hh),
+        _reason(found, measured, mission),
+        p_value,
+    )
+
+
+def _reason(found: Sequence[JointHypothesis], measured: JointMeasurements, mission: Mission) -> str:
+    """Return the first condition for a claim that is not met: those of pairs and of joint estimates."""
+    joint = JointHypotheses((FINDER, OWN), tuple(found))
+    own = certainties(joint)[OWN]
+    reach, accuracy = mission.sensing_range, mission.accuracy
+    reason = blocking_reason(OWN, joint, own, measured, reach, accuracy, mission.confidence)
+    if reason:
+        return reason
+    best = found[0].fit
+    least = EARLY_CLAIM_P_VALUE if best.freedom < EARLY_FREEDOM else CLAIM_P_VALUE
+    level = max(best.level, 1.0)
+    if chi2_p_value(best.chi2 / level, best.freedom) < least:
+        return (
+            f"the residuals are too large: chi-square {best.chi2:.3g} for {best.freedom} degrees of freedom"
+        )
+    return _rival(best, measured, mission) or _doubt(best, measured)
+
+
+EARLY_FREEDOM = 13
+"""The degrees of freedom below which EARLY_CLAIM_P_VALUE applies: those of 16 ranges, as in pairs."""
+
+
+def _rival(best: JointFit, measured: JointMeasurements, mission: Mission) -> str:
+    """Return why poses that would make a claim wrong are likely, or an empty text; see `claim_rivals`.
+
+    They are fits in which the start of this robot is held, to either side along the longest axis.
+    """
+    prior, i = measured.prior, 3 * OWN
+    assert prior is not None
+    variances, axes = np.linalg.eigh(best.covariance[i : i + 2, i : i + 2])
+    along, far = axes[:, 1], WRONG_SIGMAS * deviation(float(np.sum(variances)))
+    information = prior.information.copy()
+    information[i : i + 2, i : i + 2] += np.outer(along, along) / (HOLDING * far) ** 2
+    weights = []
+    for offset in (0.0, far, -far):
+        mean = prior.mean.copy()
+        mean[OWN, :2] = best.start.poses[OWN, :2] + offset * along
+        held = replace(measured, prior=PosePrior(mean, information, prior.rank + 1))
+        poses = best.start.poses.copy()
+        poses[OWN, :2] = mean[OWN, :2]
+        weights.append(joint_fit(held, JointStart(poses, best.start.errors)).weight)
+    ratio, most = max(weights[1:]) - weights[0], math.log1p(-mission.confidence)
+    if ratio <= most:
+        return ""
+    return (
+        f"poses {WRONG_SIGMAS:g} sigmas away explain the ranges nearly as well: "
+        f"their log-likelihood ratio is {ratio:.3g}, allowed {most:.3g}"
+    )
+
+
+def _doubt(best: JointFit, measured: JointMeasurements) -> str:
+    """Return which profile of sensors explains the measurements much better than told, or an empty text."""
+    for name, other in claim_profiles(measured.noise):
+        again = joint_fit(replace(measured, noise=other), JointStart(best.start.poses))
+        if again.weight - best.weight > DOUBTFUL_CLAIM:
+            return f"the profile '{name}' explains the ranges and the odometry of both robots better"
+    return ""

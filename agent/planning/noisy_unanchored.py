@@ -1,0 +1,309 @@
+"""A robot of a group without an anchor, with noisy sensors: it waits until a localised robot finds it.
+
+That robot, the finder, sends its pose at a reference tick with a covariance, and its odometry from then on.
+Both drive loops in range of each other, and the ranges between them give the pose of this robot
+(`contact_fit`). It claims it when one hypothesis is left, the fit is consistent, and the pose is as accurate
+as the mission asks. A claim rests on the ranges to one finder since one reference tick.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import msgspec
+import numpy as np
+from msgspec.structs import replace
+
+from agent.estimation.gaussian.contact_fit import Contact, ContactEstimate, estimated, is_definite
+from agent.estimation.gaussian.gaussian_estimator import GAUSSIAN
+from agent.estimation.gaussian.inference import MUTUAL_RANGES, MUTUAL_RANGES_WITH_OUTLIERS
+from agent.estimation.gaussian.known_anchors import FEWEST
+from agent.estimation.gaussian.odometry_noise import Track, track
+from agent.peer import peer_state
+from agent.peer.motion_log import MotionLog
+from agent.planning import exchange, sweep
+from agent.planning.phase3_last_manoeuvre import Standing
+from agent.planning.planner import Planner, Summary
+from agent.planning.state import MODE_NAMES
+from agent.planning.sweep import Looping, Sweeping
+from protocol.messages import (
+    Command,
+    Estimate,
+    Localised,
+    Observation,
+    Ranged,
+    Report,
+    ReportWithReference,
+    RobotConfig,
+    RobotConfigWithoutAnchor,
+    Undecided,
+)
+from protocol.mission import Mission
+from protocol.motion import ORIGIN, REST, Covariance, Pose, Segment
+from protocol.sweep_strips import OWN_SIDE, contact_ticks
+
+SWEEPING = MODE_NAMES[Sweeping]
+"""The mode of a localised robot that looks for robots without an anchor."""
+
+EACH = 3
+"""The number of further ranges after which the pose is estimated again.
+
+Each estimate is a search of all poses. With 1, claims would come two ticks earlier, at three times the time.
+"""
+
+
+class Finder(msgspec.Struct, frozen=True):
+    """What a robot without an anchor knows about the localised robot that has found it."""
+
+    robot: str
+    reference: int
+    """The tick of `pose`."""
+    pose: Pose
+    """The pose of the finder at that tick in <W>, as it has estimated it."""
+    covariance: Covariance
+    """The covariance of the error of `pose`."""
+    log: MotionLog
+    """Its manoeuvres from the reference tick on."""
+    latest: int
+    """The tick of its latest report."""
+
+
+class NoisyUnanchoredState(msgspec.Struct, frozen=True):
+    """The state of a robot without an anchor, with noisy sensors."""
+
+    config: RobotConfigWithoutAnchor
+    tick: int = -1
+    odometry: Pose = ORIGIN
+    """The pose by dead reckoning, in the frame of the pose at tick 0."""
+    leg: Pose = ORIGIN
+    """The odometry at the beginning of the last segment of `log`."""
+    log: MotionLog = MotionLog()
+    ranges: Mapping[str, tuple[Ranged, ...]] = {}
+    """The latest ranges to each robot."""
+    finder: Finder | None = None
+    """The robot that has found it; None while there is none."""
+    fitted: int = 0
+    """The number of ranges to the finder at the latest estimate."""
+    found: ContactEstimate | None = None
+    """The latest estimate of the pose, of the tick `at`; None without one."""
+    at: int = -1
+    failure: str = "no localised robot has found it"
+    """The reason for which it has no claim yet."""
+    mode: Standing | Looping = Standing()
+    verdict: Localised | Undecided | None = None
+
+    @property
+    def phase(self) -> int:
+        """Return 2 until a localised robot has found it, then 3."""
+        return 2 if self.finder is None else 3
+
+    @property
+    def mode_name(self) -> str:
+        """Return the name of the mode that reports, commands and recordings use."""
+        match self.verdict:
+            case Localised():
+                return "localised"
+            case Undecided():
+                return "undecided"
+        return MODE_NAMES[type(self.mode)]
+
+
+class NoisyUnanchoredPlanner(Planner[NoisyUnanchoredState, Report]):
+    """The planner of a robot without an anchor, with noisy sensors."""
+
+    BODY = Report
+
+    def start(self, config: RobotConfig) -> NoisyUnanchoredState:
+        """Return the state of a robot that has measured nothing yet."""
+        assert isinstance(config, RobotConfigWithoutAnchor)
+        return NoisyUnanchoredState(config)
+
+    def observe(self, state: NoisyUnanchoredState, observation: Observation) -> NoisyUnanchoredState:
+        """Return `state` with the odometry and the ranges of one tick."""
+        log, odometry, leg = exchange.dead_reckoned(
+            state.log, state.odometry, state.leg, observation.executed, state.config.mission.period
+        )
+        state = replace(state, tick=observation.tick, odometry=odometry, leg=leg, log=log)
+        if state.verdict is not None:
+            return state
+        ranges = dict(state.ranges)
+        for one in observation.contacts:
+            if one.range is not None:
+                first = observation.tick - _kept(state)
+                recent = [each for each in ranges.get(one.peer, ()) if each.tick > first]
+                ranges[one.peer] = (*recent, Ranged(observation.tick, one.range))
+        return replace(state, ranges=ranges)
+
+    def report(self, state: NoisyUnanchoredState) -> Report:
+        """Return a report without a log: a robot without an anchor is in no meeting."""
+        return exchange.report_without_log(state, state.verdict)
+
+    def report_to(self, state: NoisyUnanchoredState, peer: str) -> Report:
+        """Return the same report; to its finder, with the acknowledgement of the finder's manoeuvres."""
+        report, finder = self.report(state), state.finder
+        if finder is None or finder.robot != peer:
+            return report
+        return replace(report, heard=finder.log.through)
+
+    def decide(self, state: NoisyUnanchoredState, reports: Sequence[Report] = ()) -> NoisyUnanchoredState:
+        """Return `state` with the data in `reports`, and with a verdict if they determine the own pose."""
+        if state.verdict is not None:
+            return state
+        if state.tick * state.config.mission.period >= state.config.gives_up:
+            return replace(state, verdict=Undecided(state.failure))
+        for one in reports:
+            if isinstance(one, ReportWithReference):
+                state = _with_reference(state, one)
+            elif state.finder is None and one.state == SWEEPING:
+                why = f"{one.robot} has passed it, and does not know its own pose well enough"
+                state = replace(state, failure=why)
+        state = _estimated(state)
+        return _moved_on(state) if state.verdict is None else state
+
+    def command(self, state: NoisyUnanchoredState) -> Command:
+        """Return the command for the next tick, with the phase, the mode and the verdict."""
+        controls = None
+        if isinstance(state.mode, Looping) and state.verdict is None:
+            controls = sweep.controls(
+                state.mode, state.odometry, state.config.mission, GAUSSIAN.pose_tolerance
+            )
+        driven = controls or REST
+        return Command(
+            state.tick,
+            state.config.robot,
+            driven.v,
+            driven.omega,
+            state.phase,
+            state.mode_name,
+            state.verdict,
+        )
+
+    def estimate(self, state: NoisyUnanchoredState) -> Estimate:
+        """Return the poses in <W> that are possible in the tick of an estimate, the most probable first."""
+        found = state.found if state.at == state.tick or state.verdict is not None else None
+        return Estimate(
+            tick=state.tick,
+            robot=state.config.robot,
+            local=(),
+            world=found.poses if found is not None else (),
+            localised=isinstance(state.verdict, Localised),
+            probabilities=found.probabilities if found is not None else (),
+            covariance=found.covariance if found is not None else None,
+        )
+
+    def malformed(self, body: Report) -> str | None:
+        """Return the reason why the log or the reference in a report is malformed, or None."""
+        if isinstance(body, ReportWithReference):
+            if body.reference > body.since:
+                return f"a log from tick {body.since} on, before its reference at tick {body.reference}"
+            if not is_definite(body.covariance):
+                return "a covariance of a pose that is not positive definite"
+        return peer_state.contradiction(body)
+
+    def required_mutual_ranges(self, mission: Mission) -> int:
+        """Return the minimum number of noisy mutual ranges before a claim."""
+        return MUTUAL_RANGES_WITH_OUTLIERS if mission.noise.outliers else MUTUAL_RANGES
+
+    def summary(self, state: NoisyUnanchoredState) -> Summary:
+        """Return the number of possible poses, the probability of the first, and what prevents a claim."""
+        found = state.found
+        if found is None:
+            return Summary(blocking_reason=None if state.verdict is not None else state.failure)
+        return Summary(
+            hypotheses=len(found.poses),
+            probability=found.probabilities[0],
+            blocking_reason=None if isinstance(state.verdict, Localised) else state.failure,
+            p_value=found.p_value,
+        )
+
+
+def _kept(state: NoisyUnanchoredState) -> int:
+    """Return the ticks for which a range is kept, and after which a silent finder is forgotten."""
+    return 2 * contact_ticks(state.config.mission)
+
+
+def _with_reference(state: NoisyUnanchoredState, one: ReportWithReference) -> NoisyUnanchoredState:
+    """Return `state` with the reference of a finder and its manoeuvres since then.
+
+    Another reference of the same finder counts if it is later, and another finder once the present one is
+    silent or too inaccurate.
+    """
+    known = state.finder
+    if known is not None and (known.robot, known.reference) != (one.robot, one.reference):
+        accurate = known.covariance.position_sigma <= state.config.mission.accuracy
+        if known.robot != one.robot and accurate and known.latest > state.tick - _kept(state):
+            return state
+        if known.robot == one.robot and known.reference > one.reference:
+            return state
+        known = None
+    if known is None:
+        log = MotionLog(through=one.reference)
+        known = Finder(one.robot, one.reference, one.pose, one.covariance, log, one.tick)
+        state = replace(state, fitted=0, found=None)
+    log = known.log.extended(one.since, 0, MotionLog(one.through, one.runs))
+    return replace(state, finder=replace(known, log=log, latest=max(known.latest, one.tick)))
+
+
+def _estimated(state: NoisyUnanchoredState) -> NoisyUnanchoredState:
+    """Return `state` with an estimate if there are enough new ranges, and with a claim if it allows one."""
+    finder, mission = state.finder, state.config.mission
+    if finder is None:
+        return state
+    sigma = finder.covariance.position_sigma
+    if sigma > mission.accuracy:
+        why = f"{finder.robot} knows its position to {sigma:.3g} m, required {mission.accuracy:g}"
+        return replace(state, failure=why)
+    ends = finder.reference, min(finder.log.through, state.tick)
+    ranges = tuple(
+        [
+            Ranged(one.tick - finder.reference, one.range)
+            for one in state.ranges.get(finder.robot, ())
+            if ends[0] <= one.tick <= ends[1]
+        ]
+    )
+    if len(ranges) < max(FEWEST, state.fitted + EACH):
+        return state
+    contact = Contact(
+        finder.pose,
+        finder.covariance,
+        _path(finder.log.runs, mission),
+        _path(state.log.between(finder.reference, state.tick), mission),
+        ranges,
+    )
+    found = estimated(contact, mission)
+    state = replace(state, fitted=len(ranges), found=found, at=state.tick)
+    if found is None:
+        return replace(state, failure=f"no pose explains the ranges to {finder.robot}")
+    if found.blocking_reason:
+        return replace(state, failure=f"{finder.robot} has found it: {found.blocking_reason}")
+    return replace(state, verdict=Localised(found.poses[0], found.covariance))
+
+
+def _path(runs: Sequence[Segment], mission: Mission) -> Track:
+    """Return the odometry of `runs`."""
+    ticks = [run.ticks for run in runs]
+    v, omega = (
+        np.repeat(np.array(one, np.float64), ticks)
+        for one in ([run.v for run in runs], [run.omega for run in runs])
+    )
+    return track(v + 0.0, omega + 0.0, mission.period)
+
+
+def _moved_on(state: NoisyUnanchoredState) -> NoisyUnanchoredState:
+    """Return `state` after a tick: in a loop while an accurate finder reports, else standing."""
+    finder, mission = state.finder, state.config.mission
+    if finder is None:
+        return state
+    if finder.latest <= state.tick - _kept(state):
+        return replace(state, mode=Standing(), finder=None, found=None)
+    if finder.covariance.position_sigma > mission.accuracy:
+        return replace(state, mode=Standing())
+    mode = state.mode
+    if isinstance(mode, Looping):
+        moved = sweep.onward(mode, state.odometry, mission, GAUSSIAN.pose_tolerance)
+        if moved.places and isinstance(moved, Looping):
+            return replace(state, mode=moved)
+    if finder.latest <= state.tick - contact_ticks(mission) // 2:
+        return replace(state, mode=Standing())
+    side = OWN_SIDE * mission.sensing_range
+    return replace(state, mode=sweep.looping_both_ways(state.odometry, side, side, state.tick))

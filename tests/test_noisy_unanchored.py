@@ -1,0 +1,418 @@
+"""Groups with robots without an anchor under noise: they are found, and their covariances are right."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tomli_w
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from agent.estimation.gaussian.contact_fit import Contact, estimated, is_definite, matrix
+from agent.estimation.gaussian.odometry_noise import Track, track
+from agent.planning.noisy_unanchored import NoisyUnanchoredPlanner
+from compose.audit.replay import replayed
+from compose.audit.rules import audit_run
+from compose.errors import UserError
+from compose.launch.in_process import run_mission
+from compose.recording.recording_files import agent_journal
+from compose.recording.run import Run, of_frames
+from protocol.messages import (
+    Contact as Detection,
+)
+from protocol.messages import (
+    Localised,
+    Observation,
+    Ranged,
+    ReportWithReference,
+    RobotConfigWithoutAnchor,
+    Undecided,
+)
+from protocol.mission import Mission
+from protocol.motion import REST, Controls, Covariance, Pose, Segment, step, wrap
+from protocol.noise import Noise
+from protocol.sweep_strips import SweptArea, contact_ticks, surveyed_path, sweep_speed
+from protocol.wire import MAX_REPORT_BYTES, decode, encode
+from tests.commands import tandem as tandem_command
+from tests.groups import R, localised
+from tests.test_audit import kept
+from tests.test_group_runs import audited
+from tests.test_unanchored import bound, four, last_claim, scenario_of, table_with
+from world.scenario import Scenario
+
+NOISE: dict[str, Any] = {"anchor_sigma": 0.05, "mutual_sigma": 0.05, "gyro_bias": 0.0002}
+
+
+def noisy(table: dict[str, Any], **noise: Any) -> Scenario:
+    """Return the scenario of a file with the noise of the sweep `group`, and with other `noise`."""
+    table["mission"] |= {"noise": {**NOISE, **noise}, "accuracy": 0.3}
+    return scenario_of(table)
+
+
+@cache
+def journals() -> dict[str, list[bytes]]:
+    """Return the journals of four robots, two of which have no anchor."""
+    return kept(noisy(four()))
+
+
+def references(run: Run) -> list[tuple[str, ReportWithReference]]:
+    """Return the first report with each reference, with the robot that has received it."""
+    found: dict[tuple[str, str, int], ReportWithReference] = {}
+    for robot, agent in run.agents.items():
+        for one_step in agent.steps:
+            for framed in one_step.received:
+                if isinstance(framed.report, ReportWithReference):
+                    found.setdefault((robot, framed.report.robot, framed.report.reference), framed.report)
+    return [(robot, report) for (robot, _, _), report in found.items()]
+
+
+def squared_error(pose: Pose, covariance: Covariance, truth: Pose) -> float:
+    """Return the normalised error squared of a pose; its mean is 3 if the covariance is right."""
+    error = np.array((pose.x - truth.x, pose.y - truth.y, wrap(pose.heading - truth.heading)))
+    return float(error @ np.linalg.solve(matrix(covariance), error))
+
+
+def of_finders(run: Run) -> list[float]:
+    """Return the normalised errors squared of the poses that sweeping robots have reported."""
+    ids = [robot.id for robot in run.scenario.robots]
+    return [
+        squared_error(
+            one.pose, one.covariance, run.ticks[one.reference].world.truth.poses[ids.index(one.robot)]
+        )
+        for _, one in references(run)
+    ]
+
+
+# --- groups -------------------------------------------------------------------------------------------
+
+
+def test_robots_without_an_anchor_are_localised_under_noise_within_the_bound() -> None:
+    run = of_frames(journals())
+    assert run.end is not None
+    assert run.end.outcome == "localised"
+    assert localised(run) == {"a", "b", "u", "v"}
+    assert last_claim(run) <= bound(run.scenario)
+    for robot in ("u", "v"):
+        claim = run.claim(robot)
+        assert claim is not None
+        assert claim.nees is not None
+        assert claim.nees < 16.3  # 99.9 % of chi-square with 3 degrees of freedom
+
+
+def test_the_reference_of_a_contact_stays_fixed_and_its_log_begins_there() -> None:
+    run = of_frames(journals())
+    assert references(run)
+    for robot, first in references(run):
+        same = [
+            framed.report
+            for one_step in run.agents[robot].steps
+            for framed in one_step.received
+            if isinstance(framed.report, ReportWithReference) and framed.report.reference == first.reference
+        ]
+        assert {(one.pose, one.covariance) for one in same} == {(first.pose, first.covariance)}
+        assert all(first.reference <= one.since <= one.through <= one.tick for one in same)
+
+
+def test_the_audit_and_the_replay_find_nothing_where_nothing_is_wrong() -> None:
+    run = of_frames(journals())
+    assert audit_run(run).violations == ()
+    assert replayed(run).differences == ()
+
+
+def test_the_audit_finds_a_reported_covariance_that_is_not_the_computed_one() -> None:
+    frames = {name: list(some) for name, some in journals().items()}
+    (_, report), *_ = references(of_frames(frames))
+    own = frames[agent_journal(report.robot)]
+    place = own.index(encode(report))
+    smaller = replace(report.covariance, xx=0.5 * report.covariance.xx)
+    own[place] = encode(replace(report, covariance=smaller))
+    assert (report.tick, report.robot, "decision") in audited(frames)
+
+
+def test_lost_and_late_reports_only_cost_time() -> None:
+    run = run_mission(noisy(four(fault=[{"loss": 0.7, "delay": 5}])))
+    assert len(localised(run)) == 4
+
+
+def test_reports_under_odometry_noise_fit_in_a_frame_and_no_claim_is_wrong() -> None:
+    odometry = {"v": 0.01, "omega": 0.01, "v_floor": 0.002, "omega_floor": 0.0005}
+    scenario = replace(noisy(four(), odometry=odometry), max_ticks=250)
+    run = of_frames(kept(scenario))
+    sizes = [
+        len(encode(framed.report))
+        for agent in run.agents.values()
+        for one_step in agent.steps
+        for framed in one_step.received
+    ]
+    assert max(sizes) <= MAX_REPORT_BYTES
+    assert run.end is not None
+    assert run.end.outcome in ("localised", "undecided")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("robots", "unanchored"), [(4, 2), (8, 4), (8, 6)])
+def test_random_groups_are_localised_under_noise_and_reported_poses_have_right_covariances(
+    robots: int, unanchored: int
+) -> None:
+    scores: list[float] = []
+    for seed in range(5000, 5008):
+        scenario = noisy(table_with(robots, unanchored, seed))
+        run = of_frames(kept(scenario))
+        assert run.end is not None
+        assert run.end.outcome == "localised", (seed, run.end)
+        scores += of_finders(run)
+    assert (
+        3.0 - 3.0 * math.sqrt(6.0 / len(scores)) < np.mean(scores) < 3.0 + 4.0 * math.sqrt(6.0 / len(scores))
+    )
+
+
+@pytest.mark.long
+def test_larger_errors_than_told_lead_to_no_wrong_claim() -> None:
+    for seed in range(6000, 6008):
+        table = table_with(4, 2, seed)
+        world = {"anchor_sigma": 0.075, "mutual_sigma": 0.075, "odometry": {"scale": -0.01}}
+        table["world"] = {"noise": world}
+        run = run_mission(noisy(table))
+        assert run.end is not None
+        assert run.end.outcome != "wrong", (seed, run.end)
+
+
+@pytest.mark.long
+def test_a_robot_whose_fit_has_ended_in_a_wrong_optimum_passes_on_no_pose() -> None:
+    """Without the search before a reference, its pose was 3.7 m wrong after it had come back."""
+    odometry = {"v": 0.01, "omega": 0.01, "v_floor": 0.002, "omega_floor": 0.0005}
+    run = of_frames(kept(replace(noisy(table_with(4, 2, 2), odometry=odometry), max_ticks=330)))
+    assert of_finders(run)
+    assert max(of_finders(run)) < 16.3
+    assert run.end is not None
+    assert run.end.outcome != "wrong"
+
+
+# --- the scenario -------------------------------------------------------------------------------------
+
+
+def test_gyros_that_turn_a_sweeping_robot_too_far_are_refused_with_the_value_that_would_do() -> None:
+    table = four()
+    table["mission"]["area"] = [-500.0, -500.0, 500.0, 500.0]
+    message = r"^group.toml: mission.noise.gyro_bias: within the \d+ s between two passages of its anchor"
+    with pytest.raises(UserError, match=message) as refused:
+        noisy(table)
+    enough = float(str(refused.value).split("calibrate the gyros to ")[1].split(" ")[0])
+    assert noisy(table, gyro_bias=enough).planned_sweep is not None
+
+
+def test_visitors_sweep_and_the_robots_that_they_have_visited_are_their_beacons() -> None:
+    scenario = noisy(table_with(8, 4, 2006))
+    planned = scenario.planned_sweep
+    assert planned is not None
+    finders = planned.sweepers[: planned.sweep.parts]
+    last = {robot: one for one in scenario.meetings for robot in (one.visitor, one.visited)}
+    for robot, one in last.items():
+        assert (robot in finders) == (one.visitor == robot and last[one.visited] is one)
+
+
+@given(st.floats(1.0, 100.0), st.floats(1.0, 100.0), st.integers(1, 5))
+def test_every_place_of_an_area_is_near_a_strip(width: float, height: float, parts: int) -> None:
+    area = SweptArea(0.0, 0.0, width, height, parts)
+    ways = [surveyed_path(area, part, R, (-9.0, 3.0), (-5.0, 3.0)) for part in range(parts)]
+    inside = [[(x, y) for x, y in way if x >= 0.0] for way in ways]
+    strips = sorted({one[area.across] for way in inside for one in way})
+    edges = [0.0, (height, width)[1 - area.across]]
+    gaps = [2.0 * (strips[0] - edges[0]), 2.0 * (edges[1] - strips[-1]), *np.diff(strips)]
+    assert max(gaps) <= 2.0 * 0.65 * R + 1e-9
+
+
+# --- a contact ----------------------------------------------------------------------------------------
+
+MISSION = Mission(
+    sensing_range=R,
+    period=1.0,
+    max_speed=1.0,
+    max_turn_rate=math.pi,
+    accuracy=0.3,
+    noise=Noise(anchor_sigma=0.05, mutual_sigma=0.05, gyro_bias=0.0002),
+)
+
+FINDER = [(0.0, 1.57), (0.6, 1.57), (1.0, 0.0), (0.8, 1.57), (0.6, 1.57), (0.9, 0.0), (0.9, -1.57)]
+OWN = [(0.0, 1.57), (0.6, 1.57), (0.6, 0.0), (0.0, 1.57), (0.6, 1.57), (0.6, -1.57), (0.6, 0.3)]
+"""The manoeuvres of both robots in m/s and rad/s; each is repeated."""
+
+
+def path_of(manoeuvres: list[tuple[float, float]]) -> Track:
+    v, omega = np.array(manoeuvres).T
+    return track(v, omega, 1.0)
+
+
+def poses_of(pose: Pose, manoeuvres: list[tuple[float, float]]) -> list[Pose]:
+    found = [pose]
+    for v, omega in manoeuvres:
+        found.append(step(found[-1], v, omega, 1.0))
+    return found
+
+
+def contact(seed: int, sigma: float, times: int = 3) -> tuple[Contact, Pose]:
+    """Return a contact with a finder whose position has this sigma (m), and the true pose at its end."""
+    rng = np.random.default_rng(seed)
+    covariance = Covariance(0.5 * sigma**2, 0.0, 0.0, 0.5 * sigma**2, 0.0, 0.01**2)
+    finder, angle = Pose(10.0, 20.0, rng.uniform(-3.0, 3.0)), rng.uniform(-math.pi, math.pi)
+    own = Pose(10.0 + 1.8 * math.cos(angle), 20.0 + 1.8 * math.sin(angle), rng.uniform(-3.0, 3.0))
+    there, here = poses_of(finder, FINDER * times), poses_of(own, OWN * times)
+    errors = rng.normal(0.0, np.sqrt(np.diagonal(matrix(covariance))))
+    told = Pose(finder.x + errors[0], finder.y + errors[1], finder.heading + errors[2])
+    ranges = [
+        Ranged(tick, math.hypot(one.x - other.x, one.y - other.y) + rng.normal(0.0, 0.05))
+        for tick, (one, other) in enumerate(zip(there, here, strict=True))
+    ]
+    return Contact(told, covariance, path_of(FINDER * times), path_of(OWN * times), tuple(ranges)), here[-1]
+
+
+@given(st.integers(0, 10**6), st.floats(0.01, 0.28))
+@settings(max_examples=12, deadline=None)
+def test_no_robot_knows_its_position_better_than_its_finder(seed: int, sigma: float) -> None:
+    measured, truth = contact(seed, sigma)
+    found = estimated(measured, MISSION)
+    assert found is not None
+    assert found.covariance.position_sigma >= sigma
+    if not found.blocking_reason:
+        assert squared_error(found.poses[0], found.covariance, truth) < 25.0
+
+
+def test_a_finder_that_is_less_accurate_than_the_mission_asks_leads_to_no_claim() -> None:
+    found = estimated(contact(1, 0.4)[0], MISSION)
+    assert found is not None
+    assert found.blocking_reason.startswith("the sigma of the position is 0.4")
+
+
+def test_the_same_ranges_do_not_count_twice_through_the_finder() -> None:
+    """However long a contact lasts, the error of the finder's pose is one unknown."""
+    for times in (2, 4, 8):
+        found = estimated(contact(2, 0.2, times)[0], MISSION)
+        assert found is not None
+        assert found.covariance.position_sigma >= 0.2
+
+
+@pytest.mark.long
+def test_the_covariances_of_contacts_are_right() -> None:
+    scores = []
+    for seed in range(200):
+        measured, truth = contact(seed, 0.1)
+        found = estimated(measured, MISSION)
+        assert found is not None
+        scores.append(squared_error(found.poses[0], found.covariance, truth))
+    assert 2.4 < np.mean(scores) < 3.7
+
+
+# --- a robot without an anchor ------------------------------------------------------------------------
+
+
+def config() -> RobotConfigWithoutAnchor:
+    found = noisy(four()).config("u")
+    assert isinstance(found, RobotConfigWithoutAnchor)
+    return found
+
+
+def met(sigma: float, ticks: int = 40) -> Any:
+    """Return the state of a robot after a contact with a finder whose position has this sigma, in m."""
+    planner, pose = NoisyUnanchoredPlanner(), Pose(5.0, 4.0, 0.7)
+    finder, driven = Pose(6.5, 5.0, 0.2), [(v, omega) for v, omega in FINDER * 8]
+    state, executed = planner.start(config()), None
+    runs: list[Segment] = []
+    covariance = Covariance(0.5 * sigma**2, 0.0, 0.0, 0.5 * sigma**2, 0.0, 1e-4)
+    told = finder
+    for tick in range(ticks):
+        range_ = math.hypot(finder.x - pose.x, finder.y - pose.y)
+        state = planner.observe(
+            state, Observation(tick, "u", executed, None, (Detection("b", range_, (tick,)),))
+        )
+        report = ReportWithReference(
+            tick,
+            "b",
+            2,
+            "looping",
+            None,
+            0,
+            tick,
+            tuple(runs),
+            0,
+            (),
+            0,
+            0,
+            None,
+            reference=0,
+            pose=told,
+            covariance=covariance,
+        )
+        assert planner.malformed(report) is None
+        state = planner.decide(state, [report])
+        command = planner.command(state)
+        executed = Controls(command.v, command.omega)
+        if command.verdict is not None:
+            break
+        pose = step(pose, executed.v, executed.omega, 1.0)
+        finder, runs = step(finder, *driven[tick], 1.0), [*runs, Segment(1, *driven[tick])]
+    return state, pose
+
+
+def test_a_robot_claims_its_pose_in_a_contact() -> None:
+    state, pose = met(0.05)
+    assert isinstance(state.verdict, Localised)
+    assert state.verdict.covariance is not None
+    assert squared_error(state.verdict.pose, state.verdict.covariance, pose) < 16.3
+    assert NoisyUnanchoredPlanner().report_to(state, "b").heard > 0
+
+
+def test_a_robot_stands_still_for_a_finder_that_is_too_inaccurate_and_ends_undecided() -> None:
+    planner = NoisyUnanchoredPlanner()
+    state, _ = met(0.4)
+    assert state.odometry == Pose(0.0, 0.0, 0.0)
+    late = math.ceil(state.config.gives_up / state.config.mission.period)
+    state = planner.observe(state, Observation(late, "u", REST, None))
+    state = planner.decide(state)
+    assert state.verdict == Undecided("b knows its position to 0.4 m, required 0.3")
+
+
+def test_malformed_references_are_refused() -> None:
+    planner = NoisyUnanchoredPlanner()
+    good = decode(encode(references(of_frames(journals()))[0][1]), ReportWithReference)
+    assert planner.malformed(good) is None
+    flat = Covariance(1.0, 2.0, 0.0, 1.0, 0.0, 1.0)
+    assert not is_definite(flat)
+    assert planner.malformed(replace(good, covariance=flat)) is not None
+    tiny = Covariance(1e-300, 0.0, 0.0, 1e-300, 0.0, 1e-300)
+    assert planner.malformed(replace(good, covariance=tiny)) is not None
+    assert planner.malformed(replace(good, reference=good.since + 1)) is not None
+
+
+def test_a_contact_is_longer_where_ranges_are_less_accurate() -> None:
+    assert sweep_speed(MISSION) == 1.0
+    noise = replace(MISSION.noise, mutual_sigma=0.1)
+    assert contact_ticks(replace(MISSION, noise=noise)) >= 3.9 * contact_ticks(MISSION)
+
+
+# --- processes ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+def test_processes_that_are_killed_write_the_same_journals_and_each_command_shows_them(
+    tmp_path: Path,
+) -> None:
+    table = four(name="four")
+    table["mission"] |= {"noise": NOISE, "accuracy": 0.3}
+    scenario = tmp_path / "four.toml"
+    scenario.write_text(tomli_w.dumps(table), encoding="utf-8")
+    kills = ["--kill", "a@90", "--kill", "u@100", "--kill", "world@70"]
+    for name, more in (("processes", []), ("killed", kills), ("inline", ["--in-process"])):
+        done = tandem_command("run", str(scenario), "--out", str(tmp_path / name), *more)
+        assert done.status == 0, done.err
+    for journal in (tmp_path / "inline").glob("*.journal"):
+        for other in ("processes", "killed"):
+            assert journal.read_bytes() == (tmp_path / other / journal.name).read_bytes()
+    for command in (["audit"], ["replay"], ["figures"], ["export"], ["export", "--rerun"]):
+        done = tandem_command(command[0], str(tmp_path / "inline"), *command[1:])
+        assert done.status == 0, done.err
