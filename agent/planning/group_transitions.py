@@ -51,16 +51,28 @@ With exact sensors, a robot that is not in range at the end of the way is not th
 
 
 def answering(state: GroupState, visitors: Sequence[str]) -> GroupState:
-    """Return `state` in a meeting with one of `visitors`, which have come to it, if it waits for one."""
+    """Return `state` in a meeting with one of `visitors`, which have come to it, if it waits for one.
+
+    With noise, a meeting that has not localised it by its bound may never do so: then it leaves that one.
+    """
     pair = state.pair
     if state.verdict is not None or pair.belief.phase1_done_tick is None or pair.config.peer in visitors:
         return state
-    if pair.in_contact and not refused(state, pair.config.peer) and state.silence <= SILENT_AFTER:
+    met = pair.in_contact and not refused(state, pair.config.peer) and state.silence <= SILENT_AFTER
+    if met and not _is_overdue(state):
         return state
     for visitor in visitors:
         if not refused(state, visitor):
             return _waiting(state, visitor)
     return state
+
+
+def _is_overdue(state: GroupState) -> bool:
+    """Return whether the bound of the present meeting is over; never with exact ranges: few suffice."""
+    bound = state.config.member(state.config.robot).ends
+    until = state.until if state.until is not None else 0.0
+    noisy = not state.config.mission.noise.exact
+    return noisy and state.pair.tick > bound and _now(state.pair) >= until
 
 
 def refused(state: GroupState, robot: str) -> bool:
@@ -250,7 +262,8 @@ def _is_late(state: GroupState, member: Member) -> bool:
     back from its orbit.
     """
     known, config = state.other(member.robot), state.config
-    if known.localised or known.failed:
+    apart = math.hypot(member.anchor.x - config.anchor.x, member.anchor.y - config.anchor.y)
+    if known.localised or known.failed or apart < config.mission.orienting_distance:
         return False
     if known.missed is None:
         return True

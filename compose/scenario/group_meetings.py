@@ -71,7 +71,13 @@ def group_meetings(robots: Sequence[RobotTable], mission: Mission, planner: Plan
         )
     anchors = [robot.anchor for robot in robots if robot.anchor is not None]
     ids = [robot.id for robot in robots]
-    near = _neighbours(anchors)
+    nearest = mission.orienting_distance
+    near = _neighbours(anchors, nearest)
+    if not any(near):
+        raise Unworkable(
+            f"robot.anchor: no two anchors are {nearest:.3g} m apart, and with mission.noise, robots with "
+            "nearer ones cannot determine their headings"
+        )
 
     def rendezvous(i: int, j: int) -> Rendezvous:
         return planner_loader.orbits(
@@ -79,11 +85,12 @@ def group_meetings(robots: Sequence[RobotTable], mission: Mission, planner: Plan
         )
 
     def pair_time(i: int, j: int) -> float:
-        if len(robots) >= LARGE and j not in near[i]:
+        if math.dist(anchors[i], anchors[j]) < nearest or (len(robots) >= LARGE and j not in near[i]):
             return math.inf
         return pair_ticks(mission, rendezvous(i, j)) * mission.period
 
-    plan = group_plan(anchors, pair_time, mission.max_speed, meeting_ticks(mission) * mission.period)
+    meeting = meeting_ticks(mission) * mission.period
+    plan = group_plan(anchors, pair_time, mission.max_speed, meeting, nearest)
     turned = mission.noise.priors.gyro_bias * plan.bound
     if not mission.noise.exact and turned > MOST_TURNED:
         enough = _rounded_down(MOST_TURNED / plan.bound)
@@ -144,9 +151,11 @@ def _retried(
     return found
 
 
-def _neighbours(anchors: Sequence[tuple[float, float]]) -> list[set[int]]:
-    """Return the NEIGHBOURS nearest anchors of each anchor."""
-    return [
-        set(sorted(range(len(anchors)), key=lambda j: math.dist(one, anchors[j]))[1 : NEIGHBOURS + 1])
-        for one in anchors
-    ]
+def _neighbours(anchors: Sequence[tuple[float, float]], nearest: float) -> list[set[int]]:
+    """Return the NEIGHBOURS nearest anchors of each anchor, of those at least `nearest` m from it."""
+    found = []
+    for i, one in enumerate(anchors):
+        apart = {j: math.dist(one, other) for j, other in enumerate(anchors) if j != i}
+        far = [j for j in apart if apart[j] >= nearest]
+        found.append(set(sorted(far, key=apart.__getitem__)[:NEIGHBOURS]))
+    return found
