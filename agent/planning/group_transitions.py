@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from agent.estimation.knowledge import Belief
 from agent.planning import passing, phase2_orbit, sweep_transitions, transitions
-from agent.planning.group_state import GroupState
+from agent.planning.group_state import Fix, GroupState
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Travelling
 from agent.planning.state import Done, RobotState
 from protocol.messages import Contact, Localised, Member, Retry, Undecided, Verdict
@@ -80,6 +80,52 @@ def refused(state: GroupState, robot: str) -> bool:
     return state.verdict is None and state.other(robot).failed
 
 
+def with_claim(state: GroupState, claim: Localised) -> GroupState:
+    """Return `state` of a robot that has determined its pose in the present meeting.
+
+    If this contradicts the pose that it knows, one of two peers has reported false data. A pose on which
+    several meetings agree stays. One that follows from a single meeting is withdrawn, because nothing tells
+    which of the two it was, and the robot waits for a third one.
+    """
+    pair, peer, fix = state.pair, state.config.peer, state.fix
+    contradiction = _contradiction(state, claim)
+    if contradiction is None:
+        fix = Fix(pair.tick, claim, (*(fix.peers if fix is not None else ()), peer))
+        verdict = claim if state.verdict is None else state.verdict
+        return replace(state, verdict=verdict, fix=fix, frame=compose(claim.pose, inverse(pair.odometry)))
+    assert fix is not None
+    if len(fix.peers) > 1:
+        return _after_meeting(state)
+    (other,) = fix.peers
+    state = state.with_other(other, replace(state.other(other), failed=True))
+    return replace(state, verdict=None, fix=None, failure=contradiction)
+
+
+def _contradiction(state: GroupState, claim: Localised) -> Undecided | None:
+    """Return how `claim`, of the present meeting, contradicts the known pose; None if it does not.
+
+    The claims of robots with exact sensors have no covariance, and are never wrong.
+    """
+    pair, fix, mission = state.pair, state.fix, state.config.mission
+    if fix is None or claim.covariance is None:
+        return None
+    # imports numpy, which robots with exact sensors do not need
+    from agent.estimation.gaussian.claim_agreement import difference  # noqa: PLC0415
+
+    off = difference(fix.claim, fix.tick, claim, pair.tick, pair.log, mission)
+    if off.p_value >= 1.0 - mission.confidence:
+        return None
+    return Undecided(
+        f"{fix.peers[-1]} and {state.config.peer} contradict each other: by their reports, its pose differs "
+        f"by {off.position:.3g} m and {off.heading:.3g} rad (p = {off.p_value:.2g})"
+    )
+
+
+def _is_withdrawn(state: GroupState) -> bool:
+    """Return whether the present meeting contradicts an earlier one, so that the robot knows no pose."""
+    return state.verdict is None and isinstance(state.pair.verdict, Localised)
+
+
 def after_refusal(state: GroupState) -> GroupState:
     """Return `state` of a robot whose peer has ended their meeting, because it contradicts what it knows."""
     if state.visiting:
@@ -99,6 +145,9 @@ def onward(state: GroupState, *, peer_has_left: bool = False) -> GroupState:
     `peer_has_left` says that the peer is localised, and has reported it from outside the meeting.
     """
     pair, peer = state.pair, state.pair.config.peer
+    over = peer_has_left or pair.peer_state.verdict is not None or state.unmet >= PARTED_AFTER
+    if _is_withdrawn(state):
+        return _waiting(replace(_after_meeting(state), visiting=False), peer) if over else state
     if not isinstance(state.verdict, Localised):
         return _after_failure(state)
     if state.sweeps:
@@ -119,7 +168,6 @@ def onward(state: GroupState, *, peer_has_left: bool = False) -> GroupState:
     if not isinstance(pair.verdict, Localised):
         reported = state.lingering > 0 or not pair.in_contact  # to the peer, before this robot leaves
         return _next_visit(_after_meeting(state)) if reported else state
-    over = peer_has_left or pair.peer_state.verdict is not None or state.unmet >= PARTED_AFTER
     return _next_visit(state) if over else state
 
 
