@@ -51,15 +51,11 @@ With exact sensors, a robot that is not in range at the end of the way is not th
 
 
 def answering(state: GroupState, visitors: Sequence[str]) -> GroupState:
-    """Return `state` in a meeting with one of `visitors`, which have come to it, if it waits for one.
-
-    With noise, a meeting that has not localised it by its bound may never do so: then it leaves that one.
-    """
+    """Return `state` in a meeting with one of `visitors`, which have come to it, if it waits for one."""
     pair = state.pair
     if state.verdict is not None or pair.belief.phase1_done_tick is None or pair.config.peer in visitors:
         return state
-    met = pair.in_contact and not refused(state, pair.config.peer) and state.silence <= SILENT_AFTER
-    if met and not _is_overdue(state):
+    if _is_met(state) and state.silence <= SILENT_AFTER:
         return state
     for visitor in visitors:
         if not refused(state, visitor):
@@ -67,12 +63,16 @@ def answering(state: GroupState, visitors: Sequence[str]) -> GroupState:
     return state
 
 
-def _is_overdue(state: GroupState) -> bool:
-    """Return whether the bound of the present meeting is over; never with exact ranges: few suffice."""
-    bound = state.config.member(state.config.robot).ends
+def _is_met(state: GroupState) -> bool:
+    """Return whether this robot is in contact with its peer, in a meeting that may still localise it.
+
+    With noise, one that has not done so by its bound may never do so. Of exact ranges, a few suffice.
+    """
+    pair, config = state.pair, state.config
+    if not pair.in_contact or refused(state, config.peer):
+        return False
     until = state.until if state.until is not None else 0.0
-    noisy = not state.config.mission.noise.exact
-    return noisy and state.pair.tick > bound and _now(state.pair) >= until
+    return config.mission.noise.exact or pair.tick <= config.member(config.robot).ends or _now(pair) < until
 
 
 def refused(state: GroupState, robot: str) -> bool:
@@ -227,7 +227,7 @@ def _trying_again(state: GroupState) -> GroupState:
         return state
     retry = config.retries[state.retries]
     state = replace(state, retries=state.retries + 1)
-    if (pair.in_contact and not refused(state, config.peer)) or refused(state, retry.peer):
+    if _is_met(state) or refused(state, retry.peer):
         return state
     return _in_retry(state, retry)
 
