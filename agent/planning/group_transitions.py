@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
+from agent.estimation.gaussian.claim_agreement import difference
 from agent.estimation.knowledge import Belief
 from agent.planning import passing, phase2_orbit, sweep_transitions, transitions
 from agent.planning.group_state import Fix, GroupState
@@ -18,7 +19,7 @@ from agent.planning.state import Done, RobotState
 from protocol.messages import Contact, Localised, Member, Retry, Undecided, Verdict
 from protocol.mission import Role
 from protocol.motion import Pose, compose, inverse
-from protocol.orbits import Rendezvous
+from protocol.orbits import SIDES, Rendezvous
 
 SHORT_OF_ANCHOR = 0.5
 """The distance from the visited robot's anchor at which a visitor stops, as a fraction of R.
@@ -39,12 +40,6 @@ SILENT_AFTER = 200
 
 LINGERING = 6
 """The ticks in contact for which a visited robot waits for its visitor to leave, with a safety distance."""
-
-SIDES = 12
-"""The number of sides of the square spiral on which a visitor searches. Its radius is then three times R.
-
-With exact sensors, a robot that is not in range at the end of the way is not there.
-"""
 
 
 # --- meetings -----------------------------------------------------------------------------------------
@@ -72,7 +67,8 @@ def _is_met(state: GroupState) -> bool:
     if not pair.in_contact or refused(state, config.peer):
         return False
     until = state.until if state.until is not None else 0.0
-    return config.mission.noise.exact or pair.tick <= config.member(config.robot).ends or _now(pair) < until
+    is_noisy, ends = pair.estimator.corrects_poses, config.member(config.robot).ends
+    return not is_noisy or pair.tick <= ends or _now(pair) < until
 
 
 def refused(state: GroupState, robot: str) -> bool:
@@ -109,9 +105,6 @@ def _contradiction(state: GroupState, claim: Localised) -> Undecided | None:
     pair, fix, mission = state.pair, state.fix, state.config.mission
     if fix is None or claim.covariance is None:
         return None
-    # imports numpy, which robots with exact sensors do not need
-    from agent.estimation.gaussian.claim_agreement import difference  # noqa: PLC0415
-
     off = difference(fix.claim, fix.tick, claim, pair.tick, pair.log, mission)
     if off.p_value >= 1.0 - mission.confidence:
         return None

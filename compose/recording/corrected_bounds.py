@@ -13,9 +13,8 @@ from collections.abc import Collection, Sequence
 
 import msgspec
 
-from agent.planning.group_transitions import SIDES
 from compose.recording.run import Run
-from protocol.orbits import meeting_ticks, search_ticks
+from protocol.orbits import SIDES, meeting_ticks, search_ticks
 from protocol.sweep_strips import Place, helping_ticks, sweep_speed, sweep_ticks
 from world.faults import exchange_ticks
 from world.scenario import Scenario
