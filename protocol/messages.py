@@ -41,7 +41,7 @@ from __future__ import annotations
 
 import math
 import re
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import combinations
 from typing import Annotated, Literal
 
@@ -332,6 +332,12 @@ It searches within 3 R of that place, and finds a robot nearly R beyond.
 """
 
 
+@lru_cache(maxsize=8)
+def _widest(places: tuple[tuple[float, float], ...]) -> float:
+    """Return the largest distance in m between two of `places`; it is the same in all meetings of a group."""
+    return max([math.dist(*two) for two in combinations(places, 2)])
+
+
 class RobotConfigInGroup(RobotConfigWithOptions, frozen=True, dict=True):
     """The configuration of a robot in a group, which meets one robot after another.
 
@@ -365,8 +371,8 @@ class RobotConfigInGroup(RobotConfigWithOptions, frozen=True, dict=True):
     @cached_property
     def widest_distance(self) -> float:
         """The largest distance between two anchors of the group, in m."""
-        anchors = [(one.anchor.x, one.anchor.y) for one in self.members]
-        return max([math.dist(*two) for two in combinations(anchors, 2)], default=self.anchor_distance)
+        places = tuple([(one.anchor.x, one.anchor.y) for one in self.members])
+        return _widest(places) if len(places) > 1 else self.anchor_distance
 
     @cached_property
     def heading_accuracy(self) -> float:
@@ -422,8 +428,8 @@ class RobotConfigWithSweep(RobotConfigInGroup, frozen=True, dict=True):
 
         The poses of robots in the area follow from those of robots with an anchor.
         """
-        places = [(one.anchor.x, one.anchor.y) for one in self.members] + list(self.sweep.corners)
-        return max([math.dist(*two) for two in combinations(places, 2)])
+        anchors = [(one.anchor.x, one.anchor.y) for one in self.members]
+        return _widest((*anchors, *self.sweep.corners))
 
 
 class RobotConfigWithoutAnchor(RobotConfigWithSweep, frozen=True, dict=True):

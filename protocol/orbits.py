@@ -95,6 +95,25 @@ def meeting_ticks(mission: Mission) -> int:
     return circle + 3 * turn + 25
 
 
+SIDES = 12
+"""The number of sides of the square spiral on which a visitor searches. Its radius is then three times R.
+
+With exact sensors, a robot that is not in range at the end of the way is not there.
+"""
+
+
+def search_ticks(mission: Mission, sides: int) -> int:
+    """Return the ticks of so many sides of a visitor's search; 0 with exact sensors.
+
+    The sides are R, R, 2 R, 2 R, ... long.
+    """
+    if mission.noise.exact:
+        return 0
+    length = sum([side // 2 + 1 for side in range(sides)]) * mission.sensing_range
+    turn = math.ceil(math.pi / (mission.max_turn_rate * mission.period))
+    return math.ceil(length / (mission.max_speed * mission.period)) + sides * turn
+
+
 # --- the orbits of the `paper` planner ----------------------------------------------------------------
 
 

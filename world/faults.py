@@ -111,6 +111,56 @@ def delivery_time_bound(plan: Sequence[Fault]) -> int:
     return ticks + math.ceil(UNLUCKY * max(burst, 1.0 / through))
 
 
+def exchange_ticks(plan: Sequence[Fault]) -> tuple[int, int]:
+    """Return the ticks by which the faults of `plan` delay each meeting of a group, and all of them once.
+
+    With the probability EXCHANGED, IN_TURN Reports, which are sent again in every tick, are received in these
+    ticks besides those without faults. What delays all once are windows without any delivery. All faults
+    count for all links; one that never delivers anything does not count.
+    """
+    through, each, once = 1.0, 0, 0
+    for fault in plan:
+        each += IN_TURN * (fault.delay[1] + (fault.reorder > 0.0))
+        if fault.partition or not fault.let_through:
+            once += fault.ticks[1] - fault.ticks[0] if fault.ticks is not None else 0
+            each += fault.contact_ticks[1] - fault.contact_ticks[0] if fault.contact_ticks is not None else 0
+        else:
+            through *= min(fault.let_through, fault.burst_end if fault.burst_start else 1.0)
+    return each + _trials(IN_TURN, through) - IN_TURN, once
+
+
+IN_TURN = 4
+"""The number of Reports that two robots of a group need from each other in their turn.
+
+They are the log up to the encounter, the log up to the last manoeuvre, and the verdicts. The fourth allows
+for the slower one of two directions, and for one more manoeuvre.
+"""
+
+EXCHANGED = 0.99
+"""The probability with which a meeting is over in the time that is planned for its Reports."""
+
+
+def _trials(successes: int, chance: float) -> int:
+    """Return the number of trials that contain so many successes with the probability EXCHANGED."""
+    if chance >= 1.0:
+        return successes
+    least, most = successes - 1, successes
+    while _fewer(successes, most, chance) > 1.0 - EXCHANGED:
+        least, most = most, 2 * most
+    while most - least > 1:
+        middle = (least + most) // 2
+        if _fewer(successes, middle, chance) > 1.0 - EXCHANGED:
+            least = middle
+        else:
+            most = middle
+    return most
+
+
+def _fewer(successes: int, trials: int, chance: float) -> float:
+    """Return the probability of fewer `successes` in so many `trials` (binomial distribution)."""
+    return sum([math.comb(trials, k) * chance**k * (1.0 - chance) ** (trials - k) for k in range(successes)])
+
+
 UNLUCKY = 20.0
 """The factor between the mean waiting time and the bound. A longer wait has the probability e^-20."""
 

@@ -101,8 +101,12 @@ def advance(world: World, commands: Mapping[str, Command]) -> World | MissionOut
         command = commands.get(robot.id)
         controls = limited_controls(command, scenario.mission)
         driven.append(controls if exact else executed(controls, scenario, robot.id, truth.tick))
-        if command is not None and command.verdict is not None and robot.id not in verdicts:
-            verdicts = verdicts | {robot.id: command.verdict}
+        given = verdicts.get(robot.id)
+        # in a group, another meeting may contradict a claim, which is then withdrawn
+        if command is not None and command.verdict != given and (given is None or scenario.meetings):
+            verdicts = {name: one for name, one in verdicts.items() if name != robot.id}
+            if command.verdict is not None:
+                verdicts[robot.id] = command.verdict
             if isinstance(command.verdict, Localised):
                 claimed = claimed | {robot.id: truth.poses[place]}
     if verdicts or truth.tick >= scenario.max_ticks:

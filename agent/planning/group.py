@@ -36,7 +36,7 @@ from protocol.messages import (
     Undecided,
 )
 from protocol.mission import Mission
-from protocol.motion import Controls, compose, inverse
+from protocol.motion import Controls, compose
 
 TRAVELLING = MODE_NAMES[Travelling]
 """The mode of a robot that is localised, and drives to another one."""
@@ -117,10 +117,8 @@ class GroupPlanner(Planner[GroupState, Report]):
         silence = state.silence + 1 if pair.in_contact and not of_peer else 0
         state = replace(state, pair=pair, silence=silence)
         if isinstance(pair.verdict, Localised) and before.verdict is None:
-            frame = compose(pair.verdict.pose, inverse(pair.odometry))
             known = replace(state.other(peer), localised=True)
-            verdict = pair.verdict if state.verdict is None else state.verdict
-            state = replace(state.with_other(peer, known), frame=frame, verdict=verdict, located=pair)
+            state = group_transitions.with_claim(state.with_other(peer, known), pair.verdict)
         refusals = [one for one in reports if one.robot == peer and not one.has_log]
         if (
             pair.verdict is None

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from agent.planning.passing import Bypass
 from agent.planning.state import RobotState
 from agent.planning.sweep import Looping, Sweeping
-from protocol.messages import Ranged, RobotConfigInGroup, Verdict
+from protocol.messages import Localised, Ranged, RobotConfigInGroup, Verdict
 from protocol.motion import ORIGIN, Covariance, Pose
 
 
@@ -41,6 +41,17 @@ class Reference(msgspec.Struct, frozen=True):
     """The covariance of the error of `pose`."""
 
 
+class Fix(msgspec.Struct, frozen=True):
+    """The pose that a robot knows, by its latest meeting that agrees with the earlier ones."""
+
+    tick: int
+    """The tick in which it claimed the pose in that meeting."""
+    claim: Localised
+    """That claim."""
+    peers: tuple[str, ...]
+    """The robots whose meetings agree, in their order."""
+
+
 class GroupState(msgspec.Struct, frozen=True):
     """The state of a robot of a group."""
 
@@ -69,7 +80,12 @@ class GroupState(msgspec.Struct, frozen=True):
     searched: int = -100
     """The tick of the latest of these for a contact."""
     verdict: Verdict | None = None
-    """The verdict of the robot: that of the meeting which localised it."""
+    """The verdict of the robot: that of the meeting which localised it.
+
+    None again once another meeting contradicts that one.
+    """
+    fix: Fix | None = None
+    """The pose that the robot knows; None until it is localised."""
     failure: Verdict | None = None
     """The verdict of the latest meeting that has failed before the robot was localised."""
     frame: Pose = ORIGIN

@@ -10,15 +10,16 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
+from agent.estimation.gaussian.claim_agreement import difference
 from agent.estimation.knowledge import Belief
 from agent.planning import passing, phase2_orbit, sweep_transitions, transitions
-from agent.planning.group_state import GroupState
+from agent.planning.group_state import Fix, GroupState
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Travelling
 from agent.planning.state import Done, RobotState
 from protocol.messages import Contact, Localised, Member, Retry, Undecided, Verdict
 from protocol.mission import Role
 from protocol.motion import Pose, compose, inverse
-from protocol.orbits import Rendezvous
+from protocol.orbits import SIDES, Rendezvous
 
 SHORT_OF_ANCHOR = 0.5
 """The distance from the visited robot's anchor at which a visitor stops, as a fraction of R.
@@ -40,12 +41,6 @@ SILENT_AFTER = 200
 LINGERING = 6
 """The ticks in contact for which a visited robot waits for its visitor to leave, with a safety distance."""
 
-SIDES = 12
-"""The number of sides of the square spiral on which a visitor searches. Its radius is then three times R.
-
-With exact sensors, a robot that is not in range at the end of the way is not there.
-"""
-
 
 # --- meetings -----------------------------------------------------------------------------------------
 
@@ -55,7 +50,7 @@ def answering(state: GroupState, visitors: Sequence[str]) -> GroupState:
     pair = state.pair
     if state.verdict is not None or pair.belief.phase1_done_tick is None or pair.config.peer in visitors:
         return state
-    if pair.in_contact and not refused(state, pair.config.peer) and state.silence <= SILENT_AFTER:
+    if _is_met(state) and state.silence <= SILENT_AFTER:
         return state
     for visitor in visitors:
         if not refused(state, visitor):
@@ -63,9 +58,66 @@ def answering(state: GroupState, visitors: Sequence[str]) -> GroupState:
     return state
 
 
+def _is_met(state: GroupState) -> bool:
+    """Return whether this robot is in contact with its peer, in a meeting that may still localise it.
+
+    With noise, one that has not done so by its bound may never do so. Of exact ranges, a few suffice.
+    """
+    pair, config = state.pair, state.config
+    if not pair.in_contact or refused(state, config.peer):
+        return False
+    until = state.until if state.until is not None else 0.0
+    is_noisy, ends = pair.estimator.corrects_poses, config.member(config.robot).ends
+    return not is_noisy or pair.tick <= ends or _now(pair) < until
+
+
 def refused(state: GroupState, robot: str) -> bool:
     """Return whether this robot, which is not localised, has had a meeting with `robot` that failed."""
     return state.verdict is None and state.other(robot).failed
+
+
+def with_claim(state: GroupState, claim: Localised) -> GroupState:
+    """Return `state` of a robot that has determined its pose in the present meeting.
+
+    If this contradicts the pose that it knows, one of two peers has reported false data. A pose on which
+    several meetings agree stays. One that follows from a single meeting is withdrawn, because nothing tells
+    which of the two it was, and the robot waits for a third one.
+    """
+    pair, peer, fix = state.pair, state.config.peer, state.fix
+    contradiction = _contradiction(state, claim)
+    if contradiction is None:
+        fix = Fix(pair.tick, claim, (*(fix.peers if fix is not None else ()), peer))
+        verdict = claim if state.verdict is None else state.verdict
+        frame = compose(claim.pose, inverse(pair.odometry))
+        return replace(state, verdict=verdict, fix=fix, located=pair, frame=frame)
+    assert fix is not None
+    if len(fix.peers) > 1:
+        return _after_meeting(state)
+    (other,) = fix.peers
+    state = state.with_other(other, replace(state.other(other), failed=True))
+    return replace(state, verdict=None, fix=None, located=None, failure=contradiction)
+
+
+def _contradiction(state: GroupState, claim: Localised) -> Undecided | None:
+    """Return how `claim`, of the present meeting, contradicts the known pose; None if it does not.
+
+    The claims of robots with exact sensors have no covariance, and are never wrong.
+    """
+    pair, fix, mission = state.pair, state.fix, state.config.mission
+    if fix is None or claim.covariance is None:
+        return None
+    off = difference(fix.claim, fix.tick, claim, pair.tick, pair.log, mission)
+    if off.p_value >= 1.0 - mission.confidence:
+        return None
+    return Undecided(
+        f"{fix.peers[-1]} and {state.config.peer} contradict each other: by their reports, its pose differs "
+        f"by {off.position:.3g} m and {off.heading:.3g} rad (p = {off.p_value:.2g})"
+    )
+
+
+def _is_withdrawn(state: GroupState) -> bool:
+    """Return whether the present meeting contradicts an earlier one, so that the robot knows no pose."""
+    return state.verdict is None and isinstance(state.pair.verdict, Localised)
 
 
 def after_refusal(state: GroupState) -> GroupState:
@@ -87,6 +139,9 @@ def onward(state: GroupState, *, peer_has_left: bool = False) -> GroupState:
     `peer_has_left` says that the peer is localised, and has reported it from outside the meeting.
     """
     pair, peer = state.pair, state.pair.config.peer
+    over = peer_has_left or pair.peer_state.verdict is not None or state.unmet >= PARTED_AFTER
+    if _is_withdrawn(state):
+        return _waiting(replace(_after_meeting(state), visiting=False), peer) if over else state
     if not isinstance(state.verdict, Localised):
         return _after_failure(state)
     if state.sweeps:
@@ -107,7 +162,6 @@ def onward(state: GroupState, *, peer_has_left: bool = False) -> GroupState:
     if not isinstance(pair.verdict, Localised):
         reported = state.lingering > 0 or not pair.in_contact  # to the peer, before this robot leaves
         return next_visit(_after_meeting(state)) if reported else state
-    over = peer_has_left or pair.peer_state.verdict is not None or state.unmet >= PARTED_AFTER
     return next_visit(state) if over else state
 
 
@@ -167,7 +221,7 @@ def _trying_again(state: GroupState) -> GroupState:
         return state
     retry = config.retries[state.retries]
     state = replace(state, retries=state.retries + 1)
-    if (pair.in_contact and not refused(state, config.peer)) or refused(state, retry.peer):
+    if _is_met(state) or refused(state, retry.peer):
         return state
     return _in_retry(state, retry)
 
@@ -250,7 +304,8 @@ def _is_late(state: GroupState, member: Member) -> bool:
     back from its orbit.
     """
     known, config = state.other(member.robot), state.config
-    if known.localised or known.failed:
+    apart = math.hypot(member.anchor.x - config.anchor.x, member.anchor.y - config.anchor.y)
+    if known.localised or known.failed or apart < config.mission.orienting_distance:
         return False
     if known.missed is None:
         return True

@@ -78,11 +78,16 @@ class AgentHistory(msgspec.Struct, frozen=True):
 
     @property
     def claim(self) -> tuple[int, Localised] | None:
-        """Return the robot's first claim and its tick, or None."""
+        """Return the robot's claim and its tick: the first one since it withdrew one, if it did; or None."""
+        made = None
         for step in self.steps:
-            if step.command is not None and isinstance(step.command.verdict, Localised):
-                return step.observation.tick, step.command.verdict
-        return None
+            if step.command is None:
+                continue
+            if not isinstance(step.command.verdict, Localised):
+                made = None
+            elif made is None:
+                made = step.observation.tick, step.command.verdict
+        return made
 
     @property
     def odometry(self) -> tuple[Pose, ...]:

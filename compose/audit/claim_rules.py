@@ -13,7 +13,7 @@ from agent.process.agent_journal import AgentHistory
 from compose.audit.findings import Checks, Violation, between
 from compose.launch.planner_loader import planner_of
 from compose.recording.run import Run
-from protocol.messages import Localised, MissionEnd, PeerReport, Report, ReportWithPose
+from protocol.messages import MissionEnd, PeerReport, Report, ReportWithPose
 from protocol.motion import Pose, travelled
 from world.referee import inaccuracy, mistake
 from world.scenario import RobotSpec
@@ -25,10 +25,10 @@ def claim(run: Run) -> Checks:
     The rule also checks `outcome`.
     """
     for place, placed in enumerate(run.scenario.robots):
-        tick, made = _first_claim(run, placed.id)
-        if made is None:
+        standing, mission = run.standing_claim(placed.id), run.scenario.mission
+        if standing is None:
             continue
-        mission = run.scenario.mission
+        tick, made = standing
         why = mistake(made, run.ticks[tick].world.truth.poses[place], mission)
         yield None if why is None else Violation("claim", tick, placed.id, f"it claims a pose that is {why}")
         vague = inaccuracy(made, mission)
@@ -37,15 +37,6 @@ def claim(run: Run) -> Checks:
         if agent is not None and tick < len(agent.steps) and agent.steps[tick].command is not None:
             yield _redundant(run, placed, agent, tick)
     yield from outcome(run)
-
-
-def _first_claim(run: Run, robot: str) -> tuple[int, Localised | None]:
-    """Return the tick and the content of the robot's first claim; (0, None) if it made none."""
-    for tick, one in enumerate(run.ticks):
-        command = one.commands.get(robot)
-        if command is not None and isinstance(command.verdict, Localised):
-            return tick, command.verdict
-    return 0, None
 
 
 def _redundant(run: Run, placed: RobotSpec, agent: AgentHistory, tick: int) -> Violation | None:

@@ -89,7 +89,8 @@ def planned_meetings(found: Scenario) -> GroupMeetings:
     anchors = [(robot.id, robot.given_anchor) for robot in found.robots]
     robots = [RobotTable(robot, (at.x, at.y) if at is not None else None) for robot, at in anchors]
     planner = PlannerTable(found.planner_name, found.planner_options)
-    meetings = group_meetings([one for one in robots if one.anchor is not None], found.mission, planner)
+    anchored = [one for one in robots if one.anchor is not None]
+    meetings = group_meetings(anchored, found.mission, planner, found.faults)
     area = found.planned_sweep.sweep.bounds if found.planned_sweep is not None else None
     return with_sweep(robots, area, found.mission, meetings)
 

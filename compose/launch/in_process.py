@@ -91,13 +91,7 @@ def played(
             commands[observation.robot] = agent.decide(received)
             if sinks:
                 agent.estimate()
-            verdict = commands[observation.robot].verdict
-            if (
-                isinstance(verdict, Localised)
-                and verdict.covariance is not None
-                and observation.robot not in claims
-            ):
-                claims[observation.robot] = agent.planner.estimate(agent.state)
+            _keep_claim(claims, agent, commands[observation.robot])
         if sent:
             for robot in ids:  # it can no longer be received
                 sent.pop((robot, simulation.tick - LATEST), None)
@@ -110,6 +104,18 @@ def played(
         scenario, tuple(ticks), None, mission_outcome, end, final_reports, environment=environment.of_world()
     )
     return Run(history, claim_estimates=claims)
+
+
+def _keep_claim(claims: dict[str, Estimate], agent: Robot, command: Command) -> None:
+    """Keep in `claims` the estimate of a robot with noisy sensors in the tick of its claim.
+
+    In a group, it may withdraw the claim.
+    """
+    verdict, robot = command.verdict, command.robot
+    if verdict is None:
+        claims.pop(robot, None)
+    elif isinstance(verdict, Localised) and verdict.covariance is not None and robot not in claims:
+        claims[robot] = agent.planner.estimate(agent.state)
 
 
 @cache

@@ -14,7 +14,7 @@ from collections.abc import Collection, Sequence
 import msgspec
 
 from compose.recording.run import Run
-from protocol.orbits import meeting_ticks
+from protocol.orbits import SIDES, meeting_ticks, search_ticks
 from protocol.sweep_strips import (
     Place,
     SweptArea,
@@ -24,10 +24,8 @@ from protocol.sweep_strips import (
     sweep_speed,
     sweep_ticks,
 )
+from world.faults import exchange_ticks
 from world.scenario import Scenario
-
-SEARCHED = 42.0
-"""The length of the way on which a visitor with noisy sensors searches a robot in vain, in units of R."""
 
 
 class CorrectedBound(msgspec.Struct, frozen=True):
@@ -129,11 +127,12 @@ def _tour_ticks(scenario: Scenario, waiting: Collection[str]) -> int:
     mission = scenario.mission
     step = mission.max_speed * mission.period
     turn = math.ceil(math.pi / (mission.max_turn_rate * mission.period))
-    search = 0 if mission.noise.exact else math.ceil(SEARCHED * mission.sensing_range / step) + 12 * turn
     anchors = _anchors(scenario)
     ways = [_way_to_all(anchors, begin) for begin in range(len(anchors))]
     visits = len(anchors) - 1
-    return math.ceil(max(ways) / step) + visits * (turn + 1 + search) + len(waiting) * meeting_ticks(mission)
+    way = math.ceil(max(ways) / step) + visits * (turn + 1 + search_ticks(mission, SIDES))
+    each, once = exchange_ticks(scenario.faults)
+    return way + len(waiting) * (meeting_ticks(mission) + each) + once
 
 
 def _way_to_all(places: Sequence[Place], begin: int) -> float:

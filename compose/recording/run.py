@@ -230,12 +230,30 @@ class Run(msgspec.Struct, frozen=True, dict=True):
         return agent.estimates if agent is not None else ()
 
     def claim(self, robot: str) -> Claim | None:
-        """Return the first claim of `robot`, with its errors; None if it made none, and in hardware mode."""
-        for tick in self.ticks if self.world is not None else ():
+        """Return the claim of `robot`, with its errors; None if it made none, and in hardware mode."""
+        made = self.standing_claim(robot) if self.world is not None else None
+        if made is None:
+            return None
+        tick, verdict = made
+        return claim(tick, verdict, self.ticks[tick].truth.poses[self._place[robot]])
+
+    def standing_claim(self, robot: str) -> tuple[int, Localised] | None:
+        """Return the claim of `robot` and its tick; None if it made none, or has withdrawn it.
+
+        It is the first one, or in a group the first since the robot has withdrawn one.
+        """
+        made = None
+        for tick in self.ticks:
             command = tick.commands.get(robot)
-            if command is not None and isinstance(command.verdict, Localised):
-                return claim(tick.truth.tick, command.verdict, tick.truth.poses[self._place[robot]])
-        return None
+            if command is None:
+                continue
+            if made is None and isinstance(command.verdict, Localised):
+                made = tick.truth.tick, command.verdict
+                if not self.scenario.meetings:
+                    break
+            elif not isinstance(command.verdict, Localised):
+                made = None
+        return made
 
     def truth_held(self, robot: str) -> bool | None:
         """Return whether `robot` held the true hypothesis at its first claim (see `claim.truth_held`).

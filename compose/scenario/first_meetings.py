@@ -16,18 +16,24 @@ from protocol.mission import infeasibility
 from protocol.orbits import Rendezvous
 from protocol.rounding import TOLERANCE
 from protocol.spelling import did_you_mean
+from world.faults import Fault
 
 NEAREST_ANCHORS = TOLERANCE
 """The minimum distance in m of two anchors: nearer ones coincide at the accuracy of exact claims."""
 
 
-def meetings_of(file: ScenarioFile, source: str) -> GroupMeetings | None:
+def in_group(file: ScenarioFile) -> bool:
+    """Return whether the robots form a group, and not pairs."""
+    return len(file.robot) != 2 and all(robot.peer is None for robot in file.robot)
+
+
+def meetings_of(file: ScenarioFile, faults: Sequence[Fault], source: str) -> GroupMeetings | None:
     """Return the meetings of the group that the robots form; None if they form pairs.
 
     Raises BadScenario and Unworkable.
     """
     robots = file.robot
-    if len(robots) == 2 or any(robot.peer is not None for robot in robots):
+    if not in_group(file):
         for i, robot in enumerate(robots):
             if robot.anchor is None:
                 raise BadScenario(f"{source}: robot[{i}]: missing field 'anchor'")
@@ -39,7 +45,7 @@ def meetings_of(file: ScenarioFile, source: str) -> GroupMeetings | None:
     # least accurate are robots that are very near to each other, and those that have a long way
     _check_accuracy(file, (min(distances), max(distances)), source)
     try:
-        meetings = group_meetings([robots[i] for i in anchored], file.mission, file.planner)
+        meetings = group_meetings([robots[i] for i in anchored], file.mission, file.planner, faults)
         return with_sweep(robots, file.mission.area, file.mission, meetings)
     except Unworkable as error:
         raise Unworkable(f"{source}: {error}") from None

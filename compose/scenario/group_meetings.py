@@ -7,12 +7,15 @@ from collections.abc import Callable, Sequence
 from itertools import permutations
 from typing import NamedTuple
 
+import msgspec
+
 from compose.errors import Unworkable
 from compose.launch import planner_loader
-from compose.scenario.group_plan import group_plan
+from compose.scenario.group_plan import PlannedVisit, group_plan
 from compose.scenario.scenario_tables import PlannerTable, RobotTable
 from protocol.mission import Mission, Role
-from protocol.orbits import Rendezvous, meeting_ticks, pair_ticks, visiting
+from protocol.orbits import Rendezvous, meeting_ticks, pair_ticks, search_ticks, visiting
+from world.faults import Fault, exchange_ticks
 from world.scenario import PlannedMeeting, PlannedRetry, PlannedSweep
 
 NEIGHBOURS = 3
@@ -30,6 +33,13 @@ RETRIES = 2
 
 SLOWER = 2.0
 """The time for the visits after them, in units of the planned one: robots are not where they were planned."""
+
+SEARCHED_SIDES = 6
+"""The number of sides of its search, a square spiral, that the bound of a visit under noise allows for.
+
+They reach robots 2.5 R aside. These are two sigmas of the least accurate heading with which a robot leaves,
+so the bound of a visit is held with a probability of 0.95 at least; most headings are far more accurate.
+"""
 
 LARGE = 12
 """The number of robots from which on a group is large."""
@@ -60,10 +70,13 @@ class GroupMeetings(NamedTuple):
     """The search for robots without an anchor; None if all have one."""
 
 
-def group_meetings(robots: Sequence[RobotTable], mission: Mission, planner: PlannerTable) -> GroupMeetings:
+def group_meetings(
+    robots: Sequence[RobotTable], mission: Mission, planner: PlannerTable, faults: Sequence[Fault] = ()
+) -> GroupMeetings:
     """Return the meetings of `robots`, which have anchors, planned for the shortest bound.
 
-    Raises Unworkable if the planner is not made for groups, and UserError if it cannot be loaded.
+    Who meets whom does not depend on the `faults` of the radio, but the bounds do. Raises Unworkable if the
+    planner is not made for groups, and UserError if it cannot be loaded.
     """
     if not planner_loader.is_for_groups(planner.name):
         raise Unworkable(
@@ -71,7 +84,13 @@ def group_meetings(robots: Sequence[RobotTable], mission: Mission, planner: Plan
         )
     anchors = [robot.anchor for robot in robots if robot.anchor is not None]
     ids = [robot.id for robot in robots]
-    near = _neighbours(anchors)
+    nearest = mission.orienting_distance
+    near = _neighbours(anchors, nearest)
+    if not any(near):
+        raise Unworkable(
+            f"robot.anchor: no two anchors are {nearest:.3g} m apart, and with mission.noise, robots with "
+            "nearer ones cannot determine their headings"
+        )
 
     def rendezvous(i: int, j: int) -> Rendezvous:
         return planner_loader.orbits(
@@ -79,11 +98,12 @@ def group_meetings(robots: Sequence[RobotTable], mission: Mission, planner: Plan
         )
 
     def pair_time(i: int, j: int) -> float:
-        if len(robots) >= LARGE and j not in near[i]:
+        if math.dist(anchors[i], anchors[j]) < nearest or (len(robots) >= LARGE and j not in near[i]):
             return math.inf
         return pair_ticks(mission, rendezvous(i, j)) * mission.period
 
-    plan = group_plan(anchors, pair_time, mission.max_speed, meeting_ticks(mission) * mission.period)
+    meeting = meeting_ticks(mission) * mission.period
+    plan = group_plan(anchors, pair_time, mission.max_speed, meeting, nearest)
     turned = mission.noise.priors.gyro_bias * plan.bound
     if not mission.noise.exact and turned > MOST_TURNED:
         enough = rounded_down(MOST_TURNED / plan.bound)
@@ -92,7 +112,10 @@ def group_meetings(robots: Sequence[RobotTable], mission: Mission, planner: Plan
             f"{mission.noise.priors.gyro_bias:g} rad/s turns a robot by {turned:.2g} rad, more than "
             f"{MOST_TURNED:g}: calibrate the gyros to {enough:g} rad/s, or let the robots meet in pairs"
         )
-    planned = tuple([PlannedMeeting(ids[one.visitor], ids[one.visited], one.ends) for one in plan.meetings])
+    extra = exchange_ticks(faults)
+    meetings = _delayed(plan.meetings, mission, (extra[0] * mission.period, extra[1] * mission.period))
+    bound = meetings[-1].ends
+    planned = tuple([PlannedMeeting(ids[one.visitor], ids[one.visited], one.ends) for one in meetings])
     first: dict[str, FirstMeeting] = {}
     for one in plan.meetings:
         a, b = ids[one.visitor], ids[one.visited]
@@ -103,13 +126,31 @@ def group_meetings(robots: Sequence[RobotTable], mission: Mission, planner: Plan
             first[a] = FirstMeeting(b, "a", orbits)
         first[b] = FirstMeeting(a, "b", orbits)
     seeds = [(one.visitor, one.visited) for one in plan.meetings if one.first]
-    spread = plan.bound - min(one.ends for one in plan.meetings if one.first)
-    begins, retries = plan.bound + SLOWER * spread, []
+    spread = bound - min(one.ends for one in meetings if one.first)
+    begins, retries = bound + SLOWER * spread, []
     for i, j in _retried(seeds, len(robots), pair_time):
-        lasts = pair_time(i, j)
+        lasts = pair_time(i, j) + extra[0] * mission.period
         retries.append(PlannedRetry(ids[i], ids[j], rendezvous(i, j), begins, lasts))
         begins += lasts + SLOWER * spread
-    return GroupMeetings(planned, first, plan.bound, tuple(retries), begins)
+    return GroupMeetings(planned, first, bound, tuple(retries), begins)
+
+
+def _delayed(
+    meetings: Sequence[PlannedVisit], mission: Mission, delays: tuple[float, float]
+) -> list[PlannedVisit]:
+    """Return `meetings` with the bounds that allow for lost and late reports, and for searches under noise.
+
+    `delays` are those of each meeting, and of the first one of each robot besides, in s.
+    """
+    of_each, of_first = delays
+    search = search_ticks(mission, SEARCHED_SIDES) * mission.period
+    later: dict[int, float] = {}
+    found = []
+    for one in meetings:
+        late = (of_first if one.first else later[one.visitor] + search) + of_each
+        later[one.visitor] = later[one.visited] = late
+        found.append(msgspec.structs.replace(one, ends=one.ends + late))
+    return sorted(found, key=lambda one: one.ends)
 
 
 def rounded_down(value: float) -> float:
@@ -144,9 +185,11 @@ def _retried(
     return found
 
 
-def _neighbours(anchors: Sequence[tuple[float, float]]) -> list[set[int]]:
-    """Return the NEIGHBOURS nearest anchors of each anchor."""
-    return [
-        set(sorted(range(len(anchors)), key=lambda j: math.dist(one, anchors[j]))[1 : NEIGHBOURS + 1])
-        for one in anchors
-    ]
+def _neighbours(anchors: Sequence[tuple[float, float]], nearest: float) -> list[set[int]]:
+    """Return the NEIGHBOURS nearest anchors of each anchor, of those at least `nearest` m from it."""
+    found = []
+    for i, one in enumerate(anchors):
+        apart = {j: math.dist(one, other) for j, other in enumerate(anchors) if j != i}
+        far = [j for j in apart if apart[j] >= nearest]
+        found.append(set(sorted(far, key=apart.__getitem__)[:NEIGHBOURS]))
+    return found

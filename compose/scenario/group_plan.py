@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import cached_property
+from itertools import permutations
 from math import inf, sqrt
 
 import msgspec
@@ -57,12 +58,14 @@ def group_plan(
     seed_time: Callable[[int, int], float],
     speed: float,
     meeting: float,
+    nearest: float = 0.0,
 ) -> GroupPlan:
     """Return the plan of the group whose robots wait beside `anchors`, given in m.
 
     `seed_time(a, b)` bounds in s how long it takes until a, which searches, and b, which waits, are both
     localised beside the anchor of b; it is infinite if they cannot meet. Later a localised robot drives at
-    `speed` in m/s to the anchor of one that waits, where their meeting lasts at most `meeting` in s.
+    `speed` in m/s to the anchor of one that waits, where their meeting lasts at most `meeting` in s. Robots
+    whose anchors are less than `nearest` m apart visit each other only if no other robot can.
 
     The plan is optimal up to MOST_OPTIMAL robots; beyond, `short_forest` says what is known. Numbering and
     translation change the bound by rounding only, unless two anchors are at one place. Raises ValueError for
@@ -71,6 +74,7 @@ def group_plan(
     if len(anchors) < 2:
         raise ValueError(f"a group has at least two robots, not {len(anchors)}")
     order = sorted(range(len(anchors)), key=anchors.__getitem__)
+    near = {(a, b) for a, b in permutations(order, 2) if _distance(anchors[a], anchors[b]) < nearest}
     seed = tuple(tuple(inf if a == b else seed_time(a, b) for b in order) for a in order)
     if min(map(min, seed)) == inf:
         raise ValueError("no two robots of the group can meet first")
@@ -79,15 +83,18 @@ def group_plan(
     forest = optimal_forest(times) if len(order) <= MOST_OPTIMAL else short_forest(times)
     meetings = tuple(
         msgspec.structs.replace(each, visitor=order[each.visitor], visited=order[each.visited])
-        for each in planned_meetings(forest, times)
+        for each in planned_meetings(forest, times, {(order.index(a), order.index(b)) for a, b in near})
     )
     return GroupPlan(meetings, meetings[-1].ends, MeetingTimes(seed, travel))
 
 
-def planned_meetings(forest: WakeUpForest, times: MeetingTimes) -> list[PlannedVisit]:
+def planned_meetings(
+    forest: WakeUpForest, times: MeetingTimes, near: Collection[tuple[int, int]] = ()
+) -> list[PlannedVisit]:
     """Return the meetings of `forest`, in the order of their ends.
 
-    The robot that was visited makes the hop whose branch ends last, and its visitor the other.
+    The robot that was visited makes the hop whose branch ends last, and its visitor the other; the other way
+    round if fewer of these visits are `near`, which holds (visitor, visited).
     """
     ends = forest.ends(times)
     last = dict(ends)
@@ -97,7 +104,10 @@ def planned_meetings(forest: WakeUpForest, times: MeetingTimes) -> list[PlannedV
     meetings = [PlannedVisit(a, b, ends[b], first=True) for a, b in forest.seeds]
     for place, robot in forest.hops:
         branches = [other for start, other in forest.hops if start == place]
-        visitors[robot] = place if robot == max(branches, key=last.__getitem__) else visitors[place]
+        branches.sort(key=last.__getitem__, reverse=True)
+        ways = [dict(zip(branches, both, strict=False)) for both in permutations((place, visitors[place]))]
+        way = min(ways, key=lambda way: sum([(by, other) in near for other, by in way.items()]))
+        visitors[robot] = way[robot]
         meetings.append(PlannedVisit(visitors[robot], robot, ends[robot]))
     return sorted(meetings, key=lambda meeting: meeting.ends)
 

@@ -14,7 +14,7 @@ from msgspec.structs import asdict
 from compose.errors import BadFault, BadKill, BadScenario, Unworkable, UserError
 from compose.launch import model_loader, planner_loader
 from compose.scenario.fault_syntax import FaultTable, added, table_of
-from compose.scenario.first_meetings import linked, meetings_of, pair_meetings
+from compose.scenario.first_meetings import in_group, linked, meetings_of, pair_meetings
 from compose.scenario.group_meetings import GroupMeetings
 from compose.scenario.kills import WORLD, Kill, drawn
 from compose.scenario.scenario_tables import MAX_TICKS, MissionTable, PlannerTable, RobotTable, ScenarioFile
@@ -222,7 +222,10 @@ def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scena
     """Return the scenario of `file`, with the faults of the `--fault` options added to its own."""
     _check_noise(file.mission, source)
     _check_planner(file.planner, source)
-    meetings = meetings_of(file, source)
+    faults: tuple[Fault, ...] = ()
+    if in_group(file):
+        faults = _faults(file, options, linked(file.robot, {}, in_group=True), source)
+    meetings = meetings_of(file, faults, source)
     first = meetings.first if meetings is not None else pair_meetings(file, source)
     links = linked(file.robot, first, in_group=meetings is not None)
     _check_world_noise(file, links, source)
@@ -246,11 +249,11 @@ def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scena
         peer, role, orbits = first[robot.id]
         anchor = Anchor(*robot.anchor) if robot.anchor is not None else None
         placed.append(RobotSpec(robot.id, peer, role, anchor, start, orbits, robot.attack))
-    faults = _faults(file, options, links, source)
     if meetings is not None:
         budget = math.ceil(meetings.latest / file.mission.period)
     else:
         budget = max(tick_budget(file.mission, one.rendezvous) for one in first.values())
+        faults = _faults(file, options, links, source)
     delay = EXCHANGES * delivery_time_bound(faults) if faults else 0
     if file.max_ticks is None and budget + delay > MAX_TICKS:
         cause = "mission: the rendezvous" if budget > MAX_TICKS else "fault: the delivery of reports"

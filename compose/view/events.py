@@ -134,6 +134,8 @@ def _deciding(
     active = command.verdict is None or (grouped and command.state != "localised")
     if active and (earlier is None or command.state != earlier.state):
         yield Event(tick, "state", robot, doing(robot_setup, command.phase, command.state, None))
+    if command.verdict is None and earlier is not None and earlier.verdict is not None:
+        yield Event(tick, "undecided", robot, f"{robot} withdraws its claim: another meeting contradicts it")
     if command.verdict is not None and (earlier is None or earlier.verdict is None):
         yield _verdict(robot_setup, command, now)
 

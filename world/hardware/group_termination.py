@@ -83,7 +83,9 @@ class GroupEnding(Termination):
         self._heard[robot] = time.monotonic()
         before = robot in self._results, robot in self._complete
         if message.verdict is not None:
-            self._results.setdefault(robot, message.verdict)
+            self._results[robot] = message.verdict
+        else:
+            self._results.pop(robot, None)  # it has withdrawn its claim
         (self._complete.add if message.complete else self._complete.discard)(robot)
         return (robot in self._results, robot in self._complete) != before
 
@@ -98,7 +100,7 @@ class GroupEnding(Termination):
         A robot that catches up after a restart sends no TickStarts: it ends when it has sent enough of them.
         """
         if command is not None:
-            self.verdict = self.verdict or command.verdict
+            self.verdict = command.verdict
             self._resting = self._resting + 1 if command.state in RESTING_STATES else 0
         lost = [robot for robot in self._others if self._is_lost(robot, tick)]
         self._is_complete = self.verdict is not None and self._results.keys() | {*lost} >= self._others

@@ -85,9 +85,12 @@ def _concluding(
     claiming = []
     for robot in setup.robots:
         command, earlier = now.commands.get(robot.id), before.commands.get(robot.id)
-        if command is None or command.verdict is None or (earlier is not None and earlier.verdict):
+        pair, had = (robot.id, robot.peer), earlier is not None and earlier.verdict is not None
+        if command is not None and command.verdict is None and had:
+            text = f"{robot.id} withdraws its claim, because its meeting with {robot.peer} contradicts it."
+            yield Caption("undecided", text, pair)
+        if command is None or command.verdict is None or had:
             continue
-        pair = robot.id, robot.peer
         match command.verdict:
             case Localised():
                 claiming.append(robot.id)

@@ -1,0 +1,105 @@
+"""The agreement of two poses of one robot that it has determined in different meetings."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from agent.estimation.gaussian import inference
+from agent.estimation.gaussian.odometry_noise import (
+    Array,
+    Projection,
+    Track,
+    constant_effects,
+    constant_errors,
+    is_noisy,
+    spread,
+    variances,
+    wander,
+)
+from agent.peer.motion_log import MotionLog
+from protocol.messages import Localised
+from protocol.mission import Mission
+from protocol.motion import Covariance, Pose, compose, inverse, wrap
+from protocol.noise import Noise
+
+
+class Difference(NamedTuple):
+    """The difference of a pose from the one that follows from an earlier claim and the odometry since."""
+
+    position: float
+    """The distance of the positions in m."""
+    heading: float
+    """The difference of the headings in rad, not negative."""
+    p_value: float
+    """The probability of a difference that is as improbable, if both claims are right (chi-square test)."""
+
+
+STEPS = 8
+"""The Gauss-Newton steps to the pose that both claims suggest. Three suffice for errors of 0.3 rad."""
+
+
+def difference(
+    earlier: Localised, since: int, now: Localised, through: int, log: MotionLog, mission: Mission
+) -> Difference:
+    """Return the difference of the claim `now`, of tick `through`, from the claim `earlier`, of tick `since`.
+
+    Chi-square is that of the pose at `since` which suits both best, because an error of the heading moves a
+    far pose on an arc. The errors of the two claims and of the odometry between them are taken as
+    independent. Claims share the ranges to the robot's own anchor, so they differ by less, and the p-value is
+    too large rather than too small.
+    """
+    assert earlier.covariance is not None
+    assert now.covariance is not None
+    path = inference.path_of(log, 0, through, mission)
+    here, there = (
+        Pose(float(path.x[tick]), float(path.y[tick]), float(path.heading[tick])) for tick in (since, through)
+    )
+    way = compose(inverse(here), there)
+    off = _minus(now.pose, compose(earlier.pose, way))
+    first = np.linalg.inv(_matrix(earlier.covariance))
+    best, chi2 = earlier.pose, math.inf
+    for _ in range(STEPS):
+        begin, end = _minus(best, earlier.pose), compose(best, way)
+        left = _minus(end, now.pose)
+        drift = _drift(path, since, best.heading - here.heading, mission.noise)
+        second = np.linalg.inv(_matrix(now.covariance) + drift)
+        chi2 = float(begin @ first @ begin + left @ second @ left)
+        by_begin = np.eye(3)
+        by_begin[0, 2], by_begin[1, 2] = best.y - end.y, end.x - best.x
+        weighted = by_begin.T @ second
+        move = np.linalg.solve(first + weighted @ by_begin, first @ begin + weighted @ left)
+        best = Pose(*(np.array((best.x, best.y, best.heading)) - move).tolist())
+    return Difference(math.hypot(off[0], off[1]), abs(float(off[2])), _tail(chi2))
+
+
+def _minus(one: Pose, other: Pose) -> Array:
+    """Return the difference of two poses in x, y and heading, (3,)."""
+    return np.array((one.x - other.x, one.y - other.y, wrap(one.heading - other.heading)))
+
+
+def _drift(path: Track, since: int, turn: float, noise: Noise) -> Array:
+    """Return the covariance of the pose at the end of `path`, rotated by `turn`, by noise after `since`."""
+    if not is_noisy(noise):
+        return np.zeros((3, 3))
+    patterns = constant_errors(path.v, path.omega, noise)
+    white = variances(path.v, path.omega, noise.odometry)
+    model = wander(path, np.zeros((2, len(path.v))), patterns, white).since(since)
+    rows = Projection.pose(path, len(path.v), turn)
+    constant = constant_effects(model, rows)[:-1]
+    left, right = spread(model, rows)
+    return np.asarray(left.T @ right + constant.T @ constant)
+
+
+def _matrix(covariance: Covariance) -> Array:
+    """Return `covariance` as an array, (3, 3)."""
+    xx, xy, xh, yy, yh, hh = (getattr(covariance, name) for name in Covariance.__struct_fields__)
+    return np.array(((xx, xy, xh), (xy, yy, yh), (xh, yh, hh)))
+
+
+def _tail(chi2: float) -> float:
+    """Return the probability of a chi-square above `chi2` with three degrees of freedom."""
+    root = math.sqrt(0.5 * max(chi2, 0.0))
+    return math.erfc(root) + 2.0 / math.sqrt(math.pi) * root * math.exp(-root * root)
