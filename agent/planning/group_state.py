@@ -75,8 +75,12 @@ class GroupState(msgspec.Struct, frozen=True):
     """The pose that it reports to robots without an anchor in range, with noisy sensors; None if none is."""
     fitted: int = -1
     """The tick of its latest estimate of its pose while it sweeps, with noisy sensors."""
+    ranges: int = 0
+    """The number of its ranges at that estimate."""
+    wide: float = 0.0
+    """The sigma of its position at that estimate, in m."""
     loose: int = -6
-    """The number of its ranges at the latest of these with a large covariance."""
+    """The number of its ranges before the latest ones that have come while this sigma was large."""
     searched: int = -100
     """The tick of the latest of these for a contact."""
     verdict: Verdict | None = None

@@ -234,16 +234,17 @@ def _estimated(state: GroupState, *, searched: bool = False) -> tuple[GroupState
         mode = replace(mode, then=tuple([_moved(turn, place) for place in mode.then]))
     known = tuple([one.hypothesis for one in scored])
     pair = replace(pair, belief=replace(pair.belief, pair=known), mode=mode)
-    loose = state.loose
-    if covariance.position_sigma > LOOSE * mission.sensing_range:
-        loose = len(pair.log.ranges) + len(pair.mutual)
-    state = replace(state, pair=pair, frame=frame, loose=loose)
+    count, wide = len(pair.log.ranges) + len(pair.mutual), covariance.position_sigma
+    loose = (
+        state.ranges if count > state.ranges and state.wide > LOOSE * mission.sensing_range else state.loose
+    )
+    state = replace(state, pair=pair, frame=frame, loose=loose, ranges=count, wide=wide)
     sound = (
         searched
         and scored[0].hypothesis.probability >= mission.confidence
         and scored[0].fit.last_step <= FINISHED
         and fitted.p_value >= CLAIM_P_VALUE
-        and len(pair.log.ranges) + len(pair.mutual) >= loose + RANGES_AGAIN
+        and count >= loose + RANGES_AGAIN
     )
     if not sound:
         return state, None
