@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterable
 from itertools import pairwise
@@ -32,6 +33,7 @@ from protocol.network import keys
 from protocol.wire import decode, encode
 from tests.commands import ASSURED, PAPER_1
 from tests.stage import Stage
+from world.hardware import bridge
 from world.hardware.bridge import Field, NoStart
 from world.hardware.driver import THINKING, Reading
 from world.hardware.driver_journal import DrivenTick, DriverHistory
@@ -451,6 +453,28 @@ def test_a_b_that_was_killed_before_tick_0_begins_though_a_waits_for_it(stage: S
     assert times[5] == pytest.approx(times[0] + 5 * tick_s)
     assert times[6] == pytest.approx((9.5 + 6) * tick_s)
     assert end.tick == 9
+
+
+def test_a_mission_ends_though_zenoh_takes_its_end_never(
+    stage: Stage, played: Play, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bridge, "PUT_S", 0.05)
+    released = threading.Event()
+    sent = stage._on_put
+
+    def put(key: str, frame: bytes) -> None:
+        if key == keys.observation("r", "a") and isinstance(
+            decode(frame, Observation | MissionEnd | FinalReport), MissionEnd
+        ):
+            released.wait()
+        else:
+            sent(key, frame)
+
+    monkeypatch.setattr(stage, "_on_put", put)
+    _, end, _ = played(Recorded(), lambda tick: [encode(command(tick))])
+    released.set()
+    assert (end.tick, end.outcome) == (5, "undecided")
+    assert "no FinalReport of a: Zenoh does not take the MissionEnd" in capsys.readouterr().err
 
 
 def test_a_robot_prints_the_reason_for_a_missing_final_report(

@@ -12,6 +12,7 @@ another robot (see `tick_source`). If none arrives, it uses its own clock.
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -50,6 +51,12 @@ It is shorter than the time after which an agent replaces its link.
 """
 FINAL_REPORT_TIMEOUT_S = 2.0
 """The time in s to wait for the agent's FinalReport."""
+PUT_S = 2.0
+"""The time in s that Zenoh has to take a frame at the end of a mission.
+
+Other robots close their links at the same time. Seldom, on a busy machine, Zenoh then takes no frame any
+more, without a limit of time.
+"""
 ASTRAY = 64
 """The maximum number of ticks by which a TickStart may differ from the tick of a robot that follows it.
 
@@ -399,17 +406,32 @@ class Field:
         """Send `end` to the agent until it sends its FinalReport, and acknowledge that."""
         give_up = time.monotonic() + FINAL_REPORT_TIMEOUT_S
         while (now := time.monotonic()) < give_up and self._id in self._alive:
-            self._observation.put(encode(end))
+            if not self._is_taken(encode(end)):
+                self._inbox.say(f"no FinalReport of {self._id}: Zenoh does not take the MissionEnd")
+                return
             repeat = min(now + REPEAT_S, give_up)
             while (left := repeat - time.monotonic()) > 0.0:
                 arrival = self._inbox.next(left)
                 if arrival.topic == "gone":
                     self._alive.discard(arrival.source.robot)
                 elif arrival.topic == "command" and _is_final_report(arrival.frame, self._id):
-                    self._observation.put(arrival.frame)
+                    self._is_taken(arrival.frame)
                     return
         why = "no answer to the MissionEnd" if self._id in self._alive else "its agent has ended"
         self._inbox.say(f"no FinalReport of {self._id}: {why}")
+
+    def _is_taken(self, frame: bytes) -> bool:
+        """Send `frame` to the agent, and return whether Zenoh has taken it within PUT_S.
+
+        If not, the thread keeps this object: publishers that Zenoh cannot undeclare must not be freed.
+        """
+        sender = threading.Thread(target=self._send, args=(frame,), daemon=True)
+        sender.start()
+        sender.join(PUT_S)
+        return not sender.is_alive()
+
+    def _send(self, frame: bytes) -> None:
+        self._observation.put(frame)
 
 
 def _is_final_report(frame: bytes, robot: str) -> bool:
