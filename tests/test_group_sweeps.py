@@ -88,7 +88,10 @@ def test_the_robot_r1_of_a_drawn_group_may_have_an_attack() -> None:
     assert [robot.anchor for robot in scenario.robots] == [robot.anchor for robot in honest.robots]
 
 
-@pytest.mark.parametrize(("name", "of_group"), [("group", True), ("group-attacks", True), ("loss", False)])
+@pytest.mark.parametrize(
+    ("name", "of_group"),
+    [("group", True), ("group-attacks", True), ("group-attacks-noise", True), ("loss", False)],
+)
 def test_only_sweeps_of_groups_have_the_columns_of_groups(name: str, of_group: bool) -> None:
     sweep = spec.load(name)
     names = set(schema_of(sweep, list(cells(sweep))[:1]).names)
