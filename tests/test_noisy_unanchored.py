@@ -27,6 +27,7 @@ from protocol.messages import (
     Contact as Detection,
 )
 from protocol.messages import (
+    Estimate,
     Localised,
     Observation,
     Ranged,
@@ -267,7 +268,7 @@ def contact(seed: int, sigma: float, times: int = 3) -> tuple[Contact, Pose]:
     finder, angle = Pose(10.0, 20.0, rng.uniform(-3.0, 3.0)), rng.uniform(-math.pi, math.pi)
     own = Pose(10.0 + 1.8 * math.cos(angle), 20.0 + 1.8 * math.sin(angle), rng.uniform(-3.0, 3.0))
     there, here = poses_of(finder, FINDER * times), poses_of(own, OWN * times)
-    errors = rng.normal(0.0, np.sqrt(np.diagonal(matrix(covariance))))
+    errors = rng.normal(0.0, np.sqrt(np.diagonal(matrix(covariance)))).tolist()
     told = Pose(finder.x + errors[0], finder.y + errors[1], finder.heading + errors[2])
     ranges = [
         Ranged(tick, math.hypot(one.x - other.x, one.y - other.y) + rng.normal(0.0, 0.05))
@@ -291,6 +292,19 @@ def test_a_finder_that_is_less_accurate_than_the_mission_asks_leads_to_no_claim(
     found = estimated(contact(1, 0.4)[0], MISSION)
     assert found is not None
     assert found.blocking_reason.startswith("the sigma of the position is 0.4")
+
+
+@pytest.mark.parametrize(("x", "angle"), [(1e7, 0.01), (1.0, 1e15)])
+def test_a_reference_at_the_bounds_of_messages_gives_no_estimate_beyond_them(x: float, angle: float) -> None:
+    """An estimate beyond them could be sent and recorded, but not be read again."""
+    measured = contact(1, 0.1)[0]
+    covariance = replace(measured.covariance, hh=angle)
+    for side in (x, -x):
+        pose = replace(measured.pose, x=side)
+        found = estimated(measured._replace(pose=pose, covariance=covariance), MISSION)
+        if found is not None:
+            frame = encode(Estimate(0, "u", (), found.poses, False, found.probabilities, found.covariance))
+            assert decode(frame, Estimate).world == found.poses
 
 
 def test_the_same_ranges_do_not_count_twice_through_the_finder() -> None:

@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from msgspec.structs import replace
 
@@ -105,7 +106,21 @@ def estimated(contact: Contact, mission: Mission) -> ContactEstimate | None:
     if abs(level - 1.0) > SAME_LEVEL:  # the level is that of these measurements, not of the finder's pose
         measured = _with_level(measured, level)
         found = with_probability([joint_fit(measured, one.fit.start) for one in found])
-    return _estimate(found, measured, mission)
+    estimate = _estimate(found, measured, mission) if found else None
+    return estimate if estimate is not None and _is_sendable(estimate) else None
+
+
+def _is_sendable(estimate: ContactEstimate) -> bool:
+    """Return whether the poses and their covariance are within the bounds of messages.
+
+    They may be beyond them if the reported pose or its covariance is at a bound.
+    """
+    try:
+        sent = msgspec.to_builtins((estimate.poses, estimate.covariance))
+        msgspec.convert(sent, tuple[tuple[Pose, ...], Covariance])
+    except msgspec.ValidationError:
+        return False
+    return True
 
 
 def _measured(contact: Contact, mission: Mission) -> JointMeasurements:
