@@ -115,10 +115,10 @@ class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True
 ORIENTING = 3.0
 """The least distance of two anchors whose robots meet in a group, in sigmas of a range.
 
-The vector between their anchors alone tells two robots how they are turned in <W>: with D = 0, both could be
-turned about the common anchor, and no range would change. With sigma = 0.05 m, 3, 7 and 11 of 12 pairs were
-localised within 600 ticks at 0.03, 0.06 and 0.10 m, and all within 44 ticks at 0.15 m. With more, plans are
-longer for nothing.
+Two robots determine their headings in <W> only from the vector between their anchors: with D = 0, both could
+be turned about the common anchor, and no range would change. With sigma = 0.05 m, 3, 7 and 11 of 12 pairs
+were localised within 600 ticks at 0.03, 0.06 and 0.10 m, and all within 44 ticks at 0.15 m. With more, plans
+are longer for nothing.
 """
 
 HEADING_ACCURACY = 0.2

@@ -114,9 +114,9 @@ def delivery_time_bound(plan: Sequence[Fault]) -> int:
 def exchange_ticks(plan: Sequence[Fault]) -> tuple[int, int]:
     """Return the ticks by which the faults of `plan` delay each meeting of a group, and all of them once.
 
-    With the probability EXCHANGED, IN_TURN Reports, which are sent again in every tick, are received in these
-    ticks besides those without faults. What delays all once are windows without any delivery. All faults
-    count for all links; one that never delivers anything does not count.
+    The first is the number of extra ticks within which IN_TURN Reports, each sent again in every tick, are
+    received with the probability EXCHANGED. The second is the length of the windows without any delivery. All
+    faults count for all links; one that never delivers anything does not count.
     """
     through, each, once = 1.0, 0, 0
     for fault in plan:

@@ -80,13 +80,13 @@ class GroupState(msgspec.Struct, frozen=True):
     wide: float = 0.0
     """The sigma of its position at that estimate, in m."""
     loose: int = -6
-    """The number of its ranges before the latest ones that have come while this sigma was large."""
+    """The number of its ranges just before the latest new ones that came while this sigma was large."""
     searched: int = -100
-    """The tick of the latest of these for a contact."""
+    """The tick of its latest estimate at the beginning of a contact, which searches the whole plane."""
     verdict: Verdict | None = None
     """The verdict of the robot: that of the meeting which localised it.
 
-    None again once another meeting contradicts that one.
+    It is None again when another meeting contradicts that one.
     """
     fix: Fix | None = None
     """The pose that the robot knows; None until it is localised."""

@@ -4,8 +4,8 @@ The visitor of a last meeting sweeps a part of the area. The robot that it has v
 is its beacon: before each two strips, the sweeping robot passes its own anchor and its beacon. The ranges to
 both, and the odometry between them, are measurements of their meeting like those before its claim, so its
 pose and the covariance of it follow from the fit of that meeting (`GaussianEstimator`). Where it comes into
-range of a robot without an anchor, it reports both, and its odometry from then on, which stay fixed during
-the contact.
+range of a robot without an anchor, it reports its pose with the covariance, which stay fixed during the
+contact, and its odometry from then on.
 """
 
 from __future__ import annotations
@@ -49,7 +49,10 @@ LOOSE = 0.1
 """The sigma of the position, in units of R, from which on the next few ranges do not determine it."""
 
 RANGES_AGAIN = 6
-"""The number of ranges after which they do: two unknowns, from several sides of the anchor or the beacon."""
+"""The number of ranges from which on they determine it again.
+
+The two unknowns of the position need ranges from several sides of the anchor or the beacon.
+"""
 
 MOST_WEIGHED = 48
 """The most ranges of a kind after the claim of the meeting that a fit weighs; those before it all count.
@@ -74,7 +77,7 @@ TINY = 1e-6
 """The least difference of log-likelihoods that divides another one."""
 
 MOST_FITS = 4
-"""The most fits in a tick: ranges after a long way move the path further than the steps of one."""
+"""The most fits in a tick: after a long way, the steps of one fit do not suffice to correct the path."""
 
 
 class NoisyGroupPlanner(GroupPlanner):
@@ -170,9 +173,9 @@ class _Fitted(NamedTuple):
 
 
 def _fitted(state: GroupState, *, searched: bool) -> _Fitted:
-    """Return the fit of the latest meeting; with a search of the whole plane if they do not explain it.
+    """Return the fit of the latest meeting.
 
-    `searched` says that it is searched in any case.
+    The whole plane is searched if the known hypotheses do not explain the measurements, or if `searched`.
     """
     pair, measured = state.pair, _measured(state)
     found = _followed(pair.belief.pair, measured, _place(pair))

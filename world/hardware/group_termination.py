@@ -4,11 +4,11 @@ In a group, a Report contains the verdict of a meeting, and robots are seldom in
 drivers send each other the results of their robots, with every TickStart.
 
 A robot's own result does not end its mission, because others may need it: it stays until all robots have a
-result, and know of each other's. A robot that is not there may have been killed, and needs the results of the
-others when it is back. So one whose result is known is waited for until it has been silent for the timeout.
-If its result is not known, it is not waited for ever, either. Once it should be localised by the plan, this
-robot's planner goes there. The mission ends when the planner has nothing to do any more, or when this takes
-as long as the whole plan. In any case, it ends at max_ticks.
+result, and know each other's. A robot that sends nothing may have been killed, and needs the results of the
+others when it resumes. If its result is known, the others wait until it has sent nothing for the timeout. If
+not, they also wait until it should be localised by the plan, and their planners then drive to it. The mission
+ends when the planner has nothing more to do, or when this takes as long as the whole plan. In any case, it
+ends at max_ticks.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class GroupEnding(Termination):
         self._resting = 0
         """The number of consecutive ticks in which the planner had nothing to do."""
         self._said = 0
-        """The number of TickStarts of this process that say so."""
+        """The number of TickStarts in which this process has reported that."""
         self._known: int | None = None
         """The tick in which no robot waited for another one any more."""
 

@@ -2,8 +2,8 @@
 
 The true poses are unknown, so the outcome is never `wrong`. A robot stays until the peer has acknowledged its
 result. It then continues to send Reports for LAST_WORDS ticks, which contain its own acknowledgement. A peer
-that is not there any more may have been killed, and needs the result when it is back. So it is waited for
-until the timeout after the robot's own result.
+that has disappeared may have been killed, and needs the result when it resumes. So the robot waits for it
+until the timeout after its own result.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """The pose of a robot without an anchor, from noisy ranges to one that is localised.
 
 The other robot, the finder, has sent its pose at a reference tick with a covariance, and its odometry from
-then on. The error of that pose is one unknown of three dimensions with this prior: the odometry of both
-robots, the errors of the ranges and the start of this robot are the other unknowns of one joint fit.
+then on. In one joint fit, the error of that pose is one unknown of three dimensions, with this covariance as
+its prior. The other unknowns are the odometry errors of both robots, those of the ranges, and the start of
+this robot.
 """
 
 from __future__ import annotations
@@ -253,7 +254,7 @@ def _rival(best: JointFit, measured: JointMeasurements, mission: Mission) -> str
 
 
 def _doubt(best: JointFit, measured: JointMeasurements) -> str:
-    """Return which profile of sensors explains the measurements much better than told, or an empty text."""
+    """Return which profile explains the measurements much better than the mission's noise, or an empty text."""
     for name, other in claim_profiles(measured.noise):
         again = joint_fit(replace(measured, noise=other), JointStart(best.start.poses))
         if again.weight - best.weight > DOUBTFUL_CLAIM:

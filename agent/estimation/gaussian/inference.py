@@ -51,9 +51,9 @@ def beginning(knowledge: Knowledge, through: int) -> int:
     """Return the tick up to `through` from which on the measurements of robot a count: 0, or a later one.
 
     A robot a that has had no range to its anchor for longer than T_max has searched for b in vain. With its
-    next range it begins phase 1 again. What it has measured before says next to nothing of where it is then:
-    its heading has drifted on the orbit by up to a radian, and over such an angle no fit is linear. Both
-    robots know the tick from a's log. After LEAST_RANGES mutual ranges, a does not begin again.
+    next range it begins phase 1 again. Earlier measurements hardly constrain its pose then: the error of its
+    heading has grown on the orbit to up to a radian, and over such an angle no fit is linear. Both robots
+    determine the tick from a's log. After LEAST_RANGES mutual ranges, a does not begin again.
     """
     config = knowledge.config
     if not config.begins_again:
@@ -101,7 +101,7 @@ def own_path(knowledge: Knowledge) -> Track:
 
 
 def _own_measurements(knowledge: Knowledge) -> tuple[Track, Ranges]:
-    """Return the odometry of the robot and its ranges to its anchor, of those that count."""
+    """Return the odometry of the robot and its ranges to its anchor, without those that do not count."""
     mission, now, first = knowledge.config.mission, knowledge.tick, _own_beginning(knowledge)
     ranges = Ranges.of_lists(_ranges_within(knowledge.log, first, now), (), (), mission.noise)
     return path_of(knowledge.log, first, now, mission), ranges
