@@ -75,7 +75,7 @@ less, most of the way leads to the anchor and back.
 """
 
 BESIDE, AROUND = 0.5, 0.6
-"""How far beside its anchor or beacon a robot passes, and from how far before to as far behind, in R."""
+"""The distance at which a robot passes beside its anchor or beacon, and the half length of that way, in R."""
 
 
 class SweptArea(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):

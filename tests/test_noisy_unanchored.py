@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from agent.estimation.gaussian.contact_fit import Contact, estimated, is_definite, matrix
+from agent.estimation.gaussian.contact_fit import ContactRanges, estimated, is_definite, matrix
 from agent.estimation.gaussian.odometry_noise import Track, track
 from agent.planning.noisy_unanchored import NoisyUnanchoredPlanner
 from compose.audit.replay import replayed
@@ -261,7 +261,7 @@ def poses_of(pose: Pose, manoeuvres: list[tuple[float, float]]) -> list[Pose]:
     return found
 
 
-def contact(seed: int, sigma: float, times: int = 3) -> tuple[Contact, Pose]:
+def contact(seed: int, sigma: float, times: int = 3) -> tuple[ContactRanges, Pose]:
     """Return a contact with a finder whose position has this sigma (m), and the true pose at its end."""
     rng = np.random.default_rng(seed)
     covariance = Covariance(0.5 * sigma**2, 0.0, 0.0, 0.5 * sigma**2, 0.0, 0.01**2)
@@ -274,7 +274,9 @@ def contact(seed: int, sigma: float, times: int = 3) -> tuple[Contact, Pose]:
         Ranged(tick, math.hypot(one.x - other.x, one.y - other.y) + rng.normal(0.0, 0.05))
         for tick, (one, other) in enumerate(zip(there, here, strict=True))
     ]
-    return Contact(told, covariance, path_of(FINDER * times), path_of(OWN * times), tuple(ranges)), here[-1]
+    return ContactRanges(
+        told, covariance, path_of(FINDER * times), path_of(OWN * times), tuple(ranges)
+    ), here[-1]
 
 
 @given(st.integers(0, 10**6), st.floats(0.01, 0.28))

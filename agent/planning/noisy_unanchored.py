@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from agent.estimation.gaussian.contact_fit import Contact, ContactEstimate, estimated, is_definite
+from agent.estimation.gaussian.contact_fit import ContactEstimate, ContactRanges, estimated, is_definite
 from agent.estimation.gaussian.gaussian_estimator import GAUSSIAN
 from agent.estimation.gaussian.inference import MUTUAL_RANGES, MUTUAL_RANGES_WITH_OUTLIERS
 from agent.estimation.gaussian.known_anchors import FEWEST
@@ -53,7 +53,7 @@ Each estimate is a search of all poses. With 1, claims would come two ticks earl
 
 
 class Finder(msgspec.Struct, frozen=True):
-    """What a robot without an anchor knows about the localised robot that has found it."""
+    """The localised robot that has found one without an anchor, as far as the latter knows it."""
 
     robot: str
     reference: int
@@ -263,7 +263,7 @@ def _estimated(state: NoisyUnanchoredState) -> NoisyUnanchoredState:
     )
     if len(ranges) < max(FEWEST, state.fitted + EACH):
         return state
-    contact = Contact(
+    contact = ContactRanges(
         finder.pose,
         finder.covariance,
         _path(finder.log.runs, mission),

@@ -26,7 +26,7 @@ from protocol.motion import Covariance, Pose, compose, inverse, wrap
 from protocol.noise import Noise
 
 
-class Difference(NamedTuple):
+class ClaimDifference(NamedTuple):
     """The difference of a pose from the one that follows from an earlier claim and the odometry since."""
 
     position: float
@@ -43,7 +43,7 @@ STEPS = 8
 
 def difference(
     earlier: Localised, since: int, now: Localised, through: int, log: MotionLog, mission: Mission
-) -> Difference:
+) -> ClaimDifference:
     """Return the difference of the claim `now`, of tick `through`, from the claim `earlier`, of tick `since`.
 
     Chi-square is that of the pose at `since` which suits both best, because an error of the heading moves a
@@ -72,7 +72,7 @@ def difference(
         weighted = by_begin.T @ second
         move = np.linalg.solve(first + weighted @ by_begin, first @ begin + weighted @ left)
         best = Pose(*(np.array((best.x, best.y, best.heading)) - move).tolist())
-    return Difference(math.hypot(off[0], off[1]), abs(float(off[2])), _tail(chi2))
+    return ClaimDifference(math.hypot(off[0], off[1]), abs(float(off[2])), _tail(chi2))
 
 
 def _minus(one: Pose, other: Pose) -> Array:

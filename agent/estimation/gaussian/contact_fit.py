@@ -51,7 +51,7 @@ SAME_LEVEL = 0.05
 """The relative change of the noise level below which a fit is not repeated with it."""
 
 
-class Contact(NamedTuple):
+class ContactRanges(NamedTuple):
     """The measurements of a robot without an anchor and of its finder; tick 0 is the reference."""
 
     pose: Pose
@@ -94,7 +94,7 @@ def is_definite(covariance: Covariance) -> bool:
     return bool(least > max(SMALLEST * most, SMALLEST**2))
 
 
-def estimated(contact: Contact, mission: Mission) -> ContactEstimate | None:
+def estimated(contact: ContactRanges, mission: Mission) -> ContactEstimate | None:
     """Return the possible poses of this robot; None if there are too few ranges, or no pose explains them."""
     measured = _measured(contact, mission)
     if len(measured.ranges.rho) < FEWEST:
@@ -124,7 +124,7 @@ def _is_sendable(estimate: ContactEstimate) -> bool:
     return True
 
 
-def _measured(contact: Contact, mission: Mission) -> JointMeasurements:
+def _measured(contact: ContactRanges, mission: Mission) -> JointMeasurements:
     """Return the measurements for a joint fit, relative to the finder's position at the reference tick."""
     noise, ranges = mission.noise, contact.ranges
     count = len(ranges)

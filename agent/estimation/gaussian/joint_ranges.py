@@ -102,7 +102,7 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
     """The point of <W> (m) to which all positions are relative, so that they have small numbers."""
     noise: Noise
     prior: PosePrior | None = None
-    """What is known of the poses at tick 0 besides the ranges; None: nothing."""
+    """The prior of the poses at tick 0; None if nothing is known of them besides the ranges."""
 
     def until(self, tick: int) -> JointMeasurements:
         """Return what was measured up to `tick`."""
