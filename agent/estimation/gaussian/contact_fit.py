@@ -254,7 +254,7 @@ def _rival(best: JointFit, measured: JointMeasurements, mission: Mission) -> str
 
 
 def _doubt(best: JointFit, measured: JointMeasurements) -> str:
-    """Return which profile explains the measurements much better than the mission's noise, or an empty text."""
+    """Return which profile explains the measurements much better than the given noise, or an empty text."""
     for name, other in claim_profiles(measured.noise):
         again = joint_fit(replace(measured, noise=other), JointStart(best.start.poses))
         if again.weight - best.weight > DOUBTFUL_CLAIM:
