@@ -218,11 +218,12 @@ def test_a_robot_without_a_beacon_waits_for_it_idle_and_gives_up() -> None:
     rover.close()
 
 
+@pytest.mark.long
 def test_the_agent_of_a_robot_waits_for_the_peer_as_long_as_its_driver(tmp_path: Path) -> None:
     """That is `--connect-timeout`, however short the time is to wait for an answer."""
     ended = tandem(
         *("robot", "b", "--mission", "paper-1", "--driver", "docs.rover:Rover", "--rate", "10"),
-        *("--connect-timeout", "5", "--timeout", "1", "--out", tmp_path / "out"),
+        *("--connect-timeout", "12", "--timeout", "6", "--out", tmp_path / "out"),
     )
     assert ended.status == 3
     assert ended.err == "tandem robot b: a: not connected; no robot has moved\n"

@@ -216,7 +216,8 @@ class Field:
 
         Raises NoStart.
         """
-        tell = time.monotonic() + WAITING_S
+        waiting_s = min(WAITING_S, 0.25 * self._timeout)
+        tell = time.monotonic() + waiting_s
         unheard = time.monotonic() + UNHEARD * self._tick_s
         while not self._may_begin():
             missing = [one for one in (self._id, *self._others) if one not in self._alive]
@@ -232,7 +233,7 @@ class Field:
                 raise NoStart(f"{' and '.join(missing or self._others)}: not connected{moved}")
             if (now := time.monotonic()) >= tell:
                 self._observation.put(encode(TickStart(self._tick + 1, self._id)))
-                tell = now + WAITING_S
+                tell = now + waiting_s
             until = min(give_up, tell, unheard) if self._restarted and unheard > now else min(give_up, tell)
             self._take(self._inbox.next(until - time.monotonic()))
         if self._next == UNKNOWN and not self._restarted:  # it follows nobody yet
