@@ -391,7 +391,7 @@ def test_a_robot_that_was_down_catches_up_with_its_peer_standing(robot: str, pee
 
 
 def test_a_restarted_robot_whose_peer_comes_later_is_no_more_behind_than_the_peer(stage: Stage) -> None:
-    """Its driver waits for the peer in each tick, to measure the range, and the peer counts its ticks.
+    """A robot whose driver waits in each tick for its peer, to measure the range; the peer counts its ticks.
 
     It has nothing to catch up with, so it says where it is. Otherwise the peer would count its own ticks, and
     this robot would be late in all of them.

@@ -190,7 +190,7 @@ def test_larger_errors_than_told_lead_to_no_wrong_claim() -> None:
 
 @pytest.mark.long
 def test_a_robot_whose_fit_has_ended_in_a_wrong_optimum_passes_on_no_pose() -> None:
-    """Without the search before a reference, its pose was 3.7 m wrong after it had come back."""
+    """A pose that was 3.7 m wrong without the search before a reference, when the robot had come back."""
     odometry = {"v": 0.01, "omega": 0.01, "v_floor": 0.002, "omega_floor": 0.0005}
     run = of_frames(kept(replace(noisy(table_with(4, 2, 2), odometry=odometry), max_ticks=330)))
     assert of_finders(run)

@@ -26,6 +26,7 @@ from agent.planning.phase3_last_manoeuvre import Standing
 from agent.planning.planner import Planner, Summary
 from agent.planning.state import MODE_NAMES
 from agent.planning.sweep import Looping, Sweeping
+from agent.planning.unanchored import WaitingState
 from protocol.messages import (
     Command,
     Estimate,
@@ -39,7 +40,7 @@ from protocol.messages import (
     Undecided,
 )
 from protocol.mission import Mission
-from protocol.motion import ORIGIN, REST, Covariance, Pose, Segment
+from protocol.motion import Covariance, Pose, Segment
 from protocol.sweep_strips import OWN_SIDE, contact_ticks
 
 SWEEPING = MODE_NAMES[Sweeping]
@@ -63,21 +64,14 @@ class Finder(msgspec.Struct, frozen=True):
     covariance: Covariance
     """The covariance of the error of `pose`."""
     log: MotionLog
-    """Its manoeuvres from the reference tick on."""
+    """The manoeuvres of that robot from the reference tick on."""
     latest: int
     """The tick of its latest report."""
 
 
-class NoisyUnanchoredState(msgspec.Struct, frozen=True):
+class NoisyUnanchoredState(WaitingState, frozen=True):
     """The state of a robot without an anchor, with noisy sensors."""
 
-    config: RobotConfigWithoutAnchor
-    tick: int = -1
-    odometry: Pose = ORIGIN
-    """The pose by dead reckoning, in the frame of the pose at tick 0."""
-    leg: Pose = ORIGIN
-    """The odometry at the beginning of the last segment of `log`."""
-    log: MotionLog = MotionLog()
     ranges: Mapping[str, tuple[Ranged, ...]] = {}
     """The latest ranges to each robot."""
     finder: Finder | None = None
@@ -89,23 +83,11 @@ class NoisyUnanchoredState(msgspec.Struct, frozen=True):
     at: int = -1
     failure: str = "no localised robot has found it"
     """The reason for which it has no claim yet."""
-    mode: Standing | Looping = Standing()
-    verdict: Localised | Undecided | None = None
 
     @property
     def phase(self) -> int:
         """Return 2 until a localised robot has found it, then 3."""
         return 2 if self.finder is None else 3
-
-    @property
-    def mode_name(self) -> str:
-        """Return the name of the mode that reports, commands and recordings use."""
-        match self.verdict:
-            case Localised():
-                return "localised"
-            case Undecided():
-                return "undecided"
-        return MODE_NAMES[type(self.mode)]
 
 
 class NoisyUnanchoredPlanner(Planner[NoisyUnanchoredState, Report]):
@@ -162,21 +144,7 @@ class NoisyUnanchoredPlanner(Planner[NoisyUnanchoredState, Report]):
 
     def command(self, state: NoisyUnanchoredState) -> Command:
         """Return the command for the next tick, with the phase, the mode and the verdict."""
-        controls = None
-        if isinstance(state.mode, Looping) and state.verdict is None:
-            controls = sweep.controls(
-                state.mode, state.odometry, state.config.mission, GAUSSIAN.pose_tolerance
-            )
-        driven = controls or REST
-        return Command(
-            state.tick,
-            state.config.robot,
-            driven.v,
-            driven.omega,
-            state.phase,
-            state.mode_name,
-            state.verdict,
-        )
+        return state.command(GAUSSIAN.pose_tolerance)
 
     def estimate(self, state: NoisyUnanchoredState) -> Estimate:
         """Return the poses in <W> that are possible in the tick of an estimate, the most probable first."""

@@ -49,8 +49,8 @@ PLACES = 5
 """The number of relative placements that a claim needs: three for a position, two for a heading."""
 
 
-class UnanchoredState(msgspec.Struct, frozen=True):
-    """The state of a robot without an anchor."""
+class WaitingState(msgspec.Struct, frozen=True):
+    """The state of a robot without an anchor, with exact and with noisy sensors."""
 
     config: RobotConfigWithoutAnchor
     tick: int = -1
@@ -59,21 +59,13 @@ class UnanchoredState(msgspec.Struct, frozen=True):
     leg: Pose = ORIGIN
     """The odometry at the beginning of the last segment of `log`."""
     log: MotionLog = MotionLog()
-    base: Pose = ORIGIN
-    """The odometry at the place where it stands, or stood before its square."""
-    ranges: Mapping[tuple[str, int], tuple[float, Pose]] = {}
-    """The ranges without a reported pose yet, with the own pose relative to `base`, by robot and tick."""
-    places: Mapping[tuple[str, int], RangedPlace] = {}
-    """The ranges to robots that have reported their poses in those ticks, by robot and tick."""
-    possible: tuple[Pose, ...] = ()
-    """The poses of `base` in <W> that agree with the ranges; empty before the heading can be determined."""
     mode: Standing | Looping = Standing()
     verdict: Localised | Undecided | None = None
 
     @property
     def phase(self) -> int:
-        """Return 2 until the first range to a localised robot, then 3."""
-        return 3 if self.places else 2
+        """Return 2 until a localised robot has found it, then 3."""
+        raise NotImplementedError
 
     @property
     def mode_name(self) -> str:
@@ -84,6 +76,34 @@ class UnanchoredState(msgspec.Struct, frozen=True):
             case Undecided():
                 return "undecided"
         return MODE_NAMES[type(self.mode)]
+
+    def command(self, tolerance: float) -> Command:
+        """Return the command for the next tick; a place counts as reached within `tolerance` m."""
+        controls = None
+        if isinstance(self.mode, Looping) and self.verdict is None:
+            controls = sweep.controls(self.mode, self.odometry, self.config.mission, tolerance)
+        driven = controls or REST
+        return Command(
+            self.tick, self.config.robot, driven.v, driven.omega, self.phase, self.mode_name, self.verdict
+        )
+
+
+class UnanchoredState(WaitingState, frozen=True):
+    """The state of a robot without an anchor, with exact sensors."""
+
+    base: Pose = ORIGIN
+    """The odometry at the place where it stands, or stood before its square."""
+    ranges: Mapping[tuple[str, int], tuple[float, Pose]] = {}
+    """The ranges without a reported pose yet, with the own pose relative to `base`, by robot and tick."""
+    places: Mapping[tuple[str, int], RangedPlace] = {}
+    """The ranges to robots that have reported their poses in those ticks, by robot and tick."""
+    possible: tuple[Pose, ...] = ()
+    """The poses of `base` in <W> that agree with the ranges; empty before the heading can be determined."""
+
+    @property
+    def phase(self) -> int:
+        """Return 2 until the first range to a localised robot, then 3."""
+        return 3 if self.places else 2
 
 
 class UnanchoredPlanner(Planner[UnanchoredState, Report]):
@@ -142,19 +162,7 @@ class UnanchoredPlanner(Planner[UnanchoredState, Report]):
 
     def command(self, state: UnanchoredState) -> Command:
         """Return the command for the next tick, with the phase, the mode and the verdict."""
-        controls = None
-        if isinstance(state.mode, Looping) and state.verdict is None:
-            controls = sweep.controls(state.mode, state.odometry, state.config.mission, EXACT.pose_tolerance)
-        driven = controls or REST
-        return Command(
-            state.tick,
-            state.config.robot,
-            driven.v,
-            driven.omega,
-            state.phase,
-            state.mode_name,
-            state.verdict,
-        )
+        return state.command(EXACT.pose_tolerance)
 
     def estimate(self, state: UnanchoredState) -> Estimate:
         """Return the poses in <W> that agree with all ranges."""
