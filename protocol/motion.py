@@ -48,6 +48,11 @@ class Covariance(msgspec.Struct, frozen=True, array_like=True, gc=False, forbid_
     """The variance of the heading, in rad^2."""
 
     @property
+    def matrix(self) -> list[list[float]]:
+        """The 3 x 3 matrix of x, y (m) and heading (rad)."""
+        return [[self.xx, self.xy, self.xh], [self.xy, self.yy, self.yh], [self.xh, self.yh, self.hh]]
+
+    @property
     def position_sigma(self) -> float:
         """The square root of the trace of the covariance of the position, in m."""
         return math.sqrt(max(0.0, self.xx + self.yy))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2  # type: ignore[import-untyped]
 
 from compose.launch.in_process import run_mission
-from compose.recording.claim import matrix, nees, truth_held
+from compose.recording.claim import nees, truth_held
 from compose.recording.run import Run, read
 from compose.recording.summary_json import leave, summary
 from compose.scenario.scenario_file import load, parse
@@ -104,7 +104,7 @@ def test_nees_wraps_the_error_in_heading() -> None:
 
 
 def test_nees_of_errors_that_are_as_claimed_has_a_chi_square_of_three_degrees() -> None:
-    draw, p = np.random.default_rng(2), np.array(matrix(SURE))
+    draw, p = np.random.default_rng(2), np.array(SURE.matrix)
     errors = draw.multivariate_normal(np.zeros(3), p, 4000)
     values = np.array([nees(Pose(*e), Pose(0.0, 0.0, 0.0), SURE) for e in errors.tolist()])
     assert abs(values.mean() - 3.0) < 4.5 * math.sqrt(6.0 / len(values))

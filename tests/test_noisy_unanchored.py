@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from agent.estimation.gaussian.contact_fit import ContactRanges, estimated, is_definite, matrix
+from agent.estimation.gaussian.contact_fit import ContactRanges, estimated, is_definite
 from agent.estimation.gaussian.odometry_noise import Track, track
 from agent.planning.noisy_unanchored import NoisyUnanchoredPlanner
 from compose.audit.replay import replayed
@@ -76,7 +76,7 @@ def references(run: Run) -> list[tuple[str, ReportWithReference]]:
 def squared_error(pose: Pose, covariance: Covariance, truth: Pose) -> float:
     """Return the normalised error squared of a pose; its mean is 3 if the covariance is right."""
     error = np.array((pose.x - truth.x, pose.y - truth.y, wrap(pose.heading - truth.heading)))
-    return float(error @ np.linalg.solve(matrix(covariance), error))
+    return float(error @ np.linalg.solve(np.array(covariance.matrix), error))
 
 
 def of_finders(run: Run) -> list[float]:
@@ -268,7 +268,7 @@ def contact(seed: int, sigma: float, times: int = 3) -> tuple[ContactRanges, Pos
     finder, angle = Pose(10.0, 20.0, rng.uniform(-3.0, 3.0)), rng.uniform(-math.pi, math.pi)
     own = Pose(10.0 + 1.8 * math.cos(angle), 20.0 + 1.8 * math.sin(angle), rng.uniform(-3.0, 3.0))
     there, here = poses_of(finder, FINDER * times), poses_of(own, OWN * times)
-    errors = rng.normal(0.0, np.sqrt(np.diagonal(matrix(covariance)))).tolist()
+    errors = rng.normal(0.0, np.sqrt(np.diagonal(np.array(covariance.matrix)))).tolist()
     told = Pose(finder.x + errors[0], finder.y + errors[1], finder.heading + errors[2])
     ranges = [
         Ranged(tick, math.hypot(one.x - other.x, one.y - other.y) + rng.normal(0.0, 0.05))

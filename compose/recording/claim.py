@@ -61,12 +61,6 @@ def truth_held(estimate: Estimate, truth: Pose, accuracy: float) -> bool | None:
     return False
 
 
-def matrix(covariance: Covariance) -> list[list[float]]:
-    """Return the 3 x 3 matrix of x, y (m) and heading (rad)."""
-    c = covariance
-    return [[c.xx, c.xy, c.xh], [c.xy, c.yy, c.yh], [c.xh, c.yh, c.hh]]
-
-
 def nees(estimate: Pose, truth: Pose, covariance: Covariance) -> float:
     """Return the NEES e^T P^-1 e, where e is the error (x, y, wrapped heading) and P the covariance.
 
@@ -77,5 +71,5 @@ def nees(estimate: Pose, truth: Pose, covariance: Covariance) -> float:
     import numpy as np  # noqa: PLC0415  # loaded only if there is a covariance
 
     error = np.array([estimate.x - truth.x, estimate.y - truth.y, wrap(estimate.heading - truth.heading)])
-    variances, axes = np.linalg.eigh(np.array(matrix(covariance)))
+    variances, axes = np.linalg.eigh(np.array(covariance.matrix))
     return float(((axes.T @ error) ** 2 / np.maximum(variances, TOLERANCE**2)).sum())

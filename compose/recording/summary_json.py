@@ -13,7 +13,6 @@ from typing import Any, Literal
 import msgspec
 
 from compose.extras import version
-from compose.recording.claim import matrix
 from compose.recording.corrected_bounds import corrected_bounds
 from compose.recording.group_localisation import (
     MeetingResult,
@@ -117,7 +116,7 @@ def _robot_summary(run: Run, robot: str) -> dict[str, Any]:
         "localised": claimed is not None,
         "localised_tick": claimed.tick if claimed is not None else None,
         "estimate": _listed(claimed.pose) if claimed is not None else None,
-        "covariance": matrix(covariance) if covariance is not None else None,
+        "covariance": covariance.matrix if covariance is not None else None,
         "truth": _listed(truth[-1]) if truth else None,
         **(at_claim if run.scenario.meetings else {}),
         "position_error_m": claimed.position_error if claimed is not None else None,

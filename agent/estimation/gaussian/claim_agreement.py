@@ -22,7 +22,7 @@ from agent.estimation.gaussian.odometry_noise import (
 from agent.peer.motion_log import MotionLog
 from protocol.messages import Localised
 from protocol.mission import Mission
-from protocol.motion import Covariance, Pose, compose, inverse, wrap
+from protocol.motion import Pose, compose, inverse, wrap
 from protocol.noise import Noise
 
 
@@ -59,13 +59,13 @@ def difference(
     )
     way = compose(inverse(here), there)
     off = _minus(now.pose, compose(earlier.pose, way))
-    first = np.linalg.inv(_matrix(earlier.covariance))
+    first = np.linalg.inv(np.array(earlier.covariance.matrix))
     best, chi2 = earlier.pose, math.inf
     for _ in range(STEPS):
         begin, end = _minus(best, earlier.pose), compose(best, way)
         left = _minus(end, now.pose)
         drift = _drift(path, since, best.heading - here.heading, mission.noise)
-        second = np.linalg.inv(_matrix(now.covariance) + drift)
+        second = np.linalg.inv(np.array(now.covariance.matrix) + drift)
         chi2 = float(begin @ first @ begin + left @ second @ left)
         by_begin = np.eye(3)
         by_begin[0, 2], by_begin[1, 2] = best.y - end.y, end.x - best.x
@@ -91,12 +91,6 @@ def _drift(path: Track, since: int, turn: float, noise: Noise) -> Array:
     constant = constant_effects(model, rows)[:-1]
     left, right = spread(model, rows)
     return np.asarray(left.T @ right + constant.T @ constant)
-
-
-def _matrix(covariance: Covariance) -> Array:
-    """Return `covariance` as an array, (3, 3)."""
-    xx, xy, xh, yy, yh, hh = (getattr(covariance, name) for name in Covariance.__struct_fields__)
-    return np.array(((xx, xy, xh), (xy, yy, yh), (xh, yh, hh)))
 
 
 def _tail(chi2: float) -> float:

@@ -31,7 +31,7 @@ from agent.estimation.gaussian.joint_search import (
 )
 from agent.estimation.gaussian.known_anchors import FEWEST, AnchoredRobot, chi2_p_value, scored_fits
 from agent.estimation.gaussian.linear_model import Start
-from agent.estimation.gaussian.odometry_noise import Array, Errors, Track
+from agent.estimation.gaussian.odometry_noise import Errors, Track
 from agent.estimation.gaussian.own_sensors import DOUBTFUL_CLAIM, claim_profiles
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges
 from protocol.messages import Ranged
@@ -79,15 +79,9 @@ class ContactEstimate(NamedTuple):
     """The p-value of the consistency test of the most probable pose."""
 
 
-def matrix(covariance: Covariance) -> Array:
-    """Return a covariance as a matrix, (3, 3)."""
-    xx, xy, xh, yy, yh, hh = (getattr(covariance, name) for name in covariance.__struct_fields__)
-    return np.array(((xx, xy, xh), (xy, yy, yh), (xh, yh, hh)))
-
-
 def is_definite(covariance: Covariance) -> bool:
     """Return whether the covariance of a report is positive definite, and can be inverted."""
-    values = matrix(covariance)
+    values = np.array(covariance.matrix)
     if not np.all(np.isfinite(values)):
         return False
     least, _, most = np.linalg.eigvalsh(values).tolist()
@@ -129,7 +123,7 @@ def _measured(contact: ContactRanges, mission: Mission) -> JointMeasurements:
     noise, ranges = mission.noise, contact.ranges
     count = len(ranges)
     information = np.zeros((6, 6))
-    information[:3, :3] = np.linalg.inv(matrix(contact.covariance))
+    information[:3, :3] = np.linalg.inv(np.array(contact.covariance.matrix))
     mean = np.zeros((2, 3))
     mean[FINDER, 2] = contact.pose.heading
     measured = JointMeasurements(
