@@ -79,8 +79,9 @@ class NoisyUnanchoredState(WaitingState, frozen=True):
     fitted: int = 0
     """The number of ranges to the finder at the latest estimate."""
     found: ContactEstimate | None = None
-    """The latest estimate of the pose, of the tick `at`; None without one."""
+    """The latest estimate of the pose; None without one."""
     at: int = -1
+    """The tick of `found`; -1 before the first estimate."""
     failure: str = "no localised robot has found it"
     """The reason for which it has no claim yet."""
 
