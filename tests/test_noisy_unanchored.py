@@ -16,6 +16,9 @@ from msgspec.structs import replace
 
 from agent.estimation.gaussian.contact_fit import ContactRanges, estimated, is_definite
 from agent.estimation.gaussian.odometry_noise import Track, track
+from agent.planning.accuracy_seeking import AccuracySeeking
+from agent.planning.group_state import GroupState
+from agent.planning.noisy_search import NoisyGroupPlanner
 from agent.planning.noisy_unanchored import NoisyUnanchoredPlanner
 from compose.audit.replay import replayed
 from compose.audit.rules import audit_run
@@ -197,6 +200,54 @@ def test_a_robot_whose_fit_has_ended_in_a_wrong_optimum_passes_on_no_pose() -> N
     assert max(of_finders(run)) < 16.3
     assert run.end is not None
     assert run.end.outcome != "wrong"
+
+
+# --- meetings that contradict each other -----------------------------------------------------------------
+
+
+def three_and_one() -> dict[str, Any]:
+    """Return a scenario file in which a meets b, visits c, and then looks for u, which has no anchor."""
+    table = four()
+    table["robot"] = [
+        {"id": "a", "anchor": [0.0, 0.0]},
+        {"id": "b", "anchor": [10.0, 3.0]},
+        {"id": "c", "anchor": [2.0, 11.0]},
+        {"id": "u"},
+    ]
+    return table
+
+
+def in_search(run: Run, peers: tuple[str, ...], shift: float) -> GroupState | None:
+    """Return the state of a when it begins to sweep; None if it does not, because its claim is withdrawn.
+
+    Before it claims its pose with c, the pose that it knows is from its meetings with `peers`, and `shift` m
+    beside the one that it has computed.
+    """
+    agent, planner = run.agents["a"], NoisyGroupPlanner(AccuracySeeking())
+    state, changed = planner.start(agent.config), False
+    for one in agent.steps:
+        state = planner.observe(state, one.observation)
+        fix = state.fix
+        if not changed and fix is not None and state.config.peer == "c" and state.pair.in_contact:
+            pose = replace(fix.claim.pose, x=fix.claim.pose.x + shift)
+            fix = replace(fix, peers=peers, claim=replace(fix.claim, pose=pose))
+            state, changed = replace(state, fix=fix), True
+        state = planner.decide(state, [framed.report for framed in one.received])
+        if state.sweeps:
+            return state
+    return None
+
+
+def test_the_search_begins_with_the_pose_that_the_robot_knows_after_a_meeting_that_contradicts_it() -> None:
+    run = of_frames(kept(noisy(three_and_one())))
+    agreeing = in_search(run, ("b",), 0.0)
+    assert agreeing is not None
+    assert agreeing.pair.config.peer == "c"
+    kept_claim = in_search(run, ("b", "d"), 2.0)
+    assert kept_claim is not None
+    assert kept_claim.other("c").failed
+    assert kept_claim.pair.config.peer == "b"
+    assert in_search(run, ("b",), 2.0) is None
 
 
 # --- the scenario -------------------------------------------------------------------------------------

@@ -132,9 +132,12 @@ def _begun(state: GroupState) -> GroupState:
     assert isinstance(state.verdict, Localised)
     if config.part >= config.sweep.parts:
         return replace(state, pair=replace(pair, mode=Done(3, state.verdict)))
-    if not pair.belief.pair and state.located is not None:  # after a visit in vain
+    located = state.located
+    assert located is not None
+    # after a visit in vain, or one that contradicts what this robot knows
+    if not pair.belief.pair or pair.config.peer != located.config.peer:
         same = {"tick": pair.tick, "odometry": pair.odometry, "log": pair.log, "leg": pair.leg}
-        pair = replace(state.located, **same, mode=pair.mode)
+        pair = replace(located, **same, mode=pair.mode)
     state = _located(replace(state, pair=pair, fitted=-1))
     pair = state.pair
     part = (config.part + state.parts - 1) % config.sweep.parts
