@@ -250,6 +250,36 @@ def test_the_search_begins_with_the_pose_that_the_robot_knows_after_a_meeting_th
     assert in_search(run, ("b",), 2.0) is None
 
 
+@pytest.mark.parametrize(("peers", "shift"), [(("b",), 0.0), (("b",), 2.0), (("b", "d"), 2.0)])
+def test_a_claim_that_later_ranges_contradict_is_withdrawn_in_the_search_and_no_pose_is_reported(
+    peers: tuple[str, ...], shift: float
+) -> None:
+    run = of_frames(journals())
+    (finder,) = {report.robot for _, report in references(run)}
+    first = min(report.reference for _, report in references(run))
+    agent, planner = run.agents[finder], NoisyGroupPlanner(AccuracySeeking())
+    state = planner.start(agent.config)
+    for one in agent.steps[: first + 1]:
+        if one.observation.tick == first:
+            assert state.fix is not None
+            claim = state.fix.claim
+            claim = replace(claim, pose=replace(claim.pose, x=claim.pose.x + shift))
+            state = replace(state, fix=replace(state.fix, claim=claim, peers=peers))
+        state = planner.observe(state, one.observation)
+        state = planner.decide(state, [framed.report for framed in one.received])
+    assert (state.reference is not None) == (shift == 0.0)
+    if shift == 0.0 or len(peers) > 1:
+        assert isinstance(planner.command(state).verdict, Localised)
+        assert state.sweeps
+        return
+    command = planner.command(state)
+    assert command.verdict is None
+    assert command.state in ("aligning", "radial", "orbiting")
+    assert isinstance(state.failure, Undecided)
+    assert state.failure.reason.startswith("its ranges since its claim contradict it by ")
+    assert planner.report_to(state, state.config.peer).verdict == state.failure
+
+
 # --- the scenario -------------------------------------------------------------------------------------
 
 
