@@ -377,17 +377,15 @@ def test_a_finder_that_is_less_accurate_than_the_mission_asks_leads_to_no_claim(
     assert found.blocking_reason.startswith("the sigma of the position is 0.4")
 
 
-@pytest.mark.parametrize(("x", "angle"), [(1e7, 0.01), (1.0, 1e15)])
-def test_a_reference_at_the_bounds_of_messages_gives_no_estimate_beyond_them(x: float, angle: float) -> None:
+def test_a_reference_at_the_bounds_of_messages_gives_no_estimate_beyond_them() -> None:
     """An estimate beyond them could be sent and recorded, but not be read again."""
     measured = contact(1, 0.1)[0]
-    covariance = replace(measured.covariance, hh=angle)
-    for side in (x, -x):
-        pose = replace(measured.pose, x=side)
-        found = estimated(measured._replace(pose=pose, covariance=covariance), MISSION)
-        if found is not None:
-            frame = encode(Estimate(0, "u", (), found.poses, False, found.probabilities, found.covariance))
-            assert decode(frame, Estimate).world == found.poses
+    found = [estimated(measured._replace(pose=replace(measured.pose, x=x)), MISSION) for x in (1e7, -1e7)]
+    assert None in found
+    for one in found:
+        if one is not None:
+            frame = encode(Estimate(0, "u", (), one.poses, False, one.probabilities, one.covariance))
+            assert decode(frame, Estimate).world == one.poses
 
 
 def test_the_same_ranges_do_not_count_twice_through_the_finder() -> None:
