@@ -12,10 +12,11 @@ import pytest
 import tomli_w
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from msgspec.structs import replace
+from msgspec.structs import asdict, replace
 
 from agent.estimation.gaussian.contact_fit import ContactRanges, estimated, is_definite
 from agent.estimation.gaussian.odometry_noise import Track, track
+from agent.planning import exchange
 from agent.planning.accuracy_seeking import AccuracySeeking
 from agent.planning.group_state import GroupState
 from agent.planning.noisy_search import NoisyGroupPlanner
@@ -474,6 +475,27 @@ def test_a_robot_stands_still_for_a_finder_that_is_too_inaccurate_and_ends_undec
     state = planner.observe(state, Observation(late, "u", REST, None))
     state = planner.decide(state)
     assert state.verdict == Undecided("b knows its position to 0.4 m, required 0.3")
+
+
+def test_a_robot_that_reports_another_reference_in_each_tick_costs_an_estimate_in_three_ticks() -> None:
+    planner = NoisyUnanchoredPlanner()
+    state = planner.start(config())
+    covariance = Covariance(0.01, 0.0, 0.0, 0.01, 0.0, 1e-4)
+    without = exchange.report_without_log(state, Localised(Pose(0.0, 0.0, 0.0), covariance))
+    fields = asdict(without) | {"robot": "b", "state": "looping"}
+    estimates = set()
+    for tick in range(60):
+        seen = (Detection("b", 1.0 + 0.01 * tick, (tick,)),)
+        state = planner.observe(state, Observation(tick, "u", REST, None, seen))
+        here = max(0, tick - 20)
+        runs = (Segment(tick - here, 0.1, 0.0),) if tick > here else ()
+        fields |= {"tick": tick, "since": here, "through": tick, "runs": runs}
+        pose = Pose(0.1 * here, 0.0, 0.0)
+        report = ReportWithReference(**fields, reference=here, pose=pose, covariance=covariance)
+        assert planner.malformed(report) is None
+        state = planner.decide(state, [report])
+        estimates.add(state.at)
+    assert 5 <= len(estimates) <= 20
 
 
 def test_malformed_references_are_refused() -> None:
