@@ -21,6 +21,7 @@ from agent.planning.accuracy_seeking import AccuracySeeking
 from agent.planning.group_state import GroupState
 from agent.planning.noisy_search import NoisyGroupPlanner
 from agent.planning.noisy_unanchored import NoisyUnanchoredPlanner
+from agent.process.agent_journal import Step
 from compose.audit.replay import replayed
 from compose.audit.rules import audit_run
 from compose.errors import UserError
@@ -35,6 +36,7 @@ from protocol.messages import (
     Localised,
     Observation,
     Ranged,
+    Report,
     ReportWithReference,
     RobotConfigWithoutAnchor,
     Undecided,
@@ -54,9 +56,9 @@ from world.scenario import Scenario
 NOISE: dict[str, Any] = {"anchor_sigma": 0.05, "mutual_sigma": 0.05, "gyro_bias": 0.0002}
 
 
-def noisy(table: dict[str, Any], **noise: Any) -> Scenario:
-    """Return the scenario of a file with the noise of the sweep `group`, and with other `noise`."""
-    table["mission"] |= {"noise": {**NOISE, **noise}, "accuracy": 0.3}
+def noisy(table: dict[str, Any], accuracy: float = 0.3, **noise: Any) -> Scenario:
+    """Return the scenario of a file with the noise of the sweep `group`, other `noise` and an accuracy."""
+    table["mission"] |= {"noise": {**NOISE, **noise}, "accuracy": accuracy}
     return scenario_of(table)
 
 
@@ -75,6 +77,11 @@ def references(run: Run) -> list[tuple[str, ReportWithReference]]:
                 if isinstance(framed.report, ReportWithReference):
                     found.setdefault((robot, framed.report.robot, framed.report.reference), framed.report)
     return [(robot, report) for (robot, _, _), report in found.items()]
+
+
+def of_robots(step_: Step) -> list[Report]:
+    """Return the reports that a robot has used in a tick."""
+    return [framed.report for framed in step_.received if isinstance(framed.report, Report)]
 
 
 def squared_error(pose: Pose, covariance: Covariance, truth: Pose) -> float:
@@ -233,7 +240,7 @@ def in_search(run: Run, peers: tuple[str, ...], shift: float) -> GroupState | No
             pose = replace(fix.claim.pose, x=fix.claim.pose.x + shift)
             fix = replace(fix, peers=peers, claim=replace(fix.claim, pose=pose))
             state, changed = replace(state, fix=fix), True
-        state = planner.decide(state, [framed.report for framed in one.received])
+        state = planner.decide(state, of_robots(one))
         if state.sweeps:
             return state
     return None
@@ -267,7 +274,7 @@ def test_a_claim_that_later_ranges_contradict_is_withdrawn_in_the_search_and_no_
             claim = replace(claim, pose=replace(claim.pose, x=claim.pose.x + shift))
             state = replace(state, fix=replace(state.fix, claim=claim, peers=peers))
         state = planner.observe(state, one.observation)
-        state = planner.decide(state, [framed.report for framed in one.received])
+        state = planner.decide(state, of_robots(one))
     assert (state.reference is not None) == (shift == 0.0)
     if shift == 0.0 or len(peers) > 1:
         assert isinstance(planner.command(state).verdict, Localised)
@@ -292,6 +299,39 @@ def test_gyros_that_turn_a_sweeping_robot_too_far_are_refused_with_the_value_tha
         noisy(table)
     enough = float(str(refused.value).split("calibrate the gyros to ")[1].split(" ")[0])
     assert noisy(table, gyro_bias=enough).planned_sweep is not None
+
+
+CALIBRATED = dict.fromkeys(("gyro_bias", "wheel_scale", "range_bias", "pair_bias", "range_scale"), 1e-6)
+
+
+@pytest.mark.parametrize(("accuracy", "ranges", "least"), [(1e-3, 46955, 0.023), (0.015, 209, 0.023)])
+def test_an_accuracy_that_needs_too_many_ranges_is_refused_with_their_number(
+    accuracy: float, ranges: int, least: float
+) -> None:
+    message = (
+        f"^group.toml: mission.accuracy: {accuracy:g} m needs about {ranges} mutual ranges with "
+        rf"noise.mutual_sigma = 0.05 m, more than the 94 in which a group reaches it: set at least {least} m$"
+    )
+    table = four()
+    with pytest.raises(UserError, match=message):
+        noisy(table, accuracy=accuracy, **CALIBRATED)
+    assert noisy(table, accuracy=least, **CALIBRATED).planned_sweep is not None
+
+
+def test_a_prior_that_forbids_the_accuracy_of_robots_without_an_anchor_is_named() -> None:
+    with pytest.raises(UserError, match=r"^group.toml: mission.accuracy: the prior noise.wheel_scale"):
+        noisy(four(), accuracy=0.045)
+    assert noisy(four(), accuracy=0.05).planned_sweep is not None
+
+
+@pytest.mark.long
+def test_robots_are_localised_at_an_accuracy_just_above_the_one_that_is_refused() -> None:
+    """At 0.8 of the accuracy in the reference mission, where the limit is 1.25."""
+    for seed in range(1, 4):
+        table = four(seed=seed)
+        run = run_mission(noisy(table, accuracy=0.03, **CALIBRATED))
+        assert run.end is not None
+        assert run.end.outcome == "localised"
 
 
 def test_visitors_sweep_and_the_robots_that_they_have_visited_are_their_beacons() -> None:
