@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from functools import cache
 from pathlib import Path
@@ -554,6 +555,26 @@ def test_a_contact_is_longer_where_ranges_are_less_accurate() -> None:
     assert sweep_speed(MISSION) == 1.0
     noise = replace(MISSION.noise, mutual_sigma=0.1)
     assert contact_ticks(replace(MISSION, noise=noise)) >= 3.9 * contact_ticks(MISSION)
+
+
+# --- a robot that dies --------------------------------------------------------------------------------
+
+
+def test_a_finder_that_has_died_is_named_with_the_robots_that_it_has_not_found(tmp_path: Path) -> None:
+    table = four(name="four")
+    table["robot"][0]["dies"] = 60
+    table["mission"] |= {"noise": NOISE, "accuracy": 0.3}
+    scenario, out = tmp_path / "four.toml", tmp_path / "run"
+    scenario.write_text(tomli_w.dumps(table), encoding="utf-8")
+    done = tandem_command("run", scenario, "--in-process", "--out", out)
+    why = "u: no localised robot has found it; a is dead from tick 60 on; v is not localised either"
+    assert done.status == 1
+    assert why in done.out
+    assert "all robots but u, v were localised by tick 27" in done.out
+    found = json.loads((out / "summary.json").read_text())
+    assert found["reason"] == why
+    assert found["group"]["not_localised"] == dict.fromkeys("uv", "no localised robot has found it")
+    assert tandem_command("audit", out).status == 0
 
 
 # --- processes ----------------------------------------------------------------------------------------
