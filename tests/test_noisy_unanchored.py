@@ -6,6 +6,7 @@ import json
 import math
 from functools import cache
 from pathlib import Path
+from signal import SIGINT
 from typing import Any
 
 import numpy as np
@@ -47,6 +48,8 @@ from protocol.motion import REST, Controls, Covariance, Pose, Segment, step, wra
 from protocol.noise import Noise
 from protocol.sweep_strips import SweptArea, contact_ticks, surveyed_path, sweep_speed
 from protocol.wire import MAX_REPORT_BYTES, decode, encode
+from tests.commands import TandemProcess
+from tests.commands import journals as journals_of
 from tests.commands import tandem as tandem_command
 from tests.groups import R, localised
 from tests.test_audit import kept
@@ -134,6 +137,28 @@ def test_the_reference_of_a_contact_stays_fixed_and_its_log_begins_there() -> No
 
 def test_the_audit_and_the_replay_find_nothing_where_nothing_is_wrong() -> None:
     run = of_frames(journals())
+    assert audit_run(run).violations == ()
+    assert replayed(run).differences == ()
+
+
+@pytest.mark.parametrize(
+    ("noise", "world"),
+    [
+        ({"drop_outs": 0.2}, {}),
+        pytest.param({"outliers": 0.05}, {}, marks=pytest.mark.long),
+        pytest.param({}, {"outliers": 0.05}, marks=pytest.mark.long),
+        ({}, {"anchor_sigma": 0.075, "mutual_sigma": 0.075, "odometry": {"scale": -0.01}}),
+    ],
+)
+def test_a_recording_with_other_noise_is_audited_and_replayed_without_a_finding(
+    noise: dict[str, Any], world: dict[str, Any]
+) -> None:
+    table = four()
+    if world:
+        table["world"] = {"noise": world}
+    run = of_frames(kept(noisy(table, **noise)))
+    assert run.end is not None
+    assert run.end.outcome == "localised"
     assert audit_run(run).violations == ()
     assert replayed(run).differences == ()
 
@@ -580,21 +605,59 @@ def test_a_finder_that_has_died_is_named_with_the_robots_that_it_has_not_found(t
 # --- processes ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.long
-def test_processes_that_are_killed_write_the_same_journals_and_each_command_shows_them(
-    tmp_path: Path,
-) -> None:
+@pytest.fixture(scope="module")
+def inline(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the scenario `four.toml`, and its recording of one process, `inline`."""
+    folder = tmp_path_factory.mktemp("noisy")
     table = four(name="four")
     table["mission"] |= {"noise": NOISE, "accuracy": 0.3}
-    scenario = tmp_path / "four.toml"
-    scenario.write_text(tomli_w.dumps(table), encoding="utf-8")
-    kills = ["--kill", "a@90", "--kill", "u@100", "--kill", "world@70"]
-    for name, more in (("processes", []), ("killed", kills), ("inline", ["--in-process"])):
-        done = tandem_command("run", str(scenario), "--out", str(tmp_path / name), *more)
-        assert done.status == 0, done.err
-    for journal in (tmp_path / "inline").glob("*.journal"):
-        for other in ("processes", "killed"):
-            assert journal.read_bytes() == (tmp_path / other / journal.name).read_bytes()
+    (folder / "four.toml").write_text(tomli_w.dumps(table), encoding="utf-8")
+    done = tandem_command("run", folder / "four.toml", "--out", folder / "inline", "--in-process")
+    assert done.status == 0, done.err
+    return folder
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "kills",
+    [
+        "",
+        "a@90 u@100 world@70",
+        "a@27:report a@60:journal a@101:report a@104:command u@108:journal u@112:report",
+        "world@100:report world@101:journal u@101:command a@200",
+        "b@150 v@300:report a@300:journal world@302:command",
+        "a@100:journal a@101:command a@102:report u@102:journal v@50",
+    ],
+)
+def test_processes_that_are_killed_at_any_point_of_the_search_write_the_same_journals(
+    kills: str, inline: Path, tmp_path: Path
+) -> None:
+    options = [word for kill in kills.split() for word in ("--kill", kill)]
+    done = tandem_command("run", inline / "four.toml", "--out", tmp_path, *options)
+    assert done.status == 0, done.err
+    assert journals_of(tmp_path) == journals_of(inline / "inline")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("share", [0.2, 0.45])
+def test_a_search_that_is_stopped_leaves_a_recording_that_is_replayed_until_then(
+    share: float, inline: Path, tmp_path: Path
+) -> None:
+    world = tmp_path / "world.journal"
+    enough = math.ceil(share * (inline / "inline" / world.name).stat().st_size)
+    with TandemProcess("run", inline / "four.toml", "--out", tmp_path) as running:
+        running.until_written(world, enough)
+        running.tell(SIGINT)
+        assert running.ended().status == 130
+    replayed_until = tandem_command("replay", tmp_path)
+    assert replayed_until.status == 0, replayed_until.out
+    assert "breaks off here" in replayed_until.out
+    for name, journal in journals_of(tmp_path).items():
+        assert journals_of(inline / "inline")[name].startswith(journal)
+
+
+@pytest.mark.long
+def test_each_command_shows_a_search_under_noise(inline: Path) -> None:
     for command in (["audit"], ["replay"], ["figures"], ["export"], ["export", "--rerun"]):
-        done = tandem_command(command[0], str(tmp_path / "inline"), *command[1:])
+        done = tandem_command(command[0], inline / "inline", *command[1:])
         assert done.status == 0, done.err
