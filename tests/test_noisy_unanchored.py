@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from functools import cache
 from pathlib import Path
 from signal import SIGINT
@@ -358,6 +359,23 @@ def test_robots_are_localised_at_an_accuracy_just_above_the_one_that_is_refused(
         run = run_mission(noisy(table, accuracy=0.03, **CALIBRATED))
         assert run.end is not None
         assert run.end.outcome == "localised"
+
+
+@pytest.mark.parametrize("kind", ["v", "omega", "v_floor", "omega_floor"])
+def test_odometry_noise_that_leaves_a_finder_too_inaccurate_is_refused_with_the_values_that_would_do(
+    kind: str,
+) -> None:
+    sigma = 0.2
+    message = r"^group.toml: mission.noise.odometry: between two passages of its anchor, a robot that sweeps"
+    with pytest.raises(UserError, match=message) as refused:
+        noisy(four(), odometry={kind: sigma})
+    share = float(re.findall(r"reduce this noise to (\S+) of it", str(refused.value))[0])
+    accuracy = float(re.findall(r"set an accuracy of (\S+) m", str(refused.value))[0])
+    assert noisy(four(), odometry={kind: share * sigma}).planned_sweep is not None
+    with pytest.raises(UserError, match=message):
+        noisy(four(), odometry={kind: 1.2 * share * sigma})
+    if accuracy < R / math.sqrt(2.0):
+        assert noisy(four(), accuracy=accuracy, odometry={kind: sigma}).planned_sweep is not None
 
 
 def test_visitors_sweep_and_the_robots_that_they_have_visited_are_their_beacons() -> None:
