@@ -230,7 +230,10 @@ def test_larger_errors_than_told_lead_to_no_wrong_claim() -> None:
 def test_a_robot_whose_fit_has_ended_in_a_wrong_optimum_passes_on_no_pose() -> None:
     """A pose that was 3.7 m wrong without the search before a reference, when the robot had come back."""
     odometry = {"v": 0.01, "omega": 0.01, "v_floor": 0.002, "omega_floor": 0.0005}
-    run = of_frames(kept(replace(noisy(table_with(4, 2, 2), odometry=odometry), max_ticks=330)))
+    planned = noisy(
+        table_with(4, 2, 2), accuracy=0.9, odometry=odometry
+    )  # refused with the accuracy of 0.3 m
+    run = of_frames(kept(replace(planned, mission=replace(planned.mission, accuracy=0.3), max_ticks=330)))
     assert of_finders(run)
     assert max(of_finders(run)) < 16.3
     assert run.end is not None
