@@ -197,3 +197,20 @@ def contact_ticks(mission: Mission) -> int:
     once = sweep_ticks([(0.0, 0.0), (0.0, aside), (along, aside), (along, 0.0), (0.0, 0.0)], mission)
     sigma = mission.noise.mutual_sigma / (ENOUGH_SIGMA * mission.accuracy)
     return math.ceil(2 * NOISY_LOOPS * once * min(max(1.0, sigma * sigma), MOST_TIMES))
+
+
+def ticks_of_parts(area: SweptArea, mission: Mission, widest: float, unanchored: int) -> list[int]:
+    """Return a bound on the ticks in which any robot drives to each part of `area`, and sweeps it.
+
+    It stops once for each of the `unanchored` robots. No two anchors or corners of the area are more than
+    `widest` m apart. With noisy sensors, a robot also passes its anchor and its beacon, as far away as that.
+    """
+    exact, reach = mission.noise.exact, mission.sensing_range
+    way = math.ceil(widest / (sweep_speed(mission) * mission.period))
+    stops = unanchored * (helping_ticks(mission) if exact else contact_ticks(mission))
+    x, y = area.corners[0]
+    paths = [
+        area.path(part, reach) if exact else surveyed_path(area, part, reach, (x, y), (x + widest, y))
+        for part in range(area.parts)
+    ]
+    return [way + stops + sweep_ticks(path, mission) for path in paths]

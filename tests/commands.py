@@ -224,6 +224,8 @@ def _words(arguments: Sequence[str | Path]) -> list[str]:
     words = list(map(str, arguments))
     if words[:1] == ["run"] and "--out" in words and not {"--export", "--no-export"} & {*words}:
         words.append("--no-export")
+    if words[:1] == ["run"] and "--kill" in words and "--timeout" not in words:
+        words += ["--timeout", str(BOUND_S)]  # what ends the wait is that the killed process is back
     return words
 
 

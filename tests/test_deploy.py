@@ -261,11 +261,14 @@ def test_what_containers_cannot_run_is_refused_in_one_line(tmp_path: Path) -> No
     own.write_text(PAPER_1.replace('"paper"', '"tests.own_planners:Wrapping"'))
     there = tmp_path / "there.yaml"
     there.write_text("services: {}")
+    link = tmp_path / "link.yaml"
+    link.symlink_to("nowhere.yaml")
     for source, file, why in (
         (kills, "new.yaml", "kill: a container is not killed by a scenario"),
         (own, "new.yaml", "is not in the image, which has shipped planners only"),
         ("nothing", "new.yaml", "neither a file nor a shipped scenario"),
         ("random", "there.yaml", "there.yaml already exists; choose another file"),
+        ("random", "link.yaml", "link.yaml already exists; choose another file"),
         ("random", "no folder/new.yaml", "cannot be written: No such file or directory"),
     ):
         ended = tandem("containers", source, tmp_path / file)
@@ -273,6 +276,8 @@ def test_what_containers_cannot_run_is_refused_in_one_line(tmp_path: Path) -> No
         assert why in ended.err
         assert ended.err.count("\n") == 1
     assert there.read_text() == "services: {}"
+    assert link.is_symlink()
+    assert not (tmp_path / "nowhere.yaml").exists()
     assert not (tmp_path / "new.yaml").exists()
 
 

@@ -51,6 +51,16 @@ def test_no_file_is_replaced(folder: Path) -> None:
     assert scenario.read_text() == "mine"
 
 
+def test_a_link_that_leads_nowhere_is_not_replaced(tmp_path: Path) -> None:
+    link = tmp_path / "scenario.toml"
+    link.symlink_to("nowhere.toml")
+    ended = tandem("init", tmp_path)
+    assert ended.status == 2
+    assert ended.err == f"tandem init: {link} already exists; choose another folder\n"
+    assert link.is_symlink()
+    assert [path.name for path in tmp_path.iterdir()] == ["scenario.toml"]
+
+
 def test_a_folder_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     ended = tandem("init", "file", cwd=tmp_path)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
+import re
 from functools import cache
 from pathlib import Path
+from signal import SIGINT
 from typing import Any
 
 import numpy as np
@@ -12,11 +15,16 @@ import pytest
 import tomli_w
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from msgspec.structs import replace
+from msgspec.structs import asdict, replace
 
 from agent.estimation.gaussian.contact_fit import ContactRanges, estimated, is_definite
 from agent.estimation.gaussian.odometry_noise import Track, track
+from agent.planning import exchange
+from agent.planning.accuracy_seeking import AccuracySeeking
+from agent.planning.group_state import GroupState
+from agent.planning.noisy_search import NoisyGroupPlanner
 from agent.planning.noisy_unanchored import NoisyUnanchoredPlanner
+from agent.process.agent_journal import Step
 from compose.audit.replay import replayed
 from compose.audit.rules import audit_run
 from compose.errors import UserError
@@ -31,6 +39,7 @@ from protocol.messages import (
     Localised,
     Observation,
     Ranged,
+    Report,
     ReportWithReference,
     RobotConfigWithoutAnchor,
     Undecided,
@@ -40,6 +49,8 @@ from protocol.motion import REST, Controls, Covariance, Pose, Segment, step, wra
 from protocol.noise import Noise
 from protocol.sweep_strips import SweptArea, contact_ticks, surveyed_path, sweep_speed
 from protocol.wire import MAX_REPORT_BYTES, decode, encode
+from tests.commands import TandemProcess
+from tests.commands import journals as journals_of
 from tests.commands import tandem as tandem_command
 from tests.groups import R, localised
 from tests.test_audit import kept
@@ -50,9 +61,9 @@ from world.scenario import Scenario
 NOISE: dict[str, Any] = {"anchor_sigma": 0.05, "mutual_sigma": 0.05, "gyro_bias": 0.0002}
 
 
-def noisy(table: dict[str, Any], **noise: Any) -> Scenario:
-    """Return the scenario of a file with the noise of the sweep `group`, and with other `noise`."""
-    table["mission"] |= {"noise": {**NOISE, **noise}, "accuracy": 0.3}
+def noisy(table: dict[str, Any], accuracy: float = 0.3, **noise: Any) -> Scenario:
+    """Return the scenario of a file with the noise of the sweep `group`, other `noise` and an accuracy."""
+    table["mission"] |= {"noise": {**NOISE, **noise}, "accuracy": accuracy}
     return scenario_of(table)
 
 
@@ -71,6 +82,11 @@ def references(run: Run) -> list[tuple[str, ReportWithReference]]:
                 if isinstance(framed.report, ReportWithReference):
                     found.setdefault((robot, framed.report.robot, framed.report.reference), framed.report)
     return [(robot, report) for (robot, _, _), report in found.items()]
+
+
+def of_robots(step_: Step) -> list[Report]:
+    """Return the reports that a robot has used in a tick."""
+    return [framed.report for framed in step_.received if isinstance(framed.report, Report)]
 
 
 def squared_error(pose: Pose, covariance: Covariance, truth: Pose) -> float:
@@ -122,6 +138,28 @@ def test_the_reference_of_a_contact_stays_fixed_and_its_log_begins_there() -> No
 
 def test_the_audit_and_the_replay_find_nothing_where_nothing_is_wrong() -> None:
     run = of_frames(journals())
+    assert audit_run(run).violations == ()
+    assert replayed(run).differences == ()
+
+
+@pytest.mark.parametrize(
+    ("noise", "world"),
+    [
+        ({"drop_outs": 0.2}, {}),
+        pytest.param({"outliers": 0.05}, {}, marks=pytest.mark.long),
+        pytest.param({}, {"outliers": 0.05}, marks=pytest.mark.long),
+        ({}, {"anchor_sigma": 0.075, "mutual_sigma": 0.075, "odometry": {"scale": -0.01}}),
+    ],
+)
+def test_a_recording_with_other_noise_is_audited_and_replayed_without_a_finding(
+    noise: dict[str, Any], world: dict[str, Any]
+) -> None:
+    table = four()
+    if world:
+        table["world"] = {"noise": world}
+    run = of_frames(kept(noisy(table, **noise)))
+    assert run.end is not None
+    assert run.end.outcome == "localised"
     assert audit_run(run).violations == ()
     assert replayed(run).differences == ()
 
@@ -192,11 +230,92 @@ def test_larger_errors_than_told_lead_to_no_wrong_claim() -> None:
 def test_a_robot_whose_fit_has_ended_in_a_wrong_optimum_passes_on_no_pose() -> None:
     """A pose that was 3.7 m wrong without the search before a reference, when the robot had come back."""
     odometry = {"v": 0.01, "omega": 0.01, "v_floor": 0.002, "omega_floor": 0.0005}
-    run = of_frames(kept(replace(noisy(table_with(4, 2, 2), odometry=odometry), max_ticks=330)))
+    planned = noisy(
+        table_with(4, 2, 2), accuracy=0.9, odometry=odometry
+    )  # refused with the accuracy of 0.3 m
+    run = of_frames(kept(replace(planned, mission=replace(planned.mission, accuracy=0.3), max_ticks=330)))
     assert of_finders(run)
     assert max(of_finders(run)) < 16.3
     assert run.end is not None
     assert run.end.outcome != "wrong"
+
+
+# --- meetings that contradict each other -----------------------------------------------------------------
+
+
+def three_and_one() -> dict[str, Any]:
+    """Return a scenario file in which a meets b, visits c, and then looks for u, which has no anchor."""
+    table = four()
+    table["robot"] = [
+        {"id": "a", "anchor": [0.0, 0.0]},
+        {"id": "b", "anchor": [10.0, 3.0]},
+        {"id": "c", "anchor": [2.0, 11.0]},
+        {"id": "u"},
+    ]
+    return table
+
+
+def in_search(run: Run, peers: tuple[str, ...], shift: float) -> GroupState | None:
+    """Return the state of a when it begins to sweep; None if it does not, because its claim is withdrawn.
+
+    Before it claims its pose with c, the pose that it knows is from its meetings with `peers`, and `shift` m
+    beside the one that it has computed.
+    """
+    agent, planner = run.agents["a"], NoisyGroupPlanner(AccuracySeeking())
+    state, changed = planner.start(agent.config), False
+    for one in agent.steps:
+        state = planner.observe(state, one.observation)
+        fix = state.fix
+        if not changed and fix is not None and state.config.peer == "c" and state.pair.in_contact:
+            pose = replace(fix.claim.pose, x=fix.claim.pose.x + shift)
+            fix = replace(fix, peers=peers, claim=replace(fix.claim, pose=pose))
+            state, changed = replace(state, fix=fix), True
+        state = planner.decide(state, of_robots(one))
+        if state.sweeps:
+            return state
+    return None
+
+
+def test_the_search_begins_with_the_pose_that_the_robot_knows_after_a_meeting_that_contradicts_it() -> None:
+    run = of_frames(kept(noisy(three_and_one())))
+    agreeing = in_search(run, ("b",), 0.0)
+    assert agreeing is not None
+    assert agreeing.pair.config.peer == "c"
+    kept_claim = in_search(run, ("b", "d"), 2.0)
+    assert kept_claim is not None
+    assert kept_claim.other("c").failed
+    assert kept_claim.pair.config.peer == "b"
+    assert in_search(run, ("b",), 2.0) is None
+
+
+@pytest.mark.parametrize(("peers", "shift"), [(("b",), 0.0), (("b",), 2.0), (("b", "d"), 2.0)])
+def test_a_claim_that_later_ranges_contradict_is_withdrawn_in_the_search_and_no_pose_is_reported(
+    peers: tuple[str, ...], shift: float
+) -> None:
+    run = of_frames(journals())
+    (finder,) = {report.robot for _, report in references(run)}
+    first = min(report.reference for _, report in references(run))
+    agent, planner = run.agents[finder], NoisyGroupPlanner(AccuracySeeking())
+    state = planner.start(agent.config)
+    for one in agent.steps[: first + 1]:
+        if one.observation.tick == first:
+            assert state.fix is not None
+            claim = state.fix.claim
+            claim = replace(claim, pose=replace(claim.pose, x=claim.pose.x + shift))
+            state = replace(state, fix=replace(state.fix, claim=claim, peers=peers))
+        state = planner.observe(state, one.observation)
+        state = planner.decide(state, of_robots(one))
+    assert (state.reference is not None) == (shift == 0.0)
+    if shift == 0.0 or len(peers) > 1:
+        assert isinstance(planner.command(state).verdict, Localised)
+        assert state.sweeps
+        return
+    command = planner.command(state)
+    assert command.verdict is None
+    assert command.state in ("aligning", "radial", "orbiting")
+    assert isinstance(state.failure, Undecided)
+    assert state.failure.reason.startswith("its ranges since its claim contradict it by ")
+    assert planner.report_to(state, state.config.peer).verdict == state.failure
 
 
 # --- the scenario -------------------------------------------------------------------------------------
@@ -210,6 +329,56 @@ def test_gyros_that_turn_a_sweeping_robot_too_far_are_refused_with_the_value_tha
         noisy(table)
     enough = float(str(refused.value).split("calibrate the gyros to ")[1].split(" ")[0])
     assert noisy(table, gyro_bias=enough).planned_sweep is not None
+
+
+CALIBRATED = dict.fromkeys(("gyro_bias", "wheel_scale", "range_bias", "pair_bias", "range_scale"), 1e-6)
+
+
+@pytest.mark.parametrize(("accuracy", "ranges", "least"), [(1e-3, 46955, 0.023), (0.015, 209, 0.023)])
+def test_an_accuracy_that_needs_too_many_ranges_is_refused_with_their_number(
+    accuracy: float, ranges: int, least: float
+) -> None:
+    message = (
+        f"^group.toml: mission.accuracy: {accuracy:g} m needs about {ranges} mutual ranges with "
+        rf"noise.mutual_sigma = 0.05 m, more than the 94 in which a group reaches it: set at least {least} m$"
+    )
+    table = four()
+    with pytest.raises(UserError, match=message):
+        noisy(table, accuracy=accuracy, **CALIBRATED)
+    assert noisy(table, accuracy=least, **CALIBRATED).planned_sweep is not None
+
+
+def test_a_prior_that_forbids_the_accuracy_of_robots_without_an_anchor_is_named() -> None:
+    with pytest.raises(UserError, match=r"^group.toml: mission.accuracy: the prior noise.wheel_scale"):
+        noisy(four(), accuracy=0.045)
+    assert noisy(four(), accuracy=0.05).planned_sweep is not None
+
+
+@pytest.mark.long
+def test_robots_are_localised_at_an_accuracy_just_above_the_one_that_is_refused() -> None:
+    """At 0.8 of the accuracy in the reference mission, where the limit is 1.25."""
+    for seed in range(1, 4):
+        table = four(seed=seed)
+        run = run_mission(noisy(table, accuracy=0.03, **CALIBRATED))
+        assert run.end is not None
+        assert run.end.outcome == "localised"
+
+
+@pytest.mark.parametrize("kind", ["v", "omega", "v_floor", "omega_floor"])
+def test_odometry_noise_that_leaves_a_finder_too_inaccurate_is_refused_with_the_values_that_would_do(
+    kind: str,
+) -> None:
+    sigma = 0.2
+    message = r"^group.toml: mission.noise.odometry: between two passages of its anchor, a robot that sweeps"
+    with pytest.raises(UserError, match=message) as refused:
+        noisy(four(), odometry={kind: sigma})
+    share = float(re.findall(r"reduce this noise to (\S+) of it", str(refused.value))[0])
+    accuracy = float(re.findall(r"set an accuracy of (\S+) m", str(refused.value))[0])
+    assert noisy(four(), odometry={kind: share * sigma}).planned_sweep is not None
+    with pytest.raises(UserError, match=message):
+        noisy(four(), odometry={kind: 1.2 * share * sigma})
+    if accuracy < R / math.sqrt(2.0):
+        assert noisy(four(), accuracy=accuracy, odometry={kind: sigma}).planned_sweep is not None
 
 
 def test_visitors_sweep_and_the_robots_that_they_have_visited_are_their_beacons() -> None:
@@ -296,17 +465,15 @@ def test_a_finder_that_is_less_accurate_than_the_mission_asks_leads_to_no_claim(
     assert found.blocking_reason.startswith("the sigma of the position is 0.4")
 
 
-@pytest.mark.parametrize(("x", "angle"), [(1e7, 0.01), (1.0, 1e15)])
-def test_a_reference_at_the_bounds_of_messages_gives_no_estimate_beyond_them(x: float, angle: float) -> None:
+def test_a_reference_at_the_bounds_of_messages_gives_no_estimate_beyond_them() -> None:
     """An estimate beyond them could be sent and recorded, but not be read again."""
     measured = contact(1, 0.1)[0]
-    covariance = replace(measured.covariance, hh=angle)
-    for side in (x, -x):
-        pose = replace(measured.pose, x=side)
-        found = estimated(measured._replace(pose=pose, covariance=covariance), MISSION)
-        if found is not None:
-            frame = encode(Estimate(0, "u", (), found.poses, False, found.probabilities, found.covariance))
-            assert decode(frame, Estimate).world == found.poses
+    found = [estimated(measured._replace(pose=replace(measured.pose, x=x)), MISSION) for x in (1e7, -1e7)]
+    assert None in found
+    for one in found:
+        if one is not None:
+            frame = encode(Estimate(0, "u", (), one.poses, False, one.probabilities, one.covariance))
+            assert decode(frame, Estimate).world == one.poses
 
 
 def test_the_same_ranges_do_not_count_twice_through_the_finder() -> None:
@@ -397,6 +564,27 @@ def test_a_robot_stands_still_for_a_finder_that_is_too_inaccurate_and_ends_undec
     assert state.verdict == Undecided("b knows its position to 0.4 m, required 0.3")
 
 
+def test_a_robot_that_reports_another_reference_in_each_tick_costs_an_estimate_in_three_ticks() -> None:
+    planner = NoisyUnanchoredPlanner()
+    state = planner.start(config())
+    covariance = Covariance(0.01, 0.0, 0.0, 0.01, 0.0, 1e-4)
+    without = exchange.report_without_log(state, Localised(Pose(0.0, 0.0, 0.0), covariance))
+    fields = asdict(without) | {"robot": "b", "state": "looping"}
+    estimates = set()
+    for tick in range(60):
+        seen = (Detection("b", 1.0 + 0.01 * tick, (tick,)),)
+        state = planner.observe(state, Observation(tick, "u", REST, None, seen))
+        here = max(0, tick - 20)
+        runs = (Segment(tick - here, 0.1, 0.0),) if tick > here else ()
+        fields |= {"tick": tick, "since": here, "through": tick, "runs": runs}
+        pose = Pose(0.1 * here, 0.0, 0.0)
+        report = ReportWithReference(**fields, reference=here, pose=pose, covariance=covariance)
+        assert planner.malformed(report) is None
+        state = planner.decide(state, [report])
+        estimates.add(state.at)
+    assert 5 <= len(estimates) <= 20
+
+
 def test_malformed_references_are_refused() -> None:
     planner = NoisyUnanchoredPlanner()
     good = decode(encode(references(of_frames(journals()))[0][1]), ReportWithReference)
@@ -415,24 +603,82 @@ def test_a_contact_is_longer_where_ranges_are_less_accurate() -> None:
     assert contact_ticks(replace(MISSION, noise=noise)) >= 3.9 * contact_ticks(MISSION)
 
 
+# --- a robot that dies --------------------------------------------------------------------------------
+
+
+def test_a_finder_that_has_died_is_named_with_the_robots_that_it_has_not_found(tmp_path: Path) -> None:
+    table = four(name="four")
+    table["robot"][0]["dies"] = 60
+    table["mission"] |= {"noise": NOISE, "accuracy": 0.3}
+    scenario, out = tmp_path / "four.toml", tmp_path / "run"
+    scenario.write_text(tomli_w.dumps(table), encoding="utf-8")
+    done = tandem_command("run", scenario, "--in-process", "--out", out)
+    why = "u: no localised robot has found it; a is dead from tick 60 on; v is not localised either"
+    assert done.status == 1
+    assert why in done.out
+    assert "all robots but u, v were localised by tick 27" in done.out
+    found = json.loads((out / "summary.json").read_text())
+    assert found["reason"] == why
+    assert found["group"]["not_localised"] == dict.fromkeys("uv", "no localised robot has found it")
+    assert tandem_command("audit", out).status == 0
+
+
 # --- processes ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.long
-def test_processes_that_are_killed_write_the_same_journals_and_each_command_shows_them(
-    tmp_path: Path,
-) -> None:
+@pytest.fixture(scope="module")
+def inline(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the scenario `four.toml`, and its recording of one process, `inline`."""
+    folder = tmp_path_factory.mktemp("noisy")
     table = four(name="four")
     table["mission"] |= {"noise": NOISE, "accuracy": 0.3}
-    scenario = tmp_path / "four.toml"
-    scenario.write_text(tomli_w.dumps(table), encoding="utf-8")
-    kills = ["--kill", "a@90", "--kill", "u@100", "--kill", "world@70"]
-    for name, more in (("processes", []), ("killed", kills), ("inline", ["--in-process"])):
-        done = tandem_command("run", str(scenario), "--out", str(tmp_path / name), *more)
-        assert done.status == 0, done.err
-    for journal in (tmp_path / "inline").glob("*.journal"):
-        for other in ("processes", "killed"):
-            assert journal.read_bytes() == (tmp_path / other / journal.name).read_bytes()
+    (folder / "four.toml").write_text(tomli_w.dumps(table), encoding="utf-8")
+    done = tandem_command("run", folder / "four.toml", "--out", folder / "inline", "--in-process")
+    assert done.status == 0, done.err
+    return folder
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "kills",
+    [
+        "",
+        "a@90 u@100 world@70",
+        "a@27:report a@60:journal a@101:report a@104:command u@108:journal u@112:report",
+        "world@100:report world@101:journal u@101:command a@200",
+        "b@150 v@300:report a@300:journal world@302:command",
+        "a@100:journal a@101:command a@102:report u@102:journal v@50",
+    ],
+)
+def test_processes_that_are_killed_at_any_point_of_the_search_write_the_same_journals(
+    kills: str, inline: Path, tmp_path: Path
+) -> None:
+    options = [word for kill in kills.split() for word in ("--kill", kill)]
+    done = tandem_command("run", inline / "four.toml", "--out", tmp_path, *options)
+    assert done.status == 0, done.err
+    assert journals_of(tmp_path) == journals_of(inline / "inline")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("share", [0.2, 0.45])
+def test_a_search_that_is_stopped_leaves_a_recording_that_is_replayed_until_then(
+    share: float, inline: Path, tmp_path: Path
+) -> None:
+    world = tmp_path / "world.journal"
+    enough = math.ceil(share * (inline / "inline" / world.name).stat().st_size)
+    with TandemProcess("run", inline / "four.toml", "--out", tmp_path) as running:
+        running.until_written(world, enough)
+        running.tell(SIGINT)
+        assert running.ended().status == 130
+    replayed_until = tandem_command("replay", tmp_path)
+    assert replayed_until.status == 0, replayed_until.out
+    assert "breaks off here" in replayed_until.out
+    for name, journal in journals_of(tmp_path).items():
+        assert journals_of(inline / "inline")[name].startswith(journal)
+
+
+@pytest.mark.long
+def test_each_command_shows_a_search_under_noise(inline: Path) -> None:
     for command in (["audit"], ["replay"], ["figures"], ["export"], ["export", "--rerun"]):
-        done = tandem_command(command[0], str(tmp_path / "inline"), *command[1:])
+        done = tandem_command(command[0], inline / "inline", *command[1:])
         assert done.status == 0, done.err

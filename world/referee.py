@@ -11,11 +11,14 @@ from protocol.messages import Inconsistent, Localised, Outcome, Undecided, Verdi
 from protocol.mission import HEADING_ACCURACY, Mission
 from protocol.motion import Pose, wrap
 from protocol.rounding import TOLERANCE
-from world.scenario import Scenario
+from world.scenario import Death, Scenario
 from world.truth import Truth
 
 SIGMAS = 5.0
 """The number of claimed standard deviations by which a claim may differ from the truth, with noise."""
+
+NAMED = 4
+"""The most robots that are named at the end of a reason; the summary of a run has all of them."""
 
 
 class MissionOutcome(msgspec.Struct, frozen=True):
@@ -99,26 +102,73 @@ def decide_outcome(
             why = mistake(verdict, pose if claimed is None else claimed[robot.id], scenario.mission)
             if why is not None:
                 return MissionOutcome("wrong", f"{robot.id} claims a pose that is {why}")
-    return _no_better(scenario, verdicts, open_cases)
+    found, named = _no_better(scenario, verdicts, open_cases)
+    if not scenario.meetings or found.reason is None:
+        return found
+    further = _further(scenario, verdicts, truth.tick, named)
+    return MissionOutcome(found.outcome, "; ".join((found.reason, *further)))
 
 
 def _no_better(
     scenario: Scenario, verdicts: Mapping[str, Verdict], open_cases: Sequence[str]
-) -> MissionOutcome:
-    """Return the outcome of a run without a wrong claim."""
+) -> tuple[MissionOutcome, Sequence[str]]:
+    """Return the outcome of a run without a wrong claim, and the robots that its reason names."""
     for robot in scenario.robots:
         verdict = verdicts.get(robot.id)
         if isinstance(verdict, Inconsistent):
-            return MissionOutcome("inconsistent", f"{robot.id}: {robot.peer} reports {verdict.claim}")
+            what = f"{robot.id}: {robot.peer} reports {verdict.claim}"
+            return MissionOutcome("inconsistent", what), (robot.id,)
     for robot in scenario.robots:
         match verdicts.get(robot.id):
             case Undecided(reason):
-                return MissionOutcome("undecided", f"{robot.id}: {reason}")
+                return MissionOutcome("undecided", f"{robot.id}: {reason}"), (robot.id,)
             case Localised() as claim if (vague := inaccuracy(claim, scenario.mission)) is not None:
-                return MissionOutcome("undecided", f"{robot.id} {vague}")
+                return MissionOutcome("undecided", f"{robot.id} {vague}"), (robot.id,)
     if open_cases:
-        return MissionOutcome("undecided", f"max_ticks: {', '.join(open_cases)} not localised by then")
+        what = f"max_ticks: {', '.join(open_cases)} not localised by then"
+        return MissionOutcome("undecided", what), open_cases
     for death in scenario.deaths:
         if death.robot not in verdicts:
-            return MissionOutcome("undecided", f"{death.robot} is dead from tick {death.tick} on")
-    return MissionOutcome("localised")
+            return MissionOutcome("undecided", _dead(death)), (death.robot,)
+    return MissionOutcome("localised"), ()
+
+
+def _further(
+    scenario: Scenario, verdicts: Mapping[str, Verdict], tick: int, named: Sequence[str]
+) -> list[str]:
+    """Return which robots of a group are dead or not localised at `tick`, too, without those `named`.
+
+    A robot that is dead after its claim may be the one that was to find the others.
+    """
+    dead = [one for one in scenario.deaths if one.tick <= tick]
+    found = [_dead(one) for one in dead if one.robot not in named]
+    known = {*named, *[one.robot for one in dead]}
+    left = [robot for robot in unlocalised(scenario, verdicts, tick) if robot not in known]
+    if left:
+        names = ", ".join(left[:NAMED]) + (f" and {len(left) - NAMED} more" if len(left) > NAMED else "")
+        found.append(f"{names} {'is' if len(left) == 1 else 'are'} not localised either")
+    return found
+
+
+def _dead(death: Death) -> str:
+    return f"{death.robot} is dead from tick {death.tick} on"
+
+
+def unlocalised(scenario: Scenario, verdicts: Mapping[str, Verdict], tick: int) -> dict[str, str]:
+    """Return why robots are not localised at `tick`, by robot, in the order of `scenario`."""
+    found = {}
+    deaths = {one.robot: one for one in scenario.deaths if one.tick <= tick}
+    for robot in scenario.robots:
+        match verdicts.get(robot.id):
+            case Undecided(reason):
+                found[robot.id] = reason
+            case Inconsistent(contradiction):
+                found[robot.id] = f"its peer reports {contradiction}"
+            case Localised() as claim:
+                if (vague := inaccuracy(claim, scenario.mission)) is not None:
+                    found[robot.id] = f"it {vague}"
+            case None if robot.id in deaths:
+                found[robot.id] = f"it is dead from tick {deaths[robot.id].tick} on"
+            case None:
+                found[robot.id] = "it has no result by then"
+    return found

@@ -115,6 +115,13 @@ def _contradiction(state: GroupState, claim: Localised) -> Undecided | None:
     )
 
 
+def withdrawn(state: GroupState, failure: Undecided) -> GroupState:
+    """Return `state` without a claim, because of `failure`: the robot waits for another one than its peer."""
+    peer = state.config.peer
+    state = replace(state, verdict=None, fix=None, located=None, failure=failure, visiting=False)
+    return _waiting(_after_meeting(state), peer)
+
+
 def _is_withdrawn(state: GroupState) -> bool:
     """Return whether the present meeting contradicts an earlier one, so that the robot knows no pose."""
     return state.verdict is None and isinstance(state.pair.verdict, Localised)

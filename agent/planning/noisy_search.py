@@ -16,6 +16,7 @@ from typing import NamedTuple
 from msgspec.structs import asdict, astuple, replace
 
 from agent.estimation.gaussian import inference
+from agent.estimation.gaussian.claim_agreement import difference
 from agent.estimation.gaussian.claim_rivals import WRONG_SIGMAS, likeliest_rival
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, consistency_test
 from agent.estimation.gaussian.gaussian_estimator import GAUSSIAN
@@ -26,7 +27,7 @@ from agent.planning.group import GroupPlanner, with_sender
 from agent.planning.group_state import GroupState, Other, Reference
 from agent.planning.state import Done, RobotState
 from agent.planning.sweep import Looping, Sweeping
-from protocol.messages import Localised, Report, ReportWithReference, RobotConfigWithSweep
+from protocol.messages import Localised, Report, ReportWithReference, RobotConfigWithSweep, Undecided
 from protocol.motion import Covariance, Pose, compose, inverse
 from protocol.sweep_strips import ALONG, ASIDE, NEAR, contact_ticks, surveyed_path
 
@@ -132,9 +133,12 @@ def _begun(state: GroupState) -> GroupState:
     assert isinstance(state.verdict, Localised)
     if config.part >= config.sweep.parts:
         return replace(state, pair=replace(pair, mode=Done(3, state.verdict)))
-    if not pair.belief.pair and state.located is not None:  # after a visit in vain
+    located = state.located
+    assert located is not None
+    # after a visit in vain, or one that contradicts what this robot knows
+    if not pair.belief.pair or pair.config.peer != located.config.peer:
         same = {"tick": pair.tick, "odometry": pair.odometry, "log": pair.log, "leg": pair.leg}
-        pair = replace(state.located, **same, mode=pair.mode)
+        pair = replace(located, **same, mode=pair.mode)
     state = _located(replace(state, pair=pair, fitted=-1))
     pair = state.pair
     part = (config.part + state.parts - 1) % config.sweep.parts
@@ -288,6 +292,8 @@ def _place_of_peer(state: GroupState) -> Pose:
 def _onward(state: GroupState) -> GroupState:
     """Return `state` after a tick of a sweep, or of a contact with robots without an anchor."""
     state = _with_contact(state)
+    if not state.sweeps:  # it has withdrawn its claim
+        return state
     pair, mission = state.pair, state.config.mission
     mode = pair.mode
     assert isinstance(mode, Sweeping | Looping)
@@ -319,10 +325,29 @@ def _with_contact(state: GroupState) -> GroupState:
     ticks = [_ticks_since(state, one) for one in _helped(state)]
     if state.reference is None and 0 in ticks and state.pair.tick - state.searched > LINGER:
         state, reference = _estimated(state, searched=True)
-        return replace(state, reference=reference, searched=state.pair.tick)
+        state = replace(state, searched=state.pair.tick)
+        return _agreed(state, reference) if reference is not None else state
     if state.reference is not None and all(since > LINGER for since in ticks):
         return replace(state, reference=None)
     return state
+
+
+def _agreed(state: GroupState, reference: Reference) -> GroupState:
+    """Return `state` with `reference`, if the claim of this robot does not contradict it.
+
+    The ranges since the claim may have ruled out the hypothesis on which it rests. A claim from a single
+    meeting is then withdrawn. If several meetings agree on the claim, there is no reference.
+    """
+    fix, pair, mission = state.fix, state.pair, state.config.mission
+    assert fix is not None
+    now = Localised(reference.pose, reference.covariance)
+    off = difference(fix.claim, fix.tick, now, reference.tick, pair.log, mission)
+    if off.p_value >= 1.0 - mission.confidence:
+        return replace(state, reference=reference)
+    if len(fix.peers) > 1:
+        return state
+    why = f"its ranges since its claim contradict it by {off.position:.3g} m and {off.heading:.3g} rad"
+    return group_transitions.withdrawn(state, Undecided(f"{why} (p = {off.p_value:.2g})"))
 
 
 def _helped(state: GroupState) -> list[str]:

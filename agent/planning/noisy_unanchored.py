@@ -47,9 +47,10 @@ SWEEPING = MODE_NAMES[Sweeping]
 """The mode of a localised robot that looks for robots without an anchor."""
 
 EACH = 3
-"""The number of further ranges after which the pose is estimated again.
+"""The number of further ranges, and of ticks, after which the pose is estimated again.
 
 Each estimate is a search of all poses. With 1, claims would come two ticks earlier, at three times the time.
+The ticks bound the time that a robot takes which reports another reference in each tick.
 """
 
 
@@ -230,7 +231,7 @@ def _estimated(state: NoisyUnanchoredState) -> NoisyUnanchoredState:
             if ends[0] <= one.tick <= ends[1]
         ]
     )
-    if len(ranges) < max(FEWEST, state.fitted + EACH):
+    if len(ranges) < max(FEWEST, state.fitted + EACH) or state.tick < state.at + EACH:
         return state
     contact = ContactRanges(
         finder.pose,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shlex
 from pathlib import Path
 
@@ -33,7 +34,7 @@ def main(options: argparse.Namespace) -> int:
     scenario = found.scenario
     _check_code(options.scenario, scenario)
     place: Path = options.file
-    if place.exists():
+    if os.path.lexists(place):  # a link that leads nowhere is a file, too
         raise UserError(f"{place} already exists; choose another file")
     try:
         files.write(place, compose_file(options.scenario, scenario, place))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import shlex
 from importlib import resources
 from pathlib import Path
@@ -33,7 +34,7 @@ def main(options: argparse.Namespace) -> int:
     out: Path = options.folder
     content = starter()
     for name in content:
-        if (out / name).exists():
+        if os.path.lexists(out / name):  # a link that leads nowhere is a file, too
             raise UserError(f"{out / name} already exists; choose another folder")
     try:
         out.mkdir(parents=True, exist_ok=True)

@@ -15,15 +15,7 @@ import msgspec
 
 from compose.recording.run import Run
 from protocol.orbits import SIDES, meeting_ticks, search_ticks
-from protocol.sweep_strips import (
-    Place,
-    SweptArea,
-    contact_ticks,
-    helping_ticks,
-    surveyed_path,
-    sweep_speed,
-    sweep_ticks,
-)
+from protocol.sweep_strips import Place, ticks_of_parts
 from world.faults import exchange_ticks
 from world.scenario import Scenario
 
@@ -84,22 +76,10 @@ def _sweeps_ticks(scenario: Scenario, tour: int) -> int:
     """
     if scenario.planned_sweep is None:
         return 0
-    area, mission = scenario.planned_sweep.sweep, scenario.mission
-    way = _longest_way([*_anchors(scenario), *area.corners])
-    step = sweep_speed(mission) * mission.period
-    stop = helping_ticks(mission) if mission.noise.exact else contact_ticks(mission)
-    ticks = math.ceil(way / step) + tour + len(scenario.unanchored) * stop
-    parts = [_longest_path(area, part, scenario, way) for part in range(area.parts)]
-    return sum([ticks + sweep_ticks(path, mission) for path in parts])
-
-
-def _longest_path(area: SweptArea, part: int, scenario: Scenario, way: float) -> tuple[Place, ...]:
-    """Return the way through a part of the area; with noisy sensors, with beacons as far as `way` m."""
-    reach = scenario.mission.sensing_range
-    if scenario.mission.noise.exact:
-        return area.path(part, reach)
-    x, y = area.corners[0]
-    return surveyed_path(area, part, reach, (x, y), (x + way, y))
+    area = scenario.planned_sweep.sweep
+    widest = _longest_way([*_anchors(scenario), *area.corners])
+    parts = ticks_of_parts(area, scenario.mission, widest, len(scenario.unanchored))
+    return sum([tour + ticks for ticks in parts])
 
 
 def _anchors(scenario: Scenario) -> list[Place]:

@@ -34,6 +34,7 @@ from protocol.messages import (
     Outcome,
     RobotConfig,
     RobotConfigInGroup,
+    Verdict,
 )
 from protocol.motion import Controls, Pose
 from protocol.output import one_line
@@ -254,6 +255,17 @@ class Run(msgspec.Struct, frozen=True, dict=True):
             elif not isinstance(command.verdict, Localised):
                 made = None
         return made
+
+    def verdicts(self) -> dict[str, Verdict]:
+        """Return the verdicts of a group at the end of the run, by robot, of those that have one."""
+        found: dict[str, Verdict] = {}
+        for tick in self.ticks:
+            for robot, command in tick.commands.items():
+                if command.verdict is None:  # it may have withdrawn its claim
+                    found.pop(robot, None)
+                elif not self.scenario.is_dead(robot, tick.truth.tick):
+                    found[robot] = command.verdict
+        return found
 
     def truth_held(self, robot: str) -> bool | None:
         """Return whether `robot` held the true hypothesis at its first claim (see `claim.truth_held`).

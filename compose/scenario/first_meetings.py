@@ -105,14 +105,22 @@ def _checked_distance(file: ScenarioFile, first: int, second: int, source: str, 
 
 
 def _check_accuracy(file: ScenarioFile, distances: Sequence[float], source: str) -> None:
-    """Raise Unworkable if a prior forbids the accuracy of robots whose anchors have such distances, in m."""
+    """Raise Unworkable if the noise forbids the accuracy of robots whose anchors are so far apart, in m.
+
+    White noise averages out over many ranges: a pair may take them until `max_ticks`. In a group, robots
+    wait for others that do so.
+    """
     if file.mission.noise.exact:
         return
     # imports numpy, which scenarios with exact sensors do not need
-    from agent.estimation.gaussian.reachable_accuracy import forbidding_prior  # noqa: PLC0415
+    from agent.estimation.gaussian import reachable_accuracy as reachable  # noqa: PLC0415
 
-    for distance in distances:
-        why = forbidding_prior(file.mission, distance)
+    reasons = [reachable.forbidding_prior(file.mission, distance) for distance in distances]
+    if in_group(file) and max(distances) >= file.mission.orienting_distance:
+        searches = any(robot.anchor is None for robot in file.robot)
+        active = reachable.ACTIVE_SEARCH if searches else reachable.ACTIVE
+        reasons.append(reachable.unreachable(file.mission, max(distances), active))
+    for why in reasons:
         if why is not None:
             raise Unworkable(f"{source}: mission.{why}")
 

@@ -43,7 +43,7 @@ WAITING = "{robot} waits beside its anchor until {peer} comes into range"
 """The sentence of the state "orbiting" of a robot whose plan has no speed."""
 
 
-TIME_IS_UP = re.compile(r"max_ticks: (.+) not localised by then")
+TIME_IS_UP = re.compile(r"max_ticks: (.+?) not localised by then(.*)")
 """The reason of a mission that ends at its largest number of ticks, as the world writes it."""
 MOST_NAMES = 4
 """The largest number of robots that a sentence names."""
@@ -59,7 +59,7 @@ def end_reason(reason: str) -> str:
         names = f"{len(robots)} robots"
     else:
         names = " and ".join([", ".join(robots[:-1]), robots[-1]] if len(robots) > 1 else robots)
-    return f"the time is up, and {names} {'are' if len(robots) > 1 else 'is'} not localised"
+    return f"the time is up, and {names} {'are' if len(robots) > 1 else 'is'} not localised{found[2]}"
 
 
 def doing(robot_setup: RobotSetup, phase: int, state: str, verdict: Verdict | None) -> str:

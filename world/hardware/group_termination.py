@@ -13,7 +13,6 @@ ends at max_ticks.
 
 from __future__ import annotations
 
-import math
 import time
 
 from protocol.messages import (
@@ -30,7 +29,7 @@ from protocol.messages import (
     Undecided,
     Verdict,
 )
-from protocol.sweep_strips import helping_ticks, sweep_speed, sweep_ticks
+from protocol.sweep_strips import ticks_of_parts
 from world.hardware.termination import LAST_WORDS, Termination
 from world.referee import inaccuracy
 
@@ -146,8 +145,5 @@ def _sweep_ticks(config: RobotConfigInGroup) -> int:
     """Return a bound on the ticks in which each robot with an anchor sweeps its part; 0 if all have one."""
     if not isinstance(config, RobotConfigWithSweep):
         return 0
-    mission, sweep = config.mission, config.sweep
-    way = math.ceil(config.widest_distance / (sweep_speed(mission) * mission.period))
-    paths = [sweep.path(part, mission.sensing_range) for part in range(sweep.parts)]
-    longest = max([sweep_ticks(path, mission) for path in paths])
-    return RESTING_TICKS + way + longest + len(config.unanchored) * helping_ticks(mission)
+    parts = ticks_of_parts(config.sweep, config.mission, config.widest_distance, len(config.unanchored))
+    return RESTING_TICKS + max(parts)
