@@ -1,8 +1,13 @@
-"""Under noise a may miss b on its orbit. It then begins again at its anchor, and forgets what it measured."""
+"""Under noise a may miss b on its orbit, or leave it undecided.
+
+It then begins again at its anchor, and forgets what it measured.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -12,14 +17,16 @@ from msgspec.structs import replace
 
 from agent.estimation.gaussian.inference import beginning, path_of
 from agent.estimation.gaussian.odometry_noise import variances
-from agent.estimation.knowledge import Knowledge
+from agent.estimation.knowledge import Belief, Knowledge
 from agent.peer.motion_log import MotionLog
 from agent.peer.peer_state import PeerState
+from agent.planning.accuracy_seeking import AccuracySeeking
 from agent.planning.range_seeking import next_on_spiral
-from compose.launch.in_process import run_mission
+from agent.planning.state import RobotState
+from compose.launch.in_process import played, run_mission
 from compose.recording.run import read
 from compose.view.recorded import scenes_of
-from protocol.messages import Member, Ranged, RobotConfig, RobotConfigInGroup
+from protocol.messages import Member, Ranged, Report, RobotConfig, RobotConfigInGroup
 from protocol.mission import Mission
 from protocol.noise import Noise
 from protocol.orbits import pair_ticks, rendezvous, tick_budget
@@ -39,6 +46,19 @@ MISSED = (
     348705387925788852,  # a misses b twice
 )
 """Seeds of DRIFT, from a sweep of 20 000, in which a misses b at first."""
+WHEELS = """anchor_sigma = 0.05
+mutual_sigma = 0.05
+odometry = {v = 0.05, omega = 0.05}
+actuation = {v = 0.05, omega = 0.05}"""
+"""Noise with which one of twelve robots a meets b, and cannot claim after 60 mutual ranges."""
+UNSETTLED = (
+    1077452619412565400,
+    903395225165945070,
+    4565738891504476827,
+    2386190808387697108,  # a leaves b twice
+    2010375696666685743,
+)
+"""Seeds of WHEELS, from a sweep of 300, which ended undecided when a did not begin again after a meeting."""
 PASSED = 49
 """The number of ticks of T_max in these missions."""
 
@@ -67,6 +87,49 @@ def test_a_recording_with_a_missed_encounter_is_audited_replayed_and_told(tmp_pa
     assert "a has not met b on its circle. It drives back to its anchor to begin again." in told
 
 
+def unsettled(seed: int) -> Scenario:
+    return scenario_of(WHEELS, seed, accuracy=0.3)
+
+
+@pytest.mark.parametrize("seed", series(UNSETTLED, 2))
+def test_a_robot_that_leaves_its_peer_undecided_begins_again_and_both_localise(seed: int) -> None:
+    recording = run_mission(unsettled(seed))
+    of_a = states(recording, "a")
+    back = of_a.index("homing")
+    assert set(of_a[back - 58 : back]) <= {"surveying", "listening", "retreating"}
+    assert "straight" in of_a[back:], "phase 1 begins as at the start"
+    assert "surveying" in of_a[back:]
+    assert "homing" not in states(recording, "b")
+    assert_localised(recording)
+
+
+def test_a_recording_in_which_a_left_b_is_audited_replayed_and_told(tmp_path: Path) -> None:
+    run_mission(unsettled(UNSETTLED[0]), tmp_path)
+    assert tandem("audit", str(tmp_path)).status == 0
+    assert tandem("replay", str(tmp_path)).status == 0
+    told = [caption.text for scene in scenes_of(read(tmp_path)) for caption in scene.captions]
+    failed = "a has not found out where it is from its distances to b."
+    assert f"{failed} It drives back to its anchor to begin again." in told
+
+
+def test_neither_robot_keeps_hypotheses_of_the_meeting_that_a_left() -> None:
+    known: dict[str, list[Belief]] = {"a": [], "b": []}
+
+    class Watched(AccuracySeeking):
+        def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
+            decided = super().decide(state, reports)
+            known[state.config.robot].append(decided.belief)
+            return decided
+
+    played(unsettled(UNSETTLED[0]), {}, planner_of=lambda _: Watched())
+    for beliefs in known.values():
+        again = [now for before, now in pairwise(beliefs) if now.beginning != before.beginning]
+        assert len(again) == 1
+        assert (again[0].pair, again[0].ranges_at_last_search, again[0].p_value) == ((), 0, None)
+        assert beliefs[-1].pair, "the second meeting gives new ones"
+    assert known["a"][-1].beginning == known["b"][-1].beginning > 60
+
+
 # --- what a measured before it began again -------------------------------------------------------------
 
 
@@ -84,6 +147,10 @@ BEGINNINGS = {
     "two longer gaps": ([0, 5, 60, 64, 130, 133], (), 130),
     "ranges to b before": ([0, 5, 60, 64], (40, 41, 42), 0),
     "hardly any range to b before": ([0, 5, 60, 64], (40, 41, 80), 60),
+    "a gap after ranges to b": ([0, 5, 60, 130], (40, 41, 42), 130),
+    "59 ranges to b before": ([0, 5, 80, 84], tuple(range(6, 65)), 0),
+    "60 ranges to b before": ([0, 5, 80, 84], tuple(range(6, 66)), 80),
+    "60 ranges to b before, but some to the anchor between them": ([0, 5, 40, 80], tuple(range(6, 70)), 0),
 }
 
 

@@ -63,6 +63,8 @@ class Belief(msgspec.Struct, frozen=True):
     """The covariance of the first pose in `poses`."""
     blocking_reason: str | None = None
     """Noisy sensors: the condition that still prevents a claim; None if every condition is met."""
+    beginning: int = 0
+    """Noisy sensors: the tick from which on the measurements of a count in `pair` (`inference.beginning`)."""
     ranges_at_last_search: int = 0
     """Noisy sensors: the number of mutual ranges at the latest search of the whole plane for hypotheses."""
     inconsistency: Inconsistency | None = None

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis
-from agent.estimation.gaussian.inference import PlanningHypothesis
+from agent.estimation.gaussian.inference import MANY_MUTUAL_RANGES, PlanningHypothesis
 from agent.estimation.gaussian.odometry_noise import Track
 from agent.planning import active_sensing, exchange, phase2_orbit, range_seeking, transitions
 from agent.planning.active_sensing import CONTINUED, STALLED, Listening, Objective, Retreating, Surveying
@@ -35,7 +35,7 @@ from agent.planning.state import Asleep, Done, RobotState
 from agent.planning.strides import stride
 from protocol.messages import BranchKind, Localised, Observation, Report
 from protocol.mission import Mission, Role
-from protocol.motion import ORIGIN, REST, Controls, Pose, inverse
+from protocol.motion import ORIGIN, REST, Controls, Pose, compose, inverse
 
 MANOEUVRES = AssuredExact.MANOEUVRES
 """The manoeuvres of the searches for ranges."""
@@ -64,14 +64,6 @@ OFF_RADIUS = 0.5
 
 DROP_OUT_SIGMAS = 3.0
 """The margin for the number of drop-outs, in standard deviations."""
-
-MANY_MUTUAL_RANGES = 60
-"""The number of mutual ranges after which a lack of accuracy is due to too few ranges to the anchor.
-
-Set on the sweep `noise`, whose missions need 10 to 40. With fewer, robots that would have claimed a few ticks
-later drive back; with more, robots whose anchor is known too badly range in vain for longer. Missions with
-little noise never come near it.
-"""
 
 
 JointManoeuvres = Callable[
@@ -232,13 +224,49 @@ def _return_to_anchor(state: RobotState) -> RobotState:
     return replace(state, mode=Homing(place), belief=belief)
 
 
-def _begin_again(state: RobotState) -> RobotState:
-    """Drive to where the anchor should be after a missed encounter, and measure phase 1 again there.
+def _begin_again(state: RobotState, start: Pose) -> RobotState:
+    """Drive to where the anchor should be if a started at `start` (see `Branch`), to measure phase 1 again.
 
     The place of the last range is on the rim of the anchor's range, which a robot misses more easily.
     """
-    anchor = inverse(state.start)
+    anchor = inverse(start)
     return replace(_return_to_anchor(state), mode=Homing(Pose(anchor.x, anchor.y, 0.0), 0))
+
+
+def _leave(state: RobotState) -> RobotState:
+    """Leave the peer for the anchor: MANY_MUTUAL_RANGES have not settled the poses.
+
+    Without an anchor range since before the encounter, a begins again, as after a missed one.
+    """
+    config, belief = state.config, state.belief
+    if not (config.begins_again and inference.has_failed(state, state.log.ranges[-1].tick, state.tick + 1)):
+        return _return_to_anchor(state)
+    start = state.start
+    if belief.pair:
+        here = belief.poses[0]
+        local = Pose(here.x - config.anchor.x, here.y - config.anchor.y, here.heading)
+        start = compose(local, inverse(state.odometry))
+    return _begin_again(state, start)
+
+
+def _of_this_attempt(state: RobotState) -> RobotState:
+    """Return `state` without the belief of phase 3 that follows from measurements of an earlier attempt."""
+    first = inference.beginning(state, inference.known_through(state))
+    if first == state.belief.beginning:
+        return state
+    belief = replace(
+        state.belief,
+        beginning=first,
+        pair=(),
+        candidates=None,
+        ranges_at_last_search=0,
+        inconsistency=None,
+        p_value=None,
+        inconsistent_searches=0,
+        doubtful_claims=0,
+        returns=0,
+    )
+    return replace(state, belief=belief)
 
 
 def _next_side(place: Pose, side: int, mission: Mission) -> Homing:
@@ -277,7 +305,7 @@ def _continue_phase2(state: RobotState, ranged: bool) -> RobotState:
         since = mode.since or state.tick
         timeout += state.config.rendezvous.bound / mission.period
         if state.orbit.v != 0.0 and state.tick - since > timeout and not state.in_contact:
-            return _begin_again(state) if state.config.begins_again else _return_to_anchor(state)
+            return _begin_again(state, state.start) if state.config.begins_again else _return_to_anchor(state)
         if state.orbit.v != 0.0:
             command = phase2_orbit.pursuit(state.local_pose, state.orbit, mission)
         elif planning and state.belief.own:
@@ -342,6 +370,7 @@ def _decide_phase3(state: RobotState, planned: JointManoeuvres) -> RobotState:
     mission, role = state.config.mission, state.config.role
     if state.belief.encounter_tick is None:
         state = replace(state, belief=replace(state.belief, encounter_tick=state.tick))
+    state = _of_this_attempt(state)
     pair = inference.pair_of(state)
     mutual = pair.ranges.counts[2]
     if mutual < FEWEST_MUTUAL_RANGES:
@@ -357,7 +386,7 @@ def _decide_phase3(state: RobotState, planned: JointManoeuvres) -> RobotState:
     if tested.verdict is not None:
         return tested
     if role == "a" and len(pair.places) >= MANY_MUTUAL_RANGES * (1 + state.belief.returns):
-        return _return_to_anchor(tested)
+        return _leave(tested)
     if not scored:
         return _drive_without_hypotheses(tested)
     since, objective = _objective(state, "peer", pair.paths)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Sequence
 from functools import lru_cache
 from itertools import pairwise
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -50,20 +52,29 @@ class PlanningHypothesis(NamedTuple):
 def beginning(knowledge: Knowledge, through: int) -> int:
     """Return the tick up to `through` from which on the measurements of robot a count: 0, or a later one.
 
-    A robot a that has had no range to its anchor for longer than T_max has searched for b in vain. With its
-    next range it begins phase 1 again. Earlier measurements hardly constrain its pose then: the error of its
-    heading has grown on the orbit to up to a radian, and over such an angle no fit is linear. Both robots
-    determine the tick from a's log. After LEAST_RANGES mutual ranges, a does not begin again.
+    A robot a that has searched for b in vain, or has left b undecided, begins phase 1 again with its next
+    range to its anchor. Earlier measurements hardly constrain its pose then: the error of its heading has
+    grown to up to a radian, and over such an angle no fit is linear. Both robots determine the tick from what
+    both know: a's log and the ranges between them.
     """
-    config = knowledge.config
-    if not config.begins_again:
+    if not knowledge.config.begins_again:
         return 0
-    log = knowledge.log if config.role == "a" else knowledge.peer_state.peer
-    if len(knowledge.mutual) >= LEAST_RANGES:
-        through = min(through, knowledge.mutual[LEAST_RANGES - 1].tick)
-    longest = config.rendezvous.bound / config.mission.period
+    log = knowledge.log if knowledge.config.role == "a" else knowledge.peer_state.peer
     ticks = [ranged.tick for ranged in log.ranges if ranged.tick <= through]
-    return max([tick for before, tick in pairwise(ticks) if tick - before > longest], default=0)
+    return max([tick for before, tick in pairwise(ticks) if has_failed(knowledge, before, tick)], default=0)
+
+
+def has_failed(knowledge: Knowledge, before: int, tick: int) -> bool:
+    """Return whether a has failed to meet b, or to settle with it, by the anchor range that it has in `tick`.
+
+    It has had no range to its anchor since that of the tick `before`: for longer than T_max with fewer than
+    LEAST_RANGES mutual ranges, or with MANY_MUTUAL_RANGES of them.
+    """
+    config, at = knowledge.config, attrgetter("tick")
+    mutual = bisect_left(knowledge.mutual, tick, key=at) - bisect_left(knowledge.mutual, before, key=at)
+    if mutual < LEAST_RANGES:
+        return (tick - before) * config.mission.period > config.rendezvous.bound
+    return mutual >= MANY_MUTUAL_RANGES
 
 
 def _own_beginning(knowledge: Knowledge) -> int:
@@ -238,6 +249,14 @@ LEAST_RANGES = 3
 """The least number of ranges to an anchor, or between the robots, that may be enough.
 
 Two have no redundancy. The third checks them, if it is accurate: by its evidence against chance.
+"""
+
+MANY_MUTUAL_RANGES = 60
+"""The number of mutual ranges after which a lack of accuracy is due to too few ranges to the anchor.
+
+Set on the sweep `noise`, whose missions need 10 to 40. With fewer, robots that would have claimed a few ticks
+later drive back; with more, robots whose anchor is known too badly range in vain for longer. Missions with
+little noise never come near it.
 """
 
 ANCHOR_RANGES, ANCHOR_RANGES_WITH_OUTLIERS = 5, 7

@@ -101,14 +101,18 @@ def searching(pair: PairData) -> Iterator[Caption]:
 
 
 def beginning_again(pair: PairData) -> Iterator[Caption]:
-    """Yield which robot has not met its peer on its circle, and drives back to its anchor."""
+    """Yield which robot has not met its peer, or not settled with it, and drives back to its anchor."""
     for robot in pair.robots:
         before, now = pair.commands(robot.id)
-        if before is None or now is None or robot.orbit.v == 0.0:
+        if before is None or now is None or robot.orbit.v == 0.0 or now.state != "homing":
             continue
-        if (before.state, now.state) == ("orbiting", "homing"):
-            missed = f"{robot.id} has not met {robot.peer} on its circle."
-            yield Caption("search", f"{missed} It drives back to its anchor to begin again.", pair.ids)
+        if before.phase == 3:
+            failed = f"{robot.id} has not found out where it is from its distances to {robot.peer}."
+        elif before.state == "orbiting":
+            failed = f"{robot.id} has not met {robot.peer} on its circle."
+        else:
+            continue
+        yield Caption("search", f"{failed} It drives back to its anchor to begin again.", pair.ids)
 
 
 def _search(robots: Sequence[RobotSetup]) -> str:
