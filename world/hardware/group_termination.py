@@ -30,7 +30,7 @@ from protocol.messages import (
     Undecided,
     Verdict,
 )
-from protocol.sweep_strips import helping_ticks, sweep_speed, sweep_ticks
+from protocol.sweep_strips import helping_ticks, rounds, sweep_speed, sweep_ticks
 from world.hardware.termination import LAST_WORDS, Termination
 from world.referee import inaccuracy
 
@@ -143,11 +143,15 @@ class GroupEnding(Termination):
 
 
 def _sweep_ticks(config: RobotConfigInGroup) -> int:
-    """Return a bound on the ticks in which each robot with an anchor sweeps its part; 0 if all have one."""
+    """Return a bound on the ticks in which each robot with an anchor sweeps its parts; 0 if all have one.
+
+    If robots may report false data, it sweeps more than one, and goes to the other robots before each.
+    """
     if not isinstance(config, RobotConfigWithSweep):
         return 0
     mission, sweep = config.mission, config.sweep
     way = math.ceil(config.widest_distance / (sweep_speed(mission) * mission.period))
     paths = [sweep.path(part, mission.sensing_range) for part in range(sweep.parts)]
     longest = max([sweep_ticks(path, mission) for path in paths])
-    return RESTING_TICKS + way + longest + len(config.unanchored) * helping_ticks(mission)
+    once = RESTING_TICKS + way + longest + len(config.unanchored) * helping_ticks(mission)
+    return once + (rounds(config.tolerates) - 1) * (once + len(config.members) * way)
