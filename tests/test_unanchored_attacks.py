@@ -124,6 +124,18 @@ def test_no_shipped_attack_leads_to_a_wrong_claim() -> None:
         assert all_right(run_mission(template.seeded(3))), cell
 
 
+def test_a_robot_that_searches_for_the_one_that_comes_to_it_is_visited_by_it() -> None:
+    """Robot r3, whose meeting with the attacker has failed, searches for r4, which visits it meanwhile.
+
+    If both were robot a of the meeting, each would wait for the manoeuvre of the other one.
+    """
+    table = {**five(), "seed": 0}
+    del table["robot"], table["mission"]["area"]
+    attack = {"kind": "rotate", "part": "encounter", "size": math.radians(1.0)}
+    table["group"] = {"robots": 6, "spacing": 30.0, "without_anchor": 2, "attack": attack}
+    assert all_right(run_mission(scenario_of(table)))
+
+
 # --- the robot without an anchor ----------------------------------------------------------------------
 
 
