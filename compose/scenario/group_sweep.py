@@ -54,8 +54,8 @@ def check_unanchored(file: ScenarioFile, source: str) -> None:
         raise BadScenario(f"{where}: at least two robots of a group need one")
     if file.mission.safety_distance:
         raise Unworkable(
-            f"{source}: mission.safety_distance: there is a robot without an anchor, and robots that sweep "
-            "for it do not keep it"
+            f"{source}: mission.safety_distance: there is a robot without an anchor, and until it is "
+            "found nobody knows on which side to pass it"
         )
     _check_attacks(file, len(file.robot) - len(missing), source)
     _check_area(file, missing, source)
