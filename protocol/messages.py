@@ -416,6 +416,8 @@ class RobotConfigWithSweep(RobotConfigInGroup, frozen=True, dict=True):
     """The area in which they are, and the number of its parts."""
     part: Count = 0
     """The part that this robot sweeps first."""
+    tolerates: Annotated[int, Meta(ge=0, le=MAX_MEMBERS)] = 0
+    """The number of robots that may report false data: one more must agree on a pose before it is claimed."""
 
     @property
     def group(self) -> tuple[str, ...]:

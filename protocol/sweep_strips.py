@@ -188,6 +188,14 @@ def helping_ticks(mission: Mission) -> int:
     return LOOPS * sweep_ticks([(0.0, 0.0), (side, 0.0), (side, side), (0.0, side), (0.0, 0.0)], mission)
 
 
+def rounds(tolerates: int) -> int:
+    """Return the number of robots that sweep each part until `tolerates` + 1 honest ones have.
+
+    As many robots may report false data as `tolerates` says.
+    """
+    return 2 * tolerates + 1
+
+
 def contact_ticks(mission: Mission) -> int:
     """Return the most ticks for which a sweeping robot stops for another one with noisy sensors.
 

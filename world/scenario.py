@@ -6,13 +6,15 @@ import math
 from collections.abc import Mapping
 from functools import cached_property
 from itertools import combinations
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
+from msgspec import Meta
 from msgspec.structs import asdict
 
 from protocol.attack import Attack
 from protocol.messages import (
+    MAX_MEMBERS,
     Member,
     Retry,
     RobotConfig,
@@ -112,6 +114,8 @@ class PlannedSweep(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_
     """The robots that sweep it, in the order of the parts that they sweep first."""
     ends: Time
     """The bound in s of the time at which all robots without an anchor are localised."""
+    tolerates: Annotated[int, Meta(ge=0, le=MAX_MEMBERS)] = 0
+    """The number of robots that may report false data."""
 
 
 class Death(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
@@ -279,11 +283,15 @@ class Scenario(
 
     def _sweeping(self, config: RobotConfigInGroup, planned: PlannedSweep) -> RobotConfigWithSweep:
         """Return `config` with what the robot knows about robots without an anchor, or as one of these."""
-        unanchored = self.unanchored
-        if config.robot in unanchored:
-            return RobotConfigWithoutAnchor(**asdict(config), unanchored=unanchored, sweep=planned.sweep)
-        part = planned.sweepers.index(config.robot)
-        return RobotConfigWithSweep(**asdict(config), unanchored=unanchored, sweep=planned.sweep, part=part)
+        known = {
+            **asdict(config),
+            "unanchored": self.unanchored,
+            "sweep": planned.sweep,
+            "tolerates": planned.tolerates,
+        }
+        if config.robot in self.unanchored:
+            return RobotConfigWithoutAnchor(**known)
+        return RobotConfigWithSweep(**known, part=planned.sweepers.index(config.robot))
 
     @property
     def retries(self) -> tuple[PlannedRetry, ...]:

@@ -25,7 +25,7 @@ from protocol.messages import (
     Undecided,
     Verdict,
 )
-from protocol.motion import REST, Controls, Pose, step
+from protocol.motion import REST, Controls, Pose, compose, inverse, step
 
 
 class Reporting(Protocol):
@@ -103,12 +103,9 @@ def report(state: RobotState) -> Report:
     If the configuration contains an attack, the report holds the falsified log (see `protocol.attack`).
     """
     since, ranges_since = state.peer_state.acknowledged, state.peer_state.ranges_acknowledged
-    log, start = state.log, state.belief.branch.start if state.belief.branch and state.phase > 1 else None
+    start = state.belief.branch.start if state.belief.branch and state.phase > 1 else None
+    log = _reported_log(state)
     if (attack := state.config.attack) is not None:
-        belief = state.belief
-        log = false_reports.falsified_log(
-            log, attack, belief.phase1_done_tick, belief.encounter_tick, state.config.mission.period
-        )
         start = false_reports.start(start, attack) if start is not None else None
     unacknowledged = log.after(since, ranges_since)
     return Report(
@@ -126,6 +123,30 @@ def report(state: RobotState) -> Report:
         ranges_heard=len(state.peer_state.peer.ranges),
         verdict=state.verdict,
     )
+
+
+def _reported_log(state: RobotState) -> MotionLog:
+    """Return the log of the robot, falsified if its configuration contains an attack."""
+    attack, belief = state.config.attack, state.belief
+    if attack is None:
+        return state.log
+    return false_reports.falsified_log(
+        state.log, attack, belief.phase1_done_tick, belief.encounter_tick, state.config.mission.period
+    )
+
+
+def reported_pose(state: RobotState, frame: Pose) -> Pose:
+    """Return the pose in <W> that a localised robot reports; `frame` is its pose at tick 0.
+
+    That of an attacker follows from the start and the log that it reports to its peers.
+    """
+    attack, branch = state.config.attack, state.belief.branch
+    if attack is None or branch is None:
+        return compose(frame, state.odometry)
+    pose = compose(compose(frame, inverse(branch.start)), false_reports.start(branch.start, attack))
+    for run in _reported_log(state).runs:
+        pose = step(pose, run.v, run.omega, run.ticks * state.config.mission.period)
+    return pose
 
 
 def report_without_log(state: Reporting, verdict: Verdict | None) -> Report:

@@ -22,7 +22,7 @@ from agent.planning.log_exchange import LogPlanner
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Travelling
 from agent.planning.planner import Planner, Summary
 from agent.planning.separation import slowed
-from agent.planning.state import MODE_NAMES, Done
+from agent.planning.state import MODE_NAMES, UNCONFIRMED, Done
 from protocol.messages import (
     Command,
     Estimate,
@@ -89,7 +89,7 @@ class GroupPlanner(Planner[GroupState, Report]):
     def report_to(self, state: GroupState, peer: str) -> Report:
         """Return the report to `peer`: the log, or outside a meeting only this robot's verdict.
 
-        A robot without an anchor gets the pose of one that is localised until it is localised itself.
+        A robot without an anchor gets the pose of a localised one until it has determined its own by it.
         Until this robot is localised, one with which its meeting has failed gets the verdict of that meeting.
         """
         if group_transitions.refused(state, peer):
@@ -99,8 +99,7 @@ class GroupPlanner(Planner[GroupState, Report]):
         without_log = exchange.report_without_log(state.pair, state.verdict)
         if not (sweep_transitions.is_helped(state, peer) and isinstance(state.verdict, Localised)):
             return without_log
-        pose = compose(state.frame, state.pair.odometry)
-        return ReportWithPose(**asdict(without_log), pose=pose)
+        return ReportWithPose(**asdict(without_log), pose=exchange.reported_pose(state.pair, state.frame))
 
     def decide(self, state: GroupState, reports: Sequence[Report] = ()) -> GroupState:
         """Return `state` with the `reports` of others, and in the next meeting if this one has ended."""
@@ -175,9 +174,10 @@ class GroupPlanner(Planner[GroupState, Report]):
 
 
 def with_sender(state: GroupState, report: Report) -> GroupState:
-    """Return `state` with what `report` says about its sender: whether it travels, and is localised."""
+    """Return `state` with what `report` says about its sender: whether it travels, is localised or served."""
     known, travels = state.other(report.robot), report.state == TRAVELLING
     localised = known.localised or travels or (not report.has_log and isinstance(report.verdict, Localised))
-    if (travels, localised) == (known.travels, known.localised):
+    served = known.served or report.state == UNCONFIRMED
+    if (travels, localised, served) == (known.travels, known.localised, known.served):
         return state
-    return state.with_other(report.robot, replace(known, travels=travels, localised=localised))
+    return state.with_other(report.robot, replace(known, travels=travels, localised=localised, served=served))

@@ -23,6 +23,9 @@ class Other(msgspec.Struct, frozen=True):
     """True once it has reported that it is localised."""
     failed: bool = False
     """True once a meeting with it has failed: this robot does not meet it again."""
+    served: bool = False
+    """True once it has no anchor, and has reported that it knows its pose by this robot, and waits for others
+    to confirm it."""
     travels: bool = False
     """True if it drives to another robot, by its latest report. It counts only with a safety distance."""
     missed: int | None = None

@@ -48,8 +48,12 @@ LINGERING = 6
 def answering(state: GroupState, visitors: Sequence[str]) -> GroupState:
     """Return `state` in a meeting with one of `visitors`, which have come to it, if it waits for one."""
     pair = state.pair
-    if state.verdict is not None or pair.belief.phase1_done_tick is None or pair.config.peer in visitors:
+    if state.verdict is not None or pair.belief.phase1_done_tick is None:
         return state
+    if pair.config.peer in visitors:
+        # a robot that searches for its peer must not wait for that one's manoeuvre while it waits for its own
+        searches = state.config.role == "a" and not refused(state, pair.config.peer)
+        return _waiting(state, pair.config.peer) if searches else state
     if _is_met(state) and state.silence <= SILENT_AFTER:
         return state
     for visitor in visitors:

@@ -44,6 +44,9 @@ Phase3 = Straight | Backing | Turning | Circling | Standing | Waiting | LastMano
 Noisy3 = Surveying | Listening | Retreating
 Mode = Asleep | Phase1 | Phase2 | Phase3 | Noisy3 | Done
 
+UNCONFIRMED = "unconfirmed"
+"""The mode that a robot without an anchor reports to one by which it knows its pose, until others agree."""
+
 MODE_NAMES: dict[type, str] = {
     Asleep: "asleep",
     Straight: "straight",

@@ -16,13 +16,14 @@ from protocol.sweep_strips import NEAR
 
 
 def wanted(state: GroupState) -> bool:
-    """Return whether there are robots without an anchor that have not reported that they are localised."""
+    """Return whether there are robots without an anchor that this robot can still help."""
     return any(is_helped(state, robot) for robot in _unanchored(state))
 
 
 def is_helped(state: GroupState, robot: str) -> bool:
-    """Return whether `robot` has no anchor, and has not reported yet that it is localised."""
-    return robot in _unanchored(state) and not state.other(robot).localised
+    """Return whether `robot` has no anchor, and still needs the poses of this robot, as far as it knows."""
+    known = state.other(robot)
+    return robot in _unanchored(state) and not (known.localised or known.served)
 
 
 def _unanchored(state: GroupState) -> tuple[str, ...]:

@@ -1,12 +1,16 @@
 """A robot of a group without an anchor: it waits until a localised robot finds it, and believes its pose.
 
 The other robot drives a square while this one stands still; that determines this robot's position. Then this
-one drives a square, too; that determines its heading. A claim rests on the ranges to one other robot, in the
+one drives a square, too; that determines its heading. The pose rests on the ranges to one other robot, in the
 order of their ticks, so it does not depend on the order in which reports arrive.
+
+If f robots may report false data, it claims a pose on which f + 1 of them agree, at least one of which is
+honest. Until then, it waits for the next one.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import msgspec
@@ -19,7 +23,7 @@ from agent.peer.motion_log import MotionLog
 from agent.planning import exchange, sweep
 from agent.planning.phase3_last_manoeuvre import Standing
 from agent.planning.planner import Planner, Summary
-from agent.planning.state import MODE_NAMES
+from agent.planning.state import MODE_NAMES, UNCONFIRMED
 from agent.planning.sweep import LOOPS_FOR, Looping
 from protocol.messages import (
     Command,
@@ -33,7 +37,7 @@ from protocol.messages import (
     Undecided,
 )
 from protocol.mission import Mission
-from protocol.motion import ORIGIN, REST, Pose, compose, inverse
+from protocol.motion import ORIGIN, REST, Pose, compose, inverse, wrap
 from protocol.rounding import SURE
 
 EXPLAINED = 0.1 * SURE
@@ -44,6 +48,12 @@ It is far above the rounding errors of the poses of both robots, and far below w
 
 KEPT = 64
 """The number of ticks for which a range is kept until the report of that tick arrives."""
+
+AGREE = SURE
+"""The largest difference in m and rad between poses that two robots confirm.
+
+One of them is honest, so the error of both is smaller than the tolerance of a claim, 2 SURE.
+"""
 
 PLACES = 5
 """The number of relative placements that a claim needs: three for a position, two for a heading."""
@@ -99,11 +109,13 @@ class UnanchoredState(WaitingState, frozen=True):
     """The ranges to robots that have reported their poses in those ticks, by robot and tick."""
     possible: tuple[Pose, ...] = ()
     """The poses of `base` in <W> that agree with the ranges; empty before the heading can be determined."""
+    candidates: Mapping[str, Pose] = {}
+    """The pose in <W> of the frame of the odometry, by the robot from whose reports it follows."""
 
     @property
     def phase(self) -> int:
         """Return 2 until the first range to a localised robot, then 3."""
-        return 3 if self.places else 2
+        return 3 if self.places or self.candidates else 2
 
 
 class UnanchoredPlanner(Planner[UnanchoredState, Report]):
@@ -141,17 +153,24 @@ class UnanchoredPlanner(Planner[UnanchoredState, Report]):
         """Return a report without a log: a robot without an anchor is in no meeting."""
         return exchange.report_without_log(state, state.verdict)
 
+    def report_to(self, state: UnanchoredState, peer: str) -> Report:
+        """Return the report to `peer`, which does not stop any longer once this robot knows a pose by it."""
+        report = self.report(state)
+        if state.verdict is None and peer in state.candidates:
+            return replace(report, state=UNCONFIRMED)
+        return report
+
     def decide(self, state: UnanchoredState, reports: Sequence[Report] = ()) -> UnanchoredState:
         """Return `state` with the poses in `reports`, and with a verdict if they determine the own pose."""
         if state.verdict is not None:
             return state
         if state.tick * state.config.mission.period >= state.config.gives_up:
-            return replace(state, verdict=Undecided("no localised robot has found it"))
+            return replace(state, verdict=Undecided(_why_undecided(state)))
         ranges, places = dict(state.ranges), dict(state.places)
         if isinstance(state.mode, Standing):  # a robot that comes back may have corrected its pose
             places = {key: one for key, one in places.items() if key[1] > state.tick - LOOPS_FOR}
         for one in reports:
-            if not isinstance(one, ReportWithPose):
+            if not isinstance(one, ReportWithPose) or one.robot in state.candidates:
                 continue
             if (known := ranges.pop((one.robot, one.tick), None)) is not None:
                 distance, odometry = known
@@ -165,12 +184,15 @@ class UnanchoredPlanner(Planner[UnanchoredState, Report]):
         return state.command(EXACT.pose_tolerance)
 
     def estimate(self, state: UnanchoredState) -> Estimate:
-        """Return the poses in <W> that agree with all ranges."""
+        """Return the poses in <W> that agree with all ranges, or those that robots have not confirmed yet."""
+        world = [_now(state, one) for one in state.possible]
+        if not world:
+            world = [compose(state.candidates[robot], state.odometry) for robot in sorted(state.candidates)]
         return Estimate(
             tick=state.tick,
             robot=state.config.robot,
             local=(),
-            world=tuple([_now(state, one) for one in state.possible]),
+            world=tuple(world),
             localised=isinstance(state.verdict, Localised),
         )
 
@@ -181,7 +203,7 @@ class UnanchoredPlanner(Planner[UnanchoredState, Report]):
 
     def summary(self, state: UnanchoredState) -> Summary:
         """Return the number of possible poses."""
-        return Summary(hypotheses=len(state.possible) or None)
+        return Summary(hypotheses=len(state.possible) or len(state.candidates) or None)
 
 
 def _now(state: UnanchoredState, base: Pose) -> Pose:
@@ -191,7 +213,7 @@ def _now(state: UnanchoredState, base: Pose) -> Pose:
 
 def _resected(state: UnanchoredState) -> UnanchoredState:
     """Return `state` with what follows from its ranges to each robot: a square to drive, or a verdict."""
-    for robot in sorted({robot for robot, _ in state.places}):
+    for robot in sorted({robot for robot, _ in state.places} - state.candidates.keys()):
         known = [state.places[key] for key in sorted(state.places) if key[0] == robot]
         standing = [one for one in known if one.odometry == ORIGIN]
         moved = [one for one in known if one.odometry != ORIGIN]
@@ -202,21 +224,50 @@ def _resected(state: UnanchoredState) -> UnanchoredState:
         elif moved and (possible := resection.poses(standing, moved, EXPLAINED)):
             state = replace(state, possible=possible)
             if resection.is_certain(standing, moved, possible):
-                return replace(state, verdict=Localised(_now(state, possible[0])))
+                state = _with_candidate(state, robot, _now(state, possible[0]))
+                if state.verdict is not None:
+                    return state
     return state
+
+
+def _with_candidate(state: UnanchoredState, robot: str, pose: Pose) -> UnanchoredState:
+    """Return `state` with the present `pose`, which follows from the reports of `robot`.
+
+    It is claimed if as many robots agree on it as are needed for one of them to be honest.
+    """
+    candidates = {**state.candidates, robot: compose(pose, inverse(state.odometry))}
+    others = [compose(one, state.odometry) for by, one in state.candidates.items() if by != robot]
+    agreeing = 1 + sum([_agree(pose, other) for other in others])
+    verdict = Localised(pose) if agreeing > state.config.tolerates else None
+    return replace(state, candidates=candidates, verdict=verdict)
+
+
+def _agree(one: Pose, other: Pose) -> bool:
+    """Return whether two poses are the same to AGREE."""
+    apart = math.hypot(one.x - other.x, one.y - other.y)
+    return max(apart, abs(wrap(one.heading - other.heading))) <= AGREE
+
+
+def _why_undecided(state: UnanchoredState) -> str:
+    """Return why the robot has not claimed a pose, for a user."""
+    if not state.candidates:
+        return "no localised robot has found it"
+    found = ", ".join(sorted(state.candidates))
+    return f"{state.config.tolerates + 1} robots must agree on its pose; it is found by: {found}"
 
 
 def _moved_on(state: UnanchoredState) -> UnanchoredState:
     """Return `state` after a tick of a square. The square is repeated until the pose is known.
 
-    If nobody has reported a pose for KEPT ticks, the robot stands still again, and forgets all ranges: those
-    to the next robot that comes begin where it is then.
+    If nobody has reported a pose for KEPT ticks, except robots by which it knows a pose, the robot stands
+    still again, and forgets all ranges: those to the next robot that comes begin where it is then.
     """
     assert isinstance(state.mode, Looping)
     mission, since = state.config.mission, state.mode.since
     mode = sweep.onward(state.mode, state.odometry, mission, EXACT.pose_tolerance)
     if mode.places:
         return replace(state, mode=mode)
-    if max(tick for _, tick in state.places) > state.tick - KEPT and since > state.tick - LOOPS_FOR:
+    latest = max([tick for robot, tick in state.places if robot not in state.candidates], default=-KEPT)
+    if latest > state.tick - KEPT and since > state.tick - LOOPS_FOR:
         return replace(state, mode=sweep.looping(state.odometry, mission, since))
     return replace(state, mode=Standing(), base=state.odometry, ranges={}, places={}, possible=())

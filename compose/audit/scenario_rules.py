@@ -91,8 +91,9 @@ def planned_meetings(found: Scenario) -> GroupMeetings:
     planner = PlannerTable(found.planner_name, found.planner_options)
     anchored = [one for one in robots if one.anchor is not None]
     meetings = group_meetings(anchored, found.mission, planner, found.faults)
-    area = found.planned_sweep.sweep.bounds if found.planned_sweep is not None else None
-    return with_sweep(robots, area, found.mission, meetings)
+    if (planned := found.planned_sweep) is None:
+        return meetings
+    return with_sweep(robots, planned.sweep.bounds, found.mission, meetings, tolerates=planned.tolerates)
 
 
 def _off_first(robot: RobotSpec, first: FirstMeeting) -> str | None:

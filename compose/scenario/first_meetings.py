@@ -10,7 +10,7 @@ from itertools import permutations
 from compose.errors import BadScenario, Unworkable
 from compose.launch import planner_loader
 from compose.scenario.group_meetings import FirstMeeting, GroupMeetings, group_meetings
-from compose.scenario.group_sweep import check_unanchored, with_sweep
+from compose.scenario.group_sweep import NOT_TOLERATED, check_unanchored, with_sweep
 from compose.scenario.scenario_tables import RobotTable, ScenarioFile
 from protocol.mission import infeasibility
 from protocol.orbits import Rendezvous
@@ -37,6 +37,8 @@ def meetings_of(file: ScenarioFile, faults: Sequence[Fault], source: str) -> Gro
         for i, robot in enumerate(robots):
             if robot.anchor is None:
                 raise BadScenario(f"{source}: robot[{i}]: missing field 'anchor'")
+        if file.mission.tolerates:
+            raise Unworkable(f"{source}: {NOT_TOLERATED}")
         return None
     _check_ids(robots, source)
     check_unanchored(file, source)
@@ -46,7 +48,7 @@ def meetings_of(file: ScenarioFile, faults: Sequence[Fault], source: str) -> Gro
     _check_accuracy(file, (min(distances), max(distances)), source)
     try:
         meetings = group_meetings([robots[i] for i in anchored], file.mission, file.planner, faults)
-        return with_sweep(robots, file.mission.area, file.mission, meetings)
+        return with_sweep(robots, file.mission.area, file.mission, meetings, tolerates=file.mission.tolerates)
     except Unworkable as error:
         raise Unworkable(f"{source}: {error}") from None
 

@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 
+import msgspec
+
 from compose.errors import BadScenario, Unworkable
 from compose.scenario.group_meetings import MOST_TURNED, FirstMeeting, GroupMeetings, rounded_down
 from compose.scenario.scenario_tables import Area, RobotTable, ScenarioFile
@@ -18,6 +20,7 @@ from protocol.sweep_strips import (
     SweptArea,
     contact_ticks,
     helping_ticks,
+    rounds,
     surveyed_path,
     sweep_speed,
     sweep_ticks,
@@ -30,6 +33,11 @@ LEAVING = 10
 ASIDE = 2.0
 """The largest distance from the anchor of its last meeting at which a robot goes on, in units of R."""
 
+NOT_TOLERATED = (
+    "mission.tolerates: it is for groups in which a robot has no anchor; others check all reports themselves"
+)
+"""The reason for which `mission.tolerates` is refused elsewhere."""
+
 PARTS = 3.0
 """The time allowed for sweeps in `max_ticks`, in units of the planned bound."""
 
@@ -38,6 +46,8 @@ def check_unanchored(file: ScenarioFile, source: str) -> None:
     """Raise BadScenario or Unworkable if the robots without an anchor in a group cannot be localised."""
     missing = [i for i, robot in enumerate(file.robot) if robot.anchor is None]
     if not missing:
+        if file.mission.tolerates:
+            raise Unworkable(f"{source}: {NOT_TOLERATED}")
         return
     where = f"{source}: robot[{missing[0]}]: missing field 'anchor'"
     if file.group is not None:
@@ -46,16 +56,35 @@ def check_unanchored(file: ScenarioFile, source: str) -> None:
         raise BadScenario(f"{where}: at least two robots of a group need one")
     if file.mission.safety_distance:
         raise Unworkable(
-            f"{source}: mission.safety_distance: there is a robot without an anchor, and robots that sweep "
-            "for it do not keep it"
+            f"{source}: mission.safety_distance: there is a robot without an anchor, and until it is "
+            "found nobody knows on which side to pass it"
         )
-    attacks = [i for i, robot in enumerate(file.robot) if robot.attack is not None]
-    if attacks:
-        raise Unworkable(
-            f"{source}: robot[{attacks[0]}].attack: there is a robot without an anchor, which must believe "
-            "the poses that others report"
-        )
+    _check_attacks(file, len(file.robot) - len(missing), source)
     _check_area(file, missing, source)
+
+
+def _check_attacks(file: ScenarioFile, anchored: int, source: str) -> None:
+    """Raise Unworkable if robots without an anchor cannot tolerate the attackers among the others.
+
+    With f of them, f + 1 honest finders must agree, and `anchored` robots have an anchor.
+    """
+    tolerates = file.mission.tolerates
+    attacks = [i for i, robot in enumerate(file.robot) if robot.attack is not None]
+    if tolerates and not file.mission.noise.exact:
+        raise Unworkable(f"{source}: mission.tolerates: sensors have noise, and it is for exact ones only")
+    if tolerates and anchored < rounds(tolerates):
+        raise Unworkable(
+            f"{source}: mission.tolerates: {tolerates} false finders need {rounds(tolerates)} robots with an "
+            f"anchor, of which {tolerates + 1} are honest; there are {anchored}"
+        )
+    if len(attacks) > tolerates:
+        remedy = f"set mission.tolerates = {len(attacks)}"
+        if not file.mission.noise.exact:
+            remedy = "with noisy sensors, nothing confirms them"
+        raise Unworkable(
+            f"{source}: robot[{attacks[0]}].attack: there is a robot without an anchor, which believes the "
+            f"poses that others report: {remedy}"
+        )
 
 
 def _check_area(file: ScenarioFile, missing: Sequence[int], source: str) -> None:
@@ -72,10 +101,16 @@ def _check_area(file: ScenarioFile, missing: Sequence[int], source: str) -> None
 
 
 def with_sweep(
-    robots: Sequence[RobotTable], area: Area | None, mission: Mission, meetings: GroupMeetings
+    robots: Sequence[RobotTable],
+    area: Area | None,
+    mission: Mission,
+    meetings: GroupMeetings,
+    *,
+    tolerates: int = 0,
 ) -> GroupMeetings:
     """Return `meetings` with the search for those of `robots` that have no anchor, which are in `area`.
 
+    `tolerates` of the robots may report false data, so each part is swept by several of them.
     The latest time allows for robots that sweep the parts of others, which have failed. Raises Unworkable if
     the area is too large for rounding errors.
     """
@@ -89,6 +124,9 @@ def with_sweep(
         raise Unworkable(f"mission.area: {why}")
     plan = _planned_sweep if mission.noise.exact else _noisy_sweep
     planned = plan(robots, len(unanchored), area, mission, meetings)
+    if tolerates:
+        again = _next_rounds(planned.sweep, places, len(unanchored), tolerates, mission)
+        planned = msgspec.structs.replace(planned, ends=planned.ends + again, tolerates=tolerates)
     still = Orbit(0.0, 0.0, 0.0)
     waiting = FirstMeeting(planned.sweepers[0], "b", Rendezvous(still, still, planned.ends))
     return meetings._replace(
@@ -120,6 +158,22 @@ def _planned_sweep(
             ticks += unanchored * helping_ticks(mission)
             latest = max(latest, free[robot] + ticks * mission.period)
     return PlannedSweep(sweep, tuple(sweepers), latest)
+
+
+def _next_rounds(
+    sweep: SweptArea, places: Sequence[tuple[float, float]], unanchored: int, tolerates: int, mission: Mission
+) -> float:
+    """Return the bound in s of the rounds of a sweep after the first.
+
+    In each, a robot goes to all anchors, which are among `places`, and then sweeps the part of another one.
+    """
+    way = max([math.dist(*two) for two in combinations(places, 2)])
+    turn = math.ceil(math.pi / (mission.max_turn_rate * mission.period)) + 1
+    visits = (sweep.parts - 1) * (math.ceil(way / (mission.max_speed * mission.period)) + turn)
+    paths = [sweep.path(part, mission.sensing_range) for part in range(sweep.parts)]
+    ticks = math.ceil(way / (sweep_speed(mission) * mission.period)) + turn
+    ticks += max([sweep_ticks(path, mission) for path in paths]) + unanchored * helping_ticks(mission)
+    return (rounds(tolerates) - 1) * (visits + ticks) * mission.period
 
 
 def _last_meetings(
@@ -154,10 +208,10 @@ def _noisy_sweep(
     for part, robot in enumerate(finders):
         path = surveyed_path(sweep, part, mission.sensing_range, anchors[robot], places[robot])
         if path:
-            rounds = math.ceil(len(path) / ENDS_OF_ROUND)
+            times = math.ceil(len(path) / ENDS_OF_ROUND)
             ticks = LEAVING + aside + sweep_ticks([places[robot], *path], mission)
-            ticks += 2 * rounds * aside + unanchored * contact_ticks(mission)
-            _check_gyros(mission, math.ceil(ticks / rounds))
+            ticks += 2 * times * aside + unanchored * contact_ticks(mission)
+            _check_gyros(mission, math.ceil(ticks / times))
             _check_odometry(mission, path)
             latest = max(latest, free[robot] + ticks * mission.period)
     return PlannedSweep(sweep, (*finders, *[one for one in anchors if one not in finders]), latest)

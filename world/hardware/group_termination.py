@@ -13,6 +13,7 @@ ends at max_ticks.
 
 from __future__ import annotations
 
+import math
 import time
 
 from protocol.messages import (
@@ -29,7 +30,7 @@ from protocol.messages import (
     Undecided,
     Verdict,
 )
-from protocol.sweep_strips import ticks_of_parts
+from protocol.sweep_strips import rounds, sweep_speed, ticks_of_parts
 from world.hardware.termination import LAST_WORDS, Termination
 from world.referee import inaccuracy
 
@@ -142,8 +143,14 @@ class GroupEnding(Termination):
 
 
 def _sweep_ticks(config: RobotConfigInGroup) -> int:
-    """Return a bound on the ticks in which each robot with an anchor sweeps its part; 0 if all have one."""
+    """Return a bound on the ticks in which each robot with an anchor sweeps its parts; 0 if all have one.
+
+    If robots may report false data, it sweeps more than one, and goes to the other robots before each.
+    """
     if not isinstance(config, RobotConfigWithSweep):
         return 0
-    parts = ticks_of_parts(config.sweep, config.mission, config.widest_distance, len(config.unanchored))
-    return RESTING_TICKS + max(parts)
+    mission = config.mission
+    parts = ticks_of_parts(config.sweep, mission, config.widest_distance, len(config.unanchored))
+    way = math.ceil(config.widest_distance / (sweep_speed(mission) * mission.period))
+    once = RESTING_TICKS + max(parts)
+    return once + (rounds(config.tolerates) - 1) * (once + len(config.members) * way)

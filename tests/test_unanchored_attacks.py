@@ -1,0 +1,269 @@
+"""Groups with robots without an anchor, in which some robots report false data."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from agent.planning.unanchored import UnanchoredPlanner, UnanchoredState
+from compose.audit.replay import replayed
+from compose.errors import UserError
+from compose.launch.in_process import run_mission
+from compose.recording.run import Run, of_frames
+from compose.scenario.scenario_change import file_table
+from compose.scenario.scenario_file import ScenarioTemplate, validate
+from compose.sweep import spec
+from compose.sweep.cells import cells, setting_of
+from protocol.messages import (
+    Contact,
+    Localised,
+    Observation,
+    Report,
+    ReportWithPose,
+    Undecided,
+)
+from protocol.motion import ORIGIN, Controls, Pose, compose, step, wrap
+from protocol.rounding import TOLERANCE
+from tests.test_audit import kept
+from tests.test_group_runs import audited
+from tests.test_unanchored import four, last_claim, scenario_of
+from world.scenario import Scenario
+
+REFRAME = {"kind": "reframe", "size": 1.0}
+"""The attack that no meeting contradicts, and that moves all poses which the attacker reports rigidly."""
+
+
+def five(attackers: str = "", **fields: Any) -> dict[str, Any]:
+    """Return a scenario file of three robots with an anchor and two without, one of which may lie."""
+    table = four(**fields)
+    table["mission"] = {**table["mission"], "tolerates": 1}
+    table["robot"].insert(2, {"id": "c", "anchor": [2.0, 11.0]})
+    for robot in table["robot"]:
+        if robot["id"] in attackers:
+            robot["attack"] = REFRAME
+    return table
+
+
+def claims(run: Run) -> dict[str, float | None]:
+    """Return the larger error (m or rad) of the claim of each honest robot; None if it has none."""
+    found = {}
+    for robot in run.scenario.robots:
+        if robot.attack is None:
+            claim = run.claim(robot.id)
+            found[robot.id] = None if claim is None else max(claim.position_error, claim.heading_error)
+    return found
+
+
+def all_right(run: Run) -> bool:
+    return all(error is not None and error <= TOLERANCE for error in claims(run).values())
+
+
+# --- missions -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("attacker", ["a", "b", "c", "u"])
+def test_honest_robots_are_localised_and_never_wrong_whoever_lies(attacker: str) -> None:
+    assert all_right(run_mission(scenario_of(five(attacker))))
+
+
+def test_a_finder_that_lies_is_believed_by_a_robot_that_tolerates_no_false_report() -> None:
+    """This is why a scenario with an attack must say how many are tolerated."""
+    scenario = scenario_of(five("a"))
+    assert scenario.planned_sweep is not None
+    believing = replace(scenario, planned_sweep=replace(scenario.planned_sweep, tolerates=0))
+    assert any(error is not None and error > 0.1 for error in claims(run_mission(believing)).values())
+
+
+def test_without_an_attacker_the_second_finder_costs_time_within_the_bound() -> None:
+    once = five()
+    del once["mission"]["tolerates"]
+    both = [run_mission(scenario_of(table)) for table in (once, five())]
+    assert all(all_right(run) for run in both)
+    assert last_claim(both[0]) < last_claim(both[1])
+    for run in both:
+        assert run.scenario.planned_sweep is not None
+        assert last_claim(run) <= run.scenario.planned_sweep.ends / run.scenario.mission.period
+
+
+def test_a_recording_with_an_attacker_passes_the_audit_and_the_replay() -> None:
+    journals = kept(scenario_of(five("a")))
+    assert audited(journals) == []
+    assert replayed(of_frames(journals)).differences == ()
+
+
+def test_a_robot_with_no_second_finder_stays_undecided_and_names_the_one() -> None:
+    table = five()
+    for robot in table["robot"][1:3]:
+        robot["dies"] = 0
+    table["fault"] = [{"link": "b->u", "loss": 1.0}, {"link": "c->u", "loss": 1.0}]
+    table["robot"][1].pop("dies")  # it localises itself with a, but u does not hear it
+    run = of_frames(kept(scenario_of(table)))
+    found = claims(run)
+    assert found["u"] is None
+    assert found["a"] is not None
+    command = run.agents["u"].steps[-1].command
+    assert command is not None
+    assert command.verdict == Undecided("2 robots must agree on its pose; it is found by: a")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("fault", [{"loss": 0.8}, {"delay": 20}], ids=["loss", "delay"])
+def test_lost_and_late_reports_only_cost_time_with_an_attacker(fault: dict[str, Any]) -> None:
+    assert all_right(run_mission(scenario_of(five("a", fault=[fault]))))
+
+
+@pytest.mark.long
+def test_no_shipped_attack_leads_to_a_wrong_claim() -> None:
+    shipped = spec.load("group-attacks-unanchored")
+    for cell in cells(shipped):
+        template = setting_of(shipped, cell)
+        assert isinstance(template, ScenarioTemplate)
+        assert all_right(run_mission(template.seeded(3))), cell
+
+
+def test_a_robot_that_searches_for_the_one_that_comes_to_it_is_visited_by_it() -> None:
+    """Robot r3, whose meeting with the attacker has failed, searches for r4, which visits it meanwhile.
+
+    If both were robot a of the meeting, each would wait for the manoeuvre of the other one.
+    """
+    table = {**five(), "seed": 0}
+    del table["robot"], table["mission"]["area"]
+    attack = {"kind": "rotate", "part": "encounter", "size": math.radians(1.0)}
+    table["group"] = {"robots": 6, "spacing": 30.0, "without_anchor": 2, "attack": attack}
+    assert all_right(run_mission(scenario_of(table)))
+
+
+# --- the robot without an anchor ----------------------------------------------------------------------
+
+
+def met(state: UnanchoredState, pose: Pose, finder: str, offset: Pose) -> tuple[UnanchoredState, Pose]:
+    """Return the state and the true pose after `finder` has driven squares until `state` needs no more.
+
+    The finder reports its poses as they are after the motion `offset` of the plane.
+    """
+    planner = UnanchoredPlanner()
+    for corner in range(40):
+        dx, dy = [(0.0, 0.0), (0.1, 0.0), (0.1, 0.1), (0.0, 0.1)][corner % 4]
+        place, tick = Pose(6.0 + dx, 5.0 + dy, 0.0), state.tick + 1
+        distance = math.hypot(place.x - pose.x, place.y - pose.y)
+        command = planner.command(state)
+        driven = Controls(command.v, command.omega) if tick > 0 else None
+        if driven is not None:
+            pose = step(pose, driven.v, driven.omega, 1.0)
+            distance = math.hypot(place.x - pose.x, place.y - pose.y)
+        contact = Contact(finder, distance, (tick,))
+        state = planner.observe(state, Observation(tick, "u", driven, None, (contact,)))
+        without_log = (tick, finder, 2, "sweeping", None, 0, 0, (), 0, (), 0, 0, None)
+        state = planner.decide(state, [ReportWithPose(*without_log, compose(offset, place))])
+        if state.verdict is not None:
+            break
+    return state, pose
+
+
+def test_a_pose_is_claimed_when_one_more_finder_than_may_lie_agrees_on_it() -> None:
+    planner = UnanchoredPlanner()
+    config = scenario_of(five()).config("u")
+    pose = Pose(5.0, 4.0, 0.7)
+    state, pose = met(planner.start(config), pose, "a", Pose(0.4, -0.2, 0.3))
+    assert state.verdict is None
+    assert [planner.report_to(state, peer).state for peer in "ab"] == ["unconfirmed", "standing"]
+    state, pose = met(state, pose, "b", ORIGIN)
+    assert state.verdict is None
+    assert planner.summary(state).hypotheses == 2
+    state, pose = met(state, pose, "a", ORIGIN)  # one that has reported other poses counts no more
+    assert state.verdict is None
+    state, pose = met(state, pose, "c", ORIGIN)
+    assert isinstance(state.verdict, Localised)
+    assert math.dist((state.verdict.pose.x, state.verdict.pose.y), (pose.x, pose.y)) < 1e-9
+    assert abs(wrap(state.verdict.pose.heading - pose.heading)) < 1e-9
+
+
+def test_a_finder_that_has_heard_that_it_is_not_needed_sends_no_pose_and_does_not_stop_again() -> None:
+    agent = of_frames(kept(scenario_of(five("a")))).agents["u"]
+    received = [framed.report for one in agent.steps for framed in one.received]
+    reports = [one for one in received if isinstance(one, Report) and one.robot == "a"]
+    assert {type(one) for one in reports} == {Report, ReportWithPose}
+    stops = [one.state == "looping" for one in reports]
+    begins = [here and not before for before, here in zip([False, *stops], stops, strict=False)]
+    assert sum(begins) == 1
+
+
+# --- the poses that an attacker reports ---------------------------------------------------------------
+
+
+def test_the_pose_that_an_attacker_reports_follows_from_the_log_that_it_reports() -> None:
+    """`reframe` turns it about the anchor of the attacker; a scale of 1 changes nothing."""
+    turned = poses_of(scenario_of(five("a")))
+    table = five()
+    table["robot"][0]["attack"] = {"kind": "scale", "size": 1.0}
+    true = poses_of(scenario_of(table))
+    tick = min(turned.keys() & true.keys())  # until then, both missions are the same
+    here, there = true[tick], turned[tick]
+    c, s = math.cos(1.0), math.sin(1.0)
+    assert there.x == pytest.approx(c * here.x - s * here.y, abs=1e-9)
+    assert there.y == pytest.approx(s * here.x + c * here.y, abs=1e-9)
+
+
+def poses_of(scenario: Scenario) -> dict[int, Pose]:
+    """Return the poses that a reports to robots without an anchor, by tick; its anchor is the origin."""
+    run = of_frames(kept(scenario))
+    return {
+        framed.report.tick: framed.report.pose
+        for robot in scenario.unanchored
+        for one in run.agents[robot].steps
+        for framed in one.received
+        if isinstance(framed.report, ReportWithPose) and framed.report.robot == "a"
+    }
+
+
+# --- the scenario -------------------------------------------------------------------------------------
+
+
+def test_a_changed_scenario_keeps_the_number_of_false_reporters() -> None:
+    scenario = scenario_of(five("a"))
+    assert scenario_of(file_table(scenario)) == scenario
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda table: table["mission"].pop("tolerates"),
+            r"robot\[0\].attack: .* believes the poses that others report: set mission.tolerates = 1",
+        ),
+        (
+            lambda table: table["robot"][4].update(attack=REFRAME),
+            r"robot\[0\].attack: .*: set mission.tolerates = 2",
+        ),
+        (
+            lambda table: table["mission"].update(tolerates=2),
+            r"mission.tolerates: 2 false finders need 5 robots with an anchor, of which 3 are honest; there",
+        ),
+        (
+            lambda table: table["mission"].update(noise={"anchor_sigma": 0.05, "mutual_sigma": 0.05}),
+            r"mission.tolerates: sensors have noise, and it is for exact ones only",
+        ),
+        (
+            lambda table: (
+                [robot.setdefault("anchor", [20.0, 5.0 * len(robot)]) for robot in table["robot"][:4]]
+                and table["robot"].pop()
+            ),
+            r"mission.tolerates: it is for groups in which a robot has no anchor",
+        ),
+    ],
+)
+def test_attackers_that_are_not_tolerated_are_refused_in_one_line(change: Any, message: str) -> None:
+    table = five("a")
+    change(table)
+    with pytest.raises(UserError, match=f"^group.toml: {message}"):
+        scenario_of(table)
+
+
+def test_a_pair_tolerates_no_attacker() -> None:
+    table = five()
+    table["robot"] = table["robot"][:2]
+    with pytest.raises(UserError, match=r"mission\.tolerates: it is for groups"):
+        validate(table, "group.toml")
