@@ -29,6 +29,7 @@ from compose.audit.replay import replayed
 from compose.audit.rules import audit_run
 from compose.errors import UserError
 from compose.launch.in_process import run_mission
+from compose.recording.claim import nees
 from compose.recording.recording_files import agent_journal
 from compose.recording.run import Run, of_frames
 from protocol.messages import (
@@ -45,7 +46,7 @@ from protocol.messages import (
     Undecided,
 )
 from protocol.mission import Mission
-from protocol.motion import REST, Controls, Covariance, Pose, Segment, step, wrap
+from protocol.motion import REST, Controls, Covariance, Pose, Segment, step
 from protocol.noise import Noise
 from protocol.sweep_strips import SweptArea, contact_ticks, surveyed_path, sweep_speed
 from protocol.wire import MAX_REPORT_BYTES, decode, encode
@@ -89,19 +90,11 @@ def of_robots(step_: Step) -> list[Report]:
     return [framed.report for framed in step_.received if isinstance(framed.report, Report)]
 
 
-def squared_error(pose: Pose, covariance: Covariance, truth: Pose) -> float:
-    """Return the normalised error squared of a pose; its mean is 3 if the covariance is right."""
-    error = np.array((pose.x - truth.x, pose.y - truth.y, wrap(pose.heading - truth.heading)))
-    return float(error @ np.linalg.solve(np.array(covariance.matrix), error))
-
-
 def of_finders(run: Run) -> list[float]:
     """Return the normalised errors squared of the poses that sweeping robots have reported."""
     ids = [robot.id for robot in run.scenario.robots]
     return [
-        squared_error(
-            one.pose, one.covariance, run.ticks[one.reference].world.truth.poses[ids.index(one.robot)]
-        )
+        nees(one.pose, run.ticks[one.reference].world.truth.poses[ids.index(one.robot)], one.covariance)
         for _, one in references(run)
     ]
 
@@ -456,7 +449,7 @@ def test_no_robot_knows_its_position_better_than_its_finder(seed: int, sigma: fl
     assert found is not None
     assert found.covariance.position_sigma >= sigma
     if not found.blocking_reason:
-        assert squared_error(found.poses[0], found.covariance, truth) < 25.0
+        assert nees(found.poses[0], truth, found.covariance) < 25.0
 
 
 def test_a_finder_that_is_less_accurate_than_the_mission_asks_leads_to_no_claim() -> None:
@@ -491,7 +484,7 @@ def test_the_covariances_of_contacts_are_right() -> None:
         measured, truth = contact(seed, 0.1)
         found = estimated(measured, MISSION)
         assert found is not None
-        scores.append(squared_error(found.poses[0], found.covariance, truth))
+        scores.append(nees(found.poses[0], truth, found.covariance))
     assert 2.4 < np.mean(scores) < 3.7
 
 
@@ -550,7 +543,7 @@ def test_a_robot_claims_its_pose_in_a_contact() -> None:
     state, pose = met(0.05)
     assert isinstance(state.verdict, Localised)
     assert state.verdict.covariance is not None
-    assert squared_error(state.verdict.pose, state.verdict.covariance, pose) < 16.3
+    assert nees(state.verdict.pose, pose, state.verdict.covariance) < 16.3
     assert NoisyUnanchoredPlanner().report_to(state, "b").heard > 0
 
 

@@ -19,6 +19,7 @@ from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.claim_agreement import difference
 from agent.estimation.gaussian.claim_rivals import WRONG_SIGMAS, likeliest_rival
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, consistency_test
+from agent.estimation.gaussian.contact_fit import is_definite
 from agent.estimation.gaussian.gaussian_estimator import GAUSSIAN
 from agent.estimation.gaussian.hypotheses import Hypothesis, ScoredHypothesis, follow, search
 from agent.estimation.gaussian.range_model import PairRanges
@@ -217,7 +218,8 @@ def _place(pair: RobotState) -> int:
 def _estimated(state: GroupState, *, searched: bool = False) -> tuple[GroupState, Reference | None]:
     """Return `state` with a new estimate of the pose, and the pose if a claim of it would be right.
 
-    The conditions are those of pairs: one hypothesis is left, its fit has converged and is consistent. After
+    The conditions are those of pairs: one hypothesis is left, its fit has converged and is consistent. Where
+    rounding makes the covariance indefinite, other robots would refuse it, and the pose does not count. After
     a large sigma, the first few ranges leave more than an ellipse describes: the pose does not count until
     there are RANGES_AGAIN. If poses many sigmas away are likelier than the ellipse says, it is widened until
     it says as much; if they are far likelier, the pose does not count either.
@@ -252,6 +254,7 @@ def _estimated(state: GroupState, *, searched: bool = False) -> tuple[GroupState
         and scored[0].fit.last_step <= FINISHED
         and fitted.p_value >= CLAIM_P_VALUE
         and count >= loose + RANGES_AGAIN
+        and is_definite(covariance)
     )
     if not sound:
         return state, None
