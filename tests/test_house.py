@@ -71,8 +71,10 @@ PURE = {
 ALLOWED = {
     "__future__",
     "functools",
+    "bisect",
     "math",
     "itertools",
+    "operator",
     "collections.abc",
     "typing",
     "msgspec",
