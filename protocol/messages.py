@@ -262,6 +262,11 @@ class RobotConfig(Message, frozen=True, dict=True):
         """The largest sigma (rad) of its heading with which this robot claims its pose."""
         return HEADING_ACCURACY
 
+    @property
+    def m1(self) -> Anchor:
+        """The anchor M1 of robot a in <W>, in m: the origin of the poses in a fit of the pair."""
+        return self.anchor if self.role == "a" else self.peer_anchor
+
     @cached_property
     def anchor_distance(self) -> float:
         """The distance D between the two anchors, in m."""

@@ -298,7 +298,7 @@ def test_a_claim_that_later_ranges_contradict_is_withdrawn_in_the_search_and_no_
             state = replace(state, fix=replace(state.fix, claim=claim, peers=peers))
         state = planner.observe(state, one.observation)
         state = planner.decide(state, of_robots(one))
-    assert (state.reference is not None) == (shift == 0.0)
+    assert (state.own_pose.reference is not None) == (shift == 0.0)
     if shift == 0.0 or len(peers) > 1:
         assert isinstance(planner.command(state).verdict, Localised)
         assert state.sweeps

@@ -44,6 +44,23 @@ class Reference(msgspec.Struct, frozen=True):
     """The covariance of the error of `pose`."""
 
 
+class OwnPose(msgspec.Struct, frozen=True):
+    """The latest estimates of its own pose that a sweeping robot with noisy sensors has made."""
+
+    estimated_tick: int | None = None
+    """The tick of the latest estimate; None if the next one is due at once."""
+    ranges: int = 0
+    """The number of ranges in the latest estimate, to its anchor and to its peer."""
+    sigma: float = 0.0
+    """The sigma of its position in the latest estimate, in m."""
+    ranges_when_lost: int | None = None
+    """The number of ranges that it had when sigma was last too large and further ones came; None if never."""
+    searched_tick: int | None = None
+    """The tick of the latest search of the whole plane, when a contact began; None before the first."""
+    reference: Reference | None = None
+    """The pose that it reports to robots without an anchor in this contact; None if it reports none."""
+
+
 class Fix(msgspec.Struct, frozen=True):
     """The pose that a robot knows, by its latest meeting that agrees with the earlier ones."""
 
@@ -74,18 +91,8 @@ class GroupState(msgspec.Struct, frozen=True):
     """True if the present meeting is a visit: the robot knows its pose already."""
     located: RobotState | None = None
     """The state in the latest meeting in which the robot was localised, at its claim."""
-    reference: Reference | None = None
-    """The pose that it reports to robots without an anchor in range, with noisy sensors; None if none is."""
-    fitted: int = -1
-    """The tick of its latest estimate of its pose while it sweeps, with noisy sensors."""
-    ranges: int = 0
-    """The number of its ranges at that estimate."""
-    wide: float = 0.0
-    """The sigma of its position at that estimate, in m."""
-    loose: int = -6
-    """The number of its ranges just before the latest new ones that came while this sigma was large."""
-    searched: int = -100
-    """The tick of its latest estimate at the beginning of a contact, which searches the whole plane."""
+    own_pose: OwnPose = OwnPose()
+    """What it knows of the accuracy of its pose while it sweeps, with noisy sensors."""
     verdict: Verdict | None = None
     """The verdict of the robot: that of the meeting which localised it.
 

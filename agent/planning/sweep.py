@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import msgspec
 
 from agent.planning import phase2_orbit
 from agent.planning.phase2_orbit import Travelling
 from protocol.mission import Mission
-from protocol.motion import Controls, Pose
+from protocol.motion import Controls, Pose, compose
 from protocol.sweep_strips import SIDE, Place, sweep_speed
 
 LOOPS_FOR = 200
@@ -32,6 +33,12 @@ class Looping(msgspec.Struct, frozen=True):
     """The ends of the straights of a sweep that are left after it."""
     since: int = 0
     """The tick in which the first square began; it is repeated until a robot is localised."""
+
+
+def transformed(transform: Pose, places: Iterable[Place]) -> tuple[Place, ...]:
+    """Return `places`, in m, in the frame in which their own frame has the pose `transform`."""
+    moved = [compose(transform, Pose(x, y, 0.0)) for x, y in places]
+    return tuple([(one.x, one.y) for one in moved])
 
 
 def looping(odometry: Pose, mission: Mission, since: int, then: tuple[Place, ...] = ()) -> Looping:

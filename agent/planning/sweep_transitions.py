@@ -5,14 +5,16 @@ All functions are pure. `GroupPlanner` calls them.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 from msgspec.structs import replace
 
 from agent.planning import sweep
 from agent.planning.group_state import GroupState
 from agent.planning.sweep import LOOPS_FOR, Looping, Sweeping
 from protocol.messages import RobotConfigWithSweep
-from protocol.motion import Pose, compose, inverse
-from protocol.sweep_strips import NEAR
+from protocol.motion import inverse
+from protocol.sweep_strips import NEAR, Place
 
 
 def wanted(state: GroupState) -> bool:
@@ -41,9 +43,8 @@ def next_part(state: GroupState) -> GroupState:
     for robot in config.unanchored:
         state = state.with_other(robot, replace(state.other(robot), failed=False))
     part = (config.part + state.parts) % config.sweep.parts
-    into = inverse(state.frame)
-    ends = [compose(into, Pose(x, y, 0.0)) for x, y in config.sweep.path(part, config.mission.sensing_range)]
-    mode = Sweeping(tuple([(end.x, end.y) for end in ends]))
+    path = config.sweep.path(part, config.mission.sensing_range)
+    mode = Sweeping(sweep.transformed(inverse(state.frame), path))
     return replace(
         state,
         pair=replace(state.pair, mode=mode),
@@ -56,31 +57,56 @@ def next_part(state: GroupState) -> GroupState:
 
 
 def onward(state: GroupState) -> GroupState | None:
-    """Return `state` after a tick of a sweep; None at its end.
+    """Return `state` after a tick of a sweep with exact sensors; None at its end.
 
-    Near robots without an anchor, it drives squares until they are localised or LOOPS_FOR ticks are over, and
-    then returns to where it has left its strip.
+    Near robots without an anchor, it drives squares until they are localised or LOOPS_FOR ticks are over.
     """
-    pair, mission = state.pair, state.config.mission
-    mode, tolerance = pair.mode, pair.estimator.pose_tolerance
-    assert isinstance(mode, Sweeping | Looping)
-    mode = sweep.onward(mode, pair.odometry, mission, tolerance)
+    mission, odometry = state.config.mission, state.pair.odometry
     found = [one for one in _unanchored(state) if is_helped(state, one) and _is_near(state, one)]
-    if isinstance(mode, Looping) and pair.tick - mode.since > LOOPS_FOR:
+    moved = moved_on(
+        state,
+        found,
+        lambda since, then: sweep.looping(odometry, mission, since, then),
+        stops=bool(found),
+        longest=LOOPS_FOR,
+    )
+    return None if is_over(moved) else moved
+
+
+def moved_on(
+    state: GroupState,
+    found: Sequence[str],
+    loop: Callable[[int, tuple[Place, ...]], Looping],
+    *,
+    stops: bool,
+    longest: int,
+) -> GroupState:
+    """Return `state` after a tick of a sweep, in which the robots `found` without an anchor are in contact.
+
+    If it `stops` for them, it leaves its strip and drives a `loop`, of which it gives the first tick and the
+    places that are left of the sweep. It repeats the loop until nobody is in contact any more, or for
+    `longest` ticks, and then returns to where it has left its strip.
+    """
+    pair, mission, tolerance = state.pair, state.config.mission, state.pair.estimator.pose_tolerance
+    assert isinstance(pair.mode, Sweeping | Looping)
+    mode = sweep.onward(pair.mode, pair.odometry, mission, tolerance)
+    if isinstance(mode, Looping) and pair.tick - mode.since > longest:
         for robot in found:
             state = state.with_other(robot, replace(state.other(robot), failed=True))
         found = []
     match mode:
-        case Sweeping(places) if found:
-            here = (pair.odometry.x, pair.odometry.y)
-            mode = sweep.looping(pair.odometry, mission, pair.tick, then=(here, *places))
+        case Sweeping(places) if stops:
+            mode = loop(pair.tick, ((pair.odometry.x, pair.odometry.y), *places))
         case Looping((), then, since) if found:
-            mode = sweep.looping(pair.odometry, mission, since, then)
+            mode = loop(since, then)
         case Looping(_, then) if not found:
             mode = sweep.onward(Sweeping(then), pair.odometry, mission, tolerance)
-    if isinstance(mode, Sweeping) and not mode.places:
-        return None
     return replace(state, pair=replace(pair, mode=mode))
+
+
+def is_over(state: GroupState) -> bool:
+    """Return whether the robot has driven along all strips of its part."""
+    return isinstance(state.pair.mode, Sweeping) and not state.pair.mode.places
 
 
 def _is_near(state: GroupState, robot: str) -> bool:

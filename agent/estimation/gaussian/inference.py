@@ -441,7 +441,7 @@ def with_pair(
     ranges from different places.
     """
     config = knowledge.config
-    robot, m1 = (0, config.anchor) if config.role == "a" else (1, config.peer_anchor)
+    robot, m1 = 0 if config.role == "a" else 1, config.m1
     enough = len(pair.places) >= mutual
     inconsistency = consistency_test(scored[0].fit, pair, robot) if enough and scored else None
     blocking_reason = blocking_reason_for(scored, hypotheses, inconsistency, pair, config)
