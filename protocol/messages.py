@@ -41,8 +41,7 @@ from __future__ import annotations
 
 import math
 import re
-from functools import cached_property, lru_cache
-from itertools import combinations
+from functools import cached_property
 from typing import Annotated, Literal
 
 import msgspec
@@ -53,7 +52,7 @@ from protocol.attack import Attack
 from protocol.mission import HEADING_ACCURACY, Anchor, Mission, Options, PlannerName, Role
 from protocol.motion import ORIGIN, Controls, Covariance, Pose, Segment
 from protocol.orbits import Orbit, Rendezvous, visiting
-from protocol.sweep_strips import SweptArea
+from protocol.sweep_strips import SweptArea, widest_distance
 from protocol.units import (
     Angle,
     AngularVelocity,
@@ -337,12 +336,6 @@ It searches within 3 R of that place, and finds a robot nearly R beyond.
 """
 
 
-@lru_cache(maxsize=8)
-def _widest(places: tuple[tuple[float, float], ...]) -> float:
-    """Return the largest distance in m between two of `places`; it is the same in all meetings of a group."""
-    return max([math.dist(*two) for two in combinations(places, 2)])
-
-
 class RobotConfigInGroup(RobotConfigWithOptions, frozen=True, dict=True):
     """The configuration of a robot in a group, which meets one robot after another.
 
@@ -377,7 +370,7 @@ class RobotConfigInGroup(RobotConfigWithOptions, frozen=True, dict=True):
     def widest_distance(self) -> float:
         """The largest distance between two anchors of the group, in m."""
         places = tuple([(one.anchor.x, one.anchor.y) for one in self.members])
-        return _widest(places) if len(places) > 1 else self.anchor_distance
+        return widest_distance(places) if len(places) > 1 else self.anchor_distance
 
     @cached_property
     def heading_accuracy(self) -> float:
@@ -436,7 +429,7 @@ class RobotConfigWithSweep(RobotConfigInGroup, frozen=True, dict=True):
         The poses of robots in the area follow from those of robots with an anchor.
         """
         anchors = [(one.anchor.x, one.anchor.y) for one in self.members]
-        return _widest((*anchors, *self.sweep.corners))
+        return widest_distance((*anchors, *self.sweep.corners))
 
 
 class RobotConfigWithoutAnchor(RobotConfigWithSweep, frozen=True, dict=True):

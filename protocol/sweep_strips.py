@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import pairwise
+from functools import lru_cache
+from itertools import combinations
 from typing import Annotated
 
 import msgspec
 from msgspec import Meta
 
-from protocol.mission import Mission
 from protocol.units import Coordinate
 
 Place = tuple[float, float]
@@ -36,14 +36,6 @@ SIDE = 0.03
 If both drive one, their range grows from NEAR R by at most the two diagonals, and stays within R.
 """
 
-LOOPS = 3
-"""The number of squares within which a robot that has been found is localised.
-
-In the first, the robot that has found it drives alone; in the second, the other one drives, too. The third is
-left for reports, turns and ticks that are only partly used.
-"""
-
-
 NOISY_HALF_WIDTH = 0.65
 """HALF_WIDTH under noise: the strips are narrower, because a robot may drive 0.25 R beside its strip."""
 
@@ -57,16 +49,6 @@ of the strip. The second tells that.
 OWN_SIDE = 0.2
 """The side of the squares of a robot without an anchor under noise, in units of R."""
 
-NOISY_LOOPS = 2
-"""The pairs of rectangles within which a robot that has been found is localised under noise.
-
-A robot with sigmas of 0.05 m and R = 3 m takes 12 to 30 of their 65 ticks. With less, some are left for a
-later part of the sweep; with more, a robot that cannot be localised holds the other one up for longer.
-"""
-
-ENOUGH_SIGMA, MOST_TIMES = 1.0 / 6.0, 10.0
-"""The sigma of a range from which contacts take longer, in units of the accuracy, and the largest factor."""
-
 STRIPS_OF_ROUND = 2
 """The number of strips after which a robot with noisy sensors passes anchor and beacon again.
 
@@ -76,6 +58,12 @@ less, most of the way leads to the anchor and back.
 
 BESIDE, AROUND = 0.5, 0.6
 """The distance at which a robot passes beside its anchor or beacon, and the half length of that way, in R."""
+
+PLACES_PASSED = 6
+"""The number of places on the way past the anchor and the beacon: three each."""
+
+PLACES_OF_ROUND = PLACES_PASSED + 2 * STRIPS_OF_ROUND
+"""The number of places of a round: those, and the ends of its strips."""
 
 
 class SweptArea(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
@@ -151,6 +139,20 @@ def surveyed_path(
     return tuple([place for ends in rounds for place in (*passing, *ends)])
 
 
+def ways_between_passages(path: Sequence[Place]) -> list[Sequence[Place]]:
+    """Return the ways along the strips of a `surveyed_path`, each from the last place of a passage on."""
+    return [
+        path[begin + PLACES_PASSED - 1 : begin + PLACES_OF_ROUND]
+        for begin in range(0, len(path), PLACES_OF_ROUND)
+    ]
+
+
+@lru_cache(maxsize=8)  # all robots of a group ask for the same
+def widest_distance(places: tuple[Place, ...]) -> float:
+    """Return the largest distance in m between two of `places`; 0 if there are fewer than two."""
+    return max([math.dist(*two) for two in combinations(places, 2)], default=0.0)
+
+
 def _passed(place: Place, begin: Place, end: Place, sensing_range: float) -> tuple[Place, ...]:
     """Return the places of a bent way past `place`, in the direction from `begin` to `end`."""
     apart = math.dist(begin, end)
@@ -165,60 +167,3 @@ def _passed(place: Place, begin: Place, end: Place, sensing_range: float) -> tup
             for along, aside in ways
         ]
     )
-
-
-def sweep_speed(mission: Mission) -> float:
-    """Return the speed in m/s of a sweep, with which no robot is passed between two ticks."""
-    return min(mission.max_speed, STEP * mission.sensing_range / mission.period)
-
-
-def sweep_ticks(places: Sequence[Place], mission: Mission) -> int:
-    """Return a bound on the ticks in which a robot drives from the first of `places` to the last.
-
-    Each place costs a turn of at most pi, and a part of a tick.
-    """
-    step = sweep_speed(mission) * mission.period
-    turn = math.ceil(math.pi / (mission.max_turn_rate * mission.period)) + 1
-    return sum([math.ceil(math.dist(*ends) / step) + turn for ends in pairwise(places)], turn)
-
-
-def helping_ticks(mission: Mission) -> int:
-    """Return a bound on the ticks for which a sweeping robot stops to localise another one."""
-    side = SIDE * mission.sensing_range
-    return LOOPS * sweep_ticks([(0.0, 0.0), (side, 0.0), (side, side), (0.0, side), (0.0, 0.0)], mission)
-
-
-def rounds(tolerates: int) -> int:
-    """Return the number of robots that sweep each part until `tolerates` + 1 honest ones have.
-
-    As many robots may report false data as `tolerates` says.
-    """
-    return 2 * tolerates + 1
-
-
-def contact_ticks(mission: Mission) -> int:
-    """Return the most ticks for which a sweeping robot stops for another one with noisy sensors.
-
-    The number of ranges that it takes grows with the square of their sigma over the accuracy.
-    """
-    along, aside = ALONG * mission.sensing_range, ASIDE * mission.sensing_range
-    once = sweep_ticks([(0.0, 0.0), (0.0, aside), (along, aside), (along, 0.0), (0.0, 0.0)], mission)
-    sigma = mission.noise.mutual_sigma / (ENOUGH_SIGMA * mission.accuracy)
-    return math.ceil(2 * NOISY_LOOPS * once * min(max(1.0, sigma * sigma), MOST_TIMES))
-
-
-def ticks_of_parts(area: SweptArea, mission: Mission, widest: float, unanchored: int) -> list[int]:
-    """Return a bound on the ticks in which any robot drives to each part of `area`, and sweeps it.
-
-    It stops once for each of the `unanchored` robots. No two anchors or corners of the area are more than
-    `widest` m apart. With noisy sensors, a robot also passes its anchor and its beacon, as far away as that.
-    """
-    exact, reach = mission.noise.exact, mission.sensing_range
-    way = math.ceil(widest / (sweep_speed(mission) * mission.period))
-    stops = unanchored * (helping_ticks(mission) if exact else contact_ticks(mission))
-    x, y = area.corners[0]
-    paths = [
-        area.path(part, reach) if exact else surveyed_path(area, part, reach, (x, y), (x + widest, y))
-        for part in range(area.parts)
-    ]
-    return [way + stops + sweep_ticks(path, mission) for path in paths]

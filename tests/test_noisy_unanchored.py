@@ -48,7 +48,8 @@ from protocol.messages import (
 from protocol.mission import Mission
 from protocol.motion import REST, Controls, Covariance, Pose, Segment, step
 from protocol.noise import Noise
-from protocol.sweep_strips import SweptArea, contact_ticks, surveyed_path, sweep_speed
+from protocol.sweep_strips import SweptArea, surveyed_path
+from protocol.sweep_ticks import contact_ticks, sweep_speed
 from protocol.wire import MAX_REPORT_BYTES, decode, encode
 from tests.commands import TandemProcess
 from tests.commands import journals as journals_of

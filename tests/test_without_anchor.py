@@ -13,7 +13,8 @@ from agent.planning import sweep
 from agent.planning.sweep import Looping, Sweeping
 from protocol.mission import Mission
 from protocol.motion import ORIGIN, Pose, compose, step
-from protocol.sweep_strips import NEAR, SIDE, SweptArea, sweep_ticks
+from protocol.sweep_strips import NEAR, SIDE, SweptArea
+from protocol.sweep_ticks import way_ticks
 from tests.groups import R
 
 FLOOR = 1e-9
@@ -117,7 +118,7 @@ def test_a_sweep_takes_no_more_ticks_than_its_bound(
     mission = Mission(R, 1.0, speed, turn_rate)
     places = SweptArea(5.0, -3.0, 5.0 + wide, -3.0 + high, 1).path(0, R)
     path = driven(places, Pose(0.0, 0.0, 1.0), mission)
-    assert len(path) - 1 <= sweep_ticks([(0.0, 0.0), *places], mission)
+    assert len(path) - 1 <= way_ticks([(0.0, 0.0), *places], mission)
 
 
 @pytest.mark.parametrize("parts", [1, 2, 3, 7, 30])

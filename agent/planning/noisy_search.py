@@ -20,7 +20,8 @@ from agent.planning.state import Done
 from agent.planning.sweep import Sweeping
 from protocol.messages import Localised, Report, ReportWithReference, RobotConfigWithSweep, Undecided
 from protocol.motion import inverse
-from protocol.sweep_strips import ALONG, ASIDE, NEAR, contact_ticks, surveyed_path
+from protocol.sweep_strips import ALONG, ASIDE, NEAR, surveyed_path
+from protocol.sweep_ticks import contact_ticks
 
 LINGER = 10
 """The ticks without a range to robots without an anchor after which a contact with them is over."""

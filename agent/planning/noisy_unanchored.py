@@ -41,7 +41,8 @@ from protocol.messages import (
 )
 from protocol.mission import Mission
 from protocol.motion import Covariance, Pose, Segment
-from protocol.sweep_strips import OWN_SIDE, contact_ticks
+from protocol.sweep_strips import OWN_SIDE
+from protocol.sweep_ticks import contact_ticks
 
 SWEEPING = MODE_NAMES[Sweeping]
 """The mode of a localised robot that looks for robots without an anchor."""

@@ -11,7 +11,8 @@ from agent.planning import phase2_orbit
 from agent.planning.phase2_orbit import Travelling
 from protocol.mission import Mission
 from protocol.motion import Controls, Pose, compose
-from protocol.sweep_strips import SIDE, Place, sweep_speed
+from protocol.sweep_strips import SIDE, Place
+from protocol.sweep_ticks import sweep_speed
 
 LOOPS_FOR = 200
 """The ticks after which robots stop driving squares that have localised nobody: the other one may be dead."""

@@ -15,7 +15,8 @@ import msgspec
 
 from compose.recording.run import Run
 from protocol.orbits import SIDES, meeting_ticks, search_ticks
-from protocol.sweep_strips import Place, ticks_of_parts
+from protocol.sweep_strips import Place, widest_distance
+from protocol.sweep_ticks import ticks_of_parts
 from world.faults import exchange_ticks
 from world.scenario import Scenario
 
@@ -77,7 +78,7 @@ def _sweeps_ticks(scenario: Scenario, tour: int) -> int:
     if scenario.planned_sweep is None:
         return 0
     area = scenario.planned_sweep.sweep
-    widest = _longest_way([*_anchors(scenario), *area.corners])
+    widest = widest_distance((*_anchors(scenario), *area.corners))
     parts = ticks_of_parts(area, scenario.mission, widest, len(scenario.unanchored))
     return sum([tour + ticks for ticks in parts])
 
@@ -96,7 +97,7 @@ def _return_ticks(scenario: Scenario, waiting: Collection[str]) -> int:
     radii = [one.rendezvous.a.radius for one in scenario.robots if one.id in waiting and one.role == "a"]
     if not radii:
         return 0
-    return math.ceil((max(radii) + _longest_way(_anchors(scenario))) / step)
+    return math.ceil((max(radii) + widest_distance(tuple(_anchors(scenario)))) / step)
 
 
 def _tour_ticks(scenario: Scenario, waiting: Collection[str]) -> int:
@@ -125,8 +126,3 @@ def _way_to_all(places: Sequence[Place], begin: int) -> float:
         left.remove(nearest)
         here = nearest
     return way
-
-
-def _longest_way(places: Sequence[Place]) -> float:
-    """Return the largest distance in m between two of `places`."""
-    return max([math.dist(one, other) for one in places for other in places])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from itertools import combinations
 
 import msgspec
 
@@ -14,32 +13,30 @@ from compose.scenario.scenario_tables import Area, RobotTable, ScenarioFile
 from protocol.mission import Mission, infeasibility
 from protocol.noise import VelocityNoise
 from protocol.orbits import Orbit, Rendezvous
-from protocol.sweep_strips import (
-    STRIPS_OF_ROUND,
-    Place,
-    SweptArea,
-    contact_ticks,
-    helping_ticks,
-    rounds,
-    surveyed_path,
-    sweep_speed,
-    sweep_ticks,
-)
+from protocol.sweep_strips import Place, SweptArea, surveyed_path, ways_between_passages, widest_distance
+from protocol.sweep_ticks import part_ticks, straight_ticks, sweepers_of_part, ticks_of_parts, turn_ticks
 from world.scenario import PlannedMeeting, PlannedSweep
 
-LEAVING = 10
+LEAVING_TICKS = 10
 """The bound on the ticks after a meeting until a robot goes on (see `group_transitions.PARTED_AFTER`)."""
 
-ASIDE = 2.0
+LEAVES_WITHIN = 2.0
 """The largest distance from the anchor of its last meeting at which a robot goes on, in units of R."""
+
+SLOWER = 3.0
+"""The time for sweeps in `max_ticks`, in units of the planned bound: others sweep the parts of the dead."""
+
+MOST_WANDERED = 1.25
+"""The largest sigma of a robot on its strips by the white noise of its odometry, in units of the accuracy.
+
+Of missions of four robots, two of them without an anchor, all robots were localised in 16 of 17 below 0.7,
+in 5 of 7 from 0.9 to 1.25, and in 2 of 17 above it. The others took up to 2 000 ticks.
+"""
 
 NOT_TOLERATED = (
     "mission.tolerates: it is for groups in which a robot has no anchor; others check all reports themselves"
 )
 """The reason for which `mission.tolerates` is refused elsewhere."""
-
-PARTS = 3.0
-"""The time allowed for sweeps in `max_ticks`, in units of the planned bound."""
 
 
 def check_unanchored(file: ScenarioFile, source: str) -> None:
@@ -72,10 +69,11 @@ def _check_attacks(file: ScenarioFile, anchored: int, source: str) -> None:
     attacks = [i for i, robot in enumerate(file.robot) if robot.attack is not None]
     if tolerates and not file.mission.noise.exact:
         raise Unworkable(f"{source}: mission.tolerates: sensors have noise, and it is for exact ones only")
-    if tolerates and anchored < rounds(tolerates):
+    needed = sweepers_of_part(tolerates)
+    if tolerates and anchored < needed:
         raise Unworkable(
-            f"{source}: mission.tolerates: {tolerates} false finders need {rounds(tolerates)} robots with an "
-            f"anchor, of which {tolerates + 1} are honest; there are {anchored}"
+            f"{source}: mission.tolerates: {tolerates} false finders need {needed} robots with an anchor, of "
+            f"which {tolerates + 1} are honest; there are {anchored}"
         )
     if len(attacks) > tolerates:
         remedy = f"set mission.tolerates = {len(attacks)}"
@@ -110,75 +108,68 @@ def with_sweep(
 ) -> GroupMeetings:
     """Return `meetings` with the search for those of `robots` that have no anchor, which are in `area`.
 
-    `tolerates` of the robots may report false data, so each part is swept by several of them.
-    The latest time allows for robots that sweep the parts of others, which have failed. Raises Unworkable if
-    the area is too large for rounding errors.
+    `tolerates` of the robots may report false data, so each part is swept by several of them. The latest time
+    allows for robots that sweep the parts of others, which have failed. Raises Unworkable if the area is too
+    large for rounding errors, or if gyros or odometry are too inaccurate for a sweep.
     """
     unanchored = [robot.id for robot in robots if robot.anchor is None]
     if not unanchored or area is None:
         return meetings
-    places = [robot.anchor for robot in robots if robot.anchor is not None]
-    places += SweptArea(*area, 1).corners
-    why = infeasibility(mission, max([math.dist(*two) for two in combinations(places, 2)]))
+    anchors = {robot.id: robot.anchor for robot in robots if robot.anchor is not None}
+    widest = widest_distance((*anchors.values(), *SweptArea(*area, 1).corners))
+    why = infeasibility(mission, widest)
     if why is not None:
         raise Unworkable(f"mission.area: {why}")
-    plan = _planned_sweep if mission.noise.exact else _noisy_sweep
-    planned = plan(robots, len(unanchored), area, mission, meetings)
-    if tolerates:
-        again = _next_rounds(planned.sweep, places, len(unanchored), tolerates, mission)
-        planned = msgspec.structs.replace(planned, ends=planned.ends + again, tolerates=tolerates)
+    planned = _planned_sweep(anchors, len(unanchored), area, mission, meetings)
+    each = _next_sweep_ticks(planned.sweep, mission, widest, len(unanchored))
+    ends = planned.ends + (sweepers_of_part(tolerates) - 1) * each * mission.period
+    planned = msgspec.structs.replace(planned, ends=ends, tolerates=tolerates)
     still = Orbit(0.0, 0.0, 0.0)
     waiting = FirstMeeting(planned.sweepers[0], "b", Rendezvous(still, still, planned.ends))
     return meetings._replace(
         first={**meetings.first, **dict.fromkeys(unanchored, waiting)},
         bound=planned.ends,
-        latest=meetings.latest + PARTS * planned.ends,
+        latest=meetings.latest + SLOWER * planned.ends,
         sweep=planned,
     )
 
 
 def _planned_sweep(
-    robots: Sequence[RobotTable], unanchored: int, area: Area, mission: Mission, meetings: GroupMeetings
+    anchors: Mapping[str, Place], unanchored: int, area: Area, mission: Mission, meetings: GroupMeetings
 ) -> PlannedSweep:
     """Return the search for `unanchored` robots in `area`, in m, after `meetings`.
 
-    Each robot with an anchor sweeps a part after its last meeting. Parts and robots are in the same order
-    across the strips, so that their ways do not cross.
+    Each robot with an anchor sweeps a part after its last meeting. With noisy sensors, only the visitors of
+    last meetings do; the robots that they have visited stay, as their beacons, and come last among the
+    sweepers. Parts and robots are in the same order across the strips, so that their ways do not cross.
+    Raises Unworkable if gyros or odometry are not good enough for a round.
     """
-    anchors = {one.id: one.anchor for one in robots if one.anchor is not None}
     places, free = _last_meetings(anchors, meetings)
-    sweep = SweptArea(*area, len(anchors))
-    sweepers = sorted(places, key=lambda robot: places[robot][sweep.across])
-    aside = math.ceil(ASIDE * mission.sensing_range / (sweep_speed(mission) * mission.period))
+    exact, reach = mission.noise.exact, mission.sensing_range
+    finders = list(anchors) if exact else _last_visitors(meetings)
+    sweep = SweptArea(*area, len(finders))
+    finders.sort(key=lambda robot: places[robot][sweep.across])
+    off_anchor = straight_ticks(LEAVES_WITHIN * reach, mission)
     latest = 0.0
-    for part, robot in enumerate(sweepers):
-        path = sweep.path(part, mission.sensing_range)
-        if path:
-            ticks = LEAVING + aside + sweep_ticks([places[robot], *path], mission)
-            ticks += unanchored * helping_ticks(mission)
-            latest = max(latest, free[robot] + ticks * mission.period)
-    return PlannedSweep(sweep, tuple(sweepers), latest)
-
-
-def _next_rounds(
-    sweep: SweptArea, places: Sequence[tuple[float, float]], unanchored: int, tolerates: int, mission: Mission
-) -> float:
-    """Return the bound in s of the rounds of a sweep after the first.
-
-    In each, a robot goes to all anchors, which are among `places`, and then sweeps the part of another one.
-    """
-    way = max([math.dist(*two) for two in combinations(places, 2)])
-    turn = math.ceil(math.pi / (mission.max_turn_rate * mission.period)) + 1
-    visits = (sweep.parts - 1) * (math.ceil(way / (mission.max_speed * mission.period)) + turn)
-    paths = [sweep.path(part, mission.sensing_range) for part in range(sweep.parts)]
-    ticks = math.ceil(way / (sweep_speed(mission) * mission.period)) + turn
-    ticks += max([sweep_ticks(path, mission) for path in paths]) + unanchored * helping_ticks(mission)
-    return (rounds(tolerates) - 1) * (visits + ticks) * mission.period
+    for part, robot in enumerate(finders):
+        path = sweep.path(part, reach)
+        if not exact:
+            path = surveyed_path(sweep, part, reach, anchors[robot], places[robot])
+        if not path:
+            continue
+        ticks = LEAVING_TICKS + off_anchor + part_ticks([places[robot], *path], mission, unanchored)
+        if not exact:
+            rounds = ways_between_passages(path)
+            ticks += 2 * len(rounds) * off_anchor
+            _check_gyros(mission, math.ceil(ticks / len(rounds)))
+            _check_odometry(mission, rounds)
+        latest = max(latest, free[robot] + ticks * mission.period)
+    return PlannedSweep(sweep, (*finders, *[one for one in anchors if one not in finders]), latest)
 
 
 def _last_meetings(
-    anchors: Mapping[str, tuple[float, float]], meetings: GroupMeetings
-) -> tuple[dict[str, tuple[float, float]], dict[str, float]]:
+    anchors: Mapping[str, Place], meetings: GroupMeetings
+) -> tuple[dict[str, Place], dict[str, float]]:
     """Return the place (m) of the last meeting of each robot, and the time (s) at which it ends."""
     places, free = dict(anchors), dict.fromkeys(anchors, 0.0)
     for meeting in meetings.planned:
@@ -187,40 +178,23 @@ def _last_meetings(
     return places, free
 
 
-def _noisy_sweep(
-    robots: Sequence[RobotTable], unanchored: int, area: Area, mission: Mission, meetings: GroupMeetings
-) -> PlannedSweep:
-    """Return the search for `unanchored` robots in `area`, in m, after `meetings`, with noisy sensors.
-
-    The visitors of last meetings sweep a part each. The robots that they have visited stay, as their beacons.
-    They come last among the sweepers. Raises Unworkable if gyros or odometry are not good enough for a round.
-    """
-    anchors = {one.id: one.anchor for one in robots if one.anchor is not None}
-    places, free = _last_meetings(anchors, meetings)
+def _last_visitors(meetings: GroupMeetings) -> list[str]:
+    """Return the visitors of those meetings that are the last of both robots."""
     last: dict[str, PlannedMeeting] = {}
     for meeting in meetings.planned:
         last[meeting.visitor] = last[meeting.visited] = meeting
-    finders = [robot for robot, one in last.items() if one.visitor == robot and last[one.visited] is one]
-    sweep = SweptArea(*area, len(finders))
-    finders.sort(key=lambda robot: places[robot][sweep.across])
-    aside = math.ceil(ASIDE * mission.sensing_range / (sweep_speed(mission) * mission.period))
-    latest = 0.0
-    for part, robot in enumerate(finders):
-        path = surveyed_path(sweep, part, mission.sensing_range, anchors[robot], places[robot])
-        if path:
-            times = math.ceil(len(path) / ENDS_OF_ROUND)
-            ticks = LEAVING + aside + sweep_ticks([places[robot], *path], mission)
-            ticks += 2 * times * aside + unanchored * contact_ticks(mission)
-            _check_gyros(mission, math.ceil(ticks / times))
-            _check_odometry(mission, path)
-            latest = max(latest, free[robot] + ticks * mission.period)
-    return PlannedSweep(sweep, (*finders, *[one for one in anchors if one not in finders]), latest)
+    return [robot for robot, one in last.items() if one.visitor == robot and last[one.visited] is one]
 
 
-PLACES_PASSED = 6
-"""The number of places of a round at the anchor and the beacon."""
-ENDS_OF_ROUND = PLACES_PASSED + 2 * STRIPS_OF_ROUND
-"""The number of places in a round of `surveyed_path`."""
+def _next_sweep_ticks(sweep: SweptArea, mission: Mission, widest: float, unanchored: int) -> int:
+    """Return the bound on the ticks in which each part is swept by one robot more than before.
+
+    That robot goes to all anchors first. No two of these or corners of the area are more than `widest` m
+    apart.
+    """
+    turn = turn_ticks(mission)
+    visit = math.ceil(widest / (mission.max_speed * mission.period)) + turn
+    return (sweep.parts - 1) * visit + turn + max(ticks_of_parts(sweep, mission, widest, unanchored))
 
 
 def _check_gyros(mission: Mission, ticks: int) -> None:
@@ -235,23 +209,14 @@ def _check_gyros(mission: Mission, ticks: int) -> None:
         )
 
 
-MOST_WANDERED = 1.25
-"""The largest sigma of a robot on its strips by the white noise of its odometry, in units of the accuracy.
-
-Of missions of four robots, two of them without an anchor, all robots were localised in 16 of 17 below 0.7,
-in 5 of 7 from 0.9 to 1.25, and in 2 of 17 above it. The others took up to 2 000 ticks.
-"""
-
-
-def _check_odometry(mission: Mission, path: Sequence[Place]) -> None:
-    """Raise Unworkable if a robot on the strips of `path` hardly ever knows its pose well enough."""
+def _check_odometry(mission: Mission, ways: Sequence[Sequence[Place]]) -> None:
+    """Raise Unworkable if a robot on these ways between passages hardly ever knows its pose well enough."""
     noise = mission.noise.odometry
     if noise == VelocityNoise():
         return
     # imports numpy, which scenarios without this noise do not need
     from agent.estimation.gaussian.reachable_accuracy import rounded_up, swept_sigma  # noqa: PLC0415
 
-    ways = [path[i + PLACES_PASSED - 1 : i + ENDS_OF_ROUND] for i in range(0, len(path), ENDS_OF_ROUND)]
     sigma = max([swept_sigma(mission, way) for way in ways])
     if sigma > MOST_WANDERED * mission.accuracy:
         share = rounded_down(MOST_WANDERED * mission.accuracy / sigma)

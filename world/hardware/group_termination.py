@@ -13,7 +13,6 @@ ends at max_ticks.
 
 from __future__ import annotations
 
-import math
 import time
 
 from protocol.messages import (
@@ -30,7 +29,7 @@ from protocol.messages import (
     Undecided,
     Verdict,
 )
-from protocol.sweep_strips import rounds, sweep_speed, ticks_of_parts
+from protocol.sweep_ticks import straight_ticks, sweepers_of_part, ticks_of_parts
 from world.hardware.termination import LAST_WORDS, Termination
 from world.referee import inaccuracy
 
@@ -149,8 +148,7 @@ def _sweep_ticks(config: RobotConfigInGroup) -> int:
     """
     if not isinstance(config, RobotConfigWithSweep):
         return 0
-    mission = config.mission
-    parts = ticks_of_parts(config.sweep, mission, config.widest_distance, len(config.unanchored))
-    way = math.ceil(config.widest_distance / (sweep_speed(mission) * mission.period))
-    once = RESTING_TICKS + max(parts)
-    return once + (rounds(config.tolerates) - 1) * (once + len(config.members) * way)
+    mission, widest = config.mission, config.widest_distance
+    once = RESTING_TICKS + max(ticks_of_parts(config.sweep, mission, widest, len(config.unanchored)))
+    tour = len(config.members) * straight_ticks(widest, mission)
+    return once + (sweepers_of_part(config.tolerates) - 1) * (once + tour)

@@ -29,7 +29,7 @@ from agent.estimation.gaussian.odometry_noise import (
 from agent.estimation.gaussian.range_model import Ranges, predict
 from protocol.mission import Mission
 from protocol.noise import Noise, VelocityNoise
-from protocol.sweep_strips import sweep_speed
+from protocol.sweep_ticks import sweep_speed
 
 PRIORS = {
     "range_bias": "measure the bias of the radios at known distances",
