@@ -263,8 +263,12 @@ _COUNTS = ("anchor_ranges", "mutual_ranges", "reports_sent", "reports_heard", "b
 
 
 def _claim(run: recorded.Run, robot: str) -> Claim | None:
-    """Return the first claim of `robot`; in hardware mode, its errors are NaN."""
-    if run.world is not None or robot not in run.agents or (found := run.agents[robot].claim) is None:
+    """Return the standing claim of `robot`; in hardware mode, its errors are NaN."""
+    if (
+        run.world is not None
+        or robot not in run.agents
+        or (found := run.agents[robot].standing_claim) is None
+    ):
         return run.claim(robot)
     tick, verdict = found
     return Claim(tick, verdict.pose, verdict.covariance, math.nan, math.nan, None)

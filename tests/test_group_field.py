@@ -164,7 +164,7 @@ def test_four_robots_localise_in_hardware_mode(tmp_path: Path, text: str, encryp
     late = late or any(one.missed for agent in agents.values() for one in agent.steps)
     simulated = run_mission(four.scenario)
     for name, agent in agents.items():
-        claim, expected = agent.claim, simulated.claim(name)
+        claim, expected = agent.standing_claim, simulated.claim(name)
         assert claim is not None
         assert expected is not None
         assert late or claim[0] == expected.tick
@@ -270,4 +270,4 @@ def steps(out: Path, robot: str) -> Sequence[Step]:
 
 def claims(out: Path, robot: str) -> bool:
     """Return whether `robot` has claimed a pose."""
-    return bool(steps(out, robot)) and told(out, robot).claim is not None
+    return bool(steps(out, robot)) and told(out, robot).standing_claim is not None

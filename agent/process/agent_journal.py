@@ -77,8 +77,8 @@ class AgentHistory(msgspec.Struct, frozen=True):
         return tuple([step.estimate for step in self.steps if step.estimate is not None])
 
     @property
-    def claim(self) -> tuple[int, Localised] | None:
-        """Return the robot's claim and its tick: the first one since it withdrew one, if it did; or None."""
+    def standing_claim(self) -> tuple[int, Localised] | None:
+        """The claim that the robot has made and not withdrawn, and its tick; None if there is none."""
         made = None
         for step in self.steps:
             if step.command is None:
@@ -104,7 +104,7 @@ class AgentHistory(msgspec.Struct, frozen=True):
 
         Empty if the robot claimed no pose.
         """
-        claim, odometry = self.claim, self.odometry
+        claim, odometry = self.standing_claim, self.odometry
         if claim is None:
             return ()
         tick, verdict = claim

@@ -48,7 +48,7 @@ class Side(msgspec.Struct, frozen=True, dict=True):
     replay: AgentReplay | None
     """The recomputed planner states; None if the robot's journal cannot be read."""
     claim: Claim | None = None
-    """The robot's first claim, compared with the ground truth; None in hardware mode and later meetings."""
+    """The robot's standing claim, with its errors; None in hardware mode and in later meetings."""
     first: int = 0
     """The tick in which the robot leaves for the meeting; 0 in its first one."""
 

@@ -58,7 +58,7 @@ class GroupRobot(msgspec.Struct, frozen=True):
     commands: tuple[Command | None, ...]
     """The commands; None in ticks whose Command missed the deadline."""
     localised: int | None
-    """The tick of its first claim; None without one."""
+    """The tick of its standing claim (`Run.standing_claim`); None without one."""
     bound: float | None
     """The planned bound of that tick; None if it is unknown."""
 

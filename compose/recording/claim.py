@@ -19,7 +19,7 @@ HELD_SIGMAS = 6.0
 
 
 class Claim(msgspec.Struct, frozen=True):
-    """The first claim of a robot, with its errors."""
+    """The standing claim of a robot, which it has not withdrawn, with its errors in the tick of the claim."""
 
     tick: int
     """Tick of the claim."""

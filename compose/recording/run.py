@@ -70,7 +70,7 @@ class Run(msgspec.Struct, frozen=True, dict=True):
     notes: tuple[str, ...] = ()
     """One line for each file other than a journal that cannot be read, and is ignored."""
     claim_estimates: dict[str, Estimate] = {}
-    """The Estimate of each robot at its first claim, if the run took place in this process."""
+    """The Estimate of each robot in the tick of its standing claim, if the run took place in this process."""
 
     # --- static data ---
 
@@ -231,7 +231,7 @@ class Run(msgspec.Struct, frozen=True, dict=True):
         return agent.estimates if agent is not None else ()
 
     def claim(self, robot: str) -> Claim | None:
-        """Return the claim of `robot`, with its errors; None if it made none, and in hardware mode."""
+        """Return the standing claim of `robot`, with its errors; None without one, and in hardware mode."""
         made = self.standing_claim(robot) if self.world is not None else None
         if made is None:
             return None
@@ -239,21 +239,21 @@ class Run(msgspec.Struct, frozen=True, dict=True):
         return claim(tick, verdict, self.ticks[tick].truth.poses[self._place[robot]])
 
     def standing_claim(self, robot: str) -> tuple[int, Localised] | None:
-        """Return the claim of `robot` and its tick; None if it made none, or has withdrawn it.
+        """Return the claim that `robot` has made and not withdrawn, and its tick; None if there is none.
 
-        It is the first one, or in a group the first since the robot has withdrawn one.
+        Only robots of a group withdraw claims. The first claim of a robot of a pair is final.
         """
         made = None
         for tick in self.ticks:
             command = tick.commands.get(robot)
             if command is None:
                 continue
-            if made is None and isinstance(command.verdict, Localised):
+            if not isinstance(command.verdict, Localised):
+                made = None
+            elif made is None:
                 made = tick.truth.tick, command.verdict
                 if not self.scenario.meetings:
                     break
-            elif not isinstance(command.verdict, Localised):
-                made = None
         return made
 
     def verdicts(self) -> dict[str, Verdict]:
@@ -268,7 +268,7 @@ class Run(msgspec.Struct, frozen=True, dict=True):
         return found
 
     def truth_held(self, robot: str) -> bool | None:
-        """Return whether `robot` held the true hypothesis at its first claim (see `claim.truth_held`).
+        """Return whether `robot` held the true hypothesis at its standing claim (see `claim.truth_held`).
 
         None without a claim, with exact sensors, and if neither this process nor a journal has its Estimate.
         """

@@ -116,7 +116,7 @@ class CellSummary(msgspec.Struct, frozen=True):
     honest_localised: int | None
     """only for groups: number of honest robots, of all trials, whose claims are right"""
     honest_undecided: int | None
-    """only for groups: number of those that made no claim"""
+    """only for groups: number of those that have no claim at the end"""
     honest_wrong: int | None
     """only for groups: number of those whose claims are wrong"""
     attacker_met: int | None

@@ -58,9 +58,9 @@ class RobotRow(msgspec.Struct, frozen=True, array_like=True):
     candidates_left: int | None = None
     """number of these that are consistent with the ticks without a detection"""
     position_error_m: float | None = None
-    """position error of the first claim"""
+    """position error of the claim, in its tick; a claim that the robot has withdrawn does not count"""
     heading_error_rad: float | None = None
-    """heading error of the first claim"""
+    """heading error of that claim"""
     hypotheses: int | None = None
     """number of hypotheses about the poses of the pair at the end"""
     probability: float | None = None
@@ -72,7 +72,7 @@ class RobotRow(msgspec.Struct, frozen=True, array_like=True):
     nees: float | None = None
     """normalised estimation error squared of the claim"""
     truth_held: bool | None = None
-    """true if the true pose was among the robot's hypotheses at its first claim, with noisy sensors"""
+    """true if the true pose was among the robot's hypotheses at that claim, with noisy sensors"""
     bound_m: float | None = None
     """Cramér-Rao bound on the position (square root of the trace), for the trajectories up to the last claim
     of the pair"""
@@ -129,11 +129,11 @@ class TrialRow(msgspec.Struct, frozen=True, array_like=True):
     which end when they did"""
     honest_tick: int | None = None
     """only for a group: tick of the last claim of an honest robot: one without an attack that does not die;
-    None if one made no claim"""
+    None if one has no claim at the end"""
     honest_localised: int | None = None
     """only for a group: number of honest robots whose claims are right"""
     honest_undecided: int | None = None
-    """only for a group: number of honest robots that made no claim"""
+    """only for a group: number of honest robots that have no claim at the end"""
     honest_wrong: int | None = None
     """only for a group: number of honest robots whose claims are wrong"""
     attacker_met: int | None = None
@@ -146,15 +146,15 @@ class TrialRow(msgspec.Struct, frozen=True, array_like=True):
     candidates_left: int | None = None
     """largest number of these that are consistent with the ticks without a detection"""
     position_error_m: float | None = None
-    """largest position error of any robot's first claim"""
+    """largest position error of any robot's claim, without those that were withdrawn"""
     heading_error_rad: float | None = None
-    """largest heading error of any robot's first claim"""
+    """largest heading error of any robot's claim, likewise"""
     hypotheses: int | None = None
     """largest number of hypotheses of any robot at the end"""
     nearest_m: float | None = None
     """least distance in m of two peers, from their first mutual range on; None without a safety distance"""
     claims: int | None = None
-    """number of robots that claimed to be localised"""
+    """number of robots that claimed to be localised, and have not withdrawn the claim"""
     claims_within: int | None = None
     """number of claims with a position error of at most 3 times mission.accuracy"""
     nees: float | None = None
@@ -298,7 +298,7 @@ def _reported(final_report: FinalReport | None) -> RobotRow:
 
 
 def _claimed(row: RobotRow, claim: Claim | None) -> RobotRow:
-    """Return `row` with the errors and the covariance of the robot's first claim."""
+    """Return `row` with the errors and the covariance of the robot's standing claim."""
     if claim is None:
         return row
     row = replace(row, position_error_m=claim.position_error, heading_error_rad=claim.heading_error)
