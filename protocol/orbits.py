@@ -95,7 +95,7 @@ def meeting_ticks(mission: Mission) -> int:
     return circle + 3 * turn + 25
 
 
-SIDES = 12
+SEARCH_SIDES = 12
 """The number of sides of the square spiral on which a visitor searches. Its radius is then three times R.
 
 With exact sensors, a robot that is not in range at the end of the way is not there.

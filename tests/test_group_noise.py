@@ -20,13 +20,13 @@ from compose.errors import Unworkable
 from compose.launch.in_process import run_mission
 from compose.launch.planner_loader import planner_of
 from compose.recording.run import read
-from compose.scenario.group_meetings import SEARCHED_SIDES
+from compose.scenario.group_meetings import ALLOWED_SIDES
 from compose.scenario.scenario_file import scenario_table, validate
 from protocol.messages import Localised, RobotConfigInGroup, Undecided
 from protocol.mission import Mission
 from protocol.motion import ORIGIN, Covariance, Pose, compose, inverse, step
 from protocol.noise import Noise, VelocityNoise
-from protocol.orbits import SIDES, meeting_ticks, search_ticks
+from protocol.orbits import SEARCH_SIDES, meeting_ticks, search_ticks
 from tests.groups import R, group_of, localised, table_of
 from world.faults import EXCHANGED, IN_TURN, Fault, exchange_ticks
 from world.scenario import Scenario
@@ -243,11 +243,11 @@ def test_groups_of_sixteen_that_lose_nine_of_ten_reports_are_localised_within_th
 
 def test_the_bound_of_a_visit_under_noise_allows_for_a_search() -> None:
     exact, noisy = (group_of(4, 1, sigma=sigma) for sigma in (0.0, SIGMA))
-    assert search_ticks(exact.mission, SIDES) == 0
-    assert search_ticks(noisy.mission, SIDES) == 42 * R + SIDES
+    assert search_ticks(exact.mission, SEARCH_SIDES) == 0
+    assert search_ticks(noisy.mission, SEARCH_SIDES) == 42 * R + SEARCH_SIDES
     firsts = [one for one in noisy.meetings if one.ends == noisy.meetings[0].ends]
     assert firsts
     visits = [one for one in noisy.meetings if one.visited not in (noisy.meetings[0].visitor,)][1:]
-    least = meeting_ticks(noisy.mission) + search_ticks(noisy.mission, SEARCHED_SIDES)
+    least = meeting_ticks(noisy.mission) + search_ticks(noisy.mission, ALLOWED_SIDES)
     assert noisy.meetings[-1].ends >= noisy.meetings[0].ends + least
     assert visits

@@ -84,7 +84,7 @@ def test_a_recording_with_a_missed_encounter_is_audited_replayed_and_told(tmp_pa
     assert tandem("audit", str(tmp_path)).status == 0
     assert tandem("replay", str(tmp_path)).status == 0
     told = [caption.text for scene in scenes_of(read(tmp_path)) for caption in scene.captions]
-    assert "a has not met b on its circle. It drives back to its anchor to begin again." in told
+    assert "a has not met b on its circle. It drives back to its anchor to measure its pose again." in told
 
 
 def unsettled(seed: int) -> Scenario:
@@ -109,7 +109,7 @@ def test_a_recording_in_which_a_left_b_is_audited_replayed_and_told(tmp_path: Pa
     assert tandem("replay", str(tmp_path)).status == 0
     told = [caption.text for scene in scenes_of(read(tmp_path)) for caption in scene.captions]
     failed = "a has not found out where it is from its distances to b."
-    assert f"{failed} It drives back to its anchor to begin again." in told
+    assert f"{failed} It drives back to its anchor to measure its pose again." in told
 
 
 def test_neither_robot_keeps_hypotheses_of_the_meeting_that_a_left() -> None:

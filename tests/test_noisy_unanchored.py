@@ -334,7 +334,7 @@ def test_an_accuracy_that_needs_too_many_ranges_is_refused_with_their_number(
 ) -> None:
     message = (
         f"^group.toml: mission.accuracy: {accuracy:g} m needs about {ranges} mutual ranges with "
-        rf"noise.mutual_sigma = 0.05 m, more than the 94 in which a group reaches it: set at least {least} m$"
+        rf"noise.mutual_sigma = 0.05 m, more than the 94 that a group may take: set at least {least} m$"
     )
     table = four()
     with pytest.raises(UserError, match=message):
@@ -575,7 +575,7 @@ def test_a_robot_that_reports_another_reference_in_each_tick_costs_an_estimate_i
         report = ReportWithReference(**fields, reference=here, pose=pose, covariance=covariance)
         assert planner.malformed(report) is None
         state = planner.decide(state, [report])
-        estimates.add(state.at)
+        estimates.add(state.estimated_tick)
     assert 5 <= len(estimates) <= 20
 
 

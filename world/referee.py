@@ -102,14 +102,14 @@ def decide_outcome(
             why = mistake(verdict, pose if claimed is None else claimed[robot.id], scenario.mission)
             if why is not None:
                 return MissionOutcome("wrong", f"{robot.id} claims a pose that is {why}")
-    found, named = _no_better(scenario, verdicts, open_cases)
+    found, named = _outcome_of_right_claims(scenario, verdicts, open_cases)
     if not scenario.meetings or found.reason is None:
         return found
-    further = _further(scenario, verdicts, truth.tick, named)
-    return MissionOutcome(found.outcome, "; ".join((found.reason, *further)))
+    clauses = _others_not_localised(scenario, verdicts, truth.tick, named)
+    return MissionOutcome(found.outcome, "; ".join((found.reason, *clauses)))
 
 
-def _no_better(
+def _outcome_of_right_claims(
     scenario: Scenario, verdicts: Mapping[str, Verdict], open_cases: Sequence[str]
 ) -> tuple[MissionOutcome, Sequence[str]]:
     """Return the outcome of a run without a wrong claim, and the robots that its reason names."""
@@ -133,17 +133,17 @@ def _no_better(
     return MissionOutcome("localised"), ()
 
 
-def _further(
+def _others_not_localised(
     scenario: Scenario, verdicts: Mapping[str, Verdict], tick: int, named: Sequence[str]
 ) -> list[str]:
-    """Return which robots of a group are dead or not localised at `tick`, too, without those `named`.
+    """Return clauses about the robots of a group, without those `named`, that are dead or not localised.
 
-    A robot that is dead after its claim may be the one that was to find the others.
+    A dead robot that is localised may be the one that was to find the others.
     """
     dead = [one for one in scenario.deaths if one.tick <= tick]
     found = [_dead(one) for one in dead if one.robot not in named]
     known = {*named, *[one.robot for one in dead]}
-    left = [robot for robot in unlocalised(scenario, verdicts, tick) if robot not in known]
+    left = [robot for robot in not_localised(scenario, verdicts, tick) if robot not in known]
     if left:
         names = ", ".join(left[:NAMED]) + (f" and {len(left) - NAMED} more" if len(left) > NAMED else "")
         found.append(f"{names} {'is' if len(left) == 1 else 'are'} not localised either")
@@ -154,8 +154,8 @@ def _dead(death: Death) -> str:
     return f"{death.robot} is dead from tick {death.tick} on"
 
 
-def unlocalised(scenario: Scenario, verdicts: Mapping[str, Verdict], tick: int) -> dict[str, str]:
-    """Return why robots are not localised at `tick`, by robot, in the order of `scenario`."""
+def not_localised(scenario: Scenario, verdicts: Mapping[str, Verdict], tick: int) -> dict[str, str]:
+    """Return the reason for each robot that is not localised at `tick`, in the order of `scenario`."""
     found = {}
     deaths = {one.robot: one for one in scenario.deaths if one.tick <= tick}
     for robot in scenario.robots:

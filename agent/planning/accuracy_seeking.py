@@ -234,9 +234,9 @@ def _begin_again(state: RobotState, start: Pose) -> RobotState:
 
 
 def _leave(state: RobotState) -> RobotState:
-    """Leave the peer for the anchor: MANY_MUTUAL_RANGES have not settled the poses.
+    """Drive back to the anchor, because MANY_MUTUAL_RANGES have not settled the poses.
 
-    Without an anchor range since before the encounter, a begins again, as after a missed one.
+    A robot a without a range to its anchor meanwhile begins again, as after a missed encounter.
     """
     config, belief = state.config, state.belief
     if not (config.begins_again and inference.has_failed(state, state.log.ranges[-1].tick, state.tick + 1)):
@@ -250,7 +250,7 @@ def _leave(state: RobotState) -> RobotState:
 
 
 def _of_this_attempt(state: RobotState) -> RobotState:
-    """Return `state` without the belief of phase 3 that follows from measurements of an earlier attempt."""
+    """Return `state` without the hypotheses and tests of an attempt before a last began again."""
     first = inference.beginning(state, inference.known_through(state))
     if first == state.belief.beginning:
         return state

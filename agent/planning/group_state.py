@@ -83,7 +83,7 @@ class GroupState(msgspec.Struct, frozen=True):
     """The number of retries whose time has come."""
     parts: int = 0
     """The number of parts of an area that the robot has begun to sweep for robots without an anchor."""
-    swept: int = -1
+    part_tick: int = -1
     """The tick in which it began the latest of them."""
     until: float | None = None
     """The time in s at which the search of a retry ends; None if there is none."""

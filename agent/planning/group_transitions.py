@@ -19,7 +19,7 @@ from agent.planning.state import Done, RobotState
 from protocol.messages import Contact, Localised, Member, Retry, Undecided, Verdict
 from protocol.mission import Role
 from protocol.motion import Pose, compose, inverse
-from protocol.orbits import SIDES, Rendezvous
+from protocol.orbits import SEARCH_SIDES, Rendezvous
 
 SHORT_OF_ANCHOR = 0.5
 """The distance from the visited robot's anchor at which a visitor stops, as a fraction of R.
@@ -295,7 +295,7 @@ def next_visit(state: GroupState) -> GroupState:
         (_missed(state, one), math.hypot(one.anchor.x - here.x, one.anchor.y - here.y), one.robot)
         for one in config.members
         if one.ends < tick and one.robot != config.robot and _is_late(state, one)  # few are
-        if not seeks or _missed(state, one) < state.swept  # one tour after each part
+        if not seeks or _missed(state, one) < state.part_tick  # one tour after each part
     ]
     if late:
         return _on_visit(state, min(late)[2])
@@ -413,8 +413,8 @@ def searching(pair: RobotState) -> RobotState:
 def _has_searched(state: GroupState) -> bool:
     """Return whether the robot has searched for its peer in vain."""
     assert isinstance(state.verdict, Localised)
-    mode = state.pair.mode
-    return isinstance(mode, Travelling) and mode.side > (0 if state.verdict.covariance is None else SIDES)
+    mode, sides = state.pair.mode, 0 if state.verdict.covariance is None else SEARCH_SIDES
+    return isinstance(mode, Travelling) and mode.side > sides
 
 
 def stop(frame: Pose, pair: RobotState) -> tuple[float, float]:

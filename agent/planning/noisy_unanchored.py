@@ -78,12 +78,12 @@ class NoisyUnanchoredState(WaitingState, frozen=True):
     """The latest ranges to each robot."""
     finder: Finder | None = None
     """The robot that has found it; None while there is none."""
-    fitted: int = 0
-    """The number of ranges to the finder at the latest estimate."""
-    found: ContactEstimate | None = None
+    estimate: ContactEstimate | None = None
     """The latest estimate of the pose; None without one."""
-    at: int = -1
-    """The tick of `found`; -1 before the first estimate."""
+    estimated_tick: int = -1
+    """The tick of the latest estimate; -1 before the first."""
+    ranges_at_estimate: int = 0
+    """The number of ranges to the finder at the latest estimate."""
     failure: str = "no localised robot has found it"
     """The reason for which it has no claim yet."""
 
@@ -105,10 +105,7 @@ class NoisyUnanchoredPlanner(Planner[NoisyUnanchoredState, Report]):
 
     def observe(self, state: NoisyUnanchoredState, observation: Observation) -> NoisyUnanchoredState:
         """Return `state` with the odometry and the ranges of one tick."""
-        log, odometry, leg = exchange.dead_reckoned(
-            state.log, state.odometry, state.leg, observation.executed, state.config.mission.period
-        )
-        state = replace(state, tick=observation.tick, odometry=odometry, leg=leg, log=log)
+        state = state.after_odometry(observation)
         if state.verdict is not None:
             return state
         ranges = dict(state.ranges)
@@ -151,7 +148,8 @@ class NoisyUnanchoredPlanner(Planner[NoisyUnanchoredState, Report]):
 
     def estimate(self, state: NoisyUnanchoredState) -> Estimate:
         """Return the poses in <W> that are possible in the tick of an estimate, the most probable first."""
-        found = state.found if state.at == state.tick or state.verdict is not None else None
+        is_new = state.estimated_tick == state.tick or state.verdict is not None
+        found = state.estimate if is_new else None
         return Estimate(
             tick=state.tick,
             robot=state.config.robot,
@@ -177,7 +175,7 @@ class NoisyUnanchoredPlanner(Planner[NoisyUnanchoredState, Report]):
 
     def summary(self, state: NoisyUnanchoredState) -> Summary:
         """Return the number of possible poses, the probability of the first, and what prevents a claim."""
-        found = state.found
+        found = state.estimate
         if found is None:
             return Summary(blocking_reason=None if state.verdict is not None else state.failure)
         return Summary(
@@ -210,7 +208,7 @@ def _with_reference(state: NoisyUnanchoredState, one: ReportWithReference) -> No
     if known is None:
         log = MotionLog(through=one.reference)
         known = Finder(one.robot, one.reference, one.pose, one.covariance, log, one.tick)
-        state = replace(state, fitted=0, found=None)
+        state = replace(state, ranges_at_estimate=0, estimate=None)
     log = known.log.extended(one.since, 0, MotionLog(one.through, one.runs))
     return replace(state, finder=replace(known, log=log, latest=max(known.latest, one.tick)))
 
@@ -232,7 +230,7 @@ def _estimated(state: NoisyUnanchoredState) -> NoisyUnanchoredState:
             if ends[0] <= one.tick <= ends[1]
         ]
     )
-    if len(ranges) < max(FEWEST, state.fitted + EACH) or state.tick < state.at + EACH:
+    if len(ranges) < max(FEWEST, state.ranges_at_estimate + EACH) or state.tick < state.estimated_tick + EACH:
         return state
     contact = ContactRanges(
         finder.pose,
@@ -242,7 +240,7 @@ def _estimated(state: NoisyUnanchoredState) -> NoisyUnanchoredState:
         ranges,
     )
     found = estimated(contact, mission)
-    state = replace(state, fitted=len(ranges), found=found, at=state.tick)
+    state = replace(state, estimate=found, estimated_tick=state.tick, ranges_at_estimate=len(ranges))
     if found is None:
         return replace(state, failure=f"no pose explains the ranges to {finder.robot}")
     if found.blocking_reason:
@@ -266,7 +264,7 @@ def _moved_on(state: NoisyUnanchoredState) -> NoisyUnanchoredState:
     if finder is None:
         return state
     if finder.latest <= state.tick - _kept(state):
-        return replace(state, mode=Standing(), finder=None, found=None)
+        return replace(state, mode=Standing(), finder=None, estimate=None)
     if finder.covariance.position_sigma > mission.accuracy:
         return replace(state, mode=Standing())
     mode = state.mode

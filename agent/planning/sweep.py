@@ -1,4 +1,4 @@
-"""The motion of a sweep: along the strips of an area, and on a small square in range of another robot."""
+"""The motion of a sweep: along the strips of an area, and in loops in range of another robot."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ class Sweeping(msgspec.Struct, frozen=True):
 
 
 class Looping(msgspec.Struct, frozen=True):
-    """A robot drives a small square, so that a robot without an anchor is localised from their ranges."""
+    """A robot drives a loop, so that a robot without an anchor is localised by the ranges between the two."""
 
     places: tuple[Place, ...]
     """The corners that are left, in m in the frame of the odometry. The last one is where it began."""
     then: tuple[Place, ...] = ()
     """The ends of the straights of a sweep that are left after it."""
     since: int = 0
-    """The tick in which the first square began; it is repeated until a robot is localised."""
+    """The tick in which the first loop began; it is repeated until a robot is localised."""
 
 
 def transformed(transform: Pose, places: Iterable[Place]) -> tuple[Place, ...]:

@@ -49,7 +49,7 @@ def next_part(state: GroupState) -> GroupState:
         state,
         pair=replace(state.pair, mode=mode),
         parts=state.parts + 1,
-        swept=state.pair.tick,
+        part_tick=state.pair.tick,
         visiting=False,
         unmet=0,
         silence=0,

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Self
 
 import msgspec
 from msgspec.structs import replace
@@ -87,6 +88,13 @@ class WaitingState(msgspec.Struct, frozen=True):
                 return "undecided"
         return MODE_NAMES[type(self.mode)]
 
+    def after_odometry(self, observation: Observation) -> Self:
+        """Return this state in the tick of `observation`, with its odometry."""
+        log, odometry, leg = exchange.dead_reckoned(
+            self.log, self.odometry, self.leg, observation.executed, self.config.mission.period
+        )
+        return replace(self, tick=observation.tick, odometry=odometry, leg=leg, log=log)
+
     def command(self, tolerance: float) -> Command:
         """Return the command for the next tick; a place counts as reached within `tolerance` m."""
         controls = None
@@ -131,14 +139,13 @@ class UnanchoredPlanner(Planner[UnanchoredState, Report]):
 
     def observe(self, state: UnanchoredState, observation: Observation) -> UnanchoredState:
         """Return `state` with the odometry and the ranges of one tick."""
-        log, odometry, leg = exchange.dead_reckoned(
-            state.log, state.odometry, state.leg, observation.executed, state.config.mission.period
-        )
-        state = replace(state, tick=observation.tick, odometry=odometry, leg=leg, log=log)
+        state = state.after_odometry(observation)
         if state.verdict is not None:
             return state
         # where it stands, rounding must not look like a motion
-        moved = compose(inverse(state.base), odometry) if odometry != state.base else ORIGIN
+        moved = ORIGIN
+        if state.odometry != state.base:
+            moved = compose(inverse(state.base), state.odometry)
         new = {
             (one.peer, observation.tick): (one.range, moved)
             for one in observation.contacts

@@ -14,7 +14,7 @@ from collections.abc import Collection, Sequence
 import msgspec
 
 from compose.recording.run import Run
-from protocol.orbits import SIDES, meeting_ticks, search_ticks
+from protocol.orbits import SEARCH_SIDES, meeting_ticks, search_ticks
 from protocol.sweep_strips import Place, widest_distance
 from protocol.sweep_ticks import ticks_of_parts
 from world.faults import exchange_ticks
@@ -111,7 +111,7 @@ def _tour_ticks(scenario: Scenario, waiting: Collection[str]) -> int:
     anchors = _anchors(scenario)
     ways = [_way_to_all(anchors, begin) for begin in range(len(anchors))]
     visits = len(anchors) - 1
-    way = math.ceil(max(ways) / step) + visits * (turn + 1 + search_ticks(mission, SIDES))
+    way = math.ceil(max(ways) / step) + visits * (turn + 1 + search_ticks(mission, SEARCH_SIDES))
     each, once = exchange_ticks(scenario.faults)
     return way + len(waiting) * (meeting_ticks(mission) + each) + once
 

@@ -25,7 +25,7 @@ from compose.recording.ticks_csv import ticks_csv
 from protocol import files
 from protocol.messages import FinalReport
 from protocol.motion import Pose, wrap
-from world.referee import unlocalised
+from world.referee import not_localised
 from world.scenario import Scenario
 from world.sensors import in_contact
 
@@ -82,7 +82,7 @@ def _group(run: Run) -> dict[str, Any]:
         "bound_ticks": max(one.bound_ticks for one in results),
         "localised_tick": max(tick for tick in ticks if tick is not None) if None not in ticks else None,
         "corrected_bounds": msgspec.to_builtins(list(corrected_bounds(run))),
-        "not_localised": unlocalised(run.scenario, run.verdicts(), run.length - 1),
+        "not_localised": not_localised(run.scenario, run.verdicts(), run.length - 1),
         "deaths": {one.robot: one.tick for one in run.scenario.deaths},
         "meetings": msgspec.to_builtins(meetings),
         **({"without_anchor": msgspec.to_builtins(searches)} if searches else {}),

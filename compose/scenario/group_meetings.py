@@ -34,7 +34,7 @@ RETRIES = 2
 SLOWER = 2.0
 """The time for the visits after them, in units of the planned one: robots are not where they were planned."""
 
-SEARCHED_SIDES = 6
+ALLOWED_SIDES = 6
 """The number of sides of its search, a square spiral, that the bound of a visit under noise allows for.
 
 They reach robots 2.5 R aside. These are two sigmas of the least accurate heading with which a robot leaves,
@@ -143,7 +143,7 @@ def _delayed(
     `delays` are those of each meeting, and of the first one of each robot besides, in s.
     """
     of_each, of_first = delays
-    search = search_ticks(mission, SEARCHED_SIDES) * mission.period
+    search = search_ticks(mission, ALLOWED_SIDES) * mission.period
     later: dict[int, float] = {}
     found = []
     for one in meetings:

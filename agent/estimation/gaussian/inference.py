@@ -52,10 +52,10 @@ class PlanningHypothesis(NamedTuple):
 def beginning(knowledge: Knowledge, through: int) -> int:
     """Return the tick up to `through` from which on the measurements of robot a count: 0, or a later one.
 
-    A robot a that has searched for b in vain, or has left b undecided, begins phase 1 again with its next
-    range to its anchor. Earlier measurements hardly constrain its pose then: the error of its heading has
-    grown to up to a radian, and over such an angle no fit is linear. Both robots determine the tick from what
-    both know: a's log and the ranges between them.
+    A robot a that has failed (see `has_failed`) begins phase 1 again with its next range to its anchor.
+    Earlier measurements hardly constrain its pose then: the error of its heading has grown to up to a radian,
+    and over such an angle no fit is linear. Both robots compute the tick from data that both have: a's log
+    and the ranges between them.
     """
     if not knowledge.config.begins_again:
         return 0
@@ -65,16 +65,16 @@ def beginning(knowledge: Knowledge, through: int) -> int:
 
 
 def has_failed(knowledge: Knowledge, before: int, tick: int) -> bool:
-    """Return whether a has failed to meet b, or to settle with it, by the anchor range that it has in `tick`.
+    """Return whether a robot a without a range to its anchor from tick `before` until `tick` has failed.
 
-    It has had no range to its anchor since that of the tick `before`: for longer than T_max with fewer than
-    LEAST_RANGES mutual ranges, or with MANY_MUTUAL_RANGES of them.
+    It has if it has not met b in more than T_max, or if MANY_MUTUAL_RANGES have not settled the poses. It has
+    met b if there are LEAST_RANGES mutual ranges.
     """
     config, at = knowledge.config, attrgetter("tick")
-    mutual = bisect_left(knowledge.mutual, tick, key=at) - bisect_left(knowledge.mutual, before, key=at)
-    if mutual < LEAST_RANGES:
+    count = bisect_left(knowledge.mutual, tick, key=at) - bisect_left(knowledge.mutual, before, key=at)
+    if count < LEAST_RANGES:
         return (tick - before) * config.mission.period > config.rendezvous.bound
-    return mutual >= MANY_MUTUAL_RANGES
+    return count >= MANY_MUTUAL_RANGES
 
 
 def _own_beginning(knowledge: Knowledge) -> int:

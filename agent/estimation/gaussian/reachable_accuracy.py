@@ -18,6 +18,7 @@ from msgspec.structs import replace
 from agent.estimation.gaussian.fitted_poses import deviation, poses
 from agent.estimation.gaussian.least_squares import fit
 from agent.estimation.gaussian.odometry_noise import (
+    Array,
     Projection,
     Ticks,
     Track,
@@ -29,7 +30,8 @@ from agent.estimation.gaussian.odometry_noise import (
 from agent.estimation.gaussian.range_model import Ranges, predict
 from protocol.mission import Mission
 from protocol.noise import Noise, VelocityNoise
-from protocol.sweep_ticks import sweep_speed
+from protocol.sweep_strips import Place
+from protocol.sweep_ticks import straight_ticks
 
 PRIORS = {
     "range_bias": "measure the bias of the radios at known distances",
@@ -48,7 +50,6 @@ AROUND_ANCHOR = 20
 TOGETHER = 60
 """The number of ticks in which both robots of the reference mission measure mutual ranges."""
 
-
 ACTIVE = 1.5
 """The factor by which a mission may be more accurate than the reference mission, whose way is not optimal.
 
@@ -57,9 +58,8 @@ Robots choose where to range and may take more ranges, so it is more than 1: the
 would be accepted at 0.1 m, although it reaches 0.19 m.
 """
 
-
 ACTIVE_SEARCH = 1.25
-"""ACTIVE where some robots have no anchor: another robot finds them, whose error adds to theirs.
+"""ACTIVE of a group in which robots have no anchor: the error of the robot that finds them adds to theirs.
 
 Of four robots, two of them without an anchor, all were localised at the first passage in 12 of 12 missions
 with 0.8 to 1 of the accuracy in the reference mission. With 1 to 1.2, 10 of 12 were localised, 5 of them late
@@ -80,8 +80,8 @@ def unreachable(mission: Mission, distance: float, active: float) -> str | None:
     ranges = TOGETHER * (white / mission.accuracy) ** 2
     return (
         f"accuracy: {mission.accuracy:.3g} m needs about {ranges:.0f} mutual ranges with noise.mutual_sigma "
-        f"= {mission.noise.mutual_sigma:.3g} m, more than the {TOGETHER * active**2:.0f} in which a group "
-        f"reaches it: set at least {rounded_up(white / active):g} m"
+        f"= {mission.noise.mutual_sigma:.3g} m, more than the {TOGETHER * active**2:.0f} that a group "
+        f"may take: set at least {rounded_up(white / active):g} m"
     )
 
 
@@ -149,24 +149,12 @@ def _ranges(path: Track, anchor: list[float], reach: float) -> list[tuple[int, f
     return [(tick, 0.0) for tick in np.flatnonzero(rho <= reach).tolist()]
 
 
-def swept_sigma(mission: Mission, way: Sequence[tuple[float, float]]) -> float:
+def swept_sigma(mission: Mission, way: Sequence[Place]) -> float:
     """Return the median sigma (m) of the position of a robot that drives along `way` (m) from a known pose.
 
-    It is that of the white noise of its odometry, over all ticks of the way. A robot turns at each place.
+    The sigma is that of the white noise of its odometry; the median is over all ticks of the way.
     """
-    step = sweep_speed(mission) * mission.period
-    most = mission.max_turn_rate * mission.period
-    moves: list[tuple[float, float, int]] = []
-    """The length (m) and the angle (rad) of a motion of each tick, and the number of such ticks."""
-    heading: float | None = None
-    for begin, end in pairwise(way):
-        ahead = math.atan2(end[1] - begin[1], end[0] - begin[0])
-        turn = 0.0 if heading is None else math.remainder(ahead - heading, math.tau)
-        length, heading = math.dist(begin, end), ahead
-        turning, driving = math.ceil(abs(turn) / most), math.ceil(length / step)
-        moves += [(0.0, turn / max(turning, 1), turning), (length / max(driving, 1), 0.0, driving)]
-    ticks = [count for _, _, count in moves]
-    v, omega = (np.repeat([one[i] / mission.period for one in moves], ticks) for i in (0, 1))
+    v, omega = _driven(way, mission)
     path, k = track(v, omega, mission.period), len(v)
     white = variances(v, omega, mission.noise.odometry)
     model = wander(path, np.zeros((2, k)), np.zeros((0, 2, k)), white)
@@ -174,5 +162,22 @@ def swept_sigma(mission: Mission, way: Sequence[tuple[float, float]]) -> float:
     rows = Projection.positions(
         path, Ticks.of(np.tile(np.arange(1, k + 1), 2), k), np.stack((along_x, 1.0 - along_x))
     )
-    of_rows = np.sum(np.multiply(*spread(model, rows)), axis=0)
-    return float(np.median(np.sqrt(of_rows[:k] + of_rows[k:])))
+    of_axes = np.sum(np.multiply(*spread(model, rows)), axis=0)
+    return float(np.median(np.sqrt(of_axes[:k] + of_axes[k:])))
+
+
+def _driven(way: Sequence[Place], mission: Mission) -> tuple[Array, Array]:
+    """Return v (m/s) and omega (rad/s) in each tick of a robot that drives along `way` (m)."""
+    moves: list[tuple[float, float, int]] = []
+    """The length (m) and the angle (rad) of the motion of a tick, and the number of such ticks."""
+    heading: float | None = None
+    for begin, end in pairwise(way):
+        ahead = math.atan2(end[1] - begin[1], end[0] - begin[0])
+        turn = 0.0 if heading is None else math.remainder(ahead - heading, math.tau)
+        length, heading = math.dist(begin, end), ahead
+        turning = math.ceil(abs(turn) / (mission.max_turn_rate * mission.period))
+        driving = straight_ticks(length, mission)
+        moves += [(0.0, turn / max(turning, 1), turning), (length / max(driving, 1), 0.0, driving)]
+    ticks = [count for _, _, count in moves]
+    v, omega = (np.repeat([one[i] / mission.period for one in moves], ticks) for i in (0, 1))
+    return v, omega

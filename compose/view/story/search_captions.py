@@ -101,7 +101,7 @@ def searching(pair: PairData) -> Iterator[Caption]:
 
 
 def beginning_again(pair: PairData) -> Iterator[Caption]:
-    """Yield which robot has not met its peer, or not settled with it, and drives back to its anchor."""
+    """Yield which robot drives back to its anchor, since it missed its peer or is not localised by it."""
     for robot in pair.robots:
         before, now = pair.commands(robot.id)
         if before is None or now is None or robot.orbit.v == 0.0 or now.state != "homing":
@@ -112,7 +112,7 @@ def beginning_again(pair: PairData) -> Iterator[Caption]:
             failed = f"{robot.id} has not met {robot.peer} on its circle."
         else:
             continue
-        yield Caption("search", f"{failed} It drives back to its anchor to begin again.", pair.ids)
+        yield Caption("search", f"{failed} It drives back to its anchor to measure its pose again.", pair.ids)
 
 
 def _search(robots: Sequence[RobotSetup]) -> str:
