@@ -37,7 +37,7 @@ REFRAME = {"kind": "reframe", "size": 1.0}
 
 
 def five(attackers: str = "", **fields: Any) -> dict[str, Any]:
-    """Return a scenario file of three robots with an anchor and two without, one of which may lie."""
+    """Return a scenario file of three robots with an anchor and two without, one of which may attack."""
     table = four(**fields)
     table["mission"] = {**table["mission"], "tolerates": 1}
     table["robot"].insert(2, {"id": "c", "anchor": [2.0, 11.0]})
@@ -65,11 +65,11 @@ def all_right(run: Run) -> bool:
 
 
 @pytest.mark.parametrize("attacker", ["a", "b", "c", "u"])
-def test_honest_robots_are_localised_and_never_wrong_whoever_lies(attacker: str) -> None:
+def test_honest_robots_are_localised_and_never_wrong_whoever_attacks(attacker: str) -> None:
     assert all_right(run_mission(scenario_of(five(attacker))))
 
 
-def test_a_finder_that_lies_is_believed_by_a_robot_that_tolerates_no_false_report() -> None:
+def test_an_attacker_that_is_a_finder_is_believed_by_a_robot_that_tolerates_no_false_report() -> None:
     """This is why a scenario with an attack must say how many are tolerated."""
     scenario = scenario_of(five("a"))
     assert scenario.planned_sweep is not None
@@ -240,11 +240,11 @@ def test_a_changed_scenario_keeps_the_number_of_false_reporters() -> None:
         ),
         (
             lambda table: table["mission"].update(tolerates=2),
-            r"mission.tolerates: 2 false finders need 5 robots with an anchor, of which 3 are honest; there",
+            r"mission.tolerates: to tolerate 2, 5 robots need an anchor, of which 3 are then honest; there",
         ),
         (
             lambda table: table["mission"].update(noise={"anchor_sigma": 0.05, "mutual_sigma": 0.05}),
-            r"mission.tolerates: sensors have noise, and it is for exact ones only",
+            r"mission.tolerates: it is for exact sensors only, and these have noise",
         ),
         (
             lambda table: (

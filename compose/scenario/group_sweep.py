@@ -68,12 +68,12 @@ def _check_attacks(file: ScenarioFile, anchored: int, source: str) -> None:
     tolerates = file.mission.tolerates
     attacks = [i for i, robot in enumerate(file.robot) if robot.attack is not None]
     if tolerates and not file.mission.noise.exact:
-        raise Unworkable(f"{source}: mission.tolerates: sensors have noise, and it is for exact ones only")
+        raise Unworkable(f"{source}: mission.tolerates: it is for exact sensors only, and these have noise")
     needed = sweepers_of_part(tolerates)
     if tolerates and anchored < needed:
         raise Unworkable(
-            f"{source}: mission.tolerates: {tolerates} false finders need {needed} robots with an anchor, of "
-            f"which {tolerates + 1} are honest; there are {anchored}"
+            f"{source}: mission.tolerates: to tolerate {tolerates}, {needed} robots need an anchor, of which "
+            f"{tolerates + 1} are then honest; there are {anchored}"
         )
     if len(attacks) > tolerates:
         remedy = f"set mission.tolerates = {len(attacks)}"
