@@ -90,8 +90,8 @@ def advance(world: World, commands: Mapping[str, Command]) -> World | MissionOut
 
     A robot without a Command rests, and so does a dead one.
     """
-    scenario, truth = world.scenario, world.truth
-    verdicts, claimed = world.verdicts, world.claimed
+    scenario, truth, claimed = world.scenario, world.truth, world.claimed
+    verdicts = verdicts_after(world, commands)
     driven = []
     exact = scenario.sensors.exact
     for place, robot in enumerate(scenario.robots):
@@ -101,14 +101,9 @@ def advance(world: World, commands: Mapping[str, Command]) -> World | MissionOut
         command = commands.get(robot.id)
         controls = limited_controls(command, scenario.mission)
         driven.append(controls if exact else executed(controls, scenario, robot.id, truth.tick))
-        given = verdicts.get(robot.id)
-        # in a group, another meeting may contradict a claim, which is then withdrawn
-        if command is not None and command.verdict != given and (given is None or scenario.meetings):
-            verdicts = {name: one for name, one in verdicts.items() if name != robot.id}
-            if command.verdict is not None:
-                verdicts[robot.id] = command.verdict
-            if isinstance(command.verdict, Localised):
-                claimed = claimed | {robot.id: truth.poses[place]}
+        verdict = verdicts.get(robot.id)
+        if isinstance(verdict, Localised) and verdict is not world.verdicts.get(robot.id):
+            claimed = claimed | {robot.id: truth.poses[place]}
     if verdicts or truth.tick >= scenario.max_ticks:
         mission_outcome = decide_outcome(scenario, truth, verdicts, claimed)
         if mission_outcome is not None:
@@ -118,6 +113,24 @@ def advance(world: World, commands: Mapping[str, Command]) -> World | MissionOut
     return World(
         scenario, moved, tuple(driven), verdicts, claimed, world.pairs, links, executed_before=world.executed
     )
+
+
+def verdicts_after(world: World, commands: Mapping[str, Command]) -> dict[str, Verdict]:
+    """Return the verdicts of the robots after the `commands` of this tick, by robot.
+
+    The first verdict of a robot of a pair is final. In a group, another meeting may contradict a claim, which
+    is then withdrawn.
+    """
+    scenario, found = world.scenario, world.verdicts
+    for robot in scenario.robots:
+        command, given = commands.get(robot.id), found.get(robot.id)
+        if command is None or command.verdict == given or scenario.is_dead(robot.id, world.truth.tick):
+            continue
+        if given is None or scenario.meetings:
+            found = {name: one for name, one in found.items() if name != robot.id}
+            if command.verdict is not None:
+                found[robot.id] = command.verdict
+    return found
 
 
 def _carried(

@@ -40,7 +40,7 @@ from protocol.motion import Controls, Pose
 from protocol.output import one_line
 from world import world_journal
 from world.scenario import Scenario
-from world.tick import observations
+from world.tick import observations, verdicts_after
 from world.world_journal import Tick, WorldHistory
 
 if TYPE_CHECKING:
@@ -257,15 +257,8 @@ class Run(msgspec.Struct, frozen=True, dict=True):
         return made
 
     def verdicts(self) -> dict[str, Verdict]:
-        """Return the verdicts of a group at the end of the run, by robot, of those that have one."""
-        found: dict[str, Verdict] = {}
-        for tick in self.ticks:
-            for robot, command in tick.commands.items():
-                if command.verdict is None:  # it may have withdrawn its claim
-                    found.pop(robot, None)
-                elif not self.scenario.is_dead(robot, tick.truth.tick):
-                    found[robot] = command.verdict
-        return found
+        """Return the verdicts at the end of the run, by robot, of those that have one."""
+        return verdicts_after(self.ticks[-1].world, self.ticks[-1].commands) if self.ticks else {}
 
     def truth_held(self, robot: str) -> bool | None:
         """Return whether `robot` held the true hypothesis at its standing claim (see `claim.truth_held`).
