@@ -136,11 +136,13 @@ def after_refusal(state: GroupState) -> GroupState:
     if state.visiting:
         return next_visit(_after_meeting(state))
     failure = Undecided(f"{state.config.peer} does not go on with the meeting")
+    if state.pair.belief.phase1_done_tick is None:
+        return without_peer(state, failure)
     return _resumed(_after_meeting(replace(state, failure=failure)))
 
 
 def without_peer(state: GroupState, failure: Verdict) -> GroupState:
-    """Return `state` of a robot in phase 1 that goes on with it: the reports of its peer have failed."""
+    """Return `state` of a robot in phase 1 that goes on with it, without its peer, because of `failure`."""
     return _after_meeting(replace(state, failure=failure))
 
 
