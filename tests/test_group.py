@@ -21,7 +21,7 @@ from compose.launch.in_process import run_mission
 from compose.launch.planner_loader import planner_of
 from compose.recording.run import Run, read
 from compose.scenario.scenario_file import validate
-from protocol.messages import Localised, Report, RobotConfigInGroup
+from protocol.messages import Contact, Localised, Observation, Report, RobotConfigInGroup, Undecided
 from protocol.mission import HEADING_ACCURACY, Mission
 from protocol.motion import Pose, step
 from protocol.wire import MAX_REPORT_BYTES, encode
@@ -154,6 +154,21 @@ def test_a_robot_whose_meetings_with_all_others_have_failed_gives_up_at_once() -
     claims = [claim.tick for robot in ("r0", "r1") if (claim := run.claim(robot)) is not None]
     assert run.end.tick < max(claims) + 20
     assert run.end.tick < 0.5 * scenario.max_ticks
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.05])
+def test_a_robot_in_phase_1_goes_on_with_it_when_its_peer_ends_their_meeting(sigma: float) -> None:
+    config = group_of(3, 1, sigma=sigma).config("r0")
+    planner = planner_of(config)
+    near = (Contact(config.peer, 2.0, (0,)),)
+    state = planner.observe(planner.start(config), Observation(0, "r0", None, 1.0, near))
+    refusal = Report(0, config.peer, 1, "straight", None, 0, 0, (), 0, (), 0, 0, Undecided("a false log"))
+    after = planner.decide(state, [refusal])
+    assert after.verdict is None
+    assert after.other(config.peer).failed
+    command = planner.command(after)
+    assert (command.phase, command.state) == (1, "straight")
+    assert command.v > 0.0
 
 
 def test_a_robot_sends_its_log_only_to_the_robot_that_it_meets(tmp_path: Path) -> None:

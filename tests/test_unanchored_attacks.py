@@ -8,10 +8,12 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
+from agent.planning.group import TRAVELLING
 from agent.planning.unanchored import UnanchoredPlanner, UnanchoredState
 from compose.audit.replay import replayed
 from compose.errors import UserError
 from compose.launch.in_process import run_mission
+from compose.launch.planner_loader import planner_of
 from compose.recording.run import Run, of_frames
 from compose.scenario.scenario_change import file_table
 from compose.scenario.scenario_file import ScenarioTemplate, validate
@@ -23,9 +25,10 @@ from protocol.messages import (
     Observation,
     Report,
     ReportWithPose,
+    RobotConfigInGroup,
     Undecided,
 )
-from protocol.motion import ORIGIN, Controls, Pose, compose, step, wrap
+from protocol.motion import ORIGIN, REST, Controls, Pose, Segment, compose, step, wrap
 from protocol.rounding import TOLERANCE
 from tests.test_audit import kept
 from tests.test_group_runs import audited
@@ -134,6 +137,25 @@ def test_a_robot_that_searches_for_the_one_that_comes_to_it_is_visited_by_it() -
     attack = {"kind": "rotate", "part": "encounter", "size": math.radians(1.0)}
     table["group"] = {"robots": 6, "spacing": 30.0, "without_anchor": 2, "attack": attack}
     assert all_right(run_mission(scenario_of(table)))
+
+
+def test_a_robot_without_an_anchor_that_claims_to_visit_is_not_met() -> None:
+    """It has no anchor and no log. One that reports a log all the same is in no meeting."""
+    scenario = scenario_of(five())
+    config = scenario.config("a")
+    planner = planner_of(config)
+    assert isinstance(config, RobotConfigInGroup)
+    run = run_mission(scenario)
+    done = next(tick for tick, one in enumerate(run.ticks) if one.commands["a"].phase > 1)
+    state = planner.start(config)
+    for tick in range(done + 1):
+        state = planner.decide(planner.observe(state, run.observations[tick]["a"]))
+    assert state.verdict is None
+    visit = Report(done, "u", 3, TRAVELLING, ORIGIN, 0, 1, (Segment(1, 0.0, 0.0),), 0, (), 0, 0)
+    assert visit.has_log
+    met = Observation(done + 1, "a", REST, None, (Contact("u", 1.0, (done,)),))
+    after = planner.decide(planner.observe(state, met), [visit])
+    assert after.config.peer == config.peer
 
 
 # --- the robot without an anchor ----------------------------------------------------------------------

@@ -105,7 +105,8 @@ class GroupPlanner(Planner[GroupState, Report]):
         """Return `state` with the `reports` of others, and in the next meeting if this one has ended."""
         for one in reports:
             state = with_sender(state, one)
-        logs = [one for one in reports if one.has_log]
+        anchored = [one.robot for one in state.config.members]
+        logs = [one for one in reports if one.has_log and one.robot in anchored]  # others are in no meeting
         state = group_transitions.answering(state, [one.robot for one in logs if one.state == TRAVELLING])
         peer, before = state.pair.config.peer, state.pair
         alone = state.sweeps or group_transitions.refused(state, peer)
