@@ -185,6 +185,8 @@ def _anchor_error(mission: Mission, size: float) -> float:
         across, moment = across + 2.0 * reach * y, moment + y * y
         floor = rounding(size, k + 2, (k + 2) * step, k * turn)
         radial = min(radial, floor * (1.0 + SAME + across / moment))
+        if floor * (1.0 + SAME + 4.0) > radial:  # y is at most R / 2, so the ratio stays above 4
+            break
     round_it = 0.5 * math.pi + 2.0 * TAU / 3.0
     floor = rounding(size, 6, (TAU + 4.0) * step, round_it)
     return max(radial, floor * (1.0 + SAME + 2.0 * reach / step))

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import re
 import socket
+import time
 from pathlib import Path
 
 import pytest
 
 from compose.errors import BadScenario
 from compose.scenario.scenario_file import parse
+from protocol.mission import Mission, infeasibility
 from tests.commands import PAPER_1, Ended, several_pairs, tandem, world
 
 LISTEN = ("--listen", "tcp/127.0.0.1:7447")
@@ -193,6 +195,13 @@ AMOUNTS = {
     "noise": ("0.01", "[]", "true"),
 }
 """Invalid values for the fields of `noise`."""
+
+
+def test_a_mission_in_which_a_turn_takes_a_month_is_checked_at_once() -> None:
+    """The largest error of phase 1 is sought among the ticks of half a turn: here, three million."""
+    begin = time.process_time()
+    assert infeasibility(Mission(3.0, 1.0, 1.0, 1e-6), 10.0) is None
+    assert time.process_time() - begin < 0.5
 
 
 def with_noise(field: str, value: str) -> str:
