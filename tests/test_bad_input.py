@@ -254,6 +254,8 @@ def test_noise_misspelt_is_named(field: str, says: str) -> None:
             "noise.outlier_bias: the lower bound 2 m is above the upper bound 0.3 m",
         ),
         ("noise.outlier_bias", "[-0.1, 0.3]", "noise.outlier_bias[0]: "),
+        ("noise.sigma_degrees", "5e-324", "noise.sigma_degrees: set 0 or at least 1e-300"),
+        ("noise.strays", "5e-324", "noise.strays: set 0 or at least 1e-300"),
         ("noise.outlier_bias", "[0.3, nan]", "noise.outlier_bias[1]: "),
         ("noise.outlier_bias", "[0.3, 2e6]", "noise.outlier_bias[1]: "),
         (
