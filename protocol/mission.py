@@ -211,12 +211,17 @@ SMALLEST = 1e-300
 """The smallest positive value of a field of the noise: half of the smallest floating-point number is 0."""
 
 
-def noise_infeasibility(mission: Mission) -> str | None:
-    """Return the field and why robots cannot localise themselves with this noise, or None if they can."""
-    noise, reach, accuracy = mission.noise, mission.sensing_range, mission.accuracy
+def too_small(noise: Noise) -> str | None:
+    """Return the field of `noise` that is too small to compute with, and why; None if there is none."""
     for name, value in (("sigma_degrees", noise.sigma_degrees), ("strays", noise.strays)):
         if 0.0 < value < SMALLEST:
             return f"noise.{name}: set 0 or at least {SMALLEST:g}: {value:g} is too small to divide"
+    return None
+
+
+def noise_infeasibility(mission: Mission) -> str | None:
+    """Return the field and why robots cannot localise themselves with this noise, or None if they can."""
+    noise, reach, accuracy = mission.noise, mission.sensing_range, mission.accuracy
     if noise.exact:
         return None
     for name, sigma in (("anchor_sigma", noise.anchor_sigma), ("mutual_sigma", noise.mutual_sigma)):

@@ -14,8 +14,11 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from agent.planning import group_transitions
 from agent.planning.group import TRAVELLING
+from agent.planning.group_transitions import SILENT_AFTER
 from agent.planning.phase2_orbit import Travelling, next_side, travel_controls
+from agent.planning.state import Done
 from compose.errors import BadScenario, Unworkable, UserError
 from compose.launch.in_process import run_mission
 from compose.launch.planner_loader import planner_of
@@ -169,6 +172,25 @@ def test_a_robot_in_phase_1_goes_on_with_it_when_its_peer_ends_their_meeting(sig
     command = planner.command(after)
     assert (command.phase, command.state) == (1, "straight")
     assert command.v > 0.0
+
+
+@pytest.mark.parametrize(
+    ("silence", "refused", "leaves"),
+    [(SILENT_AFTER, False, False), (SILENT_AFTER + 1, False, True), (0, True, True)],
+    ids=["the peer may still report its result", "the peer is silent", "the peer has ended the meeting"],
+)
+def test_a_localised_robot_waits_for_its_peer_beside_it_for_a_bounded_time(
+    silence: int, refused: bool, leaves: bool
+) -> None:
+    scenario = group_of(3, 1)
+    visitor = next(one.visitor for one in scenario.meetings if scenario.config(one.visitor).visits)
+    config = scenario.config(visitor)
+    planner = planner_of(config)
+    state, claim = planner.start(config), Localised(Pose(0.0, 0.0, 0.0))
+    pair = replace(state.pair, mode=Done(3, claim), in_contact=True)
+    assert pair.verdict == claim
+    state = replace(state, pair=pair, verdict=claim, silence=silence)
+    assert group_transitions.onward(state, peer_has_left=refused).visiting == leaves
 
 
 def test_a_robot_sends_its_log_only_to_the_robot_that_it_meets(tmp_path: Path) -> None:

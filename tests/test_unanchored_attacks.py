@@ -127,6 +127,50 @@ def test_no_shipped_attack_leads_to_a_wrong_claim() -> None:
         assert all_right(run_mission(template.seeded(3))), cell
 
 
+SLIGHTLY_LONGER = {"kind": "shift", "part": "all", "size": 1e-6}
+SLIGHTLY_FARTHER = {"kind": "radius", "size": 1e-6}
+
+
+@pytest.mark.parametrize(
+    ("seed", "anchors", "attackers", "unanchored"),
+    [
+        pytest.param(
+            480005,
+            [
+                (2.7, 1.1),
+                (7.4, 15.3),
+                (0.4, 10.3),
+                (20.7, 19.7),
+                (4.7, 19.6),
+                (14.7, 4.1),
+                (11.3, 17.0),
+                (4.0, 21.1),
+            ],
+            {6: SLIGHTLY_LONGER, 7: SLIGHTLY_FARTHER},
+            1,
+            id="an attacker is found while it is in phase 1",
+        ),
+        pytest.param(
+            591718,
+            [(5.1, 16.9), (12.5, 3.3), (17.2, 17.8), (7.6, 6.4), (7.8, 8.3)],
+            {2: SLIGHTLY_LONGER, 3: SLIGHTLY_FARTHER},
+            2,
+            id="an attacker is localised beside a robot that has found it",
+        ),
+    ],
+)
+def test_two_attackers_of_different_kinds_keep_no_honest_robot_from_a_right_claim(
+    seed: int, anchors: list[tuple[float, float]], attackers: dict[int, Any], unanchored: int
+) -> None:
+    robots: list[dict[str, Any]] = [{"id": f"r{i}", "anchor": [*at]} for i, at in enumerate(anchors)]
+    for i, attack in attackers.items():
+        robots[i]["attack"] = attack
+    robots += [{"id": f"u{i}"} for i in range(unanchored)]
+    table = {**five(), "seed": seed, "robot": robots}
+    table["mission"] |= {"area": [0.0, 0.0, 25.0, 25.0], "tolerates": 2}
+    assert all_right(run_mission(scenario_of(table)))
+
+
 def test_a_robot_that_searches_for_the_one_that_comes_to_it_is_visited_by_it() -> None:
     """Robot r3, whose meeting with the attacker has failed, searches for r4, which visits it meanwhile.
 
