@@ -157,6 +157,29 @@ SLIGHTLY_FARTHER = {"kind": "radius", "size": 1e-6}
             2,
             id="an attacker is localised beside a robot that has found it",
         ),
+        pytest.param(
+            107945,
+            [
+                (8.3, 1.0),
+                (10.2, 7.0),
+                (2.7, 6.3),
+                (12.0, 11.1),
+                (5.1, 9.4),
+                (1.9, 1.6),
+                (8.8, 0.6),
+                (11.5, 2.2),
+            ],
+            {4: {"kind": "heading", "size": 1e-6}, 6: SLIGHTLY_FARTHER},
+            1,
+            id="an attacker that has been found stays beside a robot that others visit",
+        ),
+        pytest.param(
+            316929,
+            [(11.67, 6.57), (6.83, 8.24), (2.97, 8.55), (4.38, 10.16), (5.54, 7.96)],
+            {1: {"kind": "rotate", "part": "orbit", "size": 0.2}, 4: {"kind": "radius", "size": 0.3}},
+            2,
+            id="two robots that are near each other have a retry",
+        ),
     ],
 )
 def test_two_attackers_of_different_kinds_keep_no_honest_robot_from_a_right_claim(
@@ -165,9 +188,10 @@ def test_two_attackers_of_different_kinds_keep_no_honest_robot_from_a_right_clai
     robots: list[dict[str, Any]] = [{"id": f"r{i}", "anchor": [*at]} for i, at in enumerate(anchors)]
     for i, attack in attackers.items():
         robots[i]["attack"] = attack
-    robots += [{"id": f"u{i}"} for i in range(unanchored)]
-    table = {**five(), "seed": seed, "robot": robots}
-    table["mission"] |= {"area": [0.0, 0.0, 25.0, 25.0], "tolerates": 2}
+    robots += [{"id": f"u{len(anchors) + i}"} for i in range(unanchored)]
+    table = {**five(), "seed": seed, "robot": robots, "max_ticks": 2000}
+    side = math.ceil(max(max(at) for at in anchors))
+    table["mission"] |= {"area": [0.0, 0.0, side, side], "tolerates": 2}
     assert all_right(run_mission(scenario_of(table)))
 
 

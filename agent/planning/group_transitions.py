@@ -50,10 +50,9 @@ def answering(state: GroupState, visitors: Sequence[str]) -> GroupState:
     pair = state.pair
     if state.verdict is not None or pair.belief.phase1_done_tick is None:
         return state
-    if pair.config.peer in visitors:
+    if pair.config.peer in visitors and not refused(state, pair.config.peer):
         # a robot that searches for its peer must not wait for that one's manoeuvre while it waits for its own
-        searches = state.config.role == "a" and not refused(state, pair.config.peer)
-        return _waiting(state, pair.config.peer) if searches else state
+        return _waiting(state, pair.config.peer) if state.config.role == "a" else state
     if _is_met(state):
         return state
     for visitor in visitors:
@@ -240,7 +239,9 @@ def _trying_again(state: GroupState) -> GroupState:
         return state
     retry = config.retries[state.retries]
     state = replace(state, retries=state.retries + 1)
-    if _is_met(state) or refused(state, retry.peer):
+    # with its peer, which it has only been near so far, the robot meets in the roles of the retry
+    begun = retry.peer != config.peer or pair.peer_state.latest >= 0
+    if (begun and _is_met(state)) or refused(state, retry.peer):
         return state
     return _in_retry(state, retry)
 
