@@ -183,8 +183,7 @@ def test_a_localised_robot_waits_for_its_peer_beside_it_for_a_bounded_time(
     silence: int, refused: bool, leaves: bool
 ) -> None:
     scenario = group_of(3, 1)
-    visitor = next(one.visitor for one in scenario.meetings if scenario.config(one.visitor).visits)
-    config = scenario.config(visitor)
+    config = scenario.config(scenario.meetings[-1].visitor)
     planner = planner_of(config)
     state, claim = planner.start(config), Localised(Pose(0.0, 0.0, 0.0))
     pair = replace(state.pair, mode=Done(3, claim), in_contact=True)
