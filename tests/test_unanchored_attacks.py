@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import combinations
 from typing import Any
 
 import pytest
@@ -32,7 +33,7 @@ from protocol.motion import ORIGIN, REST, Controls, Pose, Segment, compose, step
 from protocol.rounding import TOLERANCE
 from tests.test_audit import kept
 from tests.test_group_runs import audited
-from tests.test_unanchored import four, last_claim, scenario_of
+from tests.test_unanchored import four, last_claim, scenario_of, table_with
 from world.scenario import Scenario
 
 REFRAME = {"kind": "reframe", "size": 1.0}
@@ -193,6 +194,21 @@ def test_two_attackers_of_different_kinds_keep_no_honest_robot_from_a_right_clai
     side = math.ceil(max(max(at) for at in anchors))
     table["mission"] |= {"area": [0.0, 0.0, side, side], "tolerates": 2}
     assert all_right(run_mission(scenario_of(table)))
+
+
+@pytest.mark.parametrize(("anchored", "tolerates"), [(3, 1), (4, 1), (5, 2), (6, 2), (9, 2), (7, 3), (9, 4)])
+def test_some_pair_of_the_plan_is_without_any_robots_that_may_report_false_data(
+    anchored: int, tolerates: int
+) -> None:
+    for seed in range(4):
+        table = table_with(anchored + 1, 1, seed)
+        table["mission"]["tolerates"] = tolerates
+        scenario = scenario_of(table)
+        peers = {robot.id: scenario.config(robot.id).peer for robot in scenario.robots}
+        pairs = [(robot, peer) for robot, peer in peers.items() if peers[peer] == robot]
+        pairs += [(one.visitor, one.visited) for one in scenario.retries]
+        for attackers in combinations([one.id for one in scenario.robots], tolerates):
+            assert any(not {*pair} & {*attackers} for pair in pairs)
 
 
 def test_a_robot_that_searches_for_the_one_that_comes_to_it_is_visited_by_it() -> None:
