@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import re
 import socket
+import time
 from pathlib import Path
 
 import pytest
 
 from compose.errors import BadScenario
 from compose.scenario.scenario_file import parse
+from protocol.mission import Mission, infeasibility
 from tests.commands import PAPER_1, Ended, several_pairs, tandem, world
 
 LISTEN = ("--listen", "tcp/127.0.0.1:7447")
@@ -195,6 +197,13 @@ AMOUNTS = {
 """Invalid values for the fields of `noise`."""
 
 
+def test_a_mission_in_which_a_turn_takes_a_month_is_checked_at_once() -> None:
+    """The largest error of phase 1 is sought among the ticks of half a turn: here, three million."""
+    begin = time.process_time()
+    assert infeasibility(Mission(3.0, 1.0, 1.0, 1e-6), 10.0) is None
+    assert time.process_time() - begin < 0.5
+
+
 def with_noise(field: str, value: str) -> str:
     """Return GOOD with that field in its mission table; dotted TOML keys are nested tables."""
     return changed(GOOD, "[mission]\n", f"[mission]\n{field} = {value}\n")
@@ -245,6 +254,8 @@ def test_noise_misspelt_is_named(field: str, says: str) -> None:
             "noise.outlier_bias: the lower bound 2 m is above the upper bound 0.3 m",
         ),
         ("noise.outlier_bias", "[-0.1, 0.3]", "noise.outlier_bias[0]: "),
+        ("noise.sigma_degrees", "5e-324", "noise.sigma_degrees: set 0 or at least 1e-300"),
+        ("noise.strays", "5e-324", "noise.strays: set 0 or at least 1e-300"),
         ("noise.outlier_bias", "[0.3, nan]", "noise.outlier_bias[1]: "),
         ("noise.outlier_bias", "[0.3, 2e6]", "noise.outlier_bias[1]: "),
         (

@@ -14,14 +14,17 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from agent.planning import group_transitions
 from agent.planning.group import TRAVELLING
+from agent.planning.group_transitions import SILENT_AFTER
 from agent.planning.phase2_orbit import Travelling, next_side, travel_controls
+from agent.planning.state import Done
 from compose.errors import BadScenario, Unworkable, UserError
 from compose.launch.in_process import run_mission
 from compose.launch.planner_loader import planner_of
 from compose.recording.run import Run, read
 from compose.scenario.scenario_file import validate
-from protocol.messages import Localised, Report, RobotConfigInGroup
+from protocol.messages import Contact, Localised, Observation, Report, RobotConfigInGroup, Undecided
 from protocol.mission import HEADING_ACCURACY, Mission
 from protocol.motion import Pose, step
 from protocol.wire import MAX_REPORT_BYTES, encode
@@ -154,6 +157,39 @@ def test_a_robot_whose_meetings_with_all_others_have_failed_gives_up_at_once() -
     claims = [claim.tick for robot in ("r0", "r1") if (claim := run.claim(robot)) is not None]
     assert run.end.tick < max(claims) + 20
     assert run.end.tick < 0.5 * scenario.max_ticks
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.05])
+def test_a_robot_in_phase_1_goes_on_with_it_when_its_peer_ends_their_meeting(sigma: float) -> None:
+    config = group_of(3, 1, sigma=sigma).config("r0")
+    planner = planner_of(config)
+    near = (Contact(config.peer, 2.0, (0,)),)
+    state = planner.observe(planner.start(config), Observation(0, "r0", None, 1.0, near))
+    refusal = Report(0, config.peer, 1, "straight", None, 0, 0, (), 0, (), 0, 0, Undecided("a false log"))
+    after = planner.decide(state, [refusal])
+    assert after.verdict is None
+    assert after.other(config.peer).failed
+    command = planner.command(after)
+    assert (command.phase, command.state) == (1, "straight")
+    assert command.v > 0.0
+
+
+@pytest.mark.parametrize(
+    ("silence", "refused", "leaves"),
+    [(SILENT_AFTER, False, False), (SILENT_AFTER + 1, False, True), (0, True, True)],
+    ids=["the peer may still report its result", "the peer is silent", "the peer has ended the meeting"],
+)
+def test_a_localised_robot_waits_for_its_peer_beside_it_for_a_bounded_time(
+    silence: int, refused: bool, leaves: bool
+) -> None:
+    scenario = group_of(3, 1)
+    config = scenario.config(scenario.meetings[-1].visitor)
+    planner = planner_of(config)
+    state, claim = planner.start(config), Localised(Pose(0.0, 0.0, 0.0))
+    pair = replace(state.pair, mode=Done(3, claim), in_contact=True)
+    assert pair.verdict == claim
+    state = replace(state, pair=pair, verdict=claim, silence=silence)
+    assert group_transitions.onward(state, peer_has_left=refused).visiting == leaves
 
 
 def test_a_robot_sends_its_log_only_to_the_robot_that_it_meets(tmp_path: Path) -> None:

@@ -54,6 +54,30 @@ id = "c"
 id = "d"
 """
 """A group in which a and b meet first, and find c and d, which have no anchor, after 20 ticks."""
+TOLERANT = f"""name = "four"
+seed = 17
+{SECTION_IV}
+area = [0.0, 0.0, 7.0, 6.0]
+tolerates = 1
+[[robot]]
+id = "a"
+anchor = [0.0, 0.0]
+attack = {{kind = "reframe", size = 1.0}}
+[[robot]]
+id = "b"
+anchor = [7.0, 1.0]
+[[robot]]
+id = "c"
+anchor = [3.0, 6.0]
+[[robot]]
+id = "d"
+anchor = [1.0, 3.0]
+[[robot]]
+id = "e"
+[[robot]]
+id = "f"
+"""
+"""A group in which a reports false poses to e and f, which claim theirs by others after 20 ticks."""
 RATE = 4
 
 
@@ -75,7 +99,7 @@ class Group:
     def start(self, *names: str) -> None:
         """Start these robots, with the same commands each time."""
         for name in names:
-            start, place = self.scenario.robot(name).start, "abcd".index(name)
+            start, place = self.scenario.robot(name).start, "abcdef".index(name)
             connect = [word for one in self._endpoints[:place] for word in ("--connect", one)]
             self.robots[name] = self._open.enter_context(
                 TandemProcess(
@@ -228,10 +252,28 @@ def test_robots_without_an_anchor_localise_in_hardware_mode(tmp_path: Path, kill
         four.start("a", "b", "c", "d")
         for name in killed:
             four.robots[name].until(lambda name=name: len(steps(tmp_path, name)) > at, "some ticks are over")  # type: ignore[misc]
+        for name in killed:  # once one is killed, the others measure no further ticks
             four.kill(name)
         four.start(*killed)
         all_are_localised(tmp_path, four)
         assert all("resumed at tick" in four.robots[name].out for name in killed)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("killed", "at"), [("", 0), ("a", 16), ("bf", 18)])
+def test_robots_that_tolerate_an_attacker_localise_in_hardware_mode(
+    tmp_path: Path, killed: str, at: int
+) -> None:
+    """Also if the attacker is killed, or an honest finder and a robot that waits for a second one are."""
+    with group(tmp_path, TOLERANT) as six:
+        six.start(*"abcdef")
+        for name in killed:
+            six.robots[name].until(lambda name=name: len(steps(tmp_path, name)) > at, "some ticks are over")  # type: ignore[misc]
+        for name in killed:  # once one is killed, the others measure no further ticks
+            six.kill(name)
+        six.start(*killed)
+        all_are_localised(tmp_path, six)
+        assert all("resumed at tick" in six.robots[name].out for name in killed)
 
 
 @pytest.mark.long

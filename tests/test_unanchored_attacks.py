@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+from itertools import combinations
 from typing import Any
 
 import pytest
 from msgspec.structs import replace
 
+from agent.planning.group import TRAVELLING
 from agent.planning.unanchored import UnanchoredPlanner, UnanchoredState
 from compose.audit.replay import replayed
 from compose.errors import UserError
 from compose.launch.in_process import run_mission
+from compose.launch.planner_loader import planner_of
 from compose.recording.run import Run, of_frames
 from compose.scenario.scenario_change import file_table
 from compose.scenario.scenario_file import ScenarioTemplate, validate
@@ -23,13 +26,14 @@ from protocol.messages import (
     Observation,
     Report,
     ReportWithPose,
+    RobotConfigInGroup,
     Undecided,
 )
-from protocol.motion import ORIGIN, Controls, Pose, compose, step, wrap
+from protocol.motion import ORIGIN, REST, Controls, Pose, Segment, compose, step, wrap
 from protocol.rounding import TOLERANCE
 from tests.test_audit import kept
 from tests.test_group_runs import audited
-from tests.test_unanchored import four, last_claim, scenario_of
+from tests.test_unanchored import four, last_claim, scenario_of, table_with
 from world.scenario import Scenario
 
 REFRAME = {"kind": "reframe", "size": 1.0}
@@ -124,6 +128,89 @@ def test_no_shipped_attack_leads_to_a_wrong_claim() -> None:
         assert all_right(run_mission(template.seeded(3))), cell
 
 
+SLIGHTLY_LONGER = {"kind": "shift", "part": "all", "size": 1e-6}
+SLIGHTLY_FARTHER = {"kind": "radius", "size": 1e-6}
+
+
+@pytest.mark.parametrize(
+    ("seed", "anchors", "attackers", "unanchored"),
+    [
+        pytest.param(
+            480005,
+            [
+                (2.7, 1.1),
+                (7.4, 15.3),
+                (0.4, 10.3),
+                (20.7, 19.7),
+                (4.7, 19.6),
+                (14.7, 4.1),
+                (11.3, 17.0),
+                (4.0, 21.1),
+            ],
+            {6: SLIGHTLY_LONGER, 7: SLIGHTLY_FARTHER},
+            1,
+            id="an attacker is found while it is in phase 1",
+        ),
+        pytest.param(
+            591718,
+            [(5.1, 16.9), (12.5, 3.3), (17.2, 17.8), (7.6, 6.4), (7.8, 8.3)],
+            {2: SLIGHTLY_LONGER, 3: SLIGHTLY_FARTHER},
+            2,
+            id="an attacker is localised beside a robot that has found it",
+        ),
+        pytest.param(
+            107945,
+            [
+                (8.3, 1.0),
+                (10.2, 7.0),
+                (2.7, 6.3),
+                (12.0, 11.1),
+                (5.1, 9.4),
+                (1.9, 1.6),
+                (8.8, 0.6),
+                (11.5, 2.2),
+            ],
+            {4: {"kind": "heading", "size": 1e-6}, 6: SLIGHTLY_FARTHER},
+            1,
+            id="an attacker that has been found stays beside a robot that others visit",
+        ),
+        pytest.param(
+            316929,
+            [(11.67, 6.57), (6.83, 8.24), (2.97, 8.55), (4.38, 10.16), (5.54, 7.96)],
+            {1: {"kind": "rotate", "part": "orbit", "size": 0.2}, 4: {"kind": "radius", "size": 0.3}},
+            2,
+            id="two robots that are near each other have a retry",
+        ),
+    ],
+)
+def test_two_attackers_of_different_kinds_keep_no_honest_robot_from_a_right_claim(
+    seed: int, anchors: list[tuple[float, float]], attackers: dict[int, Any], unanchored: int
+) -> None:
+    robots: list[dict[str, Any]] = [{"id": f"r{i}", "anchor": [*at]} for i, at in enumerate(anchors)]
+    for i, attack in attackers.items():
+        robots[i]["attack"] = attack
+    robots += [{"id": f"u{len(anchors) + i}"} for i in range(unanchored)]
+    table = {**five(), "seed": seed, "robot": robots, "max_ticks": 2000}
+    side = math.ceil(max(max(at) for at in anchors))
+    table["mission"] |= {"area": [0.0, 0.0, side, side], "tolerates": 2}
+    assert all_right(run_mission(scenario_of(table)))
+
+
+@pytest.mark.parametrize(("anchored", "tolerates"), [(3, 1), (4, 1), (5, 2), (6, 2), (9, 2), (7, 3), (9, 4)])
+def test_some_pair_of_the_plan_is_without_any_robots_that_may_report_false_data(
+    anchored: int, tolerates: int
+) -> None:
+    for seed in range(4):
+        table = table_with(anchored + 1, 1, seed)
+        table["mission"]["tolerates"] = tolerates
+        scenario = scenario_of(table)
+        peers = {robot.id: scenario.config(robot.id).peer for robot in scenario.robots}
+        pairs = [(robot, peer) for robot, peer in peers.items() if peers[peer] == robot]
+        pairs += [(one.visitor, one.visited) for one in scenario.retries]
+        for attackers in combinations([one.id for one in scenario.robots], tolerates):
+            assert any(not {*pair} & {*attackers} for pair in pairs)
+
+
 def test_a_robot_that_searches_for_the_one_that_comes_to_it_is_visited_by_it() -> None:
     """Robot r3, whose meeting with the attacker has failed, searches for r4, which visits it meanwhile.
 
@@ -134,6 +221,25 @@ def test_a_robot_that_searches_for_the_one_that_comes_to_it_is_visited_by_it() -
     attack = {"kind": "rotate", "part": "encounter", "size": math.radians(1.0)}
     table["group"] = {"robots": 6, "spacing": 30.0, "without_anchor": 2, "attack": attack}
     assert all_right(run_mission(scenario_of(table)))
+
+
+def test_a_robot_without_an_anchor_that_claims_to_visit_is_not_met() -> None:
+    """It has no anchor and no log. One that reports a log all the same is in no meeting."""
+    scenario = scenario_of(five())
+    config = scenario.config("a")
+    planner = planner_of(config)
+    assert isinstance(config, RobotConfigInGroup)
+    run = run_mission(scenario)
+    done = next(tick for tick, one in enumerate(run.ticks) if one.commands["a"].phase > 1)
+    state = planner.start(config)
+    for tick in range(done + 1):
+        state = planner.decide(planner.observe(state, run.observations[tick]["a"]))
+    assert state.verdict is None
+    visit = Report(done, "u", 3, TRAVELLING, ORIGIN, 0, 1, (Segment(1, 0.0, 0.0),), 0, (), 0, 0)
+    assert visit.has_log
+    met = Observation(done + 1, "a", REST, None, (Contact("u", 1.0, (done,)),))
+    after = planner.decide(planner.observe(state, met), [visit])
+    assert after.config.peer == config.peer
 
 
 # --- the robot without an anchor ----------------------------------------------------------------------

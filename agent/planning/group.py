@@ -105,7 +105,8 @@ class GroupPlanner(Planner[GroupState, Report]):
         """Return `state` with the `reports` of others, and in the next meeting if this one has ended."""
         for one in reports:
             state = with_sender(state, one)
-        logs = [one for one in reports if one.has_log]
+        anchored = [one.robot for one in state.config.members]
+        logs = [one for one in reports if one.has_log and one.robot in anchored]  # others are in no meeting
         state = group_transitions.answering(state, [one.robot for one in logs if one.state == TRAVELLING])
         peer, before = state.pair.config.peer, state.pair
         alone = state.sweeps or group_transitions.refused(state, peer)
@@ -119,15 +120,12 @@ class GroupPlanner(Planner[GroupState, Report]):
             known = replace(state.other(peer), localised=True)
             state = group_transitions.with_claim(state.with_other(peer, known), pair.verdict)
         refusals = [one for one in reports if one.robot == peer and not one.has_log]
-        if (
-            pair.verdict is None
-            and not alone
-            and any(isinstance(one.verdict, Inconsistent | Undecided) for one in refusals)
-        ):
+        has_failed = any(isinstance(one.verdict, Inconsistent | Undecided) for one in refusals)
+        if pair.verdict is None and not alone and has_failed:
             return group_transitions.after_refusal(state)
         # exact robots claim within a tick of each other, and wait for each other's verdict
         left = any(isinstance(one.verdict, Localised) and one.verdict.covariance for one in refusals)
-        return group_transitions.onward(state, peer_has_left=left)
+        return group_transitions.onward(state, peer_has_left=left or has_failed)
 
     def command(self, state: GroupState) -> Command:
         """Return the command for the next tick, with the phase, the mode and the robot's verdict."""

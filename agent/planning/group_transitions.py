@@ -50,11 +50,10 @@ def answering(state: GroupState, visitors: Sequence[str]) -> GroupState:
     pair = state.pair
     if state.verdict is not None or pair.belief.phase1_done_tick is None:
         return state
-    if pair.config.peer in visitors:
+    if pair.config.peer in visitors and not refused(state, pair.config.peer):
         # a robot that searches for its peer must not wait for that one's manoeuvre while it waits for its own
-        searches = state.config.role == "a" and not refused(state, pair.config.peer)
-        return _waiting(state, pair.config.peer) if searches else state
-    if _is_met(state) and state.silence <= SILENT_AFTER:
+        return _waiting(state, pair.config.peer) if state.config.role == "a" else state
+    if _is_met(state):
         return state
     for visitor in visitors:
         if not refused(state, visitor):
@@ -68,11 +67,16 @@ def _is_met(state: GroupState) -> bool:
     With noise, one that has not done so by its bound may never do so. Of exact ranges, a few suffice.
     """
     pair, config = state.pair, state.config
-    if not pair.in_contact or refused(state, config.peer):
+    if not pair.in_contact or _is_silent(state) or refused(state, config.peer):
         return False
     until = state.until if state.until is not None else 0.0
     is_noisy, ends = pair.estimator.corrects_poses, config.member(config.robot).ends
     return not is_noisy or pair.tick <= ends or _now(pair) < until
+
+
+def _is_silent(state: GroupState) -> bool:
+    """Return whether this robot takes its peer, which is in range, for lost."""
+    return state.silence > SILENT_AFTER
 
 
 def refused(state: GroupState, robot: str) -> bool:
@@ -136,21 +140,24 @@ def after_refusal(state: GroupState) -> GroupState:
     if state.visiting:
         return next_visit(_after_meeting(state))
     failure = Undecided(f"{state.config.peer} does not go on with the meeting")
+    if state.pair.belief.phase1_done_tick is None:
+        return without_peer(state, failure)
     return _resumed(_after_meeting(replace(state, failure=failure)))
 
 
 def without_peer(state: GroupState, failure: Verdict) -> GroupState:
-    """Return `state` of a robot in phase 1 that goes on with it: the reports of its peer have failed."""
+    """Return `state` of a robot in phase 1 that goes on with it, without its peer, because of `failure`."""
     return _after_meeting(replace(state, failure=failure))
 
 
 def onward(state: GroupState, *, peer_has_left: bool = False) -> GroupState:
     """Return `state` in the next meeting if the present one is over.
 
-    `peer_has_left` says that the peer is localised, and has reported it from outside the meeting.
+    `peer_has_left` says that the peer has a result, and has reported it from outside the meeting.
     """
     pair, peer = state.pair, state.pair.config.peer
-    over = peer_has_left or pair.peer_state.verdict is not None or state.unmet >= PARTED_AFTER
+    left = peer_has_left or state.unmet >= PARTED_AFTER or _is_silent(state)
+    over = left or pair.peer_state.verdict is not None
     if _is_withdrawn(state):
         return _waiting(replace(_after_meeting(state), visiting=False), peer) if over else state
     if not isinstance(state.verdict, Localised):
@@ -165,7 +172,7 @@ def onward(state: GroupState, *, peer_has_left: bool = False) -> GroupState:
         if _has_searched(state):
             known = replace(state.other(peer), missed=pair.tick)
             return next_visit(state.with_other(peer, known))
-        if state.silence > SILENT_AFTER:
+        if _is_silent(state):
             return next_visit(_after_meeting(state))
         return state
     if not isinstance(pair.mode, Done) or _must_linger(state):
@@ -191,7 +198,7 @@ def _after_failure(state: GroupState) -> GroupState:
         return replace(state, verdict=pair.verdict or state.failure or late)
     if pair.verdict is not None:
         state = _resumed(_after_meeting(replace(state, failure=pair.verdict)))
-    elif _has_orbited(state) and not pair.in_contact:
+    elif _has_orbited(state) and (not pair.in_contact or _is_silent(state)):
         state = _waiting(replace(state, until=None), config.peer)
     return _trying_again(state)
 
@@ -232,7 +239,9 @@ def _trying_again(state: GroupState) -> GroupState:
         return state
     retry = config.retries[state.retries]
     state = replace(state, retries=state.retries + 1)
-    if _is_met(state) or refused(state, retry.peer):
+    # with its peer, which it has only been near so far, the robot meets in the roles of the retry
+    begun = retry.peer != config.peer or pair.peer_state.latest >= 0
+    if (begun and _is_met(state)) or refused(state, retry.peer):
         return state
     return _in_retry(state, retry)
 

@@ -90,10 +90,11 @@ def planned_meetings(found: Scenario) -> GroupMeetings:
     robots = [RobotTable(robot, (at.x, at.y) if at is not None else None) for robot, at in anchors]
     planner = PlannerTable(found.planner_name, found.planner_options)
     anchored = [one for one in robots if one.anchor is not None]
-    meetings = group_meetings(anchored, found.mission, planner, found.faults)
     if (planned := found.planned_sweep) is None:
-        return meetings
-    return with_sweep(robots, planned.sweep.bounds, found.mission, meetings, tolerates=planned.tolerates)
+        return group_meetings(anchored, found.mission, planner, found.faults)
+    tolerates = planned.tolerates
+    meetings = group_meetings(anchored, found.mission, planner, found.faults, tolerates=tolerates)
+    return with_sweep(robots, planned.sweep.bounds, found.mission, meetings, tolerates=tolerates)
 
 
 def _off_first(robot: RobotSpec, first: FirstMeeting) -> str | None:

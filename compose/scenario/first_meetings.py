@@ -47,8 +47,10 @@ def meetings_of(file: ScenarioFile, faults: Sequence[Fault], source: str) -> Gro
     # least accurate are robots that are very near to each other, and those that have a long way
     _check_accuracy(file, (min(distances), max(distances)), source)
     try:
-        meetings = group_meetings([robots[i] for i in anchored], file.mission, file.planner, faults)
-        return with_sweep(robots, file.mission.area, file.mission, meetings, tolerates=file.mission.tolerates)
+        tolerates = file.mission.tolerates
+        anchors = [robots[i] for i in anchored]
+        meetings = group_meetings(anchors, file.mission, file.planner, faults, tolerates=tolerates)
+        return with_sweep(robots, file.mission.area, file.mission, meetings, tolerates=tolerates)
     except Unworkable as error:
         raise Unworkable(f"{source}: {error}") from None
 

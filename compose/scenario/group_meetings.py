@@ -29,7 +29,7 @@ The search for hypotheses takes the measured path for nearly right. With 0.003 r
 """
 
 RETRIES = 2
-"""The number of pairs that try again, one after the other. With three robots, they are all other pairs."""
+"""The least number of pairs that try again, in turn. With three robots, they are all other pairs."""
 
 SLOWER = 2.0
 """The time for the visits after them, in units of the planned one: robots are not where they were planned."""
@@ -71,9 +71,16 @@ class GroupMeetings(NamedTuple):
 
 
 def group_meetings(
-    robots: Sequence[RobotTable], mission: Mission, planner: PlannerTable, faults: Sequence[Fault] = ()
+    robots: Sequence[RobotTable],
+    mission: Mission,
+    planner: PlannerTable,
+    faults: Sequence[Fault] = (),
+    *,
+    tolerates: int = 0,
 ) -> GroupMeetings:
     """Return the meetings of `robots`, which have anchors, planned for the shortest bound.
+
+    `tolerates` of them may report false data: some pair of the plan is without them.
 
     Who meets whom does not depend on the `faults` of the radio, but the bounds do. Raises Unworkable if the
     planner is not made for groups, and UserError if it cannot be loaded.
@@ -128,7 +135,7 @@ def group_meetings(
     seeds = [(one.visitor, one.visited) for one in plan.meetings if one.first]
     spread = bound - min(one.ends for one in meetings if one.first)
     begins, retries = bound + SLOWER * spread, []
-    for i, j in _retried(seeds, len(robots), pair_time):
+    for i, j in _retried(seeds, len(robots), pair_time, tolerates):
         lasts = pair_time(i, j) + extra[0] * mission.period
         retries.append(PlannedRetry(ids[i], ids[j], rendezvous(i, j), begins, lasts))
         begins += lasts + SLOWER * spread
@@ -160,21 +167,20 @@ def rounded_down(value: float) -> float:
 
 
 def _retried(
-    seeds: Sequence[tuple[int, int]], robots: int, pair_time: Callable[[int, int], float]
+    seeds: Sequence[tuple[int, int]], robots: int, pair_time: Callable[[int, int], float], tolerates: int
 ) -> list[tuple[int, int]]:
     """Return the pairs that try again in their order: robots that have been in few pairs, then quick pairs.
 
-    If one robot is the reason why a first pair has failed, one of the next two pairs is without it.
+    If one robot is the reason why a first pair has failed, one of the next two pairs is without it. There are
+    more than two if `tolerates` robots could be in all pairs, the first ones included.
     """
     uses = [sum([robot in pair for pair in seeds]) for robot in range(robots)]
     tried = {frozenset(pair) for pair in seeds}
+    timed = [(pair_time(a, b), a, b) for a, b in permutations(range(robots), 2)]
+    possible = [one for one in timed if one[0] < math.inf]
     found: list[tuple[int, int]] = []
-    while len(found) < RETRIES:
-        left = [
-            (uses[a] + uses[b], pair_time(a, b), a, b)
-            for a, b in permutations(range(robots), 2)
-            if frozenset((a, b)) not in tried and pair_time(a, b) < math.inf
-        ]
+    while len(found) < RETRIES or len(tried) <= sum(sorted(uses, reverse=True)[:tolerates]):
+        left = [(uses[a] + uses[b], time, a, b) for time, a, b in possible if frozenset((a, b)) not in tried]
         if not left:
             break
         _, _, a, b = min(left)

@@ -27,6 +27,7 @@ from protocol.mission import (
     Mission,
     noise_infeasibility,
     safety_infeasibility,
+    too_small,
 )
 from protocol.motion import TAU, Pose, wrap
 from protocol.noise import with_profile
@@ -334,7 +335,7 @@ def _check_noise(mission: Mission, source: str) -> None:
             f"{source}: mission.noise.outlier_bias: the lower bound {least:.6g} m is above the upper "
             f"bound {most:.6g} m"
         )
-    why = noise_infeasibility(mission) or safety_infeasibility(mission)
+    why = too_small(mission.noise) or noise_infeasibility(mission) or safety_infeasibility(mission)
     if why is not None:
         raise Unworkable(f"{source}: mission.{why}")
 
