@@ -405,6 +405,15 @@ class RobotConfigInGroup(RobotConfigWithOptions, frozen=True, dict=True):
         return msgspec.structs.replace(self, peer=peer, role=role, peer_anchor=anchor, rendezvous=orbits)
 
 
+class RobotConfigWithConfirmation(RobotConfigInGroup, frozen=True, dict=True):
+    """The configuration of a robot in a group that tolerates false data: its claim needs several peers."""
+
+    tolerates: Annotated[int, Meta(ge=0, le=MAX_MEMBERS)] = 0
+    """The number of robots that may report false data: one more must agree on a pose before it is claimed."""
+    confirmations: Annotated[tuple[Retry, ...], Meta(max_length=3 * MAX_MEMBERS)] = ()
+    """The visits that it makes for this, in their order. Each lasts until the robot is back at its anchor."""
+
+
 class RobotConfigWithSweep(RobotConfigInGroup, frozen=True, dict=True):
     """The configuration of a robot that sweeps an area for robots without an anchor, after its visits."""
 
@@ -444,6 +453,7 @@ AnyRobotConfig = (
     RobotConfig
     | RobotConfigWithOptions
     | RobotConfigInGroup
+    | RobotConfigWithConfirmation
     | RobotConfigWithSweep
     | RobotConfigWithoutAnchor
 )
@@ -703,6 +713,7 @@ OfRobot = (
     | RobotConfig
     | RobotConfigWithOptions
     | RobotConfigInGroup
+    | RobotConfigWithConfirmation
     | RobotConfigWithSweep
     | RobotConfigWithoutAnchor
     | Observation

@@ -90,7 +90,13 @@ def test_the_robot_r1_of_a_drawn_group_may_have_an_attack() -> None:
 
 @pytest.mark.parametrize(
     ("name", "of_group"),
-    [("group", True), ("group-attacks", True), ("group-attacks-noise", True), ("loss", False)],
+    [
+        ("group", True),
+        ("group-attacks", True),
+        ("group-attacks-noise", True),
+        ("group-attacks-noise-tolerated", True),
+        ("loss", False),
+    ],
 )
 def test_only_sweeps_of_groups_have_the_columns_of_groups(name: str, of_group: bool) -> None:
     sweep = spec.load(name)

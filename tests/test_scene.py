@@ -9,7 +9,7 @@ from typing import NamedTuple
 import pytest
 from msgspec.structs import replace
 
-from agent.planning.state import MODE_NAMES
+from agent.planning.state import MODE_NAMES, UNCONFIRMED
 from compose.launch import in_process
 from compose.recording.recording_files import WORLD_JOURNAL
 from compose.recording.run import read as read_record
@@ -275,7 +275,7 @@ def test_the_process_that_writes_a_journal_is_known_by_its_lock(tmp_path: Path) 
 
 
 def test_every_state_has_its_sentence() -> None:
-    assert set(MODE_NAMES.values()) | {"localised"} == {*DOING, *SEEKING}
+    assert set(MODE_NAMES.values()) | {"localised", UNCONFIRMED} == {*DOING, *SEEKING}
     robot_setup = of_scenario(load("paper-1")).robot_setup("b")
     for phase in (1, 2, 3):
         for state in (*DOING, *SEEKING):

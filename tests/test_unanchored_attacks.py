@@ -357,7 +357,7 @@ def test_a_changed_scenario_keeps_the_number_of_false_reporters() -> None:
                 [robot.setdefault("anchor", [20.0, 5.0 * len(robot)]) for robot in table["robot"][:4]]
                 and table["robot"].pop()
             ),
-            r"mission.tolerates: it is for groups in which a robot has no anchor",
+            r"mission.tolerates: sensors are exact and all robots have an anchor, so they check all reports",
         ),
     ],
 )

@@ -19,6 +19,7 @@ from protocol.messages import (
     Retry,
     RobotConfig,
     RobotConfigInGroup,
+    RobotConfigWithConfirmation,
     RobotConfigWithOptions,
     RobotConfigWithoutAnchor,
     RobotConfigWithSweep,
@@ -118,6 +119,17 @@ class PlannedSweep(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_
     """The number of robots that may report false data."""
 
 
+class PlannedConfirmation(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """The meetings after which robots claim poses on which several peers agree."""
+
+    tolerates: Annotated[int, Meta(ge=1, le=MAX_MEMBERS)]
+    """The number of robots that may report false data."""
+    visits: tuple[PlannedRetry, ...]
+    """The visits, in the order in which they begin; those of one time are of different robots."""
+    ends: Time
+    """The bound in s of the time at which all have claimed their poses if no robot reports false data."""
+
+
 class Death(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """A robot that is dead for good: it stands still, and measures, sends and receives nothing."""
 
@@ -196,6 +208,11 @@ class Scenario(
         return None
 
     @property
+    def confirmation(self) -> PlannedConfirmation | None:
+        """The meetings that confirm poses; here, None: robots claim the pose that they know."""
+        return None
+
+    @property
     def unanchored(self) -> tuple[str, ...]:
         """The robots without an anchor, in the order of the scenario."""
         return tuple([robot.id for robot in self.robots if robot.given_anchor is None])
@@ -269,6 +286,18 @@ class Scenario(
                 retries=self._retries_of(own.id),
                 gives_up=self.max_ticks * self.mission.period * GIVES_UP,
             )
+            if (planned := self.confirmation) is not None:
+                return RobotConfigWithConfirmation(
+                    **asdict(in_group),
+                    tolerates=planned.tolerates,
+                    confirmations=tuple(
+                        [
+                            Retry(one.visited, "a", one.rendezvous, one.begins, one.lasts)
+                            for one in planned.visits
+                            if one.visitor == own.id
+                        ]
+                    ),
+                )
             return in_group if self.planned_sweep is None else self._sweeping(in_group, self.planned_sweep)
         if not self.planner_options:
             return config
@@ -378,7 +407,25 @@ class ScenarioWithSweep(
     """The search for robots without an anchor."""
 
 
+class ScenarioWithConfirmation(
+    ScenarioOfGroup,
+    frozen=True,
+    array_like=True,
+    forbid_unknown_fields=True,
+    tag="scenario-with-confirmation",
+):
+    """A mission of a group in which some robots may report false data."""
+
+    confirmation: PlannedConfirmation | None = None
+    """The meetings that confirm poses."""
+
+
 RecordedScenario = (
-    Scenario | ScenarioWithWorldNoise | ScenarioWithOptions | ScenarioOfGroup | ScenarioWithSweep
+    Scenario
+    | ScenarioWithWorldNoise
+    | ScenarioWithOptions
+    | ScenarioOfGroup
+    | ScenarioWithSweep
+    | ScenarioWithConfirmation
 )
 """The kinds of scenario in a world's journal."""

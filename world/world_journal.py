@@ -216,7 +216,8 @@ def _unplanned(scenario: Scenario) -> str | None:
     unanchored = scenario.unanchored
     if first.keys() != {robot.id for robot in scenario.robots} - set(unanchored):
         return "in its scenario the meetings are not those of its robots"
-    for retry in scenario.retries:
+    confirming = scenario.confirmation.visits if scenario.confirmation is not None else ()
+    for retry in (*scenario.retries, *confirming):
         if retry.visitor == retry.visited or not {retry.visitor, retry.visited} <= first.keys():
             return "in its scenario the retries are not those of its robots"
     sweep = scenario.planned_sweep

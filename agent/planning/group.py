@@ -61,7 +61,7 @@ class GroupPlanner(Planner[GroupState, Report]):
     def observe(self, state: GroupState, observation: Observation) -> GroupState:
         """Return `state` with the sensor data of one tick, ranges to all robots of the group included."""
         pair = self.pair_planner.observe(state.pair, observation)
-        if pair.in_contact and group_transitions.refused(state, pair.config.peer):
+        if pair.in_contact and (state.alone or group_transitions.refused(state, pair.config.peer)):
             pair = replace(pair, in_contact=False)
         for contact in observation.contacts:
             if contact.peer != pair.config.peer and contact.range is not None:
@@ -94,7 +94,7 @@ class GroupPlanner(Planner[GroupState, Report]):
         """
         if group_transitions.refused(state, peer):
             return exchange.report_without_log(state.pair, state.failure)
-        if peer == state.pair.config.peer and not state.sweeps:
+        if peer == state.pair.config.peer and state.meets:
             return exchange.report(state.pair)
         without_log = exchange.report_without_log(state.pair, state.verdict)
         if not (sweep_transitions.is_helped(state, peer) and isinstance(state.verdict, Localised)):
@@ -104,12 +104,12 @@ class GroupPlanner(Planner[GroupState, Report]):
     def decide(self, state: GroupState, reports: Sequence[Report] = ()) -> GroupState:
         """Return `state` with the `reports` of others, and in the next meeting if this one has ended."""
         for one in reports:
-            state = with_sender(state, one)
+            state = self.with_sender(state, one)
         anchored = [one.robot for one in state.config.members]
         logs = [one for one in reports if one.has_log and one.robot in anchored]  # others are in no meeting
         state = group_transitions.answering(state, [one.robot for one in logs if one.state == TRAVELLING])
         peer, before = state.pair.config.peer, state.pair
-        alone = state.sweeps or group_transitions.refused(state, peer)
+        alone = not state.meets or group_transitions.refused(state, peer)
         of_peer = [] if alone else [one for one in logs if one.robot == peer]
         pair = self.pair_planner.decide(before, of_peer)
         if before.verdict is None and pair.verdict is not None and pair.belief.phase1_done_tick is None:
@@ -117,14 +117,16 @@ class GroupPlanner(Planner[GroupState, Report]):
         silence = state.silence + 1 if pair.in_contact and not of_peer else 0
         state = replace(state, pair=pair, silence=silence)
         if isinstance(pair.verdict, Localised) and before.verdict is None:
-            known = replace(state.other(peer), localised=True)
-            state = group_transitions.with_claim(state.with_other(peer, known), pair.verdict)
+            state = self.with_pose(state, pair.verdict)
         refusals = [one for one in reports if one.robot == peer and not one.has_log]
         has_failed = any(isinstance(one.verdict, Inconsistent | Undecided) for one in refusals)
         if pair.verdict is None and not alone and has_failed:
             return group_transitions.after_refusal(state)
         # exact robots claim within a tick of each other, and wait for each other's verdict
-        left = any(isinstance(one.verdict, Localised) and one.verdict.covariance for one in refusals)
+        left = any(
+            one.state == UNCONFIRMED or (isinstance(one.verdict, Localised) and one.verdict.covariance)
+            for one in refusals
+        )
         return group_transitions.onward(state, peer_has_left=left or has_failed)
 
     def command(self, state: GroupState) -> Command:
@@ -142,15 +144,30 @@ class GroupPlanner(Planner[GroupState, Report]):
         planner does not compute how the noise of the odometry adds up.
         """
         estimate, latest = exchange.estimate(state.pair), state.pair.verdict
-        if not isinstance(state.verdict, Localised):
+        if state.fix is None:
             return estimate
         return replace(
             estimate,
             world=(compose(state.frame, state.pair.odometry),),
-            localised=True,
+            localised=isinstance(state.verdict, Localised),
             probabilities=(),
             covariance=latest.covariance if isinstance(latest, Localised) else None,
         )
+
+    # --- what a subclass decides otherwise ---
+
+    def with_sender(self, state: GroupState, report: Report) -> GroupState:
+        """Return `state` with what `report` says about its sender: whether it travels or is localised."""
+        return with_sender(state, report)
+
+    def with_pose(self, state: GroupState, pose: Localised) -> GroupState:
+        """Return `state` of a robot that has determined its `pose` in the present meeting, and claims it."""
+        peer = state.config.peer
+        state = state.with_other(peer, replace(state.other(peer), localised=True))
+        state = group_transitions.with_claim(state, pose)
+        if state.fix is None:
+            return state
+        return state if state.verdict is not None else replace(state, verdict=pose)
 
     # --- optional ---
 

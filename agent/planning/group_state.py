@@ -72,6 +72,19 @@ class Fix(msgspec.Struct, frozen=True):
     """The robots whose meetings agree, in their order."""
 
 
+class Confirming(msgspec.Struct, frozen=True):
+    """How far the pose of a robot is confirmed, if robots of its group may report false data."""
+
+    meetings: tuple[RobotState, ...] = ()
+    """The states at the claims in its meetings with different peers, in the order of these meetings."""
+    visits: int = 0
+    """The number of visits for this that the robot has begun or left out."""
+    until: float | None = None
+    """The time in s at which the present one ends; None if there is none."""
+    ranges: int = 0
+    """The number of ranges to its anchor when it has last compared the poses of its meetings."""
+
+
 class GroupState(msgspec.Struct, frozen=True):
     """The state of a robot of a group."""
 
@@ -87,6 +100,8 @@ class GroupState(msgspec.Struct, frozen=True):
     """The tick in which it began the latest of them."""
     until: float | None = None
     """The time in s at which the search of a retry ends; None if there is none."""
+    alone: bool = False
+    """True if the robot is back at its anchor, or on its way, and in no meeting until a visitor comes."""
     visiting: bool = False
     """True if the present meeting is a visit: the robot knows its pose already."""
     located: RobotState | None = None
@@ -94,12 +109,14 @@ class GroupState(msgspec.Struct, frozen=True):
     own_pose: OwnPose = OwnPose()
     """What it knows of the accuracy of its pose while it sweeps, with noisy sensors."""
     verdict: Verdict | None = None
-    """The verdict of the robot: that of the meeting which localised it.
+    """The verdict of the robot: the pose that it claims, or why it claims none.
 
     It is None again when another meeting contradicts that one.
     """
     fix: Fix | None = None
-    """The pose that the robot knows; None until it is localised."""
+    """The pose that the robot knows, and by which it drives; None until a meeting has determined it."""
+    confirming: Confirming = Confirming()
+    """How far that pose is confirmed, if a claim of it needs several peers."""
     failure: Verdict | None = None
     """The verdict of the latest meeting that has failed before the robot was localised."""
     frame: Pose = ORIGIN
@@ -114,6 +131,18 @@ class GroupState(msgspec.Struct, frozen=True):
     """The number of consecutive ticks in range of the peer since the end of their meeting."""
     silence: int = 0
     """The number of consecutive ticks in range of the peer without a log of it."""
+
+    @property
+    def waits(self) -> bool:
+        """Return whether the robot meets those that come to it: it knows no pose, or has returned."""
+        if self.fix is None:
+            return self.verdict is None
+        return not (self.visiting or self.sweeps) and self.pair.verdict is None
+
+    @property
+    def meets(self) -> bool:
+        """Return whether the robot exchanges logs with its peer, if they are in contact."""
+        return not (self.alone or self.sweeps)
 
     @property
     def sweeps(self) -> bool:

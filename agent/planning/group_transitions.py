@@ -16,7 +16,15 @@ from agent.planning import passing, phase2_orbit, sweep_transitions, transitions
 from agent.planning.group_state import Fix, GroupState
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Travelling
 from agent.planning.state import Done, RobotState
-from protocol.messages import Contact, Localised, Member, Retry, Undecided, Verdict
+from protocol.messages import (
+    Contact,
+    Localised,
+    Member,
+    Retry,
+    RobotConfigWithConfirmation,
+    Undecided,
+    Verdict,
+)
 from protocol.mission import Role
 from protocol.motion import Pose, compose, inverse
 from protocol.orbits import SEARCH_SIDES, Rendezvous
@@ -48,9 +56,9 @@ LINGERING = 6
 def answering(state: GroupState, visitors: Sequence[str]) -> GroupState:
     """Return `state` in a meeting with one of `visitors`, which have come to it, if it waits for one."""
     pair = state.pair
-    if state.verdict is not None or pair.belief.phase1_done_tick is None:
+    if not state.waits or pair.belief.phase1_done_tick is None:
         return state
-    if pair.config.peer in visitors and not refused(state, pair.config.peer):
+    if pair.config.peer in visitors and not (state.alone or refused(state, pair.config.peer)):
         # a robot that searches for its peer must not wait for that one's manoeuvre while it waits for its own
         return _waiting(state, pair.config.peer) if state.config.role == "a" else state
     if _is_met(state):
@@ -80,12 +88,12 @@ def _is_silent(state: GroupState) -> bool:
 
 
 def refused(state: GroupState, robot: str) -> bool:
-    """Return whether this robot, which is not localised, has had a meeting with `robot` that failed."""
-    return state.verdict is None and state.other(robot).failed
+    """Return whether this robot, which waits for others, has had a meeting with `robot` that failed."""
+    return state.waits and state.other(robot).failed
 
 
 def with_claim(state: GroupState, claim: Localised) -> GroupState:
-    """Return `state` of a robot that has determined its pose in the present meeting.
+    """Return `state` of a robot that has determined its pose in the present meeting, and knows it now.
 
     If this contradicts the pose that it knows, one of two peers has reported false data. A pose on which
     several meetings agree stays. One that follows from a single meeting is withdrawn, because nothing tells
@@ -95,9 +103,8 @@ def with_claim(state: GroupState, claim: Localised) -> GroupState:
     contradiction = _contradiction(state, claim)
     if contradiction is None:
         fix = Fix(pair.tick, claim, (*(fix.peers if fix is not None else ()), peer))
-        verdict = claim if state.verdict is None else state.verdict
         frame = compose(claim.pose, inverse(pair.odometry))
-        return replace(state, verdict=verdict, fix=fix, located=pair, frame=frame)
+        return replace(state, fix=fix, located=pair, frame=frame)
     assert fix is not None
     if len(fix.peers) > 1:
         return _after_meeting(state)
@@ -132,7 +139,7 @@ def withdrawn(state: GroupState, failure: Undecided) -> GroupState:
 
 def _is_withdrawn(state: GroupState) -> bool:
     """Return whether the present meeting contradicts an earlier one, so that the robot knows no pose."""
-    return state.verdict is None and isinstance(state.pair.verdict, Localised)
+    return state.fix is None and state.verdict is None and isinstance(state.pair.verdict, Localised)
 
 
 def after_refusal(state: GroupState) -> GroupState:
@@ -160,14 +167,15 @@ def onward(state: GroupState, *, peer_has_left: bool = False) -> GroupState:
     over = left or pair.peer_state.verdict is not None
     if _is_withdrawn(state):
         return _waiting(replace(_after_meeting(state), visiting=False), peer) if over else state
-    if not isinstance(state.verdict, Localised):
+    if state.fix is None:
         return _after_failure(state)
     if state.sweeps:
+        assert state.verdict is not None
         swept = sweep_transitions.onward(state)
         done = Done(pair.phase, state.verdict)
         return swept or next_visit(replace(state, pair=replace(pair, mode=done)))
     if state.visiting and pair.verdict is None:
-        if state.other(peer).localised:  # by another robot
+        if state.other(peer).localised and state.verdict is not None:  # by another robot
             return next_visit(state)
         if _has_searched(state):
             known = replace(state.other(peer), missed=pair.tick)
@@ -212,7 +220,7 @@ def _has_nobody(state: GroupState) -> bool:
 def _resumed(state: GroupState) -> GroupState:
     """Return `state` of a robot whose meeting has failed: in the retry that it has left, or waiting."""
     config = state.config
-    if state.retries:
+    if state.retries and state.fix is None:
         retry = config.retries[state.retries - 1]
         if not refused(state, retry.peer) and _now(state.pair) < retry.begins + retry.lasts:
             return _in_retry(state, retry)
@@ -294,8 +302,10 @@ def next_visit(state: GroupState) -> GroupState:
         peer = config.visits[visits]
         visits += 1
         if not (state.other(peer).localised or state.other(peer).failed):
-            return _on_visit(replace(state, visits=visits), peer)
+            return on_visit(replace(state, visits=visits), peer)
     state = replace(state, visits=visits)
+    if isinstance(config, RobotConfigWithConfirmation):
+        return at_anchor(state)
     seeks = sweep_transitions.wanted(state)
     if seeks and state.parts == 0:
         return sweep_transitions.next_part(state)
@@ -307,7 +317,7 @@ def next_visit(state: GroupState) -> GroupState:
         if not seeks or _missed(state, one) < state.part_tick  # one tour after each part
     ]
     if late:
-        return _on_visit(state, min(late)[2])
+        return on_visit(state, min(late)[2])
     return sweep_transitions.next_part(state) if seeks else state
 
 
@@ -333,7 +343,12 @@ def _is_late(state: GroupState, member: Member) -> bool:
     return (state.pair.tick - known.missed) * mission.period * mission.max_speed > config.widest_distance
 
 
-def _on_visit(state: GroupState, peer: str) -> GroupState:
+def at_anchor(state: GroupState) -> GroupState:
+    """Return `state` of a robot that returns to its anchor, and waits for any visitor."""
+    return replace(_waiting(state, state.config.peer), alone=True)
+
+
+def on_visit(state: GroupState, peer: str) -> GroupState:
     """Return `state` of a localised robot that drives to `peer`."""
     state = _in_meeting(state, peer, "a")
     pair = replace(state.pair, mode=Travelling(stop(state.frame, state.pair)))
@@ -365,7 +380,7 @@ def _in_meeting(state: GroupState, peer: str, role: Role, orbits: Rendezvous | N
             ranges_at_last_fit=belief.ranges_at_last_fit,
         ),
     )
-    return replace(state, pair=fresh, visiting=False, unmet=0, silence=0)
+    return replace(state, pair=fresh, alone=False, visiting=False, unmet=0, silence=0)
 
 
 def passing_others(state: GroupState, contacts: Sequence[Contact]) -> GroupState:
@@ -421,8 +436,8 @@ def searching(pair: RobotState) -> RobotState:
 
 def _has_searched(state: GroupState) -> bool:
     """Return whether the robot has searched for its peer in vain."""
-    assert isinstance(state.verdict, Localised)
-    mode, sides = state.pair.mode, 0 if state.verdict.covariance is None else SEARCH_SIDES
+    assert state.fix is not None
+    mode, sides = state.pair.mode, 0 if state.fix.claim.covariance is None else SEARCH_SIDES
     return isinstance(mode, Travelling) and mode.side > sides
 
 

@@ -10,6 +10,7 @@ from compose.errors import Unworkable
 from compose.launch import planner_loader
 from compose.recording.run import Run
 from compose.scenario.first_meetings import NEAREST_ANCHORS
+from compose.scenario.group_confirmation import with_confirmation
 from compose.scenario.group_meetings import FirstMeeting, GroupMeetings, group_meetings
 from compose.scenario.group_sweep import with_sweep
 from compose.scenario.scenario_tables import PlannerTable, RobotTable
@@ -71,9 +72,7 @@ def _group(found: Scenario) -> Checks:
         for i, (given, expected) in enumerate(zip(some, others, strict=False)):
             off = None if given == expected else f"{name}[{i}].{difference(given, expected)}"
             yield _violation(None, off)
-    if found.planned_sweep is not None and planned.sweep is not None:
-        given, expected = found.planned_sweep, planned.sweep
-        yield _violation(None, None if given == expected else f"planned_sweep.{difference(given, expected)}")
+    yield _violation(None, _off_search(found, planned))
     for robot in found.robots:
         first = planned.first[robot.id]
         for why in (
@@ -84,12 +83,27 @@ def _group(found: Scenario) -> Checks:
             yield _violation(robot.id, why)
 
 
+def _off_search(found: Scenario, planned: GroupMeetings) -> str | None:
+    """Return how the sweep for robots without an anchor, or the confirming visits, differ from the plan."""
+    if found.planned_sweep is not None and planned.sweep is not None and found.planned_sweep != planned.sweep:
+        return f"planned_sweep.{difference(found.planned_sweep, planned.sweep)}"
+    if found.confirmation is None or planned.confirmation is None:
+        return None
+    if found.confirmation != planned.confirmation:
+        return f"confirmation.{difference(found.confirmation, planned.confirmation)}"
+    return None
+
+
 def planned_meetings(found: Scenario) -> GroupMeetings:
     """Return the meetings of the group in a scenario. Raises Unworkable if its planner has none."""
     anchors = [(robot.id, robot.given_anchor) for robot in found.robots]
     robots = [RobotTable(robot, (at.x, at.y) if at is not None else None) for robot, at in anchors]
     planner = PlannerTable(found.planner_name, found.planner_options)
     anchored = [one for one in robots if one.anchor is not None]
+    if (confirmed := found.confirmation) is not None:
+        tolerates = confirmed.tolerates
+        meetings = group_meetings(anchored, found.mission, planner, found.faults, tolerates=tolerates)
+        return with_confirmation(robots, found.mission, meetings, found.faults, tolerates)
     if (planned := found.planned_sweep) is None:
         return group_meetings(anchored, found.mission, planner, found.faults)
     tolerates = planned.tolerates

@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 from compose.errors import UserError
 from compose.launch.class_loader import named
-from protocol.messages import RobotConfig, RobotConfigInGroup, RobotConfigWithoutAnchor, RobotConfigWithSweep
+from protocol.messages import (
+    RobotConfig,
+    RobotConfigInGroup,
+    RobotConfigWithConfirmation,
+    RobotConfigWithoutAnchor,
+    RobotConfigWithSweep,
+)
 from protocol.mission import Mission
 from protocol.orbits import RENDEZVOUS, Rendezvous, rendezvous
 from protocol.spelling import did_you_mean
@@ -89,6 +95,7 @@ def unguarded_planner_of(config: RobotConfig) -> Planner[Any, Any]:
     if not isinstance(config, RobotConfigInGroup):
         return found
     from agent.planning.assured import AssuredExact  # noqa: PLC0415  # it imports numpy
+    from agent.planning.confirmation import ConfirmingPlanner  # noqa: PLC0415  # likewise
     from agent.planning.group import GroupPlanner  # noqa: PLC0415  # likewise
     from agent.planning.noisy_search import NoisyGroupPlanner  # noqa: PLC0415  # likewise
     from agent.planning.noisy_unanchored import NoisyUnanchoredPlanner  # noqa: PLC0415  # likewise
@@ -99,6 +106,8 @@ def unguarded_planner_of(config: RobotConfig) -> Planner[Any, Any]:
         return UnanchoredPlanner() if exact else NoisyUnanchoredPlanner()
     if not isinstance(found, AssuredExact):
         raise UserError(f"robots with the planner {name} meet in pairs, not in a group")
+    if isinstance(config, RobotConfigWithConfirmation):
+        return ConfirmingPlanner(found)
     searches = isinstance(config, RobotConfigWithSweep) and not exact
     return NoisyGroupPlanner(found) if searches else GroupPlanner(found)
 

@@ -18,7 +18,7 @@ from protocol.orbits import SEARCH_SIDES, meeting_ticks, search_ticks
 from protocol.sweep_strips import Place, widest_distance
 from protocol.sweep_ticks import ticks_of_parts
 from world.faults import exchange_ticks
-from world.scenario import Scenario
+from world.scenario import PlannedConfirmation, Scenario
 
 
 class CorrectedBound(msgspec.Struct, frozen=True):
@@ -43,6 +43,8 @@ def corrected_bounds(run: Run) -> tuple[CorrectedBound, ...]:
     if run.world is None or not run.scenario.meetings:
         return ()
     scenario, last = run.scenario, run.length - 1
+    if scenario.confirmation is not None:
+        return _of_confirmation(run, scenario.confirmation)
     claims = {robot: claim.tick for robot in run.robots if (claim := run.claim(robot)) is not None}
     ends = {one.robot: one.ends for one in scenario.members}
     if (planned := scenario.planned_sweep) is not None:
@@ -68,6 +70,17 @@ def corrected_bounds(run: Run) -> tuple[CorrectedBound, ...]:
         found.append(CorrectedBound(tick, late, bound))
         tick = (bound if min(claims.values(), default=last) <= begins else begins) + 1
     return tuple(found)
+
+
+def _of_confirmation(run: Run, planned: PlannedConfirmation) -> tuple[CorrectedBound, ...]:
+    """Return the end of the visits that confirm poses, if a robot is late after the first pass of them."""
+    period, late = run.scenario.mission.period, math.ceil(planned.ends / run.scenario.mission.period)
+    claims = {robot: run.claim(robot) for robot in run.robots}
+    robots = tuple([robot for robot, claim in claims.items() if claim is None or claim.tick > late])
+    if not robots or late + 1 >= run.length - 1:
+        return ()
+    last = max([one.begins + one.lasts for one in planned.visits], default=planned.ends)
+    return (CorrectedBound(late + 1, robots, math.ceil(last / period)),)
 
 
 def _sweeps_ticks(scenario: Scenario, tour: int) -> int:

@@ -59,12 +59,14 @@ def meeting_results(run: Run) -> Iterator[MeetingResult]:
         return
     claims = {robot: run.claim(robot) for robot in run.robots} if run.scenario.meetings else {}
     period = run.scenario.mission.period
+    confirmed = run.scenario.confirmation
     for one in run.scenario.meetings:
+        ends = confirmed.ends if confirmed is not None else one.ends
         ticks = [claim.tick for robot in (one.visitor, one.visited) if (claim := claims[robot]) is not None]
         yield MeetingResult(
             one.visitor,
             one.visited,
-            one.ends,
-            math.ceil(one.ends / period - ROUNDING),
+            ends,
+            math.ceil(ends / period - ROUNDING),
             max(ticks) if len(ticks) == 2 else None,
         )

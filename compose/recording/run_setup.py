@@ -208,8 +208,8 @@ def of_scenario(scenario: Scenario, mode: str | None = None, tick_s: float | Non
 
 def _bound(scenario: Scenario) -> float:
     """Return the bound T_max in s: that of the group, or the largest of all pairs."""
-    if scenario.planned_sweep is not None:
-        return scenario.planned_sweep.ends
+    if (planned := scenario.confirmation or scenario.planned_sweep) is not None:
+        return planned.ends
     return max(
         [one.ends for one in scenario.meetings] or [robot.rendezvous.bound for robot in scenario.robots]
     )

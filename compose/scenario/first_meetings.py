@@ -9,8 +9,9 @@ from itertools import permutations
 
 from compose.errors import BadScenario, Unworkable
 from compose.launch import planner_loader
+from compose.scenario.group_confirmation import check_tolerated, with_confirmation
 from compose.scenario.group_meetings import FirstMeeting, GroupMeetings, group_meetings
-from compose.scenario.group_sweep import NOT_TOLERATED, check_unanchored, with_sweep
+from compose.scenario.group_sweep import check_unanchored, with_sweep
 from compose.scenario.scenario_tables import RobotTable, ScenarioFile
 from protocol.mission import infeasibility
 from protocol.orbits import Rendezvous
@@ -38,11 +39,13 @@ def meetings_of(file: ScenarioFile, faults: Sequence[Fault], source: str) -> Gro
             if robot.anchor is None:
                 raise BadScenario(f"{source}: robot[{i}]: missing field 'anchor'")
         if file.mission.tolerates:
-            raise Unworkable(f"{source}: {NOT_TOLERATED}")
+            raise Unworkable(f"{source}: mission.tolerates: it is for groups, and the robots form pairs")
         return None
     _check_ids(robots, source)
     check_unanchored(file, source)
     anchored = [i for i, robot in enumerate(robots) if robot.anchor is not None]
+    if len(anchored) == len(robots):
+        check_tolerated(file, source)
     distances = [_checked_distance(file, i, j, source) for j in anchored for i in anchored if i < j]
     # least accurate are robots that are very near to each other, and those that have a long way
     _check_accuracy(file, (min(distances), max(distances)), source)
@@ -50,6 +53,8 @@ def meetings_of(file: ScenarioFile, faults: Sequence[Fault], source: str) -> Gro
         tolerates = file.mission.tolerates
         anchors = [robots[i] for i in anchored]
         meetings = group_meetings(anchors, file.mission, file.planner, faults, tolerates=tolerates)
+        if tolerates and len(anchored) == len(robots):
+            return with_confirmation(robots, file.mission, meetings, faults, tolerates)
         return with_sweep(robots, file.mission.area, file.mission, meetings, tolerates=tolerates)
     except Unworkable as error:
         raise Unworkable(f"{source}: {error}") from None

@@ -16,7 +16,7 @@ from compose.scenario.scenario_tables import PlannerTable, RobotTable
 from protocol.mission import Mission, Role
 from protocol.orbits import Rendezvous, meeting_ticks, pair_ticks, search_ticks, visiting
 from world.faults import Fault, exchange_ticks
-from world.scenario import PlannedMeeting, PlannedRetry, PlannedSweep
+from world.scenario import PlannedConfirmation, PlannedMeeting, PlannedRetry, PlannedSweep
 
 NEIGHBOURS = 3
 """The number of nearest anchors among which a robot's first peer is chosen, in a large group."""
@@ -68,6 +68,8 @@ class GroupMeetings(NamedTuple):
     """The bound in s of the time at which the last of these has localised all robots that can be."""
     sweep: PlannedSweep | None = None
     """The search for robots without an anchor; None if all have one."""
+    confirmation: PlannedConfirmation | None = None
+    """The meetings that confirm poses; None if robots claim the pose that they know."""
 
 
 def group_meetings(

@@ -33,18 +33,11 @@ Of missions of four robots, two of them without an anchor, all robots were local
 in 5 of 7 from 0.9 to 1.25, and in 2 of 17 above it. The others took up to 2 000 ticks.
 """
 
-NOT_TOLERATED = (
-    "mission.tolerates: it is for groups in which a robot has no anchor; others check all reports themselves"
-)
-"""The reason for which `mission.tolerates` is refused elsewhere."""
-
 
 def check_unanchored(file: ScenarioFile, source: str) -> None:
     """Raise BadScenario or Unworkable if the robots without an anchor in a group cannot be localised."""
     missing = [i for i, robot in enumerate(file.robot) if robot.anchor is None]
     if not missing:
-        if file.mission.tolerates:
-            raise Unworkable(f"{source}: {NOT_TOLERATED}")
         return
     where = f"{source}: robot[{missing[0]}]: missing field 'anchor'"
     if file.group is not None:

@@ -41,6 +41,7 @@ from world.scenario import (
     RobotSpec,
     Scenario,
     ScenarioOfGroup,
+    ScenarioWithConfirmation,
     ScenarioWithOptions,
     ScenarioWithSweep,
     ScenarioWithWorldNoise,
@@ -290,6 +291,8 @@ def _with_world(scenario: Scenario, file: ScenarioFile, meetings: GroupMeetings 
             retries=meetings.retries,
             deaths=tuple([Death(one.id, one.dies) for one in file.robot if one.dies is not None]),
         )
+        if meetings.confirmation is not None:
+            return ScenarioWithConfirmation(**asdict(of_group), confirmation=meetings.confirmation)
         if meetings.sweep is None:
             return of_group
         return ScenarioWithSweep(**asdict(of_group), planned_sweep=meetings.sweep)

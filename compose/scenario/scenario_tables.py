@@ -57,8 +57,11 @@ class MissionTable(Mission, frozen=True, forbid_unknown_fields=True):
     area: Area | None = None
     """x_min, y_min, x_max, y_max in m: the area in which robots without an anchor are."""
     tolerates: Annotated[int, Meta(ge=0, le=MAX_ROBOTS)] = 0
-    """The number of robots that may report false data, in a group with robots without an anchor. These claim
-    a pose on which one more finder agrees."""
+    """The number of robots of a group that may report false data: one more must agree before a claim.
+
+    With exact sensors, that holds for robots without an anchor. With noisy ones, it holds for all robots, and
+    all have an anchor.
+    """
 
     @property
     def plain(self) -> Mission:

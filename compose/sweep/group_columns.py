@@ -94,11 +94,11 @@ def _travel_ticks(run: Run) -> float | None:
     """Return a lower bound of the ticks until all are localised, from the first meetings as they went.
 
     They are those of the plan, and end when they did; then robots travel from anchor to anchor, and meetings
-    take no time. None if a first meeting has not localised both of its robots, if a robot dies, or if one of
-    them has no anchor.
+    take no time. None if a first meeting has not localised both of its robots, if a robot dies, if one has no
+    anchor, or if claims need several meetings.
     """
     scenario = run.scenario
-    if scenario.deaths or scenario.planned_sweep is not None:
+    if scenario.deaths or scenario.planned_sweep is not None or scenario.confirmation is not None:
         return None
     place = {robot.id: i for i, robot in enumerate(scenario.robots)}
     hop = tuple(tuple(_way(scenario, i, j) for j in place.values()) for i in place.values())

@@ -37,6 +37,7 @@ DOING = {
     "retreating": "{robot} has left {peer}'s range and drives back along its path, and as far again",
     "listening": "{robot} stands still within {peer}'s range and waits for missing reports",
     "localised": "{robot} is localised and stands still",
+    "unconfirmed": "{robot} knows a pose by {peer}, and waits until another robot confirms it",
 }
 """Sentences by state name, of all other states."""
 WAITING = "{robot} waits beside its anchor until {peer} comes into range"

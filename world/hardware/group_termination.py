@@ -13,6 +13,7 @@ ends at max_ticks.
 
 from __future__ import annotations
 
+import math
 import time
 
 from protocol.messages import (
@@ -22,6 +23,7 @@ from protocol.messages import (
     MissionEnd,
     PeerReport,
     RobotConfigInGroup,
+    RobotConfigWithConfirmation,
     RobotConfigWithoutAnchor,
     RobotConfigWithSweep,
     TickStart,
@@ -55,7 +57,7 @@ class GroupEnding(Termination):
         self._group, self._others = config.group, {*config.others}
         self._ends = {one.robot: one.ends for one in config.members}
         """The tick until which each robot is localised, by the plan."""
-        self._plan = max(self._ends.values()) + _sweep_ticks(config)
+        self._plan = max(max(self._ends.values()) + _sweep_ticks(config), _confirmed_tick(config))
         """The tick until which all are; a bound of it if some robots have no anchor."""
         self._visits = not isinstance(config, RobotConfigWithoutAnchor)
         """True if this robot's planner goes to robots that are late."""
@@ -139,6 +141,14 @@ class GroupEnding(Termination):
             what = f"{self._me} is localised; no result of {', '.join(missing)} received"
             return MissionEnd(tick, "undecided", what)
         return MissionEnd(tick, "localised", None)
+
+
+def _confirmed_tick(config: RobotConfigInGroup) -> int:
+    """Return the tick in which the last visit ends by which this robot confirms poses; 0 if there is none."""
+    if not isinstance(config, RobotConfigWithConfirmation):
+        return 0
+    ends = [one.begins + one.lasts for one in config.confirmations]
+    return math.ceil(max(ends, default=0.0) / config.mission.period)
 
 
 def _sweep_ticks(config: RobotConfigInGroup) -> int:

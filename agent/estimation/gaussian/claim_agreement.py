@@ -58,12 +58,12 @@ def difference(
         Pose(float(path.x[tick]), float(path.y[tick]), float(path.heading[tick])) for tick in (since, through)
     )
     way = compose(inverse(here), there)
-    off = _minus(now.pose, compose(earlier.pose, way))
+    off = minus(now.pose, compose(earlier.pose, way))
     first = np.linalg.inv(np.array(earlier.covariance.matrix))
     best, chi2 = earlier.pose, math.inf
     for _ in range(STEPS):
-        begin, end = _minus(best, earlier.pose), compose(best, way)
-        left = _minus(end, now.pose)
+        begin, end = minus(best, earlier.pose), compose(best, way)
+        left = minus(end, now.pose)
         drift = _drift(path, since, best.heading - here.heading, mission.noise)
         second = np.linalg.inv(np.array(now.covariance.matrix) + drift)
         chi2 = float(begin @ first @ begin + left @ second @ left)
@@ -75,7 +75,19 @@ def difference(
     return ClaimDifference(math.hypot(off[0], off[1]), abs(float(off[2])), _tail(chi2))
 
 
-def _minus(one: Pose, other: Pose) -> Array:
+def agreement(one: Localised, other: Localised) -> float:
+    """Return the p-value of the difference of two claims of one tick, if both are right (chi-square test).
+
+    Their errors are taken as independent, so the p-value is too large rather than too small.
+    """
+    assert one.covariance is not None
+    assert other.covariance is not None
+    off = minus(one.pose, other.pose)
+    both = np.array(one.covariance.matrix) + np.array(other.covariance.matrix)
+    return _tail(float(off @ np.linalg.solve(both, off)))
+
+
+def minus(one: Pose, other: Pose) -> Array:
     """Return the difference of two poses in x, y and heading, (3,)."""
     return np.array((one.x - other.x, one.y - other.y, wrap(one.heading - other.heading)))
 

@@ -1,0 +1,185 @@
+"""A robot of a group in which f robots may report false data: it claims a pose on which f + 1 meetings agree.
+
+It knows the pose of its latest meeting, and drives by it. After its planned visits, it returns to its
+anchor. From there, it visits further robots as planned, and meets those that visit it. Beside its anchor, its
+own ranges determine its pose but for a rotation about the anchor. Each meeting determines that rotation by
+itself. At least one of f + 1 peers is honest, so a pose that covers what f + 1 of them lead to is right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+
+from msgspec.structs import replace
+
+from agent.estimation.gaussian.claim_agreement import agreement
+from agent.estimation.gaussian.covariance_union import covariance_union
+from agent.estimation.gaussian.later_pose import later_pose
+from agent.planning import group_transitions
+from agent.planning.group import TRAVELLING, GroupPlanner
+from agent.planning.group_state import Fix, GroupState
+from agent.planning.state import UNCONFIRMED
+from protocol.messages import Command, Localised, Report, RobotConfigWithConfirmation, Undecided
+from protocol.mission import HEADING_ACCURACY
+from protocol.motion import compose, inverse
+
+RANGES_AGAIN, SHARE_AGAIN = 6, 1.1
+"""The ranges to its anchor after which a robot compares its meetings again: so many, and in proportion."""
+
+BEGINS_WITHIN = 0.3
+"""The part of the time of a visit in which it may begin, if the robot is not free before."""
+
+SILENT_AFTER = 8
+"""The ticks in range without a report after which a visitor has left, or is dead."""
+
+
+class ConfirmingPlanner(GroupPlanner):
+    """The planner of a robot in a group with noisy sensors that tolerates false data."""
+
+    def decide(self, state: GroupState, reports: Sequence[Report] = ()) -> GroupState:
+        """Return `state` with the `reports` of others, on the next visit, or with a claim or a verdict."""
+        return _with_verdict(_on_time(super().decide(state, reports)))
+
+    def report_to(self, state: GroupState, peer: str) -> Report:
+        """Return the report to `peer`. Outside a meeting, it says if this robot's pose is unconfirmed."""
+        report = super().report_to(state, peer)
+        if report.has_log or state.fix is None or report.verdict is not None:
+            return report
+        return replace(report, state=UNCONFIRMED)
+
+    def command(self, state: GroupState) -> Command:
+        """Return the command for the next tick; its state says if the pose of a meeting is unconfirmed."""
+        command = super().command(state)
+        if state.verdict is None and isinstance(state.pair.verdict, Localised):
+            return replace(command, state=UNCONFIRMED)
+        return command
+
+    def with_sender(self, state: GroupState, report: Report) -> GroupState:
+        """Return `state` with what `report` says: one that travels need not have claimed its pose."""
+        known = state.other(report.robot)
+        claims = not report.has_log and isinstance(report.verdict, Localised)
+        known = replace(known, travels=report.state == TRAVELLING, localised=known.localised or claims)
+        return state.with_other(report.robot, known)
+
+    def with_pose(self, state: GroupState, pose: Localised) -> GroupState:
+        """Return `state` of a robot that has determined its `pose` in the present meeting and uses it."""
+        pair = state.pair
+        others = [one for one in state.confirming.meetings if one.config.peer != pair.config.peer]
+        meetings = (*others, pair)
+        return replace(
+            state,
+            fix=Fix(pair.tick, pose, tuple([one.config.peer for one in meetings])),
+            located=pair,
+            frame=compose(pose.pose, inverse(pair.odometry)),
+            confirming=replace(state.confirming, meetings=meetings),
+        )
+
+
+def _config(state: GroupState) -> RobotConfigWithConfirmation:
+    assert isinstance(state.config, RobotConfigWithConfirmation)
+    return state.config
+
+
+def _now(state: GroupState) -> float:
+    """Return the time since tick 0 in s."""
+    return state.pair.tick * state.config.mission.period
+
+
+# --- visits -------------------------------------------------------------------------------------------
+
+
+def _on_time(state: GroupState) -> GroupState:
+    """Return `state` on the visit whose time has come, or back from the one whose time is over."""
+    config, confirming, now = _config(state), state.confirming, _now(state)
+    if state.visiting and confirming.until is not None:
+        if now < confirming.until or state.pair.verdict is not None:
+            return state
+        return group_transitions.at_anchor(state)
+    while confirming.visits < len(config.confirmations):
+        visit = config.confirmations[confirming.visits]
+        in_time = now < visit.begins + BEGINS_WITHIN * visit.lasts
+        if now < visit.begins or (in_time and not _is_free(state)):
+            break
+        confirming = replace(confirming, visits=confirming.visits + 1)
+        if in_time and _is_useful(state, visit.peer):
+            confirming = replace(confirming, until=visit.begins + visit.lasts)
+            return group_transitions.on_visit(replace(_oriented(state), confirming=confirming), visit.peer)
+    return replace(state, confirming=confirming)
+
+
+def _is_free(state: GroupState) -> bool:
+    """Return whether this robot knows a pose, waits beside its anchor, and is in no meeting."""
+    alone = state.alone or not state.pair.in_contact or state.silence > SILENT_AFTER
+    return state.fix is not None and state.waits and alone
+
+
+def _is_useful(state: GroupState, peer: str) -> bool:
+    """Return whether a meeting with `peer` may confirm the pose of one of the two."""
+    known = state.other(peer)
+    met = any(one.config.peer == peer for one in state.confirming.meetings)
+    return not (met or known.failed or (known.localised and state.verdict is not None))
+
+
+def _oriented(state: GroupState) -> GroupState:
+    """Return `state` with the frame of one of its meetings, by what the robot has measured since then.
+
+    It is the latest one of those that confirm a claim. Without a claim, meetings take turns from one visit to
+    the next: one of them may have been with an attacker, and lead astray.
+    """
+    pair, confirming = state.pair, state.confirming
+    poses = [pose for one in confirming.meetings if (pose := later_pose(one, pair)) is not None]
+    if not poses:
+        return state
+    turn = 0 if state.verdict is not None else confirming.visits % len(poses)
+    return replace(state, frame=compose(poses[-1 - turn].pose, inverse(pair.odometry)))
+
+
+# --- the claim ----------------------------------------------------------------------------------------
+
+
+def _with_verdict(state: GroupState) -> GroupState:
+    """Return `state` with the claim on which enough meetings agree, or Undecided when the time is over."""
+    if state.verdict is not None or state.fix is None:
+        return state
+    config = _config(state)
+    if _now(state) >= config.gives_up:
+        met = ", ".join(state.fix.peers)
+        why = f"{config.tolerates + 1} robots must agree on its pose; it knows one by: {met}"
+        return replace(state, verdict=Undecided(why))
+    return _confirmed(state) if _is_comparison_due(state) else state
+
+
+def _is_comparison_due(state: GroupState) -> bool:
+    """Return whether the robot compares the poses by its meetings: after each, and beside its anchor."""
+    pair, fix, ranges = state.pair, state.fix, state.pair.log.ranges
+    if fix is not None and fix.tick == pair.tick:
+        return True
+    if not (state.waits and ranges and ranges[-1].tick == pair.tick):
+        return False
+    return len(ranges) >= SHARE_AGAIN * state.confirming.ranges + RANGES_AGAIN
+
+
+def _confirmed(state: GroupState) -> GroupState:
+    """Return `state` with a claim that covers the poses by enough meetings which agree, if it is accurate."""
+    config, confirming, pair = _config(state), state.confirming, state.pair
+    needed = config.tolerates + 1
+    if len(confirming.meetings) < needed:
+        return state
+    state = replace(state, confirming=replace(confirming, ranges=len(pair.log.ranges)))
+    poses = {one.config.peer: later_pose(one, pair) for one in confirming.meetings}
+    known = [(peer, pose) for peer, pose in poses.items() if pose is not None]
+    for chosen in combinations(known, needed):
+        claims = [pose for _, pose in chosen]
+        if any(agreement(*two) < 1.0 - config.mission.confidence for two in combinations(claims, 2)):
+            continue
+        claim = covariance_union(claims)
+        assert claim.covariance is not None
+        position, heading = claim.covariance.position_sigma, claim.covariance.heading_sigma
+        if position <= config.mission.accuracy and heading <= HEADING_ACCURACY:
+            peers = [peer for peer, _ in chosen]
+            meetings = sorted(confirming.meetings, key=lambda one: one.config.peer in peers)
+            frame = compose(claim.pose, inverse(pair.odometry))
+            confirming = replace(state.confirming, meetings=tuple(meetings))
+            return replace(state, verdict=claim, frame=frame, confirming=confirming)
+    return state

@@ -1,0 +1,338 @@
+"""Groups with noisy sensors that tolerate false data: a claim needs several meetings that agree."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from functools import lru_cache
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from agent.estimation.gaussian.claim_agreement import agreement, minus
+from agent.estimation.gaussian.covariance_union import covariance_union
+from agent.planning.confirmation import ConfirmingPlanner
+from agent.planning.group_state import GroupState
+from compose.audit.replay import replayed
+from compose.errors import Unworkable
+from compose.launch.in_process import run_mission
+from compose.launch.planner_loader import planner_of
+from compose.recording.corrected_bounds import corrected_bounds
+from compose.recording.run import Run, of_frames
+from compose.scenario.scenario_change import file_table
+from compose.scenario.scenario_file import ScenarioTemplate, scenario_table, validate
+from compose.sweep import spec
+from compose.sweep.cells import cells, setting_of
+from compose.sweep.group_columns import group_columns
+from protocol.messages import Localised, Report, RobotConfigWithConfirmation, Undecided
+from protocol.motion import Covariance, Pose
+from tests.groups import table_of
+from tests.test_audit import kept
+from tests.test_group_noise import TURNED
+from tests.test_group_runs import audited
+from world.scenario import Scenario
+
+WRONG = 8
+"""The seed of a group in which r1, with the attack TURNED, misleads r2 in its only meeting until tick 200."""
+
+
+def table_with(seed: int, attack: dict[str, Any] | None = None, **mission: Any) -> dict[str, Any]:
+    """Return a scenario file of four robots that tolerate one false one, which r1 may be."""
+    table: dict[str, Any] = scenario_table("random-group")
+    noise = {"anchor_sigma": 0.05, "mutual_sigma": 0.05, "gyro_bias": 0.0002}
+    table["mission"] |= {"accuracy": 0.3, "noise": noise, "tolerates": 1} | mission
+    group: dict[str, Any] = {"robots": 4, "spacing": 30.0}
+    if attack is not None:
+        group["attack"] = attack
+    return table | {"seed": seed, "group": group}
+
+
+def scenario_with(seed: int, attack: dict[str, Any] | None = None, **mission: Any) -> Scenario:
+    return validate(table_with(seed, attack, **mission), "group.toml").seeded(None)
+
+
+def honest(run: Run) -> tuple[int, int, int]:
+    """Return how many honest robots claim a right pose, none, and a wrong one."""
+    columns = group_columns(run)
+    assert columns is not None
+    return columns.honest_localised, columns.honest_undecided, columns.honest_wrong
+
+
+@lru_cache(maxsize=1)
+def without_attacker() -> dict[str, list[bytes]]:
+    """Return the journals of a group in which nobody reports false data."""
+    return kept(scenario_with(3))
+
+
+def states(run: Run, robot: str) -> list[GroupState]:
+    """Return the states of a robot after each tick of its recording."""
+    agent = run.agents[robot]
+    planner = planner_of(agent.config)
+    assert isinstance(planner, ConfirmingPlanner)
+    state, found = planner.start(agent.config), []
+    for one in agent.steps:
+        state = planner.observe(state, one.observation)
+        state = planner.decide(state, [framed.report for framed in one.received])  # type: ignore[misc]
+        found.append(state)
+    return found
+
+
+# --- missions -----------------------------------------------------------------------------------------
+
+
+def test_all_claim_right_poses_within_the_bound_if_nobody_reports_false_data() -> None:
+    run = of_frames(without_attacker())
+    scenario = run.scenario
+    assert scenario.confirmation is not None
+    claims = [run.claim(robot) for robot in run.robots]
+    assert all(claim is not None and claim.tick <= scenario.confirmation.ends for claim in claims)
+    assert honest(run) == (4, 0, 0)
+    assert corrected_bounds(run) == ()
+
+
+def test_the_recording_passes_the_audit_and_the_replay() -> None:
+    journals = without_attacker()
+    assert audited(journals) == []
+    assert replayed(of_frames(journals)).differences == ()
+
+
+def test_a_robot_claims_a_pose_later_than_it_knows_one_and_by_two_peers_that_agree() -> None:
+    run = of_frames(without_attacker())
+    for robot in run.robots:
+        before, after = next(
+            (one, other) for one, other in pairwise(states(run, robot)) if other.verdict is not None
+        )
+        assert before.verdict is None
+        assert before.fix is not None
+        assert isinstance(after.verdict, Localised)
+        peers = {one.config.peer for one in after.confirming.meetings}
+        assert len(peers) == len(after.confirming.meetings) >= 2
+
+
+def test_a_robot_that_knows_a_pose_says_that_it_is_unconfirmed_and_makes_no_claim() -> None:
+    run = of_frames(without_attacker())
+    commands = [one.command for one in run.agents["r1"].steps if one.command is not None]
+    unconfirmed = [one for one in commands if one.state == "unconfirmed"]
+    assert unconfirmed
+    assert all(one.verdict is None for one in unconfirmed)
+    sent = [framed.report for one in run.agents["r1"].steps for framed in one.reports]
+    bodies = [one for one in sent if isinstance(one, Report)]
+    assert any(one.state == "unconfirmed" and one.verdict is None for one in bodies)
+
+
+def test_honest_robots_claim_right_poses_in_a_group_with_an_attacker() -> None:
+    assert honest(run_mission(scenario_with(3, TURNED))) == (3, 0, 0)
+
+
+@pytest.mark.long
+def test_an_attacker_that_misleads_a_robot_in_its_only_meeting_leads_to_no_wrong_claim() -> None:
+    """Without `tolerates`, a robot of this group claims a wrong pose."""
+    believing, careful = (
+        of_frames(kept(replace(scenario_with(WRONG, TURNED, tolerates=tolerates), max_ticks=200)))
+        for tolerates in (0, 1)
+    )
+    assert honest(believing) == (2, 0, 1)
+    assert honest(careful)[2] == 0
+    assert careful.claim("r2") is None
+    assert isinstance(careful.verdicts()["r2"], Undecided)
+
+
+@pytest.mark.long
+def test_further_meetings_localise_a_robot_that_an_attacker_has_misled() -> None:
+    journals = kept(scenario_with(WRONG, TURNED))
+    assert honest(of_frames(journals)) == (3, 0, 0)
+    assert audited(journals) == []
+
+
+def test_a_robot_whose_other_peers_are_dead_ends_undecided_and_names_the_one() -> None:
+    table = table_with(3)
+    scenario = validate(table, "group.toml").seeded(None)
+    table = {**file_table(scenario), "max_ticks": 400}
+    for robot in table["robot"]:
+        if robot["id"] not in (scenario.meetings[0].visitor, scenario.meetings[0].visited):
+            robot["dies"] = 0
+    run = of_frames(kept(validate(table, "group.toml").seeded(None)))
+    verdicts = run.verdicts()
+    first = scenario.meetings[0]
+    assert verdicts == {
+        first.visitor: Undecided(f"2 robots must agree on its pose; it knows one by: {first.visited}"),
+        first.visited: Undecided(f"2 robots must agree on its pose; it knows one by: {first.visitor}"),
+    }
+
+
+@pytest.mark.long
+def test_no_shipped_attack_leads_to_a_wrong_claim() -> None:
+    shipped = spec.load("group-attacks-noise-tolerated")
+    for cell in cells(shipped):
+        template = setting_of(shipped, cell)
+        assert isinstance(template, ScenarioTemplate)
+        scenario = template.seeded(5)
+        if scenario.confirmation is not None and len(scenario.robots) == 4:
+            assert honest(of_frames(kept(scenario)))[2] == 0, cell
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("fault", [{"loss": 0.7}, {"delay": 10}], ids=["loss", "delay"])
+def test_lost_and_late_reports_only_cost_time(fault: dict[str, Any]) -> None:
+    table = table_with(3) | {"fault": [fault]}
+    run = of_frames(kept(validate(table, "group.toml").seeded(None)))
+    assert honest(run) == (4, 0, 0)
+
+
+def test_a_robot_leaves_for_its_anchor_though_the_one_that_it_has_met_is_in_range() -> None:
+    run = of_frames(without_attacker())
+    left = 0
+    for robot in run.robots:
+        steps = run.agents[robot].steps[1:]
+        for (before, state), step in zip(pairwise(states(run, robot)), steps, strict=True):
+            in_range = [one.peer for one in step.observation.contacts]
+            if before.alone and state.alone and state.pair.config.peer in in_range:
+                left += 1
+                assert not state.pair.in_contact
+    assert left > 4
+
+
+def test_a_fit_after_a_long_way_that_ends_beside_the_right_pose_is_searched_again() -> None:
+    """Without the search, a robot of this group was 0.3 m off, and no two of its meetings agreed."""
+    claim = run_mission(scenario_with(4)).claim("r1")
+    assert claim is not None
+    assert claim.position_error < 0.1
+
+
+# --- the plan -----------------------------------------------------------------------------------------
+
+
+@given(robots=st.integers(4, 9), seed=st.integers(0, 1000), tolerates=st.integers(1, 3))
+def test_each_robot_meets_enough_others_and_is_in_one_meeting_at_a_time(
+    robots: int, seed: int, tolerates: int
+) -> None:
+    if robots < 2 * tolerates + 2:
+        return
+    table = table_of(robots, seed, sigma=0.05, side=3.0)
+    table["mission"]["tolerates"] = tolerates
+    table["mission"]["noise"]["gyro_bias"] = 1e-5
+    scenario = validate(table, "group.toml").seeded(None)
+    assert scenario.confirmation is not None
+    visits = scenario.confirmation.visits
+    busy = Counter([(one.begins, robot) for one in visits for robot in (one.visitor, one.visited)])
+    assert set(busy.values()) <= {1}
+    met = {frozenset((one.visitor, one.visited)) for one in scenario.meetings}
+    met |= {frozenset((one.visitor, one.visited)) for one in visits}
+    assert min(sum(robot.id in pair for pair in met) for robot in scenario.robots) >= 2 * tolerates + 1
+    times = sorted({(one.begins, one.begins + one.lasts) for one in visits})
+    assert times[0][0] == scenario.meetings[-1].ends
+    assert all(one[1] <= other[0] + 1e-9 for one, other in pairwise(times))
+    assert scenario.confirmation.ends < scenario.max_ticks
+
+
+def test_a_robot_is_told_the_visits_that_it_makes() -> None:
+    scenario = scenario_with(3)
+    assert scenario.confirmation is not None
+    for robot in scenario.robots:
+        config = scenario.config(robot.id)
+        assert isinstance(config, RobotConfigWithConfirmation)
+        planned = [one.visited for one in scenario.confirmation.visits if one.visitor == robot.id]
+        assert [one.peer for one in config.confirmations] == planned
+
+
+def test_a_changed_scenario_keeps_the_number_of_false_reporters() -> None:
+    scenario = scenario_with(3, TURNED)
+    assert validate(file_table(scenario), "group.toml").seeded(None) == scenario
+
+
+def test_an_audit_finds_a_visit_that_is_not_planned() -> None:
+    journals = without_attacker()
+    scenario = of_frames(journals).scenario
+    assert scenario.confirmation is not None
+    changed = replace(scenario, confirmation=replace(scenario.confirmation, ends=1.0))
+    assert "confirmation.ends is 1.0" in str(audited_scenario(changed))
+
+
+def audited_scenario(scenario: Scenario) -> list[str]:
+    """Return what the audit says about the scenario of a recording."""
+    from compose.audit.scenario_rules import _group  # noqa: PLC0415
+
+    return [one.what for one in _group(scenario) if one is not None]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda table: table["group"].update(robots=3),
+            r"mission.tolerates: with 1 false, a robot needs 3 others, of which 2 are honest; there are 2$",
+        ),
+        (
+            lambda table: table["mission"].pop("noise"),
+            r"mission.tolerates: sensors are exact and all robots have an anchor, so they check all reports",
+        ),
+        (
+            lambda table: table["mission"].update(safety_distance=0.5),
+            r"mission.tolerates: it is not for groups with a mission.safety_distance",
+        ),
+    ],
+)
+def test_what_cannot_be_tolerated_is_refused_in_one_line(change: Any, message: str) -> None:
+    table = table_with(3)
+    change(table)
+    with pytest.raises(Unworkable, match=f"^group.toml: {message}"):
+        validate(table, "group.toml").seeded(None)
+
+
+def test_more_attackers_than_are_tolerated_are_refused_in_one_line() -> None:
+    table = file_table(scenario_with(3, TURNED))
+    table["robot"][2]["attack"] = TURNED
+    with pytest.raises(
+        Unworkable, match=r"robot\[2\].attack: 2 robots have one, and mission.tolerates is 1$"
+    ):
+        validate(table, "group.toml").seeded(None)
+
+
+# --- poses that agree ---------------------------------------------------------------------------------
+
+
+@st.composite
+def claims(draw: st.DrawFn) -> Localised:
+    """Return a claim with any positive definite covariance."""
+    numbers = st.floats(-2.0, 2.0)
+    root = np.array([[draw(numbers) for _ in range(3)] for _ in range(3)])
+    c = root @ root.T + 1e-3 * np.eye(3)
+    moments = [float(c[j, k]) for j, k in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))]
+    return Localised(Pose(draw(numbers), draw(numbers), draw(numbers)), Covariance(*moments))
+
+
+def matrix(claim: Localised) -> Any:
+    assert claim.covariance is not None
+    return np.array(claim.covariance.matrix)
+
+
+@given(st.lists(claims(), min_size=1, max_size=4))
+def test_a_union_covers_each_claim_and_its_difference(found: list[Localised]) -> None:
+    union = covariance_union(found)
+    assert union.pose == found[-1].pose
+    for one in found:
+        off = minus(one.pose, union.pose)
+        left = matrix(union) - matrix(one) - np.outer(off, off)
+        assert np.linalg.eigvalsh(left).min() >= -1e-6 * np.abs(matrix(union)).max()
+
+
+@given(claims())
+def test_the_union_of_the_same_claims_is_that_claim(one: Localised) -> None:
+    assert np.allclose(matrix(covariance_union([one, one, one])), matrix(one), atol=1e-9)
+
+
+def test_the_p_values_of_right_claims_of_one_tick_are_uniform() -> None:
+    rng, sigma = np.random.default_rng(1), Covariance(0.01, 0.0, 0.0, 0.02, 0.0, 0.03)
+    draws = rng.standard_normal((2, 2000, 3)) * np.sqrt([0.01, 0.02, 0.03])
+    values = [
+        agreement(Localised(Pose(*one), sigma), Localised(Pose(*other), sigma))
+        for one, other in zip(*draws.tolist(), strict=True)
+    ]
+    for bound in (0.01, 0.1, 0.5):
+        share = sum(value <= bound for value in values) / len(values)
+        assert share == pytest.approx(bound, abs=4.0 * math.sqrt(bound * (1.0 - bound) / len(values)))
