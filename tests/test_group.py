@@ -16,6 +16,7 @@ from msgspec.structs import replace
 
 from agent.planning import group_transitions
 from agent.planning.group import TRAVELLING
+from agent.planning.group_state import Fix
 from agent.planning.group_transitions import SILENT_AFTER
 from agent.planning.phase2_orbit import Travelling, next_side, travel_controls
 from agent.planning.state import Done
@@ -188,7 +189,7 @@ def test_a_localised_robot_waits_for_its_peer_beside_it_for_a_bounded_time(
     state, claim = planner.start(config), Localised(Pose(0.0, 0.0, 0.0))
     pair = replace(state.pair, mode=Done(3, claim), in_contact=True)
     assert pair.verdict == claim
-    state = replace(state, pair=pair, verdict=claim, silence=silence)
+    state = replace(state, pair=pair, verdict=claim, fix=Fix(0, claim, (config.peer,)), silence=silence)
     assert group_transitions.onward(state, peer_has_left=refused).visiting == leaves
 
 
