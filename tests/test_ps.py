@@ -68,10 +68,11 @@ def test_a_running_mission_is_listed_as_json_with_all_known_values(tmp_path: Pat
         "versions": [VERSION],
         "missing": [],
     }
+    assert mission["tick"] > 0
     assert [one["robot"] for one in mission["robots"]] == ["a", "b"]
     for one in mission["robots"]:
         assert one["there"] is True
-        assert 0 < one["tick"] <= mission["tick"] + 1
+        assert one["tick"] > 0
         assert one["phase"] in (1, 2, 3)
         assert one["state"]
 

@@ -73,7 +73,7 @@ class Fix(msgspec.Struct, frozen=True):
 
 
 class Confirming(msgspec.Struct, frozen=True):
-    """How far the pose of a robot is confirmed, if robots of its group may report false data."""
+    """The meetings that confirm the pose of a robot, if robots of its group may report false data."""
 
     meetings: tuple[RobotState, ...] = ()
     """The states at the claims in its meetings with different peers, in the order of these meetings."""
@@ -107,7 +107,7 @@ class GroupState(msgspec.Struct, frozen=True):
     located: RobotState | None = None
     """The state in the latest meeting in which the robot was localised, at its claim."""
     own_pose: OwnPose = OwnPose()
-    """What it knows of the accuracy of its pose while it sweeps, with noisy sensors."""
+    """The accuracy of its pose while it sweeps, with noisy sensors."""
     verdict: Verdict | None = None
     """The verdict of the robot: the pose that it claims, or why it claims none.
 
@@ -116,7 +116,7 @@ class GroupState(msgspec.Struct, frozen=True):
     fix: Fix | None = None
     """The pose that the robot knows, and by which it drives; None until a meeting has determined it."""
     confirming: Confirming = Confirming()
-    """How far that pose is confirmed, if a claim of it needs several peers."""
+    """The meetings that confirm that pose, if a claim of it needs several peers."""
     failure: Verdict | None = None
     """The verdict of the latest meeting that has failed before the robot was localised."""
     frame: Pose = ORIGIN
@@ -126,7 +126,7 @@ class GroupState(msgspec.Struct, frozen=True):
     unmet: int = 0
     """The number of consecutive ticks out of range of the peer since this robot's verdict in the meeting."""
     passing: Bypass = Bypass()
-    """How it passes robots of other meetings, if the mission has a safety distance."""
+    """The way past robots of other meetings, if the mission has a safety distance."""
     lingering: int = 0
     """The number of consecutive ticks in range of the peer since the end of their meeting."""
     silence: int = 0

@@ -52,7 +52,7 @@ TEN = "o^vs<>pdh8"
 
 
 class Look(NamedTuple):
-    """How a robot is drawn."""
+    """The colour and the marks of a robot."""
 
     colour: str
     marks: dict[str, Any]
