@@ -19,7 +19,7 @@ CONFIRMING = 30
 """The ticks beside its anchor in which a robot that has come back measures its pose."""
 
 PASSES = 3
-"""The number of times that the visits take place: at once, again for what has failed, and after all retries of the group."""
+"""The number of times that the visits take place: at once, for what has failed, and after all retries."""
 
 
 def others_to_meet(tolerates: int) -> int:

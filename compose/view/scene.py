@@ -100,7 +100,7 @@ class Player(msgspec.Struct, frozen=True, omit_defaults=True):
     command: Decision | None = None
     held: HeldPoses | None = None
     reported: FalsePose | None = None
-    """The pose that the robot reports of itself, if the scenario has an attack of it and its true pose is known."""
+    """The pose that the robot reports of itself, if it is an attacker and its true pose is known."""
     peer: str | None = None
     """The robot that it meets at present, or next, in a group; None for pairs."""
 
