@@ -288,10 +288,10 @@ def test_a_summary_has_the_mean_nees_with_its_band_and_the_rate_within_three_tim
     rows += [trial.lost(0, 3, 1, "lost", None), row_of(claimed(EXACT, None, by=0.0), 4)]
     figures = figures_of(rows, tmp_path)
     assert (figures.trials, figures.claims, figures.within_3_accuracy) == (5, 4, 0.75)
-    assert rows[2].outcome == "wrong"  # and no trial with the right hypothesis
-    assert figures.nees_mean == pytest.approx(np.mean([row.nees for row in rows[:2]]))
+    assert rows[2].outcome == "wrong"
+    assert figures.nees_mean == pytest.approx(np.mean([row.nees for row in rows[:3]])), "all claims are in"
     assert (figures.nees_low, figures.nees_high) == pytest.approx(
-        (chi2.ppf(0.005, 6) / 2, chi2.ppf(0.995, 6) / 2)
+        (chi2.ppf(0.005, 9) / 3, chi2.ppf(0.995, 9) / 3)
     )
 
 

@@ -79,8 +79,8 @@ class CellSummary(msgspec.Struct, frozen=True):
     truth_held: float | None
     """fraction of the trials with claims under noise in which every such robot held the true hypothesis"""
     nees_mean: float | None
-    """mean over trials that were not wrong of the mean NEES of their robots' claims; 3 is expected if
-    the claimed covariances are consistent"""
+    """mean over trials of the mean NEES of their robots' claims, wrong ones included; 3 is expected if the
+    claimed covariances are consistent"""
     nees_low: float | None
     """lower bound of the band that contains nees_mean in 99 % of sweeps if covariances are consistent"""
     nees_high: float | None
@@ -150,7 +150,7 @@ def counted(table: pa.Table, refused: str | None = None) -> CellSummary:
     ticks = column(table, "ticks")[np.array([outcome == "localised" for outcome in outcomes], bool)]
     meeting, error = _known(column(table, "meeting_tick")), _known(column(table, "position_error_m"))
     right = table.filter(pa.array([outcome != "wrong" for outcome in outcomes], pa.bool_()))
-    claims, nees = int(_known(column(table, "claims")).sum()), _known(column(right, "nees"))
+    claims, nees = int(_known(column(table, "claims")).sum()), _known(column(table, "nees"))
     nees_low, nees_high = nees_band(len(nees))
     violations = _known(column(table, "violations"))
     shares, makespans, corrected = [
@@ -180,7 +180,7 @@ def counted(table: pa.Table, refused: str | None = None) -> CellSummary:
         nees_mean=float(nees.mean()) if len(nees) else None,
         nees_low=nees_low,
         nees_high=nees_high,
-        rmse_over_bound=_rmse_over_bound(right),
+        rmse_over_bound=_rmse_over_bound(table),
         reports_p50=_percentile(_known(column(table, "reports_sent")), 50),
         audited=len(violations),
         clean=int((violations == 0.0).sum()),
