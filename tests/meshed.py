@@ -17,7 +17,7 @@ RUN = "mesh"
 if __name__ == "__main__":
     name, own, *others = sys.argv[1:]
     awaited = set(sys.stdin.readline().split())
-    with session.open_router(Endpoints(tuple(others), (own,)), 5.0) as link:
+    with session.open_router(Endpoints(tuple(others), (own,)), 5.0, closes=False) as link:
         inbox = Inbox(name)
         starts = session.publisher(link, keys.tick_start(RUN, name))
         for robot in sorted(awaited):

@@ -220,8 +220,8 @@ def test_a_world_that_listens_reports_a_missing_router_and_runs(
 
 
 @pytest.mark.long
-def test_routers_that_connect_to_each_other_at_once_do_not_hang() -> None:
-    """With low latency, some of six routers hang in about every eighth round."""
+def test_routers_that_connect_to_each_other_at_once_do_not_hang_and_end_silently() -> None:
+    """With low latency, some of six hang in about every eighth round. Of those that close, 4 % panic."""
     names = "abcdef"
     for _ in range(25):
         endpoints = [free_endpoint() for _ in names]
@@ -239,17 +239,26 @@ def test_routers_that_connect_to_each_other_at_once_do_not_hang() -> None:
                 ready, _, _ = select.select([one.stdout], [], [], BOUND_S)
                 assert ready, "no answer"
                 assert one.stdout.readline() == "linked\n"
+            for one in six:
+                assert one.stdin is not None
+                one.stdin.close()
+                one.stdin = None  # as `communicate` expects
 
 
 @contextmanager
 def meshed(name: str, *endpoints: str) -> Iterator[subprocess.Popen[str]]:
     """Yield a router that connects to all but the first of the endpoints, and end it."""
     process = subprocess.Popen(
-        [*MESHED, name, *endpoints], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [*MESHED, name, *endpoints],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     try:
         yield process
-        process.communicate(timeout=BOUND_S)
+        assert process.communicate(timeout=BOUND_S) == ("", "")
+        assert process.returncode == 0
     finally:
         process.kill()
         process.wait()

@@ -115,7 +115,7 @@ def _run(
     )
     own = free_endpoint("tls" if keys else "tcp")
     endpoints = Endpoints(reached.connect, (own, *reached.listen), reached.settings, reached.folder)
-    with session.open_router(endpoints, RELISTEN_S) as link:
+    with session.open_router(endpoints, RELISTEN_S, closes=False) as link:  # the robots end at once
         children = Supervisor(inbox)
         agent = f"agent {options.id}"
         arguments = [

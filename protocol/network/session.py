@@ -48,6 +48,9 @@ REFUSAL = zenoh.Encoding.TEXT_PLAIN
 
 zenoh.init_log_from_env_or("off")
 
+_left_open: list[zenoh.Session] = []
+"""The sessions that last until the process ends; Zenoh closes those that are freed."""
+
 
 T = TypeVar("T")
 
@@ -74,11 +77,13 @@ def _check_limits() -> None:
 
 
 @contextmanager
-def open_router(endpoints: Endpoints, wait: float = 0.0) -> Iterator[zenoh.Session]:
+def open_router(endpoints: Endpoints, wait: float = 0.0, *, closes: bool = True) -> Iterator[zenoh.Session]:
     """Yield a session in router mode. Wait up to `wait` s until its endpoints are free.
 
-    The routers to which it connects may start later, and restart. Raises CannotListen, and OSError if the
-    process's limits are too low.
+    The routers to which it connects may start later, and restart. If it `closes` while they do, Zenoh 1.10
+    may panic, and print a stack trace. If not, it lasts until the process ends, which should be soon.
+
+    Raises CannotListen, and OSError if the process's limits are too low.
     """
     _check_limits()
     give_up = time.monotonic() + wait
@@ -92,7 +97,11 @@ def open_router(endpoints: Endpoints, wait: float = 0.0) -> Iterator[zenoh.Sessi
                 why = "already in use" if taken else "cannot listen there"
                 raise CannotListen(f"{' and '.join(endpoints.listen)}: {why}") from None
         time.sleep(LISTEN_AGAIN_S)
-    with _closing(session):
+    if closes:
+        with _closing(session):
+            yield session
+    else:
+        _left_open.append(session)
         yield session
 
 
