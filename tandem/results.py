@@ -64,6 +64,10 @@ class Run(msgspec.Struct, frozen=True, dict=True, eq=False):
     wall_s: float | None = None
     """The wall time of the run in s; None if unknown."""
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.model, recorded.Run):
+            raise UserError(f"{self.model!r} is no run; open a recording with tandem.open")
+
     # --- the outcome ---
 
     @property

@@ -379,3 +379,8 @@ def test_a_wrong_argument_of_an_estimate_is_one_line(arguments: dict[str, Any], 
     with pytest.raises(tandem.UserError, match=re.escape(says)) as found:
         tandem.estimate(SAMPLE, **arguments)
     assert "\n" not in str(found.value)
+
+
+def test_a_run_is_not_made_from_the_path_of_a_recording(tmp_path: Path) -> None:
+    with pytest.raises(tandem.UserError, match="is no run; open a recording with tandem.open"):
+        tandem.Run(str(tmp_path))  # type: ignore[arg-type]
