@@ -382,5 +382,5 @@ def test_a_wrong_argument_of_an_estimate_is_one_line(arguments: dict[str, Any], 
 
 
 def test_a_run_is_not_made_from_the_path_of_a_recording(tmp_path: Path) -> None:
-    with pytest.raises(tandem.UserError, match="is no run; open a recording with tandem.open"):
+    with pytest.raises(tandem.UserError, match=r"is no run; open a recording with tandem\.open$"):
         tandem.Run(str(tmp_path))  # type: ignore[arg-type]
