@@ -143,11 +143,14 @@ def _with_verdict(state: GroupState) -> GroupState:
     if state.verdict is not None or state.fix is None:
         return state
     config = _config(state)
-    if _now(state) >= config.gives_up:
-        met = ", ".join(state.fix.peers)
-        why = f"{config.tolerates + 1} robots must agree on its pose; it knows one by: {met}"
-        return replace(state, verdict=Undecided(why))
-    return _confirmed(state) if _is_comparison_due(state) else state
+    is_late = _now(state) >= config.gives_up
+    if is_late or _is_comparison_due(state):
+        state = _confirmed(state)
+    if state.verdict is not None or not is_late:
+        return state
+    met = ", ".join([one.config.peer for one in state.confirming.meetings])
+    why = f"{config.tolerates + 1} robots must agree on its pose; it knows one by: {met}"
+    return replace(state, verdict=Undecided(why))
 
 
 def _is_comparison_due(state: GroupState) -> bool:

@@ -18,8 +18,8 @@ from world.scenario import PlannedConfirmation, PlannedRetry
 CONFIRMING = 30
 """The ticks beside its anchor in which a robot that has come back measures its pose."""
 
-PASSES = 3
-"""The number of times that the visits take place: at once, for what has failed, and after all retries."""
+PASSES = 4
+"""The number of times that robots visit each other: the last two passes begin after all retries."""
 
 
 def others_to_meet(tolerates: int) -> int:
@@ -60,32 +60,33 @@ def with_confirmation(
 ) -> GroupMeetings:
     """Return `meetings` of `robots`, which all have an anchor, with those that confirm their poses.
 
-    In each round, robots that have planned meetings with too few others meet in pairs, beside the anchor of
-    one of the two, and the other one returns. In the second pass, they change their roles: the visitor may
-    have missed the other one, because an attacker had led to its pose. The first pass begins when all should
-    know their poses.
+    In each round, robots meet in pairs, beside the anchor of one of the two, and the other one returns. The
+    first pass adds to the planned meetings, and begins when all should know their poses. The later ones
+    include the planned meetings, which an attacker may have prevented. From one pass to the next, robots
+    change their roles, because only a robot that knows its pose can visit another one, and because an
+    attacker may have led a visitor astray.
     """
     anchors = {one.id: one.anchor for one in robots if one.anchor is not None}
-    begins, visits = meetings.bound, list[PlannedRetry]()
-    ends = begins
+    planned = {frozenset((one.visitor, one.visited)) for one in meetings.planned}
+    begins, ends, visits = meetings.bound, meetings.bound, list[PlannedRetry]()
     each, once = exchange_ticks(faults)
     for number in range(PASSES):
-        met = {frozenset((one.visitor, one.visited)) for one in meetings.planned}
+        if number == PASSES - 2:
+            begins = max(begins, meetings.latest)
+        met = planned if number == 0 else set[frozenset[str]]()
         for pairs in _rounds(anchors, met, others_to_meet(tolerates), mission.orienting_distance):
             way = max([math.dist(anchors[a], anchors[b]) for a, b in pairs])
             ticks = 2 * math.ceil(way / (mission.max_speed * mission.period)) + CONFIRMING
             ticks += LEAVING_TICKS + search_ticks(mission, ALLOWED_SIDES) + meeting_ticks(mission)
             ticks += each + once
             lasts = ticks * mission.period
-            for visitor, visited in pairs:
-                a, b = (visited, visitor) if number == 1 else (visitor, visited)
+            for pair in pairs:
+                a, b = pair if number % 2 == 0 else pair[::-1]
                 orbits = visiting(mission, math.dist(anchors[a], anchors[b]))
                 visits.append(PlannedRetry(a, b, orbits, begins, lasts))
             begins += lasts
         if number == 0:
             ends = begins
-        elif number == 1:
-            begins = max(begins, meetings.latest)
     return meetings._replace(
         bound=ends, latest=begins, confirmation=PlannedConfirmation(tolerates, tuple(visits), ends)
     )
