@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from agent.estimation.gaussian.known_anchors import chi2_p_value
+from agent.estimation.gaussian.consistency import chi2_p_value
 from agent.estimation.gaussian.range_model import Ranges, predicted
 from compose.errors import UserError
 from compose.recording.estimating.anchored_estimate import AnchoredMeasurements

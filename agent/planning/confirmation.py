@@ -1,9 +1,10 @@
-"""A robot of a group in which f robots may report false data: it claims a pose on which f + 1 meetings agree.
+"""The planner of a robot in a group with noisy sensors, of which f robots may report false data.
 
-It knows the pose of its latest meeting, and drives by it. After its planned visits, it returns to its
-anchor. From there, it visits further robots as planned, and meets those that visit it. Beside its anchor, its
-own ranges determine its pose but for a rotation about the anchor. Each meeting determines that rotation by
-itself. At least one of f + 1 peers is honest, so a pose that covers what f + 1 of them lead to is right.
+The robot claims a pose only when its meetings with f + 1 peers agree. Before, it knows a pose by its latest
+meeting, and drives by it. After its planned visits, it returns to its anchor. From there, it makes the visits
+that confirm poses, and meets those that visit it. Beside its anchor, its own ranges determine its pose but
+for a rotation about the anchor. Each meeting determines that rotation by itself. At least one of f + 1 peers
+is honest, so a pose is right if its covariance covers the poses of f + 1 meetings.
 """
 
 from __future__ import annotations
@@ -25,54 +26,53 @@ from protocol.mission import HEADING_ACCURACY
 from protocol.motion import compose, inverse
 
 RANGES_AGAIN, SHARE_AGAIN = 6, 1.1
-"""The ranges to its anchor after which a robot compares its meetings again: so many, and in proportion."""
+"""After so many more ranges to its anchor, and so many times more, a robot compares its meetings again."""
 
 BEGINS_WITHIN = 0.3
-"""The part of the time of a visit in which it may begin, if the robot is not free before."""
+"""The fraction of the time of a visit within which it may begin, if the robot is not free at once."""
 
 SILENT_AFTER = 8
-"""The ticks in range without a report after which a visitor has left, or is dead."""
+"""The ticks in range without a log of a visitor after which a robot takes its meeting with it for over."""
 
 
 class ConfirmingPlanner(GroupPlanner):
-    """The planner of a robot in a group with noisy sensors that tolerates false data."""
+    """The planner of a robot whose claim needs several peers (`mission.tolerates`)."""
 
     def decide(self, state: GroupState, reports: Sequence[Report] = ()) -> GroupState:
-        """Return `state` with the `reports` of others, on the next visit, or with a claim or a verdict."""
-        return _with_verdict(_on_time(super().decide(state, reports)))
+        """Return `state` with the `reports` of others, on the visit that is due, or with its verdict."""
+        return _with_verdict(_in_due_visit(super().decide(state, reports)))
 
     def report_to(self, state: GroupState, peer: str) -> Report:
-        """Return the report to `peer`. Outside a meeting, it says if this robot's pose is unconfirmed."""
+        """Return the report to `peer`. Outside a meeting, its state says if the pose is unconfirmed."""
         report = super().report_to(state, peer)
         if report.has_log or state.fix is None or report.verdict is not None:
             return report
         return replace(report, state=UNCONFIRMED)
 
     def command(self, state: GroupState) -> Command:
-        """Return the command for the next tick; its state says if the pose of a meeting is unconfirmed."""
+        """Return the command for the next tick; its state says if a meeting gave an unconfirmed pose."""
         command = super().command(state)
         if state.verdict is None and isinstance(state.pair.verdict, Localised):
             return replace(command, state=UNCONFIRMED)
         return command
 
     def with_sender(self, state: GroupState, report: Report) -> GroupState:
-        """Return `state` with what `report` says: one that travels need not have claimed its pose."""
+        """Return `state` with what `report` says: a robot that travels need not have claimed its pose."""
         known = state.other(report.robot)
         claims = not report.has_log and isinstance(report.verdict, Localised)
         known = replace(known, travels=report.state == TRAVELLING, localised=known.localised or claims)
         return state.with_other(report.robot, known)
 
     def with_pose(self, state: GroupState, pose: Localised) -> GroupState:
-        """Return `state` of a robot that has determined its `pose` in the present meeting and uses it."""
+        """Return `state` of a robot that knows its `pose` now, by the present meeting."""
         pair = state.pair
         others = [one for one in state.confirming.meetings if one.config.peer != pair.config.peer]
-        meetings = (*others, pair)
         return replace(
             state,
-            fix=Fix(pair.tick, pose, tuple([one.config.peer for one in meetings])),
+            fix=Fix(pair.tick, pose, (pair.config.peer,)),
             located=pair,
             frame=compose(pose.pose, inverse(pair.odometry)),
-            confirming=replace(state.confirming, meetings=meetings),
+            confirming=replace(state.confirming, meetings=(*others, pair)),
         )
 
 
@@ -89,8 +89,8 @@ def _now(state: GroupState) -> float:
 # --- visits -------------------------------------------------------------------------------------------
 
 
-def _on_time(state: GroupState) -> GroupState:
-    """Return `state` on the visit whose time has come, or back from the one whose time is over."""
+def _in_due_visit(state: GroupState) -> GroupState:
+    """Return `state` on the visit whose time has come, or on the way back from one whose time is over."""
     config, confirming, now = _config(state), state.confirming, _now(state)
     if state.visiting and confirming.until is not None:
         if now < confirming.until or state.pair.verdict is not None:
@@ -102,9 +102,9 @@ def _on_time(state: GroupState) -> GroupState:
         if now < visit.begins or (in_time and not _is_free(state)):
             break
         confirming = replace(confirming, visits=confirming.visits + 1)
-        if in_time and _is_useful(state, visit.peer):
+        if in_time and _may_confirm(state, visit.peer):
             confirming = replace(confirming, until=visit.begins + visit.lasts)
-            return group_transitions.on_visit(replace(_oriented(state), confirming=confirming), visit.peer)
+            return group_transitions.on_visit(replace(_with_frame(state), confirming=confirming), visit.peer)
     return replace(state, confirming=confirming)
 
 
@@ -114,18 +114,18 @@ def _is_free(state: GroupState) -> bool:
     return state.fix is not None and state.waits and alone
 
 
-def _is_useful(state: GroupState, peer: str) -> bool:
-    """Return whether a meeting with `peer` may confirm the pose of one of the two."""
+def _may_confirm(state: GroupState, peer: str) -> bool:
+    """Return whether a meeting with `peer` may confirm the pose of one of the two robots."""
     known = state.other(peer)
     met = any(one.config.peer == peer for one in state.confirming.meetings)
     return not (met or known.failed or (known.localised and state.verdict is not None))
 
 
-def _oriented(state: GroupState) -> GroupState:
-    """Return `state` with the frame of one of its meetings, by what the robot has measured since then.
+def _with_frame(state: GroupState) -> GroupState:
+    """Return `state` with the frame that follows from one of its meetings and its measurements since then.
 
-    It is the latest one of those that confirm a claim. Without a claim, meetings take turns from one visit to
-    the next: one of them may have been with an attacker, and lead astray.
+    With a claim, it is the latest meeting of those that confirm it. Without one, meetings take turns from one
+    visit to the next, because one of them may have been with an attacker, and lead astray.
     """
     pair, confirming = state.pair, state.confirming
     poses = [pose for one in confirming.meetings if (pose := later_pose(one, pair)) is not None]
@@ -139,7 +139,7 @@ def _oriented(state: GroupState) -> GroupState:
 
 
 def _with_verdict(state: GroupState) -> GroupState:
-    """Return `state` with the claim on which enough meetings agree, or Undecided when the time is over."""
+    """Return `state` with a claim if enough meetings agree, or Undecided if the robot gives up."""
     if state.verdict is not None or state.fix is None:
         return state
     config = _config(state)
@@ -154,7 +154,7 @@ def _with_verdict(state: GroupState) -> GroupState:
 
 
 def _is_comparison_due(state: GroupState) -> bool:
-    """Return whether the robot compares the poses by its meetings: after each, and beside its anchor."""
+    """Return whether the robot compares the poses of its meetings: after each, and beside its anchor."""
     pair, fix, ranges = state.pair, state.fix, state.pair.log.ranges
     if fix is not None and fix.tick == pair.tick:
         return True
@@ -164,7 +164,7 @@ def _is_comparison_due(state: GroupState) -> bool:
 
 
 def _confirmed(state: GroupState) -> GroupState:
-    """Return `state` with a claim that covers the poses by enough meetings which agree, if it is accurate."""
+    """Return `state` with a claim that covers the poses of enough meetings which agree, if it is accurate."""
     config, confirming, pair = _config(state), state.confirming, state.pair
     needed = config.tolerates + 1
     if len(confirming.meetings) < needed:
@@ -174,7 +174,7 @@ def _confirmed(state: GroupState) -> GroupState:
     known = [(peer, pose) for peer, pose in poses.items() if pose is not None]
     for chosen in combinations(known, needed):
         claims = [pose for _, pose in chosen]
-        if any(agreement(*two) < 1.0 - config.mission.confidence for two in combinations(claims, 2)):
+        if not all(agreement(*two) >= 1.0 - config.mission.confidence for two in combinations(claims, 2)):
             continue
         claim = covariance_union(claims)
         assert claim.covariance is not None

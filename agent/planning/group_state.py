@@ -101,7 +101,7 @@ class GroupState(msgspec.Struct, frozen=True):
     until: float | None = None
     """The time in s at which the search of a retry ends; None if there is none."""
     alone: bool = False
-    """True if the robot is back at its anchor, or on its way, and in no meeting until a visitor comes."""
+    """True if the robot is at its anchor, or on its way there, and in no meeting until a visitor comes."""
     visiting: bool = False
     """True if the present meeting is a visit: the robot knows its pose already."""
     located: RobotState | None = None
@@ -134,7 +134,7 @@ class GroupState(msgspec.Struct, frozen=True):
 
     @property
     def waits(self) -> bool:
-        """Return whether the robot meets those that come to it: it knows no pose, or has returned."""
+        """Return whether the robot meets visitors: it knows no pose yet, or is back at its anchor."""
         if self.fix is None:
             return self.verdict is None
         return not (self.visiting or self.sweeps) and self.pair.verdict is None

@@ -72,7 +72,7 @@ def _group(found: Scenario) -> Checks:
         for i, (given, expected) in enumerate(zip(some, others, strict=False)):
             off = None if given == expected else f"{name}[{i}].{difference(given, expected)}"
             yield _violation(None, off)
-    yield _violation(None, _off_search(found, planned))
+    yield _violation(None, _search_difference(found, planned))
     for robot in found.robots:
         first = planned.first[robot.id]
         for why in (
@@ -83,7 +83,7 @@ def _group(found: Scenario) -> Checks:
             yield _violation(robot.id, why)
 
 
-def _off_search(found: Scenario, planned: GroupMeetings) -> str | None:
+def _search_difference(found: Scenario, planned: GroupMeetings) -> str | None:
     """Return how the sweep for robots without an anchor, or the confirming visits, differ from the plan."""
     if found.planned_sweep is not None and planned.sweep is not None and found.planned_sweep != planned.sweep:
         return f"planned_sweep.{difference(found.planned_sweep, planned.sweep)}"

@@ -49,42 +49,59 @@ def difference(
     Chi-square is that of the pose at `since` which suits both best, because an error of the heading moves a
     far pose on an arc. The errors of the two claims and of the odometry between them are taken as
     independent. Claims share the ranges to the robot's own anchor, so they differ by less, and the p-value is
-    too large rather than too small.
+    too large rather than too small. It is 0 if a covariance is singular, which explains no difference.
     """
-    assert earlier.covariance is not None
-    assert now.covariance is not None
     path = inference.path_of(log, 0, through, mission)
     here, there = (
         Pose(float(path.x[tick]), float(path.y[tick]), float(path.heading[tick])) for tick in (since, through)
     )
     way = compose(inverse(here), there)
     off = minus(now.pose, compose(earlier.pose, way))
-    first = np.linalg.inv(np.array(earlier.covariance.matrix))
+    try:
+        chi2 = _least_chi2(earlier, since, now, way, path, mission.noise)
+    except np.linalg.LinAlgError:
+        chi2 = math.inf
+    return ClaimDifference(math.hypot(off[0], off[1]), abs(float(off[2])), _p_value(chi2))
+
+
+def _least_chi2(
+    earlier: Localised, since: int, now: Localised, way: Pose, path: Track, noise: Noise
+) -> float:
+    """Return the chi-square of the pose at `since` which suits `earlier` and `now`, `way` after it, best.
+
+    Raises LinAlgError if a covariance is singular.
+    """
+    heading = float(path.heading[since])
+    first = np.linalg.inv(matrix(earlier))
     best, chi2 = earlier.pose, math.inf
     for _ in range(STEPS):
         begin, end = minus(best, earlier.pose), compose(best, way)
         left = minus(end, now.pose)
-        drift = _drift(path, since, best.heading - here.heading, mission.noise)
-        second = np.linalg.inv(np.array(now.covariance.matrix) + drift)
+        drift = _drift(path, since, best.heading - heading, noise)
+        second = np.linalg.inv(matrix(now) + drift)
         chi2 = float(begin @ first @ begin + left @ second @ left)
         by_begin = np.eye(3)
         by_begin[0, 2], by_begin[1, 2] = best.y - end.y, end.x - best.x
         weighted = by_begin.T @ second
         move = np.linalg.solve(first + weighted @ by_begin, first @ begin + weighted @ left)
         best = Pose(*(np.array((best.x, best.y, best.heading)) - move).tolist())
-    return ClaimDifference(math.hypot(off[0], off[1]), abs(float(off[2])), _tail(chi2))
+    return chi2
 
 
 def agreement(one: Localised, other: Localised) -> float:
-    """Return the p-value of the difference of two claims of one tick, if both are right (chi-square test).
+    """Return the p-value of the difference of two poses of one tick, if both are right (chi-square test).
 
-    Their errors are taken as independent, so the p-value is too large rather than too small.
+    Their errors are taken as independent, so the p-value is too large rather than too small. Both have
+    positive definite covariances.
     """
-    assert one.covariance is not None
-    assert other.covariance is not None
     off = minus(one.pose, other.pose)
-    both = np.array(one.covariance.matrix) + np.array(other.covariance.matrix)
-    return _tail(float(off @ np.linalg.solve(both, off)))
+    return _p_value(float(off @ np.linalg.solve(matrix(one) + matrix(other), off)))
+
+
+def matrix(claim: Localised) -> Array:
+    """Return the covariance of a pose under noise, in x, y (m) and heading (rad), (3, 3)."""
+    assert claim.covariance is not None
+    return np.array(claim.covariance.matrix)
 
 
 def minus(one: Pose, other: Pose) -> Array:
@@ -105,7 +122,11 @@ def _drift(path: Track, since: int, turn: float, noise: Noise) -> Array:
     return np.asarray(left.T @ right + constant.T @ constant)
 
 
-def _tail(chi2: float) -> float:
-    """Return the probability of a chi-square above `chi2` with three degrees of freedom."""
-    root = math.sqrt(0.5 * max(chi2, 0.0))
+def _p_value(chi2: float) -> float:
+    """Return the probability of a chi-square above `chi2` with three degrees of freedom, exactly."""
+    root = math.sqrt(0.5 * min(max(chi2, 0.0), CERTAIN))
     return math.erfc(root) + 2.0 / math.sqrt(math.pi) * root * math.exp(-root * root)
+
+
+CERTAIN = 4000.0
+"""A chi-square whose p-value is 0 as a float, like those of all larger ones."""

@@ -139,8 +139,7 @@ def _against_own(fitted: Fit, own: Fit, noise: Noise) -> tuple[float, float]:
     degrees = noise.sigma_degrees + own_free
     level = min((noise.sigma_degrees + own.chi2) / degrees, HIGHEST_LEVEL)
     p_value = f_tail(more / more_free / level, more_free, degrees)
-    bound = 0.5 * math.erfc(_normal(more / HIGHEST_LEVEL, more_free) / math.sqrt(2.0))
-    return min(p_value, bound), _normal(more / level, more_free)
+    return min(p_value, chi2_p_value(more / HIGHEST_LEVEL, more_free)), _normal(more / level, more_free)
 
 
 LEARNED_P_VALUE = 1e-2
@@ -253,6 +252,11 @@ def _beta_fraction(x: float, a: float, b: float) -> float:
 
 FRACTION_TERMS = 500
 """The maximum number of terms of the fraction; it needs about the root of the degrees of freedom."""
+
+
+def chi2_p_value(chi2: float, free: int) -> float:
+    """Return the probability of a larger chi-square with `free` degrees of freedom (Wilson and Hilferty)."""
+    return 0.5 * math.erfc(_normal(chi2, free) / math.sqrt(2.0))
 
 
 def _normal(chi2: float, free: int) -> float:

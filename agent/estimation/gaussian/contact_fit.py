@@ -18,7 +18,7 @@ from msgspec.structs import replace
 
 from agent.estimation.gaussian.beacon_guesses import beacon_guesses
 from agent.estimation.gaussian.claim_rivals import WRONG_SIGMAS
-from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, EARLY_CLAIM_P_VALUE
+from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, EARLY_CLAIM_P_VALUE, chi2_p_value
 from agent.estimation.gaussian.fitted_poses import deviation
 from agent.estimation.gaussian.joint_claims import blocking_reason
 from agent.estimation.gaussian.joint_fit import JointFit, JointStart, joint_fit
@@ -29,7 +29,7 @@ from agent.estimation.gaussian.joint_search import (
     certainties,
     with_probability,
 )
-from agent.estimation.gaussian.known_anchors import FEWEST, AnchoredRobot, chi2_p_value, scored_fits
+from agent.estimation.gaussian.known_anchors import FEWEST, AnchoredRobot, scored_fits
 from agent.estimation.gaussian.linear_model import Start
 from agent.estimation.gaussian.odometry_noise import Errors, Track
 from agent.estimation.gaussian.own_sensors import DOUBTFUL_CLAIM, claim_profiles

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from agent.estimation.gaussian.claim_agreement import minus
+from agent.estimation.gaussian.claim_agreement import matrix, minus
 from agent.estimation.gaussian.odometry_noise import Array
 from protocol.messages import Localised
 from protocol.motion import Covariance
@@ -20,17 +20,12 @@ def covariance_union(claims: Sequence[Localised]) -> Localised:
     where d_i is its difference from the last one (covariance union; Uhlmann 2003).
     """
     best = claims[-1]
-    union = _matrix(best)
+    union = matrix(best)
     for one in claims[:-1]:
         off = minus(one.pose, best.pose)
-        union = _larger(union, _matrix(one) + np.outer(off, off))
+        union = _larger(union, matrix(one) + np.outer(off, off))
     xx, xy, xh, yy, yh, hh = (float(union[j, k]) for j, k in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
     return Localised(best.pose, Covariance(xx, xy, xh, yy, yh, hh))
-
-
-def _matrix(claim: Localised) -> Array:
-    assert claim.covariance is not None
-    return np.array(claim.covariance.matrix)
 
 
 def _larger(one: Array, other: Array) -> Array:

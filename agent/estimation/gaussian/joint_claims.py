@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, HIGHEST_LEVEL
+from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, HIGHEST_LEVEL, chi2_p_value
 from agent.estimation.gaussian.fitted_poses import deviation
 from agent.estimation.gaussian.inference import MUTUAL_RANGES, MUTUAL_RANGES_WITH_OUTLIERS
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
@@ -16,7 +16,7 @@ from agent.estimation.gaussian.joint_search import (
     JointHypotheses,
     beacons,
 )
-from agent.estimation.gaussian.known_anchors import MOST_STRAYS, chi2_p_value, inaccuracy
+from agent.estimation.gaussian.known_anchors import MOST_STRAYS, inaccuracy
 from agent.estimation.gaussian.noise_level import INLIER
 from agent.estimation.gaussian.odometry_noise import Places
 from agent.estimation.gaussian.range_model import ELSEWHERE

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from agent.estimation.gaussian.anchor_guesses import anchors
-from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, HIGHEST_LEVEL
+from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, HIGHEST_LEVEL, chi2_p_value
 from agent.estimation.gaussian.fitted_poses import deviation
 from agent.estimation.gaussian.hypotheses import (
     WARM_STEPS,
@@ -199,10 +199,3 @@ def inaccuracy(covariance: Array, accuracy: float) -> str:
     if not heading <= HEADING_ACCURACY:
         return f"the sigma of the heading is {heading:.3g} rad, required {HEADING_ACCURACY:g}"
     return ""
-
-
-def chi2_p_value(chi2: float, free: int) -> float:
-    """Return the probability of a larger chi-square with `free` degrees of freedom (Wilson and Hilferty)."""
-    spread = 2.0 / (9.0 * free)
-    normal = ((max(chi2, 0.0) / free) ** (1.0 / 3.0) - (1.0 - spread)) / math.sqrt(spread)
-    return 0.5 * math.erfc(normal / math.sqrt(2.0))
