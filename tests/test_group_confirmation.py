@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from functools import lru_cache
-from itertools import pairwise
+from itertools import pairwise, permutations
 from typing import Any
 
 import numpy as np
@@ -14,8 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from agent.estimation.gaussian.claim_agreement import agreement, minus
+from agent.estimation.gaussian.claim_agreement import agreement, difference, minus
 from agent.estimation.gaussian.covariance_union import covariance_union
+from agent.peer.motion_log import MotionLog
 from agent.planning.confirmation import ConfirmingPlanner
 from agent.planning.group_state import GroupState
 from compose.audit.replay import replayed
@@ -36,6 +37,8 @@ from tests.test_audit import kept
 from tests.test_group_noise import TURNED
 from tests.test_group_runs import audited
 from world.scenario import Scenario
+
+SHIFTED = {"kind": "shift", "part": "all", "size": 0.3}
 
 WRONG = 8
 """The seed of a group in which r1, with the attack TURNED, misleads r2 in its only meeting until tick 200."""
@@ -204,6 +207,35 @@ def test_a_fit_after_a_long_way_that_ends_beside_the_right_pose_is_searched_agai
     assert claim.position_error < 0.1
 
 
+def test_a_robot_compares_its_meetings_once_more_before_it_gives_up() -> None:
+    """Without it, the agreement of a late meeting was not found."""
+    run = of_frames(without_attacker())
+    found = states(run, "r1")
+    tick = next(tick for tick, one in enumerate(found) if one.verdict is not None)
+    before, after, step = found[tick - 1], found[tick], run.agents["r1"].steps[tick]
+    config = before.config
+    assert isinstance(config, RobotConfigWithConfirmation)
+    assert isinstance(after.verdict, Localised)
+    assert after.fix is not None
+    assert after.fix.tick < after.pair.tick  # no meeting has just ended
+    planner = planner_of(config)
+
+    def decided(gives_up: float) -> GroupState:
+        pair = replace(before.pair, config=replace(config, gives_up=gives_up))
+        state = replace(before, pair=pair, confirming=replace(before.confirming, ranges=10**6))
+        state = planner.observe(state, step.observation)
+        return planner.decide(state, [framed.report for framed in step.received])  # type: ignore[no-any-return]
+
+    assert decided(math.inf).verdict is None
+    assert decided(0.0).verdict == after.verdict
+
+
+@pytest.mark.long
+def test_an_attacker_in_a_first_meeting_does_not_leave_robots_undecided() -> None:
+    """The robot that r1 met first was on retries while others visited it, and did not meet them after that."""
+    assert honest(run_mission(scenario_with(8867783836166564671, SHIFTED))) == (3, 0, 0)
+
+
 # --- the plan -----------------------------------------------------------------------------------------
 
 
@@ -228,6 +260,15 @@ def test_each_robot_meets_enough_others_and_is_in_one_meeting_at_a_time(
     assert times[0][0] == scenario.meetings[-1].ends
     assert all(one[1] <= other[0] + 1e-9 for one, other in pairwise(times))
     assert scenario.confirmation.ends < scenario.max_ticks
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_after_all_retries_robots_visit_each_other_in_both_roles(seed: int) -> None:
+    scenario = scenario_with(seed)
+    assert scenario.confirmation is not None
+    after = max(one.begins + one.lasts for one in scenario.retries)
+    late = [(one.visitor, one.visited) for one in scenario.confirmation.visits if one.begins >= after]
+    assert {*late} == {*permutations([robot.id for robot in scenario.robots], 2)}
 
 
 def test_a_robot_is_told_the_visits_that_it_makes() -> None:
@@ -324,6 +365,27 @@ def test_a_union_covers_each_claim_and_its_difference(found: list[Localised]) ->
 @given(claims())
 def test_the_union_of_the_same_claims_is_that_claim(one: Localised) -> None:
     assert np.allclose(matrix(covariance_union([one, one, one])), matrix(one), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "moments", [(0.0,) * 6, (0.01, 0.01, 0.0, 0.01, 0.0, 0.01), (-0.01, 0.0, 0.0, 0.01, 0.0, 0.0)]
+)
+def test_a_claim_with_a_singular_covariance_agrees_with_no_other_one(moments: tuple[float, ...]) -> None:
+    """A singular matrix has no inverse: it ended the process."""
+    mission = scenario_with(3).mission
+    exact = replace(mission, noise=replace(mission.noise, gyro_bias=None))
+    singular, sure = Covariance(*moments), Covariance(0.01, 0.0, 0.0, 0.01, 0.0, 0.01)
+    log = MotionLog().drove(0.0, 0.0)
+    for one, other in ((singular, sure), (sure, singular), (singular, singular)):
+        earlier, now = Localised(Pose(0.0, 0.0, 0.0), one), Localised(Pose(1.0, 0.0, 0.0), other)
+        assert difference(earlier, 0, now, 1, log, exact).p_value < 0.001
+
+
+@pytest.mark.parametrize("moved", [0.0, 1.0, 1e3, 1e7])
+def test_the_difference_of_two_claims_has_a_p_value_however_large_it_is(moved: float) -> None:
+    sure = Covariance(1e-15, 0.0, 0.0, 1e-15, 0.0, 1e-15)
+    p_value = agreement(Localised(Pose(0.0, 0.0, 0.0), sure), Localised(Pose(moved, 0.0, 0.0), sure))
+    assert p_value == (1.0 if moved == 0.0 else 0.0)
 
 
 def test_the_p_values_of_right_claims_of_one_tick_are_uniform() -> None:
