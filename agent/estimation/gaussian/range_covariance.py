@@ -108,7 +108,7 @@ The normal matrix loses as many digits as this has, and QR takes longer.
 
 
 MOST_EXPLAINED = 1e8
-"""The variance of a range, in units of what the other ranges leave of it, above which products are solved for.
+"""The variance of a range, in units of what the others leave of it, above which products are solved for.
 
 Products with the inverse lose as many digits as this has, and solving takes longer. With exact ranges and
 odometry noise of 1 %, the variance of a claim, which is a difference of such products, was wrong by up to
