@@ -112,7 +112,7 @@ MOST_EXPLAINED = 1e8
 
 Products with the inverse lose as many digits as this has, and solving takes longer. With exact ranges and
 odometry noise of 1 %, the variance of a claim, which is a difference of such products, was wrong by up to
-1e-7 m^2, and could be negative. A sigma of 0.001 m leads to this value if odometry is off by 10 m.
+3e-6 m^2, and could be negative. A sigma of 0.001 m leads to this value if odometry is off by 10 m.
 """
 
 GRAIN = 1e-12
