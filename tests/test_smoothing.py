@@ -15,6 +15,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from agent.estimation.gaussian import odometry_noise
+from agent.estimation.gaussian.consistency import FINISHED
 from agent.estimation.gaussian.fitted import Fit
 from agent.estimation.gaussian.fitted_poses import deviation, poses
 from agent.estimation.gaussian.least_squares import STILL, fit, fits
@@ -31,7 +32,7 @@ from agent.estimation.gaussian.odometry_noise import (
     track,
     wander,
 )
-from agent.estimation.gaussian.range_model import Ranges, predict
+from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges, predict
 from protocol.motion import ORIGIN, Pose, compose, step
 from protocol.noise import Noise, VelocityNoise
 
@@ -581,6 +582,58 @@ def test_fits_that_are_computed_at_once_are_those_computed_alone(seed: int, nois
             sigmas = np.sqrt(np.diagonal(alone.covariance))
             assert np.max(np.abs(found.guess - alone.guess) / sigmas) < 1e-4
             assert found.log_likelihood == pytest.approx(alone.log_likelihood, rel=1e-4, abs=1e-4)
+
+
+OF_EXACT_RANGES = Noise(odometry=VelocityNoise(0.02, 0.02)).as_told
+
+
+def test_a_fit_that_has_converged_explains_exact_ranges() -> None:
+    """The guess may be still while the path is not: then residuals are thousands of their sigmas."""
+    converged = 0
+    for seed in range(80, 160):
+        one = told(seed, OF_EXACT_RANGES)
+        if not clear(one):
+            continue
+        found = fit(nudged(one, seed, 0.01), *one[:3], one.apart)
+        if found.last_step <= FINISHED:
+            converged += 1
+            assert np.max(np.abs(found.residuals)) < 10.0 * SIGMA_FLOOR, seed
+    assert converged > 5, converged
+
+
+REST = 4
+"""The number of ticks that both robots then stand still."""
+
+
+def resting(told: Told) -> Told:
+    """Return `told` with REST more ticks at rest, in which each range is measured again."""
+    paths = [
+        track(np.append(path.v, np.zeros(REST)), np.append(path.omega, np.zeros(REST)), path.period)
+        for path in told.measured
+    ]
+    lists = []
+    for kind in range(3):
+        rho = told.ranges.rho[told.ranges.rows(kind)].tolist()
+        lists.append(list(enumerate(rho + REST * rho[-1:])))
+    ranges = Ranges.of_lists(lists[0], lists[1], lists[2], told.noise)
+    return told._replace(measured=(paths[0], paths[1]), ranges=ranges)
+
+
+@few
+@given(seeds, st.sampled_from((0.001, 0.003, 0.01)))
+def test_the_distance_from_an_anchor_is_as_accurate_as_exact_ranges_at_rest(seed: int, share: float) -> None:
+    """Its variance is a difference of products with a covariance whose inverse has lost all digits."""
+    one = told(seed, Noise(odometry=VelocityNoise(share, share)).as_told)
+    assume(clear(one))
+    one = resting(one)
+    found = settled(one)
+    assume(converged(found))
+    mean, covariance = poses(found, one.apart)
+    for robot, anchor in enumerate(((0.0, 0.0), one.apart)):
+        own = slice(3 * robot, 3 * robot + 2)
+        along = (mean[own] - anchor) / np.hypot(*(mean[own] - anchor))
+        variance = float(along @ covariance[own, own] @ along) / found.level
+        assert 0.0 < variance < 10.0 * SIGMA_FLOOR**2
 
 
 def test_a_variance_that_rounding_has_made_negative_is_no_knowledge() -> None:

@@ -122,10 +122,13 @@ def fits(
         still = settled & (expected < shortest)
         still &= step > 0 or decrease < 1.0 or not problem.noisy  # the path is corrected at least once
         if step == steps:
+            off = _off_model(point, variance, quality)
+            at_end = quality._replace(last_step=np.where(off > 1.0, off, quality.last_step))
             for row, i in enumerate(left):
-                ended[i] = _fit(problem, row, point, point, weights, system, quality)
+                ended[i] = _fit(problem, row, point, point, weights, system, at_end)
             break
         begun, point = point, stepped(problem, point, linear, system, variance)
+        still &= _off_model(point, variance, quality) <= 1.0
         at_end = quality._replace(last_step=expected)
         for row in np.flatnonzero(still).tolist():
             ended[left[row]] = _fit(problem, row, point, begun, weights, system, at_end)
@@ -228,6 +231,16 @@ def _quality(system: NormalEquations, weights: Array, noise: Noise) -> _Quality:
     level = np.array([noise_level(one, count - change.shape[-1], noise) for one, count in told])
     length = np.abs(np.add.reduce(change * product(system.information, change), -1))
     return _Quality(chi2, inliers, level, np.sqrt(length / level))
+
+
+def _off_model(point: Point, variance: Array, quality: _Quality) -> Array:
+    """Return the sigmas by which the errors at `point` exceed those of the linear model; shape (fits,).
+
+    The length of a step tells how far the guess is from its optimum, but not how far the path is: where
+    ranges are exact, the second order of a step of the path can leave residuals of thousands of their sigmas.
+    More than one sigma is a step that the path still has to take.
+    """
+    return np.sqrt(np.maximum(point.cost(variance) - quality.chi2, 0.0) / quality.level)
 
 
 def _solved(jacobian: Array, innovation: Array, covariance: RangeCovariance) -> NormalEquations:

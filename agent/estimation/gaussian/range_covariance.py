@@ -41,6 +41,9 @@ class RangeCovariance(NamedTuple):
     def solve(self, columns: Array) -> Array:
         """Return `columns`, shape (..., N, k), multiplied by the inverse covariance."""
         if self._dense:
+            explained = np.diagonal(self.white, axis1=-2, axis2=-1) * self.precisions
+            if explained.size and explained.max() > MOST_EXPLAINED:
+                return np.asarray(np.linalg.solve(self.white, columns), np.float64)
             return np.asarray(self.inverse @ columns, np.float64)
         solved: Array = self.inverse[..., None] * columns
         if self.columns.shape[-1]:
@@ -103,6 +106,14 @@ MOST_INFORMATION = 1e6
 The normal matrix loses as many digits as this has, and QR takes longer.
 """
 
+
+MOST_EXPLAINED = 1e8
+"""The variance of a range, in units of what the others leave of it, above which products are solved for.
+
+Products with the inverse lose as many digits as this has, and solving takes longer. With exact ranges and
+odometry noise of 1 %, the variance of a claim, which is a difference of such products, was wrong by up to
+3e-6 m^2, and could be negative. A sigma of 0.001 m leads to this value if odometry is off by 10 m.
+"""
 
 GRAIN = 1e-12
 """The least variance of a range, as a fraction of the largest variance from odometry noise.
