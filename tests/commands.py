@@ -62,10 +62,10 @@ id = "a"
 anchor = [0.0, 0.0]
 [[robot]]
 id = "b"
-anchor = [60.0, 0.0]
+anchor = [120.0, 0.0]
 """
 """A scenario of LONG_TICKS ticks: long enough for a test to interfere with the run."""
-LONG_TICKS = 1874
+LONG_TICKS = 4794
 ASSURED = "max_ticks = 1_000_000\n" + PAPER_1.replace('"paper"', '"assured"').replace(
     "10.0, 0.0", "60.0, 0.0"
 ).replace("11.3", "61.3")
@@ -75,10 +75,10 @@ REAL_TIME = ASSURED.replace("1_000_000", "600")
 OVER = (0, 1)
 """The exit statuses of a mission that has ended; in real time, either is possible."""
 ENDLESS = (
-    LONG.replace("60.0", "400.0").replace("max_speed = 1.0", "max_speed = 0.1").replace('"long"', '"endless"')
+    LONG.replace("120.0", "400.0").replace("max_speed = 1.0", "max_speed = 0.1").replace('"long"', '"endless"')
 )
 """A scenario so long that it does not end during a test."""
-LONG_JOURNAL_BYTES = 180_000
+LONG_JOURNAL_BYTES = 470_000
 """The size in bytes that the world's journal of LONG exceeds during the run."""
 
 

@@ -118,9 +118,13 @@ def test_a_run_continues_after_each_process_is_suspended_for_a_moment(
 ) -> None:
     out = tmp_path / "out"
     with TandemProcess("run", undisturbed, "--out", out, "-q") as run:
+        run.until_written(out / "world.journal", 2_000)
+        stop(process_of(out, "world"))  # the run waits until its processes are found
+        pids = [process_of(out, *name.split()) for name in NAMES]
+        os.kill(pids[NAMES.index("world")], SIGCONT)
         for turn in range(9):
             run.until_written(out / "world.journal", 2_000 + 8_000 * turn)
-            pid = process_of(out, *NAMES[turn % 3].split())
+            pid = pids[turn % 3]
             stop(pid)
             written = size(out / "world.journal")
             os.kill(pid, SIGCONT)
