@@ -75,7 +75,9 @@ REAL_TIME = ASSURED.replace("1_000_000", "600")
 OVER = (0, 1)
 """The exit statuses of a mission that has ended; in real time, either is possible."""
 ENDLESS = (
-    LONG.replace("120.0", "400.0").replace("max_speed = 1.0", "max_speed = 0.1").replace('"long"', '"endless"')
+    LONG.replace("120.0", "400.0")
+    .replace("max_speed = 1.0", "max_speed = 0.1")
+    .replace('"long"', '"endless"')
 )
 """A scenario so long that it does not end during a test."""
 LONG_JOURNAL_BYTES = 470_000
