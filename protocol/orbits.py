@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import cache, cached_property
+from itertools import pairwise
 
 import msgspec
 
@@ -95,23 +96,46 @@ def meeting_ticks(mission: Mission) -> int:
     return circle + 3 * turn + 25
 
 
-SEARCH_SIDES = 12
-"""The number of sides of the square spiral on which a visitor searches. Its radius is then three times R.
+SHORT_OF_ANCHOR = 0.5
+"""The distance from the visited robot's anchor at which a visitor stops, as a fraction of R.
+
+The robot waits R / 8 from its anchor, so it is in range there; and on the anchor, the ranges to it would not
+depend on where it waits.
+"""
+
+SEARCH_SIDES = 4
+"""The number of sides of a visitor's search across its way, if its heading is not too inaccurate for that.
 
 With exact sensors, a robot that is not in range at the end of the way is not there.
 """
 
 
-def search_ticks(mission: Mission, sides: int) -> int:
-    """Return the ticks of so many sides of a visitor's search; 0 with exact sensors.
+def search_legs(sides: int) -> int:
+    """Return the number of legs of so many sides of a search; see `leg_end`."""
+    return max(2 * sides - 1, 0)
 
-    The sides are R, R, 2 R, 2 R, ... long.
+
+def leg_end(leg: int) -> float:
+    """Return how far to the left of its way leg `leg`, from 1 on, of a visitor's search ends, in units of R.
+
+    The sides end at 2, -4, 6, -8, ...: to the left and to the right in turn. Each but the first has two legs.
+    The first of them leads to the end of the last side in this direction: 2, 0, -4, 2, 6, -4, -8, ... So a
+    leg to places that have not been searched is 4 R long at most, and near the arc on which the robot may be.
     """
+    side = leg // 2 + 1
+    away = 2.0 * side if leg % 2 else 2.0 * (side - 2)
+    return away if side % 2 else 0.0 - away
+
+
+def search_ticks(mission: Mission, sides: int) -> int:
+    """Return the ticks of so many sides of a visitor's search; 0 with exact sensors."""
     if mission.noise.exact:
         return 0
-    length = sum([side // 2 + 1 for side in range(sides)]) * mission.sensing_range
+    ends = [0.0, *map(leg_end, range(1, search_legs(sides) + 1))]
+    ways = [mission.sensing_range * abs(end - begin) for begin, end in pairwise(ends)]
+    ways[0] += SHORT_OF_ANCHOR * mission.sensing_range
     turn = math.ceil(math.pi / (mission.max_turn_rate * mission.period))
-    return math.ceil(length / (mission.max_speed * mission.period)) + sides * turn
+    return sum([math.ceil(way / (mission.max_speed * mission.period)) + turn for way in ways])
 
 
 # --- the orbits of the `paper` planner ----------------------------------------------------------------

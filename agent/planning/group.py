@@ -17,12 +17,14 @@ from collections.abc import Sequence
 from msgspec.structs import asdict, replace
 
 from agent.planning import exchange, group_transitions, sweep_transitions
+from agent.planning.active_sensing import Retreating
 from agent.planning.group_state import GroupState
 from agent.planning.log_exchange import LogPlanner
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Travelling
 from agent.planning.planner import Planner, Summary
+from agent.planning.range_seeking import Homing
 from agent.planning.separation import slowed
-from agent.planning.state import MODE_NAMES, UNCONFIRMED, Done
+from agent.planning.state import MODE_NAMES, UNCONFIRMED, Done, RobotState
 from protocol.messages import (
     Command,
     Estimate,
@@ -68,16 +70,14 @@ class GroupPlanner(Planner[GroupState, Report]):
                 known = state.other(contact.peer)
                 ranges = (*known.mutual, Ranged(observation.tick, contact.range))
                 state = state.with_other(contact.peer, replace(known, mutual=ranges))
-        if state.visiting and isinstance(pair.mode, Aligning | Radial | Orbiting):  # out of range again
+        if state.visiting and _is_out_of_range_again(state.pair, pair):
             pair = replace(pair, mode=Travelling(group_transitions.stop(state.frame, pair)))
         state = group_transitions.passing_others(replace(state, pair=pair), observation.contacts)
-        pair = state.pair
-        if isinstance(pair.mode, Travelling) and not pair.in_contact and not state.passing.places:
-            pair = group_transitions.searching(pair)
-        ended = isinstance(pair.mode, Done)
+        if isinstance(state.pair.mode, Travelling) and not pair.in_contact and not state.passing.places:
+            state = group_transitions.searching(state)
+        ended = isinstance(state.pair.mode, Done)
         return replace(
             state,
-            pair=pair,
             unmet=state.unmet + 1 if ended and not pair.in_contact else 0,
             lingering=state.lingering + 1 if ended and pair.in_contact else 0,
         )
@@ -186,6 +186,15 @@ class GroupPlanner(Planner[GroupState, Report]):
     def required_mutual_ranges(self, mission: Mission) -> int:
         """Return the minimum number of noisy mutual ranges before a claim."""
         return self.pair_planner.required_mutual_ranges(mission)
+
+
+def _is_out_of_range_again(before: RobotState, after: RobotState) -> bool:
+    """Return whether a visitor has lost the robot that it visits, and the planner of a pair leads it away.
+
+    That planner sends a robot to its orbit, or back to its own anchor, which may be far from here.
+    """
+    back = isinstance(before.mode, Retreating) and isinstance(after.mode, Homing)
+    return back or isinstance(after.mode, Aligning | Radial | Orbiting)
 
 
 def with_sender(state: GroupState, report: Report) -> GroupState:

@@ -27,14 +27,7 @@ from protocol.messages import (
 )
 from protocol.mission import Role
 from protocol.motion import Pose, compose, inverse
-from protocol.orbits import SEARCH_SIDES, Rendezvous
-
-SHORT_OF_ANCHOR = 0.5
-"""The distance from the visited robot's anchor at which a visitor stops, as a fraction of R.
-
-The robot waits R / 8 from its anchor, so it is in range there; and on the anchor, the ranges to it would not
-depend on where it waits.
-"""
+from protocol.orbits import SEARCH_SIDES, SHORT_OF_ANCHOR, Rendezvous, search_legs
 
 PARTED_AFTER = 8
 """The ticks out of range of a peer after which a robot whose meeting has ended goes on.
@@ -48,6 +41,12 @@ SILENT_AFTER = 200
 
 LINGERING = 6
 """The ticks in contact for which a visited robot waits for its visitor to leave, with a safety distance."""
+
+SEARCHED_SIGMAS = 4.0
+"""The sigmas of the heading at the claim that a visitor's search allows for."""
+
+MOST_SIDES = 8
+"""The most sides of a search. They reach 14 R to either side, and are 128 R long."""
 
 
 # --- meetings -----------------------------------------------------------------------------------------
@@ -425,26 +424,50 @@ def _must_linger(state: GroupState) -> bool:
 # --- visits -------------------------------------------------------------------------------------------
 
 
-def searching(pair: RobotState) -> RobotState:
-    """Return `pair`, a visitor out of range; if it has arrived, on the next side of the search."""
+def searching(state: GroupState) -> GroupState:
+    """Return `state` of a visitor out of range; if it has arrived, on the next leg of its search."""
+    pair = state.pair
     assert isinstance(pair.mode, Travelling)
     mission, tolerance = pair.config.mission, pair.estimator.pose_tolerance
-    if phase2_orbit.travel_controls(pair.mode, pair.odometry, mission, tolerance) is not None:
-        return pair
-    return replace(pair, mode=phase2_orbit.next_side(pair.mode, mission))
+    if not phase2_orbit.arrived(pair.mode, pair.odometry, mission, tolerance):
+        return state
+    assert state.located is not None
+    begin, anchor = state.located.odometry, _peer_anchor(state.frame, pair)
+    leg = phase2_orbit.next_leg(pair.mode, (begin.x, begin.y), (anchor.x, anchor.y), mission)
+    return replace(state, pair=replace(pair, mode=leg))
 
 
 def _has_searched(state: GroupState) -> bool:
     """Return whether the robot has searched for its peer in vain."""
+    mode = state.pair.mode
+    return isinstance(mode, Travelling) and mode.leg > search_legs(_search_sides(state))
+
+
+def _search_sides(state: GroupState) -> int:
+    """Return the number of sides of the search for the peer: with an inaccurate heading, more are necessary.
+
+    They reach SEARCHED_SIGMAS of the error that the heading at the claim has led to, to either side.
+    """
     assert state.fix is not None
-    mode, sides = state.pair.mode, 0 if state.fix.claim.covariance is None else SEARCH_SIDES
-    return isinstance(mode, Travelling) and mode.side > sides
+    assert state.located is not None
+    if state.fix.claim.covariance is None:
+        return 0
+    begin, anchor = state.located.odometry, _peer_anchor(state.frame, state.pair)
+    sigma = state.fix.claim.covariance.heading_sigma
+    aside = SEARCHED_SIGMAS * sigma * math.hypot(anchor.x - begin.x, anchor.y - begin.y)
+    needed = 1 + math.ceil(0.5 * aside / state.config.mission.sensing_range)
+    return min(max(SEARCH_SIDES, needed), MOST_SIDES)
+
+
+def _peer_anchor(frame: Pose, pair: RobotState) -> Pose:
+    """Return the place of the peer's anchor, in m in the odometry's frame."""
+    peer_anchor = pair.config.peer_anchor
+    return compose(inverse(frame), Pose(peer_anchor.x, peer_anchor.y, 0.0))
 
 
 def stop(frame: Pose, pair: RobotState) -> tuple[float, float]:
     """Return the place of a visit, in m in the odometry's frame: on the way to the anchor, short of it."""
-    peer_anchor = pair.config.peer_anchor
-    anchor = compose(inverse(frame), Pose(peer_anchor.x, peer_anchor.y, 0.0))
+    anchor = _peer_anchor(frame, pair)
     dx, dy = anchor.x - pair.odometry.x, anchor.y - pair.odometry.y
     distance = math.hypot(dx, dy)
     short = SHORT_OF_ANCHOR * pair.config.mission.sensing_range

@@ -6,10 +6,10 @@ import math
 
 import msgspec
 
-from agent.planning.range_seeking import next_on_spiral, straight, turn
+from agent.planning.range_seeking import straight, turn
 from protocol.mission import Mission
 from protocol.motion import Controls, Pose, compose, wrap
-from protocol.orbits import Orbit
+from protocol.orbits import Orbit, leg_end
 
 ASIDE = 1e-9
 """The distance from the place of Travelling at which a straight may end beside it, as a fraction of A_0."""
@@ -48,13 +48,13 @@ class Orbiting(msgspec.Struct, frozen=True):
 class Travelling(msgspec.Struct, frozen=True):
     """A localised robot of a group drives to the next one, which waits beside its anchor.
 
-    If noise has led it astray and the other robot is not in range there, it searches on a square spiral.
+    If noise has led it astray and the other robot is not in range there, it searches across its way.
     """
 
     place: tuple[float, float]
     """The end of the present straight, in m in the frame of the odometry."""
-    side: int = 0
-    """The number of sides of the spiral up to this place; 0 on the way to the robot."""
+    leg: int = 0
+    """The number of legs of the search up to this place; 0 on the way to the robot."""
 
 
 Phase2Mode = Aligning | Radial | Tangent | Orbiting
@@ -127,9 +127,20 @@ def arrived(mode: Travelling, odometry: Pose, mission: Mission, tolerance: float
     return travel_controls(mode, odometry, mission, tolerance) is None
 
 
-def next_side(mode: Travelling, mission: Mission) -> Travelling:
-    """Return the next side of the spiral after `mode`."""
-    return Travelling(next_on_spiral(mode.place, mode.side, mission), mode.side + 1)
+def next_leg(
+    mode: Travelling, begin: tuple[float, float], anchor: tuple[float, float], mission: Mission
+) -> Travelling:
+    """Return the leg after `mode` of the search for a robot that waits beside `anchor` (see `leg_end`).
+
+    The robot knew its pose at `begin`. An error of its heading there turns the way about that place. So the
+    legs end on the arc about it that leads through the anchor. Both places are in m in the frame of the
+    odometry, in which the anchor is where it would be without that error.
+    """
+    leg, (dx, dy) = mode.leg + 1, (anchor[0] - begin[0], anchor[1] - begin[1])
+    radius, aside = math.hypot(dx, dy), leg_end(leg) * mission.sensing_range
+    turned = min(max(aside / radius, -math.pi), math.pi) if radius else 0.0
+    bearing = math.atan2(dy, dx) + turned
+    return Travelling((begin[0] + radius * math.cos(bearing), begin[1] + radius * math.sin(bearing)), leg)
 
 
 def pursuit(local: Pose, orbit: Orbit, mission: Mission) -> Controls:
