@@ -17,8 +17,8 @@ from msgspec.structs import replace
 from agent.planning import group_transitions
 from agent.planning.group import TRAVELLING
 from agent.planning.group_state import Fix
-from agent.planning.group_transitions import SILENT_AFTER
-from agent.planning.phase2_orbit import Travelling, next_side, travel_controls
+from agent.planning.group_transitions import MOST_SIDES, SILENT_AFTER
+from agent.planning.phase2_orbit import Travelling, next_leg, travel_controls
 from agent.planning.state import Done
 from compose.errors import BadScenario, Unworkable, UserError
 from compose.launch.in_process import run_mission
@@ -28,6 +28,7 @@ from compose.scenario.scenario_file import validate
 from protocol.messages import Contact, Localised, Observation, Report, RobotConfigInGroup, Undecided
 from protocol.mission import HEADING_ACCURACY, Mission
 from protocol.motion import Pose, step
+from protocol.orbits import SHORT_OF_ANCHOR, search_legs, search_ticks
 from protocol.wire import MAX_REPORT_BYTES, encode
 from tests.groups import R, group_of, localised, table_of
 from tests.series import series
@@ -345,19 +346,43 @@ def test_a_visitor_reaches_its_place_by_a_turn_and_straights(
     assert math.hypot(pose.x - place[0], pose.y - place[1]) <= 1e-6
 
 
-@given(st.floats(0.0, 3.0 * R), st.floats(-math.pi, math.pi))
-@example(2.0 * R, 0.75)  # beside a corner
-def test_the_square_spiral_passes_every_place_near_its_begin_within_range(
-    away: float, bearing: float
+@given(
+    st.integers(1, MOST_SIDES),
+    st.floats(10.0 * R, 50.0 * R),
+    st.floats(-1.0, 1.0),
+    st.floats(0.0, 2.0 * math.pi),
+)
+@example(MOST_SIDES, 10.0 * R, 1.0, 0.0)
+def test_a_search_passes_a_robot_within_range_wherever_an_error_of_the_heading_has_led(
+    sides: int, way: float, share: float, bearing: float
 ) -> None:
-    target = away * math.cos(bearing), away * math.sin(bearing)
-    mode = Travelling((0.0, 0.0))
+    turned = share * (2.0 * (sides - 1) + 0.75) * R / way
+    anchor = way * math.cos(bearing), way * math.sin(bearing)
+    waits = way * math.cos(bearing + turned), way * math.sin(bearing + turned)
+    short = 1.0 - SHORT_OF_ANCHOR * R / way
+    mode = Travelling((short * anchor[0], short * anchor[1]))
     places = [mode.place]
-    for _ in range(14):
-        mode = next_side(mode, MISSION)
+    for _ in range(search_legs(sides)):
+        mode = next_leg(mode, (0.0, 0.0), anchor, MISSION)
         places.append(mode.place)
-    nearest = min(_distance(target, one, other) for one, other in pairwise(places))
-    assert nearest <= math.sqrt(0.5) * R + 1e-9
+    nearest = min(_distance(waits, one, other) for one, other in pairwise(places))
+    assert nearest <= 0.85 * R
+
+
+def test_the_ticks_of_a_search_are_those_of_its_legs() -> None:
+    noisy = group_of(4, 1, sigma=0.05).mission
+    way = 30.0 * R
+    for sides in range(1, MOST_SIDES + 1):
+        mode, pose, ticks = (
+            Travelling((way - SHORT_OF_ANCHOR * R, 0.0)),
+            Pose(way - SHORT_OF_ANCHOR * R, 0.0, 0.0),
+            0,
+        )
+        for _ in range(search_legs(sides)):
+            mode = next_leg(mode, (0.0, 0.0), (way, 0.0), noisy)
+            while (controls := travel_controls(mode, pose, noisy, 1e-9)) is not None:
+                pose, ticks = step(pose, controls.v, controls.omega, noisy.period), ticks + 1
+        assert ticks <= search_ticks(noisy, sides) <= 1.2 * ticks + 2
 
 
 def _distance(target: tuple[float, float], one: tuple[float, float], other: tuple[float, float]) -> float:

@@ -244,7 +244,6 @@ def test_groups_of_sixteen_that_lose_nine_of_ten_reports_are_localised_within_th
 def test_the_bound_of_a_visit_under_noise_allows_for_a_search() -> None:
     exact, noisy = (group_of(4, 1, sigma=sigma) for sigma in (0.0, SIGMA))
     assert search_ticks(exact.mission, SEARCH_SIDES) == 0
-    assert search_ticks(noisy.mission, SEARCH_SIDES) == 42 * R + SEARCH_SIDES
     firsts = [one for one in noisy.meetings if one.ends == noisy.meetings[0].ends]
     assert firsts
     visits = [one for one in noisy.meetings if one.visited not in (noisy.meetings[0].visitor,)][1:]
