@@ -332,7 +332,7 @@ class Retry(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=
 MOST_ASIDE = 1.25
 """The sigma of the place of a visitor at the end of its way, across it, in units of R.
 
-It searches within 3 R of that place, and finds a robot nearly R beyond.
+Five sigmas are within reach of its search.
 """
 
 

@@ -328,6 +328,32 @@ def test_the_outcome_is_that_of_all_robots(
     assert (end.outcome, end.reason) == (outcome, reason)
 
 
+@pytest.mark.parametrize(
+    ("verdicts", "outcome", "reason"),
+    [
+        (
+            {"b": Undecided("why"), "c": Undecided("y"), "d": LOCALISED},
+            "undecided",
+            "b: why; c is not localised either",
+        ),
+        (
+            {"d": Inconsistent("x"), "b": Undecided("why"), "c": Undecided("y")},
+            "inconsistent",
+            "d: its peer reports x; b, c are not localised either",
+        ),
+        ({"d": Undecided("why")}, "undecided", "d: why; no result of b, c received"),
+    ],
+)
+def test_the_reason_names_all_robots_that_are_not_localised(
+    verdicts: dict[str, Verdict], outcome: str, reason: str, ending: GroupEnding
+) -> None:
+    for robot, verdict in verdicts.items():
+        ending.receive(result(robot, verdict))
+    end = ends(ending, range(10, 801))
+    assert end is not None
+    assert (end.outcome, end.reason) == (outcome, reason)
+
+
 def test_a_robot_without_a_result_ends_at_max_ticks(ending: GroupEnding) -> None:
     for robot in "bcd":
         ending.receive(result(robot))

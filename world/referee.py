@@ -145,9 +145,15 @@ def _others_not_localised(
     known = {*named, *[one.robot for one in dead]}
     left = [robot for robot in not_localised(scenario, verdicts, tick) if robot not in known]
     if left:
-        names = ", ".join(left[:NAMED]) + (f" and {len(left) - NAMED} more" if len(left) > NAMED else "")
-        found.append(f"{names} {'is' if len(left) == 1 else 'are'} not localised either")
+        found.append(either(left))
     return found
+
+
+def either(robots: Sequence[str]) -> str:
+    """Return the clause that `robots` are not localised either, which names some of them."""
+    more = len(robots) - NAMED
+    names = ", ".join(robots[:NAMED]) + (f" and {more} more" if more > 0 else "")
+    return f"{names} {'is' if len(robots) == 1 else 'are'} not localised either"
 
 
 def _dead(death: Death) -> str:

@@ -33,7 +33,7 @@ from protocol.messages import (
 )
 from protocol.sweep_ticks import straight_ticks, sweepers_of_part, ticks_of_parts
 from world.hardware.termination import LAST_WORDS, Termination
-from world.referee import inaccuracy
+from world.referee import either, inaccuracy
 
 RESTING_STATES = ("localised", "undecided", "inconsistent")
 """The states of a planner whose meeting is over."""
@@ -123,24 +123,39 @@ class GroupEnding(Termination):
         return late > self._plan or (late > 0 and self._visits and self._resting > RESTING_TICKS)
 
     def _end(self, tick: int) -> MissionEnd:
+        """Return the MissionEnd. Its reason is that of one robot without a pose, and names the others."""
+        results = self._results if self.verdict is None else {**self._results, self._me: self.verdict}
+        missing = [robot for robot in self._group if robot not in results and robot != self._me]
+        failed = {robot: why for robot in self._group if (why := self._failure(robot, results.get(robot)))}
+        false = [robot for robot in failed if isinstance(results[robot], Inconsistent)]
+        first = next(iter(false or failed), None)
         if self.verdict is None:
-            return MissionEnd(tick, "undecided", f"max_ticks: {self._me} not localised by then")
-        results = {**self._results, self._me: self.verdict}
-        known = [(robot, results[robot]) for robot in self._group if robot in results]
-        for robot, verdict in known:
-            if isinstance(verdict, Inconsistent):
-                return MissionEnd(tick, "inconsistent", f"{robot}: its peer reports {verdict.claim}")
-        for robot, verdict in known:
-            match verdict:
-                case Undecided(reason):
-                    return MissionEnd(tick, "undecided", f"{robot}: {reason}")
-                case Localised() if (vague := inaccuracy(verdict, self._mission)) is not None:
-                    return MissionEnd(tick, "undecided", f"{robot} {vague}")
-        missing = [robot for robot in self._group if robot not in results]
+            first, reason = self._me, f"max_ticks: {self._me} not localised by then"
+        elif first is not None:
+            reason = failed[first]
+        elif missing:
+            reason = f"{self._me} is localised"
+        else:
+            return MissionEnd(tick, "localised", None)
+        clauses, left = [reason], [robot for robot in failed if robot != first]
+        if left:
+            clauses.append(either(left))
         if missing:
-            what = f"{self._me} is localised; no result of {', '.join(missing)} received"
-            return MissionEnd(tick, "undecided", what)
-        return MissionEnd(tick, "localised", None)
+            clauses.append(f"no result of {', '.join(missing)} received")
+        return MissionEnd(tick, "inconsistent" if first in false else "undecided", "; ".join(clauses))
+
+    def _failure(self, robot: str, verdict: Verdict | None) -> str | None:
+        """Return why `robot` is not localised by this result; None if it is, or has no result yet."""
+        match verdict:
+            case Undecided(reason):
+                return f"{robot}: {reason}"
+            case Inconsistent(claim):
+                return f"{robot}: its peer reports {claim}"
+            case Localised():
+                vague = inaccuracy(verdict, self._mission)
+                return f"{robot} {vague}" if vague is not None else None
+            case None:
+                return None
 
 
 def _confirmed_tick(config: RobotConfigInGroup) -> int:
