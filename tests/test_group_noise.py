@@ -250,3 +250,26 @@ def test_the_bound_of_a_visit_under_noise_allows_for_a_search() -> None:
     least = meeting_ticks(noisy.mission) + search_ticks(noisy.mission, ALLOWED_SIDES)
     assert noisy.meetings[-1].ends >= noisy.meetings[0].ends + least
     assert visits
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("seed", "visitor"),
+    [(6601513976186210778, "r1"), (4918257111182012597, "r9")],
+    ids=["it loses the robot at the edge of its range", "its heading is off by 0.15 rad"],
+)
+def test_a_visitor_searches_where_an_error_of_its_heading_leads(seed: int, visitor: str) -> None:
+    """On a square spiral, or by its own anchor, it found the other robot after 385 and 600 ticks."""
+    table: dict[str, Any] = scenario_table("random-group")
+    noise = {"anchor_sigma": SIGMA, "mutual_sigma": SIGMA, "gyro_bias": 0.0002}
+    table["mission"] |= {"accuracy": 0.3, "noise": noise}
+    table |= {"seed": seed, "group": {"robots": 16, "spacing": 30.0}}
+    scenario = validate(table, "group.toml").seeded(None)
+    run = run_mission(scenario)
+    claims = [claim.tick for robot in run.robots if (claim := run.claim(robot)) is not None]
+    assert len(claims) == 16
+    assert max(claims) <= 0.7 * scenario.meetings[-1].ends
+    commands = [command for tick in run.ticks if (command := tick.commands.get(visitor)) is not None]
+    states = {command.state for command in commands if isinstance(command.verdict, Localised)}
+    assert "travelling" in states
+    assert "homing" not in states
