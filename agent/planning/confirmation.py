@@ -23,7 +23,6 @@ from agent.planning.group_state import Fix, GroupState
 from agent.planning.state import UNCONFIRMED
 from protocol.messages import Command, Localised, Report, RobotConfigWithConfirmation, Undecided
 from protocol.mission import HEADING_ACCURACY
-from protocol.motion import compose, inverse
 
 RANGES_AGAIN, SHARE_AGAIN = 6, 1.1
 """After so many more ranges to its anchor, and so many times more, a robot compares its meetings again."""
@@ -71,9 +70,8 @@ class ConfirmingPlanner(GroupPlanner):
             state,
             fix=Fix(pair.tick, pose, (pair.config.peer,)),
             located=pair,
-            frame=compose(pose.pose, inverse(pair.odometry)),
             confirming=replace(state.confirming, meetings=(*others, pair)),
-        )
+        ).with_frame(pose.pose)
 
 
 def _config(state: GroupState) -> RobotConfigWithConfirmation:
@@ -132,7 +130,7 @@ def _with_frame(state: GroupState) -> GroupState:
     if not poses:
         return state
     turn = 0 if state.verdict is not None else confirming.visits % len(poses)
-    return replace(state, frame=compose(poses[-1 - turn].pose, inverse(pair.odometry)))
+    return state.with_frame(poses[-1 - turn].pose)
 
 
 # --- the claim ----------------------------------------------------------------------------------------
@@ -182,7 +180,6 @@ def _confirmed(state: GroupState) -> GroupState:
         if position <= config.mission.accuracy and heading <= HEADING_ACCURACY:
             peers = [peer for peer, _ in chosen]
             meetings = sorted(confirming.meetings, key=lambda one: one.config.peer in peers)
-            frame = compose(claim.pose, inverse(pair.odometry))
             confirming = replace(state.confirming, meetings=tuple(meetings))
-            return replace(state, verdict=claim, frame=frame, confirming=confirming)
+            return replace(state, verdict=claim, confirming=confirming).with_frame(claim.pose)
     return state

@@ -11,7 +11,7 @@ from agent.planning.passing import Bypass
 from agent.planning.state import RobotState
 from agent.planning.sweep import Looping, Sweeping
 from protocol.messages import Localised, Ranged, RobotConfigInGroup, Verdict
-from protocol.motion import ORIGIN, Covariance, Pose
+from protocol.motion import ORIGIN, Covariance, Pose, compose, inverse
 
 
 class Other(msgspec.Struct, frozen=True):
@@ -121,6 +121,8 @@ class GroupState(msgspec.Struct, frozen=True):
     """The verdict of the latest meeting that has failed before the robot was localised."""
     frame: Pose = ORIGIN
     """The pose in <W> of the odometry's frame, from the latest meeting in which the robot was localised."""
+    framed_at: Pose = ORIGIN
+    """The odometry where `frame` was determined. An error of its heading turns ways about this place."""
     others: Mapping[str, Other] = {}
     """The knowledge about each robot that this one has been in range of, or heard of."""
     unmet: int = 0
@@ -154,6 +156,11 @@ class GroupState(msgspec.Struct, frozen=True):
         """The configuration, with the peer and the role of the present meeting."""
         assert isinstance(self.pair.config, RobotConfigInGroup)
         return self.pair.config
+
+    def with_frame(self, pose: Pose) -> GroupState:
+        """Return this state of a robot that has determined its present `pose` in <W>."""
+        odometry = self.pair.odometry
+        return replace(self, frame=compose(pose, inverse(odometry)), framed_at=odometry)
 
     def other(self, robot: str) -> Other:
         """Return what the robot knows of `robot`."""

@@ -102,8 +102,7 @@ def with_claim(state: GroupState, claim: Localised) -> GroupState:
     contradiction = _contradiction(state, claim)
     if contradiction is None:
         fix = Fix(pair.tick, claim, (*(fix.peers if fix is not None else ()), peer))
-        frame = compose(claim.pose, inverse(pair.odometry))
-        return replace(state, fix=fix, located=pair, frame=frame)
+        return replace(state, fix=fix, located=pair).with_frame(claim.pose)
     assert fix is not None
     if len(fix.peers) > 1:
         return _after_meeting(state)
@@ -431,8 +430,7 @@ def searching(state: GroupState) -> GroupState:
     mission, tolerance = pair.config.mission, pair.estimator.pose_tolerance
     if not phase2_orbit.arrived(pair.mode, pair.odometry, mission, tolerance):
         return state
-    assert state.located is not None
-    begin, anchor = state.located.odometry, _peer_anchor(state.frame, pair)
+    begin, anchor = state.framed_at, _peer_anchor(state.frame, pair)
     leg = phase2_orbit.next_leg(pair.mode, (begin.x, begin.y), (anchor.x, anchor.y), mission)
     return replace(state, pair=replace(pair, mode=leg))
 
@@ -449,10 +447,9 @@ def _search_sides(state: GroupState) -> int:
     They reach SEARCHED_SIGMAS of the error that the heading at the claim has led to, to either side.
     """
     assert state.fix is not None
-    assert state.located is not None
     if state.fix.claim.covariance is None:
         return 0
-    begin, anchor = state.located.odometry, _peer_anchor(state.frame, state.pair)
+    begin, anchor = state.framed_at, _peer_anchor(state.frame, state.pair)
     sigma = state.fix.claim.covariance.heading_sigma
     aside = SEARCHED_SIGMAS * sigma * math.hypot(anchor.x - begin.x, anchor.y - begin.y)
     needed = 1 + math.ceil(0.5 * aside / state.config.mission.sensing_range)

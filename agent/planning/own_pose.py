@@ -196,7 +196,7 @@ def _with_estimate(state: GroupState, estimate: _Estimate | None) -> GroupState:
         sigma=estimate.covariance.position_sigma,
         ranges_when_lost=before.ranges if was_lost and ranges > before.ranges else before.ranges_when_lost,
     )
-    return replace(state, pair=pair, frame=frame, own_pose=own_pose)
+    return replace(state, pair=pair, frame=frame, framed_at=pair.odometry, own_pose=own_pose)
 
 
 def _reference(state: GroupState, estimate: _Estimate) -> Reference | None:
