@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from compose.errors import BadScenario, NoSuchField
+from compose.errors import BadScenario, NoSuchField, UserError
 from compose.launch.class_loader import name_of
 from compose.scenario.fault_syntax import table_of
 from compose.scenario.scenario_file import ScenarioTemplate, scenario_table, validate, with_planner
@@ -140,8 +140,10 @@ def scenario_of(given: Scenario | str | Path | Mapping[str, Any]) -> Scenario:
             return given
         case Mapping():
             return Scenario.from_dict(given)
-        case _:
+        case str() | Path():
             return Scenario.load(given)
+        case _:
+            raise UserError(f"scenario: not a name, path, dict or tandem.Scenario: {type(given).__name__}")
 
 
 def plain(value: Any) -> Any:

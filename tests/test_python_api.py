@@ -384,3 +384,10 @@ def test_a_wrong_argument_of_an_estimate_is_one_line(arguments: dict[str, Any], 
 def test_a_run_is_not_made_from_the_path_of_a_recording(tmp_path: Path) -> None:
     with pytest.raises(tandem.UserError, match=r"is no run; open a recording with tandem\.open$"):
         tandem.Run(str(tmp_path))  # type: ignore[arg-type]
+
+
+def test_a_scenario_of_another_type_is_an_error_that_names_its_type() -> None:
+    with pytest.raises(
+        tandem.UserError, match=r"^scenario: not a name, path, dict or tandem\.Scenario: int$"
+    ):
+        tandem.run(3)  # type: ignore[arg-type]
