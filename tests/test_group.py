@@ -17,9 +17,10 @@ from msgspec.structs import replace
 from agent.planning import group_transitions
 from agent.planning.group import TRAVELLING
 from agent.planning.group_state import Fix
-from agent.planning.group_transitions import MOST_SIDES, SILENT_AFTER
+from agent.planning.group_transitions import SILENT_AFTER
 from agent.planning.phase2_orbit import Travelling, next_leg, travel_controls
 from agent.planning.state import Done
+from agent.planning.visit import MOST_SIDES
 from compose.errors import BadScenario, Unworkable, UserError
 from compose.launch.in_process import run_mission
 from compose.launch.planner_loader import planner_of
@@ -371,13 +372,9 @@ def test_a_search_passes_a_robot_within_range_wherever_an_error_of_the_heading_h
 
 def test_the_ticks_of_a_search_are_those_of_its_legs() -> None:
     noisy = group_of(4, 1, sigma=0.05).mission
-    way = 30.0 * R
-    for sides in range(1, MOST_SIDES + 1):
-        mode, pose, ticks = (
-            Travelling((way - SHORT_OF_ANCHOR * R, 0.0)),
-            Pose(way - SHORT_OF_ANCHOR * R, 0.0, 0.0),
-            0,
-        )
+    way, short = 30.0 * R, (30.0 - SHORT_OF_ANCHOR) * R
+    for sides in range(MOST_SIDES + 1):
+        mode, pose, ticks = Travelling((short, 0.0)), Pose(short, 0.0, 0.0), 0
         for _ in range(search_legs(sides)):
             mode = next_leg(mode, (0.0, 0.0), (way, 0.0), noisy)
             while (controls := travel_controls(mode, pose, noisy, 1e-9)) is not None:

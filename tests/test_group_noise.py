@@ -37,6 +37,15 @@ TURNED = {"kind": "rotate", "part": "orbit", "size": math.radians(15.0)}
 """False reports that pass the first meeting of r3 in the group of `attacked`."""
 
 
+def random_group(seed: int, **group: Any) -> Scenario:
+    """Return the scenario `random-group` under noise, with the fields `group`."""
+    table: dict[str, Any] = scenario_table("random-group")
+    noise = {"anchor_sigma": SIGMA, "mutual_sigma": SIGMA, "gyro_bias": 0.0002}
+    table["mission"] |= {"accuracy": 0.3, "noise": noise}
+    table |= {"seed": seed, "group": {"spacing": 30.0} | group}
+    return validate(table, "group.toml").seeded(None)
+
+
 # --- robots with nearly the same anchor ---------------------------------------------------------------
 
 
@@ -82,11 +91,7 @@ def test_a_noisy_group_whose_anchors_are_all_at_one_place_is_refused_in_one_line
 
 def attacked() -> Scenario:
     """Return a group whose attacker r1 turns the path of its visit to r3 by 15 degrees; r3 then visits r2."""
-    table: dict[str, Any] = scenario_table("random-group")
-    noise = {"anchor_sigma": SIGMA, "mutual_sigma": SIGMA, "gyro_bias": 0.0002}
-    table["mission"] |= {"accuracy": 0.3, "noise": noise}
-    table |= {"seed": 105, "group": {"robots": 3, "spacing": 30.0, "attack": TURNED}}
-    return validate(table, "group.toml").seeded(None)
+    return random_group(105, robots=3, attack=TURNED)
 
 
 def test_a_claim_that_a_later_meeting_contradicts_is_withdrawn_and_no_claim_is_wrong(tmp_path: Path) -> None:
@@ -260,11 +265,7 @@ def test_the_bound_of_a_visit_under_noise_allows_for_a_search() -> None:
 )
 def test_a_visitor_searches_where_an_error_of_its_heading_leads(seed: int, visitor: str) -> None:
     """On a square spiral, or by its own anchor, it found the other robot after 385 and 600 ticks."""
-    table: dict[str, Any] = scenario_table("random-group")
-    noise = {"anchor_sigma": SIGMA, "mutual_sigma": SIGMA, "gyro_bias": 0.0002}
-    table["mission"] |= {"accuracy": 0.3, "noise": noise}
-    table |= {"seed": seed, "group": {"robots": 16, "spacing": 30.0}}
-    scenario = validate(table, "group.toml").seeded(None)
+    scenario = random_group(seed, robots=16)
     run = run_mission(scenario)
     claims = [claim.tick for robot in run.robots if (claim := run.claim(robot)) is not None]
     assert len(claims) == 16

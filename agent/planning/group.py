@@ -16,7 +16,7 @@ from collections.abc import Sequence
 
 from msgspec.structs import asdict, replace
 
-from agent.planning import exchange, group_transitions, sweep_transitions
+from agent.planning import exchange, group_transitions, sweep_transitions, visit
 from agent.planning.active_sensing import Retreating
 from agent.planning.group_state import GroupState
 from agent.planning.log_exchange import LogPlanner
@@ -71,10 +71,10 @@ class GroupPlanner(Planner[GroupState, Report]):
                 ranges = (*known.mutual, Ranged(observation.tick, contact.range))
                 state = state.with_other(contact.peer, replace(known, mutual=ranges))
         if state.visiting and _is_out_of_range_again(state.pair, pair):
-            pair = replace(pair, mode=Travelling(group_transitions.stop(state.frame, pair)))
+            pair = replace(pair, mode=Travelling(visit.stop(state.frame, pair)))
         state = group_transitions.passing_others(replace(state, pair=pair), observation.contacts)
         if isinstance(state.pair.mode, Travelling) and not pair.in_contact and not state.passing.places:
-            state = group_transitions.searching(state)
+            state = visit.searching(state)
         ended = isinstance(state.pair.mode, Done)
         return replace(
             state,

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from agent.estimation.gaussian.claim_agreement import difference
 from agent.estimation.knowledge import Belief
-from agent.planning import passing, phase2_orbit, sweep_transitions, transitions
+from agent.planning import passing, phase2_orbit, sweep_transitions, transitions, visit
 from agent.planning.group_state import Fix, GroupState
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Travelling
 from agent.planning.state import Done, RobotState
@@ -26,8 +26,8 @@ from protocol.messages import (
     Verdict,
 )
 from protocol.mission import Role
-from protocol.motion import Pose, compose, inverse
-from protocol.orbits import SEARCH_SIDES, SHORT_OF_ANCHOR, Rendezvous, search_legs
+from protocol.motion import compose
+from protocol.orbits import Rendezvous
 
 PARTED_AFTER = 8
 """The ticks out of range of a peer after which a robot whose meeting has ended goes on.
@@ -41,12 +41,6 @@ SILENT_AFTER = 200
 
 LINGERING = 6
 """The ticks in contact for which a visited robot waits for its visitor to leave, with a safety distance."""
-
-SEARCHED_SIGMAS = 4.0
-"""The sigmas of the heading at the claim that a visitor's search allows for."""
-
-MOST_SIDES = 8
-"""The most sides of a search. They reach 14 R to either side, and are 128 R long."""
 
 
 # --- meetings -----------------------------------------------------------------------------------------
@@ -175,7 +169,7 @@ def onward(state: GroupState, *, peer_has_left: bool = False) -> GroupState:
     if state.visiting and pair.verdict is None:
         if state.other(peer).localised and state.verdict is not None:  # by another robot
             return next_visit(state)
-        if _has_searched(state):
+        if visit.has_searched(state):
             known = replace(state.other(peer), missed=pair.tick)
             return next_visit(state.with_other(peer, known))
         if _is_silent(state):
@@ -349,7 +343,7 @@ def at_anchor(state: GroupState) -> GroupState:
 def on_visit(state: GroupState, peer: str) -> GroupState:
     """Return `state` of a localised robot that drives to `peer`."""
     state = _in_meeting(state, peer, "a")
-    pair = replace(state.pair, mode=Travelling(stop(state.frame, state.pair)))
+    pair = replace(state.pair, mode=Travelling(visit.stop(state.frame, state.pair)))
     return replace(state, pair=pair, visiting=True)
 
 
@@ -397,7 +391,7 @@ def passing_others(state: GroupState, contacts: Sequence[Contact]) -> GroupState
         if places and phase2_orbit.arrived(Travelling(places[0]), pair.odometry, mission, tolerance):
             places = places[1:]
         now = replace(now, places=places)
-        mode = Travelling(places[0] if places else stop(state.frame, pair))
+        mode = Travelling(places[0] if places else visit.stop(state.frame, pair))
     return replace(state, pair=replace(pair, mode=mode), passing=now)
 
 
@@ -418,55 +412,3 @@ def _must_linger(state: GroupState) -> bool:
     if state.other(state.config.peer).travels:
         return state.lingering < SILENT_AFTER
     return state.lingering < LINGERING
-
-
-# --- visits -------------------------------------------------------------------------------------------
-
-
-def searching(state: GroupState) -> GroupState:
-    """Return `state` of a visitor out of range; if it has arrived, on the next leg of its search."""
-    pair = state.pair
-    assert isinstance(pair.mode, Travelling)
-    mission, tolerance = pair.config.mission, pair.estimator.pose_tolerance
-    if not phase2_orbit.arrived(pair.mode, pair.odometry, mission, tolerance):
-        return state
-    begin, anchor = state.framed_at, _peer_anchor(state.frame, pair)
-    leg = phase2_orbit.next_leg(pair.mode, (begin.x, begin.y), (anchor.x, anchor.y), mission)
-    return replace(state, pair=replace(pair, mode=leg))
-
-
-def _has_searched(state: GroupState) -> bool:
-    """Return whether the robot has searched for its peer in vain."""
-    mode = state.pair.mode
-    return isinstance(mode, Travelling) and mode.leg > search_legs(_search_sides(state))
-
-
-def _search_sides(state: GroupState) -> int:
-    """Return the number of sides of the search for the peer: with an inaccurate heading, more are necessary.
-
-    They reach SEARCHED_SIGMAS of the error that the heading at the claim has led to, to either side.
-    """
-    assert state.fix is not None
-    if state.fix.claim.covariance is None:
-        return 0
-    begin, anchor = state.framed_at, _peer_anchor(state.frame, state.pair)
-    sigma = state.fix.claim.covariance.heading_sigma
-    aside = SEARCHED_SIGMAS * sigma * math.hypot(anchor.x - begin.x, anchor.y - begin.y)
-    needed = 1 + math.ceil(0.5 * aside / state.config.mission.sensing_range)
-    return min(max(SEARCH_SIDES, needed), MOST_SIDES)
-
-
-def _peer_anchor(frame: Pose, pair: RobotState) -> Pose:
-    """Return the place of the peer's anchor, in m in the odometry's frame."""
-    peer_anchor = pair.config.peer_anchor
-    return compose(inverse(frame), Pose(peer_anchor.x, peer_anchor.y, 0.0))
-
-
-def stop(frame: Pose, pair: RobotState) -> tuple[float, float]:
-    """Return the place of a visit, in m in the odometry's frame: on the way to the anchor, short of it."""
-    anchor = _peer_anchor(frame, pair)
-    dx, dy = anchor.x - pair.odometry.x, anchor.y - pair.odometry.y
-    distance = math.hypot(dx, dy)
-    short = SHORT_OF_ANCHOR * pair.config.mission.sensing_range
-    share = 1.0 - short / distance if distance > short else 0.0
-    return pair.odometry.x + share * dx, pair.odometry.y + share * dy

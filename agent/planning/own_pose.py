@@ -180,8 +180,8 @@ def _with_estimate(state: GroupState, estimate: _Estimate | None) -> GroupState:
     pair, before = state.pair, state.own_pose
     if estimate is None:
         return replace(state, own_pose=replace(before, estimated_tick=pair.tick))
-    frame = compose(estimate.pose, inverse(pair.odometry))
-    turn, mode = compose(inverse(frame), state.frame), pair.mode
+    framed = state.with_frame(estimate.pose)
+    turn, mode = compose(inverse(framed.frame), state.frame), pair.mode
     if isinstance(mode, Sweeping):
         mode = Sweeping(sweep.transformed(turn, mode.places))
     elif isinstance(mode, Looping):
@@ -196,7 +196,7 @@ def _with_estimate(state: GroupState, estimate: _Estimate | None) -> GroupState:
         sigma=estimate.covariance.position_sigma,
         ranges_when_lost=before.ranges if was_lost and ranges > before.ranges else before.ranges_when_lost,
     )
-    return replace(state, pair=pair, frame=frame, framed_at=pair.odometry, own_pose=own_pose)
+    return replace(framed, pair=pair, own_pose=own_pose)
 
 
 def _reference(state: GroupState, estimate: _Estimate) -> Reference | None:

@@ -1,0 +1,72 @@
+"""The way of a visitor: to the anchor of the robot that it visits, and its search there.
+
+All functions are pure. A robot of a group that knows its pose makes this way (`group_transitions`).
+"""
+
+from __future__ import annotations
+
+import math
+
+from msgspec.structs import replace
+
+from agent.planning import phase2_orbit
+from agent.planning.group_state import GroupState
+from agent.planning.phase2_orbit import Travelling
+from agent.planning.state import RobotState
+from protocol.motion import Pose, compose, inverse
+from protocol.orbits import SEARCH_SIDES, SHORT_OF_ANCHOR, search_legs
+
+SEARCHED_SIGMAS = 4.0
+"""The sigmas of the heading at the claim that a visitor's search allows for."""
+
+MOST_SIDES = 8
+"""The most sides of a search. They reach 14 R to either side, and are 128 R long."""
+
+
+def searching(state: GroupState) -> GroupState:
+    """Return `state` of a visitor out of range; if it has arrived, on the next leg of its search."""
+    pair = state.pair
+    assert isinstance(pair.mode, Travelling)
+    mission, tolerance = pair.config.mission, pair.estimator.pose_tolerance
+    if not phase2_orbit.arrived(pair.mode, pair.odometry, mission, tolerance):
+        return state
+    begin, anchor = state.framed_at, _peer_anchor(state.frame, pair)
+    leg = phase2_orbit.next_leg(pair.mode, (begin.x, begin.y), (anchor.x, anchor.y), mission)
+    return replace(state, pair=replace(pair, mode=leg))
+
+
+def has_searched(state: GroupState) -> bool:
+    """Return whether the robot has searched for its peer in vain."""
+    mode = state.pair.mode
+    return isinstance(mode, Travelling) and mode.leg > 0 and mode.leg > search_legs(_search_sides(state))
+
+
+def _search_sides(state: GroupState) -> int:
+    """Return the number of sides of the search for the peer: with an inaccurate heading, more are necessary.
+
+    They reach SEARCHED_SIGMAS of the error that the heading at the claim has led to, to either side.
+    """
+    assert state.fix is not None
+    if state.fix.claim.covariance is None:
+        return 0
+    begin, anchor = state.framed_at, _peer_anchor(state.frame, state.pair)
+    sigma = state.fix.claim.covariance.heading_sigma
+    aside = SEARCHED_SIGMAS * sigma * math.hypot(anchor.x - begin.x, anchor.y - begin.y)
+    needed = 1 + math.ceil(0.5 * aside / state.config.mission.sensing_range)
+    return min(max(SEARCH_SIDES, needed), MOST_SIDES)
+
+
+def _peer_anchor(frame: Pose, pair: RobotState) -> Pose:
+    """Return the place of the peer's anchor, in m in the odometry's frame."""
+    peer_anchor = pair.config.peer_anchor
+    return compose(inverse(frame), Pose(peer_anchor.x, peer_anchor.y, 0.0))
+
+
+def stop(frame: Pose, pair: RobotState) -> tuple[float, float]:
+    """Return the place of a visit, in m in the odometry's frame: on the way to the anchor, short of it."""
+    anchor = _peer_anchor(frame, pair)
+    dx, dy = anchor.x - pair.odometry.x, anchor.y - pair.odometry.y
+    distance = math.hypot(dx, dy)
+    short = SHORT_OF_ANCHOR * pair.config.mission.sensing_range
+    share = 1.0 - short / distance if distance > short else 0.0
+    return pair.odometry.x + share * dx, pair.odometry.y + share * dy
