@@ -7,11 +7,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from compose.recording.run import Run
-from compose.scenario.scenario_file import validate
+from compose.scenario.scenario_file import scenario_table, validate
 from world.scenario import Scenario
 
 R = 3.0
 """The sensing range in m."""
+SIGMA = 0.05
+"""The sigma of all ranges of `random_group` in m."""
 
 
 def table_of(robots: int, seed: int, *, sigma: float = 0.0, side: float = 10.0) -> dict[str, Any]:
@@ -39,6 +41,15 @@ def group_of(
     table = table_of(robots, seed, sigma=sigma)
     if attacker is not None:
         table["robot"][attacker]["attack"] = dict(attack)
+    return validate(table, "group.toml").seeded(None)
+
+
+def random_group(seed: int, **group: Any) -> Scenario:
+    """Return the scenario `random-group` under noise, with the fields `group`."""
+    table: dict[str, Any] = scenario_table("random-group")
+    noise = {"anchor_sigma": SIGMA, "mutual_sigma": SIGMA, "gyro_bias": 0.0002}
+    table["mission"] |= {"accuracy": 0.3, "noise": noise}
+    table |= {"seed": seed, "group": {"spacing": 30.0} | group}
     return validate(table, "group.toml").seeded(None)
 
 

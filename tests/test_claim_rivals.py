@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
 
 import tandem
 from agent.estimation.gaussian import claim_rivals
+from agent.planning import active_sensing, pair_claim
+from agent.planning.accuracy_seeking import AccuracySeeking
 from compose.launch.in_process import run_mission
 from compose.recording.summary_json import summary
+from tests.groups import random_group
 from tests.series import series
 from tests.surveys import SIGMA, assert_localised, scenario_of
 
@@ -34,6 +38,45 @@ def test_an_outlier_that_passes_as_an_inlier_delays_the_claim(case: tuple[dict[s
     fields, seed = case
     run = tandem.run(tandem.Scenario.load("random").with_(fields, seed=seed))
     assert run.outcome == "localised"
+
+
+def test_the_next_manoeuvre_is_planned_with_the_rival_that_blocks_a_claim(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rivals, planned = [], []
+
+    def likely_rival(*args: Any) -> claim_rivals.Rival | None:
+        rival = claim_rivals.likely_rival(*args)
+        if rival is not None:
+            rivals.append(rival)
+        return rival
+
+    def plan_together(hypotheses: Any, *args: Any) -> Any:
+        planned.append(hypotheses)
+        return active_sensing.plan_together(hypotheses, *args)
+
+    monkeypatch.setattr(pair_claim, "likely_rival", likely_rival)
+    monkeypatch.setattr(AccuracySeeking, "joint_manoeuvres", lambda _, *args: plan_together(*args))
+    assert_localised(run_mission(scenario_of(SIGMA, 384, reach=1.5)))
+    assert rivals
+    for rival in rivals:
+        (claimed, other, *_) = next(some for some in planned if rival.hypothesis in some)
+        assert other is rival.hypothesis
+        assert 0.0 < other.probability < claimed.probability
+        x, y = 3 * rival.robot, 3 * rival.robot + 1
+        sigma = math.sqrt(claimed.covariance[x, x] + claimed.covariance[y, y])
+        off = math.hypot(*(other.poses - claimed.poses)[x : y + 1])
+        assert off == pytest.approx(claim_rivals.WRONG_SIGMAS * sigma, rel=0.2)
+
+
+def test_a_robot_soon_leaves_two_places_from_which_a_rival_explains_the_ranges_as_well() -> None:
+    """Its peer has claimed. Without the rival as a hypothesis, the robot claims 384 ticks later."""
+    scenario = random_group(5871403709851652388, robots=16)
+    first = scenario.meetings[0]
+    run = run_mission(scenario)
+    claims = {robot: claim.tick for robot in run.robots if (claim := run.claim(robot)) is not None}
+    assert len(claims) == 16
+    assert claims["r3"] < first.ends
 
 
 def test_the_reason_against_a_claim_is_its_rival(monkeypatch: pytest.MonkeyPatch) -> None:

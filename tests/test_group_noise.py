@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,29 +20,18 @@ from compose.launch.in_process import run_mission
 from compose.launch.planner_loader import planner_of
 from compose.recording.run import read
 from compose.scenario.group_meetings import ALLOWED_SIDES
-from compose.scenario.scenario_file import scenario_table, validate
+from compose.scenario.scenario_file import validate
 from protocol.messages import Localised, RobotConfigInGroup, Undecided
 from protocol.mission import Mission
 from protocol.motion import ORIGIN, Covariance, Pose, compose, inverse, step
 from protocol.noise import Noise, VelocityNoise
 from protocol.orbits import SEARCH_SIDES, meeting_ticks, search_ticks
-from tests.groups import R, group_of, localised, table_of
+from tests.groups import SIGMA, R, group_of, localised, random_group, table_of
 from world.faults import EXCHANGED, IN_TURN, Fault, exchange_ticks
 from world.scenario import Scenario
 
-SIGMA = 0.05
-"""The sigma of all ranges in m."""
 TURNED = {"kind": "rotate", "part": "orbit", "size": math.radians(15.0)}
 """False reports that pass the first meeting of r3 in the group of `attacked`."""
-
-
-def random_group(seed: int, **group: Any) -> Scenario:
-    """Return the scenario `random-group` under noise, with the fields `group`."""
-    table: dict[str, Any] = scenario_table("random-group")
-    noise = {"anchor_sigma": SIGMA, "mutual_sigma": SIGMA, "gyro_bias": 0.0002}
-    table["mission"] |= {"accuracy": 0.3, "noise": noise}
-    table |= {"seed": seed, "group": {"spacing": 30.0} | group}
-    return validate(table, "group.toml").seeded(None)
 
 
 # --- robots with nearly the same anchor ---------------------------------------------------------------

@@ -382,7 +382,9 @@ def _decide_phase3(state: RobotState, planned: JointManoeuvres) -> RobotState:
     if searched and len(pair.places) >= inference.sufficient_mutual_ranges(mission):
         tested = with_consistency_test(tested)
     if tested.verdict is None and may_claim(tested.belief, pair):
-        tested = with_claim(tested, scored, hypotheses, pair)
+        tested, rival = with_claim(tested, scored, hypotheses, pair)
+        if rival is not None:
+            hypotheses = (hypotheses[0], rival.hypothesis, *hypotheses[1:])
     if tested.verdict is not None:
         return tested
     if role == "a" and len(pair.places) >= MANY_MUTUAL_RANGES * (1 + state.belief.returns):

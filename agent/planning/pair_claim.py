@@ -11,7 +11,7 @@ from typing import NamedTuple
 from msgspec.structs import replace
 
 from agent.estimation.gaussian import inference
-from agent.estimation.gaussian.claim_rivals import with_rival_check
+from agent.estimation.gaussian.claim_rivals import Rival, likely_rival, rival_reason
 from agent.estimation.gaussian.consistency import (
     CLAIM_P_VALUE,
     EARLY_CLAIM_P_VALUE,
@@ -105,18 +105,26 @@ def with_claim(
     scored: Sequence[ScoredHypothesis],
     hypotheses: Sequence[PlanningHypothesis],
     pair: PairRanges,
-) -> RobotState:
-    """Return `state` with the claim if nothing blocks it, or Undecided if profiles contradict all claims."""
-    belief = inference.with_doubt_check(state.belief, scored, pair)
-    own = 0 if state.config.role == "a" else 1
-    robots = (own,) if isinstance(state.peer_state.verdict, Localised) else (0, 1)
-    belief = with_rival_check(belief, scored, hypotheses[0], pair, state.config.mission, robots)
+) -> tuple[RobotState, Rival | None]:
+    """Return `state` with the claim if nothing blocks it, or Undecided if profiles contradict all claims.
+
+    The second result is the rival that blocks it; None if none does.
+    """
+    mission = state.config.mission
+    belief, rival = inference.with_doubt_check(state.belief, scored, pair), None
+    if belief.blocking_reason is None:
+        own = 0 if state.config.role == "a" else 1
+        robots = (own,) if isinstance(state.peer_state.verdict, Localised) else (0, 1)
+        rival = likely_rival(scored, hypotheses[0], pair, mission, robots)
+        if rival is not None:
+            belief = replace(belief, blocking_reason=rival_reason(rival, mission))
     state = replace(state, belief=belief)
-    reason = state.belief.blocking_reason
+    reason = belief.blocking_reason
     if reason is None:
-        belief = replace(state.belief, p_value=_least_p_value(state.belief))
-        return replace(state, mode=Done(3, Localised(belief.poses[0], belief.covariance)), belief=belief)
-    return state.undecided(reason) if inference.ends_in_doubt(state.belief) else state
+        belief = replace(belief, p_value=_least_p_value(belief))
+        claim = Localised(belief.poses[0], belief.covariance)
+        return replace(state, mode=Done(3, claim), belief=belief), None
+    return state.undecided(reason) if inference.ends_in_doubt(belief) else state, rival
 
 
 def _p_value_below(belief: Belief, bound: float) -> bool:

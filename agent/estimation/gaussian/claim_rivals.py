@@ -14,16 +14,15 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from msgspec.structs import replace
 
 from agent.estimation.gaussian.fitted import Fit
+from agent.estimation.gaussian.fitted_poses import last_poses
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis
 from agent.estimation.gaussian.inference import PlanningHypothesis, to_second_order
-from agent.estimation.gaussian.least_squares import held_log_likelihoods
+from agent.estimation.gaussian.least_squares import HeldFit, held_fits
 from agent.estimation.gaussian.linear_model import Problem
 from agent.estimation.gaussian.odometry_noise import Array
 from agent.estimation.gaussian.range_model import PairRanges, Ranges
-from agent.estimation.knowledge import Belief
 from protocol.mission import Mission
 
 WRONG_SIGMAS = 5.0
@@ -48,6 +47,8 @@ class Rival(NamedTuple):
     robot: int
     log_likelihood_ratio: float
     """The log-likelihood of all ranges under these poses, less that under the claimed ones."""
+    hypothesis: PlanningHypothesis
+    """The poses of both robots, for planning: less probable than the claimed ones, with their covariance."""
 
 
 @lru_cache(maxsize=2)
@@ -68,10 +69,20 @@ def likeliest_rival(
         place = claimed.poses[i : i + 2] - robot * np.array(pair.apart)
         anchor = place - FAR_ANCHOR * pair.sensing_range * along
         held, row = _holding(pair, robot, anchor, math.hypot(*(place - anchor)), HOLDING_SIGMA * far)
-        (here,) = held_log_likelihoods(held, fitted, row, np.zeros(1), 0)
-        there = held_log_likelihoods(held, fitted, row, np.array((far, -far)), HELD_STEPS)
-        rivals.append(Rival(robot, max(there) - here))
+        (here,) = held_fits(held, fitted, row, np.zeros(1), 0)
+        there = held_fits(held, fitted, row, np.array((far, -far)), HELD_STEPS)
+        best = max(there, key=lambda one: one.log_likelihood)
+        rivals.append(_rival(robot, best, best.log_likelihood - here.log_likelihood, claimed, pair))
     return max(rivals, key=lambda one: one.log_likelihood_ratio)
+
+
+def _rival(
+    robot: int, held: HeldFit, log_likelihood_ratio: float, claimed: PlanningHypothesis, pair: PairRanges
+) -> Rival:
+    """Return the rival of the claim of `robot` that follows from the fit `held`."""
+    mean = last_poses(held.guess, held.paths, pair.apart)
+    probability = math.exp(min(log_likelihood_ratio, 0.0))
+    return Rival(robot, log_likelihood_ratio, PlanningHypothesis(probability, mean, claimed.covariance))
 
 
 def _holding(pair: PairRanges, robot: int, anchor: Array, rho: float, sigma: float) -> tuple[Problem, int]:
@@ -104,25 +115,29 @@ def _holding(pair: PairRanges, robot: int, anchor: Array, rho: float, sigma: flo
     return problem._replace(common=common, scale=scale, slow=slow), row
 
 
-def with_rival_check(
-    belief: Belief,
+def likely_rival(
     scored: Sequence[ScoredHypothesis],
     claimed: PlanningHypothesis,
     pair: PairRanges,
     mission: Mission,
     robots: tuple[int, ...],
-) -> Belief:
-    """Return `belief` with a blocking reason if poses that would make a claim of `robots` wrong are likely.
+) -> Rival | None:
+    """Return the likeliest rival of claims of `robots` if it is too likely for a claim; None if it is not.
 
-    They may be as likely as other hypotheses may be probable: 1 - confidence.
+    A rival may be as likely as other hypotheses may be probable: 1 - confidence.
     """
-    if belief.blocking_reason is not None:
-        return belief
-    rival, most = likeliest_rival(scored[0].fit, pair, claimed, robots), math.log1p(-mission.confidence)
-    if rival.log_likelihood_ratio <= most:
-        return belief
-    reason = (
+    rival = likeliest_rival(scored[0].fit, pair, claimed, robots)
+    return rival if rival.log_likelihood_ratio > _most_likely(mission) else None
+
+
+def _most_likely(mission: Mission) -> float:
+    """Return the largest log-likelihood ratio that a rival of a claim may have."""
+    return math.log1p(-mission.confidence)
+
+
+def rival_reason(rival: Rival, mission: Mission) -> str:
+    """Return why `rival` blocks a claim."""
+    return (
         f"poses {WRONG_SIGMAS:g} sigmas away explain the ranges nearly as well: "
-        f"their log-likelihood ratio is {rival.log_likelihood_ratio:.3g}, allowed {most:.3g}"
+        f"their log-likelihood ratio is {rival.log_likelihood_ratio:.3g}, allowed {_most_likely(mission):.3g}"
     )
-    return replace(belief, blocking_reason=reason)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -29,11 +30,9 @@ def poses(fitted: Fit, apart: tuple[float, float]) -> tuple[Array, Array]:
     includes the surveying errors of the anchors. Of one robot, it is (3,) and (3, 3), relative to its anchor,
     wherever that is. With one anchor, the axes are those of the odometry's frame.
     """
-    size = 3 * len(fitted.paths)
-    mean, turn = np.empty(size), np.zeros((size, size))
-    for robot, path in enumerate(fitted.paths):
-        wx, wy, heading = _placed(fitted.guess[3 * robot : 3 * robot + 3], path)
-        mean[3 * robot : 3 * robot + 3] = wx + robot * apart[0], wy + robot * apart[1], heading
+    mean = last_poses(fitted.guess, fitted.paths, apart)
+    size = len(mean)
+    turn = np.zeros((size, size))
     for robot, path in enumerate(fitted.linear_paths):
         own = slice(3 * robot, 3 * robot + 3)
         c, s = math.cos(fitted.linear_guess[own][2]), math.sin(fitted.linear_guess[own][2])
@@ -79,6 +78,16 @@ def _of_survey(fitted: Fit, by_range: Array) -> Array | float:
     by_error[3:5, 2:4] -= np.eye(2)
     covariance: Array = sigma**2 * by_error @ by_error.T
     return covariance
+
+
+def last_poses(guess: Array, paths: Sequence[Track], apart: tuple[float, float]) -> Array:
+    """Return the poses at the end of `paths` by `guess`, relative to M1 along the axes of <W>, in m and rad.
+
+    The shape is (3,) for one robot, and (6,) for two.
+    """
+    placed = [_placed(guess[3 * robot : 3 * robot + 3], path) for robot, path in enumerate(paths)]
+    offsets = (0.0, 0.0, 0.0, *apart, 0.0)
+    return np.ravel(placed) + offsets[: 3 * len(placed)]
 
 
 def _placed(guess: Array, path: Track) -> tuple[float, float, float]:

@@ -287,8 +287,18 @@ SOFT = 0.1
 """The least smoothing of the ends of the outlier density, as a fraction of the least bias."""
 
 
-def held_log_likelihoods(problem: Problem, begun: Fit, row: int, offsets: Array, steps: int) -> list[float]:
-    """Return the log-likelihood of the ranges of `problem` after `steps` steps from the fit `begun`.
+class HeldFit(NamedTuple):
+    """The result of a fit in which one coordinate is held."""
+
+    log_likelihood: float
+    """The log-likelihood of the ranges; see `Fit`."""
+    guess: Array
+    paths: tuple[Track, ...]
+    """The paths with the odometry errors corrected."""
+
+
+def held_fits(problem: Problem, begun: Fit, row: int, offsets: Array, steps: int) -> list[HeldFit]:
+    """Return the fits to the ranges of `problem` after `steps` steps from the fit `begun`.
 
     The problem has the ranges of that fit and one more, at `row`, which holds a coordinate: it is no outlier.
     There is one fit for each of `offsets` (m), by which this range is longer.
@@ -312,7 +322,11 @@ def held_log_likelihoods(problem: Problem, begun: Fit, row: int, offsets: Array,
         weights[:, row] = 1.0
     chi2, level = _quality(system, weights, noise).chi2.tolist(), begun.level
     return [
-        _log_likelihood(system.one(i), chi2[i], point.residuals[i], weights[i], sigma, level, noise)
+        HeldFit(
+            _log_likelihood(system.one(i), chi2[i], point.residuals[i], weights[i], sigma, level, noise),
+            point.guess[i],
+            problem.paths(point, i),
+        )
         for i in range(len(offsets))
     ]
 
