@@ -18,8 +18,10 @@ from agent.estimation.gaussian.claim_agreement import agreement, difference, min
 from agent.estimation.gaussian.covariance_union import covariance_union
 from agent.estimation.gaussian.later_pose import later_pose
 from agent.peer.motion_log import MotionLog
+from agent.planning.active_sensing import Listening, Surveying
 from agent.planning.confirmation import ConfirmingPlanner
 from agent.planning.group_state import GroupState
+from agent.planning.range_seeking import Homing
 from compose.audit.replay import replayed
 from compose.errors import Unworkable
 from compose.launch.in_process import run_mission
@@ -242,9 +244,23 @@ def test_a_robot_compares_its_meetings_once_more_before_it_gives_up() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, 2, 8867783836166564671])
 def test_an_attacker_in_a_first_meeting_does_not_leave_robots_undecided(seed: int) -> None:
     assert honest(run_mission(scenario_with(seed, SHIFTED))) == (3, 0, 0)
+
+
+@pytest.mark.long
+def test_a_visitor_does_not_drive_home_because_of_ranges_of_earlier_meetings() -> None:
+    """With more than 60 of them, it drove home as soon as it had met the other robot again."""
+    run = of_frames(kept(scenario_with(8867783836166564671, SHIFTED)))
+    met_again = 0
+    for robot in run.agents:
+        for before, after in pairwise([state.pair for state in states(run, robot)]):
+            meets = before.config.role == "a" and isinstance(before.mode, Surveying | Listening)
+            if meets and len(before.mutual) > 60:
+                met_again += 1
+                assert not isinstance(after.mode, Homing)
+    assert met_again
 
 
 # --- the plan -----------------------------------------------------------------------------------------

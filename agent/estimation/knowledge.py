@@ -77,6 +77,8 @@ class Belief(msgspec.Struct, frozen=True):
     """Noisy sensors: the number of consecutive claims withheld because a profile contradicts them."""
     returns: int = 0
     """Noisy sensors: the number of times that the robot drove back to its anchor."""
+    earlier_ranges: int = 0
+    """Noisy sensors: the number of mutual ranges of earlier meetings with the same peer (groups)."""
 
 
 class Knowledge(msgspec.Struct, frozen=True):

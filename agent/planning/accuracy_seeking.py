@@ -17,6 +17,7 @@ from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis
 from agent.estimation.gaussian.inference import MANY_MUTUAL_RANGES, PlanningHypothesis
 from agent.estimation.gaussian.odometry_noise import Track
+from agent.estimation.gaussian.range_model import PairRanges
 from agent.planning import active_sensing, exchange, phase2_orbit, range_seeking, transitions
 from agent.planning.active_sensing import CONTINUED, STALLED, Listening, Objective, Retreating, Surveying
 from agent.planning.assured import AssuredExact
@@ -387,7 +388,7 @@ def _decide_phase3(state: RobotState, planned: JointManoeuvres) -> RobotState:
             hypotheses = (hypotheses[0], rival.hypothesis, *hypotheses[1:])
     if tested.verdict is not None:
         return tested
-    if role == "a" and len(pair.places) >= MANY_MUTUAL_RANGES * (1 + state.belief.returns):
+    if role == "a" and _measures_in_vain(state, pair):
         return _leave(tested)
     if not scored:
         return _drive_without_hypotheses(tested)
@@ -395,6 +396,12 @@ def _decide_phase3(state: RobotState, planned: JointManoeuvres) -> RobotState:
     manoeuvres = _manoeuvres(state, objective) or planned
     a, b = manoeuvres(hypotheses, pair.apart, state.mutual[-1].range, mission)
     return replace(tested, mode=Surveying("peer", a if role == "a" else b, since))
+
+
+def _measures_in_vain(state: RobotState, pair: PairRanges) -> bool:
+    """Return whether the ranges of this meeting are so many that further ones will hardly settle the poses."""
+    belief = state.belief
+    return len(pair.places) - belief.earlier_ranges >= MANY_MUTUAL_RANGES * (1 + belief.returns)
 
 
 def _manoeuvres(state: RobotState, objective: Objective) -> JointManoeuvres | None:

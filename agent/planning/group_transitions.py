@@ -370,6 +370,7 @@ def _in_meeting(state: GroupState, peer: str, role: Role, orbits: Rendezvous | N
             own=belief.own,
             branches=belief.branches,
             ranges_at_last_fit=belief.ranges_at_last_fit,
+            earlier_ranges=len(state.other(peer).mutual),
         ),
     )
     return replace(state, pair=fresh, alone=False, visiting=False, unmet=0, silence=0)
