@@ -69,6 +69,7 @@ def test_the_next_manoeuvre_is_planned_with_the_rival_that_blocks_a_claim(
         assert off == pytest.approx(claim_rivals.WRONG_SIGMAS * sigma, rel=0.2)
 
 
+@pytest.mark.long
 def test_a_robot_soon_leaves_two_places_from_which_a_rival_explains_the_ranges_as_well() -> None:
     """Its peer has claimed. Without the rival as a hypothesis, the robot claims 384 ticks later."""
     scenario = random_group(5871403709851652388, robots=16)

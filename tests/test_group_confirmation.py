@@ -203,6 +203,7 @@ def test_a_robot_leaves_for_its_anchor_though_the_one_that_it_has_met_is_in_rang
     assert left > 4
 
 
+@pytest.mark.long
 def test_the_pose_after_a_long_way_does_not_depend_on_the_hypotheses_of_its_meeting() -> None:
     """A fit that began at these hypotheses, without a search, was once 0.3 m off."""
     run = of_frames(without_attacker())

@@ -72,6 +72,7 @@ def estimate_of(recording: RangeRecording, robots: tuple[str, ...] | None = None
     return estimated(measurements(recording, robots, None, (0.0, 36.0)), ClaimRule())
 
 
+@pytest.mark.long
 def test_all_robots_of_a_recording_are_estimated_also_one_without_an_anchor() -> None:
     found = estimate_of(recorded(4, 3, unanchored=(2,)))
     assert isinstance(found.summary, GroupEstimateSummary)

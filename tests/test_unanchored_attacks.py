@@ -92,6 +92,7 @@ def test_without_an_attacker_the_second_finder_costs_time_within_the_bound() -> 
         assert last_claim(run) <= run.scenario.planned_sweep.ends / run.scenario.mission.period
 
 
+@pytest.mark.long
 def test_a_recording_with_an_attacker_passes_the_audit_and_the_replay() -> None:
     journals = kept(scenario_of(five("a")))
     assert audited(journals) == []
