@@ -399,7 +399,7 @@ def _decide_phase3(state: RobotState, planned: JointManoeuvres) -> RobotState:
 
 
 def _measures_in_vain(state: RobotState, pair: PairRanges) -> bool:
-    """Return whether the ranges of this meeting are so many that further ones will hardly settle the poses."""
+    """Return whether this meeting has so many ranges that further ones will hardly settle the poses."""
     belief = state.belief
     return len(pair.places) - belief.earlier_ranges >= MANY_MUTUAL_RANGES * (1 + belief.returns)
 
