@@ -23,7 +23,7 @@ from compose.terminal.progress import result
 from protocol.messages import Undecided
 from tests.commands import SECTION_IV
 from tests.commands import tandem as tandem_command
-from tests.groups import group_of, localised
+from tests.groups import group_of, localised, random_group
 from tests.series import series
 from world.scenario import Death, Scenario
 from world.tick import World, advance
@@ -139,6 +139,17 @@ def test_all_others_are_localised_within_the_corrected_bound(group: tuple[int, i
     assert last <= max([planned, *[one.bound_ticks for one in corrected]])
     if last > planned:
         assert corrected
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("robots", "seed"), [(4, 2190611898021423449), (8, 4689520878616184904)])
+def test_all_others_are_localised_where_a_robot_meets_the_same_one_twice_under_noise(
+    robots: int, seed: int
+) -> None:
+    """In the second meeting, it did not receive the log from its beginning, and both waited for ever."""
+    run = run_mission(random_group(seed, robots=robots, dies=[0, 80]))
+    (dead,) = run.scenario.deaths
+    assert localised(run) >= set(run.robots) - {dead.robot}
 
 
 def test_bounds_are_corrected_when_a_robot_is_late_by_what_is_known_then(four: Run) -> None:

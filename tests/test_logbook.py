@@ -142,6 +142,22 @@ def test_acknowledged_entries_are_known_and_lost_entries_are_sent_again(
     assert (last.since, last.runs, last.ranges) == (length, (), ())
 
 
+@given(ticks, st.integers(0, 40))
+def test_a_robot_that_begins_another_meeting_receives_the_whole_log_again(
+    driven: list[Tick], again: int
+) -> None:
+    """Without it, the other robot of the first meeting, which was still in it, sent the rest alone."""
+    a, b = Side(driven), Side(driven)
+    for tick in range(len(driven) + 5 + 2 * len(driven) // min(MAX_REPORT_RUNS, MAX_REPORT_RANGES)):
+        if tick == min(again, len(driven)):
+            b.peer_state = PeerState()
+        now = min(tick, len(driven))
+        from_a, from_b = (replace(told(one.books[now], one.peer_state), tick=tick) for one in (a, b))
+        a.with_report(from_b, "heard")
+        b.with_report(from_a, "heard")
+    assert b.peer_state.peer == a.books[-1]
+
+
 def test_an_overtaken_report_does_not_bring_back_an_old_state() -> None:
     old, new = (replace(told(MotionLog(), PeerState()), tick=tick) for tick in (3, 7))
     new = replace(new, state="standing", verdict=Undecided("lost"))

@@ -312,6 +312,24 @@ def test_a_claim_that_later_ranges_contradict_is_withdrawn_in_the_search_and_no_
     assert planner.report_to(state, state.config.peer).verdict == state.failure
 
 
+def test_a_robot_that_takes_a_finder_anew_receives_the_manoeuvres_since_the_reference_again() -> None:
+    run = of_frames(journals())
+    receiver, first = references(run)[0]
+    agent, planner = run.agents[first.robot], NoisyGroupPlanner(AccuracySeeking())
+    state, since = planner.start(agent.config), []
+    for one in agent.steps[: first.reference + 9]:
+        state = planner.decide(planner.observe(state, one.observation), of_robots(one))
+        report = planner.report_to(state, receiver)
+        if isinstance(report, ReportWithReference) and report.reference == first.reference:
+            since.append(report.since)
+    assert since[0] == first.reference < since[-1]
+    acknowledged = [report for report in of_robots(one) if report.robot == receiver]
+    anew = planner.decide(state, [replace(report, heard=0) for report in acknowledged])
+    again = planner.report_to(anew, receiver)
+    assert isinstance(again, ReportWithReference)
+    assert again.since == first.reference
+
+
 # --- the scenario -------------------------------------------------------------------------------------
 
 

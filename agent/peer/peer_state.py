@@ -56,9 +56,10 @@ def contradiction(report: Report) -> str | None:
 def with_report(peer_state: PeerState, report: Report) -> PeerState:
     """Return `peer_state` with the data of `report`.
 
-    Late, repeated and overtaken reports change only the number of reports received.
+    Late, repeated and overtaken reports change only the number of reports received. The latest report says
+    what the peer has, which may be less than before: in another meeting, it begins with nothing.
     """
-    newer = report.tick > peer_state.latest
+    newer, latest = report.tick > peer_state.latest, report.tick >= peer_state.latest
     known = len(peer_state.peer.ranges) >= report.ranges_since
     whole = len(report.ranges) < MAX_REPORT_RANGES
     ranges_through = report.tick if whole else report.ranges[-1].tick
@@ -71,8 +72,8 @@ def with_report(peer_state: PeerState, report: Report) -> PeerState:
         state=report.state if newer else peer_state.state,
         verdict=report.verdict if newer else peer_state.verdict,
         latest=max(report.tick, peer_state.latest),
-        acknowledged=max(report.heard, peer_state.acknowledged),
-        ranges_acknowledged=max(report.ranges_heard, peer_state.ranges_acknowledged),
+        acknowledged=report.heard if latest else peer_state.acknowledged,
+        ranges_acknowledged=report.ranges_heard if latest else peer_state.ranges_acknowledged,
         heard=peer_state.heard + 1,
         ranges_through=max(ranges_through, peer_state.ranges_through) if known else peer_state.ranges_through,
     )
