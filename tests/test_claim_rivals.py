@@ -45,8 +45,8 @@ def test_the_next_manoeuvre_is_planned_with_the_rival_that_blocks_a_claim(
 ) -> None:
     rivals, planned = [], []
 
-    def likely_rival(*args: Any) -> claim_rivals.Rival | None:
-        rival = claim_rivals.likely_rival(*args)
+    def blocking_rival(*args: Any) -> claim_rivals.Rival | None:
+        rival = claim_rivals.blocking_rival(*args)
         if rival is not None:
             rivals.append(rival)
         return rival
@@ -55,7 +55,7 @@ def test_the_next_manoeuvre_is_planned_with_the_rival_that_blocks_a_claim(
         planned.append(hypotheses)
         return active_sensing.plan_together(hypotheses, *args)
 
-    monkeypatch.setattr(pair_claim, "likely_rival", likely_rival)
+    monkeypatch.setattr(pair_claim, "blocking_rival", blocking_rival)
     monkeypatch.setattr(AccuracySeeking, "joint_manoeuvres", lambda _, *args: plan_together(*args))
     assert_localised(run_mission(scenario_of(SIGMA, 384, reach=1.5)))
     assert rivals

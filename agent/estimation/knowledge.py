@@ -78,7 +78,7 @@ class Belief(msgspec.Struct, frozen=True):
     returns: int = 0
     """Noisy sensors: the number of times that the robot drove back to its anchor."""
     earlier_ranges: int = 0
-    """Noisy sensors: the number of mutual ranges of earlier meetings with the same peer (groups)."""
+    """Noisy sensors: the number of mutual ranges with the peer before this meeting (groups)."""
 
 
 class Knowledge(msgspec.Struct, frozen=True):

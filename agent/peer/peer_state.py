@@ -56,8 +56,8 @@ def contradiction(report: Report) -> str | None:
 def with_report(peer_state: PeerState, report: Report) -> PeerState:
     """Return `peer_state` with the data of `report`.
 
-    Late, repeated and overtaken reports change only the number of reports received. The latest report says
-    what the peer has, which may be less than before: in another meeting, it begins with nothing.
+    An overtaken report adds at most a missing part of the log. Acknowledgements are those of the latest
+    report, and may decrease: a peer that begins another meeting has none of this robot's log.
     """
     newer, latest = report.tick > peer_state.latest, report.tick >= peer_state.latest
     known = len(peer_state.peer.ranges) >= report.ranges_since

@@ -399,9 +399,9 @@ def _decide_phase3(state: RobotState, planned: JointManoeuvres) -> RobotState:
 
 
 def _measures_in_vain(state: RobotState, pair: PairRanges) -> bool:
-    """Return whether this meeting has so many ranges that further ones will hardly settle the poses."""
-    belief = state.belief
-    return len(pair.places) - belief.earlier_ranges >= MANY_MUTUAL_RANGES * (1 + belief.returns)
+    """Return whether this meeting has so many ranges that more will hardly settle the poses."""
+    many = MANY_MUTUAL_RANGES * (1 + state.belief.returns)
+    return len(pair.places) >= many and len(state.mutual) - state.belief.earlier_ranges >= many
 
 
 def _manoeuvres(state: RobotState, objective: Objective) -> JointManoeuvres | None:

@@ -60,7 +60,7 @@ class NoisyGroupPlanner(GroupPlanner):
             return _begun(state) if state.sweeps else state
         for one in reports:
             known = with_sender(state, one).other(one.robot)
-            known = replace(known, acknowledged=one.heard)
+            known = replace(known, acknowledged=one.heard)  # if it is overtaken, more is sent again
             state = state.with_other(one.robot, known)
         of_peer = [one for one in reports if one.has_log and one.robot == state.pair.config.peer]
         heard = exchange.with_reports(state.pair, of_peer)

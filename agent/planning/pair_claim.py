@@ -11,7 +11,7 @@ from typing import NamedTuple
 from msgspec.structs import replace
 
 from agent.estimation.gaussian import inference
-from agent.estimation.gaussian.claim_rivals import Rival, likely_rival, rival_reason
+from agent.estimation.gaussian.claim_rivals import Rival, blocking_rival, rival_reason
 from agent.estimation.gaussian.consistency import (
     CLAIM_P_VALUE,
     EARLY_CLAIM_P_VALUE,
@@ -106,16 +106,17 @@ def with_claim(
     hypotheses: Sequence[PlanningHypothesis],
     pair: PairRanges,
 ) -> tuple[RobotState, Rival | None]:
-    """Return `state` with the claim if nothing blocks it, or Undecided if profiles contradict all claims.
+    """Return `state`, and the rival that blocks its claim or None.
 
-    The second result is the rival that blocks it; None if none does.
+    The state has the claim if nothing blocks it. It is Undecided if other profiles of the sensors contradict
+    all of its latest claims (`inference.with_doubt_check`).
     """
     mission = state.config.mission
     belief, rival = inference.with_doubt_check(state.belief, scored, pair), None
     if belief.blocking_reason is None:
         own = 0 if state.config.role == "a" else 1
         robots = (own,) if isinstance(state.peer_state.verdict, Localised) else (0, 1)
-        rival = likely_rival(scored, hypotheses[0], pair, mission, robots)
+        rival = blocking_rival(scored, hypotheses[0], pair, mission, robots)
         if rival is not None:
             belief = replace(belief, blocking_reason=rival_reason(rival, mission))
     state = replace(state, belief=belief)

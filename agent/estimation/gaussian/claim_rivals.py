@@ -45,10 +45,14 @@ class Rival(NamedTuple):
     """The likeliest poses that would make a claim wrong."""
 
     robot: int
+    """The robot whose claim they would make wrong: 0 or 1."""
     log_likelihood_ratio: float
     """The log-likelihood of all ranges under these poses, less that under the claimed ones."""
     hypothesis: PlanningHypothesis
-    """The poses of both robots, for planning: less probable than the claimed ones, with their covariance."""
+    """The poses of both robots, for planning, with the covariance of the claimed ones.
+
+    The probability is the likelihood ratio, and at most 1.
+    """
 
 
 @lru_cache(maxsize=2)
@@ -79,7 +83,7 @@ def likeliest_rival(
 def _rival(
     robot: int, held: HeldFit, log_likelihood_ratio: float, claimed: PlanningHypothesis, pair: PairRanges
 ) -> Rival:
-    """Return the rival of the claim of `robot` that follows from the fit `held`."""
+    """Return the rival of the claim of `robot` whose poses are those of the fit `held`."""
     mean = last_poses(held.guess, held.paths, pair.apart)
     probability = math.exp(min(log_likelihood_ratio, 0.0))
     return Rival(robot, log_likelihood_ratio, PlanningHypothesis(probability, mean, claimed.covariance))
@@ -115,29 +119,30 @@ def _holding(pair: PairRanges, robot: int, anchor: Array, rho: float, sigma: flo
     return problem._replace(common=common, scale=scale, slow=slow), row
 
 
-def likely_rival(
+def blocking_rival(
     scored: Sequence[ScoredHypothesis],
     claimed: PlanningHypothesis,
     pair: PairRanges,
     mission: Mission,
     robots: tuple[int, ...],
 ) -> Rival | None:
-    """Return the likeliest rival of claims of `robots` if it is too likely for a claim; None if it is not.
+    """Return the likeliest rival of the claims of `robots` if it is too likely for a claim, else None.
 
     A rival may be as likely as other hypotheses may be probable: 1 - confidence.
     """
     rival = likeliest_rival(scored[0].fit, pair, claimed, robots)
-    return rival if rival.log_likelihood_ratio > _most_likely(mission) else None
+    return rival if rival.log_likelihood_ratio > _allowed_ratio(mission) else None
 
 
-def _most_likely(mission: Mission) -> float:
+def _allowed_ratio(mission: Mission) -> float:
     """Return the largest log-likelihood ratio that a rival of a claim may have."""
     return math.log1p(-mission.confidence)
 
 
 def rival_reason(rival: Rival, mission: Mission) -> str:
     """Return why `rival` blocks a claim."""
+    ratio, allowed = rival.log_likelihood_ratio, _allowed_ratio(mission)
     return (
         f"poses {WRONG_SIGMAS:g} sigmas away explain the ranges nearly as well: "
-        f"their log-likelihood ratio is {rival.log_likelihood_ratio:.3g}, allowed {_most_likely(mission):.3g}"
+        f"their log-likelihood ratio is {ratio:.3g}, allowed {allowed:.3g}"
     )

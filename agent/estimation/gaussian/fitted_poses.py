@@ -81,7 +81,7 @@ def _of_survey(fitted: Fit, by_range: Array) -> Array | float:
 
 
 def last_poses(guess: Array, paths: Sequence[Track], apart: tuple[float, float]) -> Array:
-    """Return the poses at the end of `paths` by `guess`, relative to M1 along the axes of <W>, in m and rad.
+    """Return the poses at the end of `paths` if `guess` is right, relative to M1 along <W>, in m and rad.
 
     The shape is (3,) for one robot, and (6,) for two.
     """

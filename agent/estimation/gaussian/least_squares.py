@@ -293,6 +293,7 @@ class HeldFit(NamedTuple):
     log_likelihood: float
     """The log-likelihood of the ranges; see `Fit`."""
     guess: Array
+    """The unknowns, as in `Fit`."""
     paths: tuple[Track, ...]
     """The paths with the odometry errors corrected."""
 
@@ -301,7 +302,7 @@ def held_fits(problem: Problem, begun: Fit, row: int, offsets: Array, steps: int
     """Return the fits to the ranges of `problem` after `steps` steps from the fit `begun`.
 
     The problem has the ranges of that fit and one more, at `row`, which holds a coordinate: it is no outlier.
-    There is one fit for each of `offsets` (m), by which this range is longer.
+    There is one fit for each of `offsets` (m), which is added to this range.
     """
     noise, sigma = problem.noise, problem.ranges.sigma
     start = Start(begun.guess, begun.errors)
