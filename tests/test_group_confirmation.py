@@ -24,9 +24,12 @@ from agent.planning.group_state import GroupState
 from agent.planning.range_seeking import Homing
 from compose.audit.replay import replayed
 from compose.errors import Unworkable
+from compose.figures.agent_replay import agent_replay
+from compose.figures.pair import pairs_of
 from compose.launch.in_process import run_mission
 from compose.launch.planner_loader import planner_of
 from compose.recording.corrected_bounds import corrected_bounds
+from compose.recording.meetings import past_meetings
 from compose.recording.run import Run, of_frames
 from compose.scenario.scenario_change import file_table
 from compose.scenario.scenario_file import ScenarioTemplate, scenario_table, validate
@@ -262,6 +265,18 @@ def test_a_visitor_does_not_drive_home_because_of_ranges_of_earlier_meetings() -
                 met_again += 1
                 assert not isinstance(after.mode, Homing)
     assert met_again
+
+
+@pytest.mark.long
+def test_a_second_meeting_of_two_robots_has_file_names_of_its_own() -> None:
+    """Without the number, its figures replaced those of the first, and some were drawn several times."""
+    run = of_frames(kept(scenario_with(2, SHIFTED)))
+    pairs = list(pairs_of(run, {robot: agent_replay(run, robot) for robot in run.robots}))
+    names = [pair.name for pair in pairs]
+    assert len(set(names)) == len(names) == len(past_meetings(run))
+    assert "r3-r4-2" in names
+    first = [pair.robot(role).id for pair in pairs for role in pair.newcomers]
+    assert sorted(first) == sorted(run.robots)
 
 
 # --- the plan -----------------------------------------------------------------------------------------

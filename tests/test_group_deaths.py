@@ -198,10 +198,10 @@ def test_the_corrected_bound_is_shown_with_the_result(four: Run, capsys: pytest.
     ]
     assert found["group"]["deaths"] == {"a": 20}
     result(found)
-    shown = " ".join(capsys.readouterr().out.split())
+    shown, were = " ".join(capsys.readouterr().out.split()), "was" if len(only.late) == 1 else "were"
     assert "all robots but a were localised by tick" in shown
     assert (
-        f"corrected in tick {only.tick} to {only.bound_ticks}, as {', '.join(only.late)} were late" in shown
+        f"corrected in tick {only.tick} to {only.bound_ticks}, as {', '.join(only.late)} {were} late" in shown
     )
 
 

@@ -191,9 +191,9 @@ def test_configurations_alone_have_the_same_plan_of_meetings(run: Run) -> None:
 def test_meetings_last_until_one_of_the_robots_leaves(run: Run) -> None:
     found = past_meetings(run)
     assert found[:3] == (
-        PastMeeting("r1", "r0", 0, 21),
-        PastMeeting("r1", "r2", 22, 62),
-        PastMeeting("r0", "r3", 22, 64),
+        PastMeeting("r1", "r0", 0, 21, newcomers=frozenset({"r0", "r1"})),
+        PastMeeting("r1", "r2", 22, 62, newcomers=frozenset({"r2"})),
+        PastMeeting("r0", "r3", 22, 64, newcomers=frozenset({"r3"})),
     )
     assert {(one.a, one.b, one.first, one.last) for one in found[3:]} == {
         ("r1", "r4", 63, 108),

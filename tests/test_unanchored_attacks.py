@@ -351,7 +351,7 @@ def test_a_changed_scenario_keeps_the_number_of_false_reporters() -> None:
         ),
         (
             lambda table: table["mission"].update(noise={"anchor_sigma": 0.05, "mutual_sigma": 0.05}),
-            r"mission.tolerates: it is for exact sensors only, and these have noise",
+            r"mission.tolerates: with noisy sensors, all robots need an anchor",
         ),
         (
             lambda table: (

@@ -50,7 +50,9 @@ class Side(msgspec.Struct, frozen=True, dict=True):
     claim: Claim | None = None
     """The robot's standing claim, with its errors; None in hardware mode and in later meetings."""
     first: int = 0
-    """The tick in which the robot leaves for the meeting; 0 in its first one."""
+    """The tick in which the robot leaves for the meeting; 0 if it waits, or meets on its first orbit."""
+    is_new: bool = True
+    """True if this is its first meeting; always in pairs."""
 
     @cached_property
     def estimates(self) -> tuple[tuple[Estimate, Pose], ...]:
@@ -110,11 +112,13 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
     """
     run: Run
     """The run; without ground truth in hardware mode."""
+    number: int = 1
+    """The number of meetings of the two so far, this one included; 1 in pairs."""
 
     @property
     def name(self) -> str:
-        """The name of the pair in file names."""
-        return f"{self.a.id}-{self.b.id}"
+        """The name of the pair, or of the meeting, in file names."""
+        return f"{self.a.id}-{self.b.id}" + (f"-{self.number}" if self.number > 1 else "")
 
     @property
     def exact(self) -> bool:
@@ -171,7 +175,7 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
     @property
     def newcomers(self) -> list[Role]:
         """The roles of the readable robots whose first meeting this is: for pairs, all."""
-        return [role for role in self.readable if self.robot(role).first == 0]
+        return [role for role in self.readable if self.robot(role).is_new]
 
     def states(self, role: Role) -> tuple[RobotState, ...]:
         """Return the planner state after each tick, up to the last tick of the recording."""
@@ -275,6 +279,10 @@ def pair_of(
         own = config.role == role
         robot = config.robot if own else config.peer
         first = meeting.first if meeting is not None and role == "a" else 0
+        is_new = meeting is None or robot in meeting.newcomers
+        claim = run.claim(robot)
+        if claim is not None and meeting is not None and not is_new:
+            claim = claim if meeting.first <= claim.tick <= meeting.last else None
         if run.world is not None:
             path = run.truth(robot) or (run.scenario.robot(robot).start,)
         else:
@@ -288,8 +296,9 @@ def pair_of(
             commands=tuple([run.command(robot, tick) for tick in seen]),
             anchor_ranges=tuple([run.observations[tick][robot].anchor_range for tick in seen]),
             replay=replays.get(robot),
-            claim=run.claim(robot) if first == 0 else None,
+            claim=claim,
             first=first,
+            is_new=is_new,
         )
 
     title = run.title(list(known))
@@ -303,6 +312,7 @@ def pair_of(
         b=side("b"),
         mutual=tuple(mutual),
         run=run,
+        number=meeting.number if meeting is not None else 1,
     )
     if pair.true or not pair.placed:
         return pair

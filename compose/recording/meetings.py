@@ -10,9 +10,11 @@ to no other one.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
 import msgspec
+from msgspec.structs import replace
 
 from compose.recording.run import Run
 from compose.recording.run_setup import PresentMeeting, RunSetup
@@ -53,6 +55,10 @@ class PastMeeting(msgspec.Struct, frozen=True):
     """The tick in which the visitor leaves for it; 0 if it is the first one of both robots."""
     last: int
     """The tick before the first of the robots leaves for its next meeting, or the last one of the run."""
+    number: int = 1
+    """The number of meetings of the two so far, this one included."""
+    newcomers: frozenset[str] = frozenset()
+    """The robots whose first meeting this is."""
 
 
 def has_log(report: PeerReport) -> bool:
@@ -156,7 +162,20 @@ def past_meetings(run: Run) -> tuple[PastMeeting, ...]:
         for tick, meeting in meetings[1:]
         if meeting.visiting
     ]
-    return tuple(sorted(found, key=lambda one: (one.first, one.last)))
+    return _numbered(sorted(found, key=lambda one: (one.first, one.last)))
+
+
+def _numbered(meetings: Sequence[PastMeeting]) -> tuple[PastMeeting, ...]:
+    """Return `meetings`, which are in their order, with their numbers and newcomers."""
+    found: list[PastMeeting] = []
+    times: Counter[frozenset[str]] = Counter()
+    met: set[str] = set()
+    for one in meetings:
+        robots = frozenset((one.a, one.b))
+        times[robots] += 1
+        found.append(replace(one, number=times[robots], newcomers=robots - met))
+        met |= robots
+    return tuple(found)
 
 
 Begun = Mapping[str, list[tuple[int, PresentMeeting]]]

@@ -61,7 +61,7 @@ def _check_attacks(file: ScenarioFile, anchored: int, source: str) -> None:
     tolerates = file.mission.tolerates
     attacks = [i for i, robot in enumerate(file.robot) if robot.attack is not None]
     if tolerates and not file.mission.noise.exact:
-        raise Unworkable(f"{source}: mission.tolerates: it is for exact sensors only, and these have noise")
+        raise Unworkable(f"{source}: mission.tolerates: with noisy sensors, all robots need an anchor")
     needed = sweepers_of_part(tolerates)
     if tolerates and anchored < needed:
         raise Unworkable(

@@ -233,7 +233,9 @@ def _figures(figures: CellSummary) -> dict[str, str]:
         "corrected": _number(figures.corrected_share_max, ".2f"),
         "travel p50": _number(figures.makespan_p50, ".2f"),
         "travel p95": _number(figures.makespan_p95, ".2f"),
-        "honest": f"{figures.honest_localised}/{figures.honest_undecided}/{figures.honest_wrong}",
+        "honest": "-"
+        if figures.honest_localised is None
+        else f"{figures.honest_localised}/{figures.honest_undecided}/{figures.honest_wrong}",
         "found": f"{figures.attacker_found}/{figures.attacker_met}" if figures.attacker_met else "-",
     }
 

@@ -77,7 +77,8 @@ def _bound(group: Mapping[str, Any], robots: Mapping[str, Mapping[str, Any]]) ->
     """Return the sentence on when robots of a group were localised, its computed bound and corrections."""
     bound = f"the computed bound is {group['bound_ticks']} ticks"
     for one in group["corrected_bounds"]:
-        late = f", as {', '.join(one['late'])} were late" if len(one["late"]) <= NAMED else ""
+        were = "was" if len(one["late"]) == 1 else "were"
+        late = f", as {', '.join(one['late'])} {were} late" if len(one["late"]) <= NAMED else ""
         bound += f", corrected in tick {one['tick']} to {one['bound_ticks']}{late}"
     ticks = {name: one["localised_tick"] for name, one in robots.items()}
     left = [name for name, tick in ticks.items() if tick is None]
