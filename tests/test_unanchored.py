@@ -285,6 +285,14 @@ def test_what_cannot_be_localised_is_refused_in_one_line(change: Any, message: s
         scenario_of(table)
 
 
+def test_an_area_with_swapped_corners_is_refused_where_all_robots_have_an_anchor_too() -> None:
+    table = four(group={"robots": 4, "spacing": 10.0})
+    del table["robot"]
+    table["mission"]["area"] = [3.0, 0.0, 2.0, 1.0]
+    with pytest.raises(UserError, match=r"^group.toml: mission.area: it must be \[x_min"):
+        scenario_of(table)
+
+
 def test_check_driver_refuses_a_robot_without_an_anchor(tmp_path: Path) -> None:
     scenario = tmp_path / "four.toml"
     scenario.write_text(FILE, encoding="utf-8")

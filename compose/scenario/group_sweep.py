@@ -37,6 +37,7 @@ in 5 of 7 from 0.9 to 1.25, and in 2 of 17 above it. The others took up to 2 000
 def check_unanchored(file: ScenarioFile, source: str) -> None:
     """Raise BadScenario or Unworkable if the robots without an anchor in a group cannot be localised."""
     missing = [i for i, robot in enumerate(file.robot) if robot.anchor is None]
+    _check_order(file, source)
     if not missing:
         return
     where = f"{source}: robot[{missing[0]}]: missing field 'anchor'"
@@ -78,13 +79,20 @@ def _check_attacks(file: ScenarioFile, anchored: int, source: str) -> None:
         )
 
 
-def _check_area(file: ScenarioFile, missing: Sequence[int], source: str) -> None:
-    """Raise BadScenario if the area is missing or malformed, or if one of `missing` is not in it."""
+def _check_order(file: ScenarioFile, source: str) -> None:
+    """Raise BadScenario if the area has a smallest coordinate that is larger than the largest one."""
     if file.mission.area is None:
-        raise BadScenario(f"{source}: mission: missing field 'area': robots without an anchor are in it")
+        return
     x_min, y_min, x_max, y_max = file.mission.area
     if x_min > x_max or y_min > y_max:
         raise BadScenario(f"{source}: mission.area: it must be [x_min, y_min, x_max, y_max]")
+
+
+def _check_area(file: ScenarioFile, missing: Sequence[int], source: str) -> None:
+    """Raise BadScenario if the area is missing, or if one of `missing` is not in it."""
+    if file.mission.area is None:
+        raise BadScenario(f"{source}: mission: missing field 'area': robots without an anchor are in it")
+    x_min, y_min, x_max, y_max = file.mission.area
     for i in missing:
         start = file.robot[i].start
         if start is not None and not (x_min <= start[0] <= x_max and y_min <= start[1] <= y_max):
