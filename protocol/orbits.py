@@ -131,7 +131,7 @@ def search_ticks(mission: Mission, sides: int) -> int:
     """Return the ticks of so many sides of a visitor's search; 0 with exact sensors."""
     if mission.noise.exact:
         return 0
-    ends = [0.0 - SHORT_OF_ANCHOR, *map(leg_end, range(1, search_legs(sides) + 1))]
+    ends = [-SHORT_OF_ANCHOR, *map(leg_end, range(1, search_legs(sides) + 1))]
     ways = [mission.sensing_range * abs(end - begin) for begin, end in pairwise(ends)]
     turn = math.ceil(math.pi / (mission.max_turn_rate * mission.period))
     return sum([math.ceil(way / (mission.max_speed * mission.period)) + turn for way in ways])

@@ -44,13 +44,17 @@ def group_of(
     return validate(table, "group.toml").seeded(None)
 
 
-def random_group(seed: int, **group: Any) -> Scenario:
-    """Return the scenario `random-group` under noise, with the fields `group`."""
+def random_table(seed: int, mission: Mapping[str, Any] = {}, **group: Any) -> dict[str, Any]:
+    """Return the scenario file `random-group` under noise, with the fields `mission` and `group`."""
     table: dict[str, Any] = scenario_table("random-group")
     noise = {"anchor_sigma": SIGMA, "mutual_sigma": SIGMA, "gyro_bias": 0.0002}
-    table["mission"] |= {"accuracy": 0.3, "noise": noise}
-    table |= {"seed": seed, "group": {"spacing": 30.0} | group}
-    return validate(table, "group.toml").seeded(None)
+    table["mission"] |= {"accuracy": 0.3, "noise": noise, **mission}
+    return table | {"seed": seed, "group": {"spacing": 30.0} | group}
+
+
+def random_group(seed: int, **group: Any) -> Scenario:
+    """Return the scenario of `random_table`, with the fields `group`."""
+    return validate(random_table(seed, **group), "group.toml").seeded(None)
 
 
 def localised(run: Run) -> set[str]:

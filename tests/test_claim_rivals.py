@@ -71,7 +71,7 @@ def test_the_next_manoeuvre_is_planned_with_the_rival_that_blocks_a_claim(
 
 @pytest.mark.long
 def test_a_robot_soon_leaves_two_places_from_which_a_rival_explains_the_ranges_as_well() -> None:
-    """Its peer has claimed. Without the rival as a hypothesis, the robot claims 384 ticks later."""
+    """A robot whose peer has claimed; it claimed 384 ticks later where its rival was no hypothesis."""
     scenario = random_group(5871403709851652388, robots=16)
     first = scenario.meetings[0]
     run = run_mission(scenario)

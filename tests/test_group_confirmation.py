@@ -32,13 +32,13 @@ from compose.recording.corrected_bounds import corrected_bounds
 from compose.recording.meetings import past_meetings
 from compose.recording.run import Run, of_frames
 from compose.scenario.scenario_change import file_table
-from compose.scenario.scenario_file import ScenarioTemplate, scenario_table, validate
+from compose.scenario.scenario_file import ScenarioTemplate, validate
 from compose.sweep import spec
 from compose.sweep.cells import cells, setting_of
 from compose.sweep.group_columns import group_columns
 from protocol.messages import Localised, Report, RobotConfigWithConfirmation, Undecided
 from protocol.motion import Covariance, Pose
-from tests.groups import table_of
+from tests.groups import random_table, table_of
 from tests.test_audit import kept
 from tests.test_group_noise import TURNED
 from tests.test_group_runs import audited
@@ -52,13 +52,8 @@ WRONG = 8
 
 def table_with(seed: int, attack: dict[str, Any] | None = None, **mission: Any) -> dict[str, Any]:
     """Return a scenario file of four robots that tolerate one false one, which r1 may be."""
-    table: dict[str, Any] = scenario_table("random-group")
-    noise = {"anchor_sigma": 0.05, "mutual_sigma": 0.05, "gyro_bias": 0.0002}
-    table["mission"] |= {"accuracy": 0.3, "noise": noise, "tolerates": 1} | mission
-    group: dict[str, Any] = {"robots": 4, "spacing": 30.0}
-    if attack is not None:
-        group["attack"] = attack
-    return table | {"seed": seed, "group": group}
+    attacked = {} if attack is None else {"attack": attack}
+    return random_table(seed, {"tolerates": 1} | mission, robots=4, **attacked)
 
 
 def scenario_with(seed: int, attack: dict[str, Any] | None = None, **mission: Any) -> Scenario:
@@ -269,7 +264,7 @@ def test_a_visitor_does_not_drive_home_because_of_ranges_of_earlier_meetings() -
 
 @pytest.mark.long
 def test_a_second_meeting_of_two_robots_has_file_names_of_its_own() -> None:
-    """Without the number, its figures replaced those of the first, and some were drawn several times."""
+    """Figures of two meetings of the same robots; those of the second replaced those of the first."""
     run = of_frames(kept(scenario_with(2, SHIFTED)))
     pairs = list(pairs_of(run, {robot: agent_replay(run, robot) for robot in run.robots}))
     names = [pair.name for pair in pairs]

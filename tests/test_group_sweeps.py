@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
@@ -16,6 +17,7 @@ from compose.sweep.statistics import columns_of
 from compose.sweep.table import schema_of
 from compose.sweep.trial import Trial, run_trial
 from protocol.messages import Localised
+from tests.commands import tandem
 from tests.groups import group_of
 from world.scenario import Scenario
 
@@ -118,3 +120,14 @@ def test_the_cases_of_the_sweep_of_groups_have_the_same_groups() -> None:
         keys.setdefault(cell.fields["group.robots"], set()).add(cell.key)
     assert all(len(found) == 1 for found in keys.values())
     assert {one.fields["fault"] is not None for one in cells(sweep)} == {True, False}
+
+
+@pytest.mark.long
+def test_a_group_that_is_refused_has_no_numbers_in_the_table(tmp_path: Path) -> None:
+    spec_file = tmp_path / "refused.toml"
+    axis = '[[axis]]\nname = "tolerates"\nfield = "mission.tolerates"\nvalues = [0, 1]\n'
+    spec_file.write_text(f'name = "refused"\nscenario = "random-group"\ntrials = 1\n{axis}', encoding="utf-8")
+    ended = tandem("sweep", spec_file, "--no-audit", "--workers", "1", "--out", tmp_path / "out")
+    assert "cell 1 cannot run: mission.tolerates: " in ended.out
+    assert "4/0/0" in ended.out
+    assert "None" not in ended.out

@@ -146,7 +146,7 @@ def test_acknowledged_entries_are_known_and_lost_entries_are_sent_again(
 def test_a_robot_that_begins_another_meeting_receives_the_whole_log_again(
     driven: list[Tick], again: int
 ) -> None:
-    """Without it, the other robot of the first meeting, which was still in it, sent the rest alone."""
+    """The log of a robot that is still in the first meeting; it once sent only the rest."""
     a, b = Side(driven), Side(driven)
     for tick in range(len(driven) + 5 + 2 * len(driven) // min(MAX_REPORT_RUNS, MAX_REPORT_RANGES)):
         if tick == min(again, len(driven)):

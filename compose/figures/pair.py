@@ -48,7 +48,7 @@ class Side(msgspec.Struct, frozen=True, dict=True):
     replay: AgentReplay | None
     """The recomputed planner states; None if the robot's journal cannot be read."""
     claim: Claim | None = None
-    """The robot's standing claim, with its errors; None in hardware mode and in later meetings."""
+    """The robot's standing claim, with its errors; None in hardware mode, and in meetings after it."""
     first: int = 0
     """The tick in which the robot leaves for the meeting; 0 if it waits, or meets on its first orbit."""
     is_new: bool = True
@@ -279,10 +279,10 @@ def pair_of(
         own = config.role == role
         robot = config.robot if own else config.peer
         first = meeting.first if meeting is not None and role == "a" else 0
-        is_new = meeting is None or robot in meeting.newcomers
+        later = meeting if meeting is not None and robot not in meeting.newcomers else None
         claim = run.claim(robot)
-        if claim is not None and meeting is not None and not is_new:
-            claim = claim if meeting.first <= claim.tick <= meeting.last else None
+        if later is not None and claim is not None and not later.first <= claim.tick <= later.last:
+            claim = None
         if run.world is not None:
             path = run.truth(robot) or (run.scenario.robot(robot).start,)
         else:
@@ -298,7 +298,7 @@ def pair_of(
             replay=replays.get(robot),
             claim=claim,
             first=first,
-            is_new=is_new,
+            is_new=later is None,
         )
 
     title = run.title(list(known))

@@ -35,9 +35,12 @@ in 5 of 7 from 0.9 to 1.25, and in 2 of 17 above it. The others took up to 2 000
 
 
 def check_unanchored(file: ScenarioFile, source: str) -> None:
-    """Raise BadScenario or Unworkable if the robots without an anchor in a group cannot be localised."""
-    missing = [i for i, robot in enumerate(file.robot) if robot.anchor is None]
+    """Raise BadScenario or Unworkable if the robots without an anchor in a group cannot be localised.
+
+    The order of the coordinates of the area is checked in any group.
+    """
     _check_order(file, source)
+    missing = [i for i, robot in enumerate(file.robot) if robot.anchor is None]
     if not missing:
         return
     where = f"{source}: robot[{missing[0]}]: missing field 'anchor'"
