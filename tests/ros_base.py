@@ -64,6 +64,12 @@ class Twist(IdlStruct, typename="geometry_msgs/msg/Twist"):
 
 
 @dataclass
+class TwistStamped(IdlStruct, typename="geometry_msgs/msg/TwistStamped"):
+    header: Header
+    twist: Twist
+
+
+@dataclass
 class RosPose(IdlStruct, typename="geometry_msgs/msg/Pose"):
     position: Vector3
     orientation: Quaternion
@@ -99,20 +105,21 @@ class Range(IdlStruct, typename="sensor_msgs/msg/Range"):
     range: float32
 
 
-def odometry(pose: Pose) -> bytes:
-    at = RosPose(
-        Vector3(pose.x, pose.y, 0.0),
-        Quaternion(0.0, 0.0, math.sin(0.5 * pose.heading), math.cos(0.5 * pose.heading)),
-    )
+def odometry(pose: Pose, norm: float = 1.0, frame: str = "odom") -> bytes:
+    half = 0.5 * pose.heading
+    turned = Quaternion(0.0, 0.0, norm * math.sin(half), norm * math.cos(half))
+    return oriented(turned, Vector3(pose.x, pose.y, 0.0), frame)
+
+
+def oriented(turned: Quaternion, at: Vector3 | None = None, frame: str = "odom") -> bytes:
     zeros = [0.0] * 36
-    message = Odometry(
-        Header(), "base_link", PoseWithCovariance(at, zeros), TwistWithCovariance(Twist(), zeros)
-    )
+    pose = PoseWithCovariance(RosPose(at or Vector3(), turned), zeros)
+    message = Odometry(Header(frame_id=frame), "base_link", pose, TwistWithCovariance(Twist(), zeros))
     return bytes(message.serialize())
 
 
-def ranged(rho: float, most: float = 100.0) -> bytes:
-    return bytes(Range(Header(frame_id="uwb"), 0, 0.1, 0.0, most, rho).serialize())
+def ranged(rho: float, most: float = 100.0, least: float = 0.1) -> bytes:
+    return bytes(Range(Header(frame_id="uwb"), 0, 0.1, least, most, rho).serialize())
 
 
 def twist(payload: bytes) -> tuple[float, float]:

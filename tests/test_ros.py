@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import closing
+from itertools import cycle
 from pathlib import Path
+from queue import SimpleQueue
 
 import pytest
 from hypothesis import given
@@ -20,12 +23,16 @@ from protocol.network.endpoints import listening
 from tests import ros_base
 from tests.commands import BOUND_S, TandemProcess, tandem
 from world.hardware import ros2
+from world.hardware.driver import Reading
 
 LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 """The encapsulation header of CDR (OMG DDSI-RTPS 10.5): CDR_LE without options."""
 
 TWIST = LITTLE_ENDIAN + struct.pack("<6d", 1.5, 0.0, 0.0, 0.0, 0.0, -0.25)
 """A Twist encoded by hand: six doubles, aligned to 8 bytes after the header (OMG CORBA 15.3.1)."""
+
+STAMPED = LITTLE_ENDIAN + struct.pack("<iII1s3x", 0, 0, 1, b"\0") + TWIST[len(LITTLE_ENDIAN) :]
+"""A TwistStamped encoded by hand: a stamp, an empty frame_id, and the Twist, aligned to 8 bytes."""
 
 STAMP = struct.pack("<iI", 7, 8)
 RANGE = (
@@ -55,6 +62,13 @@ def test_a_twist_is_the_bytes_of_the_specification_and_of_another_library() -> N
     assert ros_base.twist(TWIST) == (1.5, -0.25)
 
 
+def test_a_stamped_twist_is_the_bytes_of_the_specification_and_of_another_library() -> None:
+    assert ros2.twist(1.5, -0.25, stamped=True) == STAMPED
+    vector, header = ros_base.Vector3, ros_base.Header(ros_base.Time(0, 0), "")
+    made = ros_base.TwistStamped(header, ros_base.Twist(vector(1.5), vector(z=-0.25)))
+    assert made.serialize() == STAMPED
+
+
 def test_a_range_and_an_odometry_are_read_from_the_bytes_of_the_specification() -> None:
     assert ros2.ranged(RANGE, 3.0) == 2.5
     pose = ros2.odometry(ODOMETRY)
@@ -74,6 +88,63 @@ def test_another_library_makes_the_same_bytes() -> None:
 )
 def test_a_range_out_of_reach_is_none(rho: float, reach: float, found: float | None) -> None:
     assert ros2.ranged(ros_base.ranged(rho), reach) == found
+
+
+@pytest.mark.parametrize(
+    ("rho", "most", "least", "found"),
+    [(2.5, 0.0, 0.0, 2.5), (0.0625, 0.0, 0.0, 0.0625), (2.5, 0.0, 0.1, 2.5), (2.5, math.inf, 0.0, 2.5)],
+)
+def test_a_limit_of_zero_is_no_limit(rho: float, most: float, least: float, found: float) -> None:
+    assert ros2.ranged(ros_base.ranged(rho, most, least), 3.0) == found
+    assert ros2.ranged(ros_base.ranged(3.5, most, least), 3.0) is None
+
+
+@pytest.mark.parametrize("rho", [-math.inf, 0.05])
+def test_too_close_is_no_range_and_not_out_of_reach(rho: float) -> None:
+    with pytest.raises(ros2.TooClose, match="too close to measure"):
+        ros2.ranged(ros_base.ranged(rho), 3.0)
+
+
+@pytest.mark.parametrize(
+    ("rho", "most", "least", "said"),
+    [
+        (0.0, 100.0, 0.0, "a range of 0 m"),
+        (-2.5, 100.0, 0.0, "a range of -2.5 m"),
+        (2.5, math.nan, 0.1, "limits that are none"),
+        (2.5, 100.0, math.nan, "limits that are none"),
+        (math.inf, 100.0, math.nan, "limits that are none"),
+        (2.5, 1.0, 2.0, "limits that are none: min_range 2 m, max_range 1 m"),
+        (2.5, -1.0, 0.0, "limits that are none"),
+        (2.5, math.inf, math.inf, "limits that are none"),
+    ],
+)
+def test_an_invalid_range_or_limit_is_refused(rho: float, most: float, least: float, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        ros2.ranged(ros_base.ranged(rho, most, least), 3.0)
+
+
+@given(st.floats(0.91, 1.09), st.floats(-3.1, 3.1))
+def test_the_norm_of_an_orientation_does_not_change_the_heading(norm: float, heading: float) -> None:
+    found = ros2.odometry(ros_base.odometry(Pose(3.0, -4.0, heading), norm))
+    assert found.heading == pytest.approx(heading, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("turned", "said"),
+    [
+        ((0.0, 0.0, 0.0, 0.0), "an orientation with a norm of 0, expected 1"),
+        ((0.0, 0.0, 0.0, 0.5), "a norm of 0.5"),
+        ((0.0, 0.0, 2.0, 0.0), "a norm of 2"),
+        ((0.0, 0.0, 0.0, 1e200), "a norm of 1e\\+200"),
+        ((0.0, 0.0, math.nan, 1.0), "not finite"),
+        ((math.inf, 0.0, 0.0, 1.0), "not finite"),
+        ((1.0, 0.0, 0.0, 0.0), "tilted by 180 degrees"),  # of a frame with z down
+        ((0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)), "tilted by 90 degrees"),
+    ],
+)
+def test_an_orientation_that_is_none_is_refused(turned: tuple[float, ...], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        ros2.odometry(ros_base.oriented(ros_base.Quaternion(*turned)))
 
 
 @pytest.mark.parametrize("payload", [b"", b"\0\1", RANGE[:-2], TWIST[:9], b"\xff" * 60])
@@ -171,24 +242,103 @@ def test_a_base_behind_a_bridge_fulfils_the_driver_contract(tmp_path: Path) -> N
         assert base.pose.heading != wrap(base.pose.heading) or abs(base.pose.heading) < math.pi
 
 
-def test_a_robot_of_a_group_reads_a_topic_for_each_other_robot() -> None:
-    config = parse(f'{SCENARIO}[[robot]]\nid = "c"\nanchor = [1.0, 12.0]\n', "ros").config("a")
-    endpoint = free_endpoint()
+EXACT = SCENARIO[: SCENARIO.index("[mission.noise]")] + SCENARIO[SCENARIO.index("[[robot]]") :]
+GROUP = f'{SCENARIO}[[robot]]\nid = "c"\nanchor = [1.0, 12.0]\n'
+ODOM = [ros_base.odometry(Pose(0.0, 0.0, 0.0))]
+
+
+def sensed(scenario: str, topics: Mapping[str, Sequence[bytes]], manoeuvre_s: float = 60.0) -> Reading:
+    """Return the reading of a driver that receives these messages, one after another and again."""
+    config, endpoint = parse(scenario, "ros").config("a"), free_endpoint()
     with (
         session.open_router(listening(endpoint)) as link,
-        closing(ros2.Ros2(config, 60.0, connect=endpoint)) as driver,
+        closing(ros2.Ros2(config, manoeuvre_s, connect=endpoint)) as driver,
     ):
-        topics = {"anchor_range": 1.5, "peer_range/b": 2.5, "peer_range/c": math.inf}
-        publishers = {topic: session.publisher(link, topic) for topic in (*topics, "odom")}
+        publishers = {topic: session.publisher(link, topic) for topic in topics}
+        messages = {topic: cycle(payloads) for topic, payloads in topics.items()}
         with ThreadPoolExecutor(1) as pool:
             reading = pool.submit(driver.sense, 1)
             while not reading.done():
-                publishers["odom"].put(ros_base.odometry(Pose(0.0, 0.0, 0.0)))
-                for topic, rho in topics.items():
-                    publishers[topic].put(ros_base.ranged(rho))
+                for topic, publisher in publishers.items():
+                    publisher.put(next(messages[topic]))
                 wait([reading], 0.01)
-        found = reading.result()
+        return reading.result()
+
+
+def test_a_robot_of_a_group_reads_a_topic_for_each_other_robot() -> None:
+    ranges = {"anchor_range": 1.5, "peer_range/b": 2.5, "peer_range/c": math.inf}
+    found = sensed(GROUP, {"odom": ODOM} | {topic: [ros_base.ranged(rho)] for topic, rho in ranges.items()})
     assert (found.anchor_range, found.mutual_ranges) == (1.5, {"b": 2.5})
+
+
+def test_too_close_is_a_drop_out_and_a_contact_if_the_mission_has_drop_outs() -> None:
+    near = [ros_base.ranged(-math.inf)]
+    topics = {"odom": ODOM, "anchor_range": near, "peer_range/b": near, "peer_range/c": near}
+    found = sensed(GROUP, topics)
+    assert (found.anchor_range, found.mutual_ranges) == (None, {"b": None, "c": None})
+
+
+@pytest.mark.parametrize("refused", [-math.inf, 0.05, math.nan, 0.0])
+def test_without_drop_outs_what_is_no_measurement_is_measured_again(refused: float) -> None:
+    again = [ros_base.ranged(refused), ros_base.ranged(refused), ros_base.ranged(2.5)]
+    found = sensed(EXACT, {"odom": ODOM, "anchor_range": again, "peer_range": again})
+    assert (found.anchor_range, found.mutual_ranges) == (2.5, {"b": 2.5})
+
+
+@pytest.mark.parametrize(
+    ("scenario", "topics", "said"),
+    [
+        (
+            EXACT,
+            {"anchor_range": [ros_base.ranged(-math.inf)]},
+            r"no range on anchor_range .* no drop-outs: too close to measure \(-inf\)",
+        ),
+        (
+            EXACT,
+            {"peer_range": [ros_base.ranged(0.05)]},
+            r"no range on peer_range .*: too close to measure: 0.05 m, min_range is 0.1 m",
+        ),
+        (EXACT, {"peer_range": []}, "nothing on peer_range since the robot stopped, and the mission has no"),
+        (
+            SCENARIO,
+            {"odom": [ros_base.odometry(Pose(0.0, 0.0, 1.0), 0.0)]},
+            "no odometry since the robot stopped: an orientation with a norm of 0, expected 1",
+        ),
+        (
+            SCENARIO,
+            {"peer_range": [ros_base.ranged(1.0, 2.5)]},
+            "peer_range: max_range is 2.5 m, less than the mission's sensing_range of 3 m: reduce that",
+        ),
+    ],
+)
+def test_a_measurement_that_does_not_come_ends_with_the_reason(
+    scenario: str, topics: dict[str, list[bytes]], said: str
+) -> None:
+    fine = [ros_base.ranged(2.5)]
+    given = {"odom": ODOM, "anchor_range": fine, "peer_range": fine} | topics
+    with pytest.raises((TimeoutError, ValueError), match=said):
+        sensed(scenario, {topic: payloads for topic, payloads in given.items() if payloads}, 4.0)
+
+
+def test_odometry_of_another_publisher_on_the_topic_is_not_used() -> None:
+    other = ros_base.odometry(Pose(5.0, 0.0, 0.0), frame="map")
+    found = sensed(SCENARIO, {"odom": [*ODOM, other], "anchor_range": [ros_base.ranged(2.5)]}, 4.0)
+    assert found.mark[0] in (0.0, 5.0)
+    assert found.executed == Controls(0.0, 0.0)
+
+
+@pytest.mark.parametrize(("stamped", "sent"), [("false", TWIST), ("true", STAMPED)])
+def test_a_driver_sends_stamped_twists_if_it_is_told_to(stamped: str, sent: bytes) -> None:
+    config, endpoint = parse(SCENARIO, "ros").config("a"), free_endpoint()
+    received: SimpleQueue[bytes] = SimpleQueue()
+    with session.open_router(listening(endpoint)) as link:
+        link.declare_subscriber("cmd_vel", lambda sample: received.put(sample.payload.to_bytes()))
+        with closing(ros2.Ros2(config, 60.0, connect=endpoint, stamped=stamped)) as driver:
+            driver.drive(90.0, -15.0)  # of a manoeuvre of 1 s, executed in 60 s
+            assert received.get(timeout=BOUND_S) == sent
+            driver.stop()
+    with pytest.raises(ValueError, match="stamped: 'yes', expected true or false"):
+        ros2.Ros2(config, 60.0, connect=endpoint, stamped="yes")
 
 
 @pytest.mark.long

@@ -1,9 +1,9 @@
 """A driver for robots with ROS 2, through zenoh-bridge-ros2dds.
 
 The bridge maps each topic to the Zenoh key of the same name, with messages in CDR. The driver publishes
-geometry_msgs/Twist, and subscribes to nav_msgs/Odometry and sensor_msgs/Range. It decides by the time of
-arrival whether a message is fresh, and ignores the stamps, so the clocks need not be synchronised. It needs
-the extra `ros`.
+geometry_msgs/Twist or TwistStamped, and subscribes to nav_msgs/Odometry and sensor_msgs/Range. It decides by
+the time of arrival whether a message is fresh, and ignores the stamps, so the clocks need not be
+synchronised. It needs the extra `ros`.
 """
 
 from __future__ import annotations
@@ -24,46 +24,94 @@ from protocol.network import session
 from protocol.network.endpoints import at
 from world.hardware.driver import SENSING, Reading
 
-TWIST, ODOMETRY, RANGE = "geometry_msgs/msg/Twist", "nav_msgs/msg/Odometry", "sensor_msgs/msg/Range"
+TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
+ODOMETRY, RANGE = "nav_msgs/msg/Odometry", "sensor_msgs/msg/Range"
 CONNECT_S = 10.0
 """The time in s to wait for the bridge."""
 REPEATS = 10
 """The number of Twists in a manoeuvre. A mobile base stops if it receives none for a while, as it should."""
+NORM = 0.1
+"""The largest difference from 1 of the norm of an orientation.
+
+Linear interpolation between two orientations shortens the quaternion by less, up to 100 degrees between them.
+"""
+UPRIGHT = 0.5
+"""The least cosine of the angle between the robot's vertical axis and that of the frame; REP 103 has z up."""
+TOO_CLOSE = -math.inf
+"""The range to a sensor that is too close to measure it, as in REP 117."""
+SINGLE = 1e-6
+"""The relative rounding error of the single-precision numbers of a sensor_msgs/Range, and some margin."""
 
 _types = get_typestore(Stores.ROS2_HUMBLE)
 
 
-def twist(v: float, omega: float) -> bytes:
-    """Return the geometry_msgs/Twist with `v` m/s and `omega` rad/s, in CDR."""
-    vector = _types.types["geometry_msgs/msg/Vector3"]
-    message = _types.types[TWIST](linear=vector(v, 0.0, 0.0), angular=vector(0.0, 0.0, omega))
-    return bytes(_types.serialize_cdr(message, TWIST))
+class TooClose(ValueError):
+    """A sensor_msgs/Range of a sensor that is too close to measure a range. It is in range, however."""
+
+
+def twist(v: float, omega: float, *, stamped: bool = False) -> bytes:
+    """Return the geometry_msgs/Twist with `v` m/s and `omega` rad/s, in CDR; a TwistStamped if `stamped`.
+
+    Its stamp is 0, which controllers replace by the time of arrival, in their own clock.
+    """
+    types = _types.types
+    vector = types["geometry_msgs/msg/Vector3"]
+    message = types[TWIST](linear=vector(v, 0.0, 0.0), angular=vector(0.0, 0.0, omega))
+    if not stamped:
+        return bytes(_types.serialize_cdr(message, TWIST))
+    header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, 0), "")
+    return bytes(_types.serialize_cdr(types[STAMPED](header=header, twist=message), STAMPED))
 
 
 def odometry(payload: bytes) -> Pose:
     """Return the pose in a nav_msgs/Odometry: m, m, and rad in (-pi, pi].
 
-    Raises ValueError if `payload` is not such a message, or a value is not finite.
+    Raises ValueError if `payload` is not such a message, a value is not finite, or the orientation is none of
+    an upright robot. The norm of the quaternion may differ from 1 by NORM.
     """
-    pose = _message(payload, ODOMETRY).pose.pose
-    q = pose.orientation
-    yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
-    found = Pose(float(pose.position.x), float(pose.position.y), yaw)
-    if not all(map(math.isfinite, (found.x, found.y, found.heading))):
+    return _pose(_message(payload, ODOMETRY))
+
+
+def _pose(message: Any) -> Pose:
+    """Return the pose in a decoded nav_msgs/Odometry. Raises ValueError as `odometry`."""
+    at, q = message.pose.pose.position, message.pose.pose.orientation
+    if not all(map(math.isfinite, (at.x, at.y, q.x, q.y, q.z, q.w))):
         raise ValueError("a pose that is not finite")
-    return found
+    norm = math.hypot(q.x, q.y, q.z, q.w)
+    if abs(norm - 1.0) > NORM:
+        raise ValueError(f"an orientation with a norm of {norm:.6g}, expected 1")
+    x, y, z, w = q.x / norm, q.y / norm, q.z / norm, q.w / norm
+    if (up := 1.0 - 2.0 * (x * x + y * y)) < UPRIGHT:
+        tilt = math.degrees(math.acos(max(up, -1.0)))
+        raise ValueError(f"an orientation tilted by {tilt:.0f} degrees, expected a robot in the plane, z up")
+    return Pose(float(at.x), float(at.y), math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
 
 
 def ranged(payload: bytes, reach: float) -> float | None:
-    """Return the range in a sensor_msgs/Range, in m; None beyond `reach` m or the limits of the message.
+    """Return the range in a sensor_msgs/Range, in m; None beyond `reach` m or max_range, and for +inf.
 
-    Raises ValueError if `payload` is not such a message, or the range is NaN.
+    A min_range or max_range of 0 is no limit.
+
+    Raises TooClose for -inf or a range below min_range, and ValueError if `payload` is not such a message, or
+    the range or a limit is invalid.
     """
-    message = _message(payload, RANGE)
-    rho = float(message.range)
+    return _range(_message(payload, RANGE), reach)
+
+
+def _range(message: Any, reach: float) -> float | None:
+    """Return the range in a decoded sensor_msgs/Range. Raises as `ranged`."""
+    rho, least, most = float(message.range), float(message.min_range), float(message.max_range)
     if math.isnan(rho):
         raise ValueError("a range that is not a number")
-    return rho if message.min_range <= rho <= min(message.max_range, reach) else None
+    if not (0.0 <= least < math.inf and (most == 0.0 or least <= most)):
+        raise ValueError(f"limits that are none: min_range {least:.6g} m, max_range {most:.6g} m")
+    if rho == TOO_CLOSE:
+        raise TooClose("too close to measure (-inf)")
+    if rho <= 0.0:
+        raise ValueError(f"a range of {rho:.6g} m, which no radio measures")
+    if rho < least:
+        raise TooClose(f"too close to measure: {rho:.6g} m, min_range is {least:.6g} m")
+    return rho if rho <= min(most or math.inf, reach) else None
 
 
 def executed(before: Pose, after: Pose, period: float) -> Controls:
@@ -91,20 +139,31 @@ class Ros2:
         odom: str = "odom",
         anchor_range: str = "anchor_range",
         peer_range: str = "peer_range",
+        stamped: str = "false",
     ) -> None:
         """Connect to the bridge at the Zenoh endpoint `connect`. The other options are names of topics.
 
-        In a group, the range to robot ID is on the topic `peer_range`/ID.
+        In a group, the range to robot ID is on the topic `peer_range`/ID. If `stamped` is "true", messages on
+        `cmd_vel` are TwistStamped, otherwise Twist.
 
-        Raises TimeoutError if there is no bridge within CONNECT_S.
+        Raises TimeoutError if there is no bridge within CONNECT_S, and ValueError.
         """
+        if stamped not in ("true", "false"):
+            raise ValueError(f"stamped: '{stamped}', expected true or false")
+        self._stamped = stamped == "true"
         self._mission = config.mission
         self._manoeuvre_s = manoeuvre_s
         self._changed = threading.Condition()
         self._pose: tuple[Pose, float] | None = None
         """The latest pose, with its heading not wrapped, and the time of its arrival."""
         self._ranges: dict[str, tuple[float | None, float]] = {}
-        """The latest range by topic, and the time of its arrival."""
+        """The latest range by topic, and the time of its arrival; TOO_CLOSE only if there are drop-outs."""
+        self._refused: dict[str, tuple[str, float]] = {}
+        """The reason by topic why the latest invalid message was refused, and the time of its arrival."""
+        self._frames: tuple[str, str] | None = None
+        """The frames of the odometry: that of the pose, and that of the robot."""
+        self._unsuitable: str | None = None
+        """The reason why a sensor cannot serve this mission; None if it can."""
         self._last: Pose | None = None
         """The pose at the previous reading."""
         self._rest_since = time.monotonic()
@@ -127,6 +186,7 @@ class Ros2:
 
         link = self._open.enter_context(session.open_client(at(connect), unanswered))
         self._cmd_vel = session.publisher(link, cmd_vel)
+        self._odom = odom
         link.declare_subscriber(odom, lambda sample: self._on_odometry(sample.payload.to_bytes()))
         for topic in (*self._anchors, *self._peers.values()):
             link.declare_subscriber(topic, self._on_range(topic))
@@ -134,15 +194,18 @@ class Ros2:
     def sense(self, tick: int) -> Reading:
         """Return the messages that have arrived since the robot stopped.
 
-        Raises TimeoutError if odometry is missing, or a range without drop-outs in the mission.
+        Raises TimeoutError if odometry is missing, or a range without drop-outs in the mission; ValueError if
+        a sensor is unsuitable.
         """
         now = time.monotonic()
         since = min(self._rest_since, now)
         give_up = now + (SENSING * self._manoeuvre_s if tick else CONNECT_S)
         with self._changed:
-            self._changed.wait_for(lambda: self._is_all_here(since), give_up - now)
+            self._changed.wait_for(lambda: self._unsuitable or self._is_all_here(since), give_up - now)
+            if self._unsuitable is not None:
+                raise ValueError(self._unsuitable)
             if self._pose is None or self._pose[1] < since:
-                raise TimeoutError("no odometry since the robot stopped")
+                raise TimeoutError(f"no odometry since the robot stopped{self._why(self._odom, since)}")
             pose, _ = self._pose
             driven = executed(self._last or pose, pose, self._mission.period)
             self._last = pose
@@ -150,9 +213,9 @@ class Ros2:
             mutual = [(robot, self._fresh(topic, since)) for robot, topic in self._peers.items()]
             return Reading(
                 driven,
-                anchor_range,
+                _measured(anchor_range),
                 mark=(pose.x, pose.y, pose.heading),
-                mutual_ranges={robot: rho for robot, rho in mutual if rho is not None},
+                mutual_ranges={robot: _measured(rho) for robot, rho in mutual if rho is not None},
             )
 
     def drive(self, v: float, omega: float) -> None:
@@ -160,14 +223,14 @@ class Ros2:
         self._end_drive()
         ended = self._command = threading.Event()
         faster = self._mission.period / self._manoeuvre_s  # 1 in real time
-        payload, until = twist(v * faster, omega * faster), time.monotonic() + self._manoeuvre_s
+        payload, until = self._twist(v * faster, omega * faster), time.monotonic() + self._manoeuvre_s
         self._rest_since = until
 
         def publish() -> None:
             while not ended.is_set() and (left := until - time.monotonic()) > 0.0:
                 self._cmd_vel.put(payload)
                 ended.wait(min(left, self._manoeuvre_s / REPEATS))
-            self._cmd_vel.put(twist(0.0, 0.0))
+            self._cmd_vel.put(self._twist(0.0, 0.0))
 
         self._publisher = threading.Thread(target=publish, daemon=True)
         self._publisher.start()
@@ -184,12 +247,15 @@ class Ros2:
         """End the manoeuvre, and publish a Twist of zero."""
         self._end_drive()
         self._rest_since = min(self._rest_since, time.monotonic())
-        self._cmd_vel.put(twist(0.0, 0.0))
+        self._cmd_vel.put(self._twist(0.0, 0.0))
 
     def close(self) -> None:
         """Stop the robot and disconnect from the bridge."""
         self.stop()
         self._open.close()
+
+    def _twist(self, v: float, omega: float) -> bytes:
+        return twist(v, omega, stamped=self._stamped)
 
     def _end_drive(self) -> None:
         if not self._command.is_set():
@@ -200,26 +266,46 @@ class Ros2:
 
     def _on_odometry(self, payload: bytes) -> None:
         try:
-            pose = odometry(payload)
-        except ValueError:
+            message = _message(payload, ODOMETRY)
+            pose, frames = _pose(message), (message.header.frame_id, message.child_frame_id)
+            if self._frames not in (None, frames):
+                raise ValueError(f"frames {frames}, expected {self._frames}: is there another publisher?")
+        except ValueError as error:
+            self._refuse(self._odom, error)
             return
         with self._changed:
+            self._frames = frames
             before = self._pose[0] if self._pose is not None else ORIGIN
             heading = before.heading + wrap(pose.heading - before.heading)
             self._pose = Pose(pose.x, pose.y, heading), time.monotonic()
             self._changed.notify_all()
 
     def _on_range(self, topic: str) -> Callable[[zenoh.Sample], None]:
+        reach, drop_outs = self._mission.sensing_range, self._mission.noise.drop_outs
+
         def take(sample: zenoh.Sample) -> None:
+            unsuitable = None
             try:
-                rho = ranged(sample.payload.to_bytes(), self._mission.sensing_range)
-            except ValueError:
-                return
+                message = _message(sample.payload.to_bytes(), RANGE)
+                rho = _range(message, reach)
+                if 0.0 < message.max_range < reach * (1.0 - SINGLE):
+                    unsuitable = f"{topic}: max_range is {message.max_range:.6g} m, less than the mission's "
+                    unsuitable += f"sensing_range of {reach:g} m: reduce that"
+            except ValueError as error:
+                if not (drop_outs and isinstance(error, TooClose)):
+                    self._refuse(topic, error)
+                    return
+                rho = TOO_CLOSE
             with self._changed:
+                self._unsuitable = self._unsuitable or unsuitable
                 self._ranges[topic] = rho, time.monotonic()
                 self._changed.notify_all()
 
         return take
+
+    def _refuse(self, topic: str, error: ValueError) -> None:
+        with self._changed:
+            self._refused[topic] = str(error), time.monotonic()
 
     # --- freshness of messages ---
 
@@ -232,16 +318,27 @@ class Ros2:
     def _fresh(self, topic: str, since: float) -> float | None:
         """Return the range in m that arrived on `topic` since then; None if it is out of range, or missing.
 
+        It is TOO_CLOSE if there is none for that reason, and the mission has drop-outs.
+
         Raises TimeoutError if it is missing and the mission has no drop-outs.
         """
         rho, came = self._ranges.get(topic, (None, -math.inf))
         if came >= since:
             return rho
         if not self._mission.noise.drop_outs:
-            raise TimeoutError(
-                f"nothing on {topic} since the robot stopped, and the mission has no drop-outs"
-            )
+            why = self._why(topic, since)
+            what = f"{'no range' if why else 'nothing'} on {topic} since the robot stopped"
+            raise TimeoutError(f"{what}, and the mission has no drop-outs{why}")
         return None
+
+    def _why(self, topic: str, since: float) -> str:
+        """Return why the latest invalid message on `topic` since then was refused; "" if there is none."""
+        why, came = self._refused.get(topic, ("", -math.inf))
+        return f": {why}" if came >= since else ""
+
+
+def _measured(rho: float | None) -> float | None:
+    return None if rho == TOO_CLOSE else rho
 
 
 def _message(payload: bytes, kind: str) -> Any:
