@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from itertools import pairwise
+from pathlib import Path
 from typing import cast
 
 import pytest
@@ -15,6 +16,7 @@ from msgspec.structs import replace
 from agent.process.link import SILENCE_S
 from compose.launch.driver_loader import config_of
 from compose.scenario.scenario_file import parse
+from protocol.journal.journal_file import MemoryJournal
 from protocol.messages import (
     Command,
     FinalReport,
@@ -34,9 +36,9 @@ from protocol.wire import decode, encode
 from tests.commands import ASSURED, PAPER_1
 from tests.stage import Stage
 from world.hardware import bridge
-from world.hardware.bridge import Field, NoStart
+from world.hardware.bridge import ASTRAY, Field, NoStart
 from world.hardware.driver import THINKING, Reading
-from world.hardware.driver_journal import DrivenTick, DriverHistory
+from world.hardware.driver_journal import DrivenTick, DriverHistory, driver_history
 from world.hardware.termination import LAST_WORDS, Ending
 from world.hardware.tick_source import UNHEARD
 
@@ -289,6 +291,63 @@ def test_a_peer_that_is_killed_between_its_claim_and_its_last_report_is_waited_f
 
     _, end, _ = played(Recorded(), answer, ticks=100)
     assert end == MissionEnd(40 + LAST_WORDS, "localised", None)
+
+
+def test_only_reports_of_the_mission_and_near_its_tick_are_used_and_journaled(
+    stage: Stage, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One that comes before tick 0 would be the first frame of a journal that cannot be resumed."""
+    journal = MemoryJournal()
+    field = Field(Recorded(), CONFIG, "r", stage, max_ticks=99, manoeuvre_s=MANOEUVRE_S, journal=journal)
+    field.attach(LINK)
+    genuine = report(6, 5, Undecided("why"))
+    early = [report(0, 0, LOCALISED), report(90, 90, LOCALISED)]
+    at_3 = [report(3 + ASTRAY + 1, 3, LOCALISED), report(4, 4, LOCALISED), report(10**6, 1, LOCALISED)]
+    late = [genuine, report(7, 5, Undecided("why")), report(1, 0, LOCALISED)]  # repetitions change nothing
+
+    def comes(*reports: Report) -> None:
+        for one in reports:
+            stage.comes("report", keys.report("r", "b", "a"), encode(one))
+
+    def answer(key: str, frame: bytes) -> None:
+        if key == keys.observation("r", "a"):
+            match decode(frame, Observation | TickStart | MissionEnd | FinalReport):
+                case TickStart():  # a waits for b
+                    comes(*early)
+                    stage.alive("b")
+                case Observation(tick):
+                    verdict = Undecided("why") if tick >= 5 else None
+                    stage.comes("command", keys.command("r", "a"), encode(command(tick, verdict=verdict)))
+                    comes(*{3: at_3, 6: late}.get(tick, ()))
+                case MissionEnd():
+                    stage.comes("command", keys.command("r", "a"), encode(FINAL_REPORT))
+
+    stage.answer = answer
+    stage.alive("a")
+    assert field.run_mission(10.0, lambda: None) == MissionEnd(6 + LAST_WORDS, "undecided", "a: why")
+    history = driver_history([encode(CONFIG), *journal.frames], CONFIG, Path("a"))
+    assert [one.received for one in history.ticks if one.received] == [(genuine,)]
+    refused = capsys.readouterr().err
+    for why in ("is of tick 68, this is tick 3", "acknowledges tick 4, this is tick 3", "is of tick 1000000"):
+        assert f"it {why}" in refused
+
+
+@pytest.mark.parametrize("is_end_recorded", [True, False])
+def test_a_robot_that_is_restarted_after_the_end_only_records_the_end_if_that_is_missing(
+    stage: Stage, is_end_recorded: bool
+) -> None:
+    end, journal = MissionEnd(5, "undecided", "max_ticks: a not localised by then"), MemoryJournal()
+    ticks = [
+        DrivenTick(Observation(tick, "a", None, 1.0), b"", command(tick), (report(0, 0, LOCALISED),))
+        for tick in range(6)
+    ]
+    field = Field(Recorded(), CONFIG, "r", stage, max_ticks=5, manoeuvre_s=MANOEUVRE_S, journal=journal)
+    field.resume(DriverHistory(tuple(ticks), (), end if is_end_recorded else None), 5)
+    field.attach(LINK)
+    stage.comes("report", keys.report("r", "b", "a"), encode(report(6, 5, Undecided("why"))))
+    stage.alive("a")
+    assert field.run_mission(10.0, lambda: None) == end
+    assert journal.frames == ([] if is_end_recorded else [encode(end)])
 
 
 def test_an_agent_is_told_that_its_driver_waits_for_the_peer(stage: Stage) -> None:

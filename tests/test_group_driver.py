@@ -375,6 +375,21 @@ def test_results_are_journaled_once_when_they_are_received(stage: Stage) -> None
     assert [one.robot for tick in history.ticks for one in tick.received] == ["b", "c"]
 
 
+def test_a_tick_start_of_an_unexpected_tick_changes_nothing(stage: Stage) -> None:
+    """One that a robot sent before its result arrives late; ticks far ahead are those of no robot."""
+    journal = MemoryJournal()
+    a = Member(stage, "a", 9, LOCALISED, journal)
+    stage.alive("a", "b", "c", "d")
+    starts = [result("b"), replace(result("b", None), tick=1), replace(result("c"), tick=10_000)]
+    for place, start in enumerate([replace(starts[0], tick=2), *starts[1:]]):
+        key = keys.tick_start("r", start.robot)
+        stage.comes("tick-start", key, encode(start), 2.5 * TICK_S + 0.001 * place)
+    a.play()
+    history = driver_history([encode(config_in_group("a")), *journal.frames], config_in_group("a"), Path("a"))
+    received = [one for tick in history.ticks for one in tick.received]
+    assert received == [replace(result("b"), tick=2)]
+
+
 def test_results_that_were_received_are_known_after_a_restart(stage: Stage, tmp_path: Path) -> None:
     config = config_in_group("a")
     frames = [encode(config), encode(Observation(0, "a", None, 2.0)), encode(command(0, verdict=LOCALISED))]

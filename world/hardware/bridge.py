@@ -58,7 +58,7 @@ Other robots close their links at the same time. Seldom, on a busy machine, Zeno
 more, without a limit of time.
 """
 ASTRAY = 64
-"""The maximum number of ticks by which a TickStart may differ from the tick of a robot that follows it.
+"""The maximum number of ticks by which a TickStart or Report may differ from the tick of its receiver.
 
 One of a much earlier tick was sent by a robot that has been restarted without its journal.
 """
@@ -117,7 +117,9 @@ class Field:
         )
         self._source = TickSource(config, self._tick_s)
         self._end: MissionEnd | None = None
-        """The journaled end of the mission; None before."""
+        """The end of the mission that follows from the journal; None before."""
+        self._is_end_recorded = False
+        """True if the journal contains the MissionEnd."""
         self._restarted = False
         """True if this process is a restarted one, even if it was killed before tick 0."""
         self._resumed = False
@@ -149,7 +151,7 @@ class Field:
                 self._ending.receive(message)
             self._end = self._ending.after(one.observation.tick, one.command)
             self.missed += one.command is None
-        self._end = history.end or self._end
+        self._end, self._is_end_recorded = history.end or self._end, history.end is not None
         self._tick, self._resumed, self._astray = history.tick, history.tick >= 0, self._max_ticks + 1
         self._unanswered.extend((one.observation.tick, one.frame) for one in history.ticks[known + 1 :])
 
@@ -194,7 +196,7 @@ class Field:
             end = MissionEnd(max(self._tick, 0), "failed", f"{self._id}'s driver: {failure}")
         finally:
             self._stop()
-        if self._end is None:
+        if not self._is_end_recorded:
             self._write(encode(end))
         self._finish(end)
         return end
@@ -377,8 +379,6 @@ class Field:
         start: TickStart | None = self._accepted(arrival, TickStart | TickStartInGroup)
         if start is None:
             return
-        if self._tick >= 0 and self._ending.receive(start):
-            self._write(arrival.frame)
         left, now, in_group = self._tick + 1 - start.tick, time.monotonic(), self._source.joins
         fits = -self._astray <= left <= (AHEAD if self._resumed or self._astray == ASTRAY else ASTRAY)
         begins = in_group and self._next == UNKNOWN
@@ -387,6 +387,8 @@ class Field:
             self._source.hear(start.robot, now)
             if behind or (begins and left < 0):
                 self._ahead = max(self._ahead, start.tick)
+        if self._is_current(start.tick):
+            self._use(start, arrival.frame)
         if not (begins or behind or self._source.leads(start.robot, now)):
             return
         if not fits:
@@ -397,9 +399,28 @@ class Field:
         self._next = now + left * self._tick_s
 
     def _on_report(self, arrival: Arrival) -> None:
+        """Use a Report for the end of the mission. One before tick 0 is dropped: they are cumulative."""
         report: PeerReport | None = self._accepted(arrival, PeerReport)
-        if report is not None and self._ending.receive(report):
-            self._write(arrival.frame)
+        if report is None or self._tick < 0:
+            return
+        if not self._is_current(report.tick):
+            self._inbox.refuse(arrival, f"it is of tick {report.tick}, this is tick {self._tick}")
+        elif report.heard is not None and report.heard > self._tick:
+            self._inbox.refuse(arrival, f"it acknowledges tick {report.heard}, this is tick {self._tick}")
+        else:
+            self._use(report, arrival.frame)
+
+    def _is_current(self, tick: int) -> bool:
+        """Return whether `tick` is near this robot's, or that of the robots with which it catches up."""
+        return abs(tick - max(self._tick, self._ahead)) <= ASTRAY
+
+    def _use(self, message: PeerReport | TickStart, frame: bytes) -> None:
+        """Use a message of another robot for the end of the mission, and journal it if it changes something.
+
+        The mission begins with tick 0, and its journal with the Observation of that tick.
+        """
+        if self._tick >= 0 and self._end is None and self._ending.receive(message):
+            self._write(frame)
 
     # --- the end ---
 

@@ -67,6 +67,8 @@ class GroupEnding(Termination):
         """The robots that wait for no other one."""
         self._heard = dict.fromkeys(self._others, time.monotonic())
         """The time at which each robot was heard last, on the monotonic clock."""
+        self._tick_of: dict[str, int] = {}
+        """The tick of the latest TickStart that has been received, by robot."""
         self._is_complete = False
         """True if this robot has its result, and waits for no other one."""
         self._resting = 0
@@ -77,11 +79,17 @@ class GroupEnding(Termination):
         """The tick in which no robot waited for another one any more."""
 
     def receive(self, message: PeerReport | TickStart) -> bool:
-        """Add the TickStart of another robot, and return whether it changes what is known."""
+        """Add the TickStart of another robot, and return whether it changes what is known.
+
+        What a robot has sent in an earlier tick than another one changes nothing.
+        """
         if not isinstance(message, TickStartInGroup) or message.robot not in self._others:
             return False
         robot = message.robot
         self._heard[robot] = time.monotonic()
+        if message.tick < self._tick_of.get(robot, 0):
+            return False
+        self._tick_of[robot] = message.tick
         before = robot in self._results, robot in self._complete
         if message.verdict is not None:
             self._results[robot] = message.verdict
