@@ -337,10 +337,7 @@ def test_a_robot_that_is_restarted_after_the_end_only_records_the_end_if_that_is
     stage: Stage, is_end_recorded: bool
 ) -> None:
     end, journal = MissionEnd(5, "undecided", "max_ticks: a not localised by then"), MemoryJournal()
-    ticks = [
-        DrivenTick(Observation(tick, "a", None, 1.0), b"", command(tick), (report(0, 0, LOCALISED),))
-        for tick in range(6)
-    ]
+    ticks = [DrivenTick(Observation(tick, "a", None, 1.0), b"", command(tick)) for tick in range(6)]
     field = Field(Recorded(), CONFIG, "r", stage, max_ticks=5, manoeuvre_s=MANOEUVRE_S, journal=journal)
     field.resume(DriverHistory(tuple(ticks), (), end if is_end_recorded else None), 5)
     field.attach(LINK)

@@ -22,13 +22,15 @@ from compose.launch.processes import free_endpoint
 from compose.scenario.scenario_file import load
 from docs.rover import Rover
 from protocol.journal.journal_file import CorruptJournal
-from protocol.messages import Observation
-from protocol.motion import REST
+from protocol.messages import Localised, Observation, Report
+from protocol.motion import ORIGIN, REST
+from protocol.network import keys, session
 from protocol.network.inbox import Inbox
 from protocol.wire import encode
 from tests.broken_drivers import LosesAReading
 from tests.commands import BOUND_S, TandemProcess, processes_of, size, tandem, until
 from tests.series import series
+from tests.storm import stranger_at
 from tests.test_field import ASSURED, STARTS, beacon, both_have_ended, told
 from world.hardware import driver_journal
 from world.hardware.driver_journal import DriverHistory
@@ -114,6 +116,27 @@ def test_a_killed_robot_resumes_from_its_journal(pair: Pair, killed: str, tmp_pa
     all_is_well(tmp_path, pair)
     assert f"{killed}: in run field, resumed at tick " in pair.robots[killed].out
     assert len(told(tmp_path, killed).steps) > before
+
+
+@pytest.mark.long
+def test_a_report_before_tick_0_does_not_keep_a_killed_robot_from_resuming(tmp_path: Path) -> None:
+    """The certificate of the peer suffices to send it. The malformed one after it shows that it was read."""
+    endpoint = free_endpoint()
+    words = ("robot", "a", "--mission", "paper-1", "--driver", "docs.rover:Rover", "--rate", "10")
+    robot = (*words, "--listen", endpoint, "--out", tmp_path)
+    claim = Report(0, "b", 1, "straight", ORIGIN, 0, 0, (), 0, (), 0, 0, Localised(ORIGIN))
+    with TandemProcess(*robot) as first:
+        first.until_prints("a: in run paper-1, waiting for its peer")
+        with stranger_at(endpoint) as link:
+            peer = session.publisher(link, keys.report("paper-1", "b", "a"))
+            for frame in (encode(claim), b"malformed"):
+                peer.put(frame)
+            first.until_prints("tandem robot a: refused a frame on tandem/paper-1/robot/b/to/a")
+        first.tell(SIGKILL)
+        first.ended()
+    again = tandem(*robot, "--connect-timeout", "2")
+    assert again.err.splitlines()[-1] == "tandem robot a: b: not connected; no robot has moved"
+    assert again.status == 3
 
 
 @pytest.mark.long
