@@ -58,12 +58,14 @@ class AgentProcess:
         inbox: Inbox,
         *,
         timeout: float = 30.0,
+        launched: bool = False,
         on_kill_point: Callable[[str, int], None] | None = None,
     ) -> None:
         """Continue from `memory`, in the run named `run`.
 
-        `timeout` is the longest time in s to wait for the world. `on_kill_point` is called with the name of
-        each step within a tick and the tick, so that a scheduled kill can happen there.
+        `timeout` is the longest time in s to wait for the world. An agent that is `launched` does not report
+        that the world has gone: its launcher does. `on_kill_point` is called with the name of each step
+        within a tick and the tick, so that a scheduled kill can happen there.
         """
         config = memory.config
         self._id = config.robot
@@ -90,8 +92,8 @@ class AgentProcess:
             partial(malformed, planner=self._robot.planner),
             real_time=real_time,
         )
-        self._loss_reported = False
-        """True once the loss of the world has been reported to the user."""
+        self._launched = self._loss_reported = launched
+        """True once the loss of the world has been reported to the user, or if the launcher reports it."""
         self._repeated_at = 0.0
         """The time (monotonic clock) of the last repetition."""
         self._repeat_at: float | None = None
@@ -147,7 +149,7 @@ class AgentProcess:
         """
         if gone and not self._loss_reported:
             self._inbox.say(f"the world has gone; waiting {self._world_timeout:g} s for it")
-        self._loss_reported = gone
+        self._loss_reported = gone or self._launched
 
     def attach(self, link: zenoh.Session) -> None:
         """Use `link` to send and receive from now on."""
@@ -322,9 +324,10 @@ class AgentProcess:
                 self._out_of_step.world(there=False)
                 gone = True  # frames that the world sent before may still arrive
             elif gone and arrival.topic == "nothing":
-                self._inbox.say(
-                    f"the world has gone after its MissionEnd; waiting {self._timeout:g} s for it"
-                )
+                if not self._launched:
+                    self._inbox.say(
+                        f"the world has gone after its MissionEnd; waiting {self._timeout:g} s for it"
+                    )
                 gone = False
         return end
 

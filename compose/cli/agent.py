@@ -15,6 +15,7 @@ from compose.cli.participant import (
     endpoints_of,
     old_journal,
     participate,
+    replayed,
     warn_beyond,
 )
 from compose.errors import ENDED, UserError, status_of
@@ -87,11 +88,20 @@ def _run(options: argparse.Namespace, inbox: Inbox) -> MissionEnd:
                 f"{old.path}: belongs to another run: its configuration does not match the world's"
             )
         ready = _ready(options, config, old, memory, inbox)
-        return AgentProcess(ready, run, inbox, timeout=timeout, on_kill_point=kills.taker(options.kill))
+        return AgentProcess(
+            ready,
+            run,
+            inbox,
+            timeout=timeout,
+            launched=options.launched,
+            on_kill_point=kills.taker(options.kill),
+        )
 
     def announce(run: str, config: RobotConfig) -> None:
-        if not (options.quiet or options.launched):
-            observation = memory.observation if memory is not None else None
+        observation = memory.observation if memory is not None else None
+        if options.launched and memory is not None:
+            inbox.say(replayed(observation.tick + 1 if observation is not None else 0))
+        elif not (options.quiet or options.launched):
             where = f", resumed at tick {observation.tick}" if observation is not None else ""
             say(f"{options.id}: in run {run}, with {config.peer}{where}")
 

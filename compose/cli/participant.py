@@ -91,6 +91,11 @@ def warn_beyond(endpoints: Endpoints, inbox: Inbox) -> None:
         inbox.say(warning)
 
 
+def replayed(ticks: int) -> str:
+    """Return the message of a restarted process whose decisions in `ticks` ticks equal its journal."""
+    return f"back, replayed {ticks} tick{'' if ticks == 1 else 's'}, identical"
+
+
 def old_journal(options: argparse.Namespace, name: str) -> Retrace | None:
     """Return the journal `name` of an earlier process in --out, if there is one."""
     path: Path | None = options.out / name if options.out is not None else None

@@ -15,6 +15,7 @@ from compose.cli.participant import (
     endpoints_of,
     old_journal,
     participate,
+    replayed,
     warn_beyond,
 )
 from compose.errors import ENDED, UserError
@@ -63,6 +64,8 @@ def main(options: argparse.Namespace) -> int:
                 journal = stack.enter_context(Journal(folder / WORLD_JOURNAL, fsync=options.fsync))
                 return _run(options, Simulation(scenario, journal), links, folder, inbox)
             simulation.append_to(stack.enter_context(reopened(recording, inbox)))
+            if options.launched:
+                inbox.say(replayed(simulation.tick))
             return _run(options, simulation, links, folder, inbox)
 
     return participate("tandem world", take_part, (NoRouter,), launched=options.launched)

@@ -18,6 +18,7 @@ from compose.recording.kills_file import KILLS, add_kill
 from compose.scenario.kills import WORLD, Kill, taken
 from protocol import limits
 from protocol.network.inbox import Inbox
+from protocol.output import say
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from world.scenario import RecordedScenario, Scenario
 
@@ -194,6 +195,8 @@ class _Mission:
         if kill is None:
             raise self.children.failure(name)
         self._note(kill)
+        if said := child.stderr_text().splitlines()[:-1]:  # since it was restarted itself
+            say(*said, error=True)
         if kill.after is None:
             raise ChildFailed(f"{name} was killed at tick {kill.tick} (--kill {kill.text})")
         self.kills[name].remove(kill)
