@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from functools import partial
@@ -279,6 +280,9 @@ def test_check_planner_passes_a_sound_planner(name: str) -> None:
         assert ended.out.count("ok  ") == len(ended.out.splitlines())
     assert ended.status == 0, ended
     assert len([*takewhile(str.strip, ended.out.splitlines())]) >= 8
+    said = re.compile(r"tandem (agent \w+|world): back, replayed \d+ ticks?, identical")
+    assert ended.err
+    assert all(said.fullmatch(line) for line in ended.err.splitlines()), ended.err
 
 
 # --- in groups ----------------------------------------------------------------------------------------
