@@ -8,13 +8,14 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from itertools import permutations
 from pathlib import Path
+from signal import SIGHUP
 from typing import Any
 
 import pytest
 import zenoh
 
 from agent.process import discovery
-from agent.process.discovery import Search, join
+from agent.process.discovery import Search, Unwelcome, join
 from compose.launch.processes import free_endpoint
 from compose.scenario.scenario_file import load
 from protocol.network import keys, session
@@ -187,7 +188,49 @@ def test_an_agent_waits_until_the_robot_s_former_process_has_disappeared(
 @pytest.mark.long
 def test_a_second_agent_of_the_same_robot_is_refused(waiting: str) -> None:
     ended = tandem("agent", "a", "--connect", waiting)
-    assert ended == (2, "", "tandem agent: robot 'a' is in run 'mine' already\n")
+    assert ended == (2, "", "tandem agent: robot 'a' is in run 'mine' already: another process is a\n")
+
+
+def test_of_two_processes_that_join_at_once_one_is_the_robot(
+    waiting: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """If it ends before it appears, the other one can be the robot."""
+    with (
+        session.open_client(at(waiting), unanswered) as first,
+        session.open_client(at(waiting), unanswered) as second,
+    ):
+
+        def joined(link: zenoh.Session) -> bool:
+            return join(link, "mine", "b", Search("world", at(waiting), BOUND_S, Inbox("agent"))) is not None
+
+        assert joined(first)
+        with monkeypatch.context() as hasty:
+            hasty.setattr(discovery, "REFUSED_S", 0.2)
+            with pytest.raises(Unwelcome, match="'b' is in run 'mine' already: another process is b"):
+                joined(second)
+        assert joined(second)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("at_once", [True, False])
+def test_of_two_agents_of_a_robot_one_is_refused_and_the_mission_is_not_disturbed(
+    at_once: bool, paper_1: Path, tmp_path: Path
+) -> None:
+    """Also if the mission, and the world, end while the second one waits for the first one to end."""
+    with world("paper-1", "--run", "mine", "--out", tmp_path) as (clock, endpoint), ExitStack() as open_ones:
+        agent = ("agent", "a", "--connect", endpoint)
+        twice = [open_ones.enter_context(TandemProcess(*agent))]
+        if not at_once:
+            twice[0].until_prints("a: in run mine")
+        twice.append(open_ones.enter_context(TandemProcess(*agent)))
+        if not at_once:
+            twice[1].until(lambda: twice[1].catches(SIGHUP), "it looks for its world")
+        assert tandem("agent", "b", "--connect", endpoint, "--out", tmp_path).status == 0
+        assert clock.ended().status == 0
+        refused, localised = sorted([one.ended() for one in twice], key=lambda ended: -ended.status)
+    assert refused == (2, "", "tandem agent: robot 'a' is in run 'mine' already: another process is a\n")
+    assert localised == (0, "a: in run mine, with b\na: localised after 48 ticks\n", "")
+    assert (tmp_path / "world.journal").read_bytes() == (paper_1 / "world.journal").read_bytes()
 
 
 @pytest.mark.long

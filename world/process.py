@@ -38,6 +38,11 @@ REPEAT_TO_ALL_S = 1.0
 
 It is shorter than the time after which an agent replaces its link.
 """
+JOINING_S = 0.9
+"""The time in s for which a RobotConfig is reserved for a process whose liveliness token is not there yet.
+
+An agent accepts a refusal that lasts a little longer.
+"""
 FINAL_REPORT_TIMEOUT_S = 2.0
 """The time in s to wait for the FinalReport of a robot that did not answer in the last tick."""
 
@@ -83,6 +88,8 @@ class WorldProcess:
         """The times of the next repetition to robots that have not answered, and to all robots."""
         self._alive: set[str] = set()
         """The robots with a liveliness token."""
+        self._processes: dict[str, tuple[bytes, float]] = {}
+        """The process that has the RobotConfig of each robot, and until when it is reserved for it."""
         self._answered = time.monotonic()
         """The time at which a robot last appeared, or sent a new answer."""
         self._late = 0
@@ -110,6 +117,7 @@ class WorldProcess:
         If it is `replaceable`, `run` raises RobotsLinkLost after LINK_TIMEOUT_S and a tick without messages,
         and if the session can only receive.
         """
+        self._processes.clear()  # it is not known which of them end before the next line
         self._check = session.LinkCheck(link) if replaceable else None
         run, inbox = self._run, self._inbox
         self._link_timeout = LINK_TIMEOUT_S + self._tick_s if replaceable else math.inf
@@ -121,7 +129,7 @@ class WorldProcess:
         session.on_matching(self._truth, self._want_truth)
         session.subscribe_directly(link, keys.command(run, "*"), inbox, "command")
         session.watch_liveliness(link, keys.robot_alive(run, "*"), inbox)
-        session.answer(link, keys.config(run, "*"), self._config)
+        session.answer(link, keys.config(run, "*"), self._config, self._refuse_second)
         self._token = session.show_alive(link, keys.world_alive(run))
 
     def run(self) -> MissionEnd:
@@ -239,8 +247,12 @@ class WorldProcess:
             if robot not in self._alive:
                 self._answered = time.monotonic()
             self._alive.add(robot)
+            if robot in self._processes:
+                self._processes[robot] = self._processes[robot][0], math.inf
         elif arrival.topic == "gone":
             self._alive.discard(robot)
+            if robot not in self._final_reports:
+                self._processes.pop(robot, None)
         return arrival
 
     def _accepted(self, arrival: Arrival, kind: Any) -> Command | FinalReport | None:
@@ -311,6 +323,17 @@ class WorldProcess:
             near = did_you_mean(robot, self._robots)
             return f"this world has no robot '{robot}'; it has {', '.join(self._robots)}{near}"
         return self._scenario.config(robot, self._period)
+
+    def _refuse_second(self, robot: str, process: bytes) -> str | None:
+        """Return why `process` cannot be `robot`: another process is. None if it can, or if nobody asks."""
+        if not process or robot not in self._robots:
+            return None
+        now = time.monotonic()
+        holder, until = self._processes.get(robot, (process, now))
+        if holder != process and now < until:
+            return f"robot '{robot}' is in run '{self._run}' already: another process is {robot}"
+        self._processes[robot] = process, now + JOINING_S
+        return None
 
     def _collect_final_reports(self, end: MissionEnd, expected: Collection[str]) -> list[FinalReport]:
         """Send `end` to all robots until they have answered or are gone, and return the FinalReports.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -50,6 +51,8 @@ class Search:
         self._endpoints = endpoints
         self._wait = wait
         self._inbox = inbox
+        self.process = os.urandom(8)
+        """The identifier of this process, by which a world knows it from another one of the same robot."""
         self._began = time.monotonic()
         self._reported = False
 
@@ -97,51 +100,61 @@ def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tu
 
     `run` may name the run. A former process of the robot may have ended a moment ago and still appear alive,
     for up to FORMER_S. Unknown processes may announce and answer anything, so a refusal is accepted only
-    after REFUSED_S.
+    after REFUSED_S, also if the world ends meanwhile.
 
     Raises Unwelcome if there are several runs, if the world has no such robot, or if another process for this
-    robot stays alive. Raises whatever `search` raises while there is no world.
+    robot stays alive, or did so until the world ended. Raises whatever `search` raises while there is no
+    world.
     """
     began = time.monotonic()
     refused: float | None = None
     occupied: str | None = None
-    while time.monotonic() < began + (SESSION_S if occupied is None else FORMER_S):
+    other: str | None = None
+    """The refusal of a world because of the process whose token was there at the same time."""
+    while time.monotonic() < began + (SESSION_S if occupied is None and other is None else FORMER_S):
         worlds = [key.run for key in session.alive(link, keys.world_alive(run or "*"), QUERY_S)]
-        offers = _offers(link, worlds[:MOST_WORLDS], robot)
+        offers = _offers(link, worlds[:MOST_WORLDS], robot, search.process)
         if len(offers.configs) > 1:
             raise Unwelcome(f"several runs are alive: {', '.join(offers.configs)}; choose one with --run")
         for found, config in offers.configs.items():
             return found, config
         occupied = offers.occupied
-        if offers.refused is None:
+        if occupied is not None:
+            other = offers.refused or other
+        why = offers.refused or other
+        if why is None or occupied is not None:
             refused = None
         elif refused is None:
             refused = time.monotonic()
         elif time.monotonic() > refused + REFUSED_S:
-            raise Unwelcome(offers.refused)
-        if occupied is None and offers.refused is None:
+            raise Unwelcome(why)
+        if occupied is None and why is None:
             search.wait(linked=session.linked(link), why=offers.unusable)
         else:
             search.pause()
-    if occupied is not None:
-        raise Unwelcome(f"robot '{robot}' is in run '{occupied}' already")
+    if other is not None or occupied is not None:
+        raise Unwelcome(
+            other or f"robot '{robot}' is in run '{occupied}' already: another process is {robot}"
+        )
     return None
 
 
-def _offers(link: zenoh.Session, worlds: Sequence[str], robot: str) -> _Offers:
+def _offers(link: zenoh.Session, worlds: Sequence[str], robot: str, process: bytes) -> _Offers:
     configs: dict[str, RobotConfig] = {}
     occupied = refused = unusable = None
     for world in worlds:
-        if session.alive(link, keys.robot_alive(world, robot), QUERY_S):
+        if is_occupied := bool(session.alive(link, keys.robot_alive(world, robot), QUERY_S)):
             occupied = world
-            continue
-        key = keys.config(world, robot)
         answer = session.ask(
-            link, key, QUERY_S, lambda frame: isinstance(_decoded_config(frame, robot), RobotConfig)
+            link,
+            keys.config(world, robot),
+            QUERY_S,
+            lambda frame: isinstance(_decoded_config(frame, robot), RobotConfig),
+            process,
         )
         if isinstance(answer, str):
             refused = answer
-        elif answer is not None:
+        elif answer is not None and not is_occupied:
             found = _decoded_config(answer, robot)
             if isinstance(found, RobotConfig):
                 configs[world] = found

@@ -18,7 +18,7 @@ from typing import Any
 import zenoh
 
 from agent.process.agent_journal import FramedReport
-from agent.process.discovery import ASK_AGAIN_S, NoWorld, Search, join
+from agent.process.discovery import ASK_AGAIN_S, NoWorld, Search, Unwelcome, join
 from agent.process.link import AgentLink, WorldLinkLost
 from agent.process.out_of_step import OutOfStep
 from agent.process.recovery import OWN_REPORTS_KEPT, REPORTS_KEPT, Memory
@@ -351,7 +351,8 @@ def run_agent(
     the configuration that the world has sent. `on_first_link` is called once a session is open, `on_joined`
     once the process is attached to it, and `on_end` after the MissionEnd, while the session is still open.
 
-    Raises NoWorld if there is no world and no MissionEnd is known; Unwelcome; CannotListen; Interrupted.
+    Raises NoWorld if there is no world, and Unwelcome, but neither if a MissionEnd is known; CannotListen;
+    Interrupted.
     """
     process: AgentProcess | None = None
     linked = False
@@ -376,6 +377,10 @@ def run_agent(
                 return found
         except WorldLinkLost:
             continue
+        except Unwelcome:
+            if end is None:
+                raise
+            return end
         except NoWorld:
             end = process.end if process is not None else end
             if end is None:

@@ -254,17 +254,22 @@ class LinkCheck:
 
 
 def ask(
-    session: zenoh.Session, key: str, timeout: float, is_understood: Callable[[bytes], bool] = lambda _: True
+    session: zenoh.Session,
+    key: str,
+    timeout: float,
+    is_understood: Callable[[bytes], bool] = lambda _: True,
+    process: bytes | None = None,
 ) -> bytes | str | None:
     """Return the answer to a query on `key`, or None if there is none within `timeout` s.
 
-    Any participant may answer. A frame that `is_understood` is preferred to the text of a refusal, and that
-    to any other frame.
+    `process` identifies the process that asks, if that matters. Any participant may answer. A frame that
+    `is_understood` is preferred to the text of a refusal, and that to any other frame.
     """
     refusal: str | None = None
     strange: bytes | None = None
     everyone, everything = zenoh.QueryTarget.ALL, zenoh.ConsolidationMode.NONE
-    for reply in session.get(key, timeout=timeout, target=everyone, consolidation=everything):
+    replies = session.get(key, timeout=timeout, payload=process, target=everyone, consolidation=everything)
+    for reply in replies:
         if reply.ok is not None and str(reply.ok.key_expr) == key:
             frame = reply.ok.payload.to_bytes()
             if is_understood(frame):
@@ -277,12 +282,23 @@ def ask(
     return refusal if refusal is not None else strange
 
 
-def answer(session: zenoh.Session, key: str, reply: Callable[[str], Message | str]) -> None:
-    """Answer queries on `key` with `reply`, which returns a message for a robot, or the text of a refusal."""
+def answer(
+    session: zenoh.Session,
+    key: str,
+    reply: Callable[[str], Message | str],
+    refuse: Callable[[str, bytes], str | None] = lambda *_: None,
+) -> None:
+    """Answer queries on `key` with `reply`, which returns a message for a robot, or the text of a refusal.
+
+    `refuse` returns why the process that asks for a robot is refused; None if it is not.
+    """
 
     def hand_over(query: zenoh.Query) -> None:
         asked = keys.parse(str(query.key_expr))
-        answered = reply(asked.robot) if asked is not None else NO_KEY
+        answered: Message | str = NO_KEY
+        if asked is not None:
+            process = query.payload.to_bytes() if query.payload is not None else b""
+            answered = refuse(asked.robot, process) or reply(asked.robot)
         if isinstance(answered, str):
             query.reply_err(answered, encoding=REFUSAL)
         else:
