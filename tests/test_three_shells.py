@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from itertools import permutations
 from pathlib import Path
-from signal import SIGHUP
 from typing import Any
 
 import pytest
@@ -212,25 +211,44 @@ def test_of_two_processes_that_join_at_once_one_is_the_robot(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("at_once", [True, False])
-def test_of_two_agents_of_a_robot_one_is_refused_and_the_mission_is_not_disturbed(
-    at_once: bool, paper_1: Path, tmp_path: Path
+def test_of_two_agents_that_start_at_once_one_is_refused_and_the_mission_is_not_disturbed(
+    paper_1: Path, tmp_path: Path
 ) -> None:
-    """Also if the mission, and the world, end while the second one waits for the first one to end."""
-    with world("paper-1", "--run", "mine", "--out", tmp_path) as (clock, endpoint), ExitStack() as open_ones:
+    patient = ("--timeout", "100", "--out", tmp_path)
+    with world("paper-1", "--run", "mine", *patient) as (clock, endpoint), ExitStack() as open_ones:
         agent = ("agent", "a", "--connect", endpoint)
-        twice = [open_ones.enter_context(TandemProcess(*agent))]
-        if not at_once:
-            twice[0].until_prints("a: in run mine")
-        twice.append(open_ones.enter_context(TandemProcess(*agent)))
-        if not at_once:
-            twice[1].until(lambda: twice[1].catches(SIGHUP), "it looks for its world")
+        twice = [open_ones.enter_context(TandemProcess(*agent)) for _ in range(2)]
+        until(lambda: not all(one.running for one in twice), "one of them has ended")
         assert tandem("agent", "b", "--connect", endpoint, "--out", tmp_path).status == 0
         assert clock.ended().status == 0
         refused, localised = sorted([one.ended() for one in twice], key=lambda ended: -ended.status)
     assert refused == (2, "", "tandem agent: robot 'a' is in run 'mine' already: another process is a\n")
     assert localised == (0, "a: in run mine, with b\na: localised after 48 ticks\n", "")
     assert (tmp_path / "world.journal").read_bytes() == (paper_1 / "world.journal").read_bytes()
+
+
+@pytest.mark.long
+def test_a_second_agent_that_waits_when_the_world_ends_is_refused() -> None:
+    with world("paper-1", "--run", "mine") as (_, endpoint), ExitStack() as open_ones:
+        agent = open_ones.enter_context(TandemProcess("agent", "a", "--connect", endpoint))
+        agent.until_prints("a: in run mine")
+
+        class WaitingSearch(Search):
+            waits = False
+
+            def pause(self) -> None:
+                if not self.waits:
+                    open_ones.enter_context(TandemProcess("agent", "b", "--connect", endpoint))
+                self.waits = True
+                super().pause()
+
+        search = WaitingSearch("world", at(endpoint), BOUND_S, Inbox("agent"))
+        with (
+            session.open_client(at(endpoint), unanswered) as link,
+            pytest.raises(Unwelcome, match="robot 'a' is in run 'mine' already: another process is a"),
+        ):
+            join(link, None, "a", search)
+        assert search.waits
 
 
 @pytest.mark.long
