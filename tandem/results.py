@@ -15,8 +15,8 @@ import msgspec
 from compose.errors import CannotWrite, UserError
 from compose.extras import need
 from compose.figures import PICTURES
-from compose.launch import model_loader, planner_loader
-from compose.launch.class_loader import name_of
+from compose.launch import model_loader
+from compose.launch.class_loader import name_of, trust
 from compose.recording import run as recorded
 from compose.recording.group_localisation import MeetingResult, meeting_results
 from compose.recording.recording_files import make_folder, user_errors
@@ -278,7 +278,7 @@ def open_recording(
     ()
     """
     if planner is not None:
-        planner_loader.trust(planner if isinstance(planner, str) else name_of(planner))
+        trust(planner if isinstance(planner, str) else name_of(planner))
     for one in models:
         model_loader.trust(one if isinstance(one, str) else name_of(one))
     path = Path(folder)

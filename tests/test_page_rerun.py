@@ -100,7 +100,7 @@ REFUSED: dict[str, tuple[object, int, str]] = {
     "no number": (values(sigma=float("nan")), 400, "SON is malformed"),
     "infinite": (json.dumps(values()).replace("3.0", "1e999").encode(), 400, "sensing_range"),
     "too large": (b" " * 10_000, 413, "more than 8192 bytes"),
-    "a code": (values(planner="os:system"), 400, "unknown field 'planner'"),
+    "a code": (values(planner="os:popen"), 400, "unknown field 'planner'"),
     "unknown robot": (
         values(robots={"z": moved_a(0.0, 1.0)["a"]}),
         422,
@@ -179,12 +179,11 @@ def test_sigma_is_that_of_all_ranges_and_zero_is_exact() -> None:
     assert found[1].mission.noise.exact
 
 
-def test_a_planner_that_is_not_shipped_is_not_run_again() -> None:
-    scenario = replace(PAPER_1, planner_name="os:system")
-    with pytest.raises(
-        UserError, match=r"^it uses os:system, and only planners and models of Tandem are run"
-    ):
-        changed(scenario, values_of(scenario), MOST_TICKS)
+def test_a_planner_that_the_user_has_not_named_is_not_run_again() -> None:
+    scenario = replace(PAPER_1, planner_name="os:popen")
+    for refused in (lambda: values_of(scenario), lambda: changed(scenario, values_of(PAPER_1), MOST_TICKS)):
+        with pytest.raises(UserError, match="the planner is os:popen; to run its code, add --planner"):
+            refused()
 
 
 # --- in a browser ---------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from compose.errors import UserError
 from compose.extras import need
-from compose.scenario.scenario_change import ScenarioChange, changed, require_shipped, values_of
+from compose.scenario.scenario_change import ScenarioChange, changed, values_of
 from compose.view.web.sources import Recorded, WatchedRun
 from protocol.journal.journal_file import Journal, Sink
 from world.scenario import Scenario
@@ -41,9 +41,7 @@ class ChangedMissions:
         """Return the values of `show` that can be changed. Raises UserError if it is not run again."""
         import compose.launch.in_process  # noqa: F401, PLC0415  # imports numpy; soon needed by `run`
 
-        scenario = scenario_of(show)
-        require_shipped(scenario)
-        return values_of(scenario)
+        return values_of(scenario_of(show))
 
     def run(self, show: WatchedRun, change: ScenarioChange, stopped: Callable[[], bool]) -> Recorded:
         """Run the mission of `show` with the values of `change`, unless `stopped` returns true meanwhile.
