@@ -31,6 +31,11 @@ def trust(name: str) -> None:
     _trusted.add(name)
 
 
+def trusted() -> frozenset[str]:
+    """Return the names that the user of this process has given."""
+    return frozenset(_trusted)
+
+
 def entry_points(group: str) -> dict[str, Any]:
     """Return the entry points of installed packages in `group`, by name. None of them is loaded."""
     from importlib import metadata  # noqa: PLC0415  # slow to import

@@ -105,7 +105,7 @@ class Journals:
         return self._world.world.scenario if self._world.world is not None else None
 
     def read(self) -> None:
-        """Read the frames appended since the last call. Raises OSError."""
+        """Read the frames appended since the last call, as many as `Tail` reads at once. Raises OSError."""
         self._read_kills()
         for path in journals_in(self.folder):
             tail = self._tails.setdefault(path.name, Tail(path))
@@ -137,6 +137,11 @@ class Journals:
             return
         self.known.add_kills(kills[self._kills :])
         self._kills = len(kills)
+
+    @property
+    def more(self) -> bool:
+        """True if the last call of `read` has left frames to be read by the next one."""
+        return any(tail.more for tail in self._tails.values())
 
     def fill(self) -> None:
         """Compute missing observations from the world's journal. Call once the journals are complete."""

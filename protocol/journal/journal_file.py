@@ -29,6 +29,10 @@ _HEADS = {0xC4: 1, 0xC5: 2, 0xC6: 4}
 """The first byte of a msgpack byte string -> the number of bytes of its length field."""
 
 
+PIECE_BYTES = 16 << 20
+"""The maximum number of bytes of a journal that are read at once: more than the longest frame has."""
+
+
 class CannotRecord(OSError):
     """A journal cannot be opened or written. The text of the error names the file and the reason."""
 
@@ -202,6 +206,8 @@ def torn(path: Path) -> tuple[list[bytes], int]:
     """
     tail = Tail(path)
     frames = tail.news()
+    while tail.more:
+        frames += tail.news()
     if _holds_a_frame(tail.torn) or len(packed(frames)) != tail.whole:
         raise CorruptJournal(f"{path}: damaged at byte {tail.whole}: a frame of a wrong length")
     return frames, len(tail.torn)
@@ -228,16 +234,21 @@ class Tail:
         """The number of bytes of the frames that have been read."""
         self.torn = b""
         """The bytes after them at the last read: an incomplete frame."""
+        self.more = False
+        """True if the last read has left bytes to be read by the next one."""
 
     def news(self) -> list[bytes]:
-        """Return the frames that have been added since the last call. An incomplete frame is read later.
+        """Return the frames that have been added since the last call, of at most PIECE_BYTES.
+
+        An incomplete frame is read later.
 
         Raises OSError if it cannot be read, CorruptJournal if it contains anything but frames, OtherVersion
         if its first frame has another version.
         """
         with open_file(self.path) as file:
             file.seek(self.whole)
-            data = file.read()
+            data = file.read(PIECE_BYTES)
+        self.more = False
         unpacker = msgpack.Unpacker(max_buffer_size=0)
         unpacker.feed(data)
         frames: list[bytes] = []
@@ -250,11 +261,13 @@ class Tail:
                 whole = unpacker.tell()
             self.torn = data[whole:]
             head = self.torn[: len(_LONGEST)]
-            if head.startswith(_LONGEST[:1]) and head > _LONGEST:
+            too_long = not frames and len(data) == PIECE_BYTES
+            if too_long or (head.startswith(_LONGEST[:1]) and head > _LONGEST):
                 raise ValueError("a frame of impossible length")
         except (ValueError, msgpack.UnpackException) as error:
             raise CorruptJournal(f"{self.path}: damaged at byte {self.whole + whole}: {error}") from None
         if self.whole == 0 and frames and (version := other_version(frames[0])) is not None:
             raise OtherVersion(self.path, version)
         self.whole += whole
+        self.more = len(data) == PIECE_BYTES
         return frames

@@ -16,10 +16,14 @@ from compose.recording.run import read
 from compose.view.web import estimate_page, sweep_page
 from compose.view.web.changed_missions import ChangedMissions
 from compose.view.web.live import Listener
+from compose.view.web.requested_work import RequestedWork
 from compose.view.web.sources import Recorded, WatchedRun
 from compose.view.web.trials import Trials
 from protocol.journal.journal_file import CorruptJournal
 from protocol.network.endpoints import Endpoints
+
+LONGEST_S = 60.0
+"""The wall time in s that a comparison of two recordings may take."""
 
 
 class Site:
@@ -41,8 +45,9 @@ class Site:
         self.compared = compared
         self.folder = folder
         self.estimate = estimate
-        self.trials = Trials(folder) if folder is not None else None
-        self.changed = ChangedMissions()
+        self.work = RequestedWork()
+        self.trials = Trials(folder, self.work) if folder is not None else None
+        self.changed = ChangedMissions(self.work)
         self.recorded = shows or []
         self.listeners = listeners or []
         self.over = False
@@ -82,20 +87,23 @@ class Site:
         """Return how the two recordings compare, as its value in JSON. Raises UserError."""
         if not self.compared:
             raise UserError("this server does not show two recordings side by side")
-        folders = [show.folder for show in self.recorded]
-        try:
-            found = comparison(*[read(folder) for folder in folders])
-        except (OSError, CorruptJournal) as error:
-            raise UserError(f"the recordings cannot be compared: {error}") from None
-        return {**msgspec.structs.asdict(found), "names": [str(folder) for folder in folders]}
+        folders = [str(show.folder) for show in self.recorded]
+        late = f"the recordings are not compared after {LONGEST_S:g} s: use `tandem.open`"
+        return {**self.work.result(compared, *folders, within=LONGEST_S, late=late), "names": folders}
 
     def start(self) -> None:
         """Start listening on the network."""
         for listener in self.listeners:
             listener.start()
 
+    def end(self) -> None:
+        """Let all requests end: the server is stopping."""
+        self.over = True
+        self.work.stop()
+
     def stop(self) -> None:
         """Stop listening on the network, and delete the recordings of trials and of changed missions."""
+        self.work.close()
         for listener in self.listeners:
             listener.stop()
         if self.trials is not None:
@@ -134,6 +142,14 @@ class Site:
                 for name, show in self.shows.items()
             ],
         }
+
+
+def compared(one: str, other: str) -> dict[str, Any]:
+    """Return how the recordings in two folders compare, as its value in JSON. Raises UserError."""
+    try:
+        return msgspec.structs.asdict(comparison(read(Path(one)), read(Path(other))))
+    except (OSError, CorruptJournal) as error:
+        raise UserError(f"the recordings cannot be compared: {error}") from None
 
 
 def of_record(folder: Path) -> Site:
@@ -180,7 +196,7 @@ def of_folder(folder: Path) -> Site:
         raise UserError(f"{folder} cannot be read: {error.strerror or error}") from None
     for show in shows:
         try:
-            show.poll()
+            show.load()
         except OSError as error:
             show.live = False
             show.notes.append(f"{error.filename or show.folder} cannot be read: {error.strerror or error}")
