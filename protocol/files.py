@@ -49,18 +49,31 @@ def open_regular(path: Path, flags: int) -> int:
     return file
 
 
-def read_bytes(path: Path) -> bytes:
-    """Return the content of the regular file at `path`. Raises like `open_file`."""
+class TooLarge(OSError):
+    """A file has more bytes than are read."""
+
+    def __init__(self, path: Path, most: int) -> None:
+        super().__init__(errno.EFBIG, f"it is larger than {most} bytes", str(path))
+
+
+def read_bytes(path: Path, most: int = -1) -> bytes:
+    """Return the content of the regular file at `path`.
+
+    Raises like `open_file`, and TooLarge if it has more than `most` bytes, unless that is negative.
+    """
     with open_file(path) as file:
-        return file.read()
+        found = file.read(most + 1 if most >= 0 else -1)
+    if 0 <= most < len(found):
+        raise TooLarge(path, most)
+    return found
 
 
-def read_text(path: Path) -> str:
+def read_text(path: Path, most: int = -1) -> str:
     """Return the same as text, without a byte-order mark.
 
-    Raises like `open_file`, and UnicodeDecodeError if the content is not UTF-8.
+    Raises like `read_bytes`, and UnicodeDecodeError if the content is not UTF-8.
     """
-    return read_bytes(path).decode("utf-8-sig")
+    return read_bytes(path, most).decode("utf-8-sig")
 
 
 def write(path: Path, content: bytes | str, mode: int = 0o666) -> None:

@@ -21,7 +21,7 @@ from compose.recording import run as recorded
 from compose.recording.group_localisation import MeetingResult, meeting_results
 from compose.recording.recording_files import make_folder, user_errors
 from compose.recording.summary_json import SUMMARY, Mode, leave, summary
-from protocol import files
+from protocol import documents, files
 from protocol.journal.journal_file import CorruptJournal, packed
 from protocol.messages import Outcome
 from protocol.spelling import did_you_mean
@@ -285,7 +285,7 @@ def open_recording(
     with user_errors(path):
         model = recorded.read(path)
     try:
-        known = msgspec.json.decode(files.read_bytes(path / SUMMARY), type=_Launch)
+        known = documents.json_file(path / SUMMARY, _Launch)
     except (OSError, ValueError):  # a recording may be without it
         known = _Launch()
     return Run(model, known.mode, known.wall_s)

@@ -75,10 +75,10 @@ def named(name: str, kind: Kind, group: str | None = None) -> Any:
     Modules are searched in the working directory too. Raises Untrusted if the user has not named it, KeyError
     if `group` has no such entry point, and UserError if it cannot be loaded.
     """
+    point = entry_points(group)[name] if group is not None and ":" not in name else None
     if name not in _trusted:
         raise Untrusted(f"the {kind} is {name}; to run its code, add --{kind} {name}")
-    if group is not None and ":" not in name:
-        point = entry_points(group)[name]
+    if point is not None:
         try:
             return point.load()
         except Exception as error:  # noqa: BLE001  # the code of the package may raise anything

@@ -16,7 +16,7 @@ from compose.recording.summary_json import SUMMARY
 from compose.view.reported import reported_paths
 from compose.view.run_data import RunData
 from compose.view.scene import Scene, scene
-from protocol import files
+from protocol import documents
 from protocol.journal.journal_file import CorruptJournal, OtherVersion, Tail
 from protocol.messages import OfRobot
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
@@ -181,7 +181,7 @@ class Journals:
 
     def _mode(self) -> str | None:
         try:
-            summary = msgspec.json.decode(files.read_bytes(self.folder / SUMMARY))
+            summary = documents.json_file(self.folder / SUMMARY)
             return str(summary["mode"])
         except (OSError, msgspec.MsgspecError, TypeError, KeyError):
             return None

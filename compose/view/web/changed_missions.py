@@ -17,6 +17,7 @@ from compose.extras import need
 from compose.scenario.scenario_change import ChangedScenario, ScenarioChange, changed, values_of
 from compose.view.web.requested_work import RequestedWork
 from compose.view.web.sources import Recorded, WatchedRun
+from protocol import documents
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from world.scenario import RecordedScenario, Scenario
 
@@ -131,7 +132,7 @@ def run_changed(frame: bytes, change: bytes, out: str) -> None:
 
 
 def _changed(scenario: Scenario, change: bytes) -> ChangedScenario:
-    return changed(scenario, msgspec.json.decode(change, type=ScenarioChange), MOST_TICKS)
+    return changed(scenario, documents.json_value(change, ScenarioChange), MOST_TICKS)
 
 
 def _scenario(frame: bytes) -> Scenario:

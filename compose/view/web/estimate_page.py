@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 
 from compose.errors import UserError
-from protocol import files
+from protocol import documents
 
 ESTIMATE = "estimate.json"
 
@@ -21,7 +21,7 @@ def is_estimate(folder: Path) -> bool:
 def contents(folder: Path) -> dict[str, Any]:
     """Return the summary and the figures for the page. Raises UserError if the folder cannot be read."""
     try:
-        summary = msgspec.json.decode(files.read_bytes(folder / ESTIMATE), type=dict[str, Any])
+        summary = documents.json_file(folder / ESTIMATE, dict[str, Any])
         return {
             "folder": str(folder),
             "source": str(summary["source"]),

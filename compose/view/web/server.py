@@ -39,6 +39,7 @@ from compose.view.web.site import Site
 from compose.view.web.sources import WatchedRun
 from compose.view.web.standalone import PAGE
 from compose.view.web.thumbnail import thumbnail
+from protocol import documents
 
 LOOPBACK = "127.0.0.1"
 POLL_S = 0.05
@@ -238,9 +239,10 @@ async def _change_in(request: Request) -> ScenarioChange:
         if len(body) > MAX_CHANGE_BYTES:
             raise _Refused(413, f"too many robots are changed: more than {MAX_CHANGE_BYTES} bytes")
     try:
-        return msgspec.json.decode(body, type=ScenarioChange)
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        found: ScenarioChange = documents.json_value(body, ScenarioChange)
+    except msgspec.DecodeError as error:
         raise _Refused(400, field_first(str(error), ScenarioChange)) from None
+    return found
 
 
 def _results(folder: Path | None, contents: Callable[[Path], dict[str, Any]], what: str) -> Response:
@@ -249,7 +251,7 @@ def _results(folder: Path | None, contents: Callable[[Path], dict[str, Any]], wh
         return _json({"error": f"this server shows no {what}"}, 404)
     try:
         return _json(contents(folder))
-    except UserError as error:
+    except (UserError, OverflowError) as error:  # the latter for a number that JSON cannot have
         return _json({"error": str(error)}, 500)
 
 

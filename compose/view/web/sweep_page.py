@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from compose.errors import UserError
-from protocol import files
+from protocol import documents, files
 
 SWEEP = "sweep.json"
 SUMMARY = "summary.csv"
@@ -29,7 +29,7 @@ def contents(folder: Path) -> dict[str, Any]:
     Raises UserError if the folder cannot be read.
     """
     try:
-        manifest = msgspec.json.decode(files.read_bytes(folder / SWEEP))
+        manifest = documents.json_file(folder / SWEEP)
         sweep = manifest["sweep"]
         axes = [
             {
@@ -42,7 +42,8 @@ def contents(folder: Path) -> dict[str, Any]:
         ]
         rows: list[dict[str, str]] = []
         if (folder / SUMMARY).is_file():
-            rows = list(csv.DictReader(StringIO(files.read_text(folder / SUMMARY), newline="")))
+            text = files.read_text(folder / SUMMARY, documents.MOST_BYTES)
+            rows = list(csv.DictReader(StringIO(text, newline="")))
         return {
             "folder": str(folder),
             "name": sweep["name"],

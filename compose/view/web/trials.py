@@ -11,7 +11,7 @@ import msgspec
 from compose.errors import UserError
 from compose.view.web.requested_work import RequestedWork
 from compose.view.web.sources import Recorded
-from protocol import files
+from protocol import documents, files
 
 MANIFEST, TRIALS = "sweep.json", "trials.parquet"
 LONGEST_S = 60.0
@@ -73,7 +73,7 @@ def run_worst(folder: str, cell: int, out: str) -> tuple[str, int, int]:
     from compose.sweep.statistics import noted  # noqa: PLC0415
 
     try:
-        sweep = msgspec.json.decode(files.read_bytes(Path(folder, MANIFEST)), type=Manifest).sweep
+        sweep = documents.json_file(Path(folder, MANIFEST), Manifest).sweep
         found = cell_at(sweep, cell)
         with files.open_file(Path(folder, TRIALS)) as file:
             note = noted(pq.read_table(file, filters=[("cell", "=", cell)]))
