@@ -54,14 +54,11 @@ def scenes(setup: RunSetup, known: RunData, first: int = 0, last: int | None = N
     """Return the scenes of the known ticks from `first` to `last`, inclusive."""
     last = known.last if last is None else min(last, known.last)
     paths = reported_paths(setup, known, last)
-    before = known.ticks.get(first - 1)
     shown = []
-    for tick in range(first, last + 1):
-        now = known.ticks.get(tick)
-        if now is not None:
-            reported = {robot: path[tick] for robot, path in paths.items() if tick < len(path)}
-            shown.append(scene(known.setup_at(setup, tick), before, now, known.end, reported))
-        before = now
+    for tick in known.between(first, last):
+        before, now = known.ticks.get(tick - 1), known.ticks[tick]
+        reported = {robot: path[tick] for robot, path in paths.items() if tick < len(path)}
+        shown.append(scene(known.setup_at(setup, tick), before, now, known.end, reported))
     return tuple(shown)
 
 

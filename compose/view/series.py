@@ -62,10 +62,9 @@ def series(
     last = max(min(last, known.last), first)
     step = -(-(last - first + 1) // MOST_BINS)
     ticks: list[list[tuple[RunSetup, TickData]]] = [[] for _ in range(first, last + 1, step)]
-    for tick in sorted([*known.ticks]):
-        if first <= tick <= last:
-            check()
-            ticks[(tick - first) // step].append((known.setup_at(setup, tick), known.ticks[tick]))
+    for tick in known.between(first, last):
+        check()
+        ticks[(tick - first) // step].append((known.setup_at(setup, tick), known.ticks[tick]))
     found = []
     for place, one in enumerate(setup.robots):
         if robots is not None and one.id not in robots:

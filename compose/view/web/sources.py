@@ -67,10 +67,10 @@ class WatchedRun(ABC):
         last = self.known.last
         if not self.live or self.setup is None or self.known.gone:
             return last
-        robots = len(self.setup.robots)
+        robots = {*self.setup.ids}
         for tick in range(last, max(last - UNANSWERED, -1), -1):
             data = self.known.ticks.get(tick)
-            if data is not None and len(data.commands) + len(data.late) >= robots:
+            if data is not None and data.commands.keys() | data.late >= robots:
                 return tick
         return last
 
