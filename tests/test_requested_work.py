@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import http.client
 import json
+import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,7 +27,7 @@ from compose.sweep.results_folder import Manifest
 from compose.sweep.spec import Axis, Sweep
 from compose.sweep.table import encoded, of_rows, schema_of
 from compose.sweep.trial import TrialRow
-from compose.view.web import trials
+from compose.view.web import sweep_page, trials
 from compose.view.web.requested_work import RequestedWork
 from compose.view.web.server import application
 from compose.view.web.site import Site
@@ -201,6 +202,32 @@ def test_only_browsers_on_this_machine_start_missions(tmp_path: Path) -> None:
     assert status == 403
     assert answer == {"error": "missions are run again for browsers on the server's machine only"}
     assert posted(site, "/api/cells/0/worst", "127.0.0.1")[0] == 200
+    site.stop()
+
+
+def test_links_and_what_is_no_file_are_not_served(tmp_path: Path) -> None:
+    (tmp_path / "secret.svg").write_text("secret")
+    folder = tmp_path / "stranger"
+    (folder / "figures").mkdir(parents=True)
+    results(folder, PAPER_1)
+    (folder / "figures" / "good.svg").write_text("good")
+    (folder / "figures" / "link.svg").symlink_to(tmp_path / "secret.svg")
+    (folder / "figures" / "device.svg").symlink_to("/dev/zero")
+    (folder / "figures" / "folder.svg").mkdir()
+    os.mkfifo(folder / "figures" / "pipe.svg")
+    site = Site(folder=folder)
+    assert sweep_page.contents(folder)["figures"] == ["good.svg"]
+    assert site.figure("good.svg") == b"good"
+    for name in ("link", "device", "folder", "pipe", "none"):
+        assert site.figure(f"{name}.svg") is None
+    (folder / "figures").rename(tmp_path / "elsewhere")
+    (folder / "figures").symlink_to(tmp_path / "elsewhere")
+    assert sweep_page.contents(folder)["figures"] == []
+    for name in ("summary.csv", "sweep.json"):
+        (folder / name).unlink(missing_ok=True)
+        (folder / name).symlink_to(tmp_path / "secret.svg")
+        with pytest.raises(UserError, match="cannot be read: it is a link"):
+            sweep_page.contents(folder)
     site.stop()
 
 

@@ -119,7 +119,7 @@ class _Answers:
         figure = self._site.figure(request.path_params["name"])
         if figure is None:
             return _json({"error": "there is no such figure"}, 404)
-        return FileResponse(figure, media_type="image/svg+xml")
+        return Response(figure, media_type="image/svg+xml")
 
     async def estimate(self, _request: Request) -> Response:
         return _results(self._site.estimate, estimate_page.contents, "estimate")

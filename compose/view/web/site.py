@@ -19,9 +19,12 @@ from compose.view.web.live import Listener
 from compose.view.web.requested_work import RequestedWork
 from compose.view.web.sources import Recorded, WatchedRun
 from compose.view.web.trials import Trials
+from protocol import files
 from protocol.journal.journal_file import CorruptJournal
 from protocol.network.endpoints import Endpoints
 
+MOST_FIGURE_BYTES = 64 << 20
+"""The largest size of a figure that is shown."""
 LONGEST_S = 60.0
 """The wall time in s that a comparison of two recordings may take."""
 
@@ -75,12 +78,13 @@ class Site:
         """One line for each part of a recording that cannot be read."""
         return [note for show in self.recorded for note in show.notes]
 
-    def figure(self, name: str) -> Path | None:
-        """Return the path of the figure called `name`; None if there is none."""
-        if self.folder is not None and name in sweep_page.figures(self.folder):
-            return self.folder / sweep_page.FIGURES / name
-        if self.estimate is not None and name in estimate_page.figures(self.estimate):
-            return self.estimate / name
+    def figure(self, name: str) -> bytes | None:
+        """Return the figure called `name`; None if there is none, or if it cannot be read."""
+        with suppress(OSError):
+            if self.folder is not None and name in sweep_page.figures(self.folder):
+                return files.read_inside(self.folder, sweep_page.FIGURES, name, most=MOST_FIGURE_BYTES)
+            if self.estimate is not None and name in estimate_page.figures(self.estimate):
+                return files.read_inside(self.estimate, name, most=MOST_FIGURE_BYTES)
         return None
 
     def comparison(self) -> dict[str, Any]:

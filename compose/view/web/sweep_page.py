@@ -29,7 +29,7 @@ def contents(folder: Path) -> dict[str, Any]:
     Raises UserError if the folder cannot be read.
     """
     try:
-        manifest = documents.json_file(folder / SWEEP)
+        manifest = documents.json_value(files.read_inside(folder, SWEEP, most=documents.MOST_BYTES))
         sweep = manifest["sweep"]
         axes = [
             {
@@ -42,7 +42,7 @@ def contents(folder: Path) -> dict[str, Any]:
         ]
         rows: list[dict[str, str]] = []
         if (folder / SUMMARY).is_file():
-            text = files.read_text(folder / SUMMARY, documents.MOST_BYTES)
+            text = files.read_inside(folder, SUMMARY, most=documents.MOST_BYTES).decode("utf-8-sig")
             rows = list(csv.DictReader(StringIO(text, newline="")))
         return {
             "folder": str(folder),
@@ -62,5 +62,7 @@ def contents(folder: Path) -> dict[str, Any]:
 
 
 def figures(folder: Path) -> list[str]:
-    """Return the file names of the sweep's figures."""
-    return sorted(path.name for path in (folder / FIGURES).glob("*.svg"))
+    """Return the file names of the sweep's figures. Links and what is no file are not among them."""
+    if (folder / FIGURES).is_symlink():
+        return []
+    return sorted(files.regular_in(folder / FIGURES, "*.svg"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,6 +15,8 @@ from compose.view.web.sources import Recorded
 from protocol import documents, files
 
 MANIFEST, TRIALS = "sweep.json", "trials.parquet"
+MOST_TABLE_BYTES = 1 << 30
+"""The largest size of the table of trials that is read."""
 LONGEST_S = 60.0
 """The wall time in s after which a trial that has not ended is stopped."""
 
@@ -73,10 +76,11 @@ def run_worst(folder: str, cell: int, out: str) -> tuple[str, int, int]:
     from compose.sweep.statistics import noted  # noqa: PLC0415
 
     try:
-        sweep = documents.json_file(Path(folder, MANIFEST), Manifest).sweep
+        manifest = files.read_inside(Path(folder), MANIFEST, most=documents.MOST_BYTES)
+        sweep = documents.json_value(manifest, Manifest).sweep
         found = cell_at(sweep, cell)
-        with files.open_file(Path(folder, TRIALS)) as file:
-            note = noted(pq.read_table(file, filters=[("cell", "=", cell)]))
+        table = BytesIO(files.read_inside(Path(folder), TRIALS, most=MOST_TABLE_BYTES))
+        note = noted(pq.read_table(table, filters=[("cell", "=", cell)]))
         if found is None or note is None:
             raise UserError(f"cell {cell} has no trials")
         source = f"{sweep.source}: trial {note.trial} of cell {cell}"
