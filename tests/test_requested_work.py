@@ -6,6 +6,8 @@ import asyncio
 import http.client
 import json
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -124,6 +126,17 @@ def test_no_reader_of_a_recording_or_of_results_imports_what_they_name(
     with pytest.raises(UserError, match="to run its code"):
         tandem.open(name).audit()
     assert not mark.exists()
+
+
+def test_a_file_of_settings_in_the_working_directory_changes_no_figure(tmp_path: Path) -> None:
+    """It could start LaTeX. Matplotlib reads it when it is imported, so this is a process of its own."""
+    (tmp_path / "matplotlibrc").write_text("text.usetex: True\naxes.facecolor: red\n")
+    code = (
+        "from compose.figures import style\nimport matplotlib as mpl\nassert mpl.rcParams['text.usetex']\n"
+        "with style.look(style.SCREEN):\n assert not mpl.rcParams['text.usetex']\n"
+        " assert mpl.rcParams['axes.facecolor'] != 'red'\n"
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True, timeout=60)
 
 
 @pytest.mark.parametrize("name", ["planner", "model"])
