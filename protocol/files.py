@@ -26,10 +26,11 @@ def error_text(error: OSError) -> str:
 
 
 class NotRegular(OSError):
-    """The path of a file leads to a directory, FIFO, device or socket."""
+    """The path of a file leads to a directory, FIFO, device or socket, or is a link where none may be."""
 
     def __init__(self, path: Path, mode: int) -> None:
-        kind = "a directory" if stat.S_ISDIR(mode) else "not a regular file"
+        kind = "a link" if stat.S_ISLNK(mode) else "not a regular file"
+        kind = "a directory" if stat.S_ISDIR(mode) else kind
         super().__init__(errno.EINVAL, f"it is {kind}", str(path))
 
 
@@ -49,18 +50,74 @@ def open_regular(path: Path, flags: int) -> int:
     return file
 
 
-def read_bytes(path: Path) -> bytes:
-    """Return the content of the regular file at `path`. Raises like `open_file`."""
+class TooLarge(OSError):
+    """A file has more bytes than are read."""
+
+    def __init__(self, path: Path, most: int) -> None:
+        super().__init__(errno.EFBIG, f"it is larger than {most} bytes", str(path))
+
+
+def read_bytes(path: Path, most: int = -1) -> bytes:
+    """Return the content of the regular file at `path`.
+
+    Raises like `open_file`, and TooLarge if it has more than `most` bytes, unless that is negative.
+    """
     with open_file(path) as file:
-        return file.read()
+        return _content(file, path, most)
 
 
-def read_text(path: Path) -> str:
+def read_inside(folder: Path, *names: str, most: int) -> bytes:
+    """Return the content of the regular file with the path `names` in `folder`, none of which is a link.
+
+    Somebody else may have written the folder, and a link in it may lead to any file of the user. Raises like
+    `read_bytes`, and NotRegular for a link.
+    """
+    path, place = folder.joinpath(*names), os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        for name in names[:-1]:
+            place, outer = _within(place, name, os.O_DIRECTORY, path), place
+            os.close(outer)
+        with os.fdopen(_within(place, names[-1], os.O_NONBLOCK, path), "rb") as file:
+            return _content(file, path, most)
+    finally:
+        os.close(place)
+
+
+def regular_in(folder: Path, pattern: str) -> list[str]:
+    """Return the names of the regular files in `folder` that match `pattern`, without links."""
+    found = [path for path in folder.glob(pattern) if not path.is_symlink() and path.is_file()]
+    return [path.name for path in found]
+
+
+def _within(place: int, name: str, flags: int, path: Path) -> int:
+    """Return a descriptor of the directory (O_DIRECTORY) or file `name` in `place`; errors name `path`."""
+    wanted = stat.S_ISDIR if flags & os.O_DIRECTORY else stat.S_ISREG
+    try:
+        if not wanted(mode := os.stat(name, dir_fd=place, follow_symlinks=False).st_mode):
+            raise NotRegular(path, mode)
+        found = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | flags, dir_fd=place)
+    except OSError as error:
+        error.filename = str(path)
+        raise
+    if not wanted(mode := os.fstat(found).st_mode):  # it has been replaced since `stat`
+        os.close(found)
+        raise NotRegular(path, mode)
+    return found
+
+
+def _content(file: BinaryIO, path: Path, most: int) -> bytes:
+    found = file.read(most + 1 if most >= 0 else -1)
+    if 0 <= most < len(found):
+        raise TooLarge(path, most)
+    return found
+
+
+def read_text(path: Path, most: int = -1) -> str:
     """Return the same as text, without a byte-order mark.
 
-    Raises like `open_file`, and UnicodeDecodeError if the content is not UTF-8.
+    Raises like `read_bytes`, and UnicodeDecodeError if the content is not UTF-8.
     """
-    return read_bytes(path).decode("utf-8-sig")
+    return read_bytes(path, most).decode("utf-8-sig")
 
 
 def write(path: Path, content: bytes | str, mode: int = 0o666) -> None:

@@ -15,13 +15,13 @@ import msgspec
 from compose.errors import CannotWrite, UserError
 from compose.extras import need
 from compose.figures import PICTURES
-from compose.launch import model_loader, planner_loader
-from compose.launch.class_loader import name_of
+from compose.launch import model_loader
+from compose.launch.class_loader import name_of, trust
 from compose.recording import run as recorded
 from compose.recording.group_localisation import MeetingResult, meeting_results
 from compose.recording.recording_files import make_folder, user_errors
 from compose.recording.summary_json import SUMMARY, Mode, leave, summary
-from protocol import files
+from protocol import documents, files
 from protocol.journal.journal_file import CorruptJournal, packed
 from protocol.messages import Outcome
 from protocol.spelling import did_you_mean
@@ -278,14 +278,14 @@ def open_recording(
     ()
     """
     if planner is not None:
-        planner_loader.trust(planner if isinstance(planner, str) else name_of(planner))
+        trust(planner if isinstance(planner, str) else name_of(planner))
     for one in models:
         model_loader.trust(one if isinstance(one, str) else name_of(one))
     path = Path(folder)
     with user_errors(path):
         model = recorded.read(path)
     try:
-        known = msgspec.json.decode(files.read_bytes(path / SUMMARY), type=_Launch)
+        known = documents.json_file(path / SUMMARY, _Launch)
     except (OSError, ValueError):  # a recording may be without it
         known = _Launch()
     return Run(model, known.mode, known.wall_s)

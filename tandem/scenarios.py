@@ -11,7 +11,13 @@ import msgspec
 from compose.errors import BadScenario, NoSuchField, UserError
 from compose.launch.class_loader import name_of
 from compose.scenario.fault_syntax import table_of
-from compose.scenario.scenario_file import ScenarioTemplate, scenario_table, validate, with_planner
+from compose.scenario.scenario_file import (
+    ScenarioTemplate,
+    scenario_table,
+    trust_classes,
+    validate,
+    with_planner,
+)
 from compose.sweep.field_paths import field_steps, with_value
 
 if TYPE_CHECKING:
@@ -66,6 +72,7 @@ class Scenario(msgspec.Struct, frozen=True):
         <Scenario two, seed 0: a, b>
         """
         content = plain(table)
+        trust_classes(content)
         return cls(content, source, validate(content, source))
 
     def with_(self, fields: Mapping[str, Any] | None = None, /, **top: Any) -> Scenario:

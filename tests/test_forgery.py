@@ -124,6 +124,14 @@ def test_the_tick_is_unknown_before_the_first_message_of_the_world(received: Rec
     assert received.known.last == LEAP + AHEAD
 
 
+def test_a_report_to_a_robot_outside_the_mission_is_refused(received: ReceivedMission) -> None:
+    before = told(received)
+    for peer in ("z", "a"):
+        with pytest.raises(RefusedFrame, match="which is not in the mission"):
+            received.take(Key(keys.report, RUN, "a", peer), encode(report(0, "a")))
+    assert told(received) == before
+
+
 def shown(address: str) -> dict[str, Any]:
     try:
         with urlopen(f"{address}/api/shows/{RUN}") as answer:

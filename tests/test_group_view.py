@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from matplotlib.text import Annotation
+from msgspec.structs import replace
 from playwright.sync_api import expect
 from rich.console import Console
 
@@ -35,6 +36,17 @@ from compose.view.series import series
 from compose.view.web.thumbnail import thumbnail
 from protocol.journal import journal_file
 from protocol.journal.journal_file import packed
+from protocol.messages import (
+    Command,
+    Contact,
+    Estimate,
+    GroundTruth,
+    Localised,
+    Message,
+    Observation,
+    Report,
+)
+from protocol.motion import Pose
 from tests.browser import Open, inks, scrub_to, shot, watching
 from tests.commands import SECTION_IV, tandem
 from tests.conftest import recorded
@@ -171,6 +183,47 @@ def test_a_viewer_that_joins_late_finds_the_meetings_from_the_verdicts(run: Run)
     assert run.setup is not None
     found = {robot.id: robot.peer for robot in late.setup_at(run.setup, 75).robots}
     assert found == {robot: ways[-1][1] for robot, ways in WAYS.items()}
+
+
+STRANGER = "z"
+"""A robot outside the mission, which keys and frames may name all the same."""
+
+
+def foreign(tick: int, to: str) -> list[tuple[Message, str]]:
+    """Return frames of a tick in which a robot outside the mission is sender or receiver, or is named."""
+    here = Pose(0.0, 0.0, 0.0)
+    log = Report(tick, to, 1, "standing", here, 0, 0, (), 0, (), 0, 0)
+    return [
+        (log, STRANGER),
+        (log, to),
+        (replace(log, robot=STRANGER), to),
+        (Command(tick, STRANGER, 0.0, 0.0, 1, "travelling", Localised(here)), ""),
+        (Estimate(tick, STRANGER, (here,), (here,), localised=True), ""),
+        (Observation(tick, STRANGER, None, 1.0, (Contact(to, 1.0, (tick,)),)), ""),
+        (Observation(tick, to, None, 1.0, (Contact(STRANGER, 1.0, (tick,)), Contact(to, 1.0, (tick,)))), ""),
+        (GroundTruth(tick, {STRANGER: here}), ""),
+    ]
+
+
+def test_a_robot_outside_the_mission_changes_nothing_that_viewers_show(run: Run) -> None:
+    """A member may send reports to any robot, and without certificates anyone may send as any robot."""
+    setup, whole, told = run.setup, RunData(), RunData()
+    assert setup is not None
+    for tick, data in run_data(run).ticks.items():
+        for frame, receiver in foreign(tick, "r1"):
+            told.add(frame, 0, receiver=receiver)
+        for known in (whole, told):
+            known.add(GroundTruth(tick, data.truth), 0)
+            for command in data.commands.values():
+                known.add(command, 0)
+    scenes_told = scenes(setup, told)
+    assert peers(scenes_told) == peers(scenes(setup, whole))
+    assert {player.robot for scene in scenes_told for player in scene.players} == {*setup.ids}
+    views = Views(setup)
+    for scene in scenes_told:
+        list(views.of(scene))
+    series(setup, told, 0, told.last)
+    thumbnail(setup, told)
 
 
 def test_configurations_alone_have_the_same_plan_of_meetings(run: Run) -> None:

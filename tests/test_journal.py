@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import msgpack
@@ -82,6 +83,48 @@ def test_a_journal_read_as_it_grows_gives_each_frame_once(
     assert tail.news() == []
 
 
+LIMITED = """
+import resource, sys
+from pathlib import Path
+from protocol.journal.journal_file import CorruptJournal, read
+resource.setrlimit(resource.RLIMIT_AS, (300 << 20, 300 << 20))
+try:
+    list(read(Path(sys.argv[1])))
+except CorruptJournal as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize("frames", [0, 100])
+def test_a_journal_of_any_size_is_read_in_pieces(frames: int, tmp_path: Path) -> None:
+    path = tmp_path / "a.journal"
+    data = written(path, FRAMES[:1] * frames)
+    with path.open("ab") as file:
+        file.truncate(10 << 30)
+    ended = subprocess.run(
+        [sys.executable, "-c", LIMITED, path], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert (ended.stdout, ended.stderr) == (f"{path}: damaged at byte {len(data)}: not a frame\n", "")
+
+
+def test_frames_in_several_pieces_are_all_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(journal_file, "PIECE_BYTES", 1000)
+    few = [frame for frame in FRAMES if len(frame) < 900] * 3
+    written(tmp_path / "it", few)
+    assert list(journal_file.read(tmp_path / "it")) == few
+
+
+def test_a_torn_frame_that_looks_like_many_takes_no_time(tmp_path: Path) -> None:
+    head = b"\xc6" + MAX_FRAME_BYTES.to_bytes(4, "big")
+    inner = b"\xc6" + (MAX_FRAME_BYTES // 2).to_bytes(4, "big")
+    path = tmp_path / "a.journal"
+    path.write_bytes(head + (inner * (MAX_FRAME_BYTES // 5))[: MAX_FRAME_BYTES - 1])
+    began = time.monotonic()
+    with pytest.raises(CorruptJournal):
+        list(journal_file.read(path))
+    assert time.monotonic() - began < 10.0
+
+
 GARBAGE = {
     "reserved": b"\xc1",
     "a number": b"\x07",
@@ -93,6 +136,7 @@ GARBAGE = {
     "zeros": b"\x00" * 64,
     "an oversized frame": msgpack.packb(b"x" * (MAX_FRAME_BYTES + 1)),
     "the head of a frame larger than any": b"\xc6\x7f\xff\xff\xff",
+    "the head of an array larger than any": b"\xdd\xff\xff\xff\xff",
 }
 
 

@@ -21,7 +21,7 @@ from agent.process.report_bodies import malformed, report_of
 from agent.process.report_buffer import ReportBuffer
 from compose.audit.planner_checks import QuietInbox, check_planner
 from compose.errors import BadScenario, PlannerFailed, UserError
-from compose.launch import planner_loader
+from compose.launch import class_loader
 from compose.launch.in_process import run_mission
 from compose.launch.planner_guard import GuardedPlanner
 from compose.launch.planner_loader import planner_of
@@ -149,7 +149,7 @@ def test_the_python_api_takes_a_class_and_its_options() -> None:
 
 
 def test_opening_a_recording_loads_no_code(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(planner_loader, "_trusted", set())
+    monkeypatch.setattr(class_loader, "_trusted", set())
     with pytest.raises(UserError, match="to run its code"):
         tandem.open(recording).audit()
     assert tandem.open(recording, planner=Wrapping).audit().violations == ()
@@ -202,7 +202,10 @@ def test_a_planner_of_an_installed_package_has_a_name(tmp_path: Path) -> None:
     out = tmp_path / "out"
     ended = ran("run", "paper-1", "--planner", "glean", "--no-export", "--kill", "a@9", "--out", out)
     assert ended.returncode == 0, ended
-    assert ran("audit", out).returncode == 0, "installed by the user, so its name is enough"
+    refused = ran("audit", out)
+    assert refused.returncode == 2
+    assert refused.stderr == "tandem audit: the planner is glean; to run its code, add --planner glean\n"
+    assert ran("audit", out, "--planner", "glean").returncode == 0
     wrong = ran("run", "paper-1", "--planner", "glaen", "--in-process")
     assert wrong.returncode == 2
     assert "there is no 'glaen'; there are assured, paper, glean; did you mean 'glean'?" in wrong.stderr
@@ -310,6 +313,7 @@ def test_robots_with_a_subclass_of_the_shipped_planner_form_a_group(tmp_path: Pa
 def test_robots_with_another_planner_cannot_form_a_group() -> None:
     table = table_of(3, 4)
     table["planner"] = {"name": OWN}
+    class_loader.trust(OWN)
     with pytest.raises(UserError, match=f"planner.name: robots with the planner {OWN} meet in pairs"):
         validate(table, "group.toml")
 

@@ -15,6 +15,7 @@ from compose.recording.run import read
 from compose.scenario.scenario_file import load
 from compose.view.outlines import box
 from compose.view.recorded import run_data
+from compose.view.web.requested_work import RequestedWork
 from compose.view.web.thumbnail import HEIGHT, WIDTH, thumbnail
 from compose.view.web.trials import Trials
 from tests.browser import Open, shot, watching
@@ -77,10 +78,12 @@ def test_a_cell_is_played_from_the_keyboard(opened: Open, folder: Path) -> None:
 
 
 def test_a_cell_that_cannot_be_run_is_one_line(folder: Path) -> None:
-    trials = Trials(folder)
+    work = RequestedWork()
+    trials = Trials(folder, work)
     with pytest.raises(UserError, match=r"^cell 0 cannot be run: "):
         trials.worst(0)
     trials.close()
+    work.close()
 
 
 @pytest.mark.long

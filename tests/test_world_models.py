@@ -12,7 +12,7 @@ from msgspec.structs import replace
 import tandem
 from compose.errors import BadScenario, Unworkable
 from compose.launch import in_process
-from compose.scenario.scenario_file import scenario_table, validate
+from compose.scenario.scenario_file import scenario_table, trust_classes, validate
 from protocol.journal.journal_file import MemoryJournal
 from tests.commands import tandem as command
 from tests.own_models import Late
@@ -34,7 +34,9 @@ WALL = [[5.0, -100.0, 5.0, 100.0]]
 
 def scenario_of(name: str, **world: Any) -> Scenario:
     """Return a shipped scenario with other tables in `[world]`."""
-    return validate({**scenario_table(name), "planner": {"name": "assured"}, "world": world}, name).scenario
+    table = {**scenario_table(name), "planner": {"name": "assured"}, "world": world}
+    trust_classes(table)
+    return validate(table, name).scenario
 
 
 def radios(distance: float, tick: int = 0, name: str = "report/a->b") -> Radios:

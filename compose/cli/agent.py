@@ -20,6 +20,7 @@ from compose.cli.participant import (
 )
 from compose.errors import ENDED, UserError, status_of
 from compose.launch import planner_loader
+from compose.launch.class_loader import trust
 from compose.recording.recording_files import agent_journal
 from compose.recording.run import ended
 from compose.scenario import kills
@@ -69,7 +70,7 @@ def _run(options: argparse.Namespace, inbox: Inbox) -> MissionEnd:
     endpoints = endpoints_of(options, f"agent-{options.id}", MISSING)
     old = old_journal(options, agent_journal(options.id))
     for planner in options.planner:
-        planner_loader.trust(planner)
+        trust(planner)
     memory = remember(old, planner_loader.planner_of) if old is not None else None
     end = memory.end if memory is not None else None
     which = f"world of run '{options.run}'" if options.run else "world"

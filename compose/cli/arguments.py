@@ -139,7 +139,7 @@ def add_connection(parser: ArgumentParser) -> None:
 
 
 def add_trusted_planner(parser: ArgumentParser) -> None:
-    """Add `--planner` of commands whose planner is named by a world or a recording."""
+    """Add `--planner` of commands whose planner is named by a world, a recording or a sweep's folder."""
     parser.add_argument(
         "--planner",
         action="append",

@@ -13,7 +13,7 @@ from compose.cli.recording import read_noted
 from compose.errors import ENDED, FAILED, CannotWrite
 from compose.extras import need
 from compose.figures import FORMATS, PICTURES
-from compose.launch.planner_loader import trust
+from compose.launch.class_loader import trust
 from compose.launch.second_process import OutputLine, Task, share
 from compose.recording.meetings import PastMeeting, past_meetings
 from compose.recording.recording_files import agent_journal, user_errors

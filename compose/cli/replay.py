@@ -9,7 +9,7 @@ from compose.audit.replay import replayed
 from compose.cli.arguments import add_closing, add_recording, add_trusted_planner
 from compose.cli.recording import read_noted
 from compose.errors import CLEAN, VIOLATED
-from compose.launch.planner_loader import trust
+from compose.launch.class_loader import trust
 from compose.recording.recording_files import user_errors
 from protocol.output import say
 

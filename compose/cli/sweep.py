@@ -12,7 +12,7 @@ from compose.errors import FAILED, LOCALISED, NOT_LOCALISED, STOPPED, UserError
 from compose.extras import need
 from compose.launch.signals import stop_by_signal
 from compose.sweep import spec
-from compose.sweep.cells import cells, trial_table
+from compose.sweep.cells import cell_at, trial_table
 from compose.sweep.spec import Sweep
 from protocol.network.inbox import Inbox
 from protocol.output import say
@@ -107,7 +107,7 @@ def print_trial(sweep: Sweep, cell: int, trial: int) -> int:
     """Print the scenario file of a trial. Raises UserError if there is no such cell."""
     import tomli_w  # noqa: PLC0415  # the library is optional
 
-    found = next((one for one in cells(sweep) if one.index == cell), None)
+    found = cell_at(sweep, cell)
     if found is None:
         raise UserError(f"--print-trial: {sweep.source} has no cell {cell}")
     say(*tomli_w.dumps(trial_table(sweep, found, trial)).splitlines())

@@ -17,12 +17,14 @@ from compose.cli.arguments import (
     add_launched,
     add_models,
     add_port,
+    add_trusted_planner,
     address,
     folder,
 )
 from compose.cli.recording import note
 from compose.errors import ENDED, STOPPED, UserError
 from compose.extras import need
+from compose.launch.class_loader import trust
 from compose.launch.viewers import OVER
 from protocol.output import say
 
@@ -44,6 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "shown side by side with one clock [default: live missions]",
     )
     add_models(parser)
+    add_trusted_planner(parser)
     add_connection(parser)
     parser.add_argument(
         "--address",
@@ -65,6 +68,8 @@ def main(options: argparse.Namespace) -> int:
     need("starlette", "uvicorn")
     from compose.view.web import server, site  # noqa: PLC0415  # the libraries are optional
 
+    for name in options.planner:
+        trust(name)
     if not options.recording:
         from compose.network import places  # noqa: PLC0415  # a recording needs no network
 

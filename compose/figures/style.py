@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -79,21 +79,19 @@ SWEEP = Medium(False, PAGE, 160, {"font.size": 9, "text.parse_math": False})
 """Figures of sweeps, whose labels are text of sweep files and hence printed literally."""
 
 
-def look(medium: Medium) -> AbstractContextManager[None]:
-    """Return the matplotlib settings for drawing and saving figures for `medium`.
+@contextmanager
+def look(medium: Medium) -> Iterator[None]:
+    """Use the matplotlib settings for drawing and saving figures for `medium`, and no others.
 
-    The fixed hash salt makes equal figures equal byte for byte. Fonts are embedded as TrueType (42), because
-    publishers reject Type 3, matplotlib's default.
+    Matplotlib reads a file `matplotlibrc` in the working directory. That may be a stranger's folder, and the
+    file can start LaTeX. The fixed hash salt makes equal figures equal byte for byte. Fonts are embedded as
+    TrueType (42), because publishers reject Type 3, matplotlib's default.
     """
-    return mpl.rc_context(
-        {
-            "svg.hashsalt": "tandem",
-            "pdf.fonttype": 42,
-            "ps.fonttype": 42,
-            "text.parse_math": True,
-            **medium.settings,
-        }
-    )
+    settings = {"svg.hashsalt": "tandem", "pdf.fonttype": 42, "ps.fonttype": 42, "text.parse_math": True}
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        mpl.rcParams.update({**settings, **medium.settings})
+        yield
 
 
 def save(

@@ -1,4 +1,9 @@
-"""Loading of classes by their name on a command line or in a file, MODULE:CLASS."""
+"""Loading of classes by name: MODULE:CLASS, or the name of an entry point of an installed package.
+
+A name decides which code runs, so a process loads only classes that its user has named: by a flag, in a
+scenario or sweep file of the user, or through the Python API. `trust` records these names. A name from
+anywhere else, such as a recording, a folder of results or a message, loads nothing but one of these classes.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +11,36 @@ import os
 import sys
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from compose.errors import UserError
+
+Kind = Literal["planner", "model", "driver"]
+"""The kind of a class, and the flag without -- that names it."""
+
+_trusted: set[str] = set()
+"""The names that the user of this process has given."""
+
+
+class Untrusted(UserError):
+    """A class is named by a recording, a folder or a message, and not by the user of this process."""
+
+
+def trust(name: str) -> None:
+    """Permit this process to load the class `name`, which its user has given."""
+    _trusted.add(name)
+
+
+def trusted() -> frozenset[str]:
+    """Return the names that the user of this process has given."""
+    return frozenset(_trusted)
+
+
+def entry_points(group: str) -> dict[str, Any]:
+    """Return the entry points of installed packages in `group`, by name. None of them is loaded."""
+    from importlib import metadata  # noqa: PLC0415  # slow to import
+
+    return {one.name: one for one in metadata.entry_points(group=group)}
 
 
 def name_of(cls: type) -> str:
@@ -37,14 +69,25 @@ def need_module(name: str) -> None:
         raise UserError(f"{name}: defined in an interactive session; other processes need it in a module")
 
 
-def named(name: str, kind: str) -> Any:
-    """Return the object named MODULE:CLASS, which is a `kind` such as "a driver".
+def named(name: str, kind: Kind, group: str | None = None) -> Any:
+    """Return the object named MODULE:CLASS, or the one of that entry point in `group`, which is a `kind`.
 
-    Modules are searched in the working directory too. Raises UserError.
+    Modules are searched in the working directory too. Raises Untrusted if the user has not named it, KeyError
+    if `group` has no such entry point, and UserError if it cannot be loaded.
     """
+    point = entry_points(group)[name] if group is not None and ":" not in name else None
+    if name not in _trusted:
+        raise Untrusted(f"the {kind} is {name}; to run its code, add --{kind} {name}")
+    if point is not None:
+        try:
+            return point.load()
+        except Exception as error:  # noqa: BLE001  # the code of the package may raise anything
+            raise UserError(
+                f"{name}: {point.value} cannot be loaded: {type(error).__name__}: {error}"
+            ) from None
     module, _, cls = name.partition(":")
     if not module or not cls.isidentifier():
-        raise UserError(f"'{name}' is not {kind}; expected MODULE:CLASS")
+        raise UserError(f"'{name}' is not a {kind}; expected MODULE:CLASS")
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # last, because it may contain a folder named world
     try:

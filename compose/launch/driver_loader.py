@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from compose.errors import UserError
-from compose.launch.class_loader import named
+from compose.launch.class_loader import named, trust
 from compose.scenario.scenario_file import setting
 from protocol.messages import RobotConfig
 from protocol.spelling import did_you_mean
@@ -21,8 +21,9 @@ Maker = Callable[..., Driver]
 
 
 def driver_class(name: str) -> Maker:
-    """Return the class named `name`; modules are searched in the working directory too. Raises UserError."""
-    found = named(name, "a driver")
+    """Return the class that the user has named, also of the working directory. Raises UserError."""
+    trust(name)
+    found = named(name, "driver")
     missing = [method for method in METHODS if not callable(getattr(found, method, None))]
     if not callable(found) or missing:
         raise UserError(f"{name}: is not a driver: it has no {', '.join(missing) or 'constructor'}")

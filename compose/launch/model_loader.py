@@ -1,11 +1,11 @@
-"""Range and radio models by name: shipped ones, and classes of the user (see `planner_loader`)."""
+"""Range and radio models by name: shipped ones, and classes of the user (see `class_loader`)."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from compose.errors import UserError
-from compose.launch.class_loader import named
+from compose.launch import class_loader
 from protocol.spelling import did_you_mean
 from world.radio_models import RADIO_MODELS
 from world.range_models import RANGE_MODELS
@@ -20,9 +20,10 @@ KINDS: dict[str, tuple[type, dict[str, Any]]] = {
 
 
 def check(kind: str, spec: ModelSpec) -> None:
-    """Load a model that the user has named, and create it.
+    """Load a model, and create it.
 
-    Raises UserError, whose text begins with the field of the model's table.
+    Raises UserError, whose text begins with the field of the model's table, if that is not possible, or not
+    permitted.
     """
     contract, shipped = KINDS[kind]
     if spec.model in shipped:
@@ -32,7 +33,7 @@ def check(kind: str, spec: ModelSpec) -> None:
         raise UserError(f"model: there is no '{spec.model}'; there are {', '.join(shipped)}{near}")
     else:
         try:
-            maker = trust(spec.model)
+            maker = _loaded(spec.model)
         except UserError as error:
             raise UserError(f"model: {error}") from None
         if not issubclass(maker, contract):
@@ -45,7 +46,12 @@ def check(kind: str, spec: ModelSpec) -> None:
 
 def trust(name: str) -> type:
     """Load the class of a model that the user of this process has named. Raises UserError."""
-    found = named(name, "a model")
+    class_loader.trust(name)
+    return _loaded(name)
+
+
+def _loaded(name: str) -> type:
+    found = class_loader.named(name, "model")
     if not isinstance(found, type) or not issubclass(found, RangeModel | RadioModel):
         raise UserError(f"{name} is not a range model or a radio model")
     OWN[name] = found

@@ -1,9 +1,4 @@
-"""Planners by name: shipped ones, installed ones, and classes of the user.
-
-A name decides which code runs, so a process loads only planners that its user has named: on its command line,
-in a scenario file, or by installing a package with an entry point in the group `tandem.planners`. Names that
-come over the network or from a recording select among these, and never load anything else.
-"""
+"""Planners by name: shipped ones, installed ones, and classes of the user (see `class_loader`)."""
 
 from __future__ import annotations
 
@@ -11,7 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from compose.errors import UserError
-from compose.launch.class_loader import named
+from compose.launch.class_loader import entry_points, named
 from protocol.messages import (
     RobotConfig,
     RobotConfigInGroup,
@@ -34,21 +29,8 @@ SHIPPED = tuple(sorted(RENDEZVOUS))
 METHODS = ("start", "observe", "decide", "command", "estimate")
 """The methods that a planner must define."""
 
-_trusted: set[str] = set()
-"""The names that the user of this process has given."""
-
-
 GROUP_PLANNER = "assured"
 """The shipped planner with which robots can form a group. Those of users are subclasses of its classes."""
-
-
-class UntrustedPlanner(UserError):
-    """A recording or a world names a planner that the user of this process has not named."""
-
-
-def trust(name: str) -> None:
-    """Permit this process to load the planner `name`, which its user has given."""
-    _trusted.add(name)
 
 
 def is_shipped(name: str) -> bool:
@@ -58,14 +40,11 @@ def is_shipped(name: str) -> bool:
 
 def installed() -> dict[str, Any]:
     """Return the entry points of installed packages that add planners, by name."""
-    from importlib.metadata import entry_points  # noqa: PLC0415  # slow to import
-
-    return {one.name: one for one in entry_points(group=GROUP) if one.name not in SHIPPED}
+    return {name: one for name, one in entry_points(GROUP).items() if name not in SHIPPED}
 
 
 def check(name: str, options: Mapping[str, Any]) -> None:
-    """Load the planner that the user has named, and create it. Raises UserError if that is not possible."""
-    trust(name)
+    """Load the planner, and create it. Raises UserError if that is not possible, or not permitted."""
     if is_shipped(name):
         if options:
             raise UserError(f"options: the planner '{name}' has none")
@@ -76,15 +55,13 @@ def check(name: str, options: Mapping[str, Any]) -> None:
 def planner(name: str, options: Mapping[str, Any], mission: Mission) -> Planner[Any, Any]:
     """Return a new planner for the noise of `mission`.
 
-    Raises UserError if it cannot be loaded or created, and UntrustedPlanner if the user has not named it.
+    Raises UserError if it cannot be loaded or created, and Untrusted if the user has not named it.
     """
-    _check_trust(name)
     return _guarded(name, _suited(name, options, mission))
 
 
 def planner_of(config: RobotConfig) -> Planner[Any, Any]:
     """Return the planner of the robot with this configuration. Raises like `planner`."""
-    _check_trust(config.planner_name)
     return _guarded(config.planner_name, unguarded_planner_of(config))
 
 
@@ -116,16 +93,9 @@ def is_for_groups(name: str) -> bool:
     """Return whether robots with the planner `name` can form a group. Raises like `planner`."""
     if is_shipped(name):
         return name == GROUP_PLANNER
-    _check_trust(name)
     from agent.planning.assured import AssuredExact  # noqa: PLC0415  # it imports numpy
 
     return issubclass(planner_class(name), AssuredExact)
-
-
-def _check_trust(name: str) -> None:
-    """Raise UntrustedPlanner if `name` is a class of a user that the user of this process has not named."""
-    if ":" in name and name not in _trusted:
-        raise UntrustedPlanner(f"the planner is {name}; to run its code, add --planner {name}")
 
 
 def _suited(name: str, options: Mapping[str, Any], mission: Mission) -> Planner[Any, Any]:
@@ -157,34 +127,25 @@ def orbits(name: str, options: Mapping[str, Any], mission: Mission, distance: fl
 
 
 def planner_class(name: str) -> type[Planner[Any, Any]]:
-    """Return the class of a planner. Raises UserError if it is not one."""
+    """Return the class of a planner. Raises UserError if it is not one, and Untrusted."""
     from agent.planning.planner import Planner  # noqa: PLC0415  # it imports numpy
 
     if is_shipped(name):
         from agent.planning.registry import SHIPPED as CLASSES  # noqa: PLC0415
 
         return CLASSES[name]
-    found = named(name, "a planner") if ":" in name else _of_entry_point(name)
+    try:
+        found = named(name, "planner", GROUP)
+    except KeyError:
+        names = [*SHIPPED, *installed()]
+        near = did_you_mean(name, names) or "; a planner of your own is MODULE:CLASS"
+        raise UserError(f"there is no '{name}'; there are {', '.join(names)}{near}") from None
     if not isinstance(found, type) or not issubclass(found, Planner):
         raise UserError(f"{name}: is not a planner: not a subclass of tandem.planning.Planner")
     missing = [method for method in METHODS if getattr(found, method) is getattr(Planner, method)]
     if missing:
         raise UserError(f"{name}: is not a planner: it does not define {', '.join(missing)}")
     return found
-
-
-def _of_entry_point(name: str) -> Any:
-    known = installed()
-    if name not in known:
-        names = [*SHIPPED, *known]
-        near = did_you_mean(name, names) or "; a planner of your own is MODULE:CLASS"
-        raise UserError(f"there is no '{name}'; there are {', '.join(names)}{near}")
-    try:
-        return known[name].load()
-    except Exception as error:  # noqa: BLE001  # the code of the package may raise anything
-        raise UserError(
-            f"{name}: {known[name].value} cannot be loaded: {type(error).__name__}: {error}"
-        ) from None
 
 
 def _created(name: str, options: Mapping[str, Any]) -> Planner[Any, Any]:

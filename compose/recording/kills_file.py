@@ -13,7 +13,7 @@ from msgspec import Meta
 
 from compose.recording.recording_files import KINDS, WORLD_JOURNAL, agent_journal
 from compose.scenario.kills import WORLD, Kill, Point
-from protocol import files
+from protocol import documents, files
 from protocol.journal import journal_file
 from protocol.journal.journal_file import CorruptJournal
 from protocol.messages import Command, DeadlineMissed, Observation
@@ -88,7 +88,7 @@ def _listed(path: Path) -> tuple[Killed, ...]:
     found = []
     for number, line in enumerate(content.split(b"\n")[:-1], 1):  # a line without an end is being written
         try:
-            found.append(msgspec.json.decode(line, type=Killed))
+            found.append(documents.json_value(line, Killed))
         except msgspec.MsgspecError as error:
             raise CorruptJournal(f"{path}: line {number}: {error}") from None
     return tuple(found)

@@ -82,7 +82,8 @@ def meetings_after(
     changed: dict[str, PresentMeeting] = {}
     receivers: dict[str, list[str]] = {}
     for sender, receiver in now.logs:
-        receivers.setdefault(sender, []).append(receiver)
+        if receiver in setup.partners and receiver != sender:  # anyone can be named as a receiver
+            receivers.setdefault(sender, []).append(receiver)
     for robot, partners in setup.partners.items():
         command, before = now.commands.get(robot), earlier.get(robot)
         if command is None:
@@ -154,7 +155,7 @@ def past_meetings(run: Run) -> tuple[PastMeeting, ...]:
     found = [
         PastMeeting(one.id, one.peer, 0, _last(begun, one.id, one.peer, 0, run.length))
         for one in setup.anchored
-        if one.role == "a" and begun[one.peer][0][1].peer == one.id
+        if one.role == "a" and one.peer in begun and begun[one.peer][0][1].peer == one.id
     ]
     found += [
         PastMeeting(robot, meeting.peer, tick, _last(begun, robot, meeting.peer, tick, run.length))

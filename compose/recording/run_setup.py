@@ -145,11 +145,15 @@ class RunSetup(msgspec.Struct, frozen=True, dict=True):
 
     @cached_property
     def partners(self) -> dict[RobotId, tuple[RobotId, ...]]:
-        """The peers of each robot's meetings, in their order; for pairs, one each."""
+        """The peers of each robot's meetings, in their order; for pairs, one each.
+
+        In a group, robots whose setup is not known are left out, and so are those that only meet such ones.
+        """
         if not self.visits:
             return {robot.id: (robot.peer,) for robot in self.robots}
         found: dict[RobotId, tuple[RobotId, ...]] = {}
-        for visit in self.visits:
+        known = {*self.ids}
+        for visit in [one for one in self.visits if {one.visitor, one.visited} <= known]:
             found[visit.visitor] = (*found.get(visit.visitor, ()), visit.visited)
             found[visit.visited] = (visit.visitor, *found.get(visit.visited, ()))
         return found
@@ -255,7 +259,9 @@ def _visits(configs: Sequence[RobotConfig]) -> list[Visit]:
     found = [(one, one.peer) for one in grouped if one.role == "a"]  # none without an anchor
     found += [(one, visited) for one in grouped for visited in one.visits]
     visits = [
-        Visit(one.robot, visited, one.member(visited).ends * one.mission.period) for one, visited in found
+        Visit(one.robot, visited, one.member(visited).ends * one.mission.period)
+        for one, visited in found
+        if visited in {member.robot for member in one.members}
     ]
     return sorted(visits, key=lambda visit: visit.ends_s)
 

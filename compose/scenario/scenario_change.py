@@ -15,8 +15,6 @@ from protocol.noise import Noise
 from protocol.spelling import did_you_mean
 from protocol.units import Finite, RobotId
 from world.faults import Fault
-from world.radio_models import RADIO_MODELS
-from world.range_models import RANGE_MODELS
 from world.scenario import Scenario
 from world.world_noise import WorldNoise
 
@@ -63,7 +61,11 @@ class ChangedScenario(NamedTuple):
 
 
 def values_of(scenario: Scenario) -> ScenarioChange:
-    """Return the values that `scenario` has. Sigma is the larger one of ranges to anchors and to robots."""
+    """Return the values that `scenario` has. Sigma is the larger one of ranges to anchors and to robots.
+
+    Raises UserError if it cannot be run again because this process may not load its planner.
+    """
+    planner_loader.check(scenario.planner_name, scenario.planner_options)
     noise = scenario.mission.noise
     place = _place_of_loss(scenario.faults)
     return ScenarioChange(
@@ -78,26 +80,13 @@ def values_of(scenario: Scenario) -> ScenarioChange:
     )
 
 
-def require_shipped(scenario: Scenario) -> None:
-    """Raise UserError if a mission of `scenario` runs code that is not shipped with Tandem.
-
-    The name of a planner or a model in a recording must not choose the code that this process loads.
-    """
-    models = [spec.model for spec in (scenario.range_model, scenario.radio_model) if spec is not None]
-    foreign = [name for name in models if name not in {*RANGE_MODELS, *RADIO_MODELS}]
-    if not planner_loader.is_shipped(scenario.planner_name):
-        foreign.insert(0, scenario.planner_name)
-    if foreign:
-        raise UserError(f"it uses {foreign[0]}, and only planners and models of Tandem are run again here")
-
-
 def changed(scenario: Scenario, change: ScenarioChange, most_ticks: int) -> ChangedScenario:
     """Return `scenario` with the values of `change`.
 
     Its last tick is computed again if that of `scenario` follows from the mission, and is at most
-    `most_ticks`. Raises UserError if a value is refused, as one of a file is, and like `require_shipped`.
+    `most_ticks`. Raises UserError if a value is refused, as one of a file is, or if its planner is not
+    one that this process may load.
     """
-    require_shipped(scenario)
     before = values_of(scenario)
     unknown = next((one for one in change.robots if one not in before.robots), None)
     if unknown is not None:

@@ -13,6 +13,7 @@ from msgspec.structs import asdict
 
 from compose.errors import BadFault, BadKill, BadScenario, Unworkable, UserError
 from compose.launch import model_loader, planner_loader
+from compose.launch.class_loader import trust
 from compose.scenario.fault_syntax import FaultTable, added, table_of
 from compose.scenario.first_meetings import in_group, linked, meetings_of, pair_meetings
 from compose.scenario.group_meetings import GroupMeetings
@@ -125,7 +126,22 @@ def setting(
     table = scenario_table(source)
     if planner is not None or planner_options:
         table["planner"] = with_planner(table.get("planner"), planner, dict(planner_options))
+    trust_classes(table)
     return validate(table, source, faults)
+
+
+CLASSES = (("planner", "name"), ("world", "range", "model"), ("world", "radio", "model"))
+"""The paths of the fields of a scenario file that name classes."""
+
+
+def trust_classes(table: Mapping[str, Any]) -> None:
+    """Permit this process to load the classes named by `table`, a scenario file of the user."""
+    for path in CLASSES:
+        found: Any = table
+        for step in path:
+            found = found.get(step) if isinstance(found, Mapping) else None
+        if isinstance(found, str):
+            trust(found)
 
 
 def with_planner(given: Any, name: str | None, options: Mapping[str, Any]) -> dict[str, Any]:
@@ -167,7 +183,8 @@ def parse(text: str, source: str, *, seed: int | None = None, faults: Sequence[s
 def validate(table: Mapping[str, Any], source: str, faults: Sequence[str] = ()) -> ScenarioTemplate:
     """Return the template of the scenario file whose content is `table`, with `faults` added to its own.
 
-    Raises BadScenario and Unworkable, whose texts begin with `source`.
+    A planner or a model is loaded only if the user has named it (`trust_classes`). Raises BadScenario and
+    Unworkable, whose texts begin with `source`.
     """
     try:
         file = msgspec.convert(_with_profile(table), ScenarioFile)

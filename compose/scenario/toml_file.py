@@ -11,7 +11,7 @@ import msgspec
 from msgspec import inspect
 
 from compose.errors import NotToml
-from protocol import files
+from protocol import documents, files
 from protocol.spelling import did_you_mean
 
 
@@ -21,7 +21,7 @@ def read_text(path: Path) -> str:
     Raises FileNotFoundError, and ValueError whose text says why the file cannot be read.
     """
     try:
-        return files.read_text(path)
+        return files.read_text(path, documents.MOST_BYTES)
     except FileNotFoundError:
         raise
     except OSError as error:
@@ -36,8 +36,8 @@ def table_in(text: str, source: str) -> dict[str, Any]:
     Raises NotToml, whose text begins with `source`.
     """
     try:
-        return msgspec.toml.decode(text, type=dict[str, Any])
-    except (ValueError, RecursionError) as error:  # from msgspec or from its TOML parser
+        return documents.toml_table(text)
+    except ValueError as error:
         raise NotToml(f"{source}: not TOML: {error}") from None
 
 

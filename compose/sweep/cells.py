@@ -44,18 +44,34 @@ class RefusedCell(msgspec.Struct, frozen=True):
 def cells(sweep: Sweep) -> Iterator[Cell]:
     """Yield the cells of `sweep` in order; the last axis varies fastest."""
     for index, place in enumerate(product(*[range(len(axis.values)) for axis in sweep.axes])):
-        table = sweep.base
-        fields: dict[str, Any] = {}
-        unpaired: dict[str, Any] = {}
-        for axis, i in zip(sweep.axes, place, strict=True):
-            for field, way, value in zip(axis.fields, axis.ways, axis.values[i], strict=True):
-                fields[field] = value
-                if value is None:
-                    continue
-                table = with_value(table, way, value)
-                if not axis.paired:
-                    unpaired[field] = value
-        yield Cell(index, place, fields, canonical(unpaired), table)
+        yield _cell(sweep, index, place)
+
+
+def cell_at(sweep: Sweep, index: int) -> Cell | None:
+    """Return the cell of `sweep` with that index, without those before it; None if there is none."""
+    place: list[int] = []
+    rest = index
+    for axis in reversed(sweep.axes):
+        if not axis.values:
+            return None
+        rest, i = divmod(rest, len(axis.values))
+        place.insert(0, i)
+    return _cell(sweep, index, tuple(place)) if rest == 0 else None
+
+
+def _cell(sweep: Sweep, index: int, place: tuple[int, ...]) -> Cell:
+    table = sweep.base
+    fields: dict[str, Any] = {}
+    unpaired: dict[str, Any] = {}
+    for axis, i in zip(sweep.axes, place, strict=True):
+        for field, way, value in zip(axis.fields, axis.ways, axis.values[i], strict=True):
+            fields[field] = value
+            if value is None:
+                continue
+            table = with_value(table, way, value)
+            if not axis.paired:
+                unpaired[field] = value
+    return Cell(index, place, fields, canonical(unpaired), table)
 
 
 def label(sweep: Sweep, cell: Cell) -> str:

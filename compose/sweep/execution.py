@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from compose.errors import BadSpec
+from compose.scenario.scenario_file import trust_classes
 from compose.sweep.cells import Cell, RefusedCell, setting_of
 from compose.sweep.remaining_work import EngineFailed, TrialOptions, Work
 from compose.sweep.results_folder import Folder, opened
@@ -142,6 +143,7 @@ def _left(folder: Folder, progress: Progress) -> list[Work]:
         left = [trial for trial in range(sweep.trials) if trial not in done[cell.index]]
         if not left:
             continue
+        trust_classes(cell.table)  # of the user's sweep: a folder with another one is refused
         setting = setting_of(sweep, cell)
         if isinstance(setting, RefusedCell):
             refused[cell.index] = setting.reason

@@ -25,7 +25,7 @@ from compose.sweep.field_paths import canonical
 from compose.sweep.spec import Sweep
 from compose.sweep.table import encoded, gathered, of_rows, read, schema_of
 from compose.sweep.trial import TrialRow
-from protocol import files
+from protocol import documents, files
 
 TRIALS = "trials.parquet"
 """The name of the merged table of trials."""
@@ -154,7 +154,7 @@ def _refused_before(path: Path, sweep: Sweep) -> dict[int, str]:
     Raises UserError if the folder belongs to another sweep.
     """
     try:
-        manifest = msgspec.json.decode(files.read_bytes(path / SWEEP), type=Manifest)
+        manifest = documents.json_file(path / SWEEP, Manifest)
     except FileNotFoundError:
         if (path / TRIALS).exists() or (path / PARTS).exists():
             raise UserError(f"--out: {path} contains rows of an unknown sweep") from None

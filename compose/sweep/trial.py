@@ -9,8 +9,6 @@ import msgspec
 from msgspec.structs import asdict, replace
 
 from compose.audit.findings import Findings
-from compose.launch.model_loader import trust_all
-from compose.launch.planner_loader import trust
 from compose.recording.claim import Claim
 from compose.recording.closest_approach import nearest
 from compose.recording.run import Run
@@ -204,8 +202,6 @@ def run_trial(trial: Trial) -> TrialRow:
 
     The outcome is `failed` if kills changed the recording. The caller turns exceptions into lost trials.
     """
-    trust(trial.scenario.planner_name)  # the user has named it in the scenario or in the sweep
-    trust_all(trial.scenario)
     if trial.processes or trial.kills is not None:
         played = as_processes(trial.scenario, audit=trial.audit, kills=trial.kills)
     else:

@@ -23,6 +23,8 @@ import msgspec
 from msgspec.structs import replace
 
 from compose.errors import Unworkable
+from compose.launch.class_loader import trust
+from compose.launch.model_loader import trust_all
 from compose.scenario.scenario_file import ScenarioTemplate, validate
 from compose.sweep import trial
 from compose.sweep.draws import Draws
@@ -127,6 +129,8 @@ def _played(chunk: Chunk, number: int, seed: int) -> trial.TrialRow:
     try:
         player = _function(chunk.play)
         setting, drawn = chunk.setting, {}
+        trust(setting.scenario.planner_name)  # the user has named it in the scenario or in the sweep
+        trust_all(setting.scenario)
         try:
             if chunk.draws:
                 table = chunk.draws.table(chunk.table, seed)

@@ -104,9 +104,10 @@ class RobotMap:
             self._journals.read()
         known = self._journals.known
         first = self._scene.tick + 1 if self._scene is not None else 0
-        for tick in range(first, known.last):
-            for robot, pose in (known.ticks[tick].truth if tick in known.ticks else {}).items():
-                self._paths[robot].append((pose.x, pose.y))
+        for tick in known.between(first, known.last - 1):
+            for robot, pose in known.ticks[tick].truth.items():
+                if robot in self._paths:
+                    self._paths[robot].append((pose.x, pose.y))
         new = scenes(self._setup, known, max(first, known.last - 1), known.last - 1)
         self._scene = new[-1] if new else self._scene
         scene = self._scene

@@ -16,7 +16,7 @@ from compose.recording.summary_json import SUMMARY
 from compose.view.reported import reported_paths
 from compose.view.run_data import RunData
 from compose.view.scene import Scene, scene
-from protocol import files
+from protocol import documents
 from protocol.journal.journal_file import CorruptJournal, OtherVersion, Tail
 from protocol.messages import OfRobot
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
@@ -54,14 +54,11 @@ def scenes(setup: RunSetup, known: RunData, first: int = 0, last: int | None = N
     """Return the scenes of the known ticks from `first` to `last`, inclusive."""
     last = known.last if last is None else min(last, known.last)
     paths = reported_paths(setup, known, last)
-    before = known.ticks.get(first - 1)
     shown = []
-    for tick in range(first, last + 1):
-        now = known.ticks.get(tick)
-        if now is not None:
-            reported = {robot: path[tick] for robot, path in paths.items() if tick < len(path)}
-            shown.append(scene(known.setup_at(setup, tick), before, now, known.end, reported))
-        before = now
+    for tick in known.between(first, last):
+        before, now = known.ticks.get(tick - 1), known.ticks[tick]
+        reported = {robot: path[tick] for robot, path in paths.items() if tick < len(path)}
+        shown.append(scene(known.setup_at(setup, tick), before, now, known.end, reported))
     return tuple(shown)
 
 
@@ -105,7 +102,7 @@ class Journals:
         return self._world.world.scenario if self._world.world is not None else None
 
     def read(self) -> None:
-        """Read the frames appended since the last call. Raises OSError."""
+        """Read the frames appended since the last call, as many as `Tail` reads at once. Raises OSError."""
         self._read_kills()
         for path in journals_in(self.folder):
             tail = self._tails.setdefault(path.name, Tail(path))
@@ -137,6 +134,11 @@ class Journals:
             return
         self.known.add_kills(kills[self._kills :])
         self._kills = len(kills)
+
+    @property
+    def more(self) -> bool:
+        """True if the last call of `read` has left frames to be read by the next one."""
+        return any(tail.more for tail in self._tails.values())
 
     def fill(self) -> None:
         """Compute missing observations from the world's journal. Call once the journals are complete."""
@@ -176,7 +178,7 @@ class Journals:
 
     def _mode(self) -> str | None:
         try:
-            summary = msgspec.json.decode(files.read_bytes(self.folder / SUMMARY))
+            summary = documents.json_file(self.folder / SUMMARY)
             return str(summary["mode"])
         except (OSError, msgspec.MsgspecError, TypeError, KeyError):
             return None

@@ -8,6 +8,9 @@ from compose.recording.run_setup import RobotSetup, RunSetup
 from compose.view.run_data import RunData
 from protocol.motion import Pose, compose, inverse
 
+LONGEST = 100_000
+"""The last tick up to which a path is computed: a frame can report any number of ticks."""
+
 
 def reported_paths(setup: RunSetup, known: RunData, last: int) -> dict[str, Sequence[Pose]]:
     """Return the reported poses in <W> of each attacker, from tick 0 to at most `last`.
@@ -19,7 +22,8 @@ def reported_paths(setup: RunSetup, known: RunData, last: int) -> dict[str, Sequ
     for robot in setup.robots:
         start, log = _reported_start(robot, known), known.reported_logs.get(robot.id)
         if start is not None and log is not None:
-            paths[robot.id] = log.track(start, 0, min(last, log.through), setup.mission.period)
+            end = min(last, log.through, LONGEST)
+            paths[robot.id] = log.track(start, 0, end, setup.mission.period)
     return paths
 
 

@@ -124,6 +124,15 @@ class RunData:
             known = self.ticks[tick] = TickData(tick, down=set(down))
         return known
 
+    def between(self, first: int, last: int) -> list[int]:
+        """Return the ticks from `first` to `last` of which there are data, in order.
+
+        It takes no longer than there are data, whatever number a tick in a frame has.
+        """
+        if last - first < len(self.ticks):
+            return [tick for tick in range(first, last + 1) if tick in self.ticks]
+        return sorted([tick for tick in [*self.ticks] if first <= tick <= last])
+
     def _touch(self, tick: int) -> None:
         self.touched = tick if self.touched is None else min(tick, self.touched)
         while self._meetings and next(reversed(self._meetings)) >= tick:
@@ -131,17 +140,18 @@ class RunData:
 
     def setup_at(self, setup: RunSetup, tick: int) -> RunSetup:
         """Return `setup` with the peer that each robot of a group meets in `tick`; for pairs, `setup`."""
-        if not setup.visits or not self.ticks:
+        if not setup.visits:
             return setup
-        latest = next(reversed(self._meetings), next(iter(self.ticks)) - 1)
-        for later in range(latest + 1, min(tick, self.last) + 1):
-            met, earlier = self._meetings.get(later - 1, ({}, {}))
-            commands = self.ticks[later].commands if later in self.ticks else {}
-            known = commands if len(commands) == len(setup.robots) else {**earlier, **commands}
-            seen = self.ticks[later].observations if later in self.ticks else {}
+        latest = next(reversed(self._meetings), -1)
+        for later in self.between(latest + 1, tick):
+            met, earlier = self._meetings.get(latest, ({}, {}))
+            commands = self.ticks[later].commands
+            known = commands if commands.keys() >= {*setup.ids} else {**earlier, **commands}
+            seen = self.ticks[later].observations
             heard = {robot: senders(observation) for robot, observation in seen.items()}
             now = GroupTick(commands, self._logs(later), heard, partial(self._place, later))
             self._meetings[later] = meetings_after(setup, met, earlier, now), known
+            latest = later
         present = self._meetings.get(tick, ({}, {}))[0]
         if self._setup_at is None or self._setup_at[:2] != (setup, present):
             self._setup_at = setup, present, setup.in_meetings(present)
@@ -322,6 +332,8 @@ class RunData:
         """Extend the reported log of an attacker; a report may change earlier ticks than its own."""
         config = self.configs.get(report.robot)
         if config is None or config.attack is None or not isinstance(report, Report):
+            return
+        if report.through > report.tick:  # nobody can report what has not been yet
             return
         from agent.peer.motion_log import MotionLog  # noqa: PLC0415  # the agent's code, for attackers only
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 
 import msgspec
 from msgspec import UNSET
@@ -48,25 +48,31 @@ class Series(msgspec.Struct, frozen=True):
 
 
 def series(
-    setup: RunSetup, known: RunData, first: int, last: int, robots: Collection[str] | None = None
+    setup: RunSetup,
+    known: RunData,
+    first: int,
+    last: int,
+    robots: Collection[str] | None = None,
+    check: Callable[[], None] = lambda: None,
 ) -> Series:
-    """Return the series of `robots`, or of all if None, from tick `first` to tick `last`, inclusive."""
+    """Return the series of `robots`, or of all if None, from tick `first` to tick `last`, inclusive.
+
+    `check` is called again and again, and may raise an exception to end the computation.
+    """
     last = max(min(last, known.last), first)
     step = -(-(last - first + 1) // MOST_BINS)
+    ticks: list[list[tuple[RunSetup, TickData]]] = [[] for _ in range(first, last + 1, step)]
+    for tick in known.between(first, last):
+        check()
+        ticks[(tick - first) // step].append((known.setup_at(setup, tick), known.ticks[tick]))
     found = []
-    ticks = [tick for tick in range(first, last + 1) if tick in known.ticks]
-    setups = {tick: known.setup_at(setup, tick) for tick in ticks}
     for place, one in enumerate(setup.robots):
         if robots is not None and one.id not in robots:
             continue
-        bins = [
-            [
-                _numbers(setups[tick], place, known.ticks[tick])
-                for tick in range(begin, min(begin + step, last + 1))
-                if tick in setups
-            ]
-            for begin in range(first, last + 1, step)
-        ]
+        bins = []
+        for several in ticks:
+            check()
+            bins.append([_numbers(then, place, now) for then, now in several])
         curves = {name: _curve(name, bins) for name in Numbers.__struct_fields__}
         found.append(
             RobotSeries(

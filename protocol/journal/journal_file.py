@@ -23,10 +23,18 @@ from protocol.files import open_file
 from protocol.wire import MAX_FRAME_BYTES, RELEASES, VERSION, MalformedFrame, is_sound, other_version
 
 _packer = msgpack.Packer()
-_LONGEST = b"\xc6" + MAX_FRAME_BYTES.to_bytes(4, "big")
-"""The head of the longest frame in msgpack."""
 _HEADS = {0xC4: 1, 0xC5: 2, 0xC6: 4}
 """The first byte of a msgpack byte string -> the number of bytes of its length field."""
+
+
+PIECE_BYTES = 16 << 20
+"""The maximum number of bytes of a journal that are read at once: more than the longest frame has."""
+
+MOST_CHECKED = 1 << 30
+"""The number of bytes in which a complete frame is searched within a torn one, before it counts as damaged.
+
+Of torn frames that Tandem has written, at most a tenth of that is searched.
+"""
 
 
 class CannotRecord(OSError):
@@ -202,6 +210,8 @@ def torn(path: Path) -> tuple[list[bytes], int]:
     """
     tail = Tail(path)
     frames = tail.news()
+    while tail.more:
+        frames += tail.news()
     if _holds_a_frame(tail.torn) or len(packed(frames)) != tail.whole:
         raise CorruptJournal(f"{path}: damaged at byte {tail.whole}: a frame of a wrong length")
     return frames, len(tail.torn)
@@ -209,14 +219,35 @@ def torn(path: Path) -> tuple[list[bytes], int]:
 
 def _holds_a_frame(rest: bytes) -> bool:
     """Return whether `rest`, which looks like a torn frame, contains a complete one: then it is damaged."""
+    checked = 0
     for place in range(1, len(rest)):
         width = _HEADS.get(rest[place])
         if width is not None:
             begin = place + 1 + width
             size = int.from_bytes(rest[place + 1 : begin])
-            if begin + size <= len(rest) and is_sound(rest[begin : begin + size]):
-                return True
+            if begin + size <= len(rest):
+                checked += size
+                if is_sound(rest[begin : begin + size]) or checked > MOST_CHECKED:
+                    return True
     return False
+
+
+def _end(data: bytes, begin: int) -> int | None:
+    """Return where the frame that begins there ends in `data`; None if it is incomplete.
+
+    Only heads of byte strings are read: decoding any msgpack would take memory for whatever it may contain.
+    Raises ValueError if no frame begins there.
+    """
+    if begin == len(data):
+        return None
+    width = _HEADS.get(data[begin])
+    if width is None:
+        raise ValueError("not a frame")
+    body = begin + 1 + width
+    size = int.from_bytes(data[begin + 1 : body])
+    if body <= len(data) and size > MAX_FRAME_BYTES:
+        raise ValueError("a frame of impossible length")
+    return body + size if body + size <= len(data) else None
 
 
 class Tail:
@@ -228,33 +259,33 @@ class Tail:
         """The number of bytes of the frames that have been read."""
         self.torn = b""
         """The bytes after them at the last read: an incomplete frame."""
+        self.more = False
+        """True if the last read has left bytes to be read by the next one."""
 
     def news(self) -> list[bytes]:
-        """Return the frames that have been added since the last call. An incomplete frame is read later.
+        """Return the frames that have been added since the last call, of at most PIECE_BYTES.
+
+        An incomplete frame is read later.
 
         Raises OSError if it cannot be read, CorruptJournal if it contains anything but frames, OtherVersion
         if its first frame has another version.
         """
         with open_file(self.path) as file:
             file.seek(self.whole)
-            data = file.read()
-        unpacker = msgpack.Unpacker(max_buffer_size=0)
-        unpacker.feed(data)
+            data = file.read(PIECE_BYTES)
+        self.more = False
         frames: list[bytes] = []
         whole = 0
         try:
-            for frame in unpacker:
-                if not isinstance(frame, bytes) or len(frame) > MAX_FRAME_BYTES:
-                    raise ValueError("not a frame")
-                frames.append(frame)
-                whole = unpacker.tell()
-            self.torn = data[whole:]
-            head = self.torn[: len(_LONGEST)]
-            if head.startswith(_LONGEST[:1]) and head > _LONGEST:
-                raise ValueError("a frame of impossible length")
-        except (ValueError, msgpack.UnpackException) as error:
+            while (end := _end(data, whole)) is not None:
+                begin = whole + 1 + _HEADS[data[whole]]
+                frames.append(data[begin:end])
+                whole = end
+        except ValueError as error:
             raise CorruptJournal(f"{self.path}: damaged at byte {self.whole + whole}: {error}") from None
+        self.torn = data[whole:]
         if self.whole == 0 and frames and (version := other_version(frames[0])) is not None:
             raise OtherVersion(self.path, version)
         self.whole += whole
+        self.more = len(data) == PIECE_BYTES
         return frames

@@ -16,6 +16,7 @@ from typing import Any
 import msgspec
 import zenoh
 
+from protocol import documents
 from protocol.files import open_file, read_text
 
 CONNECT_TIMEOUT_S = 1.0
@@ -204,12 +205,15 @@ def _for_mode(endpoints: Any, mode: str) -> tuple[str, ...]:
 def _read(file: Path) -> str:
     """Return the text of the Zenoh configuration in `file`. Raises BadConfiguration."""
     try:
-        text = read_text(file)
+        text = read_text(file, documents.MOST_BYTES)
+        documents.check_nesting(text, "JSON5")
         zenoh.Config.from_json5(text)
     except OSError as error:
         raise BadConfiguration(f"{file}: cannot be read: {error.strerror or error}") from None
     except UnicodeDecodeError:
         raise BadConfiguration(f"{file}: is not UTF-8") from None
+    except documents.TooNested as error:
+        raise BadConfiguration(f"{file}: {error}") from None
     except zenoh.ZError as error:
         raise BadConfiguration(f"{file}: {_what(str(error))}") from None
     return text

@@ -25,7 +25,7 @@ from compose.recording.ranging.recording_rows import (
     SourcePlace,
     wrong_field,
 )
-from protocol import files
+from protocol import documents, files
 
 TOPICS = {f"/{name}": kind for name, kind in TABLES.items()}
 """The rows of each topic. Other topics are not used."""
@@ -95,7 +95,7 @@ def _rows(
 
 def _row(data: bytes, topic: str, place: SourcePlace) -> AnyRow:
     try:
-        row: AnyRow = msgspec.json.decode(data, type=TOPICS[topic])
+        row: AnyRow = documents.json_value(data, TOPICS[topic])
     except msgspec.ValidationError as error:
         raise BadRecording(f"{place}: {wrong_field(error)}") from None
     except msgspec.DecodeError as error:

@@ -1,22 +1,25 @@
-"""Missions with other values than a recording, run in this process so that the page can play them."""
+"""Missions with other values than a recording, run so that the page can play them."""
 
 from __future__ import annotations
 
 import re
 import shutil
 import tempfile
-import time
-from collections.abc import Callable, Container
-from contextlib import ExitStack
+from collections.abc import Container
 from itertools import count
 from pathlib import Path
+from typing import Any
+
+import msgspec
 
 from compose.errors import UserError
 from compose.extras import need
-from compose.scenario.scenario_change import ScenarioChange, changed, require_shipped, values_of
+from compose.scenario.scenario_change import ChangedScenario, ScenarioChange, changed, values_of
+from compose.view.web.requested_work import RequestedWork
 from compose.view.web.sources import Recorded, WatchedRun
-from protocol.journal.journal_file import Journal, Sink
-from world.scenario import Scenario
+from protocol import documents
+from protocol.wire import MAX_FRAME_BYTES, decode, encode
+from world.scenario import RecordedScenario, Scenario
 
 MOST_CHANGED = 8
 """The number of changed missions that a server stores. Of more, the oldest is deleted."""
@@ -24,6 +27,7 @@ MOST_TICKS = 20_000
 """The last tick of a changed mission."""
 LONGEST_S = 8.0
 """The wall time in s after which a mission that has not ended is stopped."""
+LATE = f"the scenario has not been computed after {LONGEST_S:g} s"
 _ARRAY = re.compile(r"\[\n((?: +[-+.\de]+,\n)+) *\]")
 """An array of numbers with one number a line."""
 
@@ -31,52 +35,41 @@ _ARRAY = re.compile(r"\[\n((?: +[-+.\de]+,\n)+) *\]")
 class ChangedMissions:
     """The changed missions of one server, recorded in a temporary folder."""
 
-    def __init__(self) -> None:
+    def __init__(self, work: RequestedWork) -> None:
         self.shows: list[Recorded] = []
         """The recordings of the missions, the oldest first."""
+        self._work = work
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._added = 0
 
-    def values(self, show: WatchedRun) -> ScenarioChange:
+    def values(self, show: WatchedRun) -> Any:
         """Return the values of `show` that can be changed. Raises UserError if it is not run again."""
-        import compose.launch.in_process  # noqa: F401, PLC0415  # imports numpy; soon needed by `run`
+        return self._work.result(values_in, _framed(show), within=LONGEST_S, late=LATE)
 
-        scenario = scenario_of(show)
-        require_shipped(scenario)
-        return values_of(scenario)
+    def text(self, show: WatchedRun, change: ScenarioChange) -> str:
+        """Return the scenario file of the mission of `show` with the values of `change`. Raises UserError."""
+        need("tomli_w")
+        found: str = self._work.result(
+            changed_text, _framed(show), msgspec.json.encode(change), within=LONGEST_S, late=LATE
+        )
+        return found
 
-    def run(self, show: WatchedRun, change: ScenarioChange, stopped: Callable[[], bool]) -> Recorded:
-        """Run the mission of `show` with the values of `change`, unless `stopped` returns true meanwhile.
+    def run(self, show: WatchedRun, change: ScenarioChange) -> Recorded:
+        """Run the mission of `show` with the values of `change`.
 
         Raises UserError if a value is refused, or if the mission takes too long.
         """
-        from compose.launch.in_process import journals, played  # noqa: PLC0415  # imports numpy
-
-        scenario = changed(scenario_of(show), change, MOST_TICKS).scenario
+        frame = _framed(show)
         if self._folder is None:
             self._folder = tempfile.TemporaryDirectory(prefix="tandem-")
-        out = Path(tempfile.mkdtemp(dir=self._folder.name))
-        deadline = time.monotonic() + LONGEST_S
-
-        def check() -> None:
-            if time.monotonic() > deadline:
-                raise UserError(
-                    f"the mission has not ended after {LONGEST_S:g} s: save it, and run it with `tandem run`"
-                )
-            if stopped():
-                raise UserError("the server has been stopped")
-
+        out = tempfile.mkdtemp(dir=self._folder.name)
         try:
-            with ExitStack() as stack:
-                played(
-                    scenario,
-                    {
-                        name: _CheckedSink(stack.enter_context(Journal(out / name)), check)
-                        for name in journals(scenario)
-                    },
-                )
-            found = Recorded("", out)
-            found.poll()
+            late = f"the mission has not ended after {LONGEST_S:g} s: save it, and run it with `tandem run`"
+            self._work.result(
+                run_changed, frame, msgspec.json.encode(change), out, within=LONGEST_S, late=late
+            )
+            found = Recorded("", Path(out))
+            found.load(lambda: self._work.over)
         except BaseException as error:
             shutil.rmtree(out, ignore_errors=True)
             if isinstance(error, OSError):
@@ -99,35 +92,49 @@ class ChangedMissions:
             self._folder.cleanup()
 
 
-class _CheckedSink:
-    """A journal whose writes call `check` first, which may raise an exception to end the mission."""
-
-    def __init__(self, sink: Sink, check: Callable[[], None]) -> None:
-        self._sink = sink
-        self._check = check
-
-    def write(self, *frames: bytes) -> None:
-        """Append all of `frames` in one operation."""
-        self._check()
-        self._sink.write(*frames)
-
-
-def scenario_of(show: WatchedRun) -> Scenario:
-    """Return the scenario of a complete recording. Raises UserError if `show` is none, or has no scenario."""
+def _framed(show: WatchedRun) -> bytes:
+    """Return the scenario of a complete recording as a frame. Raises UserError if `show` has none."""
     if show.live:
         raise UserError("the mission is still running")
     scenario = show.scenario if isinstance(show, Recorded) else None
     if scenario is None:
         raise UserError("there is no scenario: the recording has no journal of a simulator")
-    return scenario
+    return encode(scenario)
 
 
-def changed_text(show: WatchedRun, change: ScenarioChange) -> str:
-    """Return the scenario file of the mission of `show` with the values of `change`. Raises UserError."""
-    need("tomli_w")
+# --- in a process of its own ----------------------------------------------------------------------------
+
+
+def values_in(frame: bytes) -> dict[str, Any]:
+    """Return the values of a scenario that can be changed. Raises UserError if it is not run again."""
+    found: dict[str, Any] = msgspec.to_builtins(values_of(_scenario(frame)))
+    return found
+
+
+def changed_text(frame: bytes, change: bytes) -> str:
+    """Return the scenario file of a scenario with the values of `change`, which is JSON. Raises UserError."""
     import tomli_w  # noqa: PLC0415  # the library is optional
 
-    scenario = scenario_of(show)
-    text = tomli_w.dumps(changed(scenario, change, MOST_TICKS).table)
+    scenario = _scenario(frame)
+    text = tomli_w.dumps(_changed(scenario, change).table)
     text = _ARRAY.sub(lambda found: f"[{', '.join(found[1].replace(',', ' ').split())}]", text)
     return f"# {scenario.name}, changed on the page of `tandem watch`.\n{text}"
+
+
+def run_changed(frame: bytes, change: bytes, out: str) -> None:
+    """Run a scenario with the values of `change`, and write its journals to the folder `out`.
+
+    Raises UserError if a value is refused.
+    """
+    from compose.launch.in_process import run_mission  # noqa: PLC0415  # imports numpy
+
+    run_mission(_changed(_scenario(frame), change).scenario, Path(out))
+
+
+def _changed(scenario: Scenario, change: bytes) -> ChangedScenario:
+    return changed(scenario, documents.json_value(change, ScenarioChange), MOST_TICKS)
+
+
+def _scenario(frame: bytes) -> Scenario:
+    found: Scenario = decode(frame, RecordedScenario, MAX_FRAME_BYTES)
+    return found

@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 
 from compose.errors import UserError
-from protocol import files
+from protocol import documents, files
 
 ESTIMATE = "estimate.json"
 
@@ -21,7 +21,9 @@ def is_estimate(folder: Path) -> bool:
 def contents(folder: Path) -> dict[str, Any]:
     """Return the summary and the figures for the page. Raises UserError if the folder cannot be read."""
     try:
-        summary = msgspec.json.decode(files.read_bytes(folder / ESTIMATE), type=dict[str, Any])
+        summary = documents.json_value(
+            files.read_inside(folder, ESTIMATE, most=documents.MOST_BYTES), dict[str, Any]
+        )
         return {
             "folder": str(folder),
             "source": str(summary["source"]),
@@ -40,4 +42,4 @@ def contents(folder: Path) -> dict[str, Any]:
 
 def figures(folder: Path) -> list[str]:
     """Return the file names of the estimate's figures, the paths first."""
-    return sorted([path.name for path in folder.glob("estimate-*.svg")], reverse=True)
+    return sorted(files.regular_in(folder, "estimate-*.svg"), reverse=True)

@@ -23,6 +23,8 @@ from protocol.messages import (
     MissionEnd,
     Observation,
     PeerReport,
+    RobotConfig,
+    RobotConfigInGroup,
 )
 from protocol.network import diagnosis, keys, session
 from protocol.network.endpoints import Endpoints
@@ -59,6 +61,8 @@ MOST_RUNS = 1000
 """The maximum number of listed missions."""
 MOST_APPEARING = 10_000
 """The maximum number of robots that wait for the query of their configuration."""
+MOST_LINKS = 100_000
+"""The maximum number of robots and of links between them of which frames of one mission are stored."""
 POLL_S = 0.25
 """The interval in s between checks for the stop request, and between attempts to connect."""
 QUERY_S = 2.0
@@ -80,6 +84,8 @@ class ReceivedMission(WatchedRun):
         super().__init__(run, RunData())
         self.setup = None
         self.live = True
+        self._links: set[tuple[str, str]] = set()
+        """The robots of all frames so far, and the receivers of their reports."""
         self._tick: int | None = None
         """The latest tick in a frame of the world; None before the first."""
         self._robots: dict[str, bool] = {}
@@ -96,6 +102,12 @@ class ReceivedMission(WatchedRun):
         if robot != source.robot:
             raise RefusedFrame(f"it names robot '{robot}' as its sender")
         tick: int | None = getattr(message, "tick", None)
+        config = self.known.configs.get(source.robot)
+        if source.peer and config is not None and source.peer not in _named_in(config):
+            raise RefusedFrame(f"it is for '{source.peer}', which is not in the mission")
+        if len(self._links) >= MOST_LINKS and source[2:] not in self._links:
+            raise RefusedFrame("there are too many robots")
+        self._links.add(source[2:])
         if tick is not None and not self._timely(tick, by_world=source.kind in OF_WORLD):
             return
         configured = len(self.known.configs)
@@ -137,6 +149,12 @@ class ReceivedMission(WatchedRun):
             return
         self.live = alive and self.known.end is None
         self.known.present(None, alive)
+
+
+def _named_in(config: RobotConfig) -> frozenset[str]:
+    """Return the robots of the mission that the configuration of one of them names."""
+    group = config.group if isinstance(config, RobotConfigInGroup) else ()
+    return frozenset((config.peer, *config.others, *group)) - {config.robot}
 
 
 class Listener:

@@ -10,10 +10,11 @@ import ipaddress
 import logging
 import signal
 import socket
+import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import nullcontext, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import uvicorn
@@ -33,12 +34,12 @@ from compose.scenario.toml_file import field_first
 from compose.view.recorded import scenes
 from compose.view.series import series
 from compose.view.web import estimate_page, sweep_page
-from compose.view.web.changed_missions import changed_text
 from compose.view.web.origin import refusal
 from compose.view.web.site import Site
 from compose.view.web.sources import WatchedRun
 from compose.view.web.standalone import PAGE
 from compose.view.web.thumbnail import thumbnail
+from protocol import documents
 
 LOOPBACK = "127.0.0.1"
 POLL_S = 0.05
@@ -56,6 +57,11 @@ HEADERS = {
     b"cache-control": b"no-store",
 }
 """The headers of every answer. The page loads nothing from elsewhere, and no other page may embed it."""
+T = TypeVar("T")
+MOST_WAITING = 16
+"""The maximum number of requests that are computed, or wait until they are."""
+LONGEST_SERIES_S = 10.0
+"""The wall time in s that the series of one request may take."""
 MAX_CHANGE_BYTES = 8192
 """The maximum size of a request to change a mission."""
 EMBEDDED = "/one"
@@ -74,8 +80,21 @@ class _Answers:
 
     def __init__(self, site: Site) -> None:
         self._site = site
-        self._running = asyncio.Lock()
-        """Held while a mission is run: one at a time."""
+        self._working = asyncio.Lock()
+        """Held while a request is computed: one at a time."""
+        self._waiting = 0
+        """The number of requests that are computed, or wait until they are."""
+
+    async def _computed(self, work: Callable[..., T], *arguments: Any) -> T:
+        """Return the result of `work` in a thread. Raises _Refused if MOST_WAITING requests wait already."""
+        if self._waiting >= MOST_WAITING:
+            raise _Refused(503, "the server computes other answers; try again in a moment")
+        self._waiting += 1
+        try:
+            async with self._working:
+                return await asyncio.to_thread(work, *arguments)
+        finally:
+            self._waiting -= 1
 
     async def index(self, _request: Request) -> Response:
         return FileResponse(PAGE / ("compare.html" if self._site.compared else "index.html"))
@@ -88,7 +107,7 @@ class _Answers:
 
     async def comparison(self, _request: Request) -> Response:
         try:
-            found = await asyncio.to_thread(self._site.comparison)
+            found = await self._computed(self._site.comparison)
         except UserError as error:
             return _json({"error": str(error)}, 404)
         return _json(found)
@@ -100,40 +119,41 @@ class _Answers:
         figure = self._site.figure(request.path_params["name"])
         if figure is None:
             return _json({"error": "there is no such figure"}, 404)
-        return FileResponse(figure, media_type="image/svg+xml")
+        return Response(figure, media_type="image/svg+xml")
 
     async def estimate(self, _request: Request) -> Response:
         return _results(self._site.estimate, estimate_page.contents, "estimate")
 
     async def worst(self, request: Request) -> Response:
         """Run the worst trial of a cell, unless that has been done, and return the name of its recording."""
-        trials, cell = self._site.trials, request.path_params["cell"]
+        trials, cell = self._site.trials, _whole(request.path_params["cell"])
         if trials is None:
             return _json({"error": "this server shows no sweep"}, 404)
+        _require_local(request)
+        if cell is None:
+            raise _Refused(404, "there is no such cell")
         try:
-            async with self._running:
-                worst = await asyncio.to_thread(trials.worst, cell)
+            worst = await self._computed(trials.worst, cell)
         except UserError as error:
             return _json({"error": str(error)}, 409)
         return _json({"show": worst.show.name, "outcome": worst.outcome, "trial": worst.trial})
 
     async def values(self, request: Request) -> Response:
         """Return the values of a mission that can be changed."""
-        return _json(await asyncio.to_thread(self._site.changed.values, self._changeable(request)))
+        return _json(await self._computed(self._site.changed.values, self._changeable(request)))
 
     async def changed_file(self, request: Request) -> Response:
         """Return the scenario file of a mission with other values."""
         show, change = self._changeable(request), await _change_in(request)
-        text = await asyncio.to_thread(changed_text, show, change)
+        text = await self._computed(self._site.changed.text, show, change)
         return PlainTextResponse(text, media_type="application/toml")
 
     async def run_changed(self, request: Request) -> Response:
         """Run a mission with other values, and return the name of its recording."""
         site, show, change = self._site, self._changeable(request), await _change_in(request)
-        if self._running.locked():
+        if self._working.locked():
             raise _Refused(409, "another mission is being run; try again in a moment")
-        async with self._running:
-            found = await asyncio.to_thread(site.changed.run, show, change, lambda: site.over)
+        found = await self._computed(site.changed.run, show, change)
         site.changed.add(found, site.shows)
         return _json({"show": found.name})
 
@@ -149,8 +169,7 @@ class _Answers:
         show, _ = self._show(request)
         if self._site.compared:
             raise _Refused(404, "the mission is shown side by side with another")
-        if request.client is None or not ipaddress.ip_address(request.client.host).is_loopback:
-            raise _Refused(403, "missions are run again for browsers on the server's machine only")
+        _require_local(request)
         return show
 
     async def show(self, request: Request) -> Response:
@@ -174,8 +193,14 @@ class _Answers:
         first = min(_number(request, "from", 0), max(show.known.last, 0))
         last = _number(request, "to", show.known.last)
         robots = request.query_params.getlist("robot") or None
+        give_up = time.monotonic() + LONGEST_SERIES_S
+
+        def check() -> None:
+            if self._site.over or time.monotonic() > give_up:
+                raise _Refused(503, f"it takes more than {LONGEST_SERIES_S:g} s: ask for fewer robots")
+
         # A thread, because thousands of ticks take longer than the interval of the news.
-        return _json(await asyncio.to_thread(series, setup, show.known, first, last, robots))
+        return _json(await self._computed(series, setup, show.known, first, last, robots, check))
 
     async def news(self, request: Request) -> Response:
         stream = _news(self._site, request.query_params.get("show"), _number(request, "since", 0))
@@ -189,6 +214,12 @@ class _Refused(Exception):
         super().__init__(why)
         self.status = status
         """The status of the answer."""
+
+
+def _require_local(request: Request) -> None:
+    """Raise _Refused unless the request is from this machine: only its users may start missions."""
+    if request.client is None or not ipaddress.ip_address(request.client.host).is_loopback:
+        raise _Refused(403, "missions are run again for browsers on the server's machine only")
 
 
 async def _refusal(_request: Request, error: Exception) -> Response:
@@ -208,9 +239,10 @@ async def _change_in(request: Request) -> ScenarioChange:
         if len(body) > MAX_CHANGE_BYTES:
             raise _Refused(413, f"too many robots are changed: more than {MAX_CHANGE_BYTES} bytes")
     try:
-        return msgspec.json.decode(body, type=ScenarioChange)
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        found: ScenarioChange = documents.json_value(body, ScenarioChange)
+    except msgspec.DecodeError as error:
         raise _Refused(400, field_first(str(error), ScenarioChange)) from None
+    return found
 
 
 def _results(folder: Path | None, contents: Callable[[Path], dict[str, Any]], what: str) -> Response:
@@ -219,7 +251,7 @@ def _results(folder: Path | None, contents: Callable[[Path], dict[str, Any]], wh
         return _json({"error": f"this server shows no {what}"}, 404)
     try:
         return _json(contents(folder))
-    except UserError as error:
+    except (UserError, OverflowError) as error:  # the latter for a number that JSON cannot have
         return _json({"error": str(error)}, 500)
 
 
@@ -234,7 +266,7 @@ def application(site: Site) -> Starlette:
             Route("/api/sweep", answers.sweep),
             Route("/api/estimate", answers.estimate),
             Route("/api/figures/{name}", answers.figure),
-            Route("/api/cells/{cell:int}/worst", answers.worst, methods=["POST"]),
+            Route("/api/cells/{cell}/worst", answers.worst, methods=["POST"]),
             Route("/api/shows/{name}", answers.show),
             Route("/api/shows/{name}/scenes", answers.scenes),
             Route("/api/shows/{name}/values", answers.values),
@@ -286,8 +318,13 @@ class _Sealed:
 
 
 def _number(request: Request, name: str, default: int) -> int:
-    text = request.query_params.get(name, "")
-    return int(text) if text.isascii() and text.isdigit() and len(text) < 16 else default
+    found = _whole(request.query_params.get(name, ""))
+    return default if found is None else found
+
+
+def _whole(text: str) -> int | None:
+    """Return the number from 0 to 10^15 - 1 that `text` is; None if it is none."""
+    return int(text) if text.isascii() and text.isdigit() and len(text) < 16 else None
 
 
 def _json(value: object, status: int = 200) -> Response:
@@ -383,7 +420,7 @@ async def _serve(site: Site, taken: socket.socket, ready: Ready) -> None:
     loop = asyncio.get_running_loop()
 
     def stop() -> None:
-        site.over = True
+        site.end()
         server.should_exit = True
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):

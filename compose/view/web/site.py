@@ -16,10 +16,17 @@ from compose.recording.run import read
 from compose.view.web import estimate_page, sweep_page
 from compose.view.web.changed_missions import ChangedMissions
 from compose.view.web.live import Listener
+from compose.view.web.requested_work import RequestedWork
 from compose.view.web.sources import Recorded, WatchedRun
 from compose.view.web.trials import Trials
+from protocol import files
 from protocol.journal.journal_file import CorruptJournal
 from protocol.network.endpoints import Endpoints
+
+MOST_FIGURE_BYTES = 64 << 20
+"""The largest size of a figure that is shown."""
+LONGEST_S = 60.0
+"""The wall time in s that a comparison of two recordings may take."""
 
 
 class Site:
@@ -41,8 +48,9 @@ class Site:
         self.compared = compared
         self.folder = folder
         self.estimate = estimate
-        self.trials = Trials(folder) if folder is not None else None
-        self.changed = ChangedMissions()
+        self.work = RequestedWork()
+        self.trials = Trials(folder, self.work) if folder is not None else None
+        self.changed = ChangedMissions(self.work)
         self.recorded = shows or []
         self.listeners = listeners or []
         self.over = False
@@ -70,32 +78,36 @@ class Site:
         """One line for each part of a recording that cannot be read."""
         return [note for show in self.recorded for note in show.notes]
 
-    def figure(self, name: str) -> Path | None:
-        """Return the path of the figure called `name`; None if there is none."""
-        if self.folder is not None and name in sweep_page.figures(self.folder):
-            return self.folder / sweep_page.FIGURES / name
-        if self.estimate is not None and name in estimate_page.figures(self.estimate):
-            return self.estimate / name
+    def figure(self, name: str) -> bytes | None:
+        """Return the figure called `name`; None if there is none, or if it cannot be read."""
+        with suppress(OSError):
+            if self.folder is not None and name in sweep_page.figures(self.folder):
+                return files.read_inside(self.folder, sweep_page.FIGURES, name, most=MOST_FIGURE_BYTES)
+            if self.estimate is not None and name in estimate_page.figures(self.estimate):
+                return files.read_inside(self.estimate, name, most=MOST_FIGURE_BYTES)
         return None
 
     def comparison(self) -> dict[str, Any]:
         """Return how the two recordings compare, as its value in JSON. Raises UserError."""
         if not self.compared:
             raise UserError("this server does not show two recordings side by side")
-        folders = [show.folder for show in self.recorded]
-        try:
-            found = comparison(*[read(folder) for folder in folders])
-        except (OSError, CorruptJournal) as error:
-            raise UserError(f"the recordings cannot be compared: {error}") from None
-        return {**msgspec.structs.asdict(found), "names": [str(folder) for folder in folders]}
+        folders = [str(show.folder) for show in self.recorded]
+        late = f"the recordings are not compared after {LONGEST_S:g} s: use `tandem.open`"
+        return {**self.work.result(compared, *folders, within=LONGEST_S, late=late), "names": folders}
 
     def start(self) -> None:
         """Start listening on the network."""
         for listener in self.listeners:
             listener.start()
 
+    def end(self) -> None:
+        """Let all requests end: the server is stopping."""
+        self.over = True
+        self.work.stop()
+
     def stop(self) -> None:
         """Stop listening on the network, and delete the recordings of trials and of changed missions."""
+        self.work.close()
         for listener in self.listeners:
             listener.stop()
         if self.trials is not None:
@@ -134,6 +146,14 @@ class Site:
                 for name, show in self.shows.items()
             ],
         }
+
+
+def compared(one: str, other: str) -> dict[str, Any]:
+    """Return how the recordings in two folders compare, as its value in JSON. Raises UserError."""
+    try:
+        return msgspec.structs.asdict(comparison(read(Path(one)), read(Path(other))))
+    except (OSError, CorruptJournal) as error:
+        raise UserError(f"the recordings cannot be compared: {error}") from None
 
 
 def of_record(folder: Path) -> Site:
@@ -180,7 +200,7 @@ def of_folder(folder: Path) -> Site:
         raise UserError(f"{folder} cannot be read: {error.strerror or error}") from None
     for show in shows:
         try:
-            show.poll()
+            show.load()
         except OSError as error:
             show.live = False
             show.notes.append(f"{error.filename or show.folder} cannot be read: {error.strerror or error}")

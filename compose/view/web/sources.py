@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -67,10 +67,10 @@ class WatchedRun(ABC):
         last = self.known.last
         if not self.live or self.setup is None or self.known.gone:
             return last
-        robots = len(self.setup.robots)
+        robots = {*self.setup.ids}
         for tick in range(last, max(last - UNANSWERED, -1), -1):
             data = self.known.ticks.get(tick)
-            if data is not None and len(data.commands) + len(data.late) >= robots:
+            if data is not None and data.commands.keys() | data.late >= robots:
                 return tick
         return last
 
@@ -125,11 +125,17 @@ class Recorded(WatchedRun):
         self.setup = self._journals.setup
         if written:
             self._attend(writers)
-        self.live = written and self.known.end is None
-        self._over = not written  # until a resumed mission writes again
+        self.live = (written or self._journals.more) and self.known.end is None
+        self._over = not written and not self._journals.more  # until a resumed mission writes again
         if self._over:
             self._journals.fill()
         self.revised()
+
+    def load(self, stopped: Callable[[], bool] = lambda: False) -> None:
+        """Read all that is in the journals, unless `stopped` returns true meanwhile. Raises OSError."""
+        self.poll()
+        while self._journals.more and not stopped():
+            self.poll()
 
     def _attend(self, writers: dict[str, int]) -> None:
         """Record which processes have ended or have been replaced."""

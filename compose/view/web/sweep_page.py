@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from compose.errors import UserError
-from protocol import files
+from protocol import documents, files
 
 SWEEP = "sweep.json"
 SUMMARY = "summary.csv"
@@ -29,7 +29,7 @@ def contents(folder: Path) -> dict[str, Any]:
     Raises UserError if the folder cannot be read.
     """
     try:
-        manifest = msgspec.json.decode(files.read_bytes(folder / SWEEP))
+        manifest = documents.json_value(files.read_inside(folder, SWEEP, most=documents.MOST_BYTES))
         sweep = manifest["sweep"]
         axes = [
             {
@@ -42,7 +42,8 @@ def contents(folder: Path) -> dict[str, Any]:
         ]
         rows: list[dict[str, str]] = []
         if (folder / SUMMARY).is_file():
-            rows = list(csv.DictReader(StringIO(files.read_text(folder / SUMMARY), newline="")))
+            text = files.read_inside(folder, SUMMARY, most=documents.MOST_BYTES).decode("utf-8-sig")
+            rows = list(csv.DictReader(StringIO(text, newline="")))
         return {
             "folder": str(folder),
             "name": sweep["name"],
@@ -61,5 +62,7 @@ def contents(folder: Path) -> dict[str, Any]:
 
 
 def figures(folder: Path) -> list[str]:
-    """Return the file names of the sweep's figures."""
-    return sorted(path.name for path in (folder / FIGURES).glob("*.svg"))
+    """Return the file names of the sweep's figures. Links and what is no file are not among them."""
+    if (folder / FIGURES).is_symlink():
+        return []
+    return sorted(files.regular_in(folder / FIGURES, "*.svg"))
