@@ -1,7 +1,7 @@
-"""Tables of the reference pages, generated from the code: the hook that mkdocs.yml names.
+"""Tables of the reference pages, generated from the code: `uv run docs/reference.py [--check]`.
 
-A page has a line `<!-- generated: NAME -->` for each of TABLES, and the hook writes that table below it.
-`uv run docs/reference.py NAME` prints one.
+The script writes each of TABLES into the page that has its two marker lines, between them. With `--check` it
+writes nothing, and its exit status is 1 if a page would change.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ import inspect
 import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from functools import cache, partial
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -50,7 +51,11 @@ from protocol.noise import Noise, VelocityNoise
 from tandem import rows
 from world.world_noise import WorldActuationNoise, WorldNoise, WorldOdometryNoise
 
-MARKER = re.compile(r"^<!-- generated: (?P<name>[\w-]+) -->$", re.MULTILINE)
+DOCS = Path(__file__).parent
+BEGIN = re.compile(r"^<!-- written by docs/reference.py: (?P<name>[\w-]+) -->$", re.MULTILINE)
+"""the first marker line of a table"""
+PLACE = re.compile(f"(?P<begin>{BEGIN.pattern}\n).*?(?P<end>^<!-- end of (?P=name) -->$)", re.M | re.S)
+"""a table on a page, with its marker lines"""
 NO_VALUE = "none"
 PARTS = (
     messages.Contact,
@@ -96,6 +101,8 @@ def _bounds(kind: Any) -> str:
 
 def _number(value: float) -> str:
     """Return a bound; powers of 2 that bound integers are written as powers."""
+    if value < 0:
+        return f"-{_number(-value)}"
     for power in (31, 53, 63):
         for less in (0, 1):
             if value == 2**power - less and isinstance(value, int):
@@ -135,8 +142,8 @@ def _typed(kind: types.Type) -> str:  # noqa: C901, PLR0912  # one line a kind
 
 
 def _cell(text: str) -> str:
-    """Return `text` so that it fits a cell of a table."""
-    return text.replace("|", "\\|").replace("\n", " ").replace("<", "&lt;")
+    """Return `text` so that it fits a cell of a table; a frame such as <W> would be a tag of HTML."""
+    return re.sub(r"<\w+>", r"`\g<0>`", text.replace("|", "\\|").replace("\n", " "))
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -153,10 +160,16 @@ def _default(field: types.Field) -> str:
     return "left out" if value is None else f"`{msgspec.json.encode(value).decode()}`"
 
 
-def fields_of(struct: type[msgspec.Struct], *, defaults: bool = True) -> str:
-    """Return the table of the fields of `struct`: name, type and bounds, default, meaning."""
+@cache
+def _info(struct: type[msgspec.Struct]) -> types.StructType:
     info = types.type_info(struct)
     assert isinstance(info, types.StructType)
+    return info
+
+
+def fields_of(struct: type[msgspec.Struct], *, defaults: bool = True) -> str:
+    """Return the table of the fields of `struct`: name, type and bounds, default, meaning."""
+    info = _info(struct)
     head = ["field", "type", *(["default"] if defaults else []), "meaning"]
     rows = [
         [
@@ -172,8 +185,7 @@ def fields_of(struct: type[msgspec.Struct], *, defaults: bool = True) -> str:
 
 def columns_of(struct: type[msgspec.Struct]) -> str:
     """Return the table of the columns that a row of `struct` fills: name and meaning."""
-    info = types.type_info(struct)
-    assert isinstance(info, types.StructType)
+    info = _info(struct)
     return _table(
         ["column", "type", "meaning"],
         [[f"`{field.name}`", _typed(field.type), described(struct, field.name)] for field in info.fields],
@@ -184,14 +196,8 @@ def _first_line(cls: type) -> str:
     return " ".join((cls.__doc__ or "").split("\n\n")[0].split())
 
 
-def _tag(struct: type[msgspec.Struct]) -> str:
-    info = types.type_info(struct)
-    assert isinstance(info, types.StructType)
-    return str(info.tag)
-
-
 def _chapter(struct: type[msgspec.Struct], *, tagged: bool) -> str:
-    tag = f"Tag `{_tag(struct)}`. " if tagged else ""
+    tag = f"Tag `{_info(struct).tag}`. " if tagged else ""
     return f"### {struct.__name__}\n\n{tag}{_first_line(struct)}\n\n{fields_of(struct, defaults=False)}"
 
 
@@ -318,10 +324,42 @@ TABLES: dict[str, Callable[[], str]] = {
 """the tables by the names that pages use"""
 
 
-def on_page_markdown(markdown: str, **_: object) -> str:
-    """Return a page with its generated tables. MkDocs calls this for each page. Raises KeyError."""
-    return MARKER.sub(lambda marker: TABLES[marker["name"]](), markdown)
+def written(page: str) -> str:
+    """Return the text of a page with its tables as the code has them.
+
+    Raises ValueError if a table has no second marker line, and KeyError if its name is unknown.
+    """
+    if BEGIN.findall(page) != (names := [place["name"] for place in PLACE.finditer(page)]):
+        raise ValueError(
+            f"a table has no line `<!-- end of NAME -->`; those that have one: {', '.join(names)}"
+        )
+    return PLACE.sub(lambda place: f"{place['begin']}\n{_generated(place['name'])}\n\n{place['end']}", page)
+
+
+@cache
+def _generated(name: str) -> str:
+    return TABLES[name]()
+
+
+def main(arguments: Sequence[str] | None = None, docs: Path = DOCS) -> None:
+    """Write the tables into the pages in `docs`, or compare them."""
+    parser = argparse.ArgumentParser(description="Write the generated tables into the pages of docs.")
+    parser.add_argument("--check", action="store_true", help="only compare; exit status 1 if they differ")
+    options = parser.parse_args(arguments)
+    stale = []
+    for path in sorted(docs.glob("*.md")):
+        before = path.read_text()
+        try:
+            after = written(before)
+        except (KeyError, ValueError) as error:
+            sys.exit(f"{path.name}: {error}")
+        if after != before:
+            stale.append(path.name)
+            if not options.check:
+                path.write_text(after)
+    print(*stale, sep="\n", end="\n" if stale else "")
+    sys.exit(1 if stale and options.check else 0)
 
 
 if __name__ == "__main__":
-    print(*[TABLES[name]() for name in sys.argv[1:] or TABLES], sep="\n\n")
+    main()

@@ -104,7 +104,7 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
     odometry: VelocityNoise = VelocityNoise()
     """The difference between executed and measured velocities."""
     profile: ProfileName | None = None
-    """The profile whose values hold for all fields that the scenario does not set; see PROFILES."""
+    """The profile whose values hold for all fields that the scenario does not set."""
     range_bias: Sigma | None = None
     """The prior of a bias that all ranges have in common, in m."""
     pair_bias: Sigma | None = None

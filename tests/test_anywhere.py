@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+import tandem
 from compose.errors import BadSpec, Unworkable
-from compose.launch import in_process
 from compose.scenario.scenario_file import ScenarioTemplate, validate
 from compose.scenario.toml_file import table_in
 from compose.sweep import spec
@@ -22,16 +23,21 @@ ANYWHERE = spec.load("anywhere")
 (CELL,) = cells(ANYWHERE)
 
 
+def scenario_of(trial: int, **changed: Any) -> tandem.Scenario | None:
+    """Return the scenario of a trial of the sweep, with `changed` tables; None if it is refused."""
+    try:
+        return tandem.Scenario.from_dict({**trial_table(ANYWHERE, CELL, trial), **changed})
+    except Unworkable:
+        return None
+
+
 def played(trial: int) -> str:
     """Return the outcome of a trial of the sweep, with the reason if there is one, or "refused"."""
-    table = trial_table(ANYWHERE, CELL, trial)
-    try:
-        setting = validate(table, "anywhere")
-    except Unworkable:
+    scenario = scenario_of(trial)
+    if scenario is None:
         return "refused"
-    end = in_process.run_mission(setting.seeded(table["seed"])).end
-    assert end is not None
-    return end.outcome if end.reason is None else f"trial {trial}: {end.outcome}: {end.reason}"
+    run = tandem.run(scenario)
+    return run.outcome if run.reason is None else f"trial {trial}: {run.outcome}: {run.reason}"
 
 
 @pytest.mark.long
@@ -106,21 +112,20 @@ ONCE_LOST = {
 
 @pytest.mark.parametrize("case", ONCE_LOST)
 def test_a_trial_that_was_once_lost_localises(case: str) -> None:
-    assert played(ONCE_LOST[case]) == "localised"
+    scenario = scenario_of(ONCE_LOST[case])
+    assert scenario is not None
+    run = tandem.run(scenario)
+    assert run.outcome == "localised", run.reason
+    assert not run.audit().violations
 
 
 def test_the_paper_is_never_wrong_either() -> None:
     """The planner `paper` may also end undecided."""
     for trial in range(60):
-        table = trial_table(ANYWHERE, CELL, trial)
-        try:
-            setting = validate({**table, "planner": {"name": "paper"}}, "anywhere")
-        except Unworkable:
-            continue
-        if setting.scenario.max_ticks < 3000:
-            end = in_process.run_mission(setting.seeded(table["seed"])).end
-            assert end is not None
-            assert end.outcome in ("localised", "undecided"), (trial, end)
+        scenario = scenario_of(trial, planner={"name": "paper"})
+        if scenario is not None and scenario.template.scenario.max_ticks < 3000:
+            run = tandem.run(scenario)
+            assert run.outcome in ("localised", "undecided"), (trial, run.reason)
 
 
 @pytest.mark.parametrize(

@@ -279,12 +279,36 @@ def test_the_page_of_exit_statuses_has_those_of_the_code() -> None:
 
 
 def test_every_generated_table_is_on_a_page_and_explains_each_row() -> None:
-    used = {name for page in PAGES for name in reference.MARKER.findall(page.read_text())}
-    assert used == set(reference.TABLES)
+    used = [name for page in PAGES for name in reference.BEGIN.findall(page.read_text())]
+    assert sorted(used) == sorted(reference.TABLES)
     for name, table in reference.TABLES.items():
         lines = table().splitlines()
         assert any(line.startswith(("| `", "| proto")) for line in lines), name
         assert not [line for line in lines if line.endswith("|  |")], f"{name}: a field without a meaning"
+
+
+def write_tables(docs: Path, *flags: str) -> int | str | None:
+    """Run the script that writes the generated tables, and return its exit status."""
+    with pytest.raises(SystemExit) as end:
+        reference.main(flags, docs)
+    return end.value.code
+
+
+def test_the_tables_on_the_pages_are_those_of_the_code_and_one_command_writes_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert write_tables(ROOT / "docs", "--check") == 0, (
+        f"run `uv run docs/reference.py`: {capsys.readouterr().out}"
+    )
+    text = (ROOT / "docs" / "recordings.md").read_text()
+    page = tmp_path / "recordings.md"
+    page.write_text(text.replace("| `tick` |", "| `tock` |"))
+    assert write_tables(tmp_path, "--check") == 1
+    assert capsys.readouterr().out == "recordings.md\n"
+    assert write_tables(tmp_path) == 0
+    assert page.read_text() == text
+    page.write_text(text.replace("<!-- end of tick-columns -->", ""))
+    assert str(write_tables(tmp_path)).startswith("recordings.md: a table has no line `<!-- end of NAME -->`")
 
 
 @pytest.mark.long

@@ -888,6 +888,15 @@ def test_a_spec_that_is_not_there_is_named() -> None:
     assert ended.err.startswith("tandem sweep: nowhere: neither a file nor a shipped sweep (any-start, ")
 
 
+def test_refused_trials_do_not_make_the_chunks_small(folder: Path) -> None:
+    slow = '[[draw]]\nfield = "mission.max_speed"\nlog_uniform = [1e-6, 1e-5]\n'
+    (folder / "slow.toml").write_text(f'name = "slow"\nscenario = "base.toml"\ntrials = 400\n{slow}')
+    chunks: list[int] = []
+    results = played(folder, "slow.toml", "out", done=chunks.append)
+    assert results.table["outcome"].to_pylist() == ["refused"] * 400
+    assert len(chunks) < 80
+
+
 @pytest.mark.long
 def test_a_sweep_of_draws_counts_what_it_refused_and_resumes(folder: Path) -> None:
     words = ("anywhere", "--trials", "80", "--workers", "1", "--no-audit")

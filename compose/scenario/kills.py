@@ -64,11 +64,11 @@ class KillTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A `[[kill]]` table: the fields of `--kill`, each of which can be drawn from the seed."""
 
     who: str | list[str] = DRAWN
-    """The id of a robot, WORLD or DRAWN; or a list of them, which are killed in the same tick."""
+    """The id of a robot, `world`, or `?` for one that is drawn; or a list, killed in the same tick."""
     tick: _Tick | Annotated[list[_Tick], Meta(min_length=2, max_length=2)] = 0
     """The tick, or the bounds between which it is drawn, both included."""
     point: Literal["observation", "report", "journal", "command", "?"] = "observation"
-    """The point of the tick; if DRAWN, it is drawn separately for each process."""
+    """The point of the tick; `?`: it is drawn separately for each process."""
     after: Annotated[float, Meta(ge=0.0, le=999_999.0)] | Literal["never"] = 0.0
     """Time in s until each process is restarted."""
 

@@ -151,8 +151,7 @@ def play(
             if arrival.key in submitted:
                 future, chunk, source = submitted.pop(arrival.key)
                 rows = _rows(future, chunk)
-                took_s = sum([orders.timeout if row.wall_s is None else row.wall_s for row in rows])
-                source.took(len(rows), took_s)
+                source.took(rows, orders.timeout)
                 done(rows)
             if time.monotonic() - looked > LOOK_S:
                 if client.status not in ("running", "connecting"):

@@ -14,6 +14,7 @@ import msgspec
 from compose.scenario.scenario_file import ScenarioTemplate
 from compose.sweep.cells import trial_seed
 from compose.sweep.draws import Draws
+from compose.sweep.trial import TrialRow
 from compose.sweep.worker import Chunk
 
 CHUNK_S = 1.0
@@ -51,10 +52,15 @@ class Work(msgspec.Struct):
     played_s: float = 0.0
     """wall time in s of the completed trials, weighted in the same way"""
 
-    def took(self, trials: int, wall_s: float) -> None:
-        """Update the mean duration of trials with a chunk of `trials` that took `wall_s` s in total."""
-        self.played = FADES * self.played + trials
-        self.played_s = FADES * self.played_s + wall_s
+    def took(self, rows: Sequence[TrialRow], timeout: float) -> None:
+        """Update the mean duration of trials with the rows of a chunk.
+
+        A trial that was lost with its process counts as `timeout` s, a refused one as 0 s.
+        """
+        unknown = [0.0 if row.outcome == "refused" else timeout for row in rows if row.wall_s is None]
+        known = [row.wall_s for row in rows if row.wall_s is not None]
+        self.played = FADES * self.played + len(rows)
+        self.played_s = FADES * self.played_s + sum(known) + sum(unknown)
 
     def size(self, threads: int, first: int) -> int:
         """Return the size of the next chunk for `threads` worker threads, in trials.
