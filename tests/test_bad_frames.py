@@ -19,7 +19,7 @@ import zenoh
 from msgspec.structs import replace
 
 from compose.launch.processes import free_endpoint
-from compose.scenario.scenario_file import load
+from compose.scenario.scenario_file import load, parse
 from protocol.journal.journal_file import read
 from protocol.messages import Command, Contact, FinalReport, Message, MissionEnd, Observation, Report
 from protocol.motion import ORIGIN, REST
@@ -39,6 +39,7 @@ from tests.commands import (
     world,
 )
 from tests.storm import rage, stranger_at
+from tests.test_group_field import FAR
 
 RUN = "mine"
 TIMES = 3
@@ -303,6 +304,31 @@ def test_a_robot_refuses_frames_out_of_step_and_uses_a_repeated_report_once(tmp_
     assert (final_report.reports_heard, final_report.reports_unheard) == (4, 0)
     assert final_report.reports_refused == 6
     assert final_report.frames_refused == 6 + 7
+
+
+def test_a_robot_of_a_group_refuses_reports_of_itself_and_of_robots_outside_the_mission() -> None:
+    """It would store those of any number of senders. In a group, an agent receives the reports of all."""
+    scenario, endpoint, said = parse(FAR, "four"), free_endpoint(), Inbox("test")
+    with session.open_router(listening(endpoint)) as link:
+        session.answer(link, keys.config(RUN, "*"), lambda _: scenario.config("a"))
+        session.subscribe(link, keys.command(RUN, "a"), said, "command")
+        world_says = session.publisher(link, keys.observation(RUN, "a"))
+        senders = {robot: session.publisher(link, keys.report(RUN, robot, "a")) for robot in "abz"}
+        _token = session.show_alive(link, keys.world_alive(RUN))
+        with TandemProcess("agent", "a", "--connect", endpoint) as agent:
+            agent.until_prints("a: in run mine")
+            world_says.put(encode(Observation(0, "a", None, 2.5)))
+            assert answer(said, Command).tick == 0
+            for robot, publisher in senders.items():
+                publisher.put(encode(Report(0, robot, 1, "straight", None, 0, 0, (), 0, (), 0, 0)))
+            agent.until_prints("/robot/z/to/a: its sender is not in this mission")
+            world_says.put(encode(MissionEnd(0, "undecided", "for a test")))
+            final_report = answer(said, FinalReport)
+            world_says.put(encode(final_report))
+            ended = agent.ended()
+    assert ended.status == 1
+    assert "/robot/a/to/a: its sender is not in this mission" in ended.err
+    assert (final_report.reports_refused, final_report.reports_unheard) == (2, 1)
 
 
 def answer(said: Inbox, kind: type[Message]) -> Any:

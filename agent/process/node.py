@@ -68,7 +68,7 @@ class AgentProcess:
         within a tick and the tick, so that a scheduled kill can happen there.
         """
         config = memory.config
-        self._id = config.robot
+        self._id, self._others = config.robot, {*config.others}
         self._inbox = inbox
         self._timeout = timeout
         self._tick_s = config.tick_s
@@ -121,6 +121,8 @@ class AgentProcess:
                         isinstance(message, Observation) and self._on_observation(message, arrival.frame)
                     ):
                         self._give_up = time.monotonic() + self._world_timeout
+                case "report" if arrival.source.robot not in self._others:
+                    self._inbox.refuse(arrival, "its sender is not in this mission")
                 case "report":
                     self._report_buffer.take(arrival, self._latest_tick)
                 case "gone" | "alive":
