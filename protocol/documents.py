@@ -6,6 +6,7 @@ It is checked before they are parsed, because parsers recurse, or take quadratic
 from __future__ import annotations
 
 import re
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,22 +17,24 @@ from protocol import files
 Syntax = Literal["JSON", "JSON5", "TOML"]
 MOST_NESTED = 64
 """The maximum depth of nested values. Tandem's own documents, and those of Zenoh, have at most 10."""
-MOST_BYTES = 64 << 20
-"""The maximum size of a document. The largest, the manifest of a sweep of 10^5 cells, has some MB."""
+MOST_BYTES = 16 << 20
+"""The maximum size of a document. The largest, the files of a sweep of 10^4 cells, have some MB."""
 
 _STRING = rb'"[^"\\]*(?:\\.[^"\\]*)*"?'
-_TOKENS = {
-    "JSON": re.compile(_STRING + rb"|[][{}]", re.DOTALL),
-    "JSON5": re.compile(
-        _STRING + rb"|'[^'\\]*(?:\\.[^'\\]*)*'?|//[^\n\r]*|/\*.*?(?:\*/|\Z)|[][{}]", re.DOTALL
-    ),
-    "TOML": re.compile(
-        rb'"""(?:[^\\]|\\.)*?(?:"""|\Z)|' + rb"'''.*?(?:'''|\Z)|"
-        rb'"[^"\\\n]*(?:\\.[^"\\\n]*)*"?|' + rb"'[^'\n]*'?|#[^\n]*|[][{}.,\n]",
-        re.DOTALL,
-    ),
+_IGNORED = {
+    "JSON": re.compile(_STRING, re.DOTALL),
+    "JSON5": re.compile(_STRING + rb"|'[^'\\]*(?:\\.[^'\\]*)*'?|//[^\n\r]*|/\*.*?(?:\*/|\Z)", re.DOTALL),
 }
-"""Whole strings and comments, and the signs that begin or end a nested value, or a value of TOML."""
+"""Whole strings and comments. An unfinished one ends the text."""
+_TOML = re.compile(
+    rb'"""(?:[^\\]|\\.)*?(?:"""|\Z)|' + rb"'''.*?(?:'''|\Z)|"
+    rb'"[^"\\\n]*(?:\\.[^"\\\n]*)*"?|' + rb"'[^'\n]*'?|#[^\n]*|[][{}.,\n]",
+    re.DOTALL,
+)
+"""The same of TOML, and the signs that begin or end a nested value or a key."""
+_STEPS = bytes.maketrans(b"[{]}", b"\x01\x01\xff\xff")
+"""The change of the depth by each bracket, as a signed byte."""
+_NO_BRACKETS = bytes({*range(256)} - {*b"[]{}"})
 
 
 class TooNested(msgspec.DecodeError):
@@ -66,9 +69,19 @@ def check_nesting(text: bytes | str, syntax: Syntax) -> None:
     data = text.encode(errors="surrogatepass") if isinstance(text, str) else text
     if data.count(b"[") + data.count(b"{") + data.count(b".") <= MOST_NESTED:
         return
+    if syntax == "TOML":
+        _check_toml(data)
+        return
+    steps = _IGNORED[syntax].sub(b"", data).translate(_STEPS, delete=_NO_BRACKETS)
+    if max(accumulate(memoryview(steps).cast("b")), default=0) > MOST_NESTED:
+        raise TooNested
+
+
+def _check_toml(data: bytes) -> None:
+    """Raise TooNested like `check_nesting`."""
     opened: list[int] = []
     depth = dots = 0
-    for token in _TOKENS[syntax].finditer(data):
+    for token in _TOML.finditer(data):
         match token[0]:
             case b"[" | b"{":
                 opened.append(dots)

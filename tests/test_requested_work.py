@@ -36,6 +36,7 @@ from compose.view.web.site import Site
 from tests.browser import watching
 from tests.commands import ENDLESS, PAPER_1, Ended, processes_of, until
 from tests.commands import tandem as command
+from tests.series import series
 
 CLASSES = """
 from pathlib import Path
@@ -97,7 +98,7 @@ def mark(stranger: Path) -> Iterator[Path]:
     (stranger / "imported").unlink(missing_ok=True)
 
 
-@pytest.mark.parametrize("name", ["planner", "model"])
+@pytest.mark.parametrize("name", series(["planner", "model"]))
 def test_no_reader_of_a_recording_or_of_results_imports_what_they_name(
     name: str, stranger: Path, mark: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -139,7 +140,7 @@ def test_a_file_of_settings_in_the_working_directory_changes_no_figure(tmp_path:
     subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True, timeout=60)
 
 
-@pytest.mark.parametrize("name", ["planner", "model"])
+@pytest.mark.parametrize("name", series(["planner", "model"]))
 def test_the_page_imports_what_a_folder_names_only_if_a_flag_does(
     name: str, stranger: Path, mark: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

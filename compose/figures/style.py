@@ -87,11 +87,18 @@ def look(medium: Medium) -> Iterator[None]:
     file can start LaTeX. The fixed hash salt makes equal figures equal byte for byte. Fonts are embedded as
     TrueType (42), because publishers reject Type 3, matplotlib's default.
     """
-    settings = {"svg.hashsalt": "tandem", "pdf.fonttype": 42, "ps.fonttype": 42, "text.parse_math": True}
     with mpl.rc_context():
         mpl.rcdefaults()
-        mpl.rcParams.update({**settings, **medium.settings})
-        yield
+        with mpl.rc_context(
+            {
+                "svg.hashsalt": "tandem",
+                "pdf.fonttype": 42,
+                "ps.fonttype": 42,
+                "text.parse_math": True,
+                **medium.settings,
+            }
+        ):
+            yield
 
 
 def save(

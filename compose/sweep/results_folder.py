@@ -154,7 +154,7 @@ def _refused_before(path: Path, sweep: Sweep) -> dict[int, str]:
     Raises UserError if the folder belongs to another sweep.
     """
     try:
-        manifest = documents.json_file(path / SWEEP, Manifest)
+        manifest: Manifest = documents.json_file(path / SWEEP, Manifest)
     except FileNotFoundError:
         if (path / TRIALS).exists() or (path / PARTS).exists():
             raise UserError(f"--out: {path} contains rows of an unknown sweep") from None
