@@ -2,15 +2,31 @@
 
 from __future__ import annotations
 
+import os
 import sys
+from typing import TextIO
 
 
 def say(*lines: str, error: bool = False) -> None:
-    """Print each of `lines` as one line on standard output or error; escape what its encoding lacks."""
+    """Print each of `lines` as one line on standard output or error; escape what its encoding lacks.
+
+    Raises OSError if standard output cannot be written. A line that standard error does not take is lost: it
+    must not end a mission.
+    """
     stream = sys.stderr if error else sys.stdout
     encoding = getattr(stream, "encoding", None) or "utf-8"
     text = "\n".join(map(one_line, lines))
-    print(text.encode(encoding, "backslashreplace").decode(encoding), file=stream, flush=True)
+    try:
+        print(text.encode(encoding, "backslashreplace").decode(encoding), file=stream, flush=True)
+    except OSError:
+        if not error:
+            raise
+        discard(stream)
+
+
+def discard(stream: TextIO) -> None:
+    """Redirect `stream` to /dev/null, so that the interpreter does not fail to flush it at its end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def one_line(text: str) -> str:

@@ -309,6 +309,15 @@ def test_a_mistake_has_its_exit_status_where_it_cannot_be_printed(tmp_path: Path
         assert audit.ended().status == 2
 
 
+@pytest.mark.long
+def test_a_message_that_cannot_be_printed_does_not_end_a_mission() -> None:
+    with (
+        Path("/dev/full").open("wb") as full,
+        TandemProcess("run", "paper-1", "-q", "--kill", "a@17", errors=full.fileno()) as run,
+    ):
+        assert run.ended() == (0, "localised after 48 ticks\n", "")
+
+
 def test_a_world_with_a_closed_output_does_not_blame_its_journal(tmp_path: Path) -> None:
     options = ("--listen", free_endpoint(), "--out", tmp_path / "out")
     with (

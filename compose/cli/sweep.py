@@ -97,9 +97,10 @@ def main(options: argparse.Namespace) -> int:
         if len(results.table) == results.trials:
             report.show(results, out, quiet=True)
         return STOPPED if results.interrupted else FAILED
-    report.show(results, out, quiet=options.quiet)
-    sys.stdout.flush()
-    axis_figures.draw(results, out / "figures")
+    try:
+        axis_figures.draw(results, out / "figures")
+    finally:
+        report.show(results, out, quiet=options.quiet)
     return status_of(results)
 
 

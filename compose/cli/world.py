@@ -24,7 +24,7 @@ from compose.recording.run import read
 from compose.scenario import kills
 from compose.scenario.run_settings import check_rate, run_name
 from compose.scenario.scenario_file import setting
-from compose.terminal.outcome import break_off, conclude, reopened, shown_live
+from compose.terminal.outcome import break_off, concluded, reopened, shown_live
 from protocol import limits
 from protocol.journal.journal_file import Journal
 from protocol.network.inbox import Inbox, Interrupted
@@ -111,4 +111,5 @@ def _run(
         raise
     if options.launched:  # the launcher prints the outcome
         return ENDED
-    return conclude(options, read(folder), folder, "processes", began)
+    with concluded(options, read(folder), folder, "processes", began) as status:
+        return status
