@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
-from typing import TextIO
+from contextlib import suppress
+from typing import NoReturn, TextIO
 
 
 def say(*lines: str, error: bool = False) -> None:
@@ -27,6 +28,19 @@ def say(*lines: str, error: bool = False) -> None:
 def discard(stream: TextIO) -> None:
     """Redirect `stream` to /dev/null, so that the interpreter does not fail to flush it at its end."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def leave(status: int) -> NoReturn:
+    """End the process with this exit status, without the shutdown of the interpreter.
+
+    The shutdown would hang if a Zenoh session did not close. It would abort the process if one of Zenoh's
+    threads is in a callback, which is possible for a moment after a session has closed. After a signal, it
+    would wait for the threads and servers of a library.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError):  # the reader may be gone
+            stream.flush()
+    os._exit(status)
 
 
 def one_line(text: str) -> str:

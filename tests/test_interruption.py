@@ -77,13 +77,15 @@ def test_ctrl_c_while_tandem_starts_ends_it_without_output(module: str) -> None:
     "start",
     series(
         [
+            ("sweep any-start --out OUT", "distributed"),
             ("figures RECORDING", "matplotlib"),
             ("audit RECORDING", "numpy"),
             ("replay RECORDING", "numpy"),
             ("export RECORDING --html --out OUT", "compose.view.web.standalone"),
             ("export RECORDING --out OUT", "foxglove"),
-            ("sweep noise --out OUT", "compose.cli.sweep"),
             ("watch RECORDING", "uvicorn"),
+            ("check-planner assured", "compose.audit.rules"),
+            ("world paper-1 --listen tcp/127.0.0.1:7447 --out OUT", "zenoh"),
             ("bench", "cryptography"),
             ("doctor", "compose.doctor.machine_checks"),
             ("run paper-1 --in-process --out OUT", "numpy"),

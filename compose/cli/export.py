@@ -72,13 +72,7 @@ def main(options: argparse.Namespace) -> int:
     if options.rerun:
         return _rerun(options.recording, out)
     need(*MODULES)
-    inbox = Inbox("tandem export")
-    stop_by_signal(inbox)
-    try:
-        done = exported(options.recording, out, inbox)
-    except Interrupted as signal_name:
-        inbox.say(f"stopped by {signal_name}")
-        return STOPPED
+    done = exported(options.recording, out)
     for path in done.files:
         say(str(path))
     for name, size in done.torn.items():

@@ -20,7 +20,7 @@ from compose.errors import BROKEN_PIPE, BUG, FAILED, STOPPED, USER_ERROR, UserEr
 from compose.launch.interruption import INTERRUPTION
 from protocol import limits
 from protocol.files import error_text
-from protocol.output import discard, one_line, say
+from protocol.output import discard, leave, one_line, say
 from protocol.spelling import did_you_mean
 
 DESCRIPTION = "Cooperative range-only localisation of mobile robots."
@@ -126,9 +126,8 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     forked = sys.modules.get("compose.launch.forked")
     if forked is not None:
         forked.close()
-    session = sys.modules.get("protocol.network.session")
-    if session is not None:
-        session.leave(status)
+    if status == STOPPED or "protocol.network.session" in sys.modules:
+        leave(status)
     sys.exit(status)
 
 

@@ -18,6 +18,7 @@ from compose.hardware.driver_recording import recorded
 from compose.launch.driver_loader import config_of, driver_class, made, mission, options_of
 from compose.launch.planner_loader import is_shipped
 from compose.launch.processes import free_endpoint
+from compose.launch.signals import stop_by_signal
 from compose.launch.supervisor import STOP_S, ChildFailed, Supervisor
 from compose.network import reach
 from compose.recording.recording_files import folder_for
@@ -126,6 +127,7 @@ def _run(
         ]
         children.start(agent, *arguments)
         try:
+            stop_by_signal(inbox)
             field.attach(link)
             if not options.quiet:
                 whom = "the others" if isinstance(config, RobotConfigInGroup) else "its peer"

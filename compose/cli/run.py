@@ -152,7 +152,6 @@ def _in_process(options: argparse.Namespace, scenario: Scenario, kills: tuple[Ki
 def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[Kill, ...]) -> int:
     check_rate(scenario, options.rate)
     inbox = Inbox("tandem run")
-    stop_by_signal(inbox)
     with (
         folder_for(options.out) as folder,
         _keys(options, scenario) as keys,
@@ -171,11 +170,15 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
                     kills=kills,
                     keys=keys,
                     agents_journal=bool(options.out is not None or kills or viewers or shows_live(options)),
+                    on_start=lambda: stop_by_signal(inbox),
                 )
         except supervisor.ChildFailed as failure:
             break_off(options, folder, str(failure), began)
             inbox.say(f"failed: {failure}")
             return FAILED
+        except KeyboardInterrupt:
+            break_off(options, folder, f"stopped by {INTERRUPTION.signal_name}", began)
+            raise
         except Interrupted as signal_name:
             break_off(options, folder, f"stopped by {signal_name}", began)
             inbox.say(f"stopped by {signal_name}")
@@ -247,7 +250,7 @@ def _export(options: argparse.Namespace, folder: Path, inbox: Inbox, run: Run | 
             inbox.say(f"not exported: {error}")
         return False
     try:
-        export_bar.exported(folder, folder, inbox, run=run, quiet=options.quiet)
+        export_bar.exported(folder, folder, lambda: inbox.next(0.0), run=run, quiet=options.quiet)
     except UserError as error:
         inbox.say(f"not exported: {error}")
         return False

@@ -19,6 +19,7 @@ from compose.cli.participant import (
 )
 from compose.errors import ENDED, UserError
 from compose.launch.processes import scenario_from_launcher
+from compose.launch.signals import stop_by_signal
 from compose.recording.recording_files import WORLD_JOURNAL, folder_for
 from compose.recording.run import read
 from compose.scenario import kills
@@ -95,6 +96,7 @@ def _run(
         timeout=options.timeout,
         on_kill_point=kills.taker(options.kill),
     )
+    stop_by_signal(inbox)
     links.attach(process)
     if not (options.quiet or options.launched):
         robots = ", ".join(robot.id for robot in scenario.robots)
