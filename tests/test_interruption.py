@@ -85,7 +85,7 @@ def test_ctrl_c_while_tandem_starts_ends_it_without_output(module: str) -> None:
             ("export RECORDING --out OUT", "foxglove"),
             ("watch RECORDING", "uvicorn"),
             ("check-planner assured", "compose.audit.rules"),
-            ("world paper-1 --listen tcp/127.0.0.1:7447 --out OUT", "zenoh"),
+            ("run paper-1 --secure --out OUT", "cryptography"),
             ("bench", "cryptography"),
             ("doctor", "compose.doctor.machine_checks"),
             ("run paper-1 --in-process --out OUT", "numpy"),

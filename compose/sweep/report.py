@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
@@ -87,6 +88,7 @@ def progress(name: str, say: Callable[[str], None], visible: bool) -> Iterator[P
         bars.MofNCompleteColumn(),
         _Rate(Column(no_wrap=True)),
         _Times(Column(no_wrap=True)),
+        console=tables.display_console(sys.stdout),
         disable=not visible,
         transient=True,
         expand=True,

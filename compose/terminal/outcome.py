@@ -43,10 +43,11 @@ def counting(what: str, steps: int) -> Iterator[Callable[[], None]]:
     if not steps or not sys.stderr.isatty():
         yield lambda: None
         return
-    from rich.console import Console  # noqa: PLC0415  # as above
-    from rich.progress import Progress, TimeElapsedColumn  # noqa: PLC0415
+    from rich.progress import Progress, TimeElapsedColumn  # noqa: PLC0415  # as above
 
-    console = Console(stderr=True, soft_wrap=True)  # other output is not wrapped
+    from compose.terminal import tables  # noqa: PLC0415
+
+    console = tables.display_console(sys.stderr, soft_wrap=True)  # other output is not wrapped
     with Progress(
         *Progress.get_default_columns(),
         TimeElapsedColumn(),
