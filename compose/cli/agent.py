@@ -24,6 +24,7 @@ from compose.recording.recording_files import agent_journal
 from compose.recording.run import ended
 from compose.scenario import kills
 from compose.terminal.outcome import reopened
+from compose.terminal.text_width import tell
 from protocol.journal.journal_file import CorruptJournal, Journal
 from protocol.journal.resume import Retrace
 from protocol.messages import MissionEnd, RobotConfig
@@ -57,7 +58,7 @@ def main(options: argparse.Namespace) -> int:
             raise UserError(str(error)) from None
         if options.launched:
             return ENDED
-        say(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
+        tell(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
         return status_of(end.outcome)
 
     return participate(f"tandem agent {options.id}", take_part, (NoWorld,), launched=options.launched)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from compose.cli.arguments import add_closing, add_part_of_recording, folder, names
 from compose.errors import ENDED, CannotWrite, UserError
+from compose.terminal.text_width import tell
 from protocol import files
 from protocol.output import say
 
@@ -66,7 +67,7 @@ def main(options: argparse.Namespace) -> int:
             files.write(options.out, text)
         except OSError as error:
             raise CannotWrite(f"--out: {options.out}", error) from None
-    say(*_lines(found))
+    tell(*_lines(found))
     say(*(["", *text.splitlines()] if options.out is None else [str(options.out)]))
     return ENDED
 

@@ -14,6 +14,7 @@ from compose.extras import need
 from compose.launch.signals import until_signal
 from compose.recording.recording_files import make_folder
 from compose.terminal.outcome import counting
+from compose.terminal.text_width import tell
 from protocol.output import discard, say
 
 if TYPE_CHECKING:
@@ -107,7 +108,7 @@ def main(options: argparse.Namespace) -> int:
         written = _written(options.out, problem, estimate)
         say(*map(str, written), error=options.follow)
     if not options.follow:
-        say(*_lines(estimate.summary))
+        tell(*_lines(estimate.summary))
     if stopped is not None:
         return stopped
     localised = all(one.first_claim is not None for one in estimate.summary.robots.values())

@@ -26,10 +26,10 @@ from compose.scenario import kills
 from compose.scenario.run_settings import check_rate, run_name
 from compose.scenario.scenario_file import setting
 from compose.terminal.outcome import break_off, concluded, reopened, shown_live
+from compose.terminal.text_width import tell
 from protocol import limits
 from protocol.journal.journal_file import Journal
 from protocol.network.inbox import Inbox, Interrupted
-from protocol.output import say
 from world.process import NoRouter, WorldLinks, WorldProcess
 from world.scenario import Scenario
 from world.simulation import Simulation, resumed
@@ -102,7 +102,7 @@ def _run(
         robots = ", ".join(robot.id for robot in scenario.robots)
         where = f", resumed at tick {simulation.tick}" if simulation.tick else ""
         at = " and ".join(links.endpoints.listen) or links.endpoints
-        say(f"run {run} at {at}{where}: waiting for {robots}")
+        tell(f"run {run} at {at}{where}: waiting for {robots}")
     try:
         with shown_live(options, scenario, folder):
             links.run(process)

@@ -11,7 +11,8 @@ from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table
 
-from compose.terminal.text_width import UNLIMITED, room
+from compose.terminal.text_width import room
+from protocol.output import UNLIMITED
 
 BEGIN, END = "\x1b[?2026h", "\x1b[?2026l"
 """The marks of synchronised output (DEC mode 2026): a terminal shows what is between them at once."""
