@@ -231,12 +231,12 @@ def _words(arguments: Sequence[str | Path]) -> list[str]:
     return words
 
 
-def on_a_terminal(*arguments: str | Path) -> tuple[int, str]:
-    """Run the command on a terminal of 80 columns, and return its exit status and all of its output there."""
+def on_a_terminal(*arguments: str | Path, columns: int = 80, cwd: Path | None = None) -> tuple[int, str]:
+    """Run the command on a terminal, and return its exit status and all of its output there."""
     ours, theirs = pty.openpty()
-    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))  # the last two are pixels
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))  # the last two are pixels
     shown = b""
-    with TandemProcess(*arguments, terminal=theirs, errors=theirs) as command:
+    with TandemProcess(*arguments, cwd=cwd, terminal=theirs, errors=theirs) as command:
         os.close(theirs)
         while True:
             try:

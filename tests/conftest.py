@@ -3,6 +3,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -24,6 +25,11 @@ LONG_TIMEOUT_S = 600.0
 
 Some compute for half a minute on a core of their own, and the workers share the cores, also with other work.
 """
+
+
+# Tests may be started by `uv run` or not; the commands that Tandem prints depend on it.
+os.environ.pop("UV_RUN_RECURSION_DEPTH", None)
+os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -11,6 +11,7 @@ import sys
 from protocol.network import keys, session
 from protocol.network.endpoints import Endpoints
 from protocol.network.inbox import NOTHING, Inbox
+from protocol.output import leave
 
 RUN = "mesh"
 
@@ -33,4 +34,4 @@ if __name__ == "__main__":
         assert token is not None  # a token that is not kept is withdrawn
         print("linked", flush=True)
         sys.stdin.read()
-    session.leave(0)
+    leave(0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import resource
+import shutil
 import signal
 import socket
 import subprocess
@@ -22,7 +23,9 @@ from compose.recording.run import read
 from compose.scenario.scenario_file import load
 from compose.view.export import folder as export
 from protocol import files
-from tests.commands import PAPER_1, Ended, TandemProcess, processes_of
+from tests.commands import PAPER_1, Ended, TandemProcess, processes_of, tandem
+from tests.series import series
+from tests.test_house import HOUSE
 
 
 def fifo(path: Path) -> None:
@@ -184,6 +187,48 @@ def test_the_outcome_is_printed_where_a_full_disk_takes_no_summary(how: list[str
     assert ended.stderr == "tandem run: full cannot be written: File too large\n"
     assert ended.returncode == 3
     assert not (tmp_path / "full" / "ticks.csv").exists()
+
+
+WRITING = (
+    "run paper-1 --in-process --out OUT --no-export",
+    "run paper-1 --out OUT --export",
+    "run paper-1 paper-2 --in-process --out OUT",
+    "sweep ../few.toml --out OUT --workers 1",
+    "figures RECORDING --format svg",
+    "export RECORDING --out OUT",
+    "export RECORDING --pyfg --out OUT",
+    "estimate tests/data/uwb/tiers-a-b-30-s.pyfg --noise uwb-calibrated --out OUT",
+    "calibrate tests/data/uwb/tiers-a-b-30-s.pyfg --out out.toml",
+    "keys OUT --robots a,b",
+    "init OUT",
+    "containers group-8 out.yaml",
+)
+"""Commands that write files and print."""
+
+
+@pytest.mark.parametrize("command", series(WRITING))
+def test_what_a_command_writes_is_complete_where_the_reader_of_its_output_has_gone(
+    command: str, recording: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "few.toml").write_text('name = "few"\nscenario = "random"\ntrials = 4\n')
+    files_of = {}
+    for reader in ("gone", "there"):
+        folder = tmp_path / reader
+        folder.mkdir()
+        shutil.copytree(recording, folder / "recording")
+        (folder / "tests").symlink_to(HOUSE / "tests")
+        words = command.replace("OUT", "out").replace("RECORDING", "recording").split()
+        if reader == "there":
+            assert tandem(*words, cwd=folder).status in (0, 1)
+        else:
+            end, output = os.pipe()
+            os.close(end)
+            with TandemProcess(*words, terminal=output, cwd=folder) as run:
+                os.close(output)
+                ended = run.ended()
+            assert (ended.status, ended.err) == (141, "")
+        files_of[reader] = {path.relative_to(folder): path for path in folder.rglob("*") if path.is_file()}
+    assert files_of["gone"].keys() == files_of["there"].keys()
 
 
 def test_what_is_written_replaces_a_link_and_leaves_what_it_led_to(recording: Path, tmp_path: Path) -> None:

@@ -7,12 +7,13 @@ import json
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from mcap.writer import Writer
 
-from compose.errors import STOPPED, USER_ERROR
+from compose.errors import BROKEN_PIPE, STOPPED, USER_ERROR
 from compose.recording.estimating import estimate_stream
 from compose.recording.estimating.estimate_epoch import ClaimRule
 from compose.recording.estimating.estimate_files import COLUMNS, estimate_csv
@@ -153,17 +154,29 @@ def test_estimates_are_printed_while_the_stream_is_open(messages: Messages, tmp_
 
 
 @pytest.mark.long
-def test_ctrl_c_ends_a_stream_and_the_files_are_written(messages: Messages, tmp_path: Path) -> None:
+@pytest.mark.parametrize("how", [STOPPED, BROKEN_PIPE])
+def test_a_stream_is_ended_by_ctrl_c_and_by_the_end_of_its_reader_and_the_files_are_written(
+    how: int, messages: Messages, tmp_path: Path
+) -> None:
     with following(tmp_path) as process:
         assert process.stdin is not None
         assert process.stdout is not None
-        process.stdin.write(written([one for one in messages if one[0] <= 9.0], whole=False))
+        first = written([one for one in messages if one[0] <= 9.0], whole=False)
+        process.stdin.write(first)
         process.stdin.flush()
         for _ in range(3):
             process.stdout.readline()
-        process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=BOUND_S)
-    assert process.returncode == STOPPED, errors
+        if how == STOPPED:
+            process.send_signal(signal.SIGINT)
+        else:
+            process.stdout.close()
+            with suppress(BrokenPipeError):  # it may have ended already
+                process.stdin.write(written(messages)[len(first) :])
+                process.stdin.close()
+        assert process.wait(BOUND_S) == how
+        assert process.stderr is not None
+        errors = process.stderr.read().decode()
+    assert "Traceback" not in errors, errors
     assert (tmp_path / "found" / "estimate.json").exists()
 
 

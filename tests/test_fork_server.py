@@ -274,9 +274,10 @@ def never_end() -> None:
 def test_a_process_whose_fork_server_still_imports_can_be_stopped_at_once(number: signal.Signals) -> None:
     server = ForkServer("tests.test_fork_server:never_end")
     try:
-        first, second = (server.start("os:abort", name) for name in ("first", "second"))
+        first, second = (server.start("os:abort", name, answers=True) for name in ("first", "second"))
         first.signal(number)
         assert not first.running
+        assert first.receive(BOUND_S) == b""
         assert first.end() == -number
         assert second.running
         assert not server.gone

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from compose.cli import init
+from compose.terminal.invocation import program
 from tests.commands import tandem
 from tests.test_documentation import ROOT, blocks
 
@@ -22,20 +24,41 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.long
-def test_every_printed_command_succeeds(folder: Path) -> None:
-    shown = tandem("init", "others", cwd=folder).out.partition("to go on:")[2]
-    for line in shown.strip().splitlines():
-        words = shlex.split(line)
-        cwd = folder
-        if words[0] == "cd":
-            cwd, words = folder / words[1], words[3:]
-        if words[0] == "python":
-            ran = subprocess.run(
-                [sys.executable, *words[1:]], cwd=cwd, capture_output=True, text=True, check=True
-            )
-            assert ran.stdout.startswith("localised after")
-        else:
-            assert tandem(*words[1:], cwd=cwd).status == 0, line
+@pytest.mark.parametrize("by_uv", [True, False], ids=["uv run", "on the PATH"])
+def test_every_printed_command_succeeds_in_a_shell(
+    by_uv: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if by_uv:
+        uv = shutil.which("uv")
+        if uv is None:
+            pytest.skip("there is no uv")
+        (tmp_path / "bin").mkdir()
+        (tmp_path / "bin" / "uv").symlink_to(uv)
+        monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:/usr/bin:/bin")
+        monkeypatch.setenv("UV_RUN_RECURSION_DEPTH", "1")
+        monkeypatch.setenv("UV_NO_SYNC", "1")
+    shown = tandem("init", "my files", cwd=tmp_path).out.partition("to go on:")[2]
+    lines = shown.strip().splitlines()
+    assert len(lines) == 5
+    for line in lines:
+        ran = subprocess.run(
+            ["bash", "-c", line], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300
+        )
+        assert ran.returncode == 0, (line, ran)
+
+
+def test_a_command_that_uv_started_prints_commands_for_uv(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("UV_RUN_RECURSION_DEPTH", "1")
+    project = Path(sys.prefix).parent
+    monkeypatch.chdir(tmp_path)
+    assert program("tandem") == f"uv run --project {shlex.quote(str(project))} tandem"
+    assert program("python", project / "mine") == "uv run python"
+    monkeypatch.delenv("UV_RUN_RECURSION_DEPTH")
+    assert program("tandem") == "tandem"
+    monkeypatch.setenv("PATH", "/usr/bin:/bin")
+    assert program("tandem") == f"{shlex.quote(sys.executable)} -m tandem"
 
 
 def test_no_file_is_replaced(folder: Path) -> None:

@@ -309,6 +309,15 @@ def test_a_mistake_has_its_exit_status_where_it_cannot_be_printed(tmp_path: Path
         assert audit.ended().status == 2
 
 
+@pytest.mark.long
+def test_a_message_that_cannot_be_printed_does_not_end_a_mission() -> None:
+    with (
+        Path("/dev/full").open("wb") as full,
+        TandemProcess("run", "paper-1", "-q", "--kill", "a@17", errors=full.fileno()) as run,
+    ):
+        assert run.ended() == (0, "localised after 48 ticks\n", "")
+
+
 def test_a_world_with_a_closed_output_does_not_blame_its_journal(tmp_path: Path) -> None:
     options = ("--listen", free_endpoint(), "--out", tmp_path / "out")
     with (
@@ -326,6 +335,13 @@ def test_a_terminal_shows_a_map_and_each_robots_phase_and_state_while_it_runs() 
     for words in ("phase", "orbiting", "tick ", "hypothes", "anchor +", "localised after"):
         assert words in shown, shown
     assert re.search("[\u2801-\u28ff]", shown)
+    *frames, _ = shown.split("\x1b[?2026l")
+    drawn = [frame for frame in frames if "anchor +" in frame]
+    assert drawn
+    for frame in drawn:  # each is shown at once, from its title to its legend
+        before, mark, inside = frame.partition("\x1b[?2026h")
+        assert (before, mark) == ("", "\x1b[?2026h")
+        assert inside.index("tick ") < inside.index("phase") < inside.index("anchor +")
 
 
 def test_of_many_robots_a_terminal_shows_numbers_instead_of_a_map(tmp_path: Path) -> None:

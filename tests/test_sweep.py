@@ -35,7 +35,7 @@ from compose.sweep.table import schema_of
 from compose.sweep.worker import PLAY
 from protocol.network.inbox import Inbox
 from protocol.noise import Noise, VelocityNoise
-from tests.commands import PAPER_1, Ended, TandemProcess, tandem, temporary_in, until
+from tests.commands import PAPER_1, Ended, TandemProcess, on_a_terminal, tandem, temporary_in, until
 from tests.series import series
 from world.world_noise import WorldNoise
 
@@ -482,6 +482,33 @@ def test_the_printed_command_of_a_trial_runs_it_again(folder: Path) -> None:
         for name in ("branch", "alpha", "position_error_m", "heading_error_rad"):
             assert row[f"{robot}_{name}"] == said[name]
     assert row["bytes_sent"] == sum(robot["bytes_sent"] for robot in summary["robots"].values())
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("columns", [80, 40])
+def test_a_narrow_terminal_shows_all_outcomes_and_breaks_no_word_and_no_command(
+    columns: int, folder: Path
+) -> None:
+    axes = '[[axis]]\nfield = "max_ticks"\nvalues = [9, 500]\n[[axis]]\nfield = "planner.name"\n'
+    (folder / "narrow.toml").write_text(
+        f'name = "narrow"\nscenario = "random"\ntrials = 2\n{axes}values = ["assured"]\n'
+    )
+    status, shown = on_a_terminal("sweep", "narrow.toml", columns=columns, cwd=folder)
+    assert status == 1
+    lines = re.split("\x1b\\[[?0-9;]*[a-zA-Z]|\r?\n|\r", shown)
+    (command,) = [line for line in lines if line.startswith("  tandem run ")]
+    assert re.fullmatch(
+        r"  tandem run sweep-narrow/cells/000.toml --seed \d+ --out recording-narrow-0-\d", command
+    )
+    assert max(len(line) for line in lines if line != command) <= columns
+    if columns == 80:
+        heading = next(line for line in lines if line.startswith(" cell"))
+        for outcome in report.OUTCOMES:
+            assert outcome in heading
+    else:
+        assert "cell 0, max_ticks 9, name assured: 2 trials, 2 undecided" in " ".join(lines).replace(
+            "   ", " "
+        )
 
 
 @pytest.mark.long

@@ -21,16 +21,17 @@ from compose.cli.participant import (
 from compose.errors import ENDED, UserError, status_of
 from compose.launch import planner_loader
 from compose.launch.class_loader import trust
+from compose.launch.signals import stop_by_signal
 from compose.recording.recording_files import agent_journal
 from compose.recording.run import ended
 from compose.scenario import kills
 from compose.terminal.outcome import reopened
+from compose.terminal.text_width import tell
 from protocol.journal.journal_file import CorruptJournal, Journal
 from protocol.journal.resume import Retrace
 from protocol.messages import MissionEnd, RobotConfig
-from protocol.network import session
 from protocol.network.inbox import Inbox
-from protocol.output import say
+from protocol.output import leave, say
 
 MISSING = "--connect ENDPOINT is required, such as tcp/127.0.0.1:7447"
 ENDED_SEARCH_S = 3.0
@@ -59,7 +60,7 @@ def main(options: argparse.Namespace) -> int:
             raise UserError(str(error)) from None
         if options.launched:
             return ENDED
-        say(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
+        tell(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
         return status_of(end.outcome)
 
     return participate(f"tandem agent {options.id}", take_part, (NoWorld,), launched=options.launched)
@@ -106,12 +107,13 @@ def _run(options: argparse.Namespace, inbox: Inbox) -> MissionEnd:
             where = f", resumed at tick {observation.tick}" if observation is not None else ""
             say(f"{options.id}: in run {run}, with {config.peer}{where}")
 
-    def leave() -> None:
+    def leave_at_once() -> None:
         # The world has received everything. A launched process ends here, because closing the links of
         # many robots that end at the same time takes a while.
         if options.launched:
-            session.leave(ENDED)
+            leave(ENDED)
 
+    stop_by_signal(inbox)
     return run_agent(
         options.id,
         options.run,
@@ -120,7 +122,7 @@ def _run(options: argparse.Namespace, inbox: Inbox) -> MissionEnd:
         start=start,
         on_first_link=lambda: warn_beyond(endpoints, inbox),
         on_joined=announce,
-        on_end=leave,
+        on_end=leave_at_once,
         end=end,
     )
 

@@ -14,6 +14,7 @@ from compose.errors import CLEAN, VIOLATED
 from compose.launch.class_loader import trust
 from compose.recording.recording_files import user_errors
 from compose.terminal import text_width
+from compose.terminal.text_width import tell
 from protocol.output import say
 
 SHOWN = 20
@@ -38,7 +39,7 @@ def main(options: argparse.Namespace) -> int:
 
 
 def _show(findings: Findings) -> None:
-    say(f"{findings.scenario}: {_count(len(findings.violations))} over {findings.ticks} ticks", "")
+    tell(f"{findings.scenario}: {_count(len(findings.violations))} over {findings.ticks} ticks", "")
     say(f"{'rule':10}{'checks':>8}{'violations':>12}")
     for one in findings.counts:
         say(f"{one.rule:10}{one.checks:>8}{one.violations:>12}")
@@ -49,13 +50,13 @@ def _show(findings: Findings) -> None:
         made = tables.table(["link"], LinkStatistics.__struct_fields__[1:], rows)
         say("", *tables.lines(made, text_width.room()))
     if findings.rounding:
-        say("", f"{len(findings.rounding)} checks differ by rounding alone: {findings.versions}")
+        tell("", f"{len(findings.rounding)} checks differ by rounding alone: {findings.versions}")
     elif findings.violations and findings.versions is not None:
-        say("", f"{findings.versions}: that alone can lead to other decisions")
+        tell("", f"{findings.versions}: that alone can lead to other decisions")
     if findings.violations:
         say("")
     for violation in findings.violations[:SHOWN]:
-        say(violation.line)
+        tell(violation.line)
     if len(findings.violations) > SHOWN:
         say(f"and {len(findings.violations) - SHOWN} more")
 

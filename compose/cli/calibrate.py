@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from compose.cli.arguments import add_closing, add_part_of_recording, folder, names
 from compose.errors import ENDED, CannotWrite, UserError
+from compose.terminal.text_width import tell
 from protocol import files
 from protocol.output import say
 
@@ -62,16 +62,13 @@ def main(options: argparse.Namespace) -> int:
     anchors = frozenset([one.id for one in recording.anchors])
     source = f"{found.source} of {recording.source}"
     text = profile_toml(noise_table(found, anchors), correction_of(found), source)
-    say(*_lines(found))
-    if options.out is None:
-        say("", *text.splitlines())
-        return ENDED
-    path: Path = options.out
-    try:
-        files.write(path, text)
-    except OSError as error:
-        raise CannotWrite(f"--out: {path}", error) from None
-    say(str(path))
+    if options.out is not None:
+        try:
+            files.write(options.out, text)
+        except OSError as error:
+            raise CannotWrite(f"--out: {options.out}", error) from None
+    tell(*_lines(found))
+    say(*(["", *text.splitlines()] if options.out is None else [str(options.out)]))
     return ENDED
 
 

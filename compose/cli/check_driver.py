@@ -12,6 +12,7 @@ from compose.hardware.exercise import Broken, ExerciseRun
 from compose.launch.driver_loader import config_of, driver_class, made, mission, options_of
 from compose.scenario.run_settings import check_rate
 from compose.terminal import text_width
+from compose.terminal.text_width import tell
 from protocol.output import one_line, say
 
 MARKED = len("wrong  ")
@@ -50,7 +51,7 @@ def main(options: argparse.Namespace) -> int:
             trial.go_through()
         except Broken as broken:
             where = trial.tries[-1].what if trial.tries else "the start"
-            say(f"wrong  the exercise can be completed: after '{where}': {broken}")
+            tell(f"wrong  the exercise can be completed: after '{where}': {broken}")
             return VIOLATED
     found = check_results(trial)
     for one in found:

@@ -5,12 +5,10 @@ from __future__ import annotations
 import argparse
 
 from compose.cli.arguments import SEED_HELP, add_closing, natural, planner_option
-from compose.errors import CLEAN, STOPPED, VIOLATED
+from compose.errors import CLEAN, VIOLATED
 from compose.launch import supervisor
-from compose.launch.signals import stop_by_signal
 from compose.scenario.scenario_file import setting
 from compose.terminal import text_width
-from protocol.network.inbox import Interrupted
 from protocol.output import one_line, say
 
 MARKED = len("wrong  ")
@@ -53,15 +51,9 @@ def main(options: argparse.Namespace) -> int:
     scenario = setting(options.mission, options.fault, options.planner, options.planner_option).seeded(
         options.seed
     )
-    inbox = QuietInbox("tandem check-planner")
-    stop_by_signal(inbox)
     failed = False
-    try:
-        for one in check_planner(scenario, inbox):
-            line = f"wrong  {one.what}: {one.wrong}" if one.wrong else f"ok     {one.what}"
-            say(*text_width.wrapped(one_line(line), MARKED))
-            failed |= one.wrong is not None
-    except Interrupted as signal_name:
-        say(f"tandem check-planner: stopped by {signal_name}", error=True)
-        return STOPPED
+    for one in check_planner(scenario, QuietInbox("tandem check-planner")):
+        line = f"wrong  {one.what}: {one.wrong}" if one.wrong else f"ok     {one.what}"
+        say(*text_width.wrapped(one_line(line), MARKED))
+        failed |= one.wrong is not None
     return VIOLATED if failed else CLEAN

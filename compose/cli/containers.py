@@ -12,6 +12,7 @@ from compose.errors import ENDED, CannotWrite, UserError
 from compose.hardware.compose_file import compose_file
 from compose.launch.planner_loader import is_shipped
 from compose.scenario.scenario_file import setting
+from compose.terminal.text_width import tell
 from protocol import files
 from protocol.output import say
 from world.scenario import Scenario
@@ -41,7 +42,7 @@ def main(options: argparse.Namespace) -> int:
     except OSError as error:
         raise CannotWrite(place, error) from None
     robots = ", ".join([robot.id for robot in scenario.robots])
-    say(f"{place}: a world, the agents of {robots}, and a page", "to go on:")
+    tell(f"{place}: a world, the agents of {robots}, and a page", "to go on:")
     say(f"  docker compose -f {shlex.quote(str(place))} up --build")
     return ENDED
 

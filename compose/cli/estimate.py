@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from compose.cli.arguments import add_closing, add_part_of_recording, confidence, folder, names, positive
-from compose.errors import ENDED, NOT_LOCALISED, STOPPED, CannotWrite, UserError
+from compose.errors import BROKEN_PIPE, ENDED, NOT_LOCALISED, STOPPED, CannotWrite, UserError
 from compose.extras import need
 from compose.launch.signals import until_signal
 from compose.recording.recording_files import make_folder
 from compose.terminal.outcome import counting
-from protocol.output import say
+from compose.terminal.text_width import tell
+from protocol.output import discard, say
 
 if TYPE_CHECKING:
     from compose.recording.estimating.estimate_epoch import ClaimRule
@@ -85,14 +86,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(options: argparse.Namespace) -> int:
     """Estimate, print a table and write the files.
 
-    Return NOT_LOCALISED if a robot never knew its pose well enough for a claim, and STOPPED if a stream was
-    ended by a signal.
+    Return NOT_LOCALISED if a robot never knew its pose well enough for a claim; if a stream was ended by a
+    signal STOPPED, and BROKEN_PIPE if the reader of the output has gone.
     """
     from compose.recording.estimating import estimate_epoch  # noqa: PLC0415
     from compose.recording.estimating.estimate_run import estimated, measurements  # noqa: PLC0415  # numpy
     from compose.recording.ranging.range_files import read_ranges  # noqa: PLC0415
 
-    stopped = False
+    stopped = None
     rule = estimate_epoch.ClaimRule(options.accuracy, options.confidence)
     if options.follow:
         problem, estimate, stopped = _followed(options, rule)
@@ -107,17 +108,17 @@ def main(options: argparse.Namespace) -> int:
         written = _written(options.out, problem, estimate)
         say(*map(str, written), error=options.follow)
     if not options.follow:
-        say(*_lines(estimate.summary))
-    if stopped:
-        return STOPPED
+        tell(*_lines(estimate.summary))
+    if stopped is not None:
+        return stopped
     localised = all(one.first_claim is not None for one in estimate.summary.robots.values())
     return ENDED if localised else NOT_LOCALISED
 
 
 def _followed(
     options: argparse.Namespace, rule: ClaimRule
-) -> tuple[EstimationProblem, RecordingEstimate, bool]:
-    """Print the estimates of a stream until it ends; return all of them, and whether a signal was the end."""
+) -> tuple[EstimationProblem, RecordingEstimate, int | None]:
+    """Print the estimates of a stream until it ends; return all of them, and the status if it did not end."""
     need("mcap")
     from compose.recording.estimating.estimate_files import COLUMNS, csv_line  # noqa: PLC0415
     from compose.recording.estimating.estimate_stream import StreamEstimate  # noqa: PLC0415
@@ -135,9 +136,13 @@ def _followed(
         raise UserError(f"{name} cannot be read: {error.strerror or error}") from None
     with stream, until_signal() as stopped:
         say(",".join(COLUMNS))
-        for row in estimate.rows(rows_as_they_arrive(stream, name)):
-            say(csv_line(row))
-    return *estimate.result(), bool(stopped)
+        try:
+            for row in estimate.rows(rows_as_they_arrive(stream, name)):
+                say(csv_line(row))
+        except BrokenPipeError:  # the files are of the estimates so far
+            discard(sys.stdout)
+            return *estimate.result(), BROKEN_PIPE
+    return *estimate.result(), STOPPED if stopped else None
 
 
 def _written(out: Path, problem: EstimationProblem, estimate: RecordingEstimate) -> list[Path]:

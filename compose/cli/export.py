@@ -12,6 +12,7 @@ from compose.errors import ENDED, FAILED, STOPPED, CannotWrite
 from compose.extras import need
 from compose.launch.signals import stop_by_signal
 from compose.recording.recording_files import make_folder, user_errors
+from compose.terminal.text_width import tell
 from protocol import files
 from protocol.network.inbox import Inbox, Interrupted
 from protocol.output import say
@@ -72,13 +73,7 @@ def main(options: argparse.Namespace) -> int:
     if options.rerun:
         return _rerun(options.recording, out)
     need(*MODULES)
-    inbox = Inbox("tandem export")
-    stop_by_signal(inbox)
-    try:
-        done = exported(options.recording, out, inbox)
-    except Interrupted as signal_name:
-        inbox.say(f"stopped by {signal_name}")
-        return STOPPED
+    done = exported(options.recording, out)
     for path in done.files:
         say(str(path))
     for name, size in done.torn.items():
@@ -96,7 +91,7 @@ def _pyfg(recording: Path, out: Path) -> int:
     with user_errors(recording):
         graph = written_pyfg(ranges_of_run(read_noted(recording, "export")))
     say(str(_written(out, "run.pyfg", graph.text)))
-    say(", ".join([f"{name} is {letter}" for name, letter in graph.names.items()]))
+    tell(", ".join([f"{name} is {letter}" for name, letter in graph.names.items()]))
     return ENDED
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,7 +11,6 @@ from compose.cli.recording import read_noted
 from compose.recording.recording_files import user_errors
 from compose.recording.run import Run
 from compose.terminal.outcome import counting
-from protocol.network.inbox import Inbox
 
 if TYPE_CHECKING:
     from compose.view.export.folder import Exported
@@ -20,12 +20,17 @@ MODULES = ("foxglove", "pyarrow")
 
 
 def exported(
-    folder: Path, out: Path, inbox: Inbox, *, run: Run | None = None, quiet: bool = False
+    folder: Path,
+    out: Path,
+    check: Callable[[], object] = lambda: None,
+    *,
+    run: Run | None = None,
+    quiet: bool = False,
 ) -> Exported:
     """Export the recording in `folder` to `out`, with a progress bar unless `quiet`.
 
-    `run` is the recording if it has been read already. Raises UserError if a file cannot be read or written,
-    and Interrupted if `inbox` stops the export.
+    `check` is called now and then, and stops the export by an exception. `run` is the recording if it has
+    been read already. Raises UserError if a file cannot be read or written.
     """
     from compose.view.export.folder import FILES, export  # noqa: PLC0415  # slow to import, and optional
 
@@ -34,4 +39,4 @@ def exported(
     with user_errors(folder), counting("tandem export", 0 if quiet else len(FILES)) as done:
         run = run or read_noted(folder, "export")
         gc.freeze()  # else each garbage collection goes through all messages again
-        return export(run, out, done=done, check=lambda: inbox.next(0.0), alone=alone)
+        return export(run, out, done=done, check=check, alone=alone)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -71,7 +72,11 @@ def main(options: argparse.Namespace) -> int:
     pairs: list[tuple[Sequence[str], PastMeeting | None]] = [((one.a, one.b), one) for one in past]
     pairs = pairs or [(robots, None) for robots in run.pairs]
     replayed: dict[str, AgentReplay | None] = {}
-    with counting("tandem figures", sum([len(robots) + len(kinds) for robots, _ in pairs])) as done:
+    drawn: list[str] = []
+    with (
+        _printed(drawn),
+        counting("tandem figures", sum([len(robots) + len(kinds) for robots, _ in pairs])) as done,
+    ):
         for robots, meeting in pairs:
             replays, complete = _replays(run, robots, replayed, done)
             status = status if complete else FAILED
@@ -88,9 +93,7 @@ def main(options: argparse.Namespace) -> int:
                 continue
             try:
                 tasks = drawing(pair, kinds, formats, folder, torn=bool(torn), paper=options.paper)
-                share(tasks, partial(_printed, done))
-            except BrokenPipeError:
-                raise
+                share(tasks, partial(_noted, drawn, done))
             except OSError as error:
                 raise CannotWrite(folder, error) from None
     return status
@@ -126,9 +129,23 @@ def drawing(
     return [partial(draw, kind) for kind in kinds]
 
 
-def _printed(done: Callable[[], None], lines: Sequence[OutputLine]) -> None:
+@contextmanager
+def _printed(paths: Sequence[str]) -> Iterator[None]:
+    """Print `paths` after the block, because the reader of the output may leave at the first line."""
+    try:
+        yield
+    finally:
+        if paths:
+            say(*paths)
+
+
+def _noted(drawn: list[str], done: Callable[[], None], lines: Sequence[OutputLine]) -> None:
+    """Add the paths in `lines` to those `drawn`, and print the other lines."""
     for line in lines:
-        say(line.text, error=line.error)
+        if line.error:
+            say(line.text, error=True)
+        else:
+            drawn.append(line.text)
     done()
 
 

@@ -14,6 +14,7 @@ from compose.errors import ENDED, CannotWrite, UserError
 from compose.scenario.json_schema import json_schema
 from compose.scenario.scenario_tables import ScenarioFile
 from compose.sweep.spec import SpecFile
+from compose.terminal.invocation import program
 from protocol import files
 from protocol.output import say
 
@@ -58,11 +59,11 @@ def starter() -> dict[str, str]:
 
 def commands(out: Path) -> list[str]:
     """Return the commands that use the files in `out`."""
-    place = shlex.quote(str(out))
+    place, tandem, inside = shlex.quote(str(out)), program("tandem"), program("tandem", out)
     return [
-        f"tandem run {place}/scenario.toml --out {place}/recording",
-        f"tandem sweep {place}/sweep.toml --out {place}/results",
-        f"python {place}/analyse.py",
-        f"cd {place} && tandem check-planner myplanner:MyPlanner --mission scenario.toml",
-        f"cd {place} && tandem check-driver myrobot:MyRobot --rate 10",
+        f"{tandem} run {place}/scenario.toml --out {place}/recording",
+        f"{tandem} sweep {place}/sweep.toml --out {place}/results",
+        f"{program('python')} {place}/analyse.py",
+        f"(cd {place} && {inside} check-planner myplanner:MyPlanner --mission scenario.toml)",
+        f"(cd {place} && {inside} check-driver myrobot:MyRobot --rate 10)",
     ]

@@ -7,7 +7,7 @@ import argparse
 from compose.cli.arguments import add_closing, days, folder, names
 from compose.errors import ENDED, CannotWrite, UserError
 from compose.extras import need
-from protocol.output import say
+from compose.terminal.text_width import tell
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -52,8 +52,8 @@ def main(options: argparse.Namespace) -> int:
     except OSError as error:
         raise CannotWrite(options.folder, error) from None
     if made:
-        say(f"created, valid for {options.days} days: {', '.join(made)}")
+        tell(f"created, valid for {options.days} days: {', '.join(made)}")
     if kept:
-        say(f"unchanged: {', '.join(kept)}")
-    say(f"Copy each folder in {options.folder} to its own machine only. Do not copy ca-key.pem: it signs.")
+        tell(f"unchanged: {', '.join(kept)}")
+    tell(f"Copy each folder in {options.folder} to its own machine only. Do not copy ca-key.pem: it signs.")
     return ENDED

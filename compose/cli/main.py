@@ -14,13 +14,13 @@ import traceback
 from collections.abc import Sequence
 from functools import cache
 from importlib import import_module
-from typing import NamedTuple, NoReturn, TextIO
+from typing import NamedTuple, NoReturn
 
 from compose.errors import BROKEN_PIPE, BUG, FAILED, STOPPED, USER_ERROR, UserError
 from compose.launch.interruption import INTERRUPTION
 from protocol import limits
 from protocol.files import error_text
-from protocol.output import one_line, say
+from protocol.output import discard, leave, one_line, say
 from protocol.spelling import did_you_mean
 
 DESCRIPTION = "Cooperative range-only localisation of mobile robots."
@@ -126,9 +126,8 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     forked = sys.modules.get("compose.launch.forked")
     if forked is not None:
         forked.close()
-    session = sys.modules.get("protocol.network.session")
-    if session is not None:
-        session.leave(status)
+    if status == STOPPED or "protocol.network.session" in sys.modules:
+        leave(status)
     sys.exit(status)
 
 
@@ -136,27 +135,27 @@ def _status_of(error: BaseException, command: str) -> int:
     """Return the exit status of a `command` that ended with `error`, and print why. Raises SystemExit."""
     INTERRUPTION.end()
     if INTERRUPTION.signal_name is not None or isinstance(error, KeyboardInterrupt):
-        _discard(sys.stdout)  # a part of a line may be in its buffer
-        _complain(f"{command}: stopped by {INTERRUPTION.signal_name or 'SIGINT'}")
+        discard(sys.stdout)  # a part of a line may be in its buffer
+        say(f"{command}: stopped by {INTERRUPTION.signal_name or 'SIGINT'}", error=True)
         return STOPPED
     match error:
         case UserError():
-            _complain(f"{command}: {error}")
+            say(f"{command}: {error}", error=True)
             return error.exit_status
         case BrokenPipeError():
-            _discard(sys.stdout)
+            discard(sys.stdout)
             return BROKEN_PIPE
         case OSError():
-            _discard(sys.stdout)
-            _complain(f"{command}: cannot continue: {error_text(error)}")
+            discard(sys.stdout)
+            say(f"{command}: cannot continue: {error_text(error)}", error=True)
             return FAILED
     shortage = limits.shortage(error)
     if shortage is not None:
-        _complain(f"{command}: cannot continue: {shortage}")
+        say(f"{command}: cannot continue: {shortage}", error=True)
         return FAILED
     if not isinstance(error, Exception):
         raise error
-    _complain(*"".join(traceback.format_exception(error)).splitlines())
+    say(*"".join(traceback.format_exception(error)).splitlines(), error=True)
     return BUG
 
 
@@ -214,16 +213,3 @@ def _command_list() -> str:
         members = [command for command in COMMANDS if command.group == group]
         lines += [f"{group}:", *[f"  {one.name:{width}}  {one.summary}" for one in members], ""]
     return "\n".join(lines).rstrip()
-
-
-def _complain(*lines: str) -> None:
-    """Print `lines` on standard error, if it can be written."""
-    try:
-        say(*lines, error=True)
-    except OSError:  # the exit status must be known all the same
-        _discard(sys.stderr)
-
-
-def _discard(stream: TextIO) -> None:
-    """Redirect `stream` to /dev/null, so that the interpreter does not fail to flush it at its end."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())

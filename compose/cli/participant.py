@@ -8,7 +8,7 @@ from pathlib import Path
 
 from compose.cli import arguments
 from compose.errors import FAILED, STOPPED, UserError
-from compose.launch.signals import stop_by_signal, stop_with_launcher
+from compose.launch.signals import stop_with_launcher
 from compose.network import beyond, reach
 from compose.recording.recording_files import not_recorded
 from protocol.journal.journal_file import CannotRecord, CorruptJournal, OtherVersion
@@ -47,15 +47,15 @@ def participate(
     *,
     launched: bool = False,
 ) -> int:
-    """Return the exit status of `body`, which gets an inbox that signals reach; `owner` begins its messages.
+    """Return the exit status of `body`, which gets an inbox; `owner` begins its messages.
 
-    A process that is `launched` also stops with its launcher. An exception of `failures` is printed, and the
+    `body` must call `stop_by_signal` before it runs the mission: before that, a signal is an exception. A
+    process that is `launched` also stops with its launcher. An exception of `failures` is printed, and the
     status is FAILED; after a signal it is STOPPED. Raises UserError if a flag cannot be followed.
     """
     inbox = Inbox(owner)
     if launched:
         stop_with_launcher(inbox)
-    stop_by_signal(inbox)
     try:
         return body(inbox)
     except session.CannotListen as error:

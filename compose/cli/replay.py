@@ -11,7 +11,7 @@ from compose.cli.recording import read_noted
 from compose.errors import CLEAN, VIOLATED
 from compose.launch.class_loader import trust
 from compose.recording.recording_files import user_errors
-from protocol.output import say
+from compose.terminal.text_width import tell
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,26 +30,26 @@ def main(options: argparse.Namespace) -> int:
         found = replayed(run)
     if found.differences:
         first, *more = found.differences
-        say(f"{found.scenario}: not as recorded")
-        say(_difference(first))
+        tell(f"{found.scenario}: not as recorded")
+        tell(_difference(first))
         if more:
-            say(f"and {len(more)} more, which `tandem audit` lists")
+            tell(f"and {len(more)} more, which `tandem audit` lists")
         if found.versions is not None:
-            say(f"{found.versions}: that alone can lead to other decisions")
+            tell(f"{found.versions}: that alone can lead to other decisions")
     elif found.rounding:
-        say(
+        tell(
             f"{found.scenario}: as recorded but for the last bits, over {found.ticks} ticks: "
             f"{found.rounding} of {found.checks} checks differ by rounding alone"
         )
-        say(str(found.versions))
+        tell(str(found.versions))
     else:
         counts = f"{found.ticks} ticks ({found.checks} checks)"
-        say(f"{found.scenario}: as recorded, to the bit, over {counts}")
+        tell(f"{found.scenario}: as recorded, to the bit, over {counts}")
     for tear in found.tears:
-        say(f"{_where(tear)}: {tear.what}")
+        tell(f"{_where(tear)}: {tear.what}")
     for name, journal in run.journals.items():
         if journal.torn:
-            say(f"{name} ends with {journal.torn} bytes of a torn write")
+            tell(f"{name} ends with {journal.torn} bytes of a torn write")
     return VIOLATED if found.differences else CLEAN
 
 

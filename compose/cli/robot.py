@@ -18,11 +18,13 @@ from compose.hardware.driver_recording import recorded
 from compose.launch.driver_loader import config_of, driver_class, made, mission, options_of
 from compose.launch.planner_loader import is_shipped
 from compose.launch.processes import free_endpoint
+from compose.launch.signals import stop_by_signal
 from compose.launch.supervisor import STOP_S, ChildFailed, Supervisor
 from compose.network import reach
 from compose.recording.recording_files import folder_for
 from compose.recording.run import ended
 from compose.scenario.run_settings import check_rate
+from compose.terminal.text_width import tell
 from protocol.messages import Localised, MissionEnd, RobotConfig, RobotConfigInGroup
 from protocol.motion import wrap
 from protocol.network import access_control, session
@@ -92,8 +94,8 @@ def main(options: argparse.Namespace) -> int:
         if not options.quiet:
             advice = f"; a lower --rate, such as {rate / 2:g}, leaves more time" if field.missed else ""
             missed = f"missed the deadline in {field.missed} of {end.tick + 1} ticks"
-            say(f"{options.id}: {missed}{advice}")
-        say(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
+            tell(f"{options.id}: {missed}{advice}")
+        tell(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
         return status_of(end.outcome)
 
     return participate(f"tandem robot {options.id}", take_part, (NoStart, ChildFailed))
@@ -126,6 +128,7 @@ def _run(
         ]
         children.start(agent, *arguments)
         try:
+            stop_by_signal(inbox)
             field.attach(link)
             if not options.quiet:
                 whom = "the others" if isinstance(config, RobotConfigInGroup) else "its peer"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -20,10 +19,11 @@ from compose.launch.viewers import Viewer, foxglove_server, page, stay, viewing
 from compose.recording.kills_file import KILLS
 from compose.recording.recording_files import folder_for, not_recorded
 from compose.recording.run import Run, read
+from compose.recording.summary_json import Mode
 from compose.scenario.kills import Kill
 from compose.scenario.run_settings import check_rate, run_name
 from compose.scenario.scenario_file import setting
-from compose.terminal.outcome import break_off, conclude, shown_live, shows_live
+from compose.terminal.outcome import break_off, concluded, shown_live, shows_live
 from protocol.journal.journal_file import CannotRecord
 from protocol.network.inbox import Inbox, Interrupted
 from world.scenario import Scenario
@@ -133,7 +133,8 @@ def _in_process(options: argparse.Namespace, scenario: Scenario, kills: tuple[Ki
         raise UserError("--foxglove: with --in-process, the run is over before a viewer can connect")
     began = time.perf_counter()
     if options.out is None and not options.watch:
-        return conclude(options, in_process.run_mission(scenario), None, "in-process", began)
+        with concluded(options, in_process.run_mission(scenario), None, "in-process", began) as status:
+            return status
     inbox = Inbox("tandem run")
     with folder_for(options.out) as folder, _viewers(options, scenario, folder, inbox) as viewers:
         began = time.perf_counter()
@@ -144,15 +145,13 @@ def _in_process(options: argparse.Namespace, scenario: Scenario, kills: tuple[Ki
         except KeyboardInterrupt:
             break_off(options, folder, f"stopped by {INTERRUPTION.signal_name}", began)
             raise
-        status = conclude(options, finished, folder, "in-process", began)
         stop_by_signal(inbox)
-        return _after_outcome(options, folder, viewers, inbox, status)
+        return _finish(options, finished, folder, "in-process", began, viewers, inbox)
 
 
 def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[Kill, ...]) -> int:
     check_rate(scenario, options.rate)
     inbox = Inbox("tandem run")
-    stop_by_signal(inbox)
     with (
         folder_for(options.out) as folder,
         _keys(options, scenario) as keys,
@@ -171,20 +170,22 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
                     kills=kills,
                     keys=keys,
                     agents_journal=bool(options.out is not None or kills or viewers or shows_live(options)),
+                    on_start=lambda: stop_by_signal(inbox),
                 )
         except supervisor.ChildFailed as failure:
-            inbox.say(f"failed: {failure}")
             break_off(options, folder, str(failure), began)
+            inbox.say(f"failed: {failure}")
             return FAILED
+        except KeyboardInterrupt:
+            break_off(options, folder, f"stopped by {INTERRUPTION.signal_name}", began)
+            raise
         except Interrupted as signal_name:
-            inbox.say(f"stopped by {signal_name}")
             break_off(options, folder, f"stopped by {signal_name}", began)
+            inbox.say(f"stopped by {signal_name}")
             return STOPPED
         for kill in spared:
             inbox.say(f"--kill {kill.text}: not reached")
-        run = read(folder)
-        status = conclude(options, run, folder, "processes", began)
-        return _after_outcome(options, folder, viewers, inbox, status, run)
+        return _finish(options, read(folder), folder, "processes", began, viewers, inbox)
 
 
 @contextmanager
@@ -215,21 +216,19 @@ def _viewers(
         yield started
 
 
-def _after_outcome(
+def _finish(
     options: argparse.Namespace,
+    run: Run,
     folder: Path,
+    mode: Mode,
+    began: float,
     viewers: Sequence[Viewer],
     inbox: Inbox,
-    status: int,
-    run: Run | None = None,
 ) -> int:
-    """Export the recording, serve the viewers until they are stopped, and return the exit status.
-
-    It is called once the outcome, of exit status `status`, has been printed. `run` is the recording if it
-    has been read already.
-    """
+    """Write all files, print the outcome, serve the viewers until they are stopped, and return the status."""
     try:
-        exported = _export(options, folder, inbox, run)
+        with concluded(options, run, folder, mode, began) as status:
+            exported = _export(options, folder, inbox, None if options.in_process else run)
     except Interrupted as signal_name:
         inbox.say(f"stopped by {signal_name} before the export was complete")
         return STOPPED
@@ -238,10 +237,12 @@ def _after_outcome(
 
 
 def _export(options: argparse.Namespace, folder: Path, inbox: Inbox, run: Run | None) -> bool:
-    """Export the recording if the flags allow it, and return whether it was done. Raises Interrupted."""
+    """Export the recording if the flags allow it, and return whether it was done. Raises Interrupted.
+
+    `run` is the recording if it has been read already.
+    """
     if options.out is None or options.export is False:
         return False
-    sys.stdout.flush()
     try:
         need(*export_bar.MODULES)
     except UserError as error:
@@ -249,7 +250,7 @@ def _export(options: argparse.Namespace, folder: Path, inbox: Inbox, run: Run | 
             inbox.say(f"not exported: {error}")
         return False
     try:
-        export_bar.exported(folder, folder, inbox, run=run, quiet=options.quiet)
+        export_bar.exported(folder, folder, lambda: inbox.next(0.0), run=run, quiet=options.quiet)
     except UserError as error:
         inbox.say(f"not exported: {error}")
         return False

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from compose.cli.arguments import add_closing, cell_and_trial, count, folder, natural, trials
 from compose.errors import FAILED, LOCALISED, NOT_LOCALISED, STOPPED, UserError
 from compose.extras import need
+from compose.launch.interruption import INTERRUPTION
 from compose.launch.signals import stop_by_signal
 from compose.sweep import spec
 from compose.sweep.cells import cell_at, trial_table
@@ -73,8 +75,6 @@ def main(options: argparse.Namespace) -> int:
     need("distributed", "matplotlib", "pyarrow", "tomli_w")
     if options.print_trial is not None:
         return print_trial(sweep, *options.print_trial)
-    inbox = Inbox("tandem sweep")
-    stop_by_signal(inbox)
     from compose.sweep import axis_figures, execution, report  # noqa: PLC0415  # slow to import, and optional
 
     out = options.out if options.out is not None else Path(f"sweep-{sweep.name}")
@@ -86,9 +86,10 @@ def main(options: argparse.Namespace) -> int:
         retry=options.retry,
         **chosen,
     )
+    inbox = Inbox("tandem sweep")
     visible = sys.stdout.isatty() and not options.quiet
     with report.progress(sweep.name, inbox.say, visible) as progress:
-        results = execution.sweep(sweep, out, means, inbox, progress)
+        results = execution.sweep(sweep, out, means, inbox, progress, partial(stop_by_signal, inbox))
     if results.stopped is not None:
         inbox.say(
             f"{results.stopped}: {len(results.table)} of {results.trials} trials are done; "
@@ -97,9 +98,11 @@ def main(options: argparse.Namespace) -> int:
         if len(results.table) == results.trials:
             report.show(results, out, quiet=True)
         return STOPPED if results.interrupted else FAILED
-    report.show(results, out, quiet=options.quiet)
-    sys.stdout.flush()
-    axis_figures.draw(results, out / "figures")
+    INTERRUPTION.begin("tandem sweep")
+    try:
+        axis_figures.draw(results, out / "figures")
+    finally:
+        report.show(results, out, quiet=options.quiet)
     return status_of(results)
 
 

@@ -20,16 +20,17 @@ from compose.cli.participant import (
 )
 from compose.errors import ENDED, UserError
 from compose.launch.processes import scenario_from_launcher
+from compose.launch.signals import stop_by_signal
 from compose.recording.recording_files import WORLD_JOURNAL, folder_for
 from compose.recording.run import read
 from compose.scenario import kills
 from compose.scenario.run_settings import check_rate, run_name
 from compose.scenario.scenario_file import setting
-from compose.terminal.outcome import break_off, conclude, reopened, shown_live
+from compose.terminal.outcome import break_off, concluded, reopened, shown_live
+from compose.terminal.text_width import tell
 from protocol import limits
 from protocol.journal.journal_file import Journal
 from protocol.network.inbox import Inbox, Interrupted
-from protocol.output import say
 from world.process import NoRouter, WorldLinks, WorldProcess
 from world.scenario import Scenario
 from world.simulation import Simulation, resumed
@@ -98,12 +99,13 @@ def _run(
         timeout=options.timeout,
         on_kill_point=kills.taker(options.kill),
     )
+    stop_by_signal(inbox)
     links.attach(process)
     if not (options.quiet or options.launched):
         robots = ", ".join(robot.id for robot in scenario.robots)
         where = f", resumed at tick {simulation.tick}" if simulation.tick else ""
         at = " and ".join(links.endpoints.listen) or links.endpoints
-        say(f"run {run} at {at}{where}: waiting for {robots}")
+        tell(f"run {run} at {at}{where}: waiting for {robots}")
     try:
         with shown_live(options, scenario, folder):
             links.run(process)
@@ -114,4 +116,5 @@ def _run(
         raise
     if options.launched:  # the launcher prints the outcome
         return ENDED
-    return conclude(options, read(folder), folder, "processes", began)
+    with concluded(options, read(folder), folder, "processes", began) as status:
+        return status

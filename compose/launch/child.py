@@ -15,6 +15,8 @@ KILL_S = 5.0
 """Time in s that a killed process has to end; then its fork server is considered hung, and is killed."""
 SEND_S = 60.0
 """Time in s that a process has to read what is sent to it; then it is considered hung, and is killed."""
+LOOK_S = 0.1
+"""Time in s between two looks whether a process has ended whose output is awaited."""
 READ_BYTES = 1 << 16
 """The largest number of bytes in one read from a process."""
 ERROR_BYTES = 1 << 20
@@ -116,8 +118,12 @@ class ChildProcess:
     def receive(self, timeout: float) -> bytes:
         """Return the next bytes of its standard output, none at the end. Raises TimeoutError."""
         assert self._stdout is not None
-        if not _polled(self._stdout, select.POLLIN, timeout):
-            raise TimeoutError
+        give_up = time.monotonic() + timeout
+        while not _polled(self._stdout, select.POLLIN, min(give_up - time.monotonic(), LOOK_S)):
+            if not self.running and not _polled(self._stdout, select.POLLIN, 0.0):
+                return b""  # the fork server still has the other end if it ended before it began
+            if time.monotonic() >= give_up:
+                raise TimeoutError
         return os.read(self._stdout, READ_BYTES)
 
     def stderr_text(self) -> str:

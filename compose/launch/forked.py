@@ -142,13 +142,14 @@ class ForkServer:
         """Send signal `number` to the process numbered `process`, unless it has ended.
 
         A process that has not begun counts as ended at once by SIGTERM and SIGKILL: importing may take
-        longer than a process is given to end.
+        longer than a process is given to end. Once forked, it ends because its standard input is closed.
         """
         unborn = None
         with self._lock:
-            self._ask(Signal(process, number), [])
             if self._imports and number in LETHAL:
                 unborn = self._running.pop(process, None)
+            else:
+                self._ask(Signal(process, number), [])
         if unborn is not None:
             unborn.ended(-number)
 

@@ -7,7 +7,7 @@ import signal
 import socket
 import sys
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from compose.errors import ENDED
@@ -82,6 +82,7 @@ def run_mission(
     kills: Sequence[Kill] = (),
     keys: Path | None = None,
     agents_journal: bool = True,
+    on_start: Callable[[], object] = lambda: None,
 ) -> list[Kill]:
     """Run `scenario`, write its journals to `out`, and return the kills that did not happen.
 
@@ -93,12 +94,16 @@ def run_mission(
 
     `keys` is the folder that `tandem keys` writes. With it, links are encrypted and access rules enforced.
 
+    `on_start` is called when all processes are launched.
+
     Raises ChildFailed, or Interrupted if `inbox` receives a signal. No process is left running in any case.
     """
     limits.need_files(CHILD_FILES * (1 + len(scenario.robots)) + SPARE_FILES, "a run as processes")
     arguments = _arguments(scenario, out, run, rate, timeout, keys, agents_journal=agents_journal)
     mission = _Mission(scenario, arguments, kills, inbox, out if agents_journal else None)
     try:
+        mission.start()
+        on_start()
         mission.run()
     finally:
         mission.children.stop()
@@ -160,13 +165,16 @@ class _Mission:
         self.kills = {name: [kill for kill in kills if kill.process == name] for name in arguments}
         """Kills that have not happened yet, by process name."""
 
+    def start(self) -> None:
+        """Start all processes."""
+        for name in self._arguments:
+            self._start(name)
+
     def run(self) -> None:
-        """Start all processes, and wait until they have ended, the agents at most FOLLOW_S after the world.
+        """Wait until all processes have ended, the agents at most FOLLOW_S after the world.
 
         Raises ChildFailed.
         """
-        for name in self._arguments:
-            self._start(name)
         running = set(self._arguments)
         while running:
             ended = self.children.next_end(None if WORLD in running else FOLLOW_S)

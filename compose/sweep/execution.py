@@ -90,11 +90,19 @@ class Results(msgspec.Struct, frozen=True):
         ]
 
 
-def sweep(sweep: Sweep, out: Path, means: ExecutionOptions, inbox: Inbox, progress: Progress) -> Results:
+def sweep(
+    sweep: Sweep,
+    out: Path,
+    means: ExecutionOptions,
+    inbox: Inbox,
+    progress: Progress,
+    take_signals: Callable[[], None] = lambda: None,
+) -> Results:
     """Run the trials without a row in the folder `out`, and return the results.
 
-    The results are collected even if the sweep is stopped. Raises UserError if the sweep, the scenario of a
-    cell, `out` or the scheduler is unusable.
+    The results are collected even if the sweep is stopped. `take_signals` is called when trials begin: from
+    then on, `inbox` must receive the signals. Raises UserError if the sweep, the scenario of a cell, `out` or
+    the scheduler is unusable.
     """
     with opened(out, sweep) as folder:
         check_columns(sweep, folder.schema)
@@ -104,7 +112,7 @@ def sweep(sweep: Sweep, out: Path, means: ExecutionOptions, inbox: Inbox, progre
         stopped, interrupted = None, False
         if work:
             try:
-                _play(folder, work, means, inbox, progress)
+                _play(folder, work, means, inbox, progress, take_signals)
             except Interrupted as signal_name:
                 stopped, interrupted = f"stopped by {signal_name}", True
             except EngineFailed as error:
@@ -161,7 +169,12 @@ def _left(folder: Folder, progress: Progress) -> list[Work]:
 
 
 def _play(
-    folder: Folder, work: list[Work], means: ExecutionOptions, inbox: Inbox, progress: Progress
+    folder: Folder,
+    work: list[Work],
+    means: ExecutionOptions,
+    inbox: Inbox,
+    progress: Progress,
+    take_signals: Callable[[], None],
 ) -> None:
     """Run `work`, and store its rows in `folder` as chunks complete.
 
@@ -178,7 +191,9 @@ def _play(
 
     from compose.sweep import cluster  # noqa: PLC0415  # importing Dask takes a second
 
+    pa.array([])  # its first call imports pandas, where it is installed: another second
     with cluster.connect(means.workers, means.scheduler) as client:
+        take_signals()
         cluster.play(client, work, orders, inbox, store)
 
 

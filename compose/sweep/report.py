@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
@@ -17,6 +18,8 @@ from compose.sweep.execution import SUMMARY, Progress, Results
 from compose.sweep.results_folder import CELLS
 from compose.sweep.statistics import CellSummary, noted, refusals
 from compose.terminal import tables, text_width
+from compose.terminal.invocation import program
+from compose.terminal.text_width import tell
 from protocol.output import say
 
 RATE_OVER_S = 10.0
@@ -41,11 +44,11 @@ WIDEST = (*OUTCOMES, "clean", "rate", "rate_low", "rate_high", "p50", "p95", "ma
 CHOICES = (
     ("trials", *WIDEST),
     ("trials", *WIDEST[:-2]),
-    ("trials", "rate", "rate_low", "rate_high", "p50", "p95", "max"),
-    ("trials", "rate", "p50", "max"),
-    ("trials", "rate"),
+    ("trials", *OUTCOMES, "clean", "rate", "p50", "max"),
+    ("trials", *OUTCOMES, "rate"),
+    ("trials", *OUTCOMES),
 )
-"""The possible choices of columns. The first that fits the terminal is used."""
+"""The possible choices of columns. The first that fits the terminal is used. Outcomes are never dropped."""
 OF_GROUP = ("share p50", "share max", "corrected", "travel p50", "travel p95", "honest")
 """The additional columns of sweeps of groups."""
 OF_ATTACKED_GROUP = ("found",)
@@ -87,6 +90,7 @@ def progress(name: str, say: Callable[[str], None], visible: bool) -> Iterator[P
         bars.MofNCompleteColumn(),
         _Rate(Column(no_wrap=True)),
         _Times(Column(no_wrap=True)),
+        console=tables.display_console(sys.stdout),
         disable=not visible,
         transient=True,
         expand=True,
@@ -106,9 +110,9 @@ def show(results: Results, out: Path, *, quiet: bool) -> None:
     total = {name: sum([getattr(one, name) for one in results.figures.values()]) for name in OUTCOMES}
     total["refused"] = sum([one.refused_trials for one in results.figures.values()])
     counts = ", ".join([f"{count} {name}" for name, count in total.items() if count])
-    say(f"{results.sweep.name}: {counts} of {len(results.table)} trials in {_cells(len(results.cells))}")
+    tell(f"{results.sweep.name}: {counts} of {len(results.table)} trials in {_cells(len(results.cells))}")
     if any(one.audited for one in results.figures.values()):
-        say(_audited(results))
+        tell(_audited(results))
     if quiet:
         return
     shown = len(_shown(results))
@@ -116,24 +120,25 @@ def show(results: Results, out: Path, *, quiet: bool) -> None:
         lines, columns = _lines(results)
         say("", *lines, "", *text_width.notes(NOTES, columns))
     if shown < len(results.cells):
-        say(f"{len(results.cells) - shown} cells without a problem are not listed; see {out / SUMMARY}")
+        tell(f"{len(results.cells) - shown} cells without a problem are not listed; see {out / SUMMARY}")
     for index, figures in results.figures.items():
         if figures.refused is not None:
-            say(f"cell {index} cannot run: {figures.refused}")
+            tell(f"cell {index} cannot run: {figures.refused}")
     for reason, count in refusals(results.table):
-        say(f"refused: {count}: {reason}")
+        tell(f"refused: {count}: {reason}")
     note = noted(results.table)
     if note is not None:
         why = f" ({note.why})" if note.why else ""
         how = f"{note.outcome} after {note.ticks} ticks" if note.ticks is not None else note.outcome
+        tandem = program("tandem")
         file = shlex.quote(str(out / CELLS / f"{note.cell:03d}.toml"))
-        say(f"look at trial {note.trial} of cell {note.cell} first: {how}{why}; to run it again:")
+        tell(f"look at trial {note.trial} of cell {note.cell} first: {how}{why}; to run it again:")
         if results.sweep.draws:
             source = shlex.quote(results.sweep.source)
-            say(f"  tandem sweep {source} --print-trial {note.cell}:{note.trial} > trial.toml")
+            say(f"  {tandem} sweep {source} --print-trial {note.cell}:{note.trial} > trial.toml")
             file = "trial.toml"
         recording = _new_folder(f"recording-{results.sweep.name}-{note.cell}-{note.trial}")
-        say(f"  tandem run {file} --seed {note.seed} --out {recording}")
+        say(f"  {tandem} run {file} --seed {note.seed} --out {recording}")
     say(f"results: {out}")
 
 
@@ -157,13 +162,25 @@ def _audited(results: Results) -> str:
 
 
 def _lines(results: Results) -> tuple[list[str], Sequence[str]]:
-    """Return the lines of the widest table that fits the terminal, and its columns."""
-    columns: Sequence[str] = ()
-    for columns in _choices(results):
+    """Return the lines of the widest table that fits the terminal, and its columns.
+
+    If none fits, they are those of a list, which leaves out the outcomes that no trial has.
+    """
+    choices = _choices(results)
+    for columns in choices:
         lines = tables.lines(_table(results, columns))
         if tables.fits(lines):
             return lines, columns
-    return tables.lines(_table(results, columns), text_width.room()), columns
+    found: list[str] = []
+    names = [axis.name.rpartition(".")[2] for axis in results.sweep.axes]
+    for cell in _shown(results):
+        texts = _figures(results.figures[cell.index])
+        place = [
+            f"{name} {label}" for name, label in zip(["cell", *names], _axes(results, cell), strict=True)
+        ]
+        counts = [f"{texts[one]} {one}" for one in choices[-1] if texts[one] != "0"]
+        found += text_width.wrapped(f"{', '.join(place)}: {', '.join(counts)}", 2)
+    return found, choices[-1]
 
 
 def _shown(results: Results) -> list[Cell]:
@@ -194,7 +211,7 @@ def _choices(results: Results) -> tuple[tuple[str, ...], ...]:
     )
     if not more:
         return CHOICES
-    return tuple((*columns, *more) for columns in CHOICES) + CHOICES[-1:]
+    return tuple((*columns, *more) for columns in CHOICES) + CHOICES[2:]
 
 
 def _table(results: Results, columns: Sequence[str]) -> Table:

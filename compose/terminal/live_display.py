@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections import Counter, deque
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -43,7 +44,7 @@ UNDECIDED = "no verdict yet"
 @contextmanager
 def live(scenario: Scenario, folder: Path) -> Iterator[None]:
     """Show the progress of the run recorded in `folder`, REFRESHED times a second."""
-    console = tables.console()
+    console = tables.display_console(sys.stdout)
     small = len(scenario.robots) <= MAPPED
     shown = RobotMap(scenario, folder, console) if small else RobotCounts(scenario, folder)
     with Live(

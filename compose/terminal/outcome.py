@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from compose.errors import CannotWrite, status_of
 from compose.recording import run
@@ -42,10 +43,11 @@ def counting(what: str, steps: int) -> Iterator[Callable[[], None]]:
     if not steps or not sys.stderr.isatty():
         yield lambda: None
         return
-    from rich.console import Console  # noqa: PLC0415  # as above
-    from rich.progress import Progress, TimeElapsedColumn  # noqa: PLC0415
+    from rich.progress import Progress, TimeElapsedColumn  # noqa: PLC0415  # as above
 
-    console = Console(stderr=True, soft_wrap=True)  # other output is not wrapped
+    from compose.terminal import tables  # noqa: PLC0415
+
+    console = tables.display_console(sys.stderr, soft_wrap=True)  # other output is not wrapped
     with Progress(
         *Progress.get_default_columns(),
         TimeElapsedColumn(),
@@ -57,20 +59,33 @@ def counting(what: str, steps: int) -> Iterator[Callable[[], None]]:
         yield lambda: bar.advance(task)
 
 
-def conclude(
-    options: argparse.Namespace,
-    recording: run.Run,
-    folder: Path | None,
-    mode: Mode,
-    began: float,
-) -> int:
-    """Print the outcome, write `summary.json` and `ticks.csv` if `--out` is given, return the exit status.
+@contextmanager
+def concluded(
+    options: argparse.Namespace, recording: run.Run, folder: Path | None, mode: Mode, began: float
+) -> Iterator[int]:
+    """Write `summary.json` and `ticks.csv` if `--out` is given, and yield the exit status of the outcome.
 
-    If the options have a list of `results`, the content of `summary.json` is appended to it and not printed.
+    The outcome is printed after the block, in which further files are written, because the reader of the
+    output may leave at the first line; and also if something cannot be written. If the options have a list of
+    `results`, the content of `summary.json` is appended to it instead.
+
     `began` is the value of time.perf_counter at the start, in s. Raises UserError if the files cannot be
     written.
     """
     result = summary(recording, mode, round(time.perf_counter() - began, 6))
+    try:
+        if folder is not None and options.out is not None:
+            try:
+                leave(recording, result, folder)
+            except OSError as error:
+                raise CannotWrite(folder, error) from None
+        yield status_of(result["outcome"])
+    finally:
+        _show(options, result)
+
+
+def _show(options: argparse.Namespace, result: dict[str, Any]) -> None:
+    """Print the outcome, or append `result`, the content of `summary.json`, to the options' `results`."""
     if (results := getattr(options, "results", None)) is not None:
         results.append(result)
     elif options.quiet:
@@ -79,13 +94,6 @@ def conclude(
         from compose.terminal import progress  # noqa: PLC0415  # as above
 
         progress.result(result, getattr(options, "rate", None))
-    if folder is not None and options.out is not None:
-        sys.stdout.flush()
-        try:
-            leave(recording, result, folder)
-        except OSError as error:
-            raise CannotWrite(folder, error) from None
-    return status_of(result["outcome"])
 
 
 def break_off(options: argparse.Namespace, folder: Path, reason: str, began: float) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 from compose.recording.summary_json import outcome_line
 from compose.terminal import tables, text_width
+from compose.terminal.text_width import tell
 from protocol.output import say
 
 TRUTH, ESTIMATE, ERROR, SIGMA = "true x, y, heading", "estimate", "error m", "sigma m"
@@ -66,7 +67,8 @@ def result(summary: Mapping[str, Any], rate: float | None = None) -> None:
             break
     else:
         lines = tables.lines(made, text_width.room())
-    say(f"{summary['scenario']}: {outcome_line(summary)}", "", *lines, "", *text_width.notes(NOTES, columns))
+    tell(f"{summary['scenario']}: {outcome_line(summary)}")
+    say("", *lines, "", *text_width.notes(NOTES, columns))
     if group is not None:
         say(*text_width.wrapped(_bound(group, robots)))
     if late:

@@ -4,19 +4,42 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, TextIO
 
 from rich.box import SIMPLE_HEAD
 from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table
 
-from compose.terminal.text_width import UNLIMITED, room
+from compose.terminal.text_width import room
+from protocol.output import UNLIMITED
+
+BEGIN, END = "\x1b[?2026h", "\x1b[?2026l"
+"""The marks of synchronised output (DEC mode 2026): a terminal shows what is between them at once."""
+
+
+class Frames:
+    """A stream each of whose writes a terminal shows at once; one without that mode ignores the marks."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Write `text` between the marks."""
+        return self._stream.write(f"{BEGIN}{text}{END}")
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
 
 
 def console(**options: Any) -> Console:
     """Return a console that prints text literally: `[red]` and `:smile:` are not markup."""
     return Console(markup=False, emoji=False, highlight=False, **options)
+
+
+def display_console(stream: TextIO, **options: Any) -> Console:
+    """Return a console on `stream` for what is drawn again and again."""
+    return console(file=Frames(stream), **options)
 
 
 def table(left: Sequence[str], right: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import shutil
 import sys
-import textwrap
 from collections.abc import Iterable
 
-UNLIMITED = 1000
-"""The width in columns of an output that is not a terminal."""
+from protocol import output
+from protocol.output import UNLIMITED, one_line, say
+
 LEAST = 20
 """The minimum number of columns beside an indent."""
 
@@ -28,5 +28,9 @@ def wrapped(text: str, indent: int = 0) -> list[str]:
     """Return the lines of `text`, wrapped at the terminal's width; all but the first are indented."""
     if not sys.stdout.isatty():
         return [text]
-    width = max(room(), indent + LEAST)
-    return textwrap.wrap(text, width, subsequent_indent=indent * " ", break_long_words=False)
+    return output.wrapped(text, max(room(), indent + LEAST), indent)
+
+
+def tell(*texts: str, indent: int = 0) -> None:
+    """Print each of `texts`, wrapped at the terminal's width."""
+    say(*[line for text in texts for line in wrapped(one_line(text), indent)])

@@ -8,14 +8,12 @@ token: a message that is sent before the subscriber is known would be lost.
 
 from __future__ import annotations
 
-import os
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from itertools import count
-from typing import Any, NoReturn, TypeVar
+from typing import Any, TypeVar
 
 import zenoh
 
@@ -328,15 +326,3 @@ def publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
         congestion_control=zenoh.CongestionControl.BLOCK,
         express=True,
     )
-
-
-def leave(status: int) -> NoReturn:
-    """End the process with this exit status, without the shutdown of the interpreter.
-
-    The shutdown would hang if a session did not close. It would abort the process if one of Zenoh's threads
-    is in a callback, which is possible for a moment after a session has closed.
-    """
-    for stream in (sys.stdout, sys.stderr):
-        with suppress(OSError):  # the reader may be gone
-            stream.flush()
-    os._exit(status)
