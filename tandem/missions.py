@@ -15,10 +15,9 @@ from compose.errors import UserError
 from compose.launch import in_process
 from compose.launch.class_loader import need_module
 from compose.recording import run as recorded
-from compose.recording.recording_files import WORLD_JOURNAL, folder_for
+from compose.recording.recording_files import folder_for
 from compose.scenario.kills import Kill, parse
 from compose.scenario.run_settings import check_rate, run_name
-from protocol.journal.journal_file import MemoryJournal
 from protocol.network.inbox import Inbox
 from tandem.results import Run
 from tandem.scenarios import Faults, Scenario, scenario_of
@@ -83,13 +82,9 @@ def run(
 
 
 def _in_process(chosen: Scenario) -> Run:
-    scenario = chosen.template.scenario
     began = time.perf_counter()
-    journals = {name: MemoryJournal() for name in in_process.journals(scenario)}
-    in_process.played(scenario, journals)
-    wall_s = round(time.perf_counter() - began, 6)
-    frames = {name: journals[name].frames for name in (WORLD_JOURNAL, *sorted({*journals} - {WORLD_JOURNAL}))}
-    return Run(recorded.of_frames(frames, chosen.source), "in-process", wall_s)
+    model = in_process.recorded(chosen.template.scenario, chosen.source)
+    return Run(model, "in-process", round(time.perf_counter() - began, 6))
 
 
 def _as_processes(chosen: Scenario, kills: Sequence[Kill], rate: float | None, timeout: float) -> Run:

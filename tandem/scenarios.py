@@ -81,8 +81,11 @@ class Scenario(msgspec.Struct, frozen=True):
         Paths are those of sweeps, such as "mission.noise.range_sigma", "robot.a.start" or "fault[0].loss".
         Raises BadScenario and Unworkable.
         """
-        table = self.table
-        for path, value in {**(fields or {}), **top}.items():
+        table, changed = self.table, {**(fields or {}), **top}
+        if [*changed] == ["seed"] and _is_seed(seed := plain(changed["seed"])):
+            # all else stays valid, and its validation would take as long as a mission
+            return Scenario({**table, "seed": seed}, self.source, self.template.reseeded(seed))
+        for path, value in changed.items():
             try:
                 way = field_steps(path, table)
             except NoSuchField as error:
@@ -138,6 +141,10 @@ class Scenario(msgspec.Struct, frozen=True):
 
     def __repr__(self) -> str:
         return f"<Scenario {self.name}, seed {self.seed}: {', '.join(self.robots)}>"
+
+
+def _is_seed(value: object) -> bool:
+    return type(value) is int and 0 <= value < 2**63
 
 
 def scenario_of(given: Scenario | str | Path | Mapping[str, Any]) -> Scenario:

@@ -45,6 +45,8 @@ class SweepResults(msgspec.Struct, frozen=True, eq=False):
     """One row per trial: the columns of `trials.parquet`."""
     cells: Table
     """One row per cell: the columns of `summary.csv`."""
+    differences: Table
+    """One row per cell of a paired axis and its first value: the columns of `differences.csv`."""
     results: Results
     """The results on which the command line works; they may change with any version."""
 
@@ -69,10 +71,11 @@ class SweepResults(msgspec.Struct, frozen=True, eq=False):
         return f"<SweepResults of {self.sweep.name}: {len(self.trials)} trials in {len(self.cells)} cells>"
 
     def _repr_html_(self) -> str:
-        """Return the cells, as a notebook shows them."""
+        """Return the cells and their differences, as a notebook shows them."""
         statistics = next(iter(self.results.figures.values())).__struct_fields__
         names = [name for name in self.cells.columns if name in _SHOWN or name not in statistics]
-        return Table({name: self.cells[name] for name in names})._repr_html_()
+        shown = Table({name: self.cells[name] for name in names})._repr_html_()
+        return shown + self.differences._repr_html_() if len(self.differences) else shown
 
 
 _SHOWN = ("trials", "localised", "wrong", "failed", "rate", "ticks_p50", "error_p50_m")
@@ -85,6 +88,7 @@ def sweep(
     *,
     trials: int | None = None,
     seed: int | None = None,
+    paired: bool | Sequence[str] | None = None,
     out: str | Path | None = None,
     workers: int | None = None,
     processes: bool = False,
@@ -97,9 +101,12 @@ def sweep(
     values. Without, `base` is a sweep: the name of one that ships with Tandem, the path of a file, or the
     content of one as a dict, whose `scenario` may be a Scenario.
 
-    `trials` is the number of trials per cell, and the seeds of all trials follow from `seed`. `out` is the
-    folder of the results, in which an unfinished sweep is resumed; without it, they are not written.
-    `workers` is the number of processes (by default, one per core). The other arguments are flags of
+    `trials` is the number of trials per cell, and the seeds of all trials follow from `seed`. Along a paired
+    axis, trials with the same number have the same draws: by default, if its field changes none, such as that
+    of the planner. `paired` names further fields of `axes`, or is True for all and False for none.
+
+    `out` is the folder of the results, in which an unfinished sweep is resumed; without it, they are not
+    written. `workers` is the number of processes (by default, one per core). The other arguments are flags of
     `tandem sweep`; `progress` shows a bar on standard output.
 
     Raises UserError for invalid arguments and without the extra `lab`, and SweepIncomplete.
@@ -115,7 +122,7 @@ def sweep(
     options = execution.ExecutionOptions(processes=processes, audit=audit)
     if workers is not None:
         options = msgspec.structs.replace(options, workers=workers)
-    found = _sweep_of(base, axes, trials, seed)
+    found = _sweep_of(base, axes, trials, seed, paired)
     with ExitStack() as stack:
         folder = Path(out) if out is not None else Path(stack.enter_context(tempfile.TemporaryDirectory()))
         return _results(_run(found, folder, options, visible=progress), kept=out is not None)
@@ -126,15 +133,22 @@ def _sweep_of(
     axes: Mapping[str, Sequence[Any]] | None,
     trials: int | None,
     seed: int | None,
+    paired: bool | Sequence[str] | None,
 ) -> Sweep:
     """Return the validated sweep. Raises UserError."""
+    if axes is None and paired is not None:
+        raise UserError("sweep: paired: it needs axes; an axis of a sweep file has a field 'paired'")
     if axes is not None:
+        chosen = _paired(paired, axes)
         scenario = scenario_of(base)
         table: Mapping[str, Any] = {
             "name": scenario.name,
             "scenario": scenario,
             "trials": TRIALS,
-            "axis": [{"field": field, "values": plain([*values])} for field, values in axes.items()],
+            "axis": [
+                {"field": field, "values": plain([*values]), "paired": chosen[field]}
+                for field, values in axes.items()
+            ],
         }
     elif isinstance(base, Mapping):
         table = {name: one if isinstance(one, Scenario) else plain(one) for name, one in base.items()}
@@ -154,6 +168,17 @@ def _sweep_of(
     return spec.validated({**table, **numbers}, str(table.get("name", "sweep")), Path(), base=within)
 
 
+def _paired(paired: bool | Sequence[str] | None, axes: Mapping[str, Any]) -> dict[str, bool | None]:
+    """Return for each axis whether it is paired; None leaves that to its fields. Raises UserError."""
+    if paired is None or isinstance(paired, bool):
+        return dict.fromkeys(axes, paired)
+    names = [paired] if isinstance(paired, str) else paired
+    for name in names:
+        if name not in axes:
+            raise UserError(f"sweep: paired: '{name}' is none of the axes {', '.join(axes)}")
+    return {field: True if field in names else None for field in axes}
+
+
 def _run(found: Sweep, folder: Path, options: ExecutionOptions, *, visible: bool) -> Results:
     from compose.sweep import execution, report  # noqa: PLC0415  # slow to import, and optional
 
@@ -171,7 +196,9 @@ def _results(results: Results, *, kept: bool) -> SweepResults:
             f"{results.stopped}: {len(results.table)} of {results.trials} trials are done; {how}"
         )
     trials = {name: results.table[name].to_numpy() for name in results.table.schema.names}
-    return SweepResults(results.sweep, Table(trials), Table(_cells(results)), results)
+    return SweepResults(
+        results.sweep, Table(trials), Table(_cells(results)), Table(_differences(results)), results
+    )
 
 
 def _cells(results: Results) -> dict[str, Column]:
@@ -188,6 +215,16 @@ def _cells(results: Results) -> dict[str, Column]:
     for name in columns_of(results.sweep):
         columns[name] = [getattr(one, name) for one in figures]
     return {name: _array(values) for name, values in columns.items()}
+
+
+def _differences(results: Results) -> dict[str, Column]:
+    """Return the columns of `differences.csv`."""
+    from compose.sweep.paired_differences import PairedDifference  # noqa: PLC0415  # as above
+
+    return {
+        name: _array([getattr(one, name) for one in results.differences])
+        for name in PairedDifference.__struct_fields__
+    }
 
 
 def _array(values: list[Any]) -> Column:

@@ -8,18 +8,23 @@ import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
+import msgspec
 import numpy as np
 import pytest
 
 import tandem
+from agent.process import agent_journal
 from compose import extras
 from compose.audit.rules import audit_run
+from compose.cli.benchmark import api_missions
+from compose.recording import run as recorded
 from compose.recording.estimating.estimate_rows import PoseEstimateRow
 from compose.recording.run import read
 from compose.recording.summary_json import summary
 from compose.recording.ticks_csv import rows
+from tandem import scenarios
 from tandem.columns import Table
 from tests.commands import tandem as command
 from tests.series import series
@@ -280,6 +285,49 @@ def test_faults_are_texts_or_tables() -> None:
         == scenario.with_faults({"link": "a->b", "loss": 0.5}).template.scenario.faults
         == scenario.with_({"fault": [{"link": "a->b", "loss": 0.5}]}).template.scenario.faults
     )
+
+
+@pytest.mark.parametrize("name", ["random", "noisy", "random-group"])
+def test_another_seed_gives_the_scenario_that_its_file_with_this_seed_gives(name: str) -> None:
+    scenario = tandem.Scenario.load(name)
+    assert scenario.with_(seed=5) == tandem.Scenario.from_dict({**scenario.table, "seed": 5}, name)
+    for wrong, why in ((-1, ">= 0"), (2**63, "<= "), (True, "got 'bool'"), ("5", "got 'str'")):
+        with pytest.raises(tandem.BadScenario, match=f"{name}: seed: .*{why}"):
+            scenario.with_(seed=wrong)
+
+
+@pytest.mark.parametrize(
+    "changed", [{}, {"fault[0].loss": 0.5}, {"planner.name": "paper"}, {"name": "group"}]
+)
+def test_a_run_equals_what_is_read_from_its_journals(changed: dict[str, Any]) -> None:
+    name = "random-group" if changed.get("name") == "group" else "random"
+    run = tandem.run(tandem.Scenario.load(name).with_(changed), seed=2).model
+    read = recorded.of_frames({file: one.frames for file, one in run.journals.items()}, run.source)
+    assert (run.world, run.agents, run.journals) == (read.world, read.agents, read.journals)
+    assert [*run.agents] == [*read.agents]
+    assert [*run.journals] == [*read.journals]
+
+
+def test_a_run_with_another_seed_does_nothing_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    scenario = tandem.Scenario.load("random").with_({"mission.period": 1.0})
+
+    def again(*_: object) -> NoReturn:
+        raise AssertionError("this takes as long as the mission")
+
+    monkeypatch.setattr(msgspec.inspect, "type_info", again)
+    scenario = scenario.with_({"mission.accuracy": 0.2})
+    monkeypatch.setattr(scenarios, "validate", again)
+    monkeypatch.setattr(recorded, "_world", again)
+    monkeypatch.setattr(agent_journal, "decode", again)
+    assert tandem.run(scenario, seed=7).outcome == "localised"
+
+
+@pytest.mark.long
+def test_the_benchmark_compares_the_api_with_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(api_missions, "MISSIONS", {"random": 50})
+    cells = [[*column.cells] for column in api_missions.missions_by_api(3, lambda: None).columns]
+    assert cells[0][2] == "tandem.run / engine (at most 1.6)"
+    assert float(str(cells[1][2])) < 2.0
 
 
 # --- sweeps -------------------------------------------------------------------------------------------

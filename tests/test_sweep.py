@@ -240,7 +240,8 @@ def test_a_seed_follows_from_the_sweep_the_cell_and_the_trial(folder: Path) -> N
     more = seeds(BOTH.replace("[10.0, 8]", "[1.5, 8, 10]"))
     assert more["10", "assured"] == before["10.0", "assured"], "cells beside it, and how numbers are written"
     assert more["8", "paper"] == before["8", "paper"] != before["10.0", "paper"]
-    unpaired = seeds(BOTH.replace("paired = true", ""))
+    assert seeds(BOTH.replace("paired = true", "")) == before, "planners are paired by default"
+    unpaired = seeds(BOTH.replace("paired = true", "paired = false"))
     assert len(set(unpaired.values())) == 4
     assert len(set(before.values())) == 2
     assert trial_seed(6, "{}", 0) != trial_seed(5, "{}", 0) != trial_seed(5, "{}", 1)

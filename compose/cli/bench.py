@@ -11,6 +11,7 @@ import argparse
 from rich.console import Console
 
 from compose.cli.arguments import add_closing, count
+from compose.cli.benchmark.api_missions import missions_by_api
 from compose.cli.benchmark.exact_missions import missions_per_second
 from compose.cli.benchmark.group_missions import missions_of_groups
 from compose.cli.benchmark.noisy_missions import noisy_missions
@@ -40,6 +41,7 @@ def main(options: argparse.Namespace) -> int:
     parts = (
         ticks_per_second,
         missions_per_second,
+        missions_by_api,
         noisy_missions,
         missions_of_groups,
         start_of_a_command,

@@ -14,10 +14,10 @@ from agent.planning.planner import Planner
 from agent.process.agent_journal import FramedReport
 from agent.process.robot import Robot
 from compose.launch.planner_loader import planner_of
-from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
-from compose.recording.run import Run
+from compose.recording.recording_files import WORLD_JOURNAL, JournalFile, agent_journal
+from compose.recording.run import Run, of_frames
 from protocol.journal import environment
-from protocol.journal.journal_file import Journal, Sink
+from protocol.journal.journal_file import Journal, MemoryJournal, Sink
 from protocol.messages import (
     Command,
     Estimate,
@@ -26,7 +26,7 @@ from protocol.messages import (
     MissionEnd,
     RobotConfig,
 )
-from protocol.wire import encode
+from protocol.wire import EncodedMessages, encode
 from world.faults import LATEST
 from world.referee import MissionOutcome
 from world.scenario import Scenario
@@ -53,6 +53,26 @@ def run_mission(scenario: Scenario, out: Path | None = None) -> Run:
 def journals(scenario: Scenario) -> list[str]:
     """Return the file names of the journals of a run of `scenario`."""
     return [*[agent_journal(robot.id) for robot in scenario.robots], WORLD_JOURNAL]
+
+
+def recorded(scenario: Scenario, source: object) -> Run:
+    """Run `scenario`, and return the run with the journals of its recording in memory.
+
+    It equals the run that `of_frames` reads from these journals. Messages in memory are not decoded, and the
+    world is not computed a second time. `source` appears in errors.
+    """
+    sinks = {name: MemoryJournal() for name in journals(scenario)}
+    messages = EncodedMessages()
+    run = played(scenario, sinks, encode=messages.encode)
+    frames = sinks.pop(WORLD_JOURNAL).frames
+    read = of_frames({name: sinks[name].frames for name in sorted(sinks)}, source, messages)
+    world = JournalFile(frames, messages=[messages[frame] for frame in frames])
+    return msgspec.structs.replace(
+        run,
+        agents={robot: read.agents[robot] for robot in run.robots},
+        journals={WORLD_JOURNAL: world, **read.journals},
+        source=source,
+    )
 
 
 def played(

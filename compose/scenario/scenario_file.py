@@ -90,6 +90,11 @@ class ScenarioTemplate(msgspec.Struct, frozen=True):
             ),
         )
 
+    def reseeded(self, seed: int) -> ScenarioTemplate:
+        """Return the template of the same file with another seed, which is valid. Raises like `seeded`."""
+        file = _with_robots(msgspec.structs.replace(self.file, seed=seed))
+        return msgspec.structs.replace(self, file=file, scenario=self.seeded(seed))
+
     def kills(self, seed: int, options: Sequence[Kill] = ()) -> tuple[Kill, ...]:
         """Return the kills of the file, with open fields drawn from `seed`, then those of `--kill` options.
 

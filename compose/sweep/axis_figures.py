@@ -87,7 +87,7 @@ def _success(results: Results, place: int) -> Figure:
         )
     axes.set_ylabel("localised, of all trials (95 % interval)")
     axes.set_ylim(top=min(1.02, axes.get_ylim()[1]))
-    _legend(figure, axes)
+    _legend(figure, axes, _unpaired(results, place))
     return figure
 
 
@@ -142,7 +142,7 @@ def ticks_against(results: Results, place: int) -> Figure:
     axes.yaxis.set_major_formatter("{x:.0f}")
     axes.yaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False, minor_thresholds=(1.0, 0.4)))
     axes.grid(axis="y", which="minor", lw=0.25, color="0.9")
-    _legend(figure, axes)
+    _legend(figure, axes, _unpaired(results, place))
     return figure
 
 
@@ -174,7 +174,7 @@ def _meeting(results: Results) -> Figure:
     since_release.set_ylabel("share of all trials")
     since_release.set_ylim(0.0, 1.02)
     if len(groups) > 1:
-        _legend(figure, since_release)
+        _legend(figure, since_release, _unpaired(results, None))
     return figure
 
 
@@ -249,7 +249,7 @@ def _against(axis: Axis) -> tuple[Figure, Axes, list[float]]:
     crowded = numbers is None and sum(map(len, labels)) > FITTING
     figure = Figure(figsize=(7.2, 5.0 if crowded else 3.6), layout="constrained")
     axes = figure.subplots()
-    axes.set_xlabel(axis.name)
+    axes.set_xlabel(axis.name if axis.paired else f"{axis.name} (other draws at each value)")
     axes.grid(axis="y", lw=0.4, color="0.85")
     if numbers is not None:
         if min(numbers) > 0.0 and max(numbers) >= LOGARITHMIC * min(numbers):
@@ -284,12 +284,24 @@ def _aside(axis: Axis, i: int, lines: int) -> float:
     return 0.0 if _numbers(axis) is not None else SPREAD / lines * (i - 0.5 * (lines - 1))
 
 
-def _legend(figure: Figure, axes: Axes) -> None:
-    """Add a legend above the axes, unless there are no labels."""
+def _unpaired(results: Results, place: int | None) -> str | None:
+    """Return the title of a legend whose lines have other draws, with their axes; None if all are paired."""
+    axes = [axis for i, axis in enumerate(results.sweep.axes) if i != place and len(axis.values) > 1]
+    names = [axis.name for axis in axes if not axis.paired]
+    return f"other draws at each value of {', '.join(names)}" if names else None
+
+
+def _legend(figure: Figure, axes: Axes, title: str | None) -> None:
+    """Add a legend with this title above the axes, unless there are no labels."""
     handles, labels = axes.get_legend_handles_labels()
     if any(labels):
         longest = max(map(len, labels))
         columns = next((count for count in (4, 2) if count * longest < BESIDE), 1)
         figure.legend(
-            handles, labels, loc="outside upper center", ncols=min(columns, len(labels)), frameon=False
+            handles,
+            labels,
+            title=title,
+            loc="outside upper center",
+            ncols=min(columns, len(labels)),
+            frameon=False,
         )

@@ -14,6 +14,7 @@ import pyarrow as pa
 from compose.errors import BadSpec
 from compose.scenario.scenario_file import trust_classes
 from compose.sweep.cells import Cell, RefusedCell, setting_of
+from compose.sweep.paired_differences import PairedDifference, differences_csv, paired_differences
 from compose.sweep.remaining_work import EngineFailed, TrialOptions, Work
 from compose.sweep.results_folder import Folder, opened
 from compose.sweep.spec import Sweep
@@ -25,6 +26,8 @@ from protocol.network.inbox import Inbox, Interrupted
 
 SUMMARY = "summary.csv"
 """The name of the table of cells in the results folder."""
+DIFFERENCES = "differences.csv"
+"""The name of the table of differences between cells of paired axes."""
 
 
 class ExecutionOptions(msgspec.Struct, frozen=True):
@@ -70,6 +73,8 @@ class Results(msgspec.Struct, frozen=True):
     """true if a signal stopped the sweep"""
     trials: int
     """number of trials of all cells that are not refused"""
+    differences: tuple[PairedDifference, ...] = ()
+    """differences between the cells of paired axes"""
 
     def of(self, *cells: int) -> pa.Table:
         """Return the rows of the trials of these cells."""
@@ -202,13 +207,16 @@ def _gathered(folder: Folder, stopped: str | None, interrupted: bool) -> Results
     table = folder.table()
     cells = tuple(folder.cells.values())
     figures = _figures(table, cells, folder.refused)
+    differences = paired_differences(folder.sweep, cells, table)
     try:
         folder.gather(table)
         files.write(folder.path / SUMMARY, summary_csv(folder.sweep, cells, figures))
+        if differences:
+            files.write(folder.path / DIFFERENCES, differences_csv(differences))
     except OSError as error:
         stopped = stopped or f"cannot be written: {files.error_text(error)}"
     trials = folder.sweep.trials * (len(cells) - len(folder.refused))
-    return Results(folder.sweep, cells, table, figures, stopped, interrupted, trials)
+    return Results(folder.sweep, cells, table, figures, stopped, interrupted, trials, differences)
 
 
 def _figures(table: pa.Table, cells: tuple[Cell, ...], refused: Mapping[int, str]) -> dict[int, CellSummary]:

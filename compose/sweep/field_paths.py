@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import re
 from collections.abc import Mapping, Sequence
+from functools import cache
 from itertools import pairwise
 from typing import Any
 
@@ -38,7 +39,7 @@ def field_steps(path: str, base: Mapping[str, Any]) -> Steps:
 
     The field may be missing in `base` if the schema has it. Raises NoSuchField.
     """
-    kind: inspect.Type = inspect.type_info(ScenarioFile)
+    kind = _schema()
     value: Any = base
     walked: list[str | int] = []
     for step in _split(path):
@@ -67,6 +68,12 @@ def field_steps(path: str, base: Mapping[str, Any]) -> Steps:
                 raise NoSuchField(f"{so_far} is a single value")
         walked.append(step)
     return tuple(walked)
+
+
+@cache
+def _schema() -> inspect.Type:
+    """Return the types of all fields of a scenario file, whose translation takes longer than a mission."""
+    return inspect.type_info(ScenarioFile)
 
 
 def with_value(table: Mapping[str, Any], way: Steps, value: Any) -> dict[str, Any]:

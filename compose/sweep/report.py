@@ -15,6 +15,7 @@ from rich.text import Text
 
 from compose.sweep.cells import Cell
 from compose.sweep.execution import SUMMARY, Progress, Results
+from compose.sweep.paired_differences import lines as difference_lines
 from compose.sweep.results_folder import CELLS
 from compose.sweep.statistics import CellSummary, noted, refusals
 from compose.terminal import tables, text_width
@@ -121,11 +122,8 @@ def show(results: Results, out: Path, *, quiet: bool) -> None:
         say("", *lines, "", *text_width.notes(NOTES, columns))
     if shown < len(results.cells):
         tell(f"{len(results.cells) - shown} cells without a problem are not listed; see {out / SUMMARY}")
-    for index, figures in results.figures.items():
-        if figures.refused is not None:
-            tell(f"cell {index} cannot run: {figures.refused}")
-    for reason, count in refusals(results.table):
-        tell(f"refused: {count}: {reason}")
+    say(*difference_lines(results.sweep, results.differences))
+    tell(*_refused(results))
     note = noted(results.table)
     if note is not None:
         why = f" ({note.why})" if note.why else ""
@@ -140,6 +138,15 @@ def show(results: Results, out: Path, *, quiet: bool) -> None:
         recording = _new_folder(f"recording-{results.sweep.name}-{note.cell}-{note.trial}")
         say(f"  {tandem} run {file} --seed {note.seed} --out {recording}")
     say(f"results: {out}")
+
+
+def _refused(results: Results) -> Iterator[str]:
+    """Yield a line for each cell that cannot run, and for each reason for refused trials."""
+    for index, figures in results.figures.items():
+        if figures.refused is not None:
+            yield f"cell {index} cannot run: {figures.refused}"
+    for reason, count in refusals(results.table):
+        yield f"refused: {count}: {reason}"
 
 
 def _new_folder(name: str) -> Path:

@@ -19,6 +19,7 @@ from compose.scenario import scenario_tables, shipped_files
 from compose.scenario.toml_file import field_first, read_text, table_in
 from compose.sweep.draws import Draw, Draws, DrawTable, StartsTable
 from compose.sweep.field_paths import Steps, canonical, jsonable, steps, value_at, with_value
+from compose.sweep.field_users import changes_draws, overlap
 from protocol.spelling import did_you_mean
 from protocol.units import NAME
 
@@ -60,8 +61,9 @@ class AxisTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """the name of an axis with several fields, or with labels"""
     labels: list[Label] | None = None
     """names of the values in tables and figures"""
-    paired: bool = False
-    """true if trials have the same seeds, hence the same random draws, at all values of this axis"""
+    paired: bool | None = None
+    """true if trials with the same number have the same seeds at all values; left out: where the fields
+    change neither draws nor the world, such as those of the planner"""
 
 
 class SpecFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -100,8 +102,13 @@ class Axis(msgspec.Struct, frozen=True):
     """values of the axis, each a tuple with one element per field; None leaves the field as in the base"""
     labels: tuple[str, ...] | None
     """names of the values; None to derive them from the values"""
-    paired: bool
+    paired: bool = False
     """true if the seeds of trials do not depend on this axis"""
+
+    @property
+    def of_planners(self) -> bool:
+        """True if it varies the planner or its options."""
+        return any(way[0] == "planner" for way in self.ways)
 
     @property
     def of_rows(self) -> bool:
@@ -190,6 +197,7 @@ def validated(
     axes = tuple(_axis(axis, f"{source}: axis[{i}]", base) for i, axis in enumerate(spec.axis))
     draws = Draws(_draws(spec, axes, base, source), spec.starts)
     _check_together(axes, draws, source)
+    axes = _paired(axes, [axis.paired for axis in spec.axis], base, draws)
     found = Sweep(
         source=source,
         name=spec.name,
@@ -259,7 +267,6 @@ def _axis(table: AxisTable, where: str, base: dict[str, Any]) -> Axis:
         ways=tuple(ways),
         values=tuple(values),
         labels=tuple(table.labels) if table.labels is not None else None,
-        paired=table.paired,
     )
 
 
@@ -279,7 +286,7 @@ def _axis_of_rows(table: AxisTable, rows: Sequence[RowTable], where: str, base: 
         _with_fields(base, row.set, f"{named}.set")
         found = dict(zip(row.set, _ways(list(row.set), base, f"{named}.set"), strict=True))
         for (field, way), (another, further) in combinations(found.items(), 2):
-            if _overlap(way, further):
+            if overlap(way, further):
                 raise BadSpec(f"{named}.set: '{another}' is already set by '{field}'")
         ways |= found
     if not ways:
@@ -292,14 +299,25 @@ def _axis_of_rows(table: AxisTable, rows: Sequence[RowTable], where: str, base: 
         ways=tuple(ways.values()),
         values=tuple(tuple(row.set.get(field) for field in ways) for row in rows),
         labels=tuple(labels),
-        paired=table.paired,
     )
 
 
-def _overlap(one: Steps, other: Steps) -> bool:
-    """Return whether one of the two paths leads to the other."""
-    shorter = min(len(one), len(other))
-    return one[:shorter] == other[:shorter]
+def _paired(
+    axes: Sequence[Axis], given: Sequence[bool | None], base: dict[str, Any], draws: Draws
+) -> tuple[Axis, ...]:
+    """Return `axes`, paired as `given`; where that is None, if the axis does not change what is drawn."""
+    varied = [way for axis in axes for way in axis.ways]
+    return tuple(
+        [
+            msgspec.structs.replace(
+                axis,
+                paired=not any(changes_draws(way, base, varied, draws.fields) for way in axis.ways)
+                if chosen is None
+                else chosen,
+            )
+            for axis, chosen in zip(axes, given, strict=True)
+        ]
+    )
 
 
 def _fields(table: AxisTable, where: str) -> list[str]:
@@ -424,7 +442,7 @@ def _check_together(axes: Sequence[Axis], draws: Draws, source: str) -> None:
     ]
     placed += [(f"draw[{i}]", False, draw.field, draw.way) for i, draw in enumerate(draws.fields)]
     for (one, of_rows, field, way), (other, _, another, further) in combinations(placed, 2):
-        if _overlap(way, further) and not (of_rows and one == other):
+        if overlap(way, further) and not (of_rows and one == other):
             raise BadSpec(f"{source}: {other}: '{another}' is already set by {one} ('{field}')")
     count = math.prod(len(axis.values) for axis in axes)
     if count > MAX_CELLS:
