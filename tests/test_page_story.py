@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator
 from itertools import combinations
 from typing import Any
@@ -151,6 +152,35 @@ def test_the_label_of_a_mutual_distance_goes_as_soon_as_the_robots_drive_on(
     assert labelled[0]
     assert not labelled[-1]
     assert labelled == sorted(labelled, reverse=True)
+
+
+STROKES = """() => new Promise((drawn) => {
+  const strokes = [], { stroke } = CanvasRenderingContext2D.prototype;
+  CanvasRenderingContext2D.prototype.stroke = function (path) {
+    if (path) strokes.push(`${this.strokeStyle} ${this.globalAlpha.toFixed(2)}`);
+    return path ? stroke.call(this, path) : stroke.call(this);
+  };
+  document.getElementById('canvas').dispatchEvent(new WheelEvent('wheel', { deltaY: 1 }));
+  requestAnimationFrame(() => requestAnimationFrame(() => {
+    CanvasRenderingContext2D.prototype.stroke = stroke;
+    drawn(strokes);
+  }));
+})"""
+"""A function of the page that draws again, and returns colour and opacity of each piece of a trail."""
+
+
+def test_all_seven_copies_of_a_path_have_the_colour_of_its_robot(opened: Open, address: str) -> None:
+    page = opened(f"{address}#tick=5")
+    until_shown(page, 5)
+    picture(page)
+    strokes = Counter(page.evaluate(STROKES))
+    light = (PAGE / "style.css").read_text("utf-8").split("@media")[0]
+    hues = dict(re.findall(r"--robot-([ab]): (#[0-9a-f]{6});", light))
+    pieces = {robot: strokes[f"{hue} 0.95"] for robot, hue in hues.items()}
+    assert min(pieces.values()) > 0
+    assert {robot: strokes[f"{hue} 0.35"] for robot, hue in hues.items()} == {
+        robot: 7 * count for robot, count in pieces.items()
+    }
 
 
 SEEN = {

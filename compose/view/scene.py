@@ -155,13 +155,14 @@ def scene(
     false_poses = reported or {}
     players = tuple([player_of(one, setup, now, false_poses.get(one.id)) for one in setup.robots])
     deliveries = tuple(passages(setup, before, now))
+    found = tuple(events(setup, before, now, deliveries, end))
     told = group_captions if setup.visits else captions
     return Scene(
         now.tick,
         players,
         deliveries,
-        tuple(events(setup, before, now, deliveries, end)),
-        tuple(told(setup, before, now, deliveries, end)),
+        found,
+        tuple(told(setup, before, now, found, end)),
         tuple(configurations(setup, before, now)),
     )
 

@@ -40,7 +40,7 @@ export class Beliefs {
         pen.fillStyle = player.down ? look.paper : look.robot[robot.role];
         pen.fill();
       }
-      if (tints.length && size > 6) labels.placed.push([x - size, y - size, x + size, y + size]);
+      if (!truth || (tints.length && size > 6)) labels.placed.push([x - size, y - size, x + size, y + size]);
       const colour = tints.length ? look.tint(tints[place]) : look.ghost;
       pen.strokeStyle = colour;
       pen.lineWidth = tints.length ? 2.6 : 2;

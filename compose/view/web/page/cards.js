@@ -3,7 +3,7 @@
 import { distance, wrap } from "./geometry.js";
 import { counted, task } from "./group.js";
 import { leads } from "./held.js";
-import { LEAST_GAP_M } from "./plane.js";
+import { LEAST_GAP_M } from "./trails.js";
 import { metres, probability, PHASES, place, plural, rad, speed, turning } from "./words.js";
 
 const MOST_PROBABILITIES = 5;

@@ -86,7 +86,7 @@ export const MEANINGS = [
   ["faint copies of a robot or its trail", "the same, turned around the anchor: just as possible"],
   ["dashed circle around a robot", "how far it can range its peer, in the tick in which they come in range"],
   ["trail", "in the colour of the robot, as in the figures; dotted in phase 1, dashed in phase 2, solid in phase 3"],
-  ["dashed robot and thin dashed trail", "the path that an attacker reports; a line joins it to the true one"],
+  ["dashed robot and thin dashed trail in the hue of faults", "the path that an attacker reports; a line joins it to the true one"],
   ["in a group", "the hue of a robot, of its trail and of its anchor's range tells whether it is localised; thin arrows join the anchors of robots that meet, and are dotted until the second one is localised"],
   ["circle around an anchor", "solid: its sensing range; dashed: the orbit"],
 ];
