@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from compose.launch import in_process
 from compose.recording.run import Run, read
 from compose.recording.run_setup import RunSetup
-from compose.scenario.scenario_file import load, parse
+from compose.scenario.scenario_file import load, parse, setting
 from compose.scenario.shipped_files import shipped
 from compose.view.recorded import run_data, scenes_of
 from compose.view.run_data import TickData
@@ -164,6 +164,17 @@ def test_kills_and_faults_of_every_kind_are_told(recorded: Record) -> None:
         ("b misses the deadline and stops for this tick.", ("a", "b")),
         ("The world is down: its process is gone.", ()),
     ]
+
+
+def test_the_phases_and_states_of_a_planner_of_the_user_are_shown_as_they_are(recorded: Record) -> None:
+    run = recorded(setting("paper-1", planner="tests.own_planners:Wrapping").scenario)
+    scenes = scenes_of(run)
+    begun = [one.text for shown in scenes for one in shown.events if one.kind == "phase"]
+    assert set(begun) == {f"{robot} begins phase {phase}" for robot in "ab" for phase in (1, 2, 3)}
+    assert {one.player("a").activity for one in scenes[:-1]} >= {"a: radial", "a: waiting"}
+    kinds = {caption.kind for one in scenes for caption in one.captions}
+    assert kinds.isdisjoint({"mirrored", "path", "search", "manoeuvre"})
+    assert kinds >= {"rules", "ranging", "contact", "configurations", "ruled-out", "end"}
 
 
 def test_what_each_robot_of_a_pair_finds_at_another_time_is_told_of_it_alone(recorded: Record) -> None:

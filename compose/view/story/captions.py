@@ -46,13 +46,16 @@ def captions(
         pair = PairData(robots, setup.mission.noise.exact, before, now)
         yield from rules(pair, len(groups))
         yield from ranging(pair, setup.mission.sensing_range)
-        yield from mirrored(pair)
+        if not pair.own_planner:
+            yield from mirrored(pair)
         yield from choosing_branch(pair)
-        yield from searching(pair)
-        yield from beginning_again(pair)
+        if not pair.own_planner:
+            yield from searching(pair)
+            yield from beginning_again(pair)
         yield from meeting(pair)
         yield from fitting(pair)
-        yield from planning(pair)
+        if not pair.own_planner:
+            yield from planning(pair)
         yield from concluding(pair, ended)
         yield from faults([one for one in events if one.robot in pair.ids], pair.ids)
     yield from faults([one for one in events if one.robot is None])

@@ -126,7 +126,7 @@ class Card {
     const phase = store.phase(tick, this.robot.id);
     this.root.dataset.phase = phase;
     this.root.classList.toggle("down", Boolean(player.down));
-    this.phase.textContent = `phase ${phase}: ${PHASES[phase]}${player.down ? "; down" : ""}`;
+    this.phase.textContent = `phase ${phase}${this.robot.own_planner ? "" : `: ${PHASES[phase]}`}${player.down ? "; down" : ""}`;
     if (this.doing.textContent !== player.activity) this.doing.textContent = player.activity;
     const attack = truth && player.reported ? attacked(store, tick, this.robot, player.reported) : "";
     if (this.attack.textContent !== attack) this.attack.textContent = attack;

@@ -149,7 +149,8 @@ export class Guide {
     const span = this.#span;
     for (; span.read < store.whole && span.to === null; span.read++) {
       const commands = pair.map((robot) => store.player(span.read, robot.id)?.command);
-      if (span.from === null && commands.some((command) => command?.phase === 3)) span.from = span.read;
+      const met = (robot) => this.store.player(span.read, robot.id)?.contacts?.length > 0; // a planner of the user has phases of its own
+      if (span.from === null && (pair[0].own_planner ? pair.some(met) : commands.some((command) => command?.phase === 3))) span.from = span.read;
       if (commands.every((command) => command?.verdict)) span.to = span.read;
     }
     return { from: span.from ?? span.to ?? store.last, to: span.to ?? Infinity };
