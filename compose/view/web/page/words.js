@@ -79,7 +79,7 @@ export const MEANINGS = [
   ["arc with an arrow", "where the last manoeuvre can end: the thicker, the larger J of eq. (8); the arrow is the choice"],
   ["J", "the least difference between the squares of two distances that the configurations predict"],
   ["dotted circle around an anchor", "where the robot may be by its only range"],
-  ["ellipse", "3 sigma of the most probable position"],
+  ["ellipse or arc", "3 sigma of the most probable position; an arc if the heading is so uncertain that an ellipse shows nothing"],
   ["hollow robot, crossed out", "its process is gone"],
   ["line to an anchor", "range measured in this tick"],
   ["double line", "contact; dots are reports: filled received, with a tail late, hollow lost, crossed out damaged"],
