@@ -11,12 +11,12 @@ from msgspec.structs import replace
 from compose.launch import in_process
 from compose.recording.run import Run, read
 from compose.recording.run_setup import RunSetup
-from compose.scenario.scenario_file import load, parse
+from compose.scenario.scenario_file import load, parse, setting
 from compose.scenario.shipped_files import shipped
 from compose.view.recorded import run_data, scenes_of
 from compose.view.run_data import TickData
-from compose.view.scene import Scene
-from compose.view.story.caption import Caption
+from compose.view.scene import Scene, scene
+from compose.view.story.caption import FAULTS, Caption
 from compose.view.story.captions import captions
 from protocol.attack import Attack
 from protocol.messages import Contact, Inconsistent, Localised, MissionEnd, Outcome, Undecided
@@ -149,11 +149,39 @@ def test_a_detected_attack_is_told_as_a_contradiction_and_named_with_the_truth_o
     assert not any("localised" in one.text or "false data" in one.text for one in captions)
 
 
+def test_kills_and_faults_of_every_kind_are_told(recorded: Record) -> None:
+    run = recorded(load("random", seed=3, faults=["loss=0.3, delay=0..3, duplicate=0.5, corrupt=0.3"]))
+    assert run.setup is not None
+    kinds = {caption.kind for one in scenes_of(run) for caption in one.captions}
+    assert kinds >= {"report-lost", "report-damaged", "report-late", "report-doubled"}
+    data = run_data(run)
+    before, now = data.ticks[46], data.ticks[47]
+    killed = replace(now, down={"a", None}, back={"a"}, replayed={"a": 47}, late={"b"})
+    told = [(one.text, one.robots) for one in scene(run.setup, before, killed).captions if one.kind in FAULTS]
+    assert told[:4] == [
+        ("a is down: its process is gone.", ("a", "b")),
+        ("a is back: its process replayed 47 ticks, identical.", ("a", "b")),
+        ("b misses the deadline and stops for this tick.", ("a", "b")),
+        ("The world is down: its process is gone.", ()),
+    ]
+
+
+def test_the_phases_and_states_of_a_planner_of_the_user_are_shown_as_they_are(recorded: Record) -> None:
+    run = recorded(setting("paper-1", planner="tests.own_planners:Wrapping").scenario)
+    scenes = scenes_of(run)
+    begun = [one.text for shown in scenes for one in shown.events if one.kind == "phase"]
+    assert set(begun) == {f"{robot} begins phase {phase}" for robot in "ab" for phase in (1, 2, 3)}
+    assert {one.player("a").activity for one in scenes[:-1]} >= {"a: radial", "a: waiting"}
+    kinds = {caption.kind for one in scenes for caption in one.captions}
+    assert kinds.isdisjoint({"mirrored", "path", "search", "manoeuvre"})
+    assert kinds >= {"rules", "ranging", "contact", "configurations", "ruled-out", "end"}
+
+
 def test_what_each_robot_of_a_pair_finds_at_another_time_is_told_of_it_alone(recorded: Record) -> None:
     run = recorded(load("random", seed=3, faults=["loss=0.5, delay=0..3"]))
     text = " ".join(text for _, text in told(run))
     for one in (
-        "A report of a is lost.",
+        "a's report of tick 57 to b is lost.",
         "For a, two configurations fit, each with one angle, and so one pose, of a and one of b.",
         "For b, two configurations fit, each with one angle, and so one pose, of a and one of b.",
         "For b, only one of the two configurations is left.",
@@ -300,8 +328,8 @@ def texts(setup: RunSetup, before: TickData, now: TickData) -> list[str]:
 
 
 def sentences(scenes: tuple[Scene, ...]) -> Iterator[str]:
-    for scene in scenes:
-        for caption in scene.captions:
+    for one in scenes:
+        for caption in one.captions:
             yield caption.text
             if caption.truth:
                 yield caption.truth

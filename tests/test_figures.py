@@ -13,18 +13,23 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse
+from matplotlib.patches import Polygon
+from matplotlib.path import Path as PlanePath
 
 from compose.figures import one_robot, over_time
+from compose.figures.one_robot import outline_of
+from compose.figures.pair import ROLES
 from compose.figures.sheet import Absent
 from compose.figures.style import PLACES, SCREEN, look, save
 from compose.launch.in_process import run_mission
 from compose.recording.run import read
 from compose.scenario.scenario_file import load, parse
-from compose.view.recorded import Journals
+from compose.view.outlines import Reach, arc
+from compose.view.recorded import Journals, scenes_of
 from protocol.journal.journal_file import CorruptJournal
 from protocol.journal.journal_file import read as frames
 from protocol.messages import Estimate
+from protocol.motion import Covariance, Pose
 from tests.commands import PAPER_1, Ended, several_pairs, tandem
 from tests.series import series
 from tests.test_album import pair as pair_of
@@ -165,10 +170,10 @@ def test_each_part_of_a_noisy_mission_is_in_its_picture(noisy: Path, drawn: Path
     } <= found
     assert {"probability-1-anchor", "probability-1-plane", "confidence", "near-truth"} <= found
     assert ("ghosts" in found) == any(len(one.world) > 1 for one in held)
-    assert {f"ellipse-{held[-1].tick}", f"near-{held[-1].tick}"} <= found
-    ellipses = {int(name.removeprefix("ellipse-")) for name in found if name.startswith("ellipse-")}
-    assert 1 < len(ellipses) <= 5
-    assert ellipses <= {one.tick for one in held}
+    assert {f"outline-{held[-1].tick}", f"near-{held[-1].tick}"} <= found
+    outlines = {int(name.removeprefix("outline-")) for name in found if name.startswith("outline-")}
+    assert 1 < len(outlines) <= 5
+    assert outlines <= {one.tick for one in held}
 
 
 @pytest.mark.long
@@ -195,20 +200,57 @@ def test_the_error_over_time_is_that_of_the_estimates_against_the_truth(noisy: P
     assert not held[claimed - 1].localised
 
 
-@pytest.mark.long
-def test_an_ellipse_holds_what_is_within_3_sigma(noisy: Path) -> None:
+def test_an_outline_holds_what_is_within_3_sigma(noisy: Path) -> None:
     axes = Figure().subplots()
     one_robot.draw_estimates(axes, pair_of(noisy), "a")
     last = read(noisy).estimates("a")[-1]
     assert last.covariance is not None
-    (ellipse,) = axes.findobj(lambda artist: artist.get_gid() == f"ellipse-{last.tick}")
-    assert isinstance(ellipse, Ellipse)
-    outline = ellipse.get_patch_transform().transform(
-        [(1.0, 0.0), (0.0, 1.0), (math.sqrt(0.5), -math.sqrt(0.5))]
-    )
+    (drawn,) = axes.findobj(lambda artist: artist.get_gid() == f"outline-{last.tick}")
+    assert isinstance(drawn, Polygon)
+    outline = np.asarray(drawn.get_xy())
     sigma = [[last.covariance.xx, last.covariance.xy], [last.covariance.xy, last.covariance.yy]]
     for point in outline - [last.world[0].x, last.world[0].y]:
         assert point @ np.linalg.solve(sigma, point) == pytest.approx(9.0)
+
+
+def test_a_position_along_an_arc_is_drawn_along_it_within_the_range_to_the_peer(noisy: Path) -> None:
+    """A robot that has measured one mutual range knows how far it is from its anchor, and little else."""
+    shown, pair = scenes_of(read(noisy)), pair_of(noisy)
+    for role in ROLES:
+        sigmas = {
+            one.tick: one.covariance.position_sigma for one, _ in pair.robot(role).placed if one.covariance
+        }
+        tick = max(sigmas, key=sigmas.__getitem__)
+        player = shown[tick].player(role)
+        assert player.pose
+        assert player.held
+        assert sigmas[tick] > 10.0
+        assert np.ptp(np.array(player.held.arc), axis=0).max() < 2.5
+        assert PlanePath(player.held.arc).contains_point((player.pose.x, player.pose.y))
+        estimate = next(one for one, _ in pair.robot(role).placed if one.tick == tick)
+        assert outline_of(pair, role, estimate)[:-1] == player.held.arc
+    assert not any(player.held.arc for player in shown[-1].players if player.held)
+
+
+def test_a_position_turned_about_a_point_keeps_its_distance_and_a_small_turn_is_an_ellipse() -> None:
+    across, pose = 0.1, Pose(14.0, 3.0, 0.7)  # 10 m from (6, -3)
+    for sigma, reach, span in ((0.3, None, 0.9), (5.0, None, math.pi), (5.0, Reach([(14.0, 3.0)], 2.0), 0.2)):
+        out, up = 0.8, 0.6
+        turned = 10.0 * sigma
+        covariance = Covariance(
+            (up * turned) ** 2 + (out * across) ** 2,
+            out * up * (across**2 - turned**2),
+            -6.0 * sigma**2,
+            (out * turned) ** 2 + (up * across) ** 2,
+            8.0 * sigma**2,
+            sigma**2,
+        )
+        points = np.array(arc(pose, covariance, reach)) - [6.0, -3.0]
+        assert np.abs(np.hypot(*points.T) - 10.0).max() < 3.0 * across + 1e-9
+        angles = np.angle((points @ [1.0, 1.0j]) * np.exp(-1j * math.atan2(6.0, 8.0)))
+        assert np.abs(angles).max() == pytest.approx(span, abs=0.09)
+    assert not arc(pose, Covariance(0.01, 0.0, 0.0, 0.01, 0.0, 1e-4))
+    assert not arc(pose, Covariance(0.01, 0.0, 0.0, 0.01, 0.0, 0.0))
 
 
 @pytest.mark.long
@@ -239,7 +281,7 @@ def test_an_exact_recording_has_counts_for_probabilities_and_no_ellipse(tmp_path
     assert {"possible poses", "one pose", "tolerance: 1e-6 m"} <= words
     assert {"count", "tolerance", "position-a", "ghosts", "near-truth"} <= found
     assert not {"envelope", "sigma", "confidence", "accuracy"} & found
-    assert not [name for name in found if name.startswith(("ellipse-", "probability-"))]
+    assert not [name for name in found if name.startswith(("outline-", "probability-"))]
 
 
 @pytest.mark.long

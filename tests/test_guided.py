@@ -95,6 +95,31 @@ def test_guided_play_of_thousands_of_ticks_takes_about_a_minute(opened: Open, ad
     assert 50 < sum(tick < encounter for tick in ticks) < 70
 
 
+def test_guided_play_stops_at_each_kill_and_at_the_first_fault_of_each_kind(
+    opened: Open, address: str
+) -> None:
+    page = opened(address)
+    captions: dict[int, list[dict[str, object]]] = {
+        tick: [
+            {"kind": "report-lost", "text": f"a's report of tick {tick} to b is lost.", "robots": ["a", "b"]}
+        ]
+        for tick in range(20, 30)
+    }
+    captions[10] = [
+        {"kind": "down", "text": "a is down: its process is gone.", "robots": ["a", "b"]},
+        {
+            "kind": "back",
+            "text": "a is back: its process replayed 10 ticks, identical.",
+            "robots": ["a", "b"],
+        },
+    ]
+    captions[40] = [{"kind": "down", "text": "The world is down: its process is gone.", "robots": []}]
+    ticks = page.evaluate(LONG, [20, 60, captions])
+    stops = {tick for tick in range(60) if ticks.count(tick) > 15}
+    assert stops == {10, 20, 40}
+    assert ticks.count(10) > 1.5 * ticks.count(40)
+
+
 @pytest.mark.long
 def test_the_camera_follows_the_story_until_it_is_moved(opened: Open, address: str) -> None:
     page = started(opened, address, 44)

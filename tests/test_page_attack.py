@@ -20,7 +20,7 @@ from compose.view.scene import Scene
 from protocol.attack import Attack
 from protocol.messages import Inconsistent
 from protocol.motion import travelled
-from tests.browser import Open, picture, scrub_to, watching
+from tests.browser import Open, inks, picture, scrub_to, watching
 
 HALVED = Attack("scale", 0.5, "orbit")
 LABELS = "document.getElementById('canvas').labels.map((one) => one.text)"
@@ -130,6 +130,22 @@ def test_the_card_names_the_gap_and_then_the_verdict_and_only_with_the_truth(
     expect(sentence).to_be_hidden()
     picture(page)
     assert not [text for text in page.evaluate(LABELS) if "reported" in text]
+
+
+def test_the_path_that_an_attacker_reports_is_drawn_in_the_hue_that_the_legend_gives_it(
+    opened: Open, recording: Path, attacked_address: str
+) -> None:
+    gaps = [one.gap if (one := scene.player("a").reported) else 0.0 for scene in scenes_of(read(recording))]
+    begins = next(tick for tick, gap in enumerate(gaps) if gap > 0.1)
+    page = opened(attacked_address)
+    drawn = {}
+    for tick in (begins - 2, len(gaps) - 2):
+        scrub_to(page, tick)
+        drawn[tick] = inks(page)["fault"]
+    honest, false = drawn.values()
+    assert honest < 100  # crosses over poses that are ruled out
+    assert false > 400
+    assert "var(--fault)" in page.locator("#legend li").filter(has_text="path that an attacker").inner_html()
 
 
 @pytest.mark.long

@@ -164,6 +164,28 @@ def test_no_text_overlaps_another(
         shot(page, f"labels-{name}-dark-{size[0]}")
 
 
+COVERED = """() => {
+  const { labels, targets } = document.getElementById('canvas');
+  const off = ([x, y], [l, t, r, b]) => (
+    Math.hypot(x - Math.min(Math.max(x, l), r), y - Math.min(Math.max(y, t), b))
+  );
+  return targets.filter(({ kind }) => kind !== 'anchor').flatMap(({ at, radius }) => (
+    labels.filter(({ box }) => off(at, box) < 0.6 * radius).map(({ text }) => text)
+  ));
+}"""
+
+
+def test_no_label_covers_a_robot_whose_bearing_is_unknown(opened: Open, address: str) -> None:
+    page = opened(address)
+    until_shown(page, 0)
+    page.keyboard.press("t")
+    for tick in (16, 20, 24):
+        scrub_to(page, tick)
+        picture(page)
+        assert any("bearing unknown" in text for text, *_ in page.evaluate(TEXTS))
+        assert not page.evaluate(COVERED), tick
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("size", SIZES, ids=str)
 def test_no_text_overlaps_another_at_any_moment_of_guided_play(

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 import pytest
 from playwright.sync_api import Page, expect
 
+from compose.launch.in_process import run_mission
+from compose.scenario.scenario_file import setting
 from compose.view.web.standalone import PAGE
-from tests.browser import Open, picture, stop_clock, until_shown
+from tests.browser import Open, picture, stop_clock, until_shown, watching
 
 STEP_MS = 250
 STORY = """() => ({
@@ -151,6 +155,47 @@ def test_the_label_of_a_mutual_distance_goes_as_soon_as_the_robots_drive_on(
     assert labelled[0]
     assert not labelled[-1]
     assert labelled == sorted(labelled, reverse=True)
+
+
+def test_the_phase_of_a_planner_of_the_user_is_a_number(opened: Open, tmp_path: Path) -> None:
+    run_mission(setting("paper-1", planner="tests.own_planners:Wrapping").scenario, tmp_path)
+    with watching(tmp_path) as (_, found):
+        page = opened(f"{found}#tick=8")
+        until_shown(page, 8)
+        expect(page.locator(".card[data-robot=a] .phase")).to_have_text("phase 2")
+        expect(page.locator(".card[data-robot=a]")).to_contain_text("a: radial")
+        expect(page.locator("#legend")).to_contain_text("path, phase 1")
+        for words in ("near anchor", "search", "own anchor"):
+            expect(page.locator("#mission")).not_to_contain_text(words)
+
+
+STROKES = """() => new Promise((drawn) => {
+  const strokes = [], { stroke } = CanvasRenderingContext2D.prototype;
+  CanvasRenderingContext2D.prototype.stroke = function (path) {
+    if (path) strokes.push(`${this.strokeStyle} ${this.globalAlpha.toFixed(2)}`);
+    return path ? stroke.call(this, path) : stroke.call(this);
+  };
+  document.getElementById('canvas').dispatchEvent(new WheelEvent('wheel', { deltaY: 1 }));
+  requestAnimationFrame(() => requestAnimationFrame(() => {
+    CanvasRenderingContext2D.prototype.stroke = stroke;
+    drawn(strokes);
+  }));
+})"""
+"""A function of the page that draws again, and returns colour and opacity of each piece of a trail."""
+
+
+def test_all_seven_copies_of_a_path_have_the_colour_of_its_robot(opened: Open, address: str) -> None:
+    page = opened(f"{address}#tick=5")
+    until_shown(page, 5)
+    picture(page)
+    strokes = Counter(page.evaluate(STROKES))
+    light = (PAGE / "style.css").read_text("utf-8").split("@media")[0]
+    hues = dict(re.findall(r"--robot-([ab]): (#[0-9a-f]{6});", light))
+    pieces = {robot: strokes[f"{hue} 0.95"] for robot, hue in hues.items()}
+    assert min(pieces.values()) > 0
+    assert {robot: strokes[f"{hue} 0.35"] for robot, hue in hues.items()} == {
+        robot: 7 * count for robot, count in pieces.items()
+    }
 
 
 SEEN = {

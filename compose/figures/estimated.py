@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse
+from matplotlib.patches import Polygon
 
 from compose.figures.sheet import EDGE, FOOT, GAP, Sheet, around
 from compose.figures.style import INK, MARKS, PALE, SCREEN, Medium
@@ -21,15 +21,15 @@ from compose.recording.estimating.estimate_run import EstimationProblem, Recordi
 from compose.recording.estimating.pair_measurements import listed
 from compose.recording.ranging.range_recording import Numbers, TruePath
 from compose.view.colours import COLOURS
+from compose.view.outlines import SIGMAS, outline
 from protocol.mission import Role
+from protocol.motion import Covariance, Pose
 
 AXIS, TALL, TALLEST = 0.6, 1.0, 5.0
 """The space left of a panel over time, its height, and the largest height of the plane, in inches."""
 ROLES: tuple[Role, Role] = ("a", "b")
-SIGMAS = 3.0
-"""The sigmas of the drawn ellipses and bounds."""
-ELLIPSES = 12
-"""The largest number of ellipses along a path."""
+OUTLINES = 12
+"""The largest number of outlines along a path of where the robot is."""
 NEES_BOUND = 11.34
 """The NEES that 99 % of right covariances do not exceed: chi-square of three degrees of freedom."""
 MARGIN = 0.03
@@ -38,7 +38,7 @@ LEAST_ERROR = 1e-3
 OUTLIER = 0.5
 """The weight below which a range is drawn as an outlier."""
 TOO_WIDE = 1.0
-"""The sigma (m) of a position above which no ellipse is drawn: it would cover all others."""
+"""The sigma (m) of a position above which no outline is drawn: it would cover all others."""
 
 
 MOST_PAIRS = 16
@@ -144,11 +144,11 @@ def _path(drawn: Drawn, medium: Medium) -> Figure:
             [row.x for row in rows], [row.y for row in rows], color=colour, lw=1.0, label=f"{name}, {since}"
         )
         points += [(row.x, row.y) for row in rows]
-        for row in rows[:: math.ceil(len(rows) / ELLIPSES)]:
+        for row in rows[:: math.ceil(len(rows) / OUTLINES)]:
             if math.sqrt(row.xx + row.yy) <= TOO_WIDE:
-                axes.add_patch(_ellipse(row, colour))
-                reach = [SIGMAS * math.sqrt(max(variance, 0.0)) for variance in (row.xx, row.yy)]
-                points += [(row.x + sign * reach[0], row.y + sign * reach[1]) for sign in (-1.0, 1.0)]
+                around_it = outline(Pose(row.x, row.y, row.heading), _covariance(row))
+                axes.add_patch(Polygon(around_it, facecolor=colour, edgecolor=colour, alpha=0.18, lw=0.8))
+                points += around_it
         axes.plot(rows[0].x, rows[0].y, ls="", ms=5, **marks)
     for anchor, marker in zip(drawn.problem.measured.anchors, cycle(ANCHOR_MARKS), strict=False):
         axes.plot(anchor.x, anchor.y, ls="", marker=marker, ms=5, color=INK, label=f"anchor {anchor.id}")
@@ -158,14 +158,8 @@ def _path(drawn: Drawn, medium: Medium) -> Figure:
     return sheet.finished()
 
 
-def _ellipse(row: PoseEstimateRow, colour: str) -> Ellipse:
-    """Return the ellipse of SIGMAS sigmas of a position."""
-    variances, directions = np.linalg.eigh(np.array(((row.xx, row.xy), (row.xy, row.yy))))
-    across, along = 2.0 * SIGMAS * np.sqrt(np.maximum(variances, 0.0))
-    angle = math.degrees(math.atan2(directions[1, 1], directions[0, 1]))
-    return Ellipse(
-        (row.x, row.y), along, across, angle=angle, facecolor=colour, edgecolor=colour, alpha=0.18, lw=0.8
-    )
+def _covariance(row: PoseEstimateRow) -> Covariance:
+    return Covariance(row.xx, row.xy, row.xh, row.yy, row.yh, row.hh)
 
 
 def _over_time(drawn: Drawn, medium: Medium) -> Figure:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap, to_hex, to_rgba
 from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse, FancyArrowPatch, Wedge
+from matplotlib.patches import FancyArrowPatch, Polygon, Wedge
 from matplotlib.ticker import MaxNLocator
 from matplotlib.typing import ColorType
 
@@ -32,6 +32,7 @@ from compose.figures.style import INK, PALE, SCREEN, Medium
 from compose.figures.trajectory import draw_plane, window
 from compose.recording.run import ended
 from compose.view.colours import COLOURS
+from compose.view.outlines import SIGMAS, Point, Reach, outline
 from protocol.messages import Estimate
 from protocol.mission import Role
 from protocol.motion import ORIGIN, Pose
@@ -44,13 +45,12 @@ AGES: dict[Role, LinearSegmentedColormap] = {
     "b": LinearSegmentedColormap.from_list("ages-b", ["#f2b79f", COLOURS["b"], "#4a1608"]),
 }
 """The colours of estimates over time by role, from the first to the last: the robot's hue, ever darker."""
-SIGMAS = 3.0
-ELLIPSES = 5
-"""The maximum number of error ellipses."""
+OUTLINES = 5
+"""The maximum number of outlines of where the robot is."""
 SMALLER = 0.75
-"""The largest size ratio, later over earlier, at which two overlapping ellipses are both legible."""
+"""The largest size ratio, later over earlier, at which two overlapping outlines are both legible."""
 AROUND = 2.2
-"""The maximum half-width of the enlarged panel, as a multiple of the last ellipse's size."""
+"""The maximum half-width of the enlarged panel, as a multiple of the last outline's size."""
 EXACTLY = 0.02
 """The minimum half-width of the enlarged panel with exact sensors, as a fraction of the sensing range."""
 ARROW = 0.55
@@ -116,7 +116,7 @@ def _title(pair: PairRecord, role: Role) -> list[str]:
 
 
 def draw_estimates(axes: Axes, pair: PairRecord, role: Role) -> None:
-    """Draw the most probable pose over time, ever darker, legible error ellipses, and the other poses."""
+    """Draw the most probable pose over time, ever darker, legible outlines, and the other poses."""
     one, ages = pair.robot(role), AGES[role]
     left, right, low, high = window(pair)
     ghosts = [pose for estimate, _ in one.placed for pose in others(estimate)]
@@ -136,7 +136,7 @@ def draw_estimates(axes: Axes, pair: PairRecord, role: Role) -> None:
         zorder=3, gid="estimates",
     )  # fmt: skip
     for estimate, _ in shown:
-        _ellipse(axes, one, role, estimate, ORIGIN, f"ellipse-{estimate.tick}")
+        _draw_outline(axes, pair, role, estimate, ORIGIN, f"outline-{estimate.tick}")
     final = poses[-1]
     axes.plot(final.x, final.y, "*", ms=9, mfc=ages(1.0), mec="white", mew=0.6, zorder=5, gid="final")
     axes.plot(
@@ -155,22 +155,21 @@ def _ages(one: Side, role: Role) -> dict[int, str]:
 
 
 def legible(pair: PairRecord, role: Role) -> list[tuple[Estimate, Pose]]:
-    """Return the estimates whose ellipses are drawn, with the true poses, in order of time.
+    """Return the estimates whose outlines are drawn, with the true poses, in order of time.
 
-    These are the last one and earlier ones that later ellipses do not hide, ELLIPSES at most. Ellipses
+    These are the last one and earlier ones that later outlines do not hide, OUTLINES at most. Outlines
     larger than the sensing range R are omitted, because they carry no information.
     """
     chosen: list[tuple[Estimate, Pose]] = []
     largest = pair.mission.sensing_range
     for estimate, truth in reversed(pair.robot(role).likeliest):
-        if estimate.covariance is None or len(chosen) == ELLIPSES:
+        if estimate.covariance is None or len(chosen) == OUTLINES:
             continue
-        if SIGMAS * estimate.covariance.position_sigma > largest:
+        if _size(pair, role, estimate) > largest:
             continue
         if chosen:
             after = chosen[-1][0]
-            assert after.covariance is not None
-            sizes = SIGMAS * estimate.covariance.position_sigma, SIGMAS * after.covariance.position_sigma
+            sizes = _size(pair, role, estimate), _size(pair, role, after)
             apart = error(estimate.world[0], after.world[0])
             if apart < sum(sizes) and sizes[1] > SMALLER * sizes[0]:
                 continue
@@ -178,27 +177,39 @@ def legible(pair: PairRecord, role: Role) -> list[tuple[Estimate, Pose]]:
     return chosen[::-1]
 
 
-def _ellipse(axes: Axes, one: Side, role: Role, estimate: Estimate, origin: Pose, gid: str) -> None:
-    """Draw the error ellipse of the most probable position relative to `origin`; the last one is filled."""
-    pose, covariance, last = estimate.world[0], estimate.covariance, estimate is one.likeliest[-1][0]
-    if covariance is None:
-        return
-    variances, directions = np.linalg.eigh([[covariance.xx, covariance.xy], [covariance.xy, covariance.yy]])
-    height, width = 2.0 * SIGMAS * np.sqrt(np.maximum(variances, 0.0))
-    colour = _ages(one, role)[estimate.tick]
-    axes.add_patch(
-        Ellipse(
-            (pose.x - origin.x, pose.y - origin.y),
-            width,
-            height,
-            angle=math.degrees(math.atan2(directions[1, 1], directions[0, 1])),
-            facecolor=to_rgba(colour, 0.12 if last else 0.0),
-            edgecolor=colour,
-            lw=1.4 if last else 0.8,
-            zorder=4,
-            gid=gid,
-        )
-    )
+def outline_of(pair: PairRecord, role: Role, estimate: Estimate) -> Sequence[Point]:
+    """Return the closed outline of where the most probable position is; empty without a covariance."""
+    if estimate.covariance is None:
+        return ()
+    peer, tick = pair.robot("b" if role == "a" else "a"), estimate.tick
+    met, measured = pair.mutual[tick] if tick < len(pair.mutual) else (False, None)
+    theirs = next((one for one, _ in peer.placed if one.tick == tick), None) if met else None
+    reach = None
+    if theirs is not None:
+        reach = Reach.of(pair.mission, measured, theirs.world[0], theirs.covariance)
+    return outline(estimate.world[0], estimate.covariance, reach)
+
+
+def _size(pair: PairRecord, role: Role, estimate: Estimate) -> float:
+    """Return the largest distance in m of that outline from the position; 0 without one."""
+    pose = estimate.world[0]
+    return max([math.dist((pose.x, pose.y), one) for one in outline_of(pair, role, estimate)], default=0.0)
+
+
+def _draw_outline(
+    axes: Axes, pair: PairRecord, role: Role, estimate: Estimate, origin: Pose, gid: str
+) -> None:
+    """Draw that outline relative to `origin`; the last one is filled."""
+    one = pair.robot(role)
+    colour, last = _ages(one, role)[estimate.tick], estimate is one.likeliest[-1][0]
+    points = [(x - origin.x, y - origin.y) for x, y in outline_of(pair, role, estimate)]
+    if points:
+        axes.add_patch(
+            Polygon(
+                points, facecolor=to_rgba(colour, 0.12 if last else 0.0), edgecolor=colour,
+                lw=1.4 if last else 0.8, zorder=4, gid=gid,
+            )
+        )  # fmt: skip
 
 
 def draw_near(axes: Axes, pair: PairRecord, role: Role) -> None:
@@ -219,7 +230,7 @@ def draw_near(axes: Axes, pair: PairRecord, role: Role) -> None:
     axes.plot(0.0, 0.0, "o", ms=5, color=INK, gid="near-truth", label="true")
     for estimate, then in legible(pair, role) or [(last, truth)]:
         pose, marker = estimate.world[0], "*" if estimate is last else "D"
-        _ellipse(axes, one, role, estimate, then, f"near-{estimate.tick}")
+        _draw_outline(axes, pair, role, estimate, then, f"near-{estimate.tick}")
         axes.plot(
             pose.x - then.x, pose.y - then.y, marker, ms=9 if estimate is last else 3.5, ls="",
             color=colours[estimate.tick], mec="white", mew=0.5, zorder=6, label=str(estimate.tick),
@@ -245,8 +256,7 @@ def _half(pair: PairRecord, role: Role) -> float:
     """Return the half-width of the enlarged panel, in m."""
 
     def size(estimate: Estimate, truth: Pose) -> float:
-        sigma = estimate.covariance.position_sigma if estimate.covariance is not None else 0.0
-        return SIGMAS * sigma + error(estimate.world[0], truth)
+        return _size(pair, role, estimate) + error(estimate.world[0], truth)
 
     last = size(*pair.robot(role).likeliest[-1])
     most = max([size(*one) for one in legible(pair, role)], default=last)

@@ -85,7 +85,8 @@ def timed(
         )  # fmt: skip
     if phases:
         for span, left, right in zip(spans, shares, shares[1:], strict=False):
-            names = (f"{span.phase}: {PHASES[span.phase]}", f"phase {span.phase}", str(span.phase))
+            named = f"phase {span.phase}" if pair.own_planner else f"{span.phase}: {PHASES[span.phase]}"
+            names = (named, f"phase {span.phase}", str(span.phase))
             fit = next((name for name in names[:2] if measured(name) < (right - left) * width), names[2])
             axes.text((left + right) / 2, 1.03, fit, transform=axes.transAxes, ha="center", color="0.3")
     scaled = [Span(0, spans[0].first, spans[-1].last)] if even else spans

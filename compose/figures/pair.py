@@ -131,6 +131,11 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
         return max(0, len(self.mutual) - 1)
 
     @property
+    def own_planner(self) -> bool:
+        """True if the phases are those of a planner of the user, and have no names."""
+        return self.run.setup is not None and any(one.own_planner for one in self.run.setup.robots)
+
+    @property
     def true(self) -> bool:
         """True if the paths are the ground truth, and not implied by claims."""
         return self.run.world is not None

@@ -14,7 +14,7 @@ from protocol.attack import Attack
 from protocol.messages import RobotConfig, RobotConfigInGroup, RobotConfigWithoutAnchor
 from protocol.mission import Anchor, Mission, PlannerName, Role
 from protocol.motion import Pose
-from protocol.orbits import Orbit
+from protocol.orbits import RENDEZVOUS, Orbit
 from protocol.sweep_strips import SweptArea
 from protocol.units import RobotId, Tick
 from world.faults import Fault
@@ -37,6 +37,11 @@ class RobotSetup(msgspec.Struct, frozen=True):
 
     The x-axis points from the anchor to the robot's start. None if the start is not known. A robot does
     not know this heading before it is localised, so a picture of its belief may use any heading.
+    """
+    own_planner: bool = False
+    """True if the phases and states of its Commands are those of a planner of the user.
+
+    They have names and sentences only if the planner is a shipped one, or decides in the meetings of a group.
     """
 
     @property
@@ -193,6 +198,7 @@ def of_scenario(scenario: Scenario, mode: str | None = None, tick_s: float | Non
                     robot.rendezvous.of(robot.role),
                     robot.attack,
                     frame(robot.anchor, robot.start) if robot.given_anchor is not None else None,
+                    scenario.planner_name not in RENDEZVOUS and not scenario.meetings,
                 )
                 for robot in scenario.robots
             ]
@@ -238,6 +244,7 @@ def of_configs(name: str, configs_by_robot: Mapping[str, RobotConfig]) -> RunSet
                     None if isinstance(one, RobotConfigWithoutAnchor) else one.anchor,
                     one.rendezvous.of(one.role),
                     one.attack,
+                    own_planner=one.planner_name not in RENDEZVOUS and not visits,
                 )
                 for one in configs
             ]

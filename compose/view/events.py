@@ -130,7 +130,8 @@ def _deciding(
     if command is None or (before is not None and earlier is None):
         return
     if earlier is None or command.phase != earlier.phase:
-        yield Event(tick, "phase", robot, f"{robot} begins phase {command.phase}: {PHASES[command.phase]}")
+        name = "" if robot_setup.own_planner else f": {PHASES[command.phase]}"
+        yield Event(tick, "phase", robot, f"{robot} begins phase {command.phase}{name}")
     active = command.verdict is None or (grouped and command.state != "localised")
     if active and (earlier is None or command.state != earlier.state):
         yield Event(tick, "state", robot, doing(robot_setup, command.phase, command.state, None))

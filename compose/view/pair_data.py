@@ -27,6 +27,11 @@ class PairData(msgspec.Struct, frozen=True):
         """The ids of the robots."""
         return tuple([robot.id for robot in self.robots])
 
+    @property
+    def own_planner(self) -> bool:
+        """True if phases and states are those of a planner of the user, and say nothing to others."""
+        return any(robot.own_planner for robot in self.robots)
+
     def contact(self, data: TickData | None) -> Contact | None:
         """Return the contact of the pair in `data`, as one of its robots observes it."""
         found = [contact_of(data, robot.id, robot.peer) for robot in self.robots] if data is not None else []

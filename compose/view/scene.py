@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import msgspec
 
@@ -10,6 +10,7 @@ from compose.recording.run_setup import RobotSetup, RunSetup
 from compose.view.configurations import Configurations, configurations
 from compose.view.deliveries import Passage, passages
 from compose.view.events import Event, events
+from compose.view.outlines import Point, Reach, arc, ellipse
 from compose.view.run_data import TickData
 from compose.view.story.caption import Caption
 from compose.view.story.captions import captions
@@ -26,7 +27,7 @@ from protocol.messages import (
     Verdict,
     Word,
 )
-from protocol.mission import Role
+from protocol.mission import Mission, Role
 from protocol.motion import Controls, Covariance, Pose, travelled, wrap
 
 
@@ -54,7 +55,7 @@ class Decision(msgspec.Struct, frozen=True):
     verdict: Verdict | None = None
 
 
-class HeldPoses(msgspec.Struct, frozen=True):
+class HeldPoses(msgspec.Struct, frozen=True, omit_defaults=True):
     """The poses that a robot considers possible."""
 
     local: tuple[Pose, ...]
@@ -69,6 +70,15 @@ class HeldPoses(msgspec.Struct, frozen=True):
     covariance: Covariance | None
     """The covariance of the first pose in `world`."""
     localised: bool
+    arc: tuple[Point, ...] = ()
+    """The outline in m of where the first pose in `world` is, if along an arc; empty if in an ellipse."""
+
+    @property
+    def outline(self) -> Sequence[Point]:
+        """The closed outline of where the first pose in `world` is; empty without a covariance."""
+        if self.covariance is None or not self.world:
+            return ()
+        return (*self.arc, self.arc[0]) if self.arc else ellipse(self.world[0], self.covariance)
 
 
 class FalsePose(msgspec.Struct, frozen=True):
@@ -155,13 +165,14 @@ def scene(
     false_poses = reported or {}
     players = tuple([player_of(one, setup, now, false_poses.get(one.id)) for one in setup.robots])
     deliveries = tuple(passages(setup, before, now))
+    found = tuple(events(setup, before, now, deliveries, end))
     told = group_captions if setup.visits else captions
     return Scene(
         now.tick,
         players,
         deliveries,
-        tuple(events(setup, before, now, deliveries, end)),
-        tuple(told(setup, before, now, deliveries, end)),
+        found,
+        tuple(told(setup, before, now, found, end)),
         tuple(configurations(setup, before, now)),
     )
 
@@ -174,14 +185,27 @@ def _sent(report: PeerReport, size: int) -> Sent:
             return Sent(size)
 
 
-def held_poses(robot: str, now: TickData) -> HeldPoses | None:
+def held_poses(robot: str, now: TickData, mission: Mission) -> HeldPoses | None:
     """Return the poses that `robot` holds in the tick of `now`; None if its Estimate is unknown."""
     estimate = now.estimates.get(robot)
     if estimate is None:
         return None
+    bent: tuple[Point, ...] = ()
+    if estimate.world and estimate.covariance is not None:
+        bent = arc(estimate.world[0], estimate.covariance, _reach(robot, now, mission))
     return HeldPoses(
-        estimate.local, estimate.world, estimate.probabilities, estimate.covariance, estimate.localised
+        estimate.local, estimate.world, estimate.probabilities, estimate.covariance, estimate.localised, bent
     )
+
+
+def _reach(robot: str, now: TickData, mission: Mission) -> Reach | None:
+    """Return the reach of `robot` from a peer in contact that knows where it is; None if there is none."""
+    observation = now.observations.get(robot)
+    for contact in observation.contacts if observation is not None else ():
+        peer = now.estimates.get(contact.peer)
+        if peer is not None and peer.world:
+            return Reach.of(mission, contact.range, peer.world[0], peer.covariance)
+    return None
 
 
 def player_of(
@@ -218,7 +242,7 @@ def player_of(
             if command is not None
             else None
         ),
-        held=held_poses(robot, now),
+        held=held_poses(robot, now, setup.mission),
         reported=(
             FalsePose(reported, travelled(pose, reported))
             if reported is not None and pose is not None

@@ -64,13 +64,18 @@ def end_reason(reason: str) -> str:
 
 
 def doing(robot_setup: RobotSetup, phase: int, state: str, verdict: Verdict | None) -> str:
-    """Return a sentence for the phase, state and verdict of a robot's Command."""
+    """Return a sentence for the phase, state and verdict of a robot's Command.
+
+    The state of a planner of the user is a word whose meaning only the user knows.
+    """
     beacon = robot_setup.peer if phase == 3 else "its anchor"
     match verdict:
         case Undecided(reason):
             return f"{robot_setup.id} is undecided: {reason}"
         case Inconsistent(claim):
             return f"{robot_setup.id} found an inconsistency in the reports of {robot_setup.peer}: {claim}"
+    if robot_setup.own_planner:
+        return f"{robot_setup.id}: {state}"
     if robot_setup.given_anchor is None and state == "standing":
         return f"{robot_setup.id} has no anchor, and stands still until a localised robot is in range"
     sentence = SEEKING.get(state) or DOING.get(state) or "{robot}: " + state

@@ -17,7 +17,7 @@ from msgspec import UNSET
 from compose.recording.run_setup import RobotSetup, RunSetup
 from compose.view import colours
 from compose.view.numbers import HYPOTHESES, PLOTS, PLOTTED, RANGES, Numbers
-from compose.view.outlines import box, circle, ellipse
+from compose.view.outlines import box, circle
 from compose.view.scene import Player, Scene
 from protocol.mission import Role
 from protocol.motion import Pose, compose
@@ -233,8 +233,8 @@ class _Drawing:
         )
         self._while(f"robots/{robot.id}/hypotheses", arrows if poses else None)
         outline = None
-        if held.world and held.covariance is not None:
-            outline = _lines([ellipse(held.world[0], held.covariance)], _colour(player.hue(robot)), "thin")
+        if held.outline:
+            outline = _lines([held.outline], _colour(player.hue(robot)), "thin")
         self._while(f"robots/{robot.id}/ellipse", outline)
 
     def _draw_contacts(self, scene: Scene) -> None:

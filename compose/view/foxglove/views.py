@@ -17,7 +17,7 @@ from compose.view import colours
 from compose.view.events import Event
 from compose.view.foxglove import shapes
 from compose.view.numbers import Numbers
-from compose.view.outlines import circle, ellipse
+from compose.view.outlines import circle
 from compose.view.scene import HeldPoses, Player, Scene
 from protocol.mission import Role
 from protocol.motion import Pose
@@ -278,12 +278,12 @@ class Views:
         at: fox.Timestamp,
         hue: Role,
     ) -> fox.SceneEntity:
-        """Return an arrow for each hypothesis, paler if less probable, and the error ellipse of the first."""
+        """Return an arrow for each hypothesis, paler if less probable, and where the first one may be."""
         colour = COLOURS[hue]
         probability = held.probability or (1.0 / max(1, len(poses)),) * len(poses)
         lines = []
-        if held.covariance is not None and held.world:
-            lines.append(shapes.strip(ellipse(held.world[0], held.covariance), shapes.colour(colour), 1.5))
+        if held.outline:
+            lines.append(shapes.strip(held.outline, shapes.colour(colour), 1.5))
         shades = [shapes.colour(colour, max(LEAST, share)) for share in probability]
         texts = [
             shapes.words(f"{share:.3g}", pose, self._unit, shade)

@@ -2,18 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Literal
 
 import msgspec
 
+from compose.view.events import Event
 from compose.view.pair_data import PairData
 
 CaptionKind = Literal[
     "rules", "ranging", "mirrored", "branch", "path", "search", "contact", "contact-lost", "configurations",
-    "manoeuvre", "measured", "ruled-out", "claim", "undecided", "inconsistent", "report-lost", "process",
-    "end",
+    "manoeuvre", "measured", "ruled-out", "claim", "undecided", "inconsistent", "down", "back", "late",
+    "report-lost", "report-damaged", "report-late", "report-doubled", "end",
 ]  # fmt: skip
+FAULTS: dict[CaptionKind, str] = {
+    "down": "processes are gone",
+    "back": "processes are back",
+    "late": "deadlines are missed",
+    "report-lost": "reports are lost",
+    "report-damaged": "reports arrive damaged",
+    "report-late": "reports arrive late",
+    "report-doubled": "reports arrive more than once",
+}
+"""The kinds of captions about kills and faults, which are kinds of events, and words for several of these."""
+MOST_TOLD = 2
+"""The largest number of events of one kind that a caption tells one by one."""
 COUNTS = (
     "no",
     "one",
@@ -61,6 +74,20 @@ def stopped(text: str) -> str:
 def sentence(text: str) -> str:
     """Return `text` as a sentence."""
     return stopped(text[0].upper() + text[1:])
+
+
+def faults(events: Sequence[Event], robots: tuple[str, ...] | None = None) -> Iterator[Caption]:
+    """Yield a caption for each kind of kills and faults among the events of a tick.
+
+    It is about `robots`; without them, about those of its events.
+    """
+    for kind, several in FAULTS.items():
+        found = [one for one in events if one.kind == kind]
+        if found:
+            many = f"{count_word(len(found)).capitalize()} {several}."
+            text = many if len(found) > MOST_TOLD else " ".join([stopped(one.text) for one in found])
+            whom = tuple(sorted({one.robot for one in found if one.robot is not None}))
+            yield Caption(kind, text, whom if robots is None else robots)
 
 
 def attacked(pair: PairData, reports: str) -> str | None:

@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from compose.recording.run_setup import RobotSetup, RunSetup
-from compose.view.deliveries import Passage
+from compose.view.events import Event
 from compose.view.pair_data import PairData
 from compose.view.run_data import TickData
-from compose.view.story.caption import Caption, listed
+from compose.view.story.caption import Caption, faults
 from compose.view.story.encounter_captions import fitting, meeting, planning
 from compose.view.story.ending_captions import concluding, ending
 from compose.view.story.search_captions import (
@@ -31,10 +31,13 @@ def captions(
     setup: RunSetup,
     before: TickData | None,
     now: TickData,
-    passages: Sequence[Passage],
+    events: Sequence[Event],
     end: MissionEnd | None,
 ) -> Iterator[Caption]:
-    """Yield the captions of the tick of `now`, pair by pair, and at last that of the end of the mission."""
+    """Yield the captions of the tick of `now`, pair by pair, and at last that of the end of the mission.
+
+    `events` are those of this tick.
+    """
     pairs: list[tuple[RobotSetup, ...]] = [*setup.pairs()]
     paired = {robot.id for pair in pairs for robot in pair}
     groups = [*pairs, *[(robot,) for robot in setup.robots if robot.id not in paired]]
@@ -43,29 +46,18 @@ def captions(
         pair = PairData(robots, setup.mission.noise.exact, before, now)
         yield from rules(pair, len(groups))
         yield from ranging(pair, setup.mission.sensing_range)
-        yield from mirrored(pair)
+        if not pair.own_planner:
+            yield from mirrored(pair)
         yield from choosing_branch(pair)
-        yield from searching(pair)
-        yield from beginning_again(pair)
+        if not pair.own_planner:
+            yield from searching(pair)
+            yield from beginning_again(pair)
         yield from meeting(pair)
         yield from fitting(pair)
-        yield from planning(pair)
+        if not pair.own_planner:
+            yield from planning(pair)
         yield from concluding(pair, ended)
-        yield from _losing(pair, passages)
+        yield from faults([one for one in events if one.robot in pair.ids], pair.ids)
+    yield from faults([one for one in events if one.robot is None])
     if ended is not None:
         yield ending(setup, now, ended)
-
-
-def _losing(pair: PairData, passages: Sequence[Passage]) -> Iterator[Caption]:
-    """Yield what is lost: reports, and processes."""
-    lost = [one.sender for one in passages if one.what == "lost" and one.sender in pair.ids]
-    if lost:
-        reports = "A report" if len(lost) == 1 else "Reports"
-        verb = "is" if len(lost) == 1 else "are"
-        yield Caption("report-lost", f"{reports} of {listed(sorted({*lost}))} {verb} lost.", pair.ids)
-    for robot in pair.ids:
-        was = pair.before is not None and robot in pair.before.down - pair.before.back
-        if robot in pair.now.down and not was:
-            yield Caption("process", f"The process of {robot} is gone.", pair.ids)
-        if robot in pair.now.back:
-            yield Caption("process", f"The process of {robot} runs again.", pair.ids)

@@ -27,7 +27,7 @@ def meeting(pair: PairData) -> Iterator[Caption]:
     if had is not None:
         return
     commands = [pair.commands(robot)[0] for robot in pair.ids]
-    again = any(command is not None and command.phase == 3 for command in commands)
+    again = not pair.own_planner and any(one is not None and one.phase == 3 for one in commands)
     one, other = pair.ids if len(pair.ids) > 1 else (pair.ids[0], pair.robots[0].peer)
     heard = [contact_of(pair.now, robot.id, robot.peer) for robot in pair.robots]
     swap = len(heard) > 1 and all(one is not None and one.heard for one in heard)
@@ -35,7 +35,8 @@ def meeting(pair: PairData) -> Iterator[Caption]:
     if now.range is None:
         text = f"{meet}. The distance between them is not measured in this tick."
     elif swap and not again:
-        text = f"{meet}, {metres(now.range)} apart, and exchange reports of their paths.{_alone(pair)}"
+        reports = "reports" if pair.own_planner else "reports of their paths"
+        text = f"{meet}, {metres(now.range)} apart, and exchange {reports}.{_alone(pair)}"
     else:
         text = f"{meet}. They measure the distance between them, {metres(now.range)}.{_alone(pair)}"
     yield Caption("contact", text, pair.ids)
@@ -44,7 +45,7 @@ def meeting(pair: PairData) -> Iterator[Caption]:
 def _alone(pair: PairData) -> str:
     """Return a sentence about a robot that drives alone to measure a second distance; empty if none does."""
     commands = [pair.now.commands.get(robot) for robot in pair.ids]
-    if len(pair.ids) < 2 or any(command is None or command.phase != 3 for command in commands):
+    if pair.own_planner or len(commands) < 2 or any(one is None or one.phase != 3 for one in commands):
         return ""
     driving = [robot for robot in pair.ids if pair.state(robot) in ALONE]
     standing = [robot for robot in pair.ids if pair.state(robot) == "standing"]

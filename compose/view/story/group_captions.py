@@ -9,10 +9,10 @@ from collections.abc import Iterator, Sequence
 
 from compose.recording.meetings import TRAVELLING
 from compose.recording.run_setup import RobotSetup, RunSetup
-from compose.view.deliveries import Passage, contact_of
-from compose.view.events import metres
+from compose.view.deliveries import contact_of
+from compose.view.events import Event, metres
 from compose.view.run_data import TickData
-from compose.view.story.caption import Caption, count_word, stopped
+from compose.view.story.caption import Caption, count_word, faults, stopped
 from compose.view.words import end_reason
 from protocol.messages import Inconsistent, Localised, MissionEnd, Undecided
 from protocol.motion import travelled
@@ -25,10 +25,10 @@ def group_captions(
     setup: RunSetup,
     before: TickData | None,
     now: TickData,
-    passages: Sequence[Passage],
+    events: Sequence[Event],
     end: MissionEnd | None,
 ) -> Iterator[Caption]:
-    """Yield the captions of the tick of `now`; `setup` has the peer of each robot in this tick."""
+    """Yield the captions of the tick of `now` with its `events`; `setup` has the present peers of robots."""
     ended = end if end is not None and end.tick == now.tick else None
     if before is None and now.tick == 0:
         yield _beginning(setup)
@@ -36,7 +36,7 @@ def group_captions(
         yield from _meeting(setup, before, now)
         yield from _concluding(setup, before, now, ended)
         yield from _departing(setup, before, now)
-        yield from _losing(setup, before, now, passages)
+    yield from faults(events)
     if ended is not None:
         yield _end(setup, now, ended)
 
@@ -139,19 +139,6 @@ def _begins(robot: str, state: str, before: TickData, now: TickData) -> bool:
     if command is None or earlier is None:
         return False
     return command.state == state and earlier.state not in (state, "looping")
-
-
-def _losing(
-    setup: RunSetup, before: TickData, now: TickData, passages: Sequence[Passage]
-) -> Iterator[Caption]:
-    lost = sorted({one.sender for one in passages if one.what == "lost"})
-    if lost:
-        yield Caption("report-lost", f"Reports of {_listed(lost, 'robots')} are lost.", tuple(lost))
-    for robot in setup.ids:
-        if robot in now.down and robot not in before.down - before.back:
-            yield Caption("process", f"The process of {robot} is gone.", (robot,))
-        if robot in now.back:
-            yield Caption("process", f"The process of {robot} runs again.", (robot,))
 
 
 def _end(setup: RunSetup, now: TickData, end: MissionEnd) -> Caption:

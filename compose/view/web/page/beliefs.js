@@ -31,7 +31,8 @@ export class Beliefs {
       const chance = held.probability[place] ?? 1 / poses.length;
       const [x, y] = this.plane.at(pose);
       pen.globalAlpha = tints.length ? 0.55 + 0.45 * Math.sqrt(chance) : 0.3 + 0.7 * Math.sqrt(chance);
-      if (place === 0 && covariance && held.world.length) this.#ellipse(pose, covariance, look);
+      if (place === 0 && held.arc) this.#arc(pose, held, look);
+      else if (place === 0 && covariance && held.world.length) this.#ellipse(pose, covariance, look);
       const grown = truth ? size * 1.45 : size * 1.15;
       shape(pen, robot.role, x, y, pose[2], grown);
       this.plane.targets.push({ kind: "hypothesis", robot: robot.id, place, at: [x, y], radius: grown });
@@ -40,7 +41,7 @@ export class Beliefs {
         pen.fillStyle = player.down ? look.paper : look.robot[robot.role];
         pen.fill();
       }
-      if (tints.length && size > 6) labels.placed.push([x - size, y - size, x + size, y + size]);
+      if (!truth || (tints.length && size > 6)) labels.placed.push([x - size, y - size, x + size, y + size]);
       const colour = tints.length ? look.tint(tints[place]) : look.ghost;
       pen.strokeStyle = colour;
       pen.lineWidth = tints.length ? 2.6 : 2;
@@ -166,6 +167,20 @@ export class Beliefs {
     const [x, y] = this.plane.at(pose);
     pen.beginPath();
     pen.ellipse(x, y, major * this.plane.scale, Math.max(minor * this.plane.scale, 0.5), -turn, 0, TAU);
+    this.#cloud(look);
+  }
+
+  /** Draws where the robot may be if that is along an arc; between two ticks, the arc moves with its `pose`. */
+  #arc(pose, { arc, world: [start] }, look) {
+    this.plane.marks.add("arc");
+    this.plane.context.beginPath();
+    for (const [x, y] of arc) this.plane.context.lineTo(...this.plane.at([x + pose[0] - start[0], y + pose[1] - start[1]]));
+    this.plane.context.closePath();
+    this.#cloud(look);
+  }
+
+  #cloud(look) {
+    const pen = this.plane.context;
     pen.fillStyle = look.cloud;
     pen.fill();
     pen.lineWidth = 1.5;

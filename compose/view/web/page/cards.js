@@ -3,7 +3,7 @@
 import { distance, wrap } from "./geometry.js";
 import { counted, task } from "./group.js";
 import { leads } from "./held.js";
-import { LEAST_GAP_M } from "./plane.js";
+import { LEAST_GAP_M } from "./trails.js";
 import { metres, probability, PHASES, place, plural, rad, speed, turning } from "./words.js";
 
 const MOST_PROBABILITIES = 5;
@@ -126,7 +126,7 @@ class Card {
     const phase = store.phase(tick, this.robot.id);
     this.root.dataset.phase = phase;
     this.root.classList.toggle("down", Boolean(player.down));
-    this.phase.textContent = `phase ${phase}: ${PHASES[phase]}${player.down ? "; down" : ""}`;
+    this.phase.textContent = `phase ${phase}${this.robot.own_planner ? "" : `: ${PHASES[phase]}`}${player.down ? "; down" : ""}`;
     if (this.doing.textContent !== player.activity) this.doing.textContent = player.activity;
     const attack = truth && player.reported ? attacked(store, tick, this.robot, player.reported) : "";
     if (this.attack.textContent !== attack) this.attack.textContent = attack;

@@ -10,7 +10,10 @@ const ELIMINATION_S = 3.5;
 /** How much of an elimination has been shown when all configurations that are ruled out are crossed out. */
 const ALMOST = 0.999;
 const HOLDS_S = 45; // all captions together
-const PASSING = new Set(["report-lost", "process"]); // kinds of captions for which time does not stop
+// Captions of kills and faults are no part of the story, which goes on after them. Time stops at each kill, and at the
+// first fault of each kind.
+const KILLS = new Set(["down", "back"]);
+const FAULTS = new Set([...KILLS, "late", "report-lost", "report-damaged", "report-late", "report-doubled"]);
 
 export class Guide {
   stage(store) {
@@ -63,7 +66,7 @@ export class Guide {
     if (here.length) return here.map(with_truth).join(" ");
     for (let i = this.beats.length - 1; i >= 0; i--) {
       if (this.beats[i].tick >= view.tick) continue;
-      const earlier = this.#about(this.beats[i].captions, view.focus).filter(({ kind }) => !PASSING.has(kind));
+      const earlier = this.#about(this.beats[i].captions, view.focus).filter(({ kind }) => !FAULTS.has(kind));
       if (earlier.length) return with_truth(earlier.at(-1));
     }
     return "";
@@ -114,17 +117,16 @@ export class Guide {
   }
 
   /** Returns for how many seconds time stops at a caption: long enough to read it. */
-  #hold({ kind, text, truth }, focus) {
-    if (PASSING.has(kind)) return 0;
+  #hold(caption, focus) {
     const seconds = (one) => {
       const reading = Math.min(1 + 0.03 * (one.text.length + (one.truth?.length ?? 0)), 4.5);
       return one.kind === "measured" ? Math.max(reading, ELIMINATION_S) : reading;
     };
-    let all = 0;
-    for (const { captions } of this.beats) {
-      for (const one of this.#about(captions, focus)) all += PASSING.has(one.kind) ? 0 : seconds(one);
-    }
-    return seconds({ kind, text, truth }) * Math.min(1, HOLDS_S / Math.max(all, 1));
+    const first = new Map(), told = this.beats.flatMap(({ captions }) => this.#about(captions, focus));
+    for (const one of told) if (!first.has(one.kind)) first.set(one.kind, one);
+    const stops = (one) => !FAULTS.has(one.kind) || KILLS.has(one.kind) || first.get(one.kind) === one;
+    const all = told.reduce((sum, one) => sum + (stops(one) ? seconds(one) : 0), 0);
+    return stops(caption) ? seconds(caption) * Math.min(1, HOLDS_S / Math.max(all, 1)) : 0;
   }
 
   /** Returns the seconds that the robots drive from this tick to the next. */
@@ -147,7 +149,8 @@ export class Guide {
     const span = this.#span;
     for (; span.read < store.whole && span.to === null; span.read++) {
       const commands = pair.map((robot) => store.player(span.read, robot.id)?.command);
-      if (span.from === null && commands.some((command) => command?.phase === 3)) span.from = span.read;
+      const met = (robot) => this.store.player(span.read, robot.id)?.contacts?.length > 0; // a planner of the user has phases of its own
+      if (span.from === null && (pair[0].own_planner ? pair.some(met) : commands.some((command) => command?.phase === 3))) span.from = span.read;
       if (commands.every((command) => command?.verdict)) span.to = span.read;
     }
     return { from: span.from ?? span.to ?? store.last, to: span.to ?? Infinity };

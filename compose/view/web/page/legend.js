@@ -22,10 +22,10 @@ const LASTING = {
   unlocalised: [drawn(`<path ${ROUND} fill="var(--robot-b)"/>`), "robot that is not yet localised, its path"],
   meeting: [drawn('<path d="M1 8h20" stroke="var(--robot-a)" stroke-width="1.3"/><path d="M28 8l-7 3v-6z" fill="var(--robot-a)"/>'), "who localises whom; dotted: planned"],
   anchor: [drawn('<circle cx="15" cy="8" r="7.5" fill="var(--disc)" stroke="var(--ring)"/><path d="M15 4.5l3.5 6h-7z" fill="var(--ink)"/>'), ({ range }) => `anchor (beacon); range ${range}`],
-  orbit: [drawn('<path d="M2 15q13-22 26 0" fill="none" stroke="var(--orbit)" stroke-width="1.6" stroke-dasharray="5 2.5 1 2.5"/>'), "search circle (phase 2)"],
-  "path-1": [line("faint", 'stroke-dasharray="1.5 4"'), "path, phase 1: near anchor"],
-  "path-2": [line("faint", 'stroke-dasharray="6 4"'), "path, phase 2: search"],
-  "path-3": [line("faint"), "path, phase 3: encounter"],
+  orbit: [drawn('<path d="M2 15q13-22 26 0" fill="none" stroke="var(--orbit)" stroke-width="1.6" stroke-dasharray="5 2.5 1 2.5"/>'), ({ own }) => (own ? "orbit" : "search circle (phase 2)")],
+  "path-1": [line("faint", 'stroke-dasharray="1.5 4"'), ({ own }) => `path, phase 1${own ? "" : ": near anchor"}`],
+  "path-2": [line("faint", 'stroke-dasharray="6 4"'), ({ own }) => `path, phase 2${own ? "" : ": search"}`],
+  "path-3": [line("faint"), ({ own }) => `path, phase 3${own ? "" : ": encounter"}`],
   reported: [line("fault", 'stroke-dasharray="3 3"'), "path that an attacker reports"],
 };
 /** The other marks. */
@@ -37,6 +37,7 @@ const MOMENTARY = {
   pose: [drawn(`<path ${POINTED} fill="none" stroke="var(--ghost)" stroke-width="1.6" stroke-dasharray="2.5 2"/>`), "possible pose (place and heading) of a robot"],
   "ruled-out": [drawn(`<path ${POINTED} fill="none" stroke="var(--ghost)" stroke-dasharray="2 2"/><path d="${cross}" stroke="var(--fault)" stroke-width="1.8"/>`), "pose that is ruled out"],
   ellipse: [drawn('<ellipse cx="15" cy="8" rx="12" ry="5.5" fill="var(--cloud)" stroke="var(--ghost)"/>'), "uncertainty (3 sigma)"],
+  arc: [drawn('<path d="M2 13q13-15 26 0l-4 2q-9-9-18 0z" fill="var(--cloud)" stroke="var(--ghost)"/>'), "uncertainty (3 sigma): along an arc"],
   contact: [drawn('<path d="M1 6h28M1 10h28" stroke="var(--link)" stroke-width="1.4"/>'), "in range of each other"],
   reach: [ring("link", 'stroke-dasharray="3 2.4"'), ({ range }) => `range between robots: ${range}`],
   report: [dot('fill="var(--link)"'), "report to the other robot"],
@@ -71,8 +72,8 @@ export class Legend {
   /**
    * Lists `marks` of the plane and `kinds` of events above the time line. What stays comes first, so that lines keep their places.
    *
-   * `names` are the words of the story: the ids of robots `a` and `b`, the `mover` of the last manoeuvre and its `value`, and
-   * the sensing `range`.
+   * `names` are the words of the story: the ids of robots `a` and `b`, the `mover` of the last manoeuvre and its `value`, the
+   * sensing `range`, and whether the planner is the user's `own`.
    */
   draw(marks, kinds, names) {
     const key = [...marks, "", ...kinds, "", ...Object.values(names)].join();

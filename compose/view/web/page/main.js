@@ -326,7 +326,8 @@ function legend_names() {
   const of = (role) => (several ? null : story.find((robot) => robot.role === role)?.id) ?? `of role ${role}`;
   const at = view.eliminated < 1 ? view.tick - 1 : view.tick, manoeuvre = joined(store.scene(at), story[0].id)?.manoeuvre;
   const value = manoeuvre ? `: J\u00a0=\u00a0${manoeuvre.separation_m2.toPrecision(3)}\u00a0m²` : "";
-  return { a: of("a"), b: of("b"), mover: manoeuvre?.robot ?? "a robot", value, range: `${Number(store.stage.mission.sensing_range.toFixed(3))}\u00a0m` };
+  const range = `${Number(store.stage.mission.sensing_range.toFixed(3))}\u00a0m`, own = store.stage.robots.some(({ own_planner }) => own_planner);
+  return { a: of("a"), b: of("b"), mover: manoeuvre?.robot ?? "a robot", value, range, own };
 }
 
 function controls() {

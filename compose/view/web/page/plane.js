@@ -11,7 +11,7 @@ import { cross, Look, shape, unit } from "./pen.js";
 import { same, under } from "./selection.js";
 import { Signals } from "./signals.js";
 import { Tints } from "./tints.js";
-import { kinds_of, pose_now, REPORTED, Trails, TRUE } from "./trails.js";
+import { kinds_of, LEAST_GAP_M, pose_now, REPORTED, Trails, TRUE } from "./trails.js";
 import { metres } from "./words.js";
 
 /** The time in s in which the camera covers most of the way to where it is needed. */
@@ -23,8 +23,6 @@ const LIST_PX = 42;
 const CLEAR_PX = 12;
 /** The distance in pixels that a pointer moves before it drags the plane instead of selecting what is there. */
 const DRAG_PX = 4;
-/** The least distance in m between a reported and a true position that counts as a difference. */
-export const LEAST_GAP_M = 1e-6;
 /** The least width and height in pixels of a picture: a lower window shows a part of it. */
 const LEAST_PX = 40;
 /** The largest group whose robots always have their names. */
@@ -305,7 +303,6 @@ export class Plane {
     shape(pen, robot.role, x, y, pose[2], size);
     pen.fillStyle = look.paper;
     pen.fill();
-    pen.strokeStyle = look.robot[robot.role];
     pen.lineWidth = 1.5;
     pen.setLineDash([3, 2]);
     pen.stroke();

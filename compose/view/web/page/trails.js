@@ -1,5 +1,5 @@
 // The trails of the robots: true, as an attacker reports it, or as implied by their most probable current pose. As in the
-// figures, the hue is the robot, and the line style of all but reported ones the phase: dotted, dashed, solid.
+// figures, the hue is the robot, and the line style the phase: dotted, dashed, solid. Reported ones are in the hue of faults.
 
 import { between, compose, controls, inverse, TAU } from "./geometry.js";
 import { held_now, lacks_bearing, leads } from "./held.js";
@@ -14,11 +14,14 @@ const MOST_TRAILS = 6;
 const TURNS = 8, LATER_TURNS = 4;
 const LEAST_PX = 6; // the size of robots from which on copies of them are drawn
 
-/** The poses of a trail, and the controls between two of them. */
-export const TRUE = { name: "true", pose: (player) => player?.pose, driven: (here, next) => next.executed };
+/** The least distance in m between a reported and a true position that counts as a difference. */
+export const LEAST_GAP_M = 1e-6;
+/** The poses of a trail, the controls between two of them, and whether they differ from the true ones if they should. */
+export const TRUE = { name: "true", pose: (player) => player?.pose, driven: (here, next) => next.executed, differs: () => true };
 export const REPORTED = {
   name: "reported", pose: (player) => player?.reported?.pose,
   driven: (here, next, period) => controls(here.reported.pose, next.reported.pose, period),
+  differs: (here, next) => Math.max(here.reported.gap, next.reported.gap) >= LEAST_GAP_M,
 };
 
 /** Returns the pose of `robot` on a trail; between two ticks while time passes. */
@@ -46,7 +49,7 @@ export class Trails {
     this.#stroked(pen, view, robot, kind, (stroke) => {
       for (let from = store.first; from < last; from += CHUNK) {
         const to = Math.min(from + CHUNK, last);
-        for (const [phase, path, role] of this.#pieces(store, robot, kind, from, to, to === from + CHUNK)) stroke(path, phase, role);
+        for (const piece of this.#pieces(store, robot, kind, from, to, to === from + CHUNK)) stroke(piece);
       }
     });
   }
@@ -72,7 +75,7 @@ export class Trails {
       this.#stroked(pen, view, robot, TRUE, (stroke) => {
         pen.globalAlpha = 0.35 * alpha;
         pen.transform(Math.cos(angle), Math.sin(angle), -Math.sin(angle), Math.cos(angle), turn[0], turn[1]);
-        for (const [phase, path] of pieces) stroke(path, phase);
+        for (const piece of pieces) stroke(piece);
       });
       const [at_x, at_y, heading] = compose(turn, pose);
       pen.globalAlpha = 0.5;
@@ -90,25 +93,25 @@ export class Trails {
     if (!moving || share <= 0) return;
     const player = store.player(tick, robot.id), next = store.player(tick + 1, robot.id);
     const start = kind.pose(player), end = kind.pose(next), { period } = store.stage.mission;
-    if (!start || !end) return;
+    if (!start || !end || !kind.differs(player, next)) return;
     const driven = kind.driven(player, next, period), path = new Path2D(), bends = bends_of(driven, period);
     path.moveTo(start[0], start[1]);
     for (let k = 1; k <= bends; k++) {
       const pose = between(start, end, driven, (share * k) / bends, period);
       path.lineTo(pose[0], pose[1]);
     }
-    this.#stroked(pen, view, robot, kind, (stroke) => stroke(path, store.phase(tick, robot.id), robot.role));
+    this.#stroked(pen, view, robot, kind, (stroke) => stroke({ path, phase: store.phase(tick, robot.id), role: robot.role }));
   }
 
-  /** Calls `draw` with a function that strokes a path in m, in the style of a phase. */
+  /** Calls `draw` with a function that strokes a piece of a trail, whose path is in m, in the style of its phase. */
   #stroked(pen, { look, focus }, robot, kind, draw) {
     const faint = focus && robot.id !== focus;
     const ratio = (window.devicePixelRatio || 1) * unit(), { scale: s, width: wide, height, centre } = this.plane;
     pen.save();
     pen.globalAlpha = faint ? 0.4 : 0.95;
     pen.setTransform(ratio * s, 0, 0, -ratio * s, ratio * (wide / 2 - centre[0] * s), ratio * (height / 2 + centre[1] * s));
-    draw((path, phase, role) => {
-      pen.strokeStyle = look.robot[role];
+    draw(({ path, phase, role }) => {
+      pen.strokeStyle = kind === REPORTED ? look.fault : look.robot[role];
       const { dash, width } = kind === REPORTED ? REPORTED_STYLE : TRAIL[phase] ?? TRAIL[2];
       this.plane.marks.add(kind === REPORTED ? "reported" : `path-${phase}`);
       pen.lineWidth = (faint ? 0.7 * width : width) / s;
@@ -118,7 +121,7 @@ export class Trails {
     pen.restore();
   }
 
-  /** Returns the trail from tick `from` to `to`, one path per phase and hue; cached once it is complete. */
+  /** Returns the trail from tick `from` to `to` in pieces { path, phase, role } of one style; cached once it is complete. */
   #pieces(store, robot, kind, from, to, whole) {
     const key = `${kind.name}/${robot.id}/${from}`, cached = this.#chunks.get(key);
     if (cached && whole) return cached;
@@ -127,7 +130,7 @@ export class Trails {
     for (let k = from; k < to; k++) {
       const here = store.player(k, robot.id), next = store.player(k + 1, robot.id);
       const start = kind.pose(here), end = kind.pose(next);
-      if (!start || !end) {
+      if (!start || !end || !kind.differs(here, next)) {
         path = null; phase = null;
         complete = complete && Boolean(here && next);
         continue;
@@ -137,7 +140,7 @@ export class Trails {
       if (now !== phase || hue !== role || !path) {
         path = new Path2D();
         path.moveTo(start[0], start[1]);
-        pieces.push([now, path, hue]);
+        pieces.push({ path, phase: now, role: hue });
         phase = now;
         role = hue;
       }
