@@ -69,7 +69,7 @@ def _by_fit(
     errors, ranges = {}, used.ranges
     ranged = [pair for pair, count in zip(problem.measured.pairs, last.ranges, strict=True) if count]
     for pair, rows in zip(ranged, ranges.pairs, strict=True):
-        t: Numbers = problem.measured.t0 + problem.measured.period * ranges.tick[rows].astype(float)
+        t = problem.measured.time_of(ranges.tick[rows])
         if len(t) >= FEWEST:
             errors[pair] = PairErrors(t, ranges.rho[rows], fit.residuals[rows])
     if not errors:

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from compose.errors import UserError
+import numpy as np
+
+from compose.errors import NoEstimate, UserError
 from compose.recording.estimating.anchored_estimate import (
     AnchoredEstimator,
     AnchoredMeasurements,
@@ -115,11 +117,26 @@ class RecordingEstimator:
         self._of_pair, self._of_one = PairEstimator(rule), AnchoredEstimator(rule)
         self._of_group = GroupEstimator(rule)
 
-    def epoch(self, measured: AnyMeasurements, number: int) -> EstimateEpoch:
+    def epoch(self, problem: EstimationProblem, number: int) -> EstimateEpoch:
         """Return the estimate at the end of the epoch with this `number`, from 1 on, in their order.
 
-        `measured` may have grown since the last call, and is otherwise the same.
+        The measurements may have grown since the last call, and are otherwise the same. Raises NoEstimate if
+        numbers leave the range of floats: valid ones of 1e7 m and 1e-300 m do.
         """
+        measured = problem.measured
+        try:
+            with np.errstate(all="ignore"):
+                epoch = self._epoch(measured, number)
+            known = [i for i, one in enumerate(problem.robots) if one.id not in epoch.undetermined]
+            if all(np.all(np.isfinite(one.poses[known])) for one in epoch.hypotheses):
+                return epoch
+            why = "a pose is not finite"
+        except (np.linalg.LinAlgError, ArithmeticError) as error:
+            why = str(error)
+        where = f"{problem.source}: at {measured.end(number):.15g} s"
+        raise NoEstimate(f"{where}: its numbers are too large or too small for an estimate: {why}")
+
+    def _epoch(self, measured: AnyMeasurements, number: int) -> EstimateEpoch:
         match measured:
             case PairMeasurements():
                 return self._of_pair.epoch(measured, number)
@@ -136,7 +153,7 @@ def estimated(
     epochs: list[EstimateEpoch] = []
     estimator = RecordingEstimator(rule)
     for number in range(1, problem.measured.epochs + 1):
-        epoch = estimator.epoch(problem.measured, number)
+        epoch = estimator.epoch(problem, number)
         rows += rows_of(epoch, problem.robots)
         add_epoch(epochs, epoch)
         done()
