@@ -98,7 +98,7 @@ class BadRecording(UserError):
 
 
 class NoEstimate(UserError):
-    """The numbers of a valid recording do not allow an estimate; the text names the recording and the time."""
+    """The numbers of a valid recording allow no estimate; the text names the recording and the time."""
 
     exit_status = NOT_LOCALISED
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,19 @@ from compose.recording.estimating.recorded_noise import recorded_noise
 from compose.recording.ranging.range_recording import RangeRecording, RecordedRobot
 
 AnyMeasurements = PairMeasurements | AnchoredMeasurements | GroupMeasurements
+
+
+@contextmanager
+def numerics(where: str) -> Iterator[None]:
+    """Raise NoEstimate, which begins with `where`, if numbers in the block leave the range of floats.
+
+    Those of a valid recording may, of 1e7 m or 1e-300 m. Other errors are not hidden.
+    """
+    try:
+        with np.errstate(all="ignore"):
+            yield
+    except (np.linalg.LinAlgError, ArithmeticError) as error:
+        raise NoEstimate(f"{where}: its numbers are too large or small for an estimate ({error})") from None
 
 
 class EstimationProblem(NamedTuple):
@@ -89,14 +103,15 @@ def measurements_with(
     if told is not None and told.correction is not None:
         part = told.correction.corrected(part)
     measured: AnyMeasurements
-    if len(chosen) == 1:
-        measured = anchored_measurements(part, chosen[0], assumed, ticks=ticks)
-    elif len(chosen) > 2:
-        measured = group_measurements(part, chosen, assumed, ticks=ticks)
-    else:
-        measured = pair_measurements(
-            part, chosen, assumed, ticks=ticks, anchors=anchors, all_anchors=all_anchors
-        )
+    with numerics(recording.source):
+        if len(chosen) == 1:
+            measured = anchored_measurements(part, chosen[0], assumed, ticks=ticks)
+        elif len(chosen) > 2:
+            measured = group_measurements(part, chosen, assumed, ticks=ticks)
+        else:
+            measured = pair_measurements(
+                part, chosen, assumed, ticks=ticks, anchors=anchors, all_anchors=all_anchors
+            )
     return EstimationProblem(measured, part.robots, recording.source, assumed.name)
 
 
@@ -123,18 +138,13 @@ class RecordingEstimator:
         The measurements may have grown since the last call, and are otherwise the same. Raises NoEstimate if
         numbers leave the range of floats: valid ones of 1e7 m and 1e-300 m do.
         """
-        measured = problem.measured
-        try:
-            with np.errstate(all="ignore"):
-                epoch = self._epoch(measured, number)
+        with numerics(f"{problem.source}: at {problem.measured.end(number):.15g} s"):
+            epoch = self._epoch(problem.measured, number)
             known = [i for i, one in enumerate(problem.robots) if one.id not in epoch.undetermined]
-            if all(np.all(np.isfinite(one.poses[known])) for one in epoch.hypotheses):
-                return epoch
-            why = "a pose is not finite"
-        except (np.linalg.LinAlgError, ArithmeticError) as error:
-            why = str(error)
-        where = f"{problem.source}: at {measured.end(number):.15g} s"
-        raise NoEstimate(f"{where}: its numbers are too large or too small for an estimate: {why}")
+            for one in epoch.hypotheses:
+                if not np.all(np.isfinite(one.poses[known])):
+                    raise FloatingPointError("a pose is not finite")
+            return epoch
 
     def _epoch(self, measured: AnyMeasurements, number: int) -> EstimateEpoch:
         match measured:
@@ -154,7 +164,8 @@ def estimated(
     estimator = RecordingEstimator(rule)
     for number in range(1, problem.measured.epochs + 1):
         epoch = estimator.epoch(problem, number)
-        rows += rows_of(epoch, problem.robots)
+        with numerics(problem.source):
+            rows += rows_of(epoch, problem.robots)
         add_epoch(epochs, epoch)
         done()
     return with_summary(problem, rows, epochs, rule)
@@ -165,5 +176,6 @@ def with_summary(
 ) -> RecordingEstimate:
     """Return the result of all `rows` and `epochs`."""
     last = epochs[-1] if epochs else None
-    summary = summary_of(problem.measured, rows, last, rule, problem.source, problem.noise)
+    with numerics(problem.source):
+        summary = summary_of(problem.measured, rows, last, rule, problem.source, problem.noise)
     return RecordingEstimate(rows, epochs, summary)

@@ -16,6 +16,7 @@ from compose.recording.estimating.estimate_run import (
     RecordingEstimate,
     RecordingEstimator,
     measurements_with,
+    numerics,
     with_summary,
 )
 from compose.recording.estimating.noise_files import ToldNoise
@@ -106,7 +107,8 @@ class StreamEstimate:
             if epoch.hypotheses and isinstance(measured, PairMeasurements):
                 self._anchors = (measured.a.anchor.id, measured.b.anchor.id)
             self._next += 1
-            found = rows_of(epoch, self._problem.robots)
+            with numerics(self._problem.source):
+                found = rows_of(epoch, self._problem.robots)
             self._rows += found
             add_epoch(self._epochs, epoch)
             yield from found

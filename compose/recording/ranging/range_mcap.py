@@ -34,8 +34,14 @@ def read_mcap(path: Path, anchors: Sequence[AnchorRow] = ()) -> RangeRecording:
     """
     builder = RecordingBuilder(path, anchors)
     with files.open_file(path) as file:
-        for row, place in _rows(file, path, os.fstat(file.fileno()).st_size, builder.unused):
-            builder.add(row, place)
+        size = os.fstat(file.fileno()).st_size
+        try:
+            for row, place in _rows(file, path, size, builder.unused):
+                builder.add(row, place)
+        except EndOfStream as error:
+            raise BadRecording(
+                f"{error}; --follow estimates what is before" if size else str(error)
+            ) from None
     return builder.recording()
 
 

@@ -232,7 +232,7 @@ class RecordingBuilder:
         path.append((row, covariance))
 
     def _add_jump(self, row: OdometryRow, before: float, place: object) -> None:
-        """Note the increment if it begins more than LONGEST_GAP_S after the time `before`, or lasts longer."""
+        """Note an increment that lasts, or begins after the time `before` by, more than LONGEST_GAP_S."""
         late, lasts = row.t0 - before, row.t1 - row.t0
         if max(late, lasts) <= LONGEST_GAP_S:
             return
