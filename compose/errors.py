@@ -97,6 +97,12 @@ class BadRecording(UserError):
     """A range recording is invalid; the text names the file, the line and what is wrong."""
 
 
+class NoEstimate(UserError):
+    """The numbers of a valid recording allow no estimate; the text names the recording and the time."""
+
+    exit_status = NOT_LOCALISED
+
+
 # --- keys -------------------------------------------------------------------------------------------
 
 

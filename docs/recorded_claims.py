@@ -204,7 +204,7 @@ def claimed(trial: Trial) -> Claimed:
     rule, begun = ClaimRule(trial.accuracy), time.process_time()
     estimator, rows = RecordingEstimator(rule), []
     for number in range(1, problem.measured.epochs + 1):
-        epoch = estimator.epoch(problem.measured, number)
+        epoch = estimator.epoch(problem, number)
         rows += rows_of(epoch, problem.robots)
         if all(epoch.claims):
             break

@@ -416,8 +416,8 @@ def changed(table: str, row: int, **fields: object) -> Tables:
 
 INVALID: list[tuple[str, int, dict[str, object], str]] = [
     ("odometry", 1, {"dx": "fast"}, "dx: expected a number, got 'fast'"),
-    ("odometry", 1, {"dx": "nan"}, "dx: expected a number >= -10000000.0, got 'nan'"),
-    ("odometry", 1, {"t0": "inf"}, "t0: expected a number <= 1000000000000.0, got 'inf'"),
+    ("odometry", 1, {"dx": "nan"}, "dx: expected a number, got 'nan'"),
+    ("odometry", 1, {"t0": "2e12"}, "t0: expected a number <= 1000000000000.0, got '2e12'"),
     ("odometry", 0, {"t1": -0.5}, "t1: -0.5 s is before t0, 0 s"),
     ("odometry", 2, {"t0": 0.25}, "t0: it starts at 0.25 s, and the increment of a before it ends at 0.5 s"),
     ("odometry", 1, {"robot": "b/c"}, "robot: expected a name of letters, digits, - and _, got 'b/c'"),

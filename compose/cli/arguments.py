@@ -391,7 +391,7 @@ def window(text: str) -> tuple[float, float]:
         begin, end = float(first), float(last)
     except ValueError:
         begin, end = 0.0, 0.0
-    if not dots or not 0.0 <= begin < end < 1e9:
+    if not dots or not 0.0 <= begin < end < 1e13:
         raise ArgumentTypeError(f"'{text}' is not a window in seconds such as 10..40")
     return begin, end
 

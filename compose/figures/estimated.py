@@ -254,7 +254,8 @@ def _residuals(axes: Axes, drawn: Drawn, which: int, name: str) -> None:
         return
     fit, used = fitted
     rows = used.ranges.pairs[which]
-    times = fit.ticks[rows] * drawn.problem.measured.period
+    measured = drawn.problem.measured
+    times = measured.time_of(fit.ticks[rows]) - measured.t0
     residuals, good = fit.residuals[rows], fit.weights[rows] > OUTLIER
     axes.axhline(0.0, color=PALE, lw=0.6)
     axes.plot(times[good], residuals[good], ls="", marker="o", ms=2.5, color=INK)

@@ -13,7 +13,6 @@ from compose.errors import UserError
 from compose.recording.estimating.estimate_epoch import ClaimRule, EpochFit, EstimateEpoch, of_centres
 from compose.recording.estimating.pair_measurements import listed
 from compose.recording.estimating.prepared_steps import (
-    EPOCH_S,
     Measurements,
     OneRobot,
     horizon,
@@ -46,7 +45,7 @@ class AnchoredMeasurements(Measurements, frozen=True, kw_only=True):
 
     def until(self, epoch: int) -> AnchoredRobot:
         """Return what was measured up to the end of `epoch`; the first is 1."""
-        known = self.t <= self.t0 + epoch * EPOCH_S
+        known = self.t <= self.end(epoch)
         ranges, place, radio = self.ranges, self.ranges.place, self.ranges.radio
         assert place is not None
         assert radio is not None
@@ -92,6 +91,7 @@ def anchored_measurements(
     rho, ratio = levelled(ranges.range, part.robots[0].antenna[2] - heights[radio])
     sigma = prepared.sigmas(np.full(len(rho), assumed.noise.anchor_sigma), ranges.sigma) * ratio
     unused = {"within a second after another": steps.thinned, "without odometry": steps.outside}
+    unused["in a gap of the odometry"] = steps.in_gaps
     return AnchoredMeasurements(
         robot=prepared.robot(0, anchors),
         t0=float(steps.t[0]),
@@ -102,6 +102,7 @@ def anchored_measurements(
         t=ranges.t,
         noise=assumed.noise,
         unused={why: count for why, count in unused.items() if count},
+        skipped_s=steps.skipped_s,
     )
 
 
@@ -120,7 +121,7 @@ class AnchoredEstimator:
 
     def epoch(self, measured: AnchoredMeasurements, number: int) -> EstimateEpoch:
         """Return the estimate at the end of the epoch with this `number`, from 1 on, in their order."""
-        robot, t = measured.until(number), measured.t0 + number * EPOCH_S
+        robot, t = measured.until(number), measured.end(number)
         count = len(robot.ranges.rho)
         radio = robot.ranges.radio
         assert radio is not None

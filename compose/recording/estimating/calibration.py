@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from compose.errors import UserError
 from compose.recording.estimating.estimate_epoch import ClaimRule
-from compose.recording.estimating.estimate_run import estimated, measurements
+from compose.recording.estimating.estimate_run import estimated, measurements, numerics
 from compose.recording.estimating.learned_errors import learned_errors
 from compose.recording.estimating.radio_errors import (
     FEWEST,
@@ -15,7 +15,7 @@ from compose.recording.estimating.radio_errors import (
     range_calibration,
     true_errors,
 )
-from compose.recording.ranging.range_recording import Numbers, RangeRecording
+from compose.recording.ranging.range_recording import RangeRecording
 
 ASSUMED = "uwb"
 """The profile of the estimate that replaces the truth: that of radios that nobody has calibrated."""
@@ -46,9 +46,11 @@ def calibrated(
     part = recording.part(
         chosen, *((begin, end) if window is None else (begin + window[0], begin + window[1]))
     )
-    errors = {} if by_fit else true_errors(part)
+    with numerics(recording.source):
+        errors = {} if by_fit else true_errors(part)
     if errors:
-        return range_calibration(errors, "the truth")
+        with numerics(recording.source):
+            return range_calibration(errors, "the truth")
     return _by_fit(recording, chosen, window)
 
 
@@ -69,14 +71,15 @@ def _by_fit(
     errors, ranges = {}, used.ranges
     ranged = [pair for pair, count in zip(problem.measured.pairs, last.ranges, strict=True) if count]
     for pair, rows in zip(ranged, ranges.pairs, strict=True):
-        t: Numbers = problem.measured.t0 + problem.measured.period * ranges.tick[rows].astype(float)
+        t = problem.measured.time_of(ranges.tick[rows])
         if len(t) >= FEWEST:
             errors[pair] = PairErrors(t, ranges.rho[rows], fit.residuals[rows])
     if not errors:
         raise UserError(f"{recording.source}: no pair of radios has {FEWEST} ranges")
-    found = range_calibration(errors, "the fit")
     names = [side.id for side in problem.measured.sides]
-    learned = learned_errors(fit, names, ["-".join(pair) for pair in ranged])
+    with numerics(recording.source):
+        found = range_calibration(errors, "the fit")
+        learned = learned_errors(fit, names, ["-".join(pair) for pair in ranged])
     bias, scale = learned.range_bias_m, learned.range_scale
     return found._replace(
         bias_sigma=bias.sigma if bias is not None else 0.0,

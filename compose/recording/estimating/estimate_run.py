@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import NamedTuple
 
-from compose.errors import UserError
+import numpy as np
+
+from compose.errors import NoEstimate, UserError
 from compose.recording.estimating.anchored_estimate import (
     AnchoredEstimator,
     AnchoredMeasurements,
@@ -22,6 +25,19 @@ from compose.recording.estimating.recorded_noise import recorded_noise
 from compose.recording.ranging.range_recording import RangeRecording, RecordedRobot
 
 AnyMeasurements = PairMeasurements | AnchoredMeasurements | GroupMeasurements
+
+
+@contextmanager
+def numerics(where: str) -> Iterator[None]:
+    """Raise NoEstimate, which begins with `where`, if numbers in the block leave the range of floats.
+
+    Those of a valid recording may, of 1e7 m or 1e-300 m. Other errors are not hidden.
+    """
+    try:
+        with np.errstate(all="ignore"):
+            yield
+    except (np.linalg.LinAlgError, ArithmeticError) as error:
+        raise NoEstimate(f"{where}: its numbers are too large or small for an estimate ({error})") from None
 
 
 class EstimationProblem(NamedTuple):
@@ -87,14 +103,15 @@ def measurements_with(
     if told is not None and told.correction is not None:
         part = told.correction.corrected(part)
     measured: AnyMeasurements
-    if len(chosen) == 1:
-        measured = anchored_measurements(part, chosen[0], assumed, ticks=ticks)
-    elif len(chosen) > 2:
-        measured = group_measurements(part, chosen, assumed, ticks=ticks)
-    else:
-        measured = pair_measurements(
-            part, chosen, assumed, ticks=ticks, anchors=anchors, all_anchors=all_anchors
-        )
+    with numerics(recording.source):
+        if len(chosen) == 1:
+            measured = anchored_measurements(part, chosen[0], assumed, ticks=ticks)
+        elif len(chosen) > 2:
+            measured = group_measurements(part, chosen, assumed, ticks=ticks)
+        else:
+            measured = pair_measurements(
+                part, chosen, assumed, ticks=ticks, anchors=anchors, all_anchors=all_anchors
+            )
     return EstimationProblem(measured, part.robots, recording.source, assumed.name)
 
 
@@ -115,11 +132,21 @@ class RecordingEstimator:
         self._of_pair, self._of_one = PairEstimator(rule), AnchoredEstimator(rule)
         self._of_group = GroupEstimator(rule)
 
-    def epoch(self, measured: AnyMeasurements, number: int) -> EstimateEpoch:
+    def epoch(self, problem: EstimationProblem, number: int) -> EstimateEpoch:
         """Return the estimate at the end of the epoch with this `number`, from 1 on, in their order.
 
-        `measured` may have grown since the last call, and is otherwise the same.
+        The measurements may have grown since the last call, and are otherwise the same. Raises NoEstimate if
+        numbers leave the range of floats: valid ones of 1e7 m and 1e-300 m do.
         """
+        with numerics(f"{problem.source}: at {problem.measured.end(number):.15g} s"):
+            epoch = self._epoch(problem.measured, number)
+            known = [i for i, one in enumerate(problem.robots) if one.id not in epoch.undetermined]
+            for one in epoch.hypotheses:
+                if not np.all(np.isfinite(one.poses[known])):
+                    raise FloatingPointError("a pose is not finite")
+            return epoch
+
+    def _epoch(self, measured: AnyMeasurements, number: int) -> EstimateEpoch:
         match measured:
             case PairMeasurements():
                 return self._of_pair.epoch(measured, number)
@@ -136,8 +163,9 @@ def estimated(
     epochs: list[EstimateEpoch] = []
     estimator = RecordingEstimator(rule)
     for number in range(1, problem.measured.epochs + 1):
-        epoch = estimator.epoch(problem.measured, number)
-        rows += rows_of(epoch, problem.robots)
+        epoch = estimator.epoch(problem, number)
+        with numerics(problem.source):
+            rows += rows_of(epoch, problem.robots)
         add_epoch(epochs, epoch)
         done()
     return with_summary(problem, rows, epochs, rule)
@@ -148,5 +176,6 @@ def with_summary(
 ) -> RecordingEstimate:
     """Return the result of all `rows` and `epochs`."""
     last = epochs[-1] if epochs else None
-    summary = summary_of(problem.measured, rows, last, rule, problem.source, problem.noise)
+    with numerics(problem.source):
+        summary = summary_of(problem.measured, rows, last, rule, problem.source, problem.noise)
     return RecordingEstimate(rows, epochs, summary)

@@ -6,7 +6,6 @@ of time, as in a file: a range that comes later counts from the next epoch on.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator, Sequence
 
 from compose.errors import UserError
@@ -17,6 +16,7 @@ from compose.recording.estimating.estimate_run import (
     RecordingEstimate,
     RecordingEstimator,
     measurements_with,
+    numerics,
     with_summary,
 )
 from compose.recording.estimating.noise_files import ToldNoise
@@ -61,6 +61,8 @@ class StreamEstimate:
         self._begins: dict[str, float] = {}
         self._ends: dict[str, float] = {}
         self._next = 1
+        self._due_after_s = EPOCH_S
+        """The time after the first odometry of all robots at which there may be an epoch."""
         self._problem: EstimationProblem | None = None
         self._anchors: tuple[str, str] | None = None
         self._rows: list[PoseEstimateRow] = []
@@ -84,9 +86,9 @@ class StreamEstimate:
             return
         begin = max(self._begins[name] for name in names)
         end = min(self._ends[name] for name in names)
-        complete = math.floor((end - begin) / EPOCH_S + SAME_TIME_S)
-        if complete < self._next:
+        if end - begin < self._due_after_s - SAME_TIME_S * EPOCH_S:
             return
+        self._due_after_s = end - begin + EPOCH_S  # if there is none, it is not tried with each row
         try:
             self._problem = measurements_with(
                 self._builder.recording(),
@@ -100,15 +102,17 @@ class StreamEstimate:
         except NoAnchors:
             return  # there will be ranges
         measured = self._problem.measured
-        while self._next <= min(complete, measured.epochs):
-            epoch = self._estimator.epoch(measured, self._next)
+        while self._next <= measured.epochs:
+            epoch = self._estimator.epoch(self._problem, self._next)
             if epoch.hypotheses and isinstance(measured, PairMeasurements):
                 self._anchors = (measured.a.anchor.id, measured.b.anchor.id)
             self._next += 1
-            found = rows_of(epoch, self._problem.robots)
+            with numerics(self._problem.source):
+                found = rows_of(epoch, self._problem.robots)
             self._rows += found
             add_epoch(self._epochs, epoch)
             yield from found
+        self._due_after_s = measured.end(measured.epochs) - measured.t0 + EPOCH_S
 
     def result(self) -> tuple[EstimationProblem, RecordingEstimate]:
         """Return all estimates so far. Raises UserError if no epoch is complete."""

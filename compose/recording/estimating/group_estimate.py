@@ -28,7 +28,6 @@ from compose.recording.estimating.estimate_epoch import (
     of_centres,
 )
 from compose.recording.estimating.group_measurements import GroupMeasurements
-from compose.recording.estimating.prepared_steps import EPOCH_S
 
 SEARCH_AT = tuple(8 * 2**n for n in range(16))
 """The numbers of ranges at which the whole plane is searched again."""
@@ -53,7 +52,7 @@ class GroupEstimator:
 
     def epoch(self, measured: GroupMeasurements, number: int) -> EstimateEpoch:
         """Return the estimate at the end of the epoch with this `number`, from 1 on, in their order."""
-        t, (used, reach) = measured.t0 + number * EPOCH_S, measured.until(number)
+        t, (used, reach) = measured.end(number), measured.until(number)
         found = self._extended(self._followed(used), used, reach)
         count = len(used.ranges.rho)
         due = found.scored and any(self._searched < at <= count for at in SEARCH_AT)

@@ -72,6 +72,7 @@ def group_measurements(
         known += _manoeuvres(one.id, one.path)
     joint = joint_measurements(Facts(frozenset(known)), assumed.noise, EPOCH_S / prepared.ticks_per_epoch)
     unused = {"within a second after another": steps.thinned, "without odometry of all robots": steps.outside}
+    unused["in a gap of the odometry"] = steps.in_gaps
     t0 = float(steps.t[0])
     return GroupMeasurements(
         members=members,
@@ -79,9 +80,10 @@ def group_measurements(
         t0=t0,
         ticks_per_epoch=prepared.ticks_per_epoch,
         ranges=joint.ranges.single,
-        t=np.asarray(t0 + joint.period * joint.ranges.tick, np.float64),
+        t=np.asarray(t0 + joint.period * joint.ranges.tick + steps.skipped_s[joint.ranges.tick], np.float64),
         noise=assumed.noise,
         unused={why: count for why, count in unused.items() if count},
+        skipped_s=steps.skipped_s,
     )
 
 

@@ -18,7 +18,7 @@ from agent.planning.pair_claim import (
 )
 from compose.recording.estimating.estimate_epoch import ClaimRule, EpochFit, EstimateEpoch, of_centres
 from compose.recording.estimating.pair_measurements import PairMeasurements
-from compose.recording.estimating.prepared_steps import EPOCH_S, OneRobot
+from compose.recording.estimating.prepared_steps import OneRobot
 from compose.recording.ranging.range_recording import Numbers
 from protocol.messages import RobotConfig
 from protocol.mission import Anchor, Mission, Role
@@ -49,7 +49,7 @@ class PairEstimator:
 
         `measured` may have grown since the last call, and is otherwise the same.
         """
-        pair, t = measured.until(number), measured.t0 + number * EPOCH_S
+        pair, t = measured.until(number), measured.end(number)
         known = [_knowledge(measured, role, self._belief, pair, self._rule) for role in ROLES]
         found, beliefs = _inferred(known, pair, follow_only=self._claimed)
         if found is None or not found.scored:

@@ -9,7 +9,6 @@ import numpy as np
 from agent.estimation.gaussian.range_model import PairRanges, Ranges
 from compose.errors import UserError
 from compose.recording.estimating.prepared_steps import (
-    EPOCH_S,
     Measurements,
     OneRobot,
     horizon,
@@ -66,7 +65,7 @@ class PairMeasurements(Measurements, frozen=True, kw_only=True):
     def until(self, epoch: int) -> PairRanges:
         """Return what was measured up to the end of `epoch`; the first is 1."""
         ticks = epoch * self.ticks_per_epoch
-        known = self.t <= self.t0 + epoch * EPOCH_S
+        known = self.t <= self.end(epoch)
         counts = tuple([int(np.count_nonzero(known[self.ranges.rows(kind)])) for kind in range(3)])
         first, second, mutual = counts
         place, radio = self.ranges.place, self.ranges.radio
@@ -135,6 +134,7 @@ def pair_measurements(
         "to other anchors": len(ranges.t) - len(used),
         "within a second after another": steps.thinned,
         "without odometry of both robots": steps.outside,
+        "in a gap of the odometry": steps.in_gaps,
     }
     return PairMeasurements(
         a=a,
@@ -145,6 +145,7 @@ def pair_measurements(
         t=locked(ranges.t[used].copy()),
         noise=noise,
         unused={why: count for why, count in unused.items() if count},
+        skipped_s=steps.skipped_s,
     )
 
 

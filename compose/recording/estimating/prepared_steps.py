@@ -15,6 +15,7 @@ import numpy as np
 
 from agent.estimation.gaussian.odometry_noise import Track, track
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges
+from compose.errors import BadRecording
 from compose.recording.estimating.recorded_noise import RecordedNoise
 from compose.recording.estimating.sound_odometry import SoundOdometry, at_antenna, sound
 from compose.recording.ranging.range_recording import FixedAnchor, Numbers, Places, RangeRecording
@@ -86,6 +87,16 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     noise: Noise
     unused: dict[str, int]
     """The number of ranges that are not used, by the reason."""
+    skipped_s: Numbers
+    """The time in s of long gaps that is left out before each tick; shape (K + 1,)."""
+
+    def end(self, epoch: int) -> float:
+        """Return the time in s of the end of `epoch`; the first is 1."""
+        return self.t0 + epoch * EPOCH_S + float(self.skipped_s[epoch * self.ticks_per_epoch])
+
+    def time_of(self, tick: Places) -> Numbers:
+        """Return the times in s of ticks."""
+        return np.asarray(self.t0 + self.period * tick + self.skipped_s[tick], np.float64)
 
     @property
     def period(self) -> float:
@@ -150,6 +161,11 @@ def prepared_steps(
     `ticks` is the number of them in an epoch; None: by the speed of the robots.
     """
     part = recording.part(robots, *recording.span)
+    for robot in part.robots:
+        if not len(robot.odometry.t0):
+            raise BadRecording(f"{recording.source}: {robot.id} has no odometry")
+        for jump in robot.jumps:
+            raise BadRecording(jump.why)
     prepared = tuple([sound(recording.robot(name).odometry, assumed.odometry) for name in robots])
     part = part._replace(
         robots=tuple(

@@ -71,6 +71,10 @@ def sound(
 GAP_MOTION_S = 1.0
 """The time in s for which a robot is taken to move on in a gap; then it is taken to stand."""
 
+LOST_S = 100.0
+"""The time in s of unknown motion after which nothing is known of a robot's heading, and hardly anything of
+its place. With variances of longer times, fits lose all digits."""
+
 FREE = 1.0
 """The speed (m/s) and turn rate (rad/s) that a robot is assumed to have if its odometry never moves."""
 
@@ -110,6 +114,7 @@ def _last_sound(increments: Numbers, lasts: Numbers, flagged: Flags) -> Numbers:
 def _unknown(lasts: Numbers, usual: tuple[float, float]) -> Numbers:
     """Return the covariance of motion of so many seconds at unknown speeds; shape (N, 3, 3)."""
     covariance = np.zeros((len(lasts), 3, 3))
+    lasts = np.minimum(lasts, LOST_S)
     covariance[:, 0, 0] = covariance[:, 1, 1] = np.square(usual[0] * lasts)
     covariance[:, 2, 2] = np.square(usual[1] * lasts)
     return covariance

@@ -25,6 +25,7 @@ from compose.recording.ranging.recording_rows import (
     RecordingBuilder,
     SourcePlace,
     TruePoseRow,
+    number_of,
     row_of,
 )
 from protocol import files
@@ -148,7 +149,25 @@ def _take_edge(
         if value < 0.0 and name in ("cov_xx", "cov_yy", "cov_hh"):
             raise BadRecording(f"{place}: {name}: the variance {value:g} is negative")
     xx, xy, xh, yy, yh, hh = stated
+    if not _possible(xx, xy, xh, yy, yh, hh):
+        raise BadRecording(f"{place}: no errors have this covariance: it has a negative eigenvalue")
     graph.edges.setdefault(robot, []).append(Edge(base, row, (xx, xy, xh, yy, yh, hh), place))
+
+
+def _possible(xx: float, xy: float, xh: float, yy: float, yh: float, hh: float) -> bool:
+    """Return whether a matrix with these elements, and variances from 0 on, has no negative eigenvalue."""
+    if not xy and not xh and not yh:
+        return True
+    x, y, h = [math.sqrt(value) or math.inf for value in (xx, yy, hh)]
+    if (xy and not xx * yy) or (xh and not xx * hh) or (yh and not yy * hh):
+        return False
+    a, b, c = xy / x / y, xh / x / h, yh / y / h
+    determinant = 1.0 + 2.0 * a * b * c - a * a - b * b - c * c
+    return max(abs(a), abs(b), abs(c)) <= 1.0 + ROUNDING and determinant >= -ROUNDING
+
+
+ROUNDING = 1e-6
+"""The error of correlations from the decimals of a file."""
 
 
 def _range_row(values: Mapping[str, str], place: SourcePlace) -> RangeRow:
@@ -160,18 +179,21 @@ def _range_row(values: Mapping[str, str], place: SourcePlace) -> RangeRow:
         for end in ("from", "to")
     }
     return row_of(
-        {"t": values["t"], **ends, "range": values["range"], "sigma": math.sqrt(variance)}, RangeRow, place
+        {"t": values["t"], **ends, "range": values["range"], "sigma": repr(math.sqrt(variance))},
+        RangeRow,
+        place,
     )
 
 
 def _number(text: str, name: str, place: object) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not abs(value) <= 1e15:
+    value = number_of(text)
+    if isinstance(value, str) or abs(value) > LARGEST_NUMBER:
         raise BadRecording(f"{place}: {name}: {text[:40]!a} is not a number")
     return value
+
+
+LARGEST_NUMBER = 1e15
+"""The largest variance or covariance."""
 
 
 def _stamps_are_ends(graph: Graph) -> bool:

@@ -49,6 +49,17 @@ class TruePath(NamedTuple):
     """x (m), y (m) and heading (rad), as in the file, wrapped or not; shape (N, 3)."""
 
 
+class Jump(NamedTuple):
+    """An increment of odometry that lasts too long, or begins too late, for an estimate across it."""
+
+    begin_s: float
+    """The end of the increment before it, or its own start if that is within LONGEST_GAP_S."""
+    end_s: float
+    """Its start, or its end if it lasts too long itself."""
+    why: str
+    """The row, and what is wrong, in one line."""
+
+
 class RecordedRobot(NamedTuple):
     """One robot of a range recording."""
 
@@ -58,6 +69,8 @@ class RecordedRobot(NamedTuple):
     """The true poses; None if the file has none."""
     antenna: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """The position of its radio in m: forward and to the left of its centre, and its height."""
+    jumps: tuple[Jump, ...] = ()
+    """The jumps of its odometry by more than LONGEST_GAP_S."""
 
 
 class FixedAnchor(NamedTuple):
@@ -156,6 +169,12 @@ class RangeRecording(NamedTuple):
         return RangeRecording(self.source, found, self.anchors, moved.rows(kept))
 
 
+LONGEST_GAP_S = 3600.0
+"""The longest time in s without odometry across which an estimate goes on.
+
+After an hour, nothing is known of where a robot is. Mostly a clock was set: stamps jump by years then.
+"""
+
 SAME_TIME_S = 1e-6
 """The difference in s of two stamps of the same time: the rounding of stamps in files."""
 
@@ -170,7 +189,8 @@ def _between(robot: RecordedRobot, first_s: float, last_s: float) -> RecordedRob
     if truth is not None:
         within = (truth.t >= first_s) & (truth.t <= last_s)
         truth = TruePath(locked(truth.t[within]), locked(truth.poses[within]))
-    return robot._replace(odometry=odometry, truth=truth)
+    jumps = [one for one in robot.jumps if first_s <= one.begin_s and one.end_s <= last_s]
+    return robot._replace(odometry=odometry, truth=truth, jumps=tuple(jumps))
 
 
 def locked(values: NDArray[Scalar]) -> NDArray[Scalar]:

@@ -6,7 +6,7 @@ Within an increment, a robot is assumed to turn and move at constant speeds.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -82,6 +82,10 @@ class RangeSteps(NamedTuple):
     """The number of ranges that are left out since they are before the first step or after the last."""
     thinned: int
     """The number of ranges that are left out since they are too close to the one before."""
+    in_gaps: int
+    """The number of ranges that are left out since they are in a long gap, of which one step is left."""
+    skipped_s: Numbers
+    """The time in s of long gaps that is left out before the end of each step; shape (K + 1,)."""
 
 
 DEFAULT_OPTIONS = StepOptions()
@@ -96,14 +100,18 @@ def steps_of(
     there is no such time.
     """
     paths = [recording.robot(name).odometry for name in robots]
-    t = _common_times(recording, robots, paths, options.period_s)
+    t, skipped_s = _common_times(recording, robots, paths, options.period_s)
     own = {recording.radios.index(name) for name in robots} | set(
         range(len(recording.robots), len(recording.radios))
     )
     among = np.isin(recording.ranges.first, list(own)) & np.isin(recording.ranges.second, list(own))
     ranges = recording.ranges.rows(among)
     inside = (ranges.t >= t[0]) & (ranges.t <= t[-1])
+    gap = np.diff(skipped_s) > 0.0
     covered = ranges.rows(inside)
+    known = ~gap[np.clip(np.searchsorted(t, covered.t, side="right") - 1, 0, len(t) - 2)]
+    in_gaps = int(np.count_nonzero(~known))
+    covered = covered.rows(known)
     kept = covered.rows(spaced(covered, options.range_spacing_s))
     step = np.clip(np.searchsorted(t, kept.t, side="right") - 1, 0, len(t) - 2)
     poses = [dead_reckoned(path, t) for path in paths]
@@ -121,13 +129,19 @@ def steps_of(
         locked(np.stack(offsets)),
         int(np.count_nonzero(~inside)),
         len(covered.t) - len(kept.t),
+        in_gaps,
+        locked(skipped_s),
     )
 
 
 def _common_times(
     recording: RangeRecording, robots: Sequence[str], paths: Sequence[RobotOdometry], period_s: float
-) -> Numbers:
-    """Return the ends of steps of `period_s`; what is left at the end is less than a step and left out."""
+) -> tuple[Numbers, Numbers]:
+    """Return the ends of steps of `period_s`, and the time in s that is left out before each; (K + 1,) each.
+
+    Of a gap of more than LONG_GAP_S, whole seconds are left out, so that one step bridges them. What is left
+    at the end is less than a step and left out.
+    """
     for name, path in zip(robots, paths, strict=True):
         if not len(path.t0):
             raise BadRecording(f"{recording.source}: {name} has no odometry")
@@ -137,9 +151,44 @@ def _common_times(
         between = f"{first:.15g} s to {last:.15g} s" if last > first else "none"
         what = f"less than a step of {period_s:g} s in which there is odometry of {' and '.join(robots)}"
         raise BadRecording(f"{recording.source}: there is {what} ({between})")
-    times: Numbers = first + period_s * np.arange(steps + 1)
+    number = np.concatenate([np.arange(*part) for part in _numbers(paths, first, steps, period_s)])
+    times: Numbers = first + period_s * number
     times[-1] = min(times[-1], last)
-    return times
+    return times, period_s * (number - np.arange(len(number)))
+
+
+LONG_GAP_S = 10.0
+"""The time in s without odometry, or of one increment, from which on nothing is computed inside.
+
+A robot of 0.5 m/s may be 5 m away then, and ranges to it say little. With less, the short gaps of radios and
+drivers would be bridged in one step; with more, a single row costs more steps.
+"""
+
+
+def _numbers(
+    paths: Sequence[RobotOdometry], first: float, steps: int, period_s: float
+) -> Iterator[tuple[int, int]]:
+    """Yield the begin and the end of each run of the numbers of steps that are not left out."""
+    second = max(round(1.0 / period_s), 1)
+    begun = 0
+    for begin, end in _long_gaps(paths):
+        inside = max(math.floor((begin - first) / period_s) + 1, begun + 1)
+        past = min(math.ceil((end - first) / period_s), steps + 1)
+        left_out = (past - inside) // second * second
+        if left_out > 0:
+            yield begun, inside
+            begun = inside + left_out
+    yield begun, steps + 1
+
+
+def _long_gaps(paths: Sequence[RobotOdometry]) -> list[list[float]]:
+    """Return the begin and end in s of all gaps and increments of more than LONG_GAP_S of any robot."""
+    found = []
+    for path in paths:
+        alone = np.stack((path.t0, path.t1), 1)
+        for each in (path.gaps, alone):
+            found += each[each[:, 1] - each[:, 0] > LONG_GAP_S].tolist()
+    return sorted(found)
 
 
 def spaced(ranges: RangeSeries, spacing_s: float) -> Places:

@@ -13,8 +13,10 @@ from msgspec import Meta
 
 from compose.errors import BadRecording
 from compose.recording.ranging.range_recording import (
+    LONGEST_GAP_S,
     SAME_TIME_S,
     FixedAnchor,
+    Jump,
     RangeRecording,
     RangeSeries,
     RecordedRobot,
@@ -132,10 +134,20 @@ UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 """The place in a Covariance6 of each element of the matrix."""
 
 
-def row_of(values: Any, kind: type[RowKind], place: object) -> RowKind:
-    """Return the row with `values`, texts or numbers by field. Raises BadRecording, which names `place`."""
+NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?", re.ASCII)
+"""A number in a text, as C and spreadsheets write it; JSON allows none of `.5`, `5.`, `+3` and `05`."""
+
+
+def number_of(text: str) -> float | str:
+    """Return the number in `text`, or `text` if it is none."""
+    return float(text) if NUMBER.fullmatch(text) else text
+
+
+def row_of(values: dict[str, str], kind: type[RowKind], place: object) -> RowKind:
+    """Return the row with `values`, texts by field. Raises BadRecording, which names `place`."""
     try:
-        return msgspec.convert(values, kind, strict=False)
+        read = {name: text if name in NAMES else number_of(text) for name, text in values.items()}
+        return msgspec.convert(read, kind)
     except msgspec.ValidationError as error:
         raise BadRecording(f"{place}: {wrong_field(error, values)}") from None
 
@@ -152,6 +164,10 @@ def wrong_field(error: msgspec.ValidationError, values: object = None) -> str:
     return f"{field}: {what}" if field else what
 
 
+NAMES = frozenset(("robot", "anchor", "from", "to"))
+"""The fields whose values are names; all others are numbers."""
+
+
 class RecordingBuilder:
     """A range recording that is being read, row by row. Its errors are BadRecording and name the row."""
 
@@ -161,8 +177,10 @@ class RecordingBuilder:
         self.unused: Counter[str] = Counter()
         """The number of entries that are not used, by kind."""
         self._odometry: dict[str, list[tuple[OdometryRow, Covariance6 | None]]] = {}
+        self._jumps: dict[str, list[Jump]] = {}
         self._truth: dict[str, list[TruePoseRow]] = {}
         self._given = {row.anchor: row for row in anchors}
+        self._stated: dict[str, AnchorRow] = {}
         self._anchors: dict[str, AnchorRow] = {}
         self._antennas: dict[str, AntennaRow] = {}
         self._ranges: list[tuple[RangeRow, object]] = []
@@ -183,13 +201,12 @@ class RecordingBuilder:
             case RangeRow():
                 self._add_range(row, place)
             case AnchorRow():
-                if row.anchor in self._anchors:
+                if self._stated.setdefault(row.anchor, row) != row:
                     raise BadRecording(f"{place}: there are two anchors {row.anchor}")
                 self._anchors[row.anchor] = self._given.get(row.anchor, row)
             case AntennaRow():
-                if row.robot in self._antennas:
+                if self._antennas.setdefault(row.robot, row) != row:
                     raise BadRecording(f"{place}: there are two antennas of {row.robot}")
-                self._antennas[row.robot] = row
                 self._claims.append((row.robot, place))
             case TruePoseRow():
                 path = self._truth.setdefault(row.robot, [])
@@ -211,7 +228,23 @@ class RecordingBuilder:
         if path and row.t0 < path[-1][0].t1 - SAME_TIME_S:
             end = f"the increment of {row.robot} before it ends at {path[-1][0].t1:.15g} s"
             raise BadRecording(f"{place}: t0: it starts at {row.t0:.15g} s, and {end}")
+        self._add_jump(row, path[-1][0].t1 if path else row.t0, place)
         path.append((row, covariance))
+
+    def _add_jump(self, row: OdometryRow, before: float, place: object) -> None:
+        """Note an increment that lasts, or begins after the time `before` by, more than LONGEST_GAP_S."""
+        late, lasts = row.t0 - before, row.t1 - row.t0
+        if max(late, lasts) <= LONGEST_GAP_S:
+            return
+        what = f"t1: it lasts {lasts:.6g} s"
+        begin, end = row.t0, row.t1
+        if late > LONGEST_GAP_S:
+            what = f"t0: it starts {late:.6g} s after the end of the increment of {row.robot} before it"
+            begin, end = before, row.t0
+        what += (
+            f", and an estimate bridges at most {LONGEST_GAP_S:g} s; was a clock set? --window chooses a part"
+        )
+        self._jumps.setdefault(row.robot, []).append(Jump(begin, end, f"{place}: {what}"))
 
     def _add_range(self, row: RangeRow, place: object) -> None:
         if row.first == row.second:
@@ -257,6 +290,7 @@ class RecordingBuilder:
             if truth
             else None,
             (antenna.forward, antenna.left, antenna.height) if antenna is not None else (0.0, 0.0, 0.0),
+            tuple(self._jumps.get(name, ())),
         )
 
     def _range_series(self) -> RangeSeries:
