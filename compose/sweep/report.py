@@ -48,6 +48,7 @@ CHOICES = (
     ("trials", *OUTCOMES, "clean", "rate", "p50", "max"),
     ("trials", *OUTCOMES, "rate"),
     ("trials", *OUTCOMES),
+    OUTCOMES,
 )
 """The possible choices of columns. The first that fits the terminal is used. Outcomes are never dropped."""
 OF_GROUP = ("share p50", "share max", "corrected", "travel p50", "travel p95", "honest")
@@ -171,7 +172,7 @@ def _audited(results: Results) -> str:
 def _lines(results: Results) -> tuple[list[str], Sequence[str]]:
     """Return the lines of the widest table that fits the terminal, and its columns.
 
-    If none fits, they are those of a list, which leaves out the outcomes that no trial has.
+    If none fits, they are those of a list, with a sentence for each cell.
     """
     choices = _choices(results)
     for columns in choices:
@@ -185,7 +186,7 @@ def _lines(results: Results) -> tuple[list[str], Sequence[str]]:
         place = [
             f"{name} {label}" for name, label in zip(["cell", *names], _axes(results, cell), strict=True)
         ]
-        counts = [f"{texts[one]} {one}" for one in choices[-1] if texts[one] != "0"]
+        counts = [f"{texts[one]} {one}" for one in ("trials", *OUTCOMES)]
         found += text_width.wrapped(f"{', '.join(place)}: {', '.join(counts)}", 2)
     return found, choices[-1]
 
