@@ -48,9 +48,10 @@ from protocol.journal import environment  # noqa: E402
 STYLE = ("compose/figures/style.py", "compose/view/colours.py")
 MISSIONS = ("compose/figures/*.py", "compose/view/colours.py", "compose/view/outlines.py")
 PAGE = (
-    "compose/view/*.py", "compose/view/story/*.py", "compose/view/web/film.py",
-    "compose/view/web/standalone.py", "compose/view/web/page/*",
-)  # fmt: skip
+    *[f"compose/view/{name}.py" for name in ("configurations", "events", "outlines", "words")],
+    *["compose/view/story/*.py", "compose/view/web/film.py", "compose/view/web/standalone.py"],
+    "compose/view/web/page/*",
+)
 """The code that draws figures of missions, and the page, as patterns of paths."""
 COMMENTS = {
     ".py": r'(?m)^\s*#.*$|^\s*"""(?s:.*?)"""',
@@ -142,7 +143,7 @@ def estimated(folder: Path) -> dict[str, Any]:
     """Return when each robot of the recorded sample may claim its pose, and how many ranges count."""
     estimate(folder)
     result = json.loads((folder / "estimated" / "estimate.json").read_text())
-    claims = {one["robot"]: (one["first_claim"] or {}).get("t_s") for one in result["robots"]}
+    claims = {robot: (one["first_claim"] or {}).get("t_s") for robot, one in result["robots"].items()}
     return {"first claims": claims, "ranges": result["ranges"]}
 
 
