@@ -81,7 +81,7 @@ class Source(NamedTuple):
     """True if what was decided is known within a second."""
 
 
-def mission(name: str, *, exact: bool = True, **figures: str) -> Source:
+def mission(name: str, figures: Mapping[str, str], *, exact: bool = True) -> Source:
     """Return the source of figures of the shipped scenario `name`."""
     named = {f"{file}.svg": title for file, title in figures.items()}
 
@@ -187,17 +187,17 @@ def tandem(*arguments: str) -> None:
 SOURCES = (
     mission(
         "paper-1",
-        **{
+        {
             "paper-1": "trajectory-a-b", "paper-1-phase-1": "phase-1-a", "paper-1-plan": "plan-b-47",
             "paper-1-encounter": "encounter-a-b", "paper-1-ranges": "ranges-a-b",
         },
     ),
     mission(
         "paper-2",
-        **{"paper-2": "trajectory-a-b", "paper-2-plan": "plan-b-109", "paper-2-encounter": "encounter-a-b"},
+        {"paper-2": "trajectory-a-b", "paper-2-plan": "plan-b-109", "paper-2-encounter": "encounter-a-b"},
     ),
-    mission("noisy", exact=False, **{"noisy-plan": "plan-a-b", "noisy-a": "robot-a"}),
-    mission("group-8", **{"group-8": "meetings"}),
+    mission("noisy", {"noisy-plan": "plan-a-b", "noisy-a": "robot-a"}, exact=False),
+    mission("group-8", {"group-8": "meetings"}),
     Source(
         {"page.gif": "guided play", "page.png": STILL[0]}, ("compose/scenario/shipped/paper-1.toml", *PAGE),
         page, lambda folder: decisions(ran("paper-1", folder)), exact=True, quick=True,
