@@ -1,71 +1,326 @@
-"""Draw the figures and the film of single missions in the documentation again: `uv run docs/picture.py`."""
+"""The figures of the documentation: draw them, or say which are stale.
+
+`uv run docs/picture.py` draws all of them (an hour or more: two are sweeps of 14 000 and 42 000 missions),
+`uv run docs/picture.py page.gif noisy-a.svg` those two. Then `figures.json` says from what each was made:
+hashes of its file, of the code that draws it with its input, and of what its missions decided. With `--check`
+it draws none, and prints a line for each stale figure; the exit status is 1 if there are any.
+
+A figure is stale if its file, the code that draws it, or its input has changed since it was drawn, or if its
+missions end or decide otherwise in any tick. Positions are not compared: their last bits depend on the
+processor. Under noise decisions may, too, and are compared only in the environment of the drawing.
+"""
 
 from __future__ import annotations
 
+import argparse
+import contextlib
+import csv
+import hashlib
+import io
+import json
+import os
+import re
 import shutil
+import subprocess
+import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-
-from compose.figures import PICTURES, catalogue
-from compose.figures.agent_replay import agent_replay
-from compose.figures.pair import pairs_of
-from compose.figures.sheet import Absent
-from compose.figures.style import SCREEN, look, save
-from compose.launch import in_process
-from compose.recording.run import read
-from compose.scenario import scenario_file
-from compose.view.web import film
-from compose.view.web.standalone import standalone_page
+from typing import Any, NamedTuple
 
 DOCS = Path(__file__).parent
-SHOWN: dict[str, dict[str, str]] = {
-    "paper-1": {
-        "trajectory-a-b": "paper-1",
-        "phase-1-a": "paper-1-phase-1",
-        "plan-b-47": "paper-1-plan",
-        "encounter-a-b": "paper-1-encounter",
-        "ranges-a-b": "paper-1-ranges",
-    },
-    "paper-2": {
-        "trajectory-a-b": "paper-2",
-        "plan-b-109": "paper-2-plan",
-        "encounter-a-b": "paper-2-encounter",
-    },
-    "noisy": {"plan-a-b": "noisy-plan", "robot-a": "noisy-a"},
-    "group-8": {"meetings": "group-8"},
-}
-"""By scenario: the titles of the figures of `tandem figures` that pages show, and their file names here."""
+ROOT = DOCS.parent
+RECORD = "figures.json"
+sys.path.insert(0, str(ROOT))  # for docs.examples
 
-FILMED = "paper-1"
-"""The scenario whose guided play is page.gif, and of which page.png is one picture."""
+from compose.figures import PICTURES, catalogue  # noqa: E402
+from compose.figures.agent_replay import agent_replay  # noqa: E402
+from compose.figures.pair import pairs_of  # noqa: E402
+from compose.figures.sheet import Absent  # noqa: E402
+from compose.figures.style import SCREEN, SWEEP, look, save  # noqa: E402
+from compose.launch import in_process  # noqa: E402
+from compose.recording.run import Run, read  # noqa: E402
+from compose.scenario import scenario_file  # noqa: E402
+from compose.view.web import film  # noqa: E402
+from compose.view.web.standalone import standalone_page  # noqa: E402
+from protocol.journal import environment  # noqa: E402
+
+STYLE = ("compose/figures/style.py", "compose/view/colours.py")
+MISSIONS = ("compose/figures/*.py", "compose/view/colours.py", "compose/view/outlines.py")
+PAGE = (
+    *[f"compose/view/{name}.py" for name in ("configurations", "events", "outlines", "words")],
+    *["compose/view/story/*.py", "compose/view/web/film.py", "compose/view/web/standalone.py"],
+    "compose/view/web/page/*",
+)
+"""The code that draws figures of missions, and the page, as patterns of paths."""
+COMMENTS = {
+    ".py": r'(?m)^\s*#.*$|^\s*"""(?s:.*?)"""',
+    ".js": r"(?m)^\s*//.*$|/\*(?s:.*?)\*/",
+    ".css": r"/\*(?s:.*?)\*/",
+}
+"""What is no code, by the ending of a file; spaces in these files are none either."""
 STILL = ("distance that a configuration predicts", (1360, 840))
 """The mark of the legend that page.png shows, and its size in pixels."""
+RECORDED = "tests/data/uwb/tiers-a-b-30-s.pyfg"
 
 
-def main() -> None:
-    """Draw the figures that `tandem run SCENARIO --out DIR` and `tandem figures DIR --format svg` write."""
-    for name, shown in SHOWN.items():
-        with tempfile.TemporaryDirectory() as folder:
-            draw(name, shown, Path(folder))
-            if name == FILMED:
-                page = standalone_page(Path(folder)).html
-                (DOCS / "page.gif").write_bytes(film.gif(page, film.browser("page.gif")))
-                (DOCS / "page.png").write_bytes(film.still(page, film.browser("page.png"), *STILL))
+class Source(NamedTuple):
+    """What some figures show: a mission, a recording, a sweep or an example."""
+
+    figures: Mapping[str, str]
+    """The files in docs/, each with the name of the figure in the source."""
+    code: Sequence[str]
+    """Paths of the input and of the code that draws, as patterns."""
+    draw: Callable[[Path, Mapping[str, str]], None]
+    """Draws some of the figures, in a temporary folder, as files of their names in it."""
+    decided: Callable[[Path], dict[str, Any]]
+    """Returns what was decided; for a sweep, in the first trial of each cell."""
+    exact: bool = False
+    """True if decisions are the same on all processors."""
+    quick: bool = False
+    """True if what was decided is known within a second."""
 
 
-def draw(name: str, shown: Mapping[str, str], folder: Path) -> None:
-    """Run the scenario in `folder`, and copy those of its figures to docs/ that `shown` names."""
+def mission(name: str, figures: Mapping[str, str], *, exact: bool = True) -> Source:
+    """Return the source of figures of the shipped scenario `name`."""
+    named = {f"{file}.svg": title for file, title in figures.items()}
+
+    def draw(folder: Path, wanted: Mapping[str, str]) -> None:
+        run = ran(name, folder)
+        pair = next(pairs_of(run, {robot: agent_replay(run, robot) for robot in run.robots}))
+        for kind in PICTURES:
+            with look(SCREEN):
+                for title, figure in catalogue.pictures(pair, kind):
+                    for file in [one for one in wanted if wanted[one] == title]:
+                        if not isinstance(figure, Absent):
+                            save(figure, folder / Path(file).stem, ["svg"])
+
+    return Source(
+        named, (f"compose/scenario/shipped/{name}.toml", *MISSIONS), draw,
+        lambda folder: decisions(ran(name, folder)), exact, quick=True,
+    )  # fmt: skip
+
+
+def ran(name: str, folder: Path) -> Run:
+    """Return the run of a shipped scenario, recorded in `folder`."""
     in_process.run_mission(scenario_file.load(name), folder)
-    run = read(folder)
-    pair = next(pairs_of(run, {robot: agent_replay(run, robot) for robot in run.robots}))
-    for kind in PICTURES:
-        with look(SCREEN):
-            for title, figure in catalogue.pictures(pair, kind):
-                if title in shown and not isinstance(figure, Absent):
-                    (svg,) = save(figure, folder / title, ["svg"])
-                    shutil.copyfile(svg, DOCS / f"{shown[title]}.svg")
+    return read(folder)
+
+
+def decisions(run: Run) -> dict[str, Any]:
+    """Return the end of a run, and when a robot changes its phase, state, or number of hypotheses."""
+    found: dict[str, Any] = {"ticks": run.length - 1, "outcome": run.end.outcome if run.end else None}
+    for robot in run.robots:
+        held = {one.tick: len(one.world or one.local) for one in run.estimates(robot)}
+        changes: list[tuple[int, str]] = []
+        for tick in range(run.length):
+            command = run.command(robot, tick)
+            state = f"{command.phase} {command.state} {held.get(tick, 0)}" if command is not None else "late"
+            if not changes or changes[-1][1] != state:
+                changes.append((tick, state))
+        found[robot] = "; ".join(f"{tick}: {state}" for tick, state in changes)
+    return found
+
+
+def page(folder: Path, wanted: Mapping[str, str]) -> None:
+    """Draw the guided play of paper-1, and one picture of it."""
+    ran("paper-1", folder)
+    html, program = standalone_page(folder).html, film.browser("docs/picture.py")
+    if "page.gif" in wanted:
+        (folder / "page.gif").write_bytes(film.gif(html, program))
+    if "page.png" in wanted:
+        (folder / "page.png").write_bytes(film.still(html, program, *STILL))
+
+
+def estimate(folder: Path, wanted: Mapping[str, str] = {}) -> None:
+    """Estimate the recorded sample into `folder`, and rename its figures."""
+    tandem("estimate", str(ROOT / RECORDED), "--noise", "uwb-calibrated", "--out", str(folder / "estimated"))
+    for file, name in wanted.items():
+        shutil.copyfile(folder / "estimated" / f"{name}.svg", folder / file)
+
+
+def estimated(folder: Path) -> dict[str, Any]:
+    """Return when each robot of the recorded sample may claim its pose, and how many ranges count."""
+    estimate(folder)
+    result = json.loads((folder / "estimated" / "estimate.json").read_text())
+    claims = {robot: (one["first_claim"] or {}).get("t_s") for robot, one in result["robots"].items()}
+    return {"first claims": claims, "ranges": result["ranges"]}
+
+
+def sweep(name: str, **figures: str) -> Source:
+    """Return the source of figures of a shipped sweep."""
+
+    def run(folder: Path, *options: str) -> None:
+        tandem("sweep", name, *options, "--out", str(folder / name))
+
+    def draw(folder: Path, wanted: Mapping[str, str]) -> None:
+        run(folder)
+        for file, title in wanted.items():
+            shutil.copyfile(folder / name / "figures" / f"{title}.svg", folder / file)
+
+    def decided(folder: Path) -> dict[str, Any]:
+        run(folder, "--trials", "1")
+        with (folder / name / "summary.csv").open(newline="") as file:
+            return {"cells": [(row["localised"], row["ticks_p50"]) for row in csv.DictReader(file)]}
+
+    code = (f"compose/sweep/shipped/{name}.toml", "compose/sweep/axis_figures.py", *STYLE)
+    return Source({f"{file}.svg": title for file, title in figures.items()}, code, draw, decided, exact=True)
+
+
+def radios(folder: Path, wanted: Mapping[str, str] = {}, trials: int = 20) -> str:
+    """Run the example of planners over radio models, and return what it prints."""
+    from docs.examples import planners_and_radios  # noqa: PLC0415  # an example of the Python API
+
+    printed = io.StringIO()
+    with look(SWEEP), contextlib.redirect_stdout(printed):
+        os.environ["SOURCE_DATE_EPOCH"] = "0"  # for the date that Matplotlib writes
+        for file in wanted or ["radios.svg"]:
+            planners_and_radios.main(str(folder / file), trials)
+    return printed.getvalue()
+
+
+def tandem(*arguments: str) -> None:
+    """Run a command of the program. Raises CalledProcessError if it fails."""
+    subprocess.run([sys.executable, "-m", "tandem", *arguments], cwd=ROOT, check=True, stdout=sys.stderr)
+
+
+SOURCES = (
+    mission(
+        "paper-1",
+        {
+            "paper-1": "trajectory-a-b", "paper-1-phase-1": "phase-1-a", "paper-1-plan": "plan-b-47",
+            "paper-1-encounter": "encounter-a-b", "paper-1-ranges": "ranges-a-b",
+        },
+    ),
+    mission(
+        "paper-2",
+        {"paper-2": "trajectory-a-b", "paper-2-plan": "plan-b-109", "paper-2-encounter": "encounter-a-b"},
+    ),
+    mission("noisy", {"noisy-plan": "plan-a-b", "noisy-a": "robot-a"}, exact=False),
+    mission("group-8", {"group-8": "meetings"}),
+    Source(
+        {"page.gif": "guided play", "page.png": STILL[0]}, ("compose/scenario/shipped/paper-1.toml", *PAGE),
+        page, lambda folder: decisions(ran("paper-1", folder)), exact=True, quick=True,
+    ),
+    Source(
+        {f"{one}.svg": one for one in ("estimate-path", "estimate-over-time")},
+        (RECORDED, *[f"compose/{one}.py" for one in ("figures/estimated", "figures/sheet", "view/outlines")],
+         *STYLE),
+        estimate, estimated,
+    ),
+    sweep("settings", settings="ticks-setting"),
+    sweep("loss", loss="ticks-share-lost"),
+    Source(
+        {"radios.svg": "planners over radio models"}, ("docs/examples/planners_and_radios.py",),
+        lambda folder, wanted: print(radios(folder, wanted), end=""),
+        lambda folder: {"printed": radios(folder, trials=1).splitlines()},
+    ),
+)  # fmt: skip
+"""All figures."""
+
+
+def code_of(source: Source, title: str) -> str:
+    """Return a hash of the code and the input of a figure, without comments, docstrings and spaces."""
+    parts = [title.encode()]
+    for path in sorted({path for pattern in source.code for path in ROOT.glob(pattern) if path.is_file()}):
+        content = path.read_bytes()
+        if (pattern := COMMENTS.get(path.suffix)) is not None:
+            content = re.sub(r"\s+", "", re.sub(pattern, "", content.decode())).encode()
+        parts += [path.relative_to(ROOT).as_posix().encode(), content]
+    return hashed(b"\0".join(parts))
+
+
+def file_of(name: str) -> str | None:
+    """Return a hash of a figure's file; None if there is none."""
+    path = DOCS / name
+    return hashed(path.read_bytes()) if path.is_file() else None
+
+
+def hashed(content: bytes) -> str:
+    """Return the first 16 digits of the SHA-256 hash of `content`."""
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+def names_of_figures() -> list[str]:
+    """Return the names of all figures in docs/."""
+    return [name for source in SOURCES for name in source.figures]
+
+
+def here() -> str:
+    """Return the environment on which the last bits of numbers depend."""
+    one = environment.of_robot()
+    return "; ".join([one.c_library, one.instruction_set, str(one.numpy), str(one.linear_algebra)])
+
+
+def recorded() -> dict[str, Any]:
+    """Return the content of `figures.json`, by the name of the figure."""
+    found: dict[str, Any] = json.loads((DOCS / RECORD).read_text())
+    return found
+
+
+def stale(*, quick: bool = False) -> Iterator[str]:
+    """Yield a line for each stale figure; if `quick`, without running sweeps and estimates."""
+    made = recorded()
+    for source in SOURCES:
+        decided = None
+        for name, title in source.figures.items():
+            then = made.get(name)
+            if then is None or file_of(name) != then["file"]:
+                yield f"{name}: the file is not the one that docs/picture.py has drawn"
+            elif code_of(source, title) != then["code"]:
+                yield f"{name}: the code that draws it, or its input, has changed"
+            elif (source.quick or not quick) and (source.exact or then["environment"] == here()):
+                decided = decided if decided is not None else tried(source)
+                if decided != then["decided"]:
+                    yield f"{name}: the missions that it shows decide otherwise now"
+
+
+def tried(source: Source) -> str:
+    """Return a hash of what is decided in a source now."""
+    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
+        return hashed(json.dumps(source.decided(Path(folder)), sort_keys=True).encode())
+
+
+def draw(names: Sequence[str]) -> None:
+    """Draw the figures with these names, and record from what they are made."""
+    for source in SOURCES:
+        wanted = {name: title for name, title in source.figures.items() if name in names}
+        if not wanted:
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            source.draw(Path(folder), wanted)
+            for name in wanted:
+                shutil.copyfile(Path(folder) / name, DOCS / name)
+        decided = tried(source)
+        made = recorded()
+        for name, title in wanted.items():
+            made[name] = {
+                "file": file_of(name),
+                "code": code_of(source, title),
+                "environment": here(),
+                "decided": decided,
+            }
+            print(name)
+        text = json.dumps(dict(sorted(made.items())), indent=1)
+        (DOCS / RECORD).write_text(text + "\n")
+
+
+def main() -> int:
+    """Draw figures, or check them."""
+    names = names_of_figures()
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("names", nargs="*", metavar="FIGURE", help="a file in docs/ (default: all)")
+    parser.add_argument("--check", action="store_true", help="print which figures are stale")
+    arguments = parser.parse_args()
+    if unknown := set(arguments.names) - set(names):
+        parser.error(f"no figure of docs/: {', '.join(sorted(unknown))} (there are {', '.join(names)})")
+    if arguments.check:
+        found = list(stale())
+        print(*found, sep="\n", end="\n" if found else "")
+        return 1 if found else 0
+    draw(arguments.names or names)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -15,7 +15,7 @@ from playwright.sync_api import Browser, Page, expect
 from compose.recording.recording_files import WORLD_JOURNAL
 from compose.recording.run import Run, read
 from compose.view import series as series_module
-from compose.view.recorded import run_data
+from compose.view.recorded import run_data, scenes_of
 from compose.view.series import MOST_BINS, Curve, Series, series
 from protocol.journal import journal_file
 from protocol.journal.journal_file import Journal
@@ -292,3 +292,17 @@ def test_the_charts_follow_a_mission_while_it_runs(opened: Open, noisy: Path, tm
             label = re.compile(f"^Tick {tick}. hypotheses: a {len(held.world)}, ")
             expect(page.locator(CHARTS)).to_have_attribute("aria-label", label)
             expect(page.locator("#status")).to_contain_text("running")
+
+
+def test_a_position_whose_sigma_is_large_is_drawn_along_its_arc(
+    opened: Open, noisy: Path, served: str
+) -> None:
+    shown = scenes_of(read(noisy))
+    bent = [scene.tick for scene in shown if all(player.held and player.held.arc for player in scene.players)]
+    page = opened(served)
+    legend = page.locator("#legend")
+    scrub_to(page, bent[0])
+    expect(legend).to_contain_text("uncertainty (3 sigma): along an arc")
+    assert len(legend.get_by_text("uncertainty (3 sigma)").all()) == 1  # and no ellipse
+    scrub_to(page, shown[-1].tick)
+    expect(legend).not_to_contain_text("along an arc")
