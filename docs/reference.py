@@ -42,6 +42,7 @@ from compose.scenario.scenario_tables import (
     WorldTable,
 )
 from compose.sweep.draws import DrawTable, StartsTable
+from compose.sweep.paired_differences import PairedDifference
 from compose.sweep.spec import AxisTable, RowTable, SpecFile
 from compose.sweep.trial import RobotRow, TrialRow
 from protocol import messages, wire
@@ -296,6 +297,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "starts": partial(fields_of, StartsTable),
     "trial-columns": partial(columns_of, TrialRow),
     "robot-columns": partial(columns_of, RobotRow),
+    "difference-columns": partial(columns_of, PairedDifference),
     "tick-columns": partial(columns_of, TickRow),
     "truth-table": partial(columns_of, rows.TruthRow),
     "observation-table": partial(columns_of, rows.ObservationRow),

@@ -5,7 +5,7 @@ a block of `python` as a script. A comment in the line before a block changes th
 
 - `<!-- file: NAME -->` writes the block to that file;
 - `<!-- exit status: N -->` is the exit status of its commands, which is 0 otherwise;
-- `<!-- long -->` makes it a long test;
+- `<!-- long -->`, or `<!-- long, exit status: N -->`, makes it a long test;
 - `<!-- together -->` is a block whose commands run at the same time, and have a test of their own;
 - `<!-- not run: REASON -->` is a block whose commands are only parsed.
 """
@@ -61,7 +61,13 @@ class Block(NamedTuple):
     @property
     def status(self) -> int:
         """The exit status of its commands."""
-        return int(self.comment.removeprefix("exit status: ")) if self.comment.startswith("exit") else 0
+        found = re.search(r"exit status: (\d)", self.comment)
+        return int(found[1]) if found is not None else 0
+
+    @property
+    def long(self) -> bool:
+        """True if only a long test runs it."""
+        return self.comment.startswith("long")
 
     @property
     def file(self) -> str | None:
@@ -105,7 +111,7 @@ def run_page(page: Path, folder: Path, *, long: bool) -> None:
                 [sys.executable, "-c", block.text], cwd=folder, capture_output=True, text=True, check=False
             )
             assert ran.returncode == 0, f"{block.text}\n{ran.stderr}"
-        elif block.language == "sh" and block.run and (long or block.comment != "long"):
+        elif block.language == "sh" and block.run and (long or not block.long):
             for words in block.commands():
                 if words[0] in DRIVEN:
                     run_command(words, block.status, folder)
@@ -125,7 +131,7 @@ def runnable(page: Path) -> bool:
 
 
 def is_long(page: Path) -> bool:
-    return any(one.comment == "long" for one in blocks(page))
+    return any(one.long for one in blocks(page))
 
 
 def is_later(page: Path) -> bool:

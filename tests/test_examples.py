@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from importlib import import_module
@@ -39,6 +40,34 @@ def test_an_example_runs_and_writes_its_figure(name: str, tmp_path: Path) -> Non
     assert len((EXAMPLES / f"{name}.py").read_text().splitlines()) < MAX_LINES
     import_module(f"docs.examples.{name}").main(str(tmp_path / "figure.png"), **SMALL[name])
     assert (tmp_path / "figure.png").stat().st_size > 1000
+
+
+INTERVAL = re.compile(
+    r"(?P<what>[^:\n]+): .*?[+-][\d.]+ ticks \((?P<low>[+-][\d.]+) to (?P<high>[+-][\d.]+)\)"
+)
+"""The line of a difference with its interval, as examples print it and pages show it."""
+
+
+@pytest.mark.long
+@pytest.mark.timeout(600)
+def test_figures_that_pages_show_agree_with_what_fewer_trials_print(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The 200 trials of the pages take minutes; the first 20 of the same trials must not contradict them."""
+    for name, page, trials in (
+        ("greedy_planner", "own-planner.md", 20),
+        ("planners_and_radios", "own-models.md", 3),
+    ):
+        shown = (EXAMPLES.parent / page).read_text().partition(f"<!-- printed by: {name} -->")[2]
+        import_module(f"docs.examples.{name}").main(str(tmp_path / "figure.png"), trials=trials)
+        printed = capsys.readouterr().out
+        few, many = ({one["what"]: one for one in INTERVAL.finditer(text)} for text in (printed, shown))
+        assert {*few} <= {*many}
+        for what, one in few.items():
+            other = many[what]
+            apart = float(one["low"]) > float(other["high"]) or float(other["low"]) > float(one["high"])
+            assert not apart, f"{page}: {one[0]}, and on the page {other[0]}"
+    assert few, "no interval was printed"
 
 
 @pytest.mark.parametrize("name", WITHOUT_FIGURE)

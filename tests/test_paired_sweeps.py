@@ -190,7 +190,7 @@ def test_planners_get_the_same_trials_and_their_difference_is_that_of_the_pairs(
 def test_an_axis_of_the_api_is_paired_as_the_caller_says_and_no_other_is_compared(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    axes = {"fault[0].loss": [0.0, 0.5], **PLANNERS}
+    axes: dict[str, list[Any]] = {"fault[0].loss": [0.0, 0.5], **PLANNERS}
     for paired, expected in ((None, [False, True]), (True, [True, True]), (False, [False, False])):
         results = tandem.sweep("random", axes, trials=1, paired=paired, workers=1, audit=False)
         assert [axis.paired for axis in results.sweep.axes] == expected, paired

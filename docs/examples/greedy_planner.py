@@ -66,16 +66,22 @@ def _gain(slope: np.ndarray, covariance: np.ndarray, sigma: float) -> np.ndarray
     return np.asarray(0.5 * np.log1p(variance / max(sigma, 1e-3) ** 2))
 
 
-def main(file: str = "planners.png", trials: int = 20, workers: int | None = None) -> None:
+def main(file: str = "planners.png", trials: int = 200, workers: int | None = None) -> None:
     """Run the same `trials` missions with each planner, and draw the distributions of their ticks."""
-    planners = {"greedy": Greedy, "assured": "assured", "paper": "paper"}
+    planners = {"assured": "assured", "greedy": Greedy, "paper": "paper"}
     results = tandem.sweep("noisy", {"planner.name": [*planners.values()]}, trials=trials, workers=workers)
     figure = Figure(figsize=(5.0, 3.5), layout="constrained")
     axes = figure.subplots()
     for cell, name in enumerate(planners):
         ticks = np.sort(results.trials.where(cell=cell, outcome="localised")["ticks"])
         axes.step([0, *ticks], np.arange(len(ticks) + 1) / trials, where="post", label=name)
-        print(name, "localised", len(ticks), "of", trials, "median", np.median(ticks) if len(ticks) else "-")
+        print(f"{name}: {len(ticks)} of {trials} localised, median {np.median(ticks) if len(ticks) else '-'}")
+    less = results.differences
+    for i, name in enumerate([*planners][1:]):
+        mean, low, high = (less[column][i] for column in ("ticks", "ticks_low", "ticks_high"))
+        pairs = less["both_localised"][i]
+        found = f"{mean:+.1f} ticks ({low:+.1f} to {high:+.1f}), {pairs} pairs"
+        print(f"{name} - assured:", found if pairs else "no pair localised")
     axes.set(xlabel="ticks", ylabel="part of missions that are localised", ylim=(0, 1))
     axes.legend()
     figure.savefig(file)

@@ -18,8 +18,8 @@ LOSS = (0.0, 0.5, 0.8, 0.9, 0.95)
 
 
 def main(file: str = "loss.png", trials: int = 20, workers: int | None = None) -> None:
-    """Run `trials` missions from random starts for each loss, and write the figure to `file`."""
-    results = tandem.sweep("random", {"fault[0].loss": LOSS}, trials=trials, workers=workers)
+    """Run `trials` missions from the same random starts for each loss, and write the figure to `file`."""
+    results = tandem.sweep("random", {"fault[0].loss": LOSS}, paired=True, trials=trials, workers=workers)
     print(results, "rate of localised trials:", *results.cells["rate"])
     quartiles = []
     for cell in results.cells["cell"]:

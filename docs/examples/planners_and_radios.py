@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 import tandem
 
-PLANNERS = {"greedy": "docs.examples.greedy_planner:Greedy", "assured": "assured", "paper": "paper"}
+PLANNERS = {"assured": "assured", "greedy": "docs.examples.greedy_planner:Greedy", "paper": "paper"}
 RADIOS = {
     "disc": {"model": "disc"},
     "fading": {"model": "fading", "options": {"far": 1.0, "exponent": 1.0}},
@@ -26,7 +26,7 @@ SETTING = {"mission.noise": {"anchor_sigma": 0.01, "mutual_sigma": 0.01}, "missi
 """Noise in m with which `paper` mostly reaches the accuracy in m."""
 
 
-def main(file: str = "radios.png", trials: int = 20, workers: int | None = None) -> None:
+def main(file: str = "radios.png", trials: int = 200, workers: int | None = None) -> None:
     """Run `trials` missions for each planner and radio, with the same starts, and draw both results."""
     base = tandem.Scenario.load("random").with_(SETTING)
     axes: list[dict[str, object]] = [
@@ -35,14 +35,20 @@ def main(file: str = "radios.png", trials: int = 20, workers: int | None = None)
     ]
     table = {"name": "radios", "scenario": base, "trials": trials}
     results = tandem.sweep({**table, "axis": [{**one, "paired": True} for one in axes]}, workers=workers)
-    cells = results.cells
+    cells, less = results.cells, results.differences.where(axis="planner")
     rate, ticks = (np.reshape(cells[name], (len(PLANNERS), len(RADIOS))) for name in ("rate", "ticks_p50"))
+    for i, name in enumerate(less["value"]):
+        mean, low, high = (less[column][i] for column in ("ticks", "ticks_low", "ticks_high"))
+        more, least, most = (100.0 * less[column][i] for column in ("rate", "rate_low", "rate_high"))
+        found = f", {mean:+.1f} ticks ({low:+.1f} to {high:+.1f})" if less["both_localised"][i] else ""
+        radio = [*RADIOS][less["cell"][i] % len(RADIOS)]
+        print(f"{name} - assured, {radio}: localised {more:+.1f} % ({least:+.1f} to {most:+.1f}){found}")
     figure = Figure(figsize=(8.0, 3.5), layout="constrained")
     for axis, values, label in zip(
         figure.subplots(1, 2), (rate, ticks), ("part localised", "median of ticks"), strict=True
     ):
         for row, name in enumerate(PLANNERS):
-            print(name, label, dict(zip(RADIOS, values[row].round(2).tolist(), strict=True)))
+            print(name, label, dict(zip(RADIOS, values[row].round(3).tolist(), strict=True)))
             axis.plot(range(len(RADIOS)), values[row], "o-", label=name)
         axis.set_xticks(range(len(RADIOS)), RADIOS, rotation=30)
         axis.set(ylabel=label, ylim=(0, None))
