@@ -111,8 +111,19 @@ def test_nothing_is_computed_in_a_gap_and_the_estimate_goes_on_after_it(robots: 
     assert found.summary.unused_ranges["in a gap of the odometry"] == 3
     times = sorted(set(found.rows["t_s"].tolist()))
     assert times[-1] == gap_s + 10.0
-    assert all(t <= 6.0 or t >= gap_s + 4.0 for t in times)
+    assert all(t <= 6.0 or t >= gap_s + 5.0 for t in times)
     assert len(times) <= 22
+
+
+def test_the_number_of_estimates_is_bounded_by_that_of_the_measurements(tmp_path: Path) -> None:
+    """The same rows over nineteen times the time; an increment then lasts 9.5 s."""
+    tables = recording(1, random.Random(1))
+    for rows in tables.values():
+        for row in rows:
+            row.update({stamp: 19.0 * row[stamp] for stamp in ("t", "t0", "t1") if stamp in row})
+    found = tandem.estimate(written(tmp_path, tables))
+    assert len(found.rows["t_s"]) <= 3 * len(tables["odometry"])
+    assert all(t % 9.5 in (0.0, 0.5, 1.0) for t in found.rows["t_s"])
 
 
 def test_numbers_are_read_as_c_and_spreadsheets_write_them(tmp_path: Path) -> None:

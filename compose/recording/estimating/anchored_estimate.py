@@ -103,6 +103,7 @@ def anchored_measurements(
         noise=assumed.noise,
         unused={why: count for why, count in unused.items() if count},
         skipped_s=steps.skipped_s,
+        arrivals=prepared.arrivals,
     )
 
 

@@ -163,10 +163,11 @@ def estimated(
     epochs: list[EstimateEpoch] = []
     estimator = RecordingEstimator(rule)
     for number in range(1, problem.measured.epochs + 1):
-        epoch = estimator.epoch(problem, number)
-        with numerics(problem.source):
-            rows += rows_of(epoch, problem.robots)
-        add_epoch(epochs, epoch)
+        if not problem.measured.is_silent(number):
+            epoch = estimator.epoch(problem, number)
+            with numerics(problem.source):
+                rows += rows_of(epoch, problem.robots)
+            add_epoch(epochs, epoch)
         done()
     return with_summary(problem, rows, epochs, rule)
 

@@ -103,10 +103,13 @@ class StreamEstimate:
             return  # there will be ranges
         measured = self._problem.measured
         while self._next <= measured.epochs:
-            epoch = self._estimator.epoch(self._problem, self._next)
+            number = self._next
+            self._next += 1
+            if measured.is_silent(number):
+                continue
+            epoch = self._estimator.epoch(self._problem, number)
             if epoch.hypotheses and isinstance(measured, PairMeasurements):
                 self._anchors = (measured.a.anchor.id, measured.b.anchor.id)
-            self._next += 1
             with numerics(self._problem.source):
                 found = rows_of(epoch, self._problem.robots)
             self._rows += found

@@ -84,6 +84,7 @@ def group_measurements(
         noise=assumed.noise,
         unused={why: count for why, count in unused.items() if count},
         skipped_s=steps.skipped_s,
+        arrivals=prepared.arrivals,
     )
 
 

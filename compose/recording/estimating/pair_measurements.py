@@ -146,6 +146,7 @@ def pair_measurements(
         noise=noise,
         unused={why: count for why, count in unused.items() if count},
         skipped_s=steps.skipped_s,
+        arrivals=prepared.arrivals,
     )
 
 

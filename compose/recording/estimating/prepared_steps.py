@@ -18,7 +18,14 @@ from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges
 from compose.errors import BadRecording
 from compose.recording.estimating.recorded_noise import RecordedNoise
 from compose.recording.estimating.sound_odometry import SoundOdometry, at_antenna, sound
-from compose.recording.ranging.range_recording import FixedAnchor, Numbers, Places, RangeRecording
+from compose.recording.ranging.range_recording import (
+    SAME_TIME_S,
+    FixedAnchor,
+    Numbers,
+    Places,
+    RangeRecording,
+    locked,
+)
 from compose.recording.ranging.range_steps import NEARLY_ALL, RangeSteps, StepOptions, speeds, steps_of
 from protocol.noise import Noise
 
@@ -30,6 +37,12 @@ RANGE_SPACING_S = 1.0
 
 The errors of a radio's ranges within a second are correlated: more of them would count for more than they
 tell. With less, claims are too confident.
+"""
+
+SILENCE_S = 1.0
+"""The time in s without a range and without the end of an increment after which there are no estimates.
+
+Their number is then bounded by that of the measurements, not by the time between them.
 """
 
 MOST_TICKS = 50
@@ -90,6 +103,15 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     skipped_s: Numbers
     """The time in s of long gaps that is left out before each tick; shape (K + 1,)."""
 
+    arrivals: Numbers
+    """The times in s of all ranges and of the ends of all increments, in order."""
+
+    def is_silent(self, epoch: int) -> bool:
+        """Return whether nothing was measured in SILENCE_S before the end of `epoch`: it has no estimate."""
+        end = self.end(epoch)
+        before = int(np.searchsorted(self.arrivals, end + SAME_TIME_S))
+        return not before or float(self.arrivals[before - 1]) < end - SILENCE_S
+
     def end(self, epoch: int) -> float:
         """Return the time in s of the end of `epoch`; the first is 1."""
         return self.t0 + epoch * EPOCH_S + float(self.skipped_s[epoch * self.ticks_per_epoch])
@@ -135,6 +157,8 @@ class PreparedSteps(NamedTuple):
     ticks_per_epoch: int
     steps: RangeSteps
 
+    arrivals: Numbers
+
     @property
     def ticks(self) -> Places:
         """The tick of each range: the nearest one."""
@@ -166,6 +190,7 @@ def prepared_steps(
             raise BadRecording(f"{recording.source}: {robot.id} has no odometry")
         for jump in robot.jumps:
             raise BadRecording(jump.why)
+    arrivals = np.sort(np.concatenate([part.ranges.t, *[one.odometry.t1 for one in part.robots]]))
     prepared = tuple([sound(recording.robot(name).odometry, assumed.odometry) for name in robots])
     part = part._replace(
         robots=tuple(
@@ -177,7 +202,7 @@ def prepared_steps(
     )
     ticks = ticks or ticks_per_epoch(part, assumed.noise)
     options = StepOptions(period_s=EPOCH_S / ticks, range_spacing_s=RANGE_SPACING_S)
-    return PreparedSteps(part, prepared, assumed, ticks, steps_of(part, robots, options))
+    return PreparedSteps(part, prepared, assumed, ticks, steps_of(part, robots, options), locked(arrivals))
 
 
 def ticks_per_epoch(recording: RangeRecording, noise: Noise) -> int:
