@@ -70,10 +70,10 @@ def second_place(recording: RangeRecording) -> tuple[float, float]:
 
 
 def second_ranges(
-    recording: RangeRecording, robot: str, place: tuple[float, float]
+    recording: RangeRecording, robot: str, place: tuple[float, float], anchor: int = 0
 ) -> tuple[Places, Numbers]:
-    """Return the rows of the ranges of `robot` to the first anchor, and those (m) to a second at `place`."""
-    first, radios = recording.anchors[0], recording.radios
+    """Return the rows of the ranges of `robot` to an anchor (its index), and those (m) to one at `place`."""
+    first, radios = recording.anchors[anchor], recording.radios
     ranges = recording.ranges
     rows = np.flatnonzero((ranges.first == radios.index(robot)) & (ranges.second == radios.index(first.id)))
     t, poses = truth_of(recording, robot)
@@ -182,12 +182,17 @@ class Claimed(NamedTuple):
 
 @cache
 def recording_of(source: Path) -> RangeRecording:
-    """Return the recording at `source`, without a second anchor that it has already."""
+    """Return the recording at `source`; with ranges to the first anchor in place of a second."""
     whole = read_ranges(source)
-    kept = tuple([one for one in whole.anchors if one.id != SECOND_ANCHOR])
-    ranges = whole.ranges.rows(whole.ranges.second < len(whole.robots) + len(kept))
-    assert whole.anchors[: len(kept)] == kept
-    return whole._replace(anchors=kept, ranges=ranges)
+    first, *others = whole.anchors
+    if [one.id for one in others] != [SECOND_ANCHOR]:
+        return whole
+    second, lengths = whole.ranges.second.copy(), whole.ranges.range.copy()
+    for robot in whole.robots:
+        rows, measured = second_ranges(whole, robot.id, (first.x, first.y), anchor=1)
+        second[rows], lengths[rows] = len(whole.robots), measured
+    ranges = whole.ranges._replace(second=locked(second), range=locked(lengths))
+    return whole._replace(anchors=(first,), ranges=ranges)
 
 
 def claimed(trial: Trial) -> Claimed:

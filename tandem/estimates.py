@@ -86,11 +86,14 @@ class PoseEstimates(msgspec.Struct, frozen=True, dict=True, eq=False):
     @property
     def _title(self) -> str:
         claims = [
-            f"{name} claims after {one.first_claim.t_s - self.summary.begin_s:.1f} s"
-            if one.first_claim is not None
-            else f"{name} makes no claim"
+            f"{name} makes no claim"
+            if one.first_claim is None
+            else f"{name} claims after {one.first_claim.t_s - self.summary.begin_s:.1f} s"
+            + (" and withdraws it" if one.withdrawn_s is not None else "")
             for name, one in self.summary.robots.items()
         ]
+        if self.summary.blocking_reason:
+            claims.append(self.summary.blocking_reason)
         return f"{self.summary.source}: {', '.join(claims)}"
 
     def _repr_html_(self) -> str:
@@ -105,7 +108,6 @@ def estimate(
     noise: str | Path | None = None,
     window: tuple[float, float] | None = None,
     anchors: str | Path | None = None,
-    all_anchors: bool = False,
     accuracy: float = DEFAULTS.accuracy,
     confidence: float = DEFAULTS.confidence,
 ) -> PoseEstimates:
@@ -115,9 +117,8 @@ def estimate(
     recording of Tandem), or a Run. `robots` are some of its robots, by default all; three or more are
     estimated in one fit. `noise` is the assumed noise: the name of a profile or the path of a TOML file, by
     default what the recording states. `window` is the part that is used, in s from the first odometry on.
-    `anchors` is a CSV file of further anchors. Two robots use one anchor each unless `all_anchors` is set;
-    one robot, and three or more, use all. A claim needs the standard deviation `accuracy` in m and the
-    probability `confidence`.
+    `anchors` is a CSV file of further anchors; all anchors are used. A claim needs the standard deviation
+    `accuracy` in m and the probability `confidence`.
 
     Raises UserError for invalid arguments, and if the recording cannot be read.
 
@@ -140,5 +141,5 @@ def estimate(
     else:
         ranges = read_ranges(Path(recording), Path(anchors) if anchors is not None else None)
     name = str(noise) if noise is not None else None
-    problem = measurements(ranges, robots, name, window, all_anchors=all_anchors)
+    problem = measurements(ranges, robots, name, window)
     return PoseEstimates(problem, estimated(problem, ClaimRule(accuracy, confidence)))

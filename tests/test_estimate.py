@@ -26,6 +26,7 @@ from compose.recording.estimating.estimate_epoch import ClaimRule
 from compose.recording.estimating.estimate_files import COLUMNS, estimate_csv
 from compose.recording.estimating.estimate_rows import PoseEstimate, true_pose
 from compose.recording.estimating.estimate_run import RecordingEstimate, estimated, measurements
+from compose.recording.estimating.group_measurements import MOST_ANCHORS
 from compose.recording.estimating.noise_files import RangeCorrection, told_noise
 from compose.recording.estimating.prepared_steps import EPOCH_S
 from compose.recording.estimating.sound_odometry import GAP_MOTION_S, sound
@@ -355,15 +356,14 @@ def with_third_anchor(recording: RangeRecording, seed: int, sigma: float = 0.05)
 
 def test_two_robots_range_to_any_number_of_anchors() -> None:
     recording = with_third_anchor(simulated(), 1)
-    problem = measurements(recording, None, "uwb-calibrated", None, all_anchors=True)
-    found = estimated(problem, ClaimRule()).summary
+    found = estimated(measurements(recording, None, "uwb-calibrated", None), ClaimRule()).summary
     assert [one.anchors for one in found.robots.values()] == [["M1", "LC"], ["M2", "LC"]]
-    assert list(found.ranges) == ["A-M1", "A-LC", "B-M2", "B-LC", "A-B"]
+    assert list(found.ranges) == ["A-LC", "A-M1", "B-LC", "B-M2", "A-B"]
     assert all(count >= 29 for count in found.ranges.values())
-    assert "to other anchors" not in found.unused_ranges
-    without = estimated(measurements(recording, None, "uwb-calibrated", None), ClaimRule()).summary
+    own = recording.ranges.rows(recording.ranges.second != recording.radios.index("LC"))
+    pair = recording._replace(ranges=own)
+    without = estimated(measurements(pair, None, "uwb-calibrated", None), ClaimRule()).summary
     assert [one.anchors for one in without.robots.values()] == [["M1"], ["M2"]]
-    assert without.unused_ranges["to other anchors"] == 62
     for name, robot in found.robots.items():
         assert robot.first_claim is not None
         assert robot.final is not None
@@ -400,10 +400,14 @@ def with_a_range_to_each(recording: RangeRecording, places: Sequence[tuple[float
     return recording._replace(anchors=(*recording.anchors, *more), ranges=RangeSeries(*series))
 
 
-def test_the_anchors_with_the_most_ranges_are_found_among_thousands() -> None:
+def test_the_anchors_with_the_most_ranges_are_found_among_thousands_and_the_others_are_counted() -> None:
     many = [(10.0 + number, 0.0) for number in range(20_000)]
-    problem = measurements(with_a_range_to_each(simulated(), many), None, "uwb", None)
-    assert [anchor.id for anchor in problem.measured.anchors] == ["M1", "M2"]
+    measured = measurements(with_a_range_to_each(simulated(), many), None, "uwb", None).measured
+    assert [side.anchors[0].id for side in measured.sides] == ["M1", "M2"]
+    assert [len(side.anchors) for side in measured.sides] == [MOST_ANCHORS, 1]
+    assert (
+        measured.unused[f"to others than the {MOST_ANCHORS} anchors with the most"] == 20_001 - MOST_ANCHORS
+    )
 
 
 def test_a_message_names_a_few_of_many_anchors() -> None:
@@ -426,7 +430,7 @@ def test_poses_by_three_anchors_are_off_by_what_their_covariance_says() -> None:
     nees = []
     for seed in range(20):
         recording = with_third_anchor(simulated(), seed)
-        problem = measurements(recording, None, "uwb-calibrated", None, all_anchors=True)
+        problem = measurements(recording, None, "uwb-calibrated", None)
         found = estimated(problem, ClaimRule()).summary
         nees += [one.final.nees for one in found.robots.values() if one.final and one.final.nees is not None]
     assert len(nees) == 40

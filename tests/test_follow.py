@@ -184,7 +184,7 @@ def test_a_stream_is_ended_by_ctrl_c_and_by_the_end_of_its_reader_and_the_files_
     ("words", "says"),
     [
         (("bad.mcap", "--follow"), "bad.mcap, /ranges, message 1: range: expected a number, got 'str'"),
-        (("empty.mcap", "--follow"), "empty.mcap: there is no second with odometry of two robots"),
+        (("empty.mcap", "--follow"), "empty.mcap: there is no second with odometry of all robots"),
         (("no.mcap", "--follow"), "no.mcap cannot be read: No such file or directory"),
         (
             ("bad.mcap", "--follow", "--window", "1..2"),

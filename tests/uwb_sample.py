@@ -1,7 +1,7 @@
 """The sample of recorded UWB ranges in tests/data/uwb, cut from the recording of which its README tells.
 
 The recording has one anchor, and a pair of robots needs two. The second is made from the truth and from the
-residuals of a robot's ranges to the first: its errors are those of a radio.
+residuals of a robot's ranges to the first, which it replaces: its errors are those of a radio.
 
 `uv run python -m tests.uwb_sample tiers.pyfg tests/data/uwb/tiers-a-b-30-s.pyfg` writes it.
 """
@@ -44,20 +44,28 @@ def _kept(name: str) -> bool:
     return name.startswith("L") or (name[0] in ROBOTS and int(name[1:]) <= LAST_POSE)
 
 
-def second_lines(path: Path, robot: str = ROBOTS[-1]) -> Iterator[str]:
-    """Yield the lines of the second anchor for the sample at `path`, in which it is in addition."""
+def with_second_anchor(path: Path, robot: str = ROBOTS[-1]) -> Iterator[str]:
+    """Yield the lines of the sample at `path`, with ranges of `robot` to a second anchor.
+
+    They replace those to the first, whose errors are the same: an estimate would count these twice.
+    """
     recording = read_pyfg(path)
     place = second_place(recording)
-    yield f"VERTEX_XY {SECOND_ANCHOR} {place[0]:.{VALUE_DIGITS}f} {place[1]:.{VALUE_DIGITS}f}"
     _, measured = second_ranges(recording, robot, place)
     lengths = iter(measured.tolist())
     first = recording.anchors[0].id
-    for words in map(str.split, path.read_text().splitlines()):
+    moved = []
+    for line in path.read_text().splitlines():
+        words = line.split()
         if words[0] == "EDGE_RANGE" and words[2][0] == robot and words[3] == first:
-            yield f"{' '.join(words[:3])} {SECOND_ANCHOR} {next(lengths):.{VALUE_DIGITS}f} {words[5]}"
+            moved.append(f"{' '.join(words[:3])} {SECOND_ANCHOR} {next(lengths):.{VALUE_DIGITS}f} {words[5]}")
+        else:
+            yield line
+    yield f"VERTEX_XY {SECOND_ANCHOR} {place[0]:.{VALUE_DIGITS}f} {place[1]:.{VALUE_DIGITS}f}"
+    yield from moved
 
 
 if __name__ == "__main__":
     source, target = map(Path, sys.argv[1:])
     target.write_text("\n".join([*sample_lines(source.read_text().splitlines()), ""]))
-    target.write_text(target.read_text() + "\n".join([*second_lines(target), ""]))
+    target.write_text("\n".join([*with_second_anchor(target), ""]))

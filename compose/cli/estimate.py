@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Iterator
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
     from compose.recording.estimating.estimate_epoch import ClaimRule
     from compose.recording.estimating.estimate_rows import EstimateSummary, RobotEstimate
     from compose.recording.estimating.estimate_run import EstimationProblem, RecordingEstimate
+    from compose.recording.ranging.range_recording import RecordedRobot
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,8 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--all-anchors",
         action="store_true",
-        help="use the ranges of two robots to all anchors [default: for each robot, the ranges to one "
-        "anchor; one robot, and three or more, always use all]",
+        help=argparse.SUPPRESS,  # of earlier versions
     )
     parser.add_argument(
         "--accuracy",
@@ -86,32 +88,33 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(options: argparse.Namespace) -> int:
     """Estimate, print a table and write the files.
 
-    Return NOT_LOCALISED if a robot never knew its pose well enough for a claim; if a stream was ended by a
-    signal STOPPED, and BROKEN_PIPE if the reader of the output has gone.
+    Return NOT_LOCALISED if a robot may not claim its pose at the end; if a stream was ended by a signal
+    STOPPED, and BROKEN_PIPE if the reader of the output has gone.
     """
     from compose.recording.estimating import estimate_epoch  # noqa: PLC0415
     from compose.recording.estimating.estimate_run import estimated, measurements  # noqa: PLC0415  # numpy
     from compose.recording.ranging.range_files import read_ranges  # noqa: PLC0415
 
+    if options.all_anchors:
+        say("tandem estimate: --all-anchors is the default, and goes with the next version", error=True)
     stopped = None
     rule = estimate_epoch.ClaimRule(options.accuracy, options.confidence)
     if options.follow:
         problem, estimate, stopped = _followed(options, rule)
     else:
         recording = read_ranges(options.recording, options.anchors)
-        problem = measurements(
-            recording, options.robots, options.noise, options.window, all_anchors=options.all_anchors
-        )
+        problem = measurements(recording, options.robots, options.noise, options.window)
         with counting("tandem estimate", problem.measured.epochs) as done:
             estimate = estimated(problem, rule, done)
     if options.out is not None:
         written = _written(options.out, problem, estimate)
         say(*map(str, written), error=options.follow)
     if not options.follow:
-        tell(*_lines(estimate.summary))
+        tell(*_lines(problem, estimate.summary))
     if stopped is not None:
         return stopped
-    localised = all(one.first_claim is not None for one in estimate.summary.robots.values())
+    robots = estimate.summary.robots.values()
+    localised = all(one.first_claim is not None and one.withdrawn_s is None for one in robots)
     return ENDED if localised else NOT_LOCALISED
 
 
@@ -129,7 +132,7 @@ def _followed(
         raise UserError("--follow: a stream has its own anchors, and no window")
     name = "standard input" if str(options.recording) == "-" else str(options.recording)
     noise = (told_noise(options.noise), options.noise) if options.noise is not None else None
-    estimate = StreamEstimate(name, options.robots, noise, rule, all_anchors=options.all_anchors)
+    estimate = StreamEstimate(name, options.robots, noise, rule, partial(_doubted, name))
     try:
         stream = sys.stdin.buffer if str(options.recording) == "-" else options.recording.open("rb")
     except OSError as error:
@@ -143,6 +146,10 @@ def _followed(
             discard(sys.stdout)
             return *estimate.result(), BROKEN_PIPE
     return *estimate.result(), STOPPED if stopped else None
+
+
+def _doubted(name: str, doubt: str) -> None:
+    say(f"tandem estimate: {name}: {doubt} Nothing is estimated.", error=True)
 
 
 def _written(out: Path, problem: EstimationProblem, estimate: RecordingEstimate) -> list[Path]:
@@ -172,14 +179,14 @@ def _drawn(out: Path, problem: EstimationProblem, estimate: RecordingEstimate) -
         ]
 
 
-def _lines(summary: EstimateSummary) -> list[str]:
-    """Return the table of the estimates, and what limits them."""
+def _lines(problem: EstimationProblem, summary: EstimateSummary) -> list[str]:
+    """Return the table of the estimates, what limits them, and last which claims do not hold at the end."""
     from compose.terminal.tables import lines, table  # noqa: PLC0415  # it takes time
 
     rows = [_row(name, one, summary.begin_s) for name, one in summary.robots.items()]
     right = ("first claim s", "x", "y", "heading", "sigma m", "error m", "NEES")
     found = lines(table(("robot", "anchors"), right, rows))
-    every = "both" if len(summary.robots) < 3 else "all"
+    every = {1: next(iter(summary.robots)), 2: "both"}.get(len(summary.robots), "all")
     found.append(
         f"noise: {summary.noise}; last pose in m and rad; time from the first odometry of {every} on"
     )
@@ -187,7 +194,28 @@ def _lines(summary: EstimateSummary) -> list[str]:
         found.append(f"no claim at the end: {summary.blocking_reason}")
     for why, count in summary.unused_ranges.items():
         found.append(f"{count} {'range' if count == 1 else 'ranges'} not used: {why}")
+    for robot in problem.robots:
+        found += _about(robot, summary.robots[robot.id])
+    for name, one in summary.robots.items():
+        if one.first_claim is not None and one.withdrawn_s is not None:
+            after = f"{one.withdrawn_s - summary.begin_s:.1f}"
+            found.append(f"{name}: the claim is withdrawn after {after} s, and the last pose is no claim")
     return found
+
+
+def _about(robot: RecordedRobot, one: RobotEstimate) -> Iterator[str]:
+    """Yield what was changed in the odometry of a robot, and why its last estimate has no error."""
+    if one.whole_turns:
+        what = "increments of odometry turned" if one.whole_turns > 1 else "increment of odometry turned"
+        yield f"{robot.id}: {one.whole_turns} {what} by 2 pi or more too far: whole turns were removed"
+    if one.gross_increments:
+        what = "increments of odometry were" if one.gross_increments > 1 else "increment of odometry was"
+        yield (
+            f"{robot.id}: {one.gross_increments} {what} replaced: more than three times as fast as nearly "
+            "all others"
+        )
+    if robot.truth is not None and one.final is not None and one.final.position_error_m is None:
+        yield f"{robot.id}: no error of the last estimate: no true poses around it are within a second"
 
 
 def _row(name: str, one: RobotEstimate, begin_s: float) -> list[str]:

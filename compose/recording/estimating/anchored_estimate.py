@@ -10,7 +10,14 @@ from agent.estimation.gaussian.hypotheses import Hypothesis, ScoredHypothesis
 from agent.estimation.gaussian.known_anchors import FEWEST, AnchoredRobot, blocking_reason, follow, search
 from agent.estimation.gaussian.range_model import Ranges
 from compose.errors import UserError
-from compose.recording.estimating.estimate_epoch import ClaimRule, EpochFit, EstimateEpoch, of_centres
+from compose.recording.estimating.estimate_epoch import (
+    GIVEN_UP,
+    MOST_SEARCHES,
+    ClaimRule,
+    EpochFit,
+    EstimateEpoch,
+    of_centres,
+)
 from compose.recording.estimating.pair_measurements import listed
 from compose.recording.estimating.prepared_steps import (
     Measurements,
@@ -117,7 +124,7 @@ class AnchoredEstimator:
     def __init__(self, rule: ClaimRule) -> None:
         self._rule = rule
         self._known: tuple[Hypothesis, ...] = ()
-        self._searched = 0
+        self._searched = self._searches = 0
         self._claimed = False
 
     def epoch(self, measured: AnchoredMeasurements, number: int) -> EstimateEpoch:
@@ -131,9 +138,12 @@ class AnchoredEstimator:
         scored = follow(robot, self._known) if self._known and not due else ()
         reason = "" if not scored else self._reason(robot, scored)
         moving = not scored or scored[0].fit.last_step > FINISHED
-        if count >= FEWEST and (moving or (not reason and not self._claimed)):
+        wanted = count >= FEWEST and (moving or (not reason and not self._claimed))
+        if wanted and not due and self._searches >= MOST_SEARCHES:
+            reason = reason or GIVEN_UP
+        elif wanted:
             scored = search(robot, tuple([one.hypothesis for one in scored]) or self._known)
-            self._searched = count
+            self._searched, self._searches = count, self._searches + 1
             reason = self._reason(robot, scored) if scored else ""
         if not scored:
             what = "no hypothesis explains the ranges" if count >= FEWEST else "too few ranges"

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from compose.errors import UserError
+from compose.recording.estimating.doubtful_units import TINY, doubtful_lengths
 from compose.recording.estimating.estimate_epoch import ClaimRule
+from compose.recording.estimating.estimate_rows import names_of
 from compose.recording.estimating.estimate_run import estimated, measurements, numerics
 from compose.recording.estimating.learned_errors import learned_errors
 from compose.recording.estimating.radio_errors import (
@@ -33,9 +37,7 @@ def calibrated(
 ) -> RangeCalibration:
     """Return the errors of the radios of `robots`, or of all, within `window` (s from the first odometry on).
 
-    They are against the truth if there is some, unless `by_fit`; else against an estimate of one or two
-    robots.
-    Raises UserError.
+    They are against the truth if there is some, unless `by_fit`; else against an estimate. Raises UserError.
     """
     known = [one.id for one in recording.robots]
     chosen = known if robots is None else list(robots)
@@ -49,6 +51,11 @@ def calibrated(
     with numerics(recording.source):
         errors = {} if by_fit else true_errors(part)
     if errors:
+        measured = [float(np.median(one.measured)) for one in errors.values()]
+        true = [float(np.median(one.measured - one.error)) for one in errors.values()]
+        doubt = doubtful_lengths(sum(measured) / max(sum(true), TINY), "true poses and anchors")
+        if doubt:
+            raise UserError(f"{recording.source}: {doubt}")
         with numerics(recording.source):
             return range_calibration(errors, "the truth")
     return _by_fit(recording, chosen, window)
@@ -57,15 +64,15 @@ def calibrated(
 def _by_fit(
     recording: RangeRecording, robots: Sequence[str], window: tuple[float, float] | None
 ) -> RangeCalibration:
-    """Return the errors against the ranges that the estimate of one or two robots predicts."""
+    """Return the errors against the ranges that the estimate of `robots` predicts."""
     problem = measurements(recording, robots, ASSUMED, window)
     estimate = estimated(problem, RULE)
     last = estimate.epochs[-1] if estimate.epochs else None
     if last is None or last.fitted is None or not all(last.claims):
-        why = last.blocking_reason if last is not None else "there is no odometry of both"
+        why = estimate.summary.blocking_reason or "too few ranges"
         raise UserError(
             f"{recording.source}: without true poses, an estimate of {' and '.join(robots)} is needed, "
-            f"and there is none: {why or 'too few ranges'}"
+            f"and there is none: {why}"
         )
     fit, used = last.fitted
     errors, ranges = {}, used.ranges
@@ -76,7 +83,7 @@ def _by_fit(
             errors[pair] = PairErrors(t, ranges.rho[rows], fit.residuals[rows])
     if not errors:
         raise UserError(f"{recording.source}: no pair of radios has {FEWEST} ranges")
-    names = [side.id for side in problem.measured.sides]
+    names = names_of(used, problem.measured.sides)
     with numerics(recording.source):
         found = range_calibration(errors, "the fit")
         learned = learned_errors(fit, names, ["-".join(pair) for pair in ranged])

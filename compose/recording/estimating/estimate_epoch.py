@@ -28,6 +28,19 @@ class PosesHypothesis(NamedTuple):
     """The covariance of all poses; shape (3 R, 3 R)."""
 
 
+MOST_SEARCHES = 100
+"""The number of searches of the whole plane after which it is only searched with twice as many ranges.
+
+Where no hypothesis fits, each epoch has a search. With fewer, recordings of a minute that settle late would
+have other estimates; with more, recordings that contradict themselves take longer.
+"""
+
+GIVEN_UP = (
+    f"not settled after {MOST_SEARCHES} searches of the plane; the next is due with twice as many ranges"
+)
+"""The reason against a claim that such a search has not confirmed."""
+
+
 class EpochFit(NamedTuple):
     """The fit of the first hypothesis, and what it was fitted to."""
 

@@ -11,7 +11,8 @@ import numpy as np
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from compose.recording.estimating.estimate_epoch import ClaimRule, EstimateEpoch
 from compose.recording.estimating.learned_errors import LearnedErrors, learned_errors
-from compose.recording.estimating.prepared_steps import Measurements
+from compose.recording.estimating.pair_measurements import listed
+from compose.recording.estimating.prepared_steps import Measurements, OneRobot
 from compose.recording.ranging.range_recording import Numbers, RecordedRobot
 from protocol.motion import wrap
 
@@ -93,6 +94,10 @@ class RobotEstimate(msgspec.Struct, frozen=True):
     """The number of increments of its odometry that were replaced, because no robot moves like that."""
     gaps: int
     """The number of gaps in its odometry."""
+    whole_turns: int
+    """The number of increments of its odometry from which a whole turn was removed (2 pi, or several)."""
+    withdrawn_s: float | None
+    """The time in s from which on the robot may no longer claim its pose; null if it may at the end."""
 
 
 class FinalHypothesis(msgspec.Struct, frozen=True):
@@ -129,29 +134,29 @@ class EstimateSummary(msgspec.Struct, frozen=True):
     """The number of ranges that are not used, by the reason."""
     blocking_reason: str
     """The condition for a claim that is not met at the end; empty if all are."""
-
-
-class GroupEstimateSummary(EstimateSummary, frozen=True):
-    """The content of `estimate.json` for three or more robots."""
-
-    undetermined: dict[str, str] = {}
-    """The robots without a pose at the end, with the reason."""
+    undetermined: dict[str, str]
+    """The robots without a pose at the end, with the reason; none if all are estimated as one hypothesis."""
 
 
 def true_pose(robot: RecordedRobot, t: float) -> Numbers | None:
     """Return the true pose at `t` s, shape (3,); None without truth around that time.
 
-    Between two true poses, the robot moves with constant speed on one arc.
+    Between two true poses at most TRUTH_GAP_S apart, the robot moves with constant speed on one arc. So it
+    does before the first pose and after the last, for as long as to the next one. Farther from others, a true
+    pose holds for TRUTH_END_S.
     """
     truth = robot.truth
-    if truth is None or not truth.t[0] - TRUTH_END_S <= t <= truth.t[-1] + TRUTH_END_S:
+    if truth is None or not len(truth.t):
         return None
     after = min(max(int(np.searchsorted(truth.t, t)), 1), len(truth.t) - 1)
     before = max(after - 1, 0)
     lasts = float(truth.t[after] - truth.t[before])
-    if lasts > TRUTH_GAP_S:
+    if not 0.0 < lasts <= TRUTH_GAP_S:
+        nearest = min((before, after), key=lambda one: abs(float(truth.t[one]) - t))
+        return truth.poses[nearest].copy() if abs(float(truth.t[nearest]) - t) <= TRUTH_END_S else None
+    share = (t - float(truth.t[before])) / lasts
+    if not -1.0 <= share <= 2.0:
         return None
-    share = min(max((t - float(truth.t[before])) / lasts, 0.0), 1.0) if lasts > 0.0 else 1.0
     x, y, heading = truth.poses[before].tolist()
     dx, dy, turned = (truth.poses[after] - truth.poses[before]).tolist()
     half = 0.5 * wrap(turned)
@@ -163,7 +168,7 @@ def true_pose(robot: RecordedRobot, t: float) -> Numbers | None:
 TRUTH_GAP_S = 1.0
 """The longest time in s between true poses within which they are interpolated."""
 TRUTH_END_S = 0.02
-"""The time in s before the first and after the last true pose for which that pose counts."""
+"""The time in s for which a true pose holds that is farther from others than TRUTH_GAP_S."""
 
 
 def rows_of(epoch: EstimateEpoch, robots: Sequence[RecordedRobot]) -> list[PoseEstimateRow]:
@@ -221,27 +226,44 @@ def summary_of(
     rule: ClaimRule,
     source: str,
     noise: str,
+    doubt: str = "",
 ) -> EstimateSummary:
-    """Return the summary of all `rows`; `last` is the last epoch."""
+    """Return the summary of all `rows`; `last` is the last epoch, and `doubt` that about the units."""
     sides = measured.sides
+    claims = last.claims if last is not None and not doubt else (False,) * len(sides)
     robots = {}
-    for side in sides:
+    for side, claim in zip(sides, claims, strict=True):
         own = [row for row in rows if row.robot == side.id]
-        claimed = next((row for row in own if row.claim), None)
+        claimed = [i for i, row in enumerate(own) if row.claim]
+        withdrawn_s = None
+        if claimed and not claim:
+            later = own[claimed[-1] + 1 :]
+            withdrawn_s = later[0].t_s if later or last is None else last.t
         robots[side.id] = RobotEstimate(
             [one.id for one in side.anchors],
-            _pose(claimed) if claimed is not None else None,
+            _pose(own[claimed[0]]) if claimed else None,
             _pose(own[-1]) if own else None,
             len(side.sound.gross),
             len(side.sound.gaps),
+            len(side.sound.whole_turns),
+            withdrawn_s,
+        )
+    reason = last.blocking_reason if last is not None else "there is no epoch"
+    still = [
+        side.id for side, claim in zip(sides, claims, strict=True) if not claim and _stands(side, measured)
+    ]
+    if still:
+        one = len(still) == 1
+        reason = (
+            f"{listed(still)} {'does' if one else 'do'} not move, by {'its' if one else 'their'} odometry: "
+            f"ranges do not tell the heading of a robot that stands"
         )
     pairs = ["-".join(pair) for pair in measured.pairs]
     calibration = None
     if last is not None and last.fitted is not None:
         ranged = [name for name, count in zip(pairs, last.ranges, strict=True) if count]
         fit, used = last.fitted
-        names = used.robots if isinstance(used, JointMeasurements) else [side.id for side in sides]
-        calibration = learned_errors(fit, names, ranged)
+        calibration = learned_errors(fit, names_of(used, sides), ranged)
     hypotheses = [
         FinalHypothesis(
             one.probability,
@@ -249,7 +271,7 @@ def summary_of(
         )
         for one in (last.hypotheses if last is not None else ())
     ]
-    content = (
+    return EstimateSummary(
         source,
         noise,
         measured.t0,
@@ -260,11 +282,20 @@ def summary_of(
         calibration,
         dict(zip(pairs, last.ranges if last is not None else (0,) * len(pairs), strict=True)),
         measured.unused,
-        last.blocking_reason if last is not None else "there is no epoch",
+        doubt or reason,
+        dict(last.undetermined) if last is not None else {},
     )
-    if len(sides) < 3:
-        return EstimateSummary(*content)
-    return GroupEstimateSummary(*content, dict(last.undetermined) if last is not None else {})
+
+
+def names_of(used: object, sides: Sequence[OneRobot]) -> Sequence[str]:
+    """Return the names of the robots of a fit to the measurements `used`, in its order."""
+    return used.robots if isinstance(used, JointMeasurements) else [side.id for side in sides]
+
+
+def _stands(side: OneRobot, measured: Measurements) -> bool:
+    """Return whether the path of a robot is shorter than the sigma of its ranges."""
+    x, y = side.path.x, side.path.y
+    return math.hypot(float(np.ptp(x)), float(np.ptp(y))) <= measured.noise.anchor_sigma
 
 
 def _triple(values: Numbers) -> tuple[float, float, float]:

@@ -14,13 +14,18 @@ from compose.recording.estimating.anchored_estimate import (
     AnchoredMeasurements,
     anchored_measurements,
 )
+from compose.recording.estimating.doubtful_units import doubtful_units
 from compose.recording.estimating.estimate_epoch import ClaimRule, EstimateEpoch, add_epoch
 from compose.recording.estimating.estimate_rows import EstimateSummary, PoseEstimateRow, rows_of, summary_of
 from compose.recording.estimating.group_estimate import GroupEstimator
 from compose.recording.estimating.group_measurements import GroupMeasurements, group_measurements
 from compose.recording.estimating.noise_files import ToldNoise, told_noise
 from compose.recording.estimating.pair_estimate import PairEstimator
-from compose.recording.estimating.pair_measurements import PairMeasurements, pair_measurements
+from compose.recording.estimating.pair_measurements import (
+    PairMeasurements,
+    pair_measurements,
+    ranged_anchors,
+)
 from compose.recording.estimating.recorded_noise import recorded_noise
 from compose.recording.ranging.range_recording import RangeRecording, RecordedRobot
 
@@ -49,6 +54,8 @@ class EstimationProblem(NamedTuple):
     source: str
     noise: str
     """The name of the assumed noise."""
+    doubt: str = ""
+    """The suspicion that parts of the recording are in different units; with one, nothing is estimated."""
 
 
 class RecordingEstimate(NamedTuple):
@@ -64,16 +71,13 @@ def measurements(
     robots: Sequence[str] | None,
     noise: str | None,
     window: tuple[float, float] | None,
-    *,
-    all_anchors: bool = False,
 ) -> EstimationProblem:
     """Return the measurements of `robots` within `window`, in s from the first odometry on.
 
-    `noise` is the name of a profile or the path of a file; None: what the recording states. Two robots use
-    one anchor each unless `all_anchors` is set. Raises UserError.
+    `noise` is the name of a profile or the path of a file; None: what the recording states. Raises UserError.
     """
     told = told_noise(noise) if noise is not None else None
-    return measurements_with(recording, robots, told, noise or "", window, all_anchors=all_anchors)
+    return measurements_with(recording, robots, told, noise or "", window)
 
 
 def measurements_with(
@@ -84,12 +88,13 @@ def measurements_with(
     window: tuple[float, float] | None = None,
     *,
     ticks: int | None = None,
-    anchors: tuple[str, str] | None = None,
-    all_anchors: bool = False,
+    doubtful: bool = True,
 ) -> EstimationProblem:
     """Return the measurements as `measurements` does, with the noise `told`, whose name is `name`.
 
-    `ticks`, `anchors` and `all_anchors` are those of `pair_measurements`.
+    `ticks` is the number of ticks in an epoch; None: by the speed of the robots. Two robots with ranges to
+    one anchor each are a pair, as in a mission; any others are a group, which uses all anchors. The units are
+    examined if `doubtful` is set.
     """
     chosen = _chosen(recording, robots)
     begin, end = recording.span
@@ -102,17 +107,17 @@ def measurements_with(
     assumed = recorded_noise(part, told.noise if told is not None else None, name)
     if told is not None and told.correction is not None:
         part = told.correction.corrected(part)
+    ranged = ranged_anchors(part, chosen) if len(chosen) == 2 else []
     measured: AnyMeasurements
     with numerics(recording.source):
         if len(chosen) == 1:
             measured = anchored_measurements(part, chosen[0], assumed, ticks=ticks)
-        elif len(chosen) > 2:
-            measured = group_measurements(part, chosen, assumed, ticks=ticks)
+        elif ranged and all(len(own) == 1 for own in ranged):
+            measured = pair_measurements(part, chosen, assumed, [own[0] for own in ranged], ticks=ticks)
         else:
-            measured = pair_measurements(
-                part, chosen, assumed, ticks=ticks, anchors=anchors, all_anchors=all_anchors
-            )
-    return EstimationProblem(measured, part.robots, recording.source, assumed.name)
+            measured = group_measurements(part, chosen, assumed, ticks=ticks)
+        doubt = doubtful_units(part) if doubtful else ""
+    return EstimationProblem(measured, part.robots, recording.source, assumed.name, doubt)
 
 
 def _chosen(recording: RangeRecording, robots: Sequence[str] | None) -> Sequence[str]:
@@ -158,11 +163,11 @@ class RecordingEstimator:
 def estimated(
     problem: EstimationProblem, rule: ClaimRule, done: Callable[[], None] = lambda: None
 ) -> RecordingEstimate:
-    """Return all estimates; `done` is called after each epoch."""
+    """Return all estimates; `done` is called after each epoch. There are none if the units are doubtful."""
     rows: list[PoseEstimateRow] = []
     epochs: list[EstimateEpoch] = []
     estimator = RecordingEstimator(rule)
-    for number in range(1, problem.measured.epochs + 1):
+    for number in range(1, problem.measured.epochs + 1 if not problem.doubt else 1):
         if not problem.measured.is_silent(number):
             epoch = estimator.epoch(problem, number)
             with numerics(problem.source):
@@ -177,6 +182,7 @@ def with_summary(
 ) -> RecordingEstimate:
     """Return the result of all `rows` and `epochs`."""
     last = epochs[-1] if epochs else None
+    about = problem.source, problem.noise, problem.doubt
     with numerics(problem.source):
-        summary = summary_of(problem.measured, rows, last, rule, problem.source, problem.noise)
+        summary = summary_of(problem.measured, rows, last, rule, *about)
     return RecordingEstimate(rows, epochs, summary)

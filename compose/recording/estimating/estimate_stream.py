@@ -6,7 +6,7 @@ of time, as in a file: a range that comes later counts from the next epoch on.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from compose.errors import UserError
 from compose.recording.estimating.estimate_epoch import ClaimRule, EstimateEpoch, add_epoch
@@ -20,7 +20,7 @@ from compose.recording.estimating.estimate_run import (
     with_summary,
 )
 from compose.recording.estimating.noise_files import ToldNoise
-from compose.recording.estimating.pair_measurements import NoAnchors, PairMeasurements
+from compose.recording.estimating.pair_measurements import NoAnchors
 from compose.recording.estimating.prepared_steps import EPOCH_S
 from compose.recording.ranging.range_recording import SAME_TIME_S
 from compose.recording.ranging.recording_rows import (
@@ -34,9 +34,12 @@ STREAM_TICKS = 20
 """The number of ticks in an epoch of a stream. A robot of 0.5 m/s then moves by a quarter of 0.05 m in half a
 tick; the speed of the robots is not known before they have moved."""
 
+EXAMINED_AFTER_S = 4.0
+"""The time in s after which the units are examined for the first time, then whenever it has doubled."""
+
 
 class StreamEstimate:
-    """An estimate of two robots that grows with the rows of a stream."""
+    """An estimate of one or two robots that grows with the rows of a stream."""
 
     def __init__(
         self,
@@ -44,19 +47,19 @@ class StreamEstimate:
         robots: Sequence[str] | None,
         noise: tuple[ToldNoise, str] | None,
         rule: ClaimRule,
-        *,
-        all_anchors: bool = False,
+        doubted: Callable[[str], None] = lambda _: None,
     ) -> None:
         """Begin the estimate of `robots` (None: the only two of the stream), with the noise and its name.
 
-        The robots use one anchor each unless `all_anchors` is set.
+        `doubted` is called with the suspicion that parts of the stream are in different units; as long as it
+        lasts, nothing is estimated.
         """
+        self._doubted, self._doubt, self._examined_after_s = doubted, "", EXAMINED_AFTER_S
         self._builder = RecordingBuilder(source)
         self._robots = robots
         self._told = noise[0] if noise is not None else None
         self._name = noise[1] if noise is not None else ""
         self._rule = rule
-        self._all_anchors = all_anchors
         self._estimator = RecordingEstimator(rule)
         self._begins: dict[str, float] = {}
         self._ends: dict[str, float] = {}
@@ -64,7 +67,6 @@ class StreamEstimate:
         self._due_after_s = EPOCH_S
         """The time after the first odometry of all robots at which there may be an epoch."""
         self._problem: EstimationProblem | None = None
-        self._anchors: tuple[str, str] | None = None
         self._rows: list[PoseEstimateRow] = []
         self._epochs: list[EstimateEpoch] = []
 
@@ -89,27 +91,33 @@ class StreamEstimate:
         if end - begin < self._due_after_s - SAME_TIME_S * EPOCH_S:
             return
         self._due_after_s = end - begin + EPOCH_S  # if there is none, it is not tried with each row
+        examined = end - begin >= self._examined_after_s
         try:
-            self._problem = measurements_with(
+            problem = measurements_with(
                 self._builder.recording(),
                 names,
                 self._told,
                 self._name,
                 ticks=STREAM_TICKS,
-                anchors=self._anchors,
-                all_anchors=self._all_anchors,
+                doubtful=examined,
             )
         except NoAnchors:
             return  # there will be ranges
-        measured = self._problem.measured
+        if examined:
+            self._examined_after_s = 2.0 * (end - begin)
+            if problem.doubt and problem.doubt != self._doubt:
+                self._doubted(problem.doubt)
+            self._doubt = problem.doubt
+        self._problem = problem._replace(doubt=self._doubt)
+        measured = problem.measured
+        if self._doubt:
+            self._next = measured.epochs + 1
         while self._next <= measured.epochs:
             number = self._next
             self._next += 1
             if measured.is_silent(number):
                 continue
-            epoch = self._estimator.epoch(self._problem, number)
-            if epoch.hypotheses and isinstance(measured, PairMeasurements):
-                self._anchors = (measured.a.anchor.id, measured.b.anchor.id)
+            epoch = self._estimator.epoch(problem, number)
             with numerics(self._problem.source):
                 found = rows_of(epoch, self._problem.robots)
             self._rows += found
@@ -120,6 +128,6 @@ class StreamEstimate:
     def result(self) -> tuple[EstimationProblem, RecordingEstimate]:
         """Return all estimates so far. Raises UserError if no epoch is complete."""
         if self._problem is None:
-            what = "no second with odometry of two robots and ranges to two anchors"
+            what = "no second with odometry of all robots and ranges to two anchors"
             raise UserError(f"{self._builder.source}: there is {what}")
         return self._problem, with_summary(self._problem, self._rows, self._epochs, self._rule)

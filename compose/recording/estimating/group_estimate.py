@@ -21,6 +21,8 @@ from agent.estimation.gaussian.joint_search import (
 )
 from agent.estimation.gaussian.least_squares import STEPS
 from compose.recording.estimating.estimate_epoch import (
+    GIVEN_UP,
+    MOST_SEARCHES,
     ClaimRule,
     EpochFit,
     EstimateEpoch,
@@ -46,7 +48,7 @@ class GroupEstimator:
     def __init__(self, rule: ClaimRule) -> None:
         self._rule = rule
         self._known: JointHypotheses = NOTHING
-        self._searched = 0
+        self._searched = self._searches = 0
         self._failed: dict[tuple[int, ...], int] = {}
         self._claimed: set[str] = set()
 
@@ -58,8 +60,11 @@ class GroupEstimator:
         due = found.scored and any(self._searched < at <= count for at in SEARCH_AT)
         reasons = self._reasons(found, used, reach)
         claiming = {name for name, reason in reasons.items() if not reason} - self._claimed
-        if due or claiming:
+        if claiming and not due and self._searches >= MOST_SEARCHES:
+            reasons |= dict.fromkeys(sorted(claiming), GIVEN_UP)
+        elif due or claiming:
             found, self._searched = merged(found, search(used, reach)), count
+            self._searches += 1
             reasons = self._reasons(found, used, reach)
         self._known = found
         self._claimed |= {name for name, reason in reasons.items() if not reason}

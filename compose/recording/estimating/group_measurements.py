@@ -65,14 +65,20 @@ def group_measurements(
     `ticks` is the number of them in an epoch; None: by the speed of the robots.
     """
     prepared = prepared_steps(recording, robots, assumed, ticks)
-    part, steps = prepared.part, prepared.steps
+    steps = prepared.steps
     members = tuple([prepared.robot(i, _anchors_of(i, prepared)) for i in range(len(robots))])
-    known = [*_anchors(part), *_ranges(prepared)]
+    anchors = tuple({one.id: one for robot in members for one in robot.anchors}.values())
+    ranges = list(_ranges(prepared, members))
+    known = [*_anchors(anchors), *ranges]
     for one in members:
         known += _manoeuvres(one.id, one.path)
     joint = joint_measurements(Facts(frozenset(known)), assumed.noise, EPOCH_S / prepared.ticks_per_epoch)
-    unused = {"within a second after another": steps.thinned, "without odometry of all robots": steps.outside}
-    unused["in a gap of the odometry"] = steps.in_gaps
+    unused = {
+        f"to others than the {MOST_ANCHORS} anchors with the most": len(steps.ranges.t) - len(ranges),
+        "within a second after another": steps.thinned,
+        "without odometry of all robots": steps.outside,
+        "in a gap of the odometry": steps.in_gaps,
+    }
     t0 = float(steps.t[0])
     return GroupMeasurements(
         members=members,
@@ -89,16 +95,20 @@ def group_measurements(
 
 
 def _anchors_of(robot: int, prepared: PreparedSteps) -> tuple[FixedAnchor, ...]:
-    """Return the anchors to which a robot has ranges, that with the most first."""
+    """Return the anchors to which a robot has ranges, at most MOST_ANCHORS, that with the most first."""
     part, ranges = prepared.part, prepared.steps.ranges
     seconds = ranges.second[ranges.first == robot] - len(part.robots)
     counts = np.bincount(seconds[seconds >= 0], minlength=len(part.anchors)).tolist()
     order = sorted([k for k, count in enumerate(counts) if count], key=lambda k: -counts[k])
-    return tuple([part.anchors[k] for k in order])
+    return tuple([part.anchors[k] for k in order[:MOST_ANCHORS]])
 
 
-def _anchors(part: RangeRecording) -> Iterator[Fact]:
-    for one in part.anchors:
+MOST_ANCHORS = 32
+"""The largest number of anchors of a robot that are used. Each has a bias of its own, which a fit learns."""
+
+
+def _anchors(anchors: Sequence[FixedAnchor]) -> Iterator[Fact]:
+    for one in anchors:
         yield anchor(one.id, one.x, one.y)
 
 
@@ -113,15 +123,18 @@ def _manoeuvres(robot: str, path: Track) -> Iterator[Fact]:
         yield manoeuvre(robot, tick, Manoeuvre(*row))
 
 
-def _ranges(prepared: PreparedSteps) -> Iterator[Fact]:
-    """Yield the ranges in the plane, each at the nearest tick."""
+def _ranges(prepared: PreparedSteps, members: Sequence[OneRobot]) -> Iterator[Fact]:
+    """Yield the ranges between `members` and to their anchors in the plane, each at the nearest tick."""
+    used = [{other.id for other in (*members, *one.anchors)} for one in members]
     part, ranges, noise = prepared.part, prepared.steps.ranges, prepared.assumed.noise
     heights = np.array([*[one.antenna[2] for one in part.robots], *[one.height for one in part.anchors]])
     rho, ratio = levelled(ranges.range, heights[ranges.first] - heights[ranges.second])
-    mutual = ranges.second < len(part.robots)
+    mutual, radios = ranges.second < len(part.robots), part.radios
     sigma = prepared.sigmas(np.where(mutual, noise.mutual_sigma, noise.anchor_sigma), ranges.sigma) * ratio
     rows = zip(prepared.ticks, ranges.first, ranges.second, rho, sigma, strict=True)
     for tick, first, second, length, own in rows:
-        names = part.radios[first], part.radios[second]
+        names = radios[first], radios[second]
+        if names[1] not in used[first]:
+            continue
         fact = mutual_range if second < len(part.robots) else anchor_range
         yield fact(*names, int(tick), float(length), float(own))

@@ -11,12 +11,20 @@ from agent.estimation.gaussian.range_model import PairRanges
 from agent.estimation.knowledge import Belief, Knowledge
 from agent.planning.pair_claim import (
     FEWEST_MUTUAL_RANGES,
+    SEARCH_AT,
     PairInference,
     inferred,
     may_claim,
     weighed,
 )
-from compose.recording.estimating.estimate_epoch import ClaimRule, EpochFit, EstimateEpoch, of_centres
+from compose.recording.estimating.estimate_epoch import (
+    GIVEN_UP,
+    MOST_SEARCHES,
+    ClaimRule,
+    EpochFit,
+    EstimateEpoch,
+    of_centres,
+)
 from compose.recording.estimating.pair_measurements import PairMeasurements
 from compose.recording.estimating.prepared_steps import OneRobot
 from compose.recording.ranging.range_recording import Numbers
@@ -28,6 +36,8 @@ ROLES: tuple[Role, Role] = ("a", "b")
 
 FREE_SPEED = 10.0
 """The speed (m/s) and turn rate (rad/s) of the mission that stands for a recording; nothing is planned."""
+
+FEW_RANGES = "few ranges, and a small p-value"
 
 NO_ORBIT = Orbit(0.0, 0.0, 0.0)
 
@@ -43,6 +53,7 @@ class PairEstimator:
         self._rule = rule
         self._belief = Belief()
         self._claimed = False
+        self._searched = self._searches = 0
 
     def epoch(self, measured: PairMeasurements, number: int) -> EstimateEpoch:
         """Return the estimate at the end of the epoch with this `number`, from 1 on, in their order.
@@ -51,20 +62,28 @@ class PairEstimator:
         """
         pair, t = measured.until(number), measured.end(number)
         known = [_knowledge(measured, role, self._belief, pair, self._rule) for role in ROLES]
-        found, beliefs = _inferred(known, pair, follow_only=self._claimed)
+        mutual = pair.ranges.counts[2]
+        due = any(self._searched < count <= mutual for count in SEARCH_AT)
+        spent = self._searches >= MOST_SEARCHES and not due
+        if spent and not self._belief.pair:
+            return EstimateEpoch(t, pair.ranges.counts, (), (False, False), GIVEN_UP, None)
+        found, beliefs = _inferred(known, pair, follow_only=self._claimed or spent)
+        if found is not None and found.searched:
+            self._searched, self._searches = mutual, self._searches + 1
         if found is None or not found.scored:
             reason = "no hypothesis explains the ranges" if found is not None else "too few mutual ranges"
-            return EstimateEpoch(t, measured.counts(pair.ranges), (), (False, False), reason, None)
+            return EstimateEpoch(t, pair.ranges.counts, (), (False, False), reason, None)
         self._belief = beliefs[0]
-        claims = [may_claim(one, pair) for one in beliefs]
+        settled = self._claimed or not spent
+        claims = [settled and may_claim(one, pair) for one in beliefs]
         self._claimed = self._claimed or all(claims)
         reasons = [one.blocking_reason for one in beliefs if one.blocking_reason is not None]
         return EstimateEpoch(
             t,
-            measured.counts(pair.ranges),
+            pair.ranges.counts,
             tuple([of_centres(*one, measured.sides, measured.origin) for one in _second_order(found, pair)]),
             (claims[0], claims[1]),
-            reasons[0] if reasons else "" if all(claims) else "few ranges, and a small p-value",
+            reasons[0] if reasons else "" if all(claims) else FEW_RANGES if settled else GIVEN_UP,
             EpochFit(found.scored[0].fit, pair),
         )
 

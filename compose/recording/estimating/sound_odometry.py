@@ -1,11 +1,13 @@
 """Odometry without gross increments and without gaps: their motion is unknown, within what the robot can do.
 
-A gross increment is replaced by the speeds of the last sound one, and a gap is filled with them. The
-covariance of both says that the robot may have moved like at any other time.
+A whole turn, by which a difference of wrapped headings is off, is removed first. A gross increment is
+replaced by the speeds of the last sound one, and a gap is filled with them. The covariance of both says that
+the robot may have moved like at any other time.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +39,8 @@ class SoundOdometry(NamedTuple):
     """The indices of the recorded increments that were replaced."""
     gaps: Numbers
     """The start and end in s of each gap that was filled; shape (G, 2)."""
+    whole_turns: Places
+    """The indices of the recorded increments whose turn was off by a whole turn, which was removed."""
 
 
 def sound(
@@ -46,6 +50,7 @@ def sound(
 
     `told` is its noise over one second; None for the stated covariances. `bounds` are those of `gross`.
     """
+    odometry, whole_turns = _without_whole_turns(odometry)
     bound = bounds or speed_bound(odometry)
     flagged = gross(odometry, bound)
     lasts = odometry.t1 - odometry.t0
@@ -65,7 +70,28 @@ def sound(
         order = np.lexsort((t1, t0))
         t0, t1, increments, covariance = t0[order], t1[order], increments[order], covariance[order]
     whole = RobotOdometry(locked(t0), locked(t1), locked(increments), locked(covariance))
-    return SoundOdometry(whole, np.flatnonzero(flagged), gaps)
+    return SoundOdometry(whole, np.flatnonzero(flagged), gaps, whole_turns)
+
+
+def _without_whole_turns(odometry: RobotOdometry) -> tuple[RobotOdometry, Places]:
+    """Return `odometry` without whole turns, and the increments that had one.
+
+    Of a turn beyond half a turn, whole turns are removed if what remains is nearer to the turn rate of the
+    last increment (at the beginning, of the next one) that turns by less. A robot that turns so far within
+    an increment keeps its turns.
+    """
+    turn = odometry.increments[:, 2]
+    beyond = np.abs(turn) > math.pi
+    if not np.any(beyond) or np.all(beyond):
+        return odometry, np.empty(0, np.intp)
+    lasts = np.maximum(odometry.t1 - odometry.t0, SAME_TIME_S)
+    last = np.maximum.accumulate(np.where(beyond, -1, np.arange(len(turn))))
+    expected = lasts * (turn / lasts)[np.where(last < 0, np.argmin(beyond), last)]
+    remaining = turn - math.tau * np.round(turn / math.tau)
+    removed = beyond & (np.abs(remaining - expected) < np.abs(turn - expected))
+    increments = odometry.increments.copy()
+    increments[removed, 2] = remaining[removed]
+    return odometry._replace(increments=locked(increments)), np.flatnonzero(removed)
 
 
 GAP_MOTION_S = 1.0

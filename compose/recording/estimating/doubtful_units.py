@@ -1,0 +1,324 @@
+"""The suspicion that parts of a recording are in different units, such as ranges in mm and odometry in m.
+
+Over a part of its path, a robot's ranges to an anchor determine where the anchor is in the frame of the
+odometry, and the factor between ranges and odometry. The places of two anchors in that frame give the factor
+between ranges and positions of anchors. Nothing is converted: a user is told what the data suggest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from compose.recording.estimating.prepared_steps import levelled
+from compose.recording.estimating.sound_odometry import at_antenna, sound
+from compose.recording.ranging.range_recording import Numbers, Places, RangeRecording, locked
+from compose.recording.ranging.range_steps import NEARLY_ALL, dead_reckoned, speeds
+
+PART_S, PARTS = 40.0, 3
+"""The length in s of a part, in which odometry hardly drifts, and the largest number that are examined."""
+
+FEWEST, MOST = 8, 48
+"""The least number of ranges of a robot to an anchor in a part, and the largest that is used."""
+
+MOST_ANCHORS = 3
+"""The largest number of anchors of a robot that are examined in a part: those with the most ranges."""
+
+DOUBTFUL = 2.5
+"""The least factor that is suspicious: a foot is 0.3 m.
+
+With 2, a window of 10 s of a real recording whose odometry slips was suspected; with more, feet would not be.
+"""
+
+DECISIVE = 3.0
+"""The factor by which another unit must reduce the residuals.
+
+With less, noise and slip would be taken for units; with more, robots that hardly move would be let pass."""
+
+ROUNDING = 1e-3
+"""The residuals below which fits do not differ, as a fraction of the ranges."""
+
+SLOW_TURN = 0.5
+"""The turn rate (rad/s) of nearly all motion below which turns are not suspected to be in degrees."""
+
+UNITS = {1000.0: "mm", 100.0: "cm", 39.37: "inches", 3.281: "feet"}
+"""The units that are suspected, by the number of them in a metre."""
+
+NEAR_UNIT = 1.35
+"""The largest factor between what is measured and the unit that is named."""
+
+BEARINGS, STEPS = 8, 25
+"""The number of bearings from which a fit begins, and that of its steps."""
+
+DEGREES = "the turns of odometry agree with the ranges only as degrees: are they in degrees?"
+
+
+def doubtful_units(recording: RangeRecording) -> str:
+    """Return which data of `recording` seem to be in another unit, and in which; an empty text if none do."""
+    with np.errstate(all="ignore"):  # where numbers overflow, nothing is suspected
+        return _doubt(recording)
+
+
+def _doubt(recording: RangeRecording) -> str:
+    degrees: list[bool] = []
+    by_odometry: list[float] = []
+    by_anchors: list[float] = []
+    for robot in range(len(recording.robots)):
+        groups = list(_groups(recording, robot))
+        fits = _fits(recording, robot, groups, 1.0)
+        rates = speeds(recording.robots[robot].odometry)[1]
+        if fits and float(np.percentile(rates, NEARLY_ALL)) > SLOW_TURN:
+            converted = _fits(recording, robot, groups, math.pi / 180.0)
+            pairs = list(zip(fits, converted, strict=True))
+            degrees += [one.cost > DECISIVE * other.cost for one, other in pairs]
+        by_odometry += [math.log(one.factor) for one in fits]
+        for one, other in combinations(fits, 2):
+            apart = abs(one.anchor - other.anchor)
+            if one.part == other.part and apart > 0.0:
+                by_anchors.append(math.log(_to_anchors(one, other, apart)))
+    if degrees and 2 * sum(degrees) > len(degrees):
+        return DEGREES
+    factors = [_factor(float(np.median(one))) if one else 1.0 for one in (by_odometry, by_anchors)]
+    return _suspicion(factors[0], factors[1] if by_anchors else _by_polygon(recording), bool(by_anchors))
+
+
+def _factor(logarithm: float) -> float:
+    """Return the exponential of a logarithm; 1 if that is not a number."""
+    return math.exp(min(max(-MOST_LOG, logarithm), MOST_LOG)) if math.isfinite(logarithm) else 1.0
+
+
+def doubtful_lengths(factor: float, others: str) -> str:
+    """Return the suspicion that ranges are `factor` times what `others` allow; an empty text near 1."""
+    factor = max(factor, TINY)
+    return _sentence("ranges", factor, others) if max(factor, 1.0 / factor) > DOUBTFUL else ""
+
+
+def _suspicion(by_odometry: float, by_anchors: float, located: bool) -> str:
+    """Return the sentence for the factors of ranges to odometry, and of ranges to positions of anchors.
+
+    `located` is true if the second is measured; otherwise it is 1, or a bound.
+    """
+    doubtful = [max(one, 1.0 / one) > DOUBTFUL for one in (by_odometry, by_anchors)]
+    if doubtful == [True, True] and (by_odometry > 1.0) == (by_anchors > 1.0):
+        return _sentence("ranges", by_odometry, "odometry and anchors")
+    if doubtful == [True, False] and by_odometry > 1.0 and not located:
+        return _sentence("ranges", by_odometry, "odometry")
+    if doubtful[0]:
+        return _sentence("odometry", 1.0 / by_odometry, "ranges and anchors" if located else "ranges")
+    if doubtful[1]:
+        return _sentence("positions of anchors", 1.0 / by_anchors, "ranges and odometry")
+    return ""
+
+
+def _sentence(subject: str, factor: float, others: str) -> str:
+    """Return the sentence that `subject` is `factor` times what `others` allow."""
+    ratio = max(factor, 1.0 / factor)
+    unit = min(UNITS, key=lambda one: abs(math.log(ratio / one)))
+    near = max(ratio / unit, unit / ratio) < NEAR_UNIT
+    number = unit if near else float(f"{ratio:.2g}")
+    many = f"{round(number, 1 if number < 10.0 else 0):,.15g}".replace(",", " ")
+    name = UNITS[unit] if near else "another unit"
+    verb, allow = "is" if subject == "odometry" else "are", "allows" if others == "odometry" else "allow"
+    if factor > 1.0:
+        pronoun = "it" if subject == "odometry" else "they"
+        return f"{subject} {verb} about {many} times what {others} {allow}: {verb} {pronoun} in {name}?"
+    doubted = "is" if others == "odometry" else "are"
+    return f"{subject} {verb} about 1/{many} of what {others} {allow}: {doubted} {others} in {name}?"
+
+
+# --- the ranges of one robot to one anchor ------------------------------------------------------------------
+
+
+class _Group(NamedTuple):
+    """Some ranges of a robot to one anchor within a part of its path."""
+
+    part: int
+    anchor: complex
+    """The position of the anchor in m."""
+    t: Numbers
+    rho: Numbers
+
+
+class _Fit(NamedTuple):
+    """The place of an anchor in the frame of the odometry, by the ranges of a group."""
+
+    part: int
+    anchor: complex
+    path: Numbers
+    """The places of the robot at the ranges, as complex numbers."""
+    rho: Numbers
+    factor: float
+    """The factor of ranges to odometry; 1 unless the ranges decide that it is another."""
+    place: complex
+    cost: float
+    """The mean absolute residual, in the unit of ranges, and the rounding."""
+
+
+def _groups(recording: RangeRecording, robot: int) -> Iterator[_Group]:
+    """Yield the ranges of `robot` in at most PARTS parts of its path."""
+    ranges, base, own = recording.ranges, len(recording.robots), recording.robots[robot]
+    if not len(own.odometry.t0):
+        return
+    begin, end = float(own.odometry.t0[0]), float(own.odometry.t1[-1])
+    rows = np.flatnonzero((ranges.first == robot) & (ranges.second >= base))
+    starts = np.linspace(begin, max(end - PART_S, begin), PARTS if end - begin > PARTS * PART_S else 1)
+    for part, start in enumerate(starts.tolist()):
+        inside = rows[(ranges.t[rows] >= start) & (ranges.t[rows] <= min(start + PART_S, end))]
+        counts = np.bincount(ranges.second[inside] - base, minlength=len(recording.anchors))
+        for k in np.argsort(-counts, kind="stable")[:MOST_ANCHORS].tolist():
+            if counts[k] < FEWEST:
+                continue
+            some: Places = inside[ranges.second[inside] == base + k]
+            some = some[np.unique(np.linspace(0, len(some) - 1, MOST).astype(np.intp))]
+            anchor = recording.anchors[k]
+            rho = levelled(ranges.range[some], np.full(len(some), own.antenna[2] - anchor.height))[0]
+            yield _Group(part, complex(anchor.x, anchor.y), ranges.t[some], rho)
+
+
+def _fits(recording: RangeRecording, robot: int, groups: list[_Group], turn_unit: float) -> list[_Fit]:
+    """Return the fits of `groups` with the turns of odometry multiplied by `turn_unit`."""
+    if not groups:
+        return []
+    own = recording.robots[robot]
+    increments = own.odometry.increments * np.array((1.0, 1.0, turn_unit))
+    odometry = sound(own.odometry._replace(increments=locked(increments))).odometry
+    at = dead_reckoned(at_antenna(odometry, *own.antenna[:2]), np.concatenate([one.t for one in groups]))
+    ends = np.cumsum([len(one.t) for one in groups])[:-1]
+    paths = np.split(at[:, 0] + 1j * at[:, 1], ends)
+    return [_fit(one, path) for one, path in zip(groups, paths, strict=True)]
+
+
+def _fit(group: _Group, path: Numbers) -> _Fit:
+    """Return the fit of a group whose robot is at `path`, complex numbers, in the frame of the odometry."""
+    half, rho, usual = len(path) // 2, group.rho, float(np.mean(group.rho))
+    moved, change = np.abs(path[half:] - path[:-half]), np.abs(rho[half:] - rho[:-half])
+    slope = _factor(math.log(max(TINY, float(np.sum(change)))) - math.log(max(TINY, float(np.sum(moved)))))
+    plain, plain_cost = _least(partial(_ranges_to_one, path), _around(path, usual), rho)
+    starts = [
+        np.insert(_around(path, usual / scale), 2, math.log(scale), 1)
+        for scale in (1.0, slope, 2.0 * slope, 4.0 * slope)
+    ]
+    free, free_cost = _least(partial(_ranges_to_one, path), np.concatenate(starts), rho)
+    factor = _factor(float(free[2]))
+    if plain_cost > DECISIVE * free_cost and max(factor, 1.0 / factor) > DOUBTFUL:
+        return _Fit(group.part, group.anchor, path, rho, factor, complex(free[0], free[1]), free_cost)
+    return _Fit(group.part, group.anchor, path, rho, 1.0, complex(plain[0], plain[1]), plain_cost)
+
+
+def _to_anchors(one: _Fit, other: _Fit, apart: float) -> float:
+    """Return the factor of ranges to positions of anchors; 1 unless the ranges decide that it is another.
+
+    The two anchors are `apart` by their positions.
+    """
+    scale = math.sqrt(one.factor * other.factor)
+    found = max(TINY, scale * abs(one.place - other.place) / apart)
+    if max(found, 1.0 / found) <= DOUBTFUL:
+        return 1.0
+    around = _around(one.path, float(np.mean(one.rho)) / scale)
+    turns = math.tau * np.arange(BEARINGS) / BEARINGS
+    starts = np.column_stack((np.repeat(around, BEARINGS, 0), np.tile(turns, BEARINGS)))
+    model = partial(_ranges_to_two, one.path, other.path, scale, apart)
+    _, cost = _least(model, starts, np.concatenate((one.rho, other.rho)))
+    return found if cost > DECISIVE * max(one.cost, other.cost) else 1.0
+
+
+def _around(path: Numbers, distance: float) -> Numbers:
+    """Return the places at `distance` from the middle of `path` in all BEARINGS; shape (n, 2)."""
+    places = np.mean(path) + distance * np.exp(2j * math.pi * np.arange(BEARINGS) / BEARINGS)
+    return np.stack((places.real, places.imag), 1)
+
+
+_Model = Callable[[Numbers], tuple[Numbers, Numbers]]
+"""The predicted ranges, (n, N), for n starts, (n, unknowns), and their derivatives, (n, N, unknowns)."""
+
+
+def _ranges_to_one(path: Numbers, unknowns: Numbers) -> tuple[Numbers, Numbers]:
+    """Return the ranges to an anchor at x and y, multiplied by the exponential of a third unknown."""
+    away = path - unknowns[:, :1] - 1j * unknowns[:, 1:2]
+    scale = np.exp(np.clip(unknowns[:, 2:], -MOST_LOG, MOST_LOG)) if unknowns.shape[1] == 3 else 1.0
+    distance = np.maximum(np.abs(away), TINY)
+    columns = [-scale * away.real / distance, -scale * away.imag / distance, scale * distance]
+    return columns[2], np.stack(columns[: unknowns.shape[1]], 2)
+
+
+def _ranges_to_two(
+    path: Numbers, other: Numbers, scale: float, apart: float, unknowns: Numbers
+) -> tuple[Numbers, Numbers]:
+    """Return the ranges from `path` to an anchor, and from `other` to one `apart` from it in a direction."""
+    first, jacobian = _ranges_to_one(path, unknowns[:, :2])
+    vector = apart / scale * np.exp(1j * unknowns[:, 2:])
+    moved = np.stack((unknowns[:, 0] + vector[:, 0].real, unknowns[:, 1] + vector[:, 0].imag), 1)
+    second, more = _ranges_to_one(other, moved)
+    turned = more[..., 0] * -vector.imag + more[..., 1] * vector.real
+    by_turn = np.concatenate((np.zeros_like(first), turned), 1)[..., None]
+    both = np.concatenate((np.concatenate((jacobian, more), 1), by_turn), 2)
+    return scale * np.concatenate((first, second), 1), scale * both
+
+
+def _least(model: _Model, unknowns: Numbers, rho: Numbers) -> tuple[Numbers, float]:
+    """Return the unknowns that explain the ranges `rho` best, and their cost (see `_Fit`)."""
+    usual = max(float(np.mean(rho)), TINY)
+    for _ in range(STEPS):
+        predicted, jacobian = model(unknowns)
+        residuals = rho - predicted
+        width = 2.0 * np.median(np.abs(residuals), 1, keepdims=True) + ROUNDING * usual
+        weighted = (jacobian / (1.0 + np.square(residuals / width))[..., None]).mT
+        information = weighted @ jacobian
+        diagonal = np.einsum("...ii->...i", information)
+        diagonal += DAMPING * diagonal + TINY
+        change = np.linalg.solve(information, weighted @ residuals[..., None])[..., 0]
+        effect = np.sqrt(np.mean(np.square(jacobian), 1)) * np.abs(change) / (LONGEST_STEP * usual)
+        unknowns = unknowns + change / np.maximum(np.max(effect, 1, keepdims=True), 1.0)
+    cost = np.mean(np.abs(rho - model(unknowns)[0]), 1)
+    best = int(np.argmin(cost))
+    return unknowns[best], float(cost[best]) + ROUNDING * usual
+
+
+DAMPING, LONGEST_STEP = 1e-3, 0.5
+"""The damping of a step, as a fraction of the information, and its longest effect, as one of the ranges."""
+
+TINY, MOST_LOG = 1e-12, 20.0
+"""The least length in m, and the largest logarithm of a factor."""
+
+
+# --- ranges between robots ----------------------------------------------------------------------------------
+
+
+def _by_polygon(recording: RangeRecording) -> float:
+    """Return a bound on the factor of ranges to positions of anchors, from robots that have one anchor each.
+
+    Two anchors, and two robots beside them, are the corners of a polygon, and no side is longer than all
+    others together. It is 1 if that is so.
+    """
+    pairs, ranges = recording.pairs(), recording.ranges
+    anchors = {one.id: complex(one.x, one.y) for one in recording.anchors}
+    most = {pair[0]: pair[1] for pair in sorted(pairs, key=lambda one: len(pairs[one])) if pair[1] in anchors}
+    for (a, b), rows in pairs.items():
+        if a not in most or b not in most:
+            continue
+        apart = abs(anchors[most[a]] - anchors[most[b]])
+        sides, together = [ranges.range[rows]], np.ones(len(rows), bool)
+        for robot in (a, b):
+            own = pairs[robot, most[robot]]
+            after = np.clip(np.searchsorted(ranges.t[own], ranges.t[rows]), 1, max(len(own) - 1, 1))
+            nearest = own[np.minimum(after, len(own) - 1)]
+            together &= np.abs(ranges.t[nearest] - ranges.t[rows]) <= SAME_PLACE_S
+            sides.append(ranges.range[nearest])
+        if np.count_nonzero(together) >= FEWEST:
+            lengths = np.stack(sides)[:, together]
+            whole = float(np.median(np.sum(lengths, 0)))
+            excess = float(np.median(2.0 * np.max(lengths, 0) - np.sum(lengths, 0)))
+            if apart > DOUBTFUL * whole > 0.0:
+                return max(TINY, whole / apart)
+            if excess > DOUBTFUL * apart > 0.0:
+                return excess / apart
+    return 1.0
+
+
+SAME_PLACE_S = 1.0
+"""The time in s between two ranges in which a robot hardly moves."""
