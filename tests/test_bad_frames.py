@@ -266,7 +266,7 @@ def test_a_robot_refuses_frames_out_of_step_and_uses_a_repeated_report_once(tmp_
         return Observation(tick, "a", REST if tick else None, 2.5, (Contact("b", 2.0, (tick,)),))
 
     with session.open_router(listening(endpoint)) as link:
-        session.answer(link, keys.config(RUN, "*"), lambda _: scenario.config("a"))
+        session.answer(link, keys.config(RUN, "*"), lambda *_: scenario.config("a"))
         session.subscribe(link, keys.command(RUN, "a"), said, "command")
         session.watch_liveliness(link, keys.robot_alive(RUN, "*"), said)
         world_says = session.publisher(link, keys.observation(RUN, "a"))
@@ -310,7 +310,7 @@ def test_a_robot_of_a_group_refuses_reports_of_itself_and_of_robots_outside_the_
     """It would store those of any number of senders. In a group, an agent receives the reports of all."""
     scenario, endpoint, said = parse(FAR, "four"), free_endpoint(), Inbox("test")
     with session.open_router(listening(endpoint)) as link:
-        session.answer(link, keys.config(RUN, "*"), lambda _: scenario.config("a"))
+        session.answer(link, keys.config(RUN, "*"), lambda *_: scenario.config("a"))
         session.subscribe(link, keys.command(RUN, "a"), said, "command")
         world_says = session.publisher(link, keys.observation(RUN, "a"))
         senders = {robot: session.publisher(link, keys.report(RUN, robot, "a")) for robot in "abz"}

@@ -203,7 +203,7 @@ def over(mission: Played) -> None:
 def driven(mission: Played) -> None:
     """Run the mission as in hardware mode for a: only the RobotConfig names b."""
     running(mission)
-    session.answer(mission.link, keys.config("r", "a"), lambda _: load("paper-1").config("a"))
+    session.answer(mission.link, keys.config("r", "a"), lambda *_: load("paper-1").config("a"))
 
 
 def foreign(mission: Played) -> None:

@@ -396,7 +396,7 @@ def test_an_agent_repeats_its_final_report_until_a_world_has_recorded_it(tmp_pat
 
     with ExitStack() as folder:
         with session.open_router(listening(endpoint)) as link:
-            session.answer(link, keys.config(run, "*"), lambda _: scenario.config("a"))
+            session.answer(link, keys.config(run, "*"), lambda *_: scenario.config("a"))
             _token = session.show_alive(link, keys.world_alive(run))
             agent = folder.enter_context(
                 TandemProcess("agent", "a", "--connect", endpoint, "--out", tmp_path)
@@ -426,7 +426,7 @@ def test_a_repeated_observation_makes_an_agent_repeat_its_latest_reports(tmp_pat
         assert [next_of(reports) for _ in ticks] == ticks
 
     with session.open_router(listening(endpoint)) as link:
-        session.answer(link, keys.config(run, "*"), lambda _: scenario.config("a"))
+        session.answer(link, keys.config(run, "*"), lambda *_: scenario.config("a"))
         session.watch_liveliness(link, keys.robot_alive(run, "*"), there)
         link.declare_subscriber(
             keys.report(run, "a", "b"),

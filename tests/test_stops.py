@@ -184,7 +184,7 @@ def test_a_link_over_which_nothing_comes_is_replaced_by_another() -> None:
     endpoint, config, inbox = free_endpoint(), load("paper-1").config("a", None), Inbox("a mute world")
     with session.open_router(listening(endpoint)) as link:
         session.watch_liveliness(link, keys.robot_alive("mute", "a"), inbox)
-        session.answer(link, keys.config("mute", "*"), lambda _key: config)
+        session.answer(link, keys.config("mute", "*"), lambda *_: config)
         _token = session.show_alive(link, keys.world_alive("mute"))
         with TandemProcess("agent", "a", "--connect", endpoint, "--timeout", "20") as agent:
             for topic in ("alive", "gone", "alive"):

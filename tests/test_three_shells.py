@@ -301,7 +301,7 @@ def test_an_agent_that_finds_several_runs_requires_the_run_flag() -> None:
         session.open_client(at(endpoint), unanswered) as link,
     ):
         _token = session.show_alive(link, keys.world_alive("yours"))
-        session.answer(link, keys.config("yours", "a"), lambda _: load("paper-1").config("a"))
+        session.answer(link, keys.config("yours", "a"), lambda *_: load("paper-1").config("a"))
         ended = tandem("agent", "a", "--connect", endpoint)
         says = "tandem agent: several runs are alive: mine, yours; choose one with --run\n"
         assert ended == (2, "", says)

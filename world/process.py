@@ -129,7 +129,7 @@ class WorldProcess:
         session.on_matching(self._truth, self._want_truth)
         session.subscribe_directly(link, keys.command(run, "*"), inbox, "command")
         session.watch_liveliness(link, keys.robot_alive(run, "*"), inbox)
-        session.answer(link, keys.config(run, "*"), self._config, self._refuse_second)
+        session.answer(link, keys.config(run, "*"), self._config)
         self._token = session.show_alive(link, keys.world_alive(run))
 
     def run(self) -> MissionEnd:
@@ -318,22 +318,18 @@ class WorldProcess:
     def _want_truth(self, wanted: bool) -> None:
         self._truth_wanted = wanted
 
-    def _config(self, robot: str) -> Message | str:
+    def _config(self, robot: str, process: bytes) -> Message | str:
+        """Return the RobotConfig of `robot`, which is then reserved for `process`, or why it is refused."""
         if robot not in self._robots:
             near = did_you_mean(robot, self._robots)
             return f"this world has no robot '{robot}'; it has {', '.join(self._robots)}{near}"
+        if process:
+            now = time.monotonic()
+            holder, until = self._processes.get(robot, (process, now))
+            if holder != process and now < until:
+                return session.occupied(robot, self._run)
+            self._processes[robot] = process, now + JOINING_S
         return self._scenario.config(robot, self._period)
-
-    def _refuse_second(self, robot: str, process: bytes) -> str | None:
-        """Return why `process` cannot be `robot`: another process is. None if it can, or if nobody asks."""
-        if not process or robot not in self._robots:
-            return None
-        now = time.monotonic()
-        holder, until = self._processes.get(robot, (process, now))
-        if holder != process and now < until:
-            return f"robot '{robot}' is in run '{self._run}' already: another process is {robot}"
-        self._processes[robot] = process, now + JOINING_S
-        return None
 
     def _collect_final_reports(self, end: MissionEnd, expected: Collection[str]) -> list[FinalReport]:
         """Send `end` to all robots until they have answered or are gone, and return the FinalReports.

@@ -52,7 +52,7 @@ class Search:
         self._wait = wait
         self._inbox = inbox
         self.process = os.urandom(8)
-        """The identifier of this process, by which a world knows it from another one of the same robot."""
+        """The identifier by which a world tells this process from another one of the same robot."""
         self._began = time.monotonic()
         self._reported = False
 
@@ -107,11 +107,10 @@ def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tu
     world.
     """
     began = time.monotonic()
-    refused: float | None = None
+    refused_since: float | None = None
     occupied: str | None = None
-    other: str | None = None
-    """The refusal of a world because of the process whose token was there at the same time."""
-    while time.monotonic() < began + (SESSION_S if occupied is None and other is None else FORMER_S):
+    second: str | None = None  # the last refusal while another process of the robot was alive
+    while time.monotonic() < began + (SESSION_S if occupied is None and second is None else FORMER_S):
         worlds = [key.run for key in session.alive(link, keys.world_alive(run or "*"), QUERY_S)]
         offers = _offers(link, worlds[:MOST_WORLDS], robot, search.process)
         if len(offers.configs) > 1:
@@ -120,22 +119,21 @@ def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tu
             return found, config
         occupied = offers.occupied
         if occupied is not None:
-            other = offers.refused or other
-        why = offers.refused or other
+            second = offers.refused or second
+        why = offers.refused or second
         if why is None or occupied is not None:
-            refused = None
-        elif refused is None:
-            refused = time.monotonic()
-        elif time.monotonic() > refused + REFUSED_S:
+            refused_since = None
+        elif refused_since is None:
+            refused_since = time.monotonic()
+        elif time.monotonic() > refused_since + REFUSED_S:
             raise Unwelcome(why)
         if occupied is None and why is None:
             search.wait(linked=session.linked(link), why=offers.unusable)
         else:
             search.pause()
-    if other is not None or occupied is not None:
-        raise Unwelcome(
-            other or f"robot '{robot}' is in run '{occupied}' already: another process is {robot}"
-        )
+    refusal = second or (occupied and session.occupied(robot, occupied))
+    if refusal:
+        raise Unwelcome(refusal)
     return None
 
 

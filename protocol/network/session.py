@@ -280,15 +280,15 @@ def ask(
     return refusal if refusal is not None else strange
 
 
-def answer(
-    session: zenoh.Session,
-    key: str,
-    reply: Callable[[str], Message | str],
-    refuse: Callable[[str, bytes], str | None] = lambda *_: None,
-) -> None:
-    """Answer queries on `key` with `reply`, which returns a message for a robot, or the text of a refusal.
+def occupied(robot: str, run: str) -> str:
+    """Return the text of the refusal of a second process for `robot`."""
+    return f"robot '{robot}' is in run '{run}' already: another process is {robot}"
 
-    `refuse` returns why the process that asks for a robot is refused; None if it is not.
+
+def answer(session: zenoh.Session, key: str, reply: Callable[[str, bytes], Message | str]) -> None:
+    """Answer queries on `key` with `reply`, which returns a message, or the text of a refusal.
+
+    It gets the robot, and the identifier of the process that asks, which is empty if it has given none.
     """
 
     def hand_over(query: zenoh.Query) -> None:
@@ -296,7 +296,7 @@ def answer(
         answered: Message | str = NO_KEY
         if asked is not None:
             process = query.payload.to_bytes() if query.payload is not None else b""
-            answered = refuse(asked.robot, process) or reply(asked.robot)
+            answered = reply(asked.robot, process)
         if isinstance(answered, str):
             query.reply_err(answered, encoding=REFUSAL)
         else:

@@ -176,7 +176,7 @@ class Field:
         for robot in self._ending.reporters:
             session.subscribe(link, keys.report(run, robot, me), inbox, "report")
         session.watch_liveliness(link, keys.robot_alive(run, "*"), inbox)
-        session.answer(link, keys.config(run, me), lambda _: self._config)
+        session.answer(link, keys.config(run, me), lambda *_: self._config)
         self._token = session.show_alive(link, keys.world_alive(run))
 
     def run_mission(self, wait: float, ended: Callable[[], None]) -> MissionEnd:
