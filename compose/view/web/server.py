@@ -420,7 +420,7 @@ async def _serve(site: Site, taken: socket.socket, ready: Ready) -> None:
     loop = asyncio.get_running_loop()
 
     def stop() -> None:
-        site.end()
+        site.work.stop()
         server.should_exit = True
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):

@@ -53,8 +53,6 @@ class Site:
         self.changed = ChangedMissions(self.work)
         self.recorded = shows or []
         self.listeners = listeners or []
-        self.over = False
-        """True once the server is stopping."""
 
     @property
     def shows(self) -> dict[str, WatchedRun]:
@@ -100,10 +98,10 @@ class Site:
         for listener in self.listeners:
             listener.start()
 
-    def end(self) -> None:
-        """Let all requests end: the server is stopping."""
-        self.over = True
-        self.work.stop()
+    @property
+    def over(self) -> bool:
+        """True once the server is stopping."""
+        return self.work.over
 
     def stop(self) -> None:
         """Stop listening on the network, and delete the recordings of trials and of changed missions."""
