@@ -29,8 +29,8 @@ class NotRegular(OSError):
     """The path of a file leads to a directory, FIFO, device or socket, or is a link where none may be."""
 
     def __init__(self, path: Path, mode: int) -> None:
-        kind = "a link" if stat.S_ISLNK(mode) else "not a regular file"
-        kind = "a directory" if stat.S_ISDIR(mode) else kind
+        kinds = {stat.S_IFDIR: "a directory", stat.S_IFLNK: "a link"}
+        kind = kinds.get(stat.S_IFMT(mode), "not a regular file")
         super().__init__(errno.EINVAL, f"it is {kind}", str(path))
 
 

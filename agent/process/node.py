@@ -92,8 +92,9 @@ class AgentProcess:
             partial(malformed, planner=self._robot.planner),
             real_time=real_time,
         )
-        self._launched = self._loss_reported = launched
-        """True once the loss of the world has been reported to the user, or if the launcher reports it."""
+        self._launched = launched
+        self._loss_reported = False
+        """True once the loss of the world has been reported to the user."""
         self._repeated_at = 0.0
         """The time (monotonic clock) of the last repetition."""
         self._repeat_at: float | None = None
@@ -150,8 +151,12 @@ class AgentProcess:
         The liveliness token may have disappeared before this process saw it.
         """
         if gone and not self._loss_reported:
-            self._inbox.say(f"the world has gone; waiting {self._world_timeout:g} s for it")
-        self._loss_reported = gone or self._launched
+            self._say_gone("", self._world_timeout)
+        self._loss_reported = gone
+
+    def _say_gone(self, when: str, timeout: float) -> None:
+        if not self._launched:
+            self._inbox.say(f"the world has gone{when}; waiting {timeout:g} s for it")
 
     def attach(self, link: zenoh.Session) -> None:
         """Use `link` to send and receive from now on."""
@@ -326,10 +331,7 @@ class AgentProcess:
                 self._out_of_step.world(there=False)
                 gone = True  # frames that the world sent before may still arrive
             elif gone and arrival.topic == "nothing":
-                if not self._launched:
-                    self._inbox.say(
-                        f"the world has gone after its MissionEnd; waiting {self._timeout:g} s for it"
-                    )
+                self._say_gone(" after its MissionEnd", self._timeout)
                 gone = False
         return end
 

@@ -16,7 +16,7 @@ def program(name: str, folder: Path | None = None) -> str:
     """
     if "UV_RUN_RECURSION_DEPTH" in os.environ:  # set by `uv run`
         project = Path(sys.prefix).parent
-        inside = project in (folder or Path()).resolve().parents or project == (folder or Path()).resolve()
+        inside = (folder or Path()).resolve().is_relative_to(project)
         elsewhere = (project / "pyproject.toml").exists() and not inside
         return f"uv run --project {shlex.quote(str(project))} {name}" if elsewhere else f"uv run {name}"
     found = shutil.which(name)
