@@ -1,6 +1,6 @@
-"""Documents in JSON, JSON5 and TOML, which others may have written: their nesting is bounded.
+"""The parsing of documents in JSON, JSON5 and TOML, which others may have written.
 
-It is checked before they are parsed, because parsers recurse, or take quadratic time.
+Their nesting is checked first, because parsers of nested values recurse, or take quadratic time.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _TOML = re.compile(
     rb'"[^"\\\n]*(?:\\.[^"\\\n]*)*"?|' + rb"'[^'\n]*'?|#[^\n]*|[][{}.,\n]",
     re.DOTALL,
 )
-"""The same of TOML, and the signs that begin or end a nested value or a key."""
+"""The same of TOML, and the characters that begin or end a nested value or a part of a key."""
 _STEPS = bytes.maketrans(b"[{]}", b"\x01\x01\xff\xff")
 """The change of the depth by each bracket, as a signed byte."""
 _NO_BRACKETS = bytes({*range(256)} - {*b"[]{}"})
@@ -65,7 +65,10 @@ def toml_table(text: str) -> dict[str, Any]:
 
 
 def check_nesting(text: bytes | str, syntax: Syntax) -> None:
-    """Raise TooNested if values in `text` are nested more than MOST_NESTED deep, or by dots of TOML keys."""
+    """Raise TooNested if values in `text` are nested more than MOST_NESTED deep.
+
+    In TOML, each dot in a key nests, too.
+    """
     data = text.encode(errors="surrogatepass") if isinstance(text, str) else text
     if data.count(b"[") + data.count(b"{") + data.count(b".") <= MOST_NESTED:
         return
