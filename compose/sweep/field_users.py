@@ -1,4 +1,4 @@
-"""Who uses each field of a scenario: the contract from which sweeps know whose change changes what is drawn.
+"""The users of the fields of a scenario, from which sweeps know which fields change what is drawn.
 
 All draws (starts, sensors, faults) follow from the seed of a trial and from fields of the world. Two cells
 that differ in other fields only therefore have the same draws if their trials have the same seeds.
@@ -15,39 +15,36 @@ from compose.sweep.field_paths import Steps, value_at
 from protocol.noise import PROFILES
 from world.world_noise import RANGE_FIELDS, VELOCITY_FIELDS
 
-User = Literal["world", "robots", "told"]
-"""Who uses a field: `world`, also where something is drawn from it or moves by it; `robots`, also where only
-the referee or the launcher uses it; `told`: the robots, and the world unless its own noise has the field."""
+User = Literal["world", "robots", "both"]
+"""The user of a field: `world`, also if something is drawn from it or moves by it; `robots`, also if only the
+referee or the launcher uses it; `both`: the robots, and the world unless its own noise has the field."""
+
+FIELDS: Mapping[User, Mapping[str, str]] = {
+    "world": {
+        "": "seed world fault",
+        "robot.": "id anchor start peer dies",
+        "group.": "robots spacing without_anchor dies",
+        "mission.": "sensing_range period max_speed max_turn_rate area",
+    },
+    "robots": {
+        "": "name max_ticks planner kill robot.attack group.attack",
+        "mission.": "accuracy confidence safety_distance tolerates",
+        "mission.noise.": "range_bias pair_bias range_scale slow_sigma slow_time wheel_scale gyro_bias "
+        "sigma_degrees survey_error strays",
+    },
+    "both": {
+        "mission.noise.": " ".join((*RANGE_FIELDS, "profile")),
+        "mission.noise.actuation.": " ".join(VELOCITY_FIELDS),
+        "mission.noise.odometry.": " ".join(VELOCITY_FIELDS),
+    },
+}
+"""The names of fields by their user, and by the path of the table that has them."""
 
 USERS: Mapping[str, User] = {
-    **dict.fromkeys(("name", "max_ticks", "planner", "kill"), "robots"),
-    **dict.fromkeys(("seed", "world", "fault"), "world"),
-    **dict.fromkeys(("robot.attack", "group.attack"), "robots"),
-    **dict.fromkeys(
-        [f"robot.{name}" for name in ("id", "anchor", "start", "peer", "dies")]
-        + [f"group.{name}" for name in ("robots", "spacing", "without_anchor", "dies")],
-        "world",
-    ),
-    **dict.fromkeys(
-        [f"mission.{name}" for name in ("accuracy", "confidence", "safety_distance", "tolerates")], "robots"
-    ),
-    **dict.fromkeys(
-        [f"mission.{name}" for name in ("sensing_range", "period", "max_speed", "max_turn_rate", "area")],
-        "world",
-    ),
-    **dict.fromkeys(
-        [f"mission.noise.{name}" for name in (*RANGE_FIELDS, "profile")]
-        + [f"mission.noise.{of}.{name}" for of in ("actuation", "odometry") for name in VELOCITY_FIELDS],
-        "told",
-    ),
-    **dict.fromkeys(
-        [
-            f"mission.noise.{name}"
-            for name in ("range_bias", "pair_bias", "range_scale", "slow_sigma", "slow_time")
-            + ("wheel_scale", "gyro_bias", "sigma_degrees", "survey_error", "strays")
-        ],
-        "robots",
-    ),
+    table + name: user
+    for user, tables in FIELDS.items()
+    for table, names in tables.items()
+    for name in names.split()
 }
 """The user of each field, by its path without indices; that of a table stands for all fields in it."""
 
@@ -65,7 +62,7 @@ def changes_draws(
     path = tuple([step for step in way if isinstance(step, str)])
     users = {field: user for field, user in USERS.items() if overlap(path, tuple(field.split(".")))}
     return any(
-        user == "world" or (user == "told" and not _own_noise(field, base, varied))
+        user == "world" or (user == "both" and not _own_noise(field, base, varied))
         for field, user in users.items()
     )
 
