@@ -20,12 +20,6 @@ from scipy.special import stdtrit  # type: ignore[import-untyped]
 from compose.sweep.cells import Cell
 from compose.sweep.spec import Sweep
 from compose.sweep.statistics import CONFIDENCE, Floats, column
-from compose.terminal import tables, text_width
-
-HEADINGS = ("both", "ticks", "low", "high", "rate %", "low", "high")
-"""The columns of the table for the terminal, after the names of the cells."""
-MOST_ROWS = 50
-"""The largest number of differences that the terminal shows; the file has all."""
 
 
 class PairedDifference(msgspec.Struct, frozen=True):
@@ -164,38 +158,3 @@ def differences_csv(differences: Sequence[PairedDifference]) -> str:
     rows.writerow(PairedDifference.__struct_fields__)
     rows.writerows([msgspec.structs.astuple(one) for one in differences])
     return out.getvalue()
-
-
-def lines(sweep: Sweep, differences: Sequence[PairedDifference]) -> list[str]:
-    """Return what the terminal shows: the differences between planners, and which axes are not paired."""
-    planners = {axis.name for axis in sweep.axes if axis.of_planners}
-    shown = [one for one in differences if one.axis in planners]
-    found = []
-    if shown:
-        rows = [
-            [f"{one.value} - {one.reference}", f"{one.cell} - {one.reference_cell}", *_texts(one)]
-            for one in shown[:MOST_ROWS]
-        ]
-        made = tables.table(["difference", "cells"], HEADINGS, rows)
-        found += ["", *tables.lines(made, text_width.room()), ""]
-        found += text_width.wrapped(
-            "both: trials that localised in both cells, of all with the same draws; ticks: mean difference "
-            "of these; rate: difference of the shares of all that localised; low, high: 95 % intervals"
-        )
-    other = [axis.name for axis in sweep.axes if not axis.paired and len(axis.values) > 1]
-    if other:
-        found += text_width.wrapped(
-            f"not paired: trials have other draws at each value of {', '.join(other)}, so cells also differ "
-            "by chance"
-        )
-    return found
-
-
-def _texts(one: PairedDifference) -> list[str]:
-    ticks = (one.ticks, one.ticks_low, one.ticks_high)
-    rates = (one.rate, one.rate_low, one.rate_high)
-    return [
-        f"{one.both_localised}/{one.pairs}",
-        *["-" if value is None else f"{value:+.1f}" for value in ticks],
-        *["-" if value is None else f"{100.0 * value:+.1f}" for value in rates],
-    ]

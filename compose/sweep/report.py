@@ -15,7 +15,7 @@ from rich.text import Text
 
 from compose.sweep.cells import Cell
 from compose.sweep.execution import SUMMARY, Progress, Results
-from compose.sweep.paired_differences import lines as difference_lines
+from compose.sweep.paired_differences import PairedDifference
 from compose.sweep.results_folder import CELLS
 from compose.sweep.statistics import CellSummary, noted, refusals
 from compose.terminal import tables, text_width
@@ -57,6 +57,10 @@ OF_ATTACKED_GROUP = ("found",)
 """The additional column of sweeps of groups with an attacker."""
 OF_NOISE = ("within", "nees", "nees low", "nees high")
 """The additional columns of sweeps in which robots claim covariances."""
+OF_DIFFERENCES = ("both", "ticks", "low", "high", "rate %", "low", "high")
+"""The columns of the table of differences, after the names of the cells."""
+MOST_DIFFERENCES = 50
+"""The largest number of differences that are shown; the file has all."""
 MOST_ROWS = 100
 """The largest number of cells for which the table lists all cells, also those without a problem."""
 
@@ -123,7 +127,7 @@ def show(results: Results, out: Path, *, quiet: bool) -> None:
         say("", *lines, "", *text_width.notes(NOTES, columns))
     if shown < len(results.cells):
         tell(f"{len(results.cells) - shown} cells without a problem are not listed; see {out / SUMMARY}")
-    say(*difference_lines(results.sweep, results.differences))
+    say(*_difference_lines(results))
     tell(*_refused(results))
     note = noted(results.table)
     if note is not None:
@@ -139,6 +143,39 @@ def show(results: Results, out: Path, *, quiet: bool) -> None:
         recording = _new_folder(f"recording-{results.sweep.name}-{note.cell}-{note.trial}")
         say(f"  {tandem} run {file} --seed {note.seed} --out {recording}")
     say(f"results: {out}")
+
+
+def _difference_lines(results: Results) -> list[str]:
+    """Return the lines of the differences between planners, and of the axes that are not paired."""
+    planners = {axis.name for axis in results.sweep.axes if axis.of_planners}
+    rows = [_difference_row(one) for one in results.differences if one.axis in planners]
+    found = []
+    if rows:
+        made = tables.table(["difference", "cells"], OF_DIFFERENCES, rows[:MOST_DIFFERENCES])
+        found += ["", *tables.lines(made, text_width.room()), ""]
+        found += text_width.wrapped(
+            "both: trials that localised in both cells, of all with the same draws; ticks: mean difference "
+            "of these; rate: difference of the shares of all that localised; low, high: 95 % intervals"
+        )
+    unpaired = [axis.name for axis in results.sweep.axes if not axis.paired and len(axis.values) > 1]
+    if unpaired:
+        found += text_width.wrapped(
+            f"not paired: trials have other draws at each value of {', '.join(unpaired)}, so cells also "
+            "differ by chance"
+        )
+    return found
+
+
+def _difference_row(one: PairedDifference) -> list[str]:
+    ticks = (one.ticks, one.ticks_low, one.ticks_high)
+    rates = (one.rate, one.rate_low, one.rate_high)
+    return [
+        f"{one.value} - {one.reference}",
+        f"{one.cell} - {one.reference_cell}",
+        f"{one.both_localised}/{one.pairs}",
+        *["-" if value is None else f"{value:+.1f}" for value in ticks],
+        *["-" if value is None else f"{100.0 * value:+.1f}" for value in rates],
+    ]
 
 
 def _refused(results: Results) -> Iterator[str]:
