@@ -50,15 +50,14 @@ def calibrated(
     )
     with numerics(recording.source):
         errors = {} if by_fit else true_errors(part)
-    if errors:
+        if not errors:
+            return _by_fit(recording, chosen, window)
         measured = [float(np.median(one.measured)) for one in errors.values()]
         true = [float(np.median(one.measured - one.error)) for one in errors.values()]
         doubt = doubtful_lengths(sum(measured) / max(sum(true), TINY), "true poses and anchors")
         if doubt:
             raise UserError(f"{recording.source}: {doubt}")
-        with numerics(recording.source):
-            return range_calibration(errors, "the truth")
-    return _by_fit(recording, chosen, window)
+        return range_calibration(errors, "the truth")
 
 
 def _by_fit(
@@ -84,9 +83,8 @@ def _by_fit(
     if not errors:
         raise UserError(f"{recording.source}: no pair of radios has {FEWEST} ranges")
     names = names_of(used, problem.measured.sides)
-    with numerics(recording.source):
-        found = range_calibration(errors, "the fit")
-        learned = learned_errors(fit, names, ["-".join(pair) for pair in ranged])
+    found = range_calibration(errors, "the fit")
+    learned = learned_errors(fit, names, ["-".join(pair) for pair in ranged])
     bias, scale = learned.range_bias_m, learned.range_scale
     return found._replace(
         bias_sigma=bias.sigma if bias is not None else 0.0,

@@ -58,13 +58,9 @@ BEARINGS, STEPS = 8, 25
 DEGREES = "the turns of odometry agree with the ranges only as degrees: are they in degrees?"
 
 
+@np.errstate(all="ignore")  # where numbers overflow, nothing is suspected
 def doubtful_units(recording: RangeRecording) -> str:
     """Return which data of `recording` seem to be in another unit, and in which; an empty text if none do."""
-    with np.errstate(all="ignore"):  # where numbers overflow, nothing is suspected
-        return _doubt(recording)
-
-
-def _doubt(recording: RangeRecording) -> str:
     degrees: list[bool] = []
     by_odometry: list[float] = []
     by_anchors: list[float] = []
@@ -83,8 +79,9 @@ def _doubt(recording: RangeRecording) -> str:
                 by_anchors.append(math.log(_to_anchors(one, other, apart)))
     if degrees and 2 * sum(degrees) > len(degrees):
         return DEGREES
-    factors = [_factor(float(np.median(one))) if one else 1.0 for one in (by_odometry, by_anchors)]
-    return _suspicion(factors[0], factors[1] if by_anchors else _by_polygon(recording), bool(by_anchors))
+    to_odometry = _factor(float(np.median(by_odometry))) if by_odometry else 1.0
+    to_anchors = _factor(float(np.median(by_anchors))) if by_anchors else _by_polygon(recording)
+    return _suspicion(to_odometry, to_anchors, bool(by_anchors))
 
 
 def _factor(logarithm: float) -> float:

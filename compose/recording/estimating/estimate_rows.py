@@ -248,16 +248,11 @@ def summary_of(
             len(side.sound.whole_turns),
             withdrawn_s,
         )
-    reason = last.blocking_reason if last is not None else "there is no epoch"
-    still = [
-        side.id for side, claim in zip(sides, claims, strict=True) if not claim and _stands(side, measured)
-    ]
-    if still:
-        one = len(still) == 1
-        reason = (
-            f"{listed(still)} {'does' if one else 'do'} not move, by {'its' if one else 'their'} odometry: "
-            f"ranges do not tell the heading of a robot that stands"
-        )
+    reason = doubt or _standing(
+        [side for side, claim in zip(sides, claims, strict=True) if not claim], measured
+    )
+    if not reason:
+        reason = last.blocking_reason if last is not None else "there is no epoch"
     pairs = ["-".join(pair) for pair in measured.pairs]
     calibration = None
     if last is not None and last.fitted is not None:
@@ -282,7 +277,7 @@ def summary_of(
         calibration,
         dict(zip(pairs, last.ranges if last is not None else (0,) * len(pairs), strict=True)),
         measured.unused,
-        doubt or reason,
+        reason,
         dict(last.undetermined) if last is not None else {},
     )
 
@@ -292,10 +287,20 @@ def names_of(used: object, sides: Sequence[OneRobot]) -> Sequence[str]:
     return used.robots if isinstance(used, JointMeasurements) else [side.id for side in sides]
 
 
-def _stands(side: OneRobot, measured: Measurements) -> bool:
-    """Return whether the path of a robot is shorter than the sigma of its ranges."""
-    x, y = side.path.x, side.path.y
-    return math.hypot(float(np.ptp(x)), float(np.ptp(y))) <= measured.noise.anchor_sigma
+def _standing(sides: Sequence[OneRobot], measured: Measurements) -> str:
+    """Return a sentence about the robots whose paths are shorter than the sigma of ranges; empty if none."""
+    names = [
+        side.id
+        for side in sides
+        if math.hypot(float(np.ptp(side.path.x)), float(np.ptp(side.path.y))) <= measured.noise.anchor_sigma
+    ]
+    if not names:
+        return ""
+    verb, whose = ("does", "its") if len(names) == 1 else ("do", "their")
+    return (
+        f"{listed(names)} {verb} not move, by {whose} odometry: ranges do not tell the heading of a robot "
+        "that stands"
+    )
 
 
 def _triple(values: Numbers) -> tuple[float, float, float]:
