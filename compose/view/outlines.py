@@ -1,9 +1,9 @@
 """Outlines of what viewers and figures draw: circles, where a robot may be, and the box about a run.
 
-A robot that hardly knows the heading of its anchor frame may be anywhere along an arc, which an ellipse does
-not show: with a sigma of 10 m it would be two parallel lines. So all of the covariance of a pose is drawn. If
-the heading is off by some angle, the position is turned by it about a fixed point; around it, it has the
-covariance that is left once the heading is known. Where the angle is small, that is the ellipse.
+A robot that hardly knows its heading may be anywhere along an arc, which an ellipse does not show: with a
+sigma of 10 m it would be two parallel lines. So the outline follows from the whole covariance of a pose. An
+error of the heading turns the position about a fixed point; across that arc, the position has the covariance
+that is left once the heading is known. If the angle is small, the outline is the ellipse.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ CORNERS = 72
 SIGMAS = 3.0
 """The size of an error ellipse, and the bound of an error, in standard deviations."""
 BENT = 0.5
-"""The largest deviation of an arc from its tangent that its ellipse shows, in lesser semi-axes of that."""
+"""The largest deviation of an arc from its tangent that an ellipse shows, in its lesser semi-axes."""
 Point = tuple[float, float]
+"""x and y in m."""
 
 
 def circle(centre: tuple[float, float], radius: float) -> list[tuple[float, float]]:
@@ -50,10 +51,12 @@ def _sigmas(covariance: Covariance) -> tuple[float, float]:
 
 
 class Reach(NamedTuple):
-    """The positions of a peer, and the largest distance from the nearest one, in m, that a range leaves."""
+    """Where a robot can be by its contact with a peer."""
 
     places: Sequence[Point]
+    """The possible positions of the peer."""
     length: float
+    """The largest distance in m from the nearest one."""
 
     @staticmethod
     def of(mission: Mission, measured: float | None, peer: Pose, covariance: Covariance | None) -> Reach:
