@@ -1,6 +1,6 @@
 """The figures of the documentation: draw them, or say which are stale.
 
-`uv run docs/picture.py` draws all of them (an hour or more: two are sweeps of 14 000 and 42 000 missions),
+`uv run docs/picture.py` draws all of them (hours: three are of 3 000, 14 000 and 42 000 missions),
 `uv run docs/picture.py page.gif noisy-a.svg` those two. Then `figures.json` says from what each was made:
 hashes of its file, of the code that draws it with its input, and of what its missions decided. With `--check`
 it draws none, and prints a line for each stale figure; the exit status is 1 if there are any.
@@ -167,7 +167,7 @@ def sweep(name: str, **figures: str) -> Source:
     return Source({f"{file}.svg": title for file, title in figures.items()}, code, draw, decided, exact=True)
 
 
-def radios(folder: Path, wanted: Mapping[str, str] = {}, trials: int = 20) -> str:
+def radios(folder: Path, wanted: Mapping[str, str] = {}, trials: int = 200) -> str:
     """Run the example of planners over radio models, and return what it prints."""
     from docs.examples import planners_and_radios  # noqa: PLC0415  # an example of the Python API
 

@@ -516,7 +516,9 @@ def written(number: int, seed: int, folder: Path) -> tuple[Format, Path, tuple[s
     elif draw.random() < 0.2:
         words += ["--window", draw.choice(["0..5", "3..8", "2..1000"])]
     if words[0] == "estimate":
-        words += draw.choice([[], [], ["--noise", "uwb"], ["--all-anchors"], ["--noise", "uwb-calibrated"]])
+        words += draw.choice(
+            [[], [], ["--noise", "uwb"], ["--accuracy", "0.1"], ["--noise", "uwb-calibrated"]]
+        )
     return format_, path, tuple(names), tuple(words)
 
 

@@ -154,7 +154,7 @@ def test_mcap_files_after_each_other_are_read_as_one(stream: bool, tmp_path: Pat
     tables = recording(1, random.Random(1))
     halves: list[Tables] = [
         {
-            name: [row for row in rows if later == (row.get("t0", row.get("t", 0.0)) >= 5.0)]
+            name: [row for row in rows if later == (float(row.get("t0", row.get("t", 0.0)) or 0.0) >= 5.0)]
             for name, rows in tables.items()
         }
         for later in (False, True)

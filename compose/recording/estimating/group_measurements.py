@@ -125,7 +125,8 @@ def _manoeuvres(robot: str, path: Track) -> Iterator[Fact]:
 
 def _ranges(prepared: PreparedSteps, members: Sequence[OneRobot]) -> Iterator[Fact]:
     """Yield the ranges between `members` and to their anchors in the plane, each at the nearest tick."""
-    used = [{other.id for other in (*members, *one.anchors)} for one in members]
+    names_of_members = {one.id for one in members}
+    used = [names_of_members | {anchor.id for anchor in one.anchors} for one in members]
     part, ranges, noise = prepared.part, prepared.steps.ranges, prepared.assumed.noise
     heights = np.array([*[one.antenna[2] for one in part.robots], *[one.height for one in part.anchors]])
     rho, ratio = levelled(ranges.range, heights[ranges.first] - heights[ranges.second])

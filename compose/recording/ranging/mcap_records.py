@@ -144,7 +144,8 @@ def _of_chunk(data: bytes, source: _Source) -> Iterator[Channel | Message]:
 
 
 HEAD, U32 = struct.Struct("<BQ"), struct.Struct("<I")
-Encoded, Decoded = TypeVar("Encoded"), TypeVar("Decoded")
+Encoded = TypeVar("Encoded")
+Decoded = TypeVar("Decoded")
 
 
 class _Source:

@@ -154,7 +154,8 @@ def _common_times(
     number = np.concatenate([np.arange(*part) for part in _numbers(paths, first, steps, period_s)])
     times: Numbers = first + period_s * number
     times[-1] = min(times[-1], last)
-    return times, period_s * (number - np.arange(len(number)))
+    left_out: Numbers = period_s * (number - np.arange(len(number)))
+    return times, left_out
 
 
 LONG_GAP_S = 10.0
