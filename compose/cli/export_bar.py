@@ -29,8 +29,8 @@ def exported(
 ) -> Exported:
     """Export the recording in `folder` to `out`, with a progress bar unless `quiet`.
 
-    `check` is called now and then, and stops the export by an exception. `run` is the recording if it has
-    been read already. Raises UserError if a file cannot be read or written.
+    `check` is called repeatedly, and may raise an exception to end the export. `run` is the recording if it
+    has been read already. Raises UserError if a file cannot be read or written.
     """
     from compose.view.export.folder import FILES, export  # noqa: PLC0415  # slow to import, and optional
 

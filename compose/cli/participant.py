@@ -49,7 +49,7 @@ def participate(
 ) -> int:
     """Return the exit status of `body`, which gets an inbox; `owner` begins its messages.
 
-    `body` must call `stop_by_signal` before it runs the mission: before that, a signal is an exception. A
+    `body` must call `stop_by_signal` before it runs the mission; until then, a signal raises an exception. A
     process that is `launched` also stops with its launcher. An exception of `failures` is printed, and the
     status is FAILED; after a signal it is STOPPED. Raises UserError if a flag cannot be followed.
     """

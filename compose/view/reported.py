@@ -9,7 +9,7 @@ from compose.view.run_data import RunData
 from protocol.motion import Pose, compose, inverse
 
 LONGEST = 100_000
-"""The last tick up to which a path is computed: a frame can report any number of ticks."""
+"""The largest tick up to which a path is computed: a frame may report any number of ticks."""
 
 
 def reported_paths(setup: RunSetup, known: RunData, last: int) -> dict[str, Sequence[Pose]]:

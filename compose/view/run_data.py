@@ -125,9 +125,9 @@ class RunData:
         return known
 
     def between(self, first: int, last: int) -> list[int]:
-        """Return the ticks from `first` to `last` of which there are data, in order.
+        """Return the ticks from `first` to `last` with data, in order.
 
-        It takes no longer than there are data, whatever number a tick in a frame has.
+        The time that it takes is bounded by the number of ticks with data: a frame may have any tick.
         """
         if last - first < len(self.ticks):
             return [tick for tick in range(first, last + 1) if tick in self.ticks]

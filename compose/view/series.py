@@ -57,7 +57,7 @@ def series(
 ) -> Series:
     """Return the series of `robots`, or of all if None, from tick `first` to tick `last`, inclusive.
 
-    `check` is called again and again, and may raise an exception to end the computation.
+    `check` is called for each tick and each bin, and may raise an exception to end the computation.
     """
     last = max(min(last, known.last), first)
     step = -(-(last - first + 1) // MOST_BINS)

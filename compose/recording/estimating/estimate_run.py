@@ -36,7 +36,7 @@ AnyMeasurements = PairMeasurements | AnchoredMeasurements | GroupMeasurements
 def numerics(where: str) -> Iterator[None]:
     """Raise NoEstimate, which begins with `where`, if numbers in the block leave the range of floats.
 
-    Those of a valid recording may, of 1e7 m or 1e-300 m. Other errors are not hidden.
+    They may in a valid recording, with values of 1e7 m or 1e-300 m. Other errors are not hidden.
     """
     try:
         with np.errstate(all="ignore"):
@@ -141,7 +141,7 @@ class RecordingEstimator:
         """Return the estimate at the end of the epoch with this `number`, from 1 on, in their order.
 
         The measurements may have grown since the last call, and are otherwise the same. Raises NoEstimate if
-        numbers leave the range of floats: valid ones of 1e7 m and 1e-300 m do.
+        numbers leave the range of floats (see `numerics`).
         """
         with numerics(f"{problem.source}: at {problem.measured.end(number):.15g} s"):
             epoch = self._epoch(problem.measured, number)

@@ -98,8 +98,11 @@ GAP_MOTION_S = 1.0
 """The time in s for which a robot is taken to move on in a gap; then it is taken to stand."""
 
 LOST_S = 100.0
-"""The time in s of unknown motion after which nothing is known of a robot's heading, and hardly anything of
-its place. With variances of longer times, fits lose all digits."""
+"""The longest time in s of unknown motion by which the covariance grows.
+
+After it, nothing is known of a robot's heading, and hardly anything of its position. With larger variances,
+fits lose all digits.
+"""
 
 FREE = 1.0
 """The speed (m/s) and turn rate (rad/s) that a robot is assumed to have if its odometry never moves."""

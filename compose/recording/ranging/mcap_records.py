@@ -1,6 +1,7 @@
-"""The channels and messages of MCAP files and streams. No length in a file decides what reading it takes.
+"""The channels and messages of MCAP files and streams, read in bounded memory.
 
-The library `mcap` reads as many bytes at once as a length says, and passes over what it does not know.
+The library `mcap` allocates as many bytes as a length in the file says, and skips kinds of records that it
+does not know.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ class EndOfStream(BadRecording):
 
 
 class Begin(NamedTuple):
-    """The begin of a file. The channels of a file before it are unknown in it."""
+    """The begin of a file. Channels of files before it are not valid in it."""
 
 
 class Channel(NamedTuple):
