@@ -63,17 +63,20 @@ def twist(v: float, omega: float, *, stamped: bool = False) -> bytes:
     return bytes(_types.serialize_cdr(types[STAMPED](header=header, twist=message), STAMPED))
 
 
-def odometry(payload: bytes) -> Pose:
+def decoded(payload: bytes, kind: str) -> Any:
+    """Return the message of this type in CDR. Raises ValueError."""
+    try:
+        return _types.deserialize_cdr(payload, kind)
+    except Exception as error:  # noqa: BLE001  # the library raises all kinds of errors for malformed bytes
+        raise ValueError(f"not a {kind}: {error}") from None
+
+
+def odometry(message: Any) -> Pose:
     """Return the pose in a nav_msgs/Odometry: m, m, and rad in (-pi, pi].
 
-    Raises ValueError if `payload` is not such a message, a value is not finite, or the orientation is none of
-    an upright robot. The norm of the quaternion may differ from 1 by NORM.
+    Raises ValueError if a value is not finite, or the orientation is none of an upright robot. The norm of
+    the quaternion may differ from 1 by NORM.
     """
-    return _pose(_message(payload, ODOMETRY))
-
-
-def _pose(message: Any) -> Pose:
-    """Return the pose in a decoded nav_msgs/Odometry. Raises ValueError as `odometry`."""
     at, q = message.pose.pose.position, message.pose.pose.orientation
     if not all(map(math.isfinite, (at.x, at.y, q.x, q.y, q.z, q.w))):
         raise ValueError("a pose that is not finite")
@@ -87,19 +90,12 @@ def _pose(message: Any) -> Pose:
     return Pose(float(at.x), float(at.y), math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
 
 
-def ranged(payload: bytes, reach: float) -> float | None:
+def ranged(message: Any, reach: float) -> float | None:
     """Return the range in a sensor_msgs/Range, in m; None beyond `reach` m or max_range, and for +inf.
 
-    A min_range or max_range of 0 is no limit.
-
-    Raises TooClose for -inf or a range below min_range, and ValueError if `payload` is not such a message, or
-    the range or a limit is invalid.
+    A min_range or max_range of 0 is no limit. Raises TooClose for -inf or a range below min_range, and
+    ValueError if the range or a limit is invalid.
     """
-    return _range(_message(payload, RANGE), reach)
-
-
-def _range(message: Any, reach: float) -> float | None:
-    """Return the range in a decoded sensor_msgs/Range. Raises as `ranged`."""
     rho, least, most = float(message.range), float(message.min_range), float(message.max_range)
     if math.isnan(rho):
         raise ValueError("a range that is not a number")
@@ -266,8 +262,8 @@ class Ros2:
 
     def _on_odometry(self, payload: bytes) -> None:
         try:
-            message = _message(payload, ODOMETRY)
-            pose, frames = _pose(message), (message.header.frame_id, message.child_frame_id)
+            message = decoded(payload, ODOMETRY)
+            pose, frames = odometry(message), (message.header.frame_id, message.child_frame_id)
             if self._frames not in (None, frames):
                 raise ValueError(f"frames {frames}, expected {self._frames}: is there another publisher?")
         except ValueError as error:
@@ -286,8 +282,8 @@ class Ros2:
         def take(sample: zenoh.Sample) -> None:
             unsuitable = None
             try:
-                message = _message(sample.payload.to_bytes(), RANGE)
-                rho = _range(message, reach)
+                message = decoded(sample.payload.to_bytes(), RANGE)
+                rho = ranged(message, reach)
                 if 0.0 < message.max_range < reach * (1.0 - SINGLE):
                     unsuitable = f"{topic}: max_range is {message.max_range:.6g} m, less than the mission's "
                     unsuitable += f"sensing_range of {reach:g} m: reduce that"
@@ -339,10 +335,3 @@ class Ros2:
 
 def _measured(rho: float | None) -> float | None:
     return None if rho == TOO_CLOSE else rho
-
-
-def _message(payload: bytes, kind: str) -> Any:
-    try:
-        return _types.deserialize_cdr(payload, kind)
-    except Exception as error:  # noqa: BLE001  # the library raises all kinds of errors for malformed bytes
-        raise ValueError(f"not a {kind}: {error}") from None
