@@ -188,8 +188,8 @@ def prepared_steps(
     for robot in part.robots:
         if not len(robot.odometry.t0):
             raise BadRecording(f"{recording.source}: {robot.id} has no odometry")
-        for jump in robot.jumps:
-            raise BadRecording(jump.why)
+        if robot.jumps:
+            raise BadRecording(robot.jumps[0].why)
     arrivals = np.sort(np.concatenate([part.ranges.t, *[one.odometry.t1 for one in part.robots]]))
     prepared = tuple([sound(recording.robot(name).odometry, assumed.odometry) for name in robots])
     part = part._replace(

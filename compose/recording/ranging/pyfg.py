@@ -149,12 +149,12 @@ def _take_edge(
         if value < 0.0 and name in ("cov_xx", "cov_yy", "cov_hh"):
             raise BadRecording(f"{place}: {name}: the variance {value:g} is negative")
     xx, xy, xh, yy, yh, hh = stated
-    if not _possible(xx, xy, xh, yy, yh, hh):
+    if not _is_covariance(xx, xy, xh, yy, yh, hh):
         raise BadRecording(f"{place}: no errors have this covariance: it has a negative eigenvalue")
     graph.edges.setdefault(robot, []).append(Edge(base, row, (xx, xy, xh, yy, yh, hh), place))
 
 
-def _possible(xx: float, xy: float, xh: float, yy: float, yh: float, hh: float) -> bool:
+def _is_covariance(xx: float, xy: float, xh: float, yy: float, yh: float, hh: float) -> bool:
     """Return whether a matrix with these elements, and variances from 0 on, has no negative eigenvalue."""
     if not xy and not xh and not yh:
         return True

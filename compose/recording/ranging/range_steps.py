@@ -107,13 +107,11 @@ def steps_of(
     among = np.isin(recording.ranges.first, list(own)) & np.isin(recording.ranges.second, list(own))
     ranges = recording.ranges.rows(among)
     inside = (ranges.t >= t[0]) & (ranges.t <= t[-1])
-    gap = np.diff(skipped_s) > 0.0
     covered = ranges.rows(inside)
-    known = ~gap[np.clip(np.searchsorted(t, covered.t, side="right") - 1, 0, len(t) - 2)]
-    in_gaps = int(np.count_nonzero(~known))
-    covered = covered.rows(known)
-    kept = covered.rows(spaced(covered, options.range_spacing_s))
-    step = np.clip(np.searchsorted(t, kept.t, side="right") - 1, 0, len(t) - 2)
+    in_gap = (np.diff(skipped_s) > 0.0)[_step_at(covered.t, t)]
+    known = covered.rows(~in_gap)
+    kept = known.rows(spaced(known, options.range_spacing_s))
+    step = _step_at(kept.t, t)
     poses = [dead_reckoned(path, t) for path in paths]
     offsets = [relative(at[step], dead_reckoned(path, kept.t)) for path, at in zip(paths, poses, strict=True)]
     return RangeSteps(
@@ -128,10 +126,15 @@ def steps_of(
         locked((kept.t - t[step]) / (t[step + 1] - t[step])),
         locked(np.stack(offsets)),
         int(np.count_nonzero(~inside)),
-        len(covered.t) - len(kept.t),
-        in_gaps,
+        len(known.t) - len(kept.t),
+        int(np.count_nonzero(in_gap)),
         locked(skipped_s),
     )
+
+
+def _step_at(times: Numbers, t: Numbers) -> Places:
+    """Return the step of each time, where `t` are the ends of the steps."""
+    return np.clip(np.searchsorted(t, times, side="right") - 1, 0, len(t) - 2)
 
 
 def _common_times(
@@ -154,8 +157,7 @@ def _common_times(
     number = np.concatenate([np.arange(*part) for part in _numbers(paths, first, steps, period_s)])
     times: Numbers = first + period_s * number
     times[-1] = min(times[-1], last)
-    left_out: Numbers = period_s * (number - np.arange(len(number)))
-    return times, left_out
+    return times, np.asarray(period_s * (number - np.arange(len(number))), np.float64)
 
 
 LONG_GAP_S = 10.0
