@@ -154,7 +154,7 @@ def _common_times(
     number = np.concatenate([np.arange(*part) for part in _numbers(paths, first, steps, period_s)])
     times: Numbers = first + period_s * number
     times[-1] = min(times[-1], last)
-    left_out: Numbers = period_s * (number - np.arange(len(number)))
+    left_out: Numbers = np.multiply(period_s, number - np.arange(len(number)), dtype=np.float64)
     return times, left_out
 
 
