@@ -157,7 +157,8 @@ def _common_times(
     number = np.concatenate([np.arange(*part) for part in _numbers(paths, first, steps, period_s)])
     times: Numbers = first + period_s * number
     times[-1] = min(times[-1], last)
-    return times, np.asarray(period_s * (number - np.arange(len(number))), np.float64)
+    left_out: Numbers = np.multiply(period_s, number - np.arange(len(number)), dtype=np.float64)
+    return times, left_out
 
 
 LONG_GAP_S = 10.0
