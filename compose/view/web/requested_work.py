@@ -19,13 +19,11 @@ import msgspec
 
 from compose.errors import UserError
 from compose.launch import class_loader, model_loader
-from compose.launch.child import ChildProcess
+from compose.launch.child import LOOK_S, ChildProcess
 from compose.launch.forked import ForkServer
 from protocol.output import one_line
 from world.world_models import OWN
 
-LOOK_S = 0.1
-"""The interval in s at which a waiting request looks whether the server has been stopped."""
 LENGTH_BYTES = 4
 """The number of bytes of the length before a request."""
 MOST_BYTES = 4 << 30
@@ -116,19 +114,17 @@ class RequestedWork:
             )
 
     def _received(self, child: ChildProcess, within: float, late: str) -> bytes:
-        """Return all that `child` writes."""
+        """Return all that `child` writes. `stop` ends it by killing it."""
         give_up, answer = time.monotonic() + within, b""
-        while True:
-            self._check()
-            left = give_up - time.monotonic()
-            if left <= 0.0:
-                raise UserError(late)
+        while (left := give_up - time.monotonic()) > 0.0:
             with suppress(TimeoutError):
-                if not (part := child.receive(min(left, LOOK_S))):
+                if not (part := child.receive(left)):
                     child.wait(LOOK_S)
                     self._check()
                     return answer
                 answer += part
+        self._check()
+        raise UserError(late)
 
     def _check(self) -> None:
         if self.over:
