@@ -232,8 +232,8 @@ def _holds_a_frame(rest: bytes) -> bool:
     return False
 
 
-def _end(data: bytes, begin: int) -> int | None:
-    """Return where the frame that begins there ends in `data`; None if it is incomplete.
+def _frame(data: bytes, begin: int) -> slice | None:
+    """Return the part of `data` that is the frame whose head begins there; None if it is incomplete.
 
     Only heads of byte strings are read: decoding any msgpack would take memory for whatever it may contain.
     Raises ValueError if no frame begins there.
@@ -247,7 +247,7 @@ def _end(data: bytes, begin: int) -> int | None:
     size = int.from_bytes(data[begin + 1 : body])
     if body <= len(data) and size > MAX_FRAME_BYTES:
         raise ValueError("a frame of impossible length")
-    return body + size if body + size <= len(data) else None
+    return slice(body, body + size) if body + size <= len(data) else None
 
 
 class Tail:
@@ -277,10 +277,9 @@ class Tail:
         frames: list[bytes] = []
         whole = 0
         try:
-            while (end := _end(data, whole)) is not None:
-                begin = whole + 1 + _HEADS[data[whole]]
-                frames.append(data[begin:end])
-                whole = end
+            while (frame := _frame(data, whole)) is not None:
+                frames.append(data[frame])
+                whole = frame.stop
         except ValueError as error:
             raise CorruptJournal(f"{self.path}: damaged at byte {self.whole + whole}: {error}") from None
         self.torn = data[whole:]
