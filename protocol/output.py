@@ -12,7 +12,7 @@ from typing import NoReturn, TextIO
 UNLIMITED = 1000
 """The width in columns of an output that is not a terminal."""
 JOINED = "\0"
-"""A character that no printed line contains; it stands for a space at which a line is not broken."""
+"""A character that no printed line contains, in place of a space at which a line must not be broken."""
 
 
 def say(*lines: str, error: bool = False) -> None:

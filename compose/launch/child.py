@@ -16,7 +16,7 @@ KILL_S = 5.0
 SEND_S = 60.0
 """Time in s that a process has to read what is sent to it; then it is considered hung, and is killed."""
 LOOK_S = 0.1
-"""Time in s between two looks whether a process has ended whose output is awaited."""
+"""Interval in s at which a wait for the output of a process checks whether it has ended."""
 READ_BYTES = 1 << 16
 """The largest number of bytes in one read from a process."""
 ERROR_BYTES = 1 << 20

@@ -65,8 +65,8 @@ def concluded(
 ) -> Iterator[int]:
     """Write `summary.json` and `ticks.csv` if `--out` is given, and yield the exit status of the outcome.
 
-    The outcome is printed after the block, in which further files are written, because the reader of the
-    output may leave at the first line; and also if something cannot be written. If the options have a list of
+    The outcome is printed after the block, even if something cannot be written: the block writes further
+    files, and the reader of the output may leave at the first line. If the options have a list of
     `results`, the content of `summary.json` is appended to it instead.
 
     `began` is the value of time.perf_counter at the start, in s. Raises UserError if the files cannot be

@@ -19,7 +19,7 @@ BEGIN, END = "\x1b[?2026h", "\x1b[?2026l"
 
 
 class Frames:
-    """A stream each of whose writes a terminal shows at once; one without that mode ignores the marks."""
+    """A stream of which a terminal shows each write at once; terminals without that mode ignore the marks."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream

@@ -141,9 +141,9 @@ class EstimateSummary(msgspec.Struct, frozen=True):
 def true_pose(robot: RecordedRobot, t: float) -> Numbers | None:
     """Return the true pose at `t` s, shape (3,); None without truth around that time.
 
-    Between two true poses at most TRUTH_GAP_S apart, the robot moves with constant speed on one arc. So it
-    does before the first pose and after the last, for as long as to the next one. Farther from others, a true
-    pose holds for TRUTH_END_S.
+    Between two true poses at most TRUTH_GAP_S apart, the robot moves with constant speed on one arc. The
+    first and the last arc go on for as long as they last. A true pose farther from others holds for
+    TRUTH_END_S.
     """
     truth = robot.truth
     if truth is None or not len(truth.t):

@@ -42,7 +42,7 @@ tell. With less, claims are too confident.
 SILENCE_S = 1.0
 """The time in s without a range and without the end of an increment after which there are no estimates.
 
-Their number is then bounded by that of the measurements, not by the time between them.
+So the measurements bound the number of estimates, not the time between them.
 """
 
 MOST_TICKS = 50

@@ -170,9 +170,10 @@ class RangeRecording(NamedTuple):
 
 
 LONGEST_GAP_S = 3600.0
-"""The longest time in s without odometry across which an estimate goes on.
+"""The longest time in s without odometry that an estimate bridges.
 
-After an hour, nothing is known of where a robot is. Mostly a clock was set: stamps jump by years then.
+After an hour, nothing is known of where a robot is. The usual cause is a clock that was set: stamps then jump
+by years.
 """
 
 SAME_TIME_S = 1e-6
