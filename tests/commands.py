@@ -132,6 +132,8 @@ class TandemProcess:
             stderr=self._err if errors is None else errors,
             start_new_session=True,
             cwd=cwd,
+            # Of Python, without the width that pytest's import of readline adds to that of the C library.
+            env={name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")},
         )
         self.pid = self._process.pid
 
