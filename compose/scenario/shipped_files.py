@@ -14,7 +14,7 @@ from protocol.spelling import did_you_mean
 def shipped(package: str = "scenario") -> dict[str, Path]:
     """Return the shipped scenario files by name; for the package `sweep`, the shipped sweep files."""
     path = Path(str(resources.files("compose") / package / "shipped"))
-    return {file.stem: file for file in sorted(path.glob("*.toml"))}
+    return {file.stem: file for file in sorted(path.glob("*.toml"), key=lambda file: file.stem)}
 
 
 SHIPPED = {"scenario": ("scenario", "run"), "sweep": ("sweep", "sweep")}
