@@ -29,6 +29,7 @@ PAPER_TICKS = {"paper-1": 48, "paper-2": 110}
 COLUMNS = ["tick", "robot", "x", "y", "heading", "v", "omega", "anchor_range", "mutual_range"]
 FLOATS = ["x", "y", "heading", "v", "omega", "anchor_range", "mutual_range"]
 EXACT_WHEELS = dict.fromkeys(("v", "omega", "v_floor", "omega_floor"), 0.0)
+SAMPLE = Path(__file__).parent / "data" / "uwb" / "tiers-a-b-30-s.pyfg"
 RECORD = ["agent-a.journal", "agent-b.journal", "summary.json", "ticks.csv", "world.journal"]
 
 
@@ -435,13 +436,19 @@ def test_no_table_is_broken_by_a_terminal_of_80_columns(tmp_path: Path) -> None:
         ("run", "noisy", "--in-process"),
         ("audit", out),
         ("scenarios",),
+        ("--help",),
+        ("estimate", SAMPLE, "--noise", "uwb-calibrated"),
+        ("calibrate", SAMPLE, "--out", tmp_path / "radios.toml"),
     ):
         status, text = on_a_terminal(*words)
         assert status == 0, text
+        text = text.rpartition("\x1b[?2026l")[2]  # what is left when a display is gone
         assert max(map(len, text.splitlines())) <= 80, text
         shown[words[0]] = text
     for robot in LONG_IDS:
         assert sum(line.count(robot) for line in shown["audit"].splitlines()) <= 2
+    for row in (r" A +LC0 +18\.5 +3\.67 1\.53 -1\.49 ", r" B +LC1 +18\.5 +2\.88 0\.27 \+2\.52 "):
+        assert re.search(rf"^{row} +[\d.]+ +[\d.]+ +[\d.]+\r?$", shown["estimate"], re.MULTILINE)
     (row,) = [line for line in shown["scenarios"].splitlines() if line.startswith("paper-2")]
     assert "The paper's second simulation" in row
 

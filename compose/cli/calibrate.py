@@ -74,7 +74,7 @@ def main(options: argparse.Namespace) -> int:
 
 def _lines(found: RangeCalibration) -> list[str]:
     """Return the table of the errors of each pair of radios."""
-    from compose.terminal.tables import lines, table  # noqa: PLC0415  # it takes time
+    from compose.terminal.tables import shown  # noqa: PLC0415  # it takes time
 
     rows = [
         (
@@ -91,4 +91,4 @@ def _lines(found: RangeCalibration) -> list[str]:
     ]
     right = ("ranges", "bias m", "+-", "own scale %", "sigma m", "slow m", "outliers %")
     common = f"common scale {100.0 * found.scale:+.2f} % +- {100.0 * found.scale_sigma:.2f} %"
-    return [*lines(table(("radios",), right, rows)), f"{common}; against {found.source}"]
+    return [*shown(("radios",), right, rows), f"{common}; against {found.source}"]

@@ -181,11 +181,11 @@ def _drawn(out: Path, problem: EstimationProblem, estimate: RecordingEstimate) -
 
 def _lines(problem: EstimationProblem, summary: EstimateSummary) -> list[str]:
     """Return the table of the estimates, what limits them, and last which claims do not hold at the end."""
-    from compose.terminal.tables import lines, table  # noqa: PLC0415  # it takes time
+    from compose.terminal.tables import shown  # noqa: PLC0415  # it takes time
 
     rows = [_row(name, one, summary.begin_s) for name, one in summary.robots.items()]
-    right = ("first claim s", "x", "y", "heading", "sigma m", "error m", "NEES")
-    found = lines(table(("robot", "anchors"), right, rows))
+    right = ("first claim s", "x, y, heading", "sigma m", "error m", "NEES")
+    found = shown(("robot", "anchors"), right, rows)
     every = {1: next(iter(summary.robots)), 2: "both"}.get(len(summary.robots), "all")
     found.append(
         f"noise: {summary.noise}; last pose in m and rad; time from the first odometry of {every} on"
@@ -223,16 +223,14 @@ def _row(name: str, one: RobotEstimate, begin_s: float) -> list[str]:
 
     first, last = one.first_claim, one.final
     if last is None:
-        return [name, listed(one.anchors), *["-"] * 7]
+        return [name, listed(one.anchors), *["-"] * 5]
     x, y, heading = last.pose
     sigma = (last.covariance[0][0] + last.covariance[1][1]) ** 0.5
     return [
         name,
         listed(one.anchors),
         "-" if first is None else f"{first.t_s - begin_s:.1f}",
-        f"{x:.2f}",
-        f"{y:.2f}",
-        f"{heading:.2f}",
+        f"{x:.2f} {y:.2f} {heading:+.2f}",
         f"{sigma:.2f}",
         "-" if last.position_error_m is None else f"{last.position_error_m:.2f}",
         "-" if last.nees is None else f"{last.nees:.1f}",

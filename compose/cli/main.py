@@ -18,6 +18,7 @@ from typing import NamedTuple, NoReturn
 
 from compose.errors import BROKEN_PIPE, BUG, FAILED, STOPPED, USER_ERROR, UserError
 from compose.launch.interruption import INTERRUPTION
+from compose.terminal import text_width
 from protocol import limits
 from protocol.files import error_text
 from protocol.output import discard, leave, one_line, say
@@ -211,5 +212,8 @@ def _command_list() -> str:
     lines: list[str] = []
     for group in dict.fromkeys(command.group for command in COMMANDS):
         members = [command for command in COMMANDS if command.group == group]
-        lines += [f"{group}:", *[f"  {one.name:{width}}  {one.summary}" for one in members], ""]
+        lines.append(f"{group}:")
+        for one in members:
+            lines += text_width.wrapped(f"  {one.name:{width}}  {one.summary}", width + 4)
+        lines.append("")
     return "\n".join(lines).rstrip()

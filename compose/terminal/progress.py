@@ -55,15 +55,8 @@ def result(summary: Mapping[str, Any], rate: float | None = None) -> None:
         cells = {name: _cells(robot, columns) for name, robot in robots.items()}
         rows = [(name, *of_robot.values()) for name, of_robot in cells.items()]
         made = tables.table(["robot"], columns, rows)
-        lines = tables.lines(made)
-        if tables.fits(lines):
-            break
-        if len(robots) <= LISTED:
-            lines = [
-                line
-                for name, of_robot in cells.items()
-                for line in (name, *(f"  {heading}: {cell}" for heading, cell in of_robot.items()))
-            ]
+        if len(robots) <= LISTED or tables.fits(tables.lines(made)):
+            lines = tables.shown(["robot"], columns, rows)
             break
     else:
         lines = tables.lines(made, text_width.room())

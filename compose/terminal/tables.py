@@ -11,7 +11,7 @@ from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table
 
-from compose.terminal.text_width import room
+from compose.terminal.text_width import room, wrapped
 from protocol.output import UNLIMITED
 
 BEGIN, END = "\x1b[?2026h", "\x1b[?2026l"
@@ -52,6 +52,26 @@ def table(left: Sequence[str], right: Sequence[str], rows: Iterable[Sequence[str
     for row in rows:
         made.add_row(*row)
     return made
+
+
+def shown(left: Sequence[str], right: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a table; if it does not fit the terminal, those of a list with an entry per row."""
+    as_table = lines(table(left, right, rows))
+    if fits(as_table):
+        return as_table
+    headings = [*left, *right][1:]
+    return [
+        line
+        for name, *cells in rows
+        for line in (
+            *wrapped(name),
+            *[
+                part
+                for pair in zip(headings, cells, strict=True)
+                for part in wrapped(f"  {': '.join(pair)}", 4)
+            ],
+        )
+    ]
 
 
 def fits(lines: Iterable[str]) -> bool:
