@@ -55,9 +55,8 @@ def table(left: Sequence[str], right: Sequence[str], rows: Iterable[Sequence[str
 
 
 def shown(left: Sequence[str], right: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return the lines of a table; if it does not fit the terminal, those of a list with an entry per row."""
-    as_table = lines(table(left, right, rows))
-    if fits(as_table):
+    """Return the lines of a table; if the terminal breaks a word of it, a list with an entry per row."""
+    if as_table := unbroken(left, right, rows):
         return as_table
     headings = [*left, *right][1:]
     return [
@@ -72,6 +71,14 @@ def shown(left: Sequence[str], right: Sequence[str], rows: Sequence[Sequence[str
             ],
         )
     ]
+
+
+def unbroken(left: Sequence[str], right: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a table as wide as the terminal; none if a word would be broken."""
+    found = lines(table(left, right, rows), room())
+    whole = {word for line in found for word in line.split()}
+    words = {word for cells in (left, right, *rows) for cell in cells for word in cell.split()}
+    return found if words <= whole else []
 
 
 def fits(lines: Iterable[str]) -> bool:
