@@ -488,9 +488,8 @@ def test_the_printed_command_of_a_trial_runs_it_again(folder: Path) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("columns", [80, 40])
 def test_a_narrow_terminal_shows_all_outcomes_and_breaks_no_word_and_no_command(
-    columns: int, folder: Path, monkeypatch: pytest.MonkeyPatch
+    columns: int, folder: Path
 ) -> None:
-    monkeypatch.delenv("COLUMNS", raising=False)
     axes = '[[axis]]\nfield = "max_ticks"\nvalues = [9, 500]\n[[axis]]\nfield = "planner.name"\n'
     (folder / "narrow.toml").write_text(
         f'name = "narrow"\nscenario = "random"\ntrials = 2\n{axes}values = ["assured"]\n'
@@ -506,7 +505,9 @@ def test_a_narrow_terminal_shows_all_outcomes_and_breaks_no_word_and_no_command(
     assert [line for line in result if line != command and len(line) > columns] == []
     text = " ".join(" ".join(result).split())
     counts = "2 trials, 0 localised, 2 undecided, 0 inconsistent, 0 wrong, 0 failed"
-    assert f"cell 0, max_ticks 9, name assured: {counts}" in text
+    assert f"cell 0, max_ticks 9, name assured: {counts}; rate 0.0000 (0.0000 to 0.6576) cell 1" in text
+    assert "2 localised, 0 undecided, 0 inconsistent, 0 wrong, 0 failed; rate 1.0000 (0.3424 to" in text
+    assert "\n\n\n" not in "\n".join(result)
     assert "(max_ticks: a, b not localised by then); to run it again:" in text
 
 

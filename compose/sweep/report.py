@@ -21,7 +21,7 @@ from compose.sweep.statistics import CellSummary, noted, refusals
 from compose.terminal import tables, text_width
 from compose.terminal.invocation import program
 from compose.terminal.text_width import tell
-from protocol.output import say
+from protocol.output import one_line, say
 
 RATE_OVER_S = 10.0
 """The time in s over which the rate of trials is averaged."""
@@ -124,11 +124,13 @@ def show(results: Results, out: Path, *, quiet: bool) -> None:
     shown = len(_shown(results))
     if shown:
         lines, columns = _lines(results)
-        say("", *lines, "", *text_width.notes(NOTES, columns))
+        say("", *lines)
+        _block(text_width.notes(NOTES, columns))
     if shown < len(results.cells):
         tell(f"{len(results.cells) - shown} cells without a problem are not listed; see {out / SUMMARY}")
-    say(*_difference_lines(results))
-    tell(*_refused(results))
+    _block(_difference_lines(results))
+    _block([line for reason in _refused(results) for line in text_width.wrapped(one_line(reason))])
+    say("")
     note = noted(results.table)
     if note is not None:
         why = f" ({note.why})" if note.why else ""
@@ -151,8 +153,10 @@ def _difference_lines(results: Results) -> list[str]:
     rows = [_difference_row(one) for one in results.differences if one.axis in planners]
     found = []
     if rows:
-        made = tables.table(["difference", "cells"], OF_DIFFERENCES, rows[:MOST_DIFFERENCES])
-        found += ["", *tables.lines(made, text_width.room()), ""]
+        shown = rows[:MOST_DIFFERENCES]
+        as_table = tables.unbroken(["difference", "cells"], OF_DIFFERENCES, shown)
+        found += as_table or [line for row in shown for line in _difference_sentence(*row)]
+        found += [""]
         found += text_width.wrapped(
             "both: trials that localised in both cells, of all with the same draws; ticks: mean difference "
             "of these; rate: difference of the shares of all that localised; low, high: 95 % intervals"
@@ -176,6 +180,23 @@ def _difference_row(one: PairedDifference) -> list[str]:
         *["-" if value is None else f"{value:+.1f}" for value in ticks],
         *["-" if value is None else f"{100.0 * value:+.1f}" for value in rates],
     ]
+
+
+def _difference_sentence(
+    difference: str, cells: str, both: str, ticks: str, low: str, high: str, rate: str, *bounds: str
+) -> list[str]:
+    """Return the lines of a row for a terminal on which the table does not fit."""
+    return text_width.wrapped(
+        f"{difference}, cells {cells}: both {both}; ticks {ticks} ({low} to {high}); "
+        f"rate {rate} % ({' to '.join(bounds)})",
+        2,
+    )
+
+
+def _block(lines: Sequence[str]) -> None:
+    """Print `lines`, if there are any, after an empty line."""
+    if lines:
+        say("", *lines)
 
 
 def _refused(results: Results) -> Iterator[str]:
@@ -219,13 +240,19 @@ def _lines(results: Results) -> tuple[list[str], Sequence[str]]:
     found: list[str] = []
     names = [axis.name.rpartition(".")[2] for axis in results.sweep.axes]
     for cell in _shown(results):
-        texts = _figures(results.figures[cell.index])
+        figures = results.figures[cell.index]
+        texts = _figures(figures)
         place = [
             f"{name} {label}" for name, label in zip(["cell", *names], _axes(results, cell), strict=True)
         ]
         counts = [f"{texts[one]} {one}" for one in ("trials", *OUTCOMES)]
-        found += text_width.wrapped(f"{', '.join(place)}: {', '.join(counts)}", 2)
-    return found, choices[-1]
+        sentence = f"{', '.join(place)}: {', '.join(counts)}"
+        if figures.rate is not None:
+            sentence += f"; rate {texts['rate']} ({texts['rate_low']} to {texts['rate_high']})"
+        if figures.ticks_p50 is not None:
+            sentence += f"; ticks p50 {texts['p50']}, p95 {texts['p95']}, max {texts['max']}"
+        found += text_width.wrapped(sentence, 2)
+    return found, ("rate_low", "p50")
 
 
 def _shown(results: Results) -> list[Cell]:

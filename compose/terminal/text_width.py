@@ -21,7 +21,8 @@ def room() -> int:
 def notes(wanted: Iterable[tuple[str, str]], columns: Iterable[str]) -> list[str]:
     """Return the lines of the footnotes of `columns`; `wanted` holds pairs of a column and its footnote."""
     shown = {*columns}
-    return wrapped("; ".join([note for column, note in wanted if column in shown]))
+    found = [note for column, note in wanted if column in shown]
+    return wrapped("; ".join(found)) if found else []
 
 
 def wrapped(text: str, indent: int = 0) -> list[str]:
