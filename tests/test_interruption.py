@@ -21,13 +21,14 @@ import runpy, signal, sys
 
 class Finder:
     def find_spec(self, name, *_):
-        if name == "MODULE":
+        imports = sys._getframe(2).f_code.co_name == "_find_and_load_unlocked"
+        if name == "MODULE" and imports:
             signal.raise_signal(signal.SIGNAL)
 
 sys.meta_path.insert(0, Finder())
 runpy.run_module("tandem", run_name="__main__", alter_sys=True)
 """
-"""The program `tandem`, which receives a signal just before it imports MODULE."""
+"""The program `tandem`, which receives a signal just before it imports MODULE, not where it looks for it."""
 AT_EXIT = """
 import atexit, runpy, signal
 
