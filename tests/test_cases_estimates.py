@@ -101,6 +101,31 @@ def test_the_api_suspects_each_unit_of_one_robot_and_of_two(
     assert all(one.first_claim is None for one in found.summary.robots.values())
 
 
+@pytest.mark.parametrize(
+    ("ranges", "dx", "turn", "says"),
+    [
+        (1e3, 1.0, 1.0, "s: ranges are about 1 000 times what odometry and anchors allow: are they in mm?"),
+        (1.0, 1e3, 1.0, "s: odometry is about 1 000 times what ranges and anchors allow: is it in mm?"),
+        (
+            1.0,
+            1.0,
+            180.0 / math.pi,
+            "s: the turns of odometry agree with the ranges only as degrees: are they",
+        ),
+    ],
+)
+def test_of_two_robots_the_one_in_another_unit_is_named(
+    ranges: float, dx: float, turn: float, says: str, metres: Path
+) -> None:
+    recording = read_ranges(metres)
+    of_s = (recording.ranges.first == 1) & (recording.ranges.second >= 2)
+    recording = with_ranges(recording, np.where(of_s, ranges, 1.0) * recording.ranges.range)
+    r, s = recording.robots
+    increments = s.odometry.increments * np.array((dx, dx, turn))
+    s = s._replace(odometry=s.odometry._replace(increments=increments))
+    assert says in measurements(recording._replace(robots=(r, s)), None, None, None).doubt
+
+
 def test_two_robots_with_an_anchor_each_are_suspected_too() -> None:
     recording = simulated()
     in_mm = with_ranges(recording, 1e3 * recording.ranges.range)

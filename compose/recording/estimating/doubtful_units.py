@@ -35,6 +35,9 @@ DOUBTFUL = 2.5
 With 2, a window of 10 s of a real recording whose odometry slips was suspected; with more, feet would not be.
 """
 
+LOG_ALIKE = math.log(DOUBTFUL)
+"""The difference of the logarithms of two robots' factors below which they are of one unit."""
+
 DECISIVE = 3.0
 """The factor by which another unit must reduce the residuals.
 
@@ -61,27 +64,69 @@ DEGREES = "the turns of odometry agree with the ranges only as degrees: are they
 @np.errstate(all="ignore")  # where numbers overflow, nothing is suspected
 def doubtful_units(recording: RangeRecording) -> str:
     """Return which data of `recording` seem to be in another unit, and in which; an empty text if none do."""
-    degrees: list[bool] = []
-    by_odometry: list[float] = []
-    by_anchors: list[float] = []
+    robots = {}
     for robot in range(len(recording.robots)):
-        groups = list(_groups(recording, robot))
-        fits = _fits(recording, robot, groups, 1.0)
-        rates = speeds(recording.robots[robot].odometry)[1]
-        if fits and float(np.percentile(rates, NEARLY_ALL)) > SLOW_TURN:
-            converted = _fits(recording, robot, groups, math.pi / 180.0)
-            pairs = list(zip(fits, converted, strict=True))
-            degrees += [one.cost > DECISIVE * other.cost for one, other in pairs]
-        by_odometry += [math.log(one.factor) for one in fits]
-        for one, other in combinations(fits, 2):
-            apart = abs(one.anchor - other.anchor)
-            if one.part == other.part and apart > 0.0:
-                by_anchors.append(math.log(_to_anchors(one, other, apart)))
-    if degrees and 2 * sum(degrees) > len(degrees):
-        return DEGREES
-    to_odometry = _factor(float(np.median(by_odometry))) if by_odometry else 1.0
-    to_anchors = _factor(float(np.median(by_anchors))) if by_anchors else _by_polygon(recording)
-    return _suspicion(to_odometry, to_anchors, bool(by_anchors))
+        if one := _of_robot(recording, robot):
+            robots[recording.robots[robot].id] = one
+    bound = _by_polygon(recording)
+    doubts = {name: doubt for name, one in robots.items() if (doubt := one.doubt(bound))}
+    factors = [one.odometry for one in robots.values()]
+    alike = (
+        len(set(doubts.values())) == 1 or max(factors, default=0.0) - min(factors, default=0.0) < LOG_ALIKE
+    )
+    if len(doubts) == len(robots) and alike:
+        return _Factors.of_all(list(robots.values())).doubt(bound)
+    return "; ".join(f"{name}: {doubt}" for name, doubt in doubts.items())
+
+
+class _Factors(NamedTuple):
+    """What the ranges of robots to anchors tell of the units."""
+
+    degrees: bool
+    """True if the turns of odometry are in degrees."""
+    by_odometry: list[float]
+    """The logarithms of the factors of ranges to odometry."""
+    by_anchors: list[float]
+    """The logarithms of the factors of ranges to positions of anchors."""
+
+    @classmethod
+    def of_all(cls, robots: list[_Factors]) -> _Factors:
+        """Return what `robots` tell together."""
+        return cls(
+            any(one.degrees for one in robots),
+            [factor for one in robots for factor in one.by_odometry],
+            [factor for one in robots for factor in one.by_anchors],
+        )
+
+    @property
+    def odometry(self) -> float:
+        """The median of the logarithms of the factors of ranges to odometry."""
+        return float(np.median(self.by_odometry)) if self.by_odometry else 0.0
+
+    def doubt(self, bound: float) -> str:
+        """Return the suspicion; `bound` is that of `_by_polygon`."""
+        if self.degrees:
+            return DEGREES
+        anchors = _factor(float(np.median(self.by_anchors))) if self.by_anchors else bound
+        return _suspicion(_factor(self.odometry), anchors, bool(self.by_anchors))
+
+
+def _of_robot(recording: RangeRecording, robot: int) -> _Factors | None:
+    """Return what the ranges of one robot tell; None if it has not enough of them."""
+    groups = list(_groups(recording, robot))
+    fits = _fits(recording, robot, groups, 1.0)
+    if not fits:
+        return None
+    degrees = 0
+    if float(np.percentile(speeds(recording.robots[robot].odometry)[1], NEARLY_ALL)) > SLOW_TURN:
+        converted = _fits(recording, robot, groups, math.pi / 180.0)
+        degrees = sum(one.cost > DECISIVE * other.cost for one, other in zip(fits, converted, strict=True))
+    by_anchors = []
+    for one, other in combinations(fits, 2):
+        apart = abs(one.anchor - other.anchor)
+        if one.part == other.part and apart > 0.0:
+            by_anchors.append(math.log(_to_anchors(one, other, apart)))
+    return _Factors(2 * degrees > len(fits), [math.log(one.factor) for one in fits], by_anchors)
 
 
 def _factor(logarithm: float) -> float:
