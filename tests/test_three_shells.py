@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from itertools import permutations
 from pathlib import Path
 from typing import Any
@@ -208,6 +208,28 @@ def test_of_two_processes_that_join_at_once_one_is_the_robot(
             with pytest.raises(Unwelcome, match="'b' is in run 'mine' already: another process is b"):
                 joined(second)
         assert joined(second)
+
+
+def test_an_agent_that_was_not_ready_in_time_is_refused_if_another_is_the_robot(
+    waiting: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(discovery, "REFUSED_S", 0.2)
+    with (
+        session.open_client(at(waiting), unanswered) as first,
+        session.open_client(at(waiting), unanswered) as second,
+    ):
+        slow, fast = [Search("world", at(waiting), BOUND_S, Inbox("agent")) for _ in range(2)]
+        assert join(first, "mine", "b", slow) is not None
+
+        def fast_joins() -> bool:
+            with suppress(Unwelcome):
+                return join(second, "mine", "b", fast) is not None
+            return False
+
+        until(fast_joins, "the reservation has ended")
+        discovery.confirm(second, "mine", "b", fast)
+        with pytest.raises(Unwelcome, match="'b' is in run 'mine' already: another process is b"):
+            discovery.confirm(first, "mine", "b", slow)
 
 
 @pytest.mark.long

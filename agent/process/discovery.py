@@ -143,13 +143,7 @@ def _offers(link: zenoh.Session, worlds: Sequence[str], robot: str, process: byt
     for world in worlds:
         if is_occupied := bool(session.alive(link, keys.robot_alive(world, robot), QUERY_S)):
             occupied = world
-        answer = session.ask(
-            link,
-            keys.config(world, robot),
-            QUERY_S,
-            lambda frame: isinstance(_decoded_config(frame, robot), RobotConfig),
-            process,
-        )
+        answer = _answer(link, world, robot, process)
         if isinstance(answer, str):
             refused = answer
         elif answer is not None and not is_occupied:
@@ -159,6 +153,27 @@ def _offers(link: zenoh.Session, worlds: Sequence[str], robot: str, process: byt
             else:
                 unusable = found
     return _Offers(configs, occupied, refused, unusable)
+
+
+def _answer(link: zenoh.Session, world: str, robot: str, process: bytes) -> bytes | str | None:
+    """Return the answer of `world` to the query of `process` for the RobotConfig of `robot`."""
+    key = keys.config(world, robot)
+    return session.ask(
+        link, key, QUERY_S, lambda frame: isinstance(_decoded_config(frame, robot), RobotConfig), process
+    )
+
+
+def confirm(link: zenoh.Session, run: str, robot: str, search: Search) -> None:
+    """Ask again for the RobotConfig of `robot`, just before its liveliness token appears.
+
+    The world reserves it for a short time only, and this process may have needed longer until it was ready.
+    Raises Unwelcome if another process has it since, for REFUSED_S.
+    """
+    began = time.monotonic()
+    while isinstance(why := _answer(link, run, robot, search.process), str):
+        if time.monotonic() > began + REFUSED_S:
+            raise Unwelcome(why)
+        search.pause()
 
 
 def _decoded_config(answer: bytes, robot: str) -> RobotConfig | str:

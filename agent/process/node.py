@@ -18,7 +18,7 @@ from typing import Any
 import zenoh
 
 from agent.process.agent_journal import FramedReport
-from agent.process.discovery import ASK_AGAIN_S, NoWorld, Search, Unwelcome, join
+from agent.process.discovery import ASK_AGAIN_S, NoWorld, Search, Unwelcome, confirm, join
 from agent.process.link import AgentLink, WorldLinkLost
 from agent.process.out_of_step import OutOfStep
 from agent.process.recovery import OWN_REPORTS_KEPT, REPORTS_KEPT, Memory
@@ -372,6 +372,7 @@ def run_agent(
                     if joined is None:  # a session that has lost its link finds nothing; a new one may
                         continue
                     process = start(*joined)
+                    confirm(link, joined[0], robot, search)
                     process.attach(link)
                     on_joined(*joined)
                 else:
