@@ -44,6 +44,11 @@ class TooNested(msgspec.DecodeError):
         super().__init__(f"it is nested more than {MOST_NESTED} deep")
 
 
+def flaw(error: Exception) -> str:
+    """Return what is wrong with a document of which a field was looked up, by the exception."""
+    return f"the field {error} is missing" if isinstance(error, KeyError) else str(error)
+
+
 def json_value(text: bytes | str, kind: Any = Any) -> Any:
     """Return the value of type `kind` in the JSON `text`. Raises msgspec.DecodeError."""
     try:

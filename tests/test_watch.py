@@ -350,8 +350,17 @@ def test_what_is_no_summary_of_an_estimate_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "estimate.json").write_text('{"robots": 3}')
     ended = tandem("watch", str(tmp_path))
     assert ended.status == USER_ERROR
-    assert "estimate.json is not the summary of an estimate" in ended.err
+    assert ended.err.endswith(
+        "estimate.json is not the summary of an estimate: the field 'source' is missing\n"
+    )
     assert ended.err.count("\n") == 1
+
+
+def test_a_manifest_that_is_nested_too_deeply_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "sweep.json").write_text("[" * 1000)
+    ended = tandem("watch", str(tmp_path))
+    assert ended.status == USER_ERROR
+    assert ended.err.endswith("sweep.json is not a valid sweep manifest: it is nested more than 64 deep\n")
 
 
 @pytest.mark.long

@@ -37,7 +37,8 @@ def contents(folder: Path) -> dict[str, Any]:
     except OSError as error:
         raise UserError(f"{folder} cannot be read: {error.strerror or error}") from None
     except (msgspec.MsgspecError, KeyError, TypeError, ValueError) as error:
-        raise UserError(f"{folder / ESTIMATE} is not the summary of an estimate: {error!r}") from None
+        why = documents.flaw(error)
+        raise UserError(f"{folder / ESTIMATE} is not the summary of an estimate: {why}") from None
 
 
 def figures(folder: Path) -> list[str]:

@@ -58,7 +58,7 @@ def contents(folder: Path) -> dict[str, Any]:
     except OSError as error:
         raise UserError(f"{folder} cannot be read: {error.strerror or error}") from None
     except (msgspec.MsgspecError, KeyError, TypeError, UnicodeDecodeError, csv.Error) as error:
-        raise UserError(f"{folder / SWEEP} is not a valid sweep manifest: {error!r}") from None
+        raise UserError(f"{folder / SWEEP} is not a valid sweep manifest: {documents.flaw(error)}") from None
 
 
 def figures(folder: Path) -> list[str]:
