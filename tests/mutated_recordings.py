@@ -593,9 +593,11 @@ def tried(number: int, seed: int) -> Trial:
         accepted = _accepted(path, follow="--follow" in words)
         end = ended(words)
     problem = ""
+    lines = end.errors.count("\n")
+    most_lines = 2 if "--follow" in words else 1  # a stream may tell a suspicion before it breaks off
     if end.status not in (0, 1, 2):
         problem = f"status {end.status}"
-    elif "Traceback" in end.errors or end.errors.count("\n") > 1 or (end.status == 2 and not end.errors):
+    elif "Traceback" in end.errors or lines > most_lines or (end.status == 2 and not lines):
         problem = "the error is not one line"
     elif end.cpu_s > BOUND_CPU_S or end.mb > BOUND_MB:
         problem = "too large"

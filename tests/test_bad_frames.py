@@ -312,11 +312,12 @@ def test_a_robot_of_a_group_refuses_reports_of_itself_and_of_robots_outside_the_
     with session.open_router(listening(endpoint)) as link:
         session.answer(link, keys.config(RUN, "*"), lambda *_: scenario.config("a"))
         session.subscribe(link, keys.command(RUN, "a"), said, "command")
+        session.watch_liveliness(link, keys.robot_alive(RUN, "*"), said)
         world_says = session.publisher(link, keys.observation(RUN, "a"))
         senders = {robot: session.publisher(link, keys.report(RUN, robot, "a")) for robot in "abz"}
         _token = session.show_alive(link, keys.world_alive(RUN))
         with TandemProcess("agent", "a", "--connect", endpoint) as agent:
-            agent.until_prints("a: in run mine")
+            assert said.next(BOUND_S).topic == "alive"  # it subscribes before
             world_says.put(encode(Observation(0, "a", None, 2.5)))
             assert answer(said, Command).tick == 0
             for robot, publisher in senders.items():
