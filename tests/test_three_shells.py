@@ -219,14 +219,14 @@ def test_an_agent_that_was_not_ready_in_time_is_refused_if_another_is_the_robot(
         session.open_client(at(waiting), unanswered) as second,
     ):
         slow, fast = [Search("world", at(waiting), BOUND_S, Inbox("agent")) for _ in range(2)]
-        assert join(first, "mine", "b", slow) is not None
 
-        def fast_joins() -> bool:
+        def joins(link: zenoh.Session, search: Search) -> bool:
             with suppress(Unwelcome):
-                return join(second, "mine", "b", fast) is not None
+                return join(link, "mine", "b", search) is not None
             return False
 
-        until(fast_joins, "the reservation has ended")
+        until(lambda: joins(first, slow), "the reservation of another test has ended")
+        until(lambda: joins(second, fast), "the reservation has ended")
         discovery.confirm(second, "mine", "b", fast)
         with pytest.raises(Unwelcome, match="'b' is in run 'mine' already: another process is b"):
             discovery.confirm(first, "mine", "b", slow)
