@@ -455,7 +455,7 @@ def test_results_are_left_in_a_folder_named_for_the_sweep(folder: Path) -> None:
     }
     assert min(drawn.values()) > 5_000
     assert {path.name for path in out.iterdir()} == {
-        *("sweep.json", "cells", "figures", "summary.csv", "trials.parquet")
+        *("sweep.json", "cells", "figures", "summary.csv", "differences.csv", "trials.parquet")
     }
     summary = summary_rows(out)
     assert [row["trials"] for row in summary] == ["2"] * 4
@@ -660,7 +660,7 @@ def test_a_figure_distinguishes_the_values_of_the_other_axes_while_they_are_few(
     drawn: dict[str, Figure] = {}
     monkeypatch.setattr(axis_figures, "save", lambda figure, path: drawn.update({path.name: figure}))
     third = '[[axis]]\nfield = "mission.noise.outliers"\nvalues = [0, 0.05]\n'
-    third += '[[axis]]\nfield = "max_ticks"\nvalues = [1, 2, 3, 4]\n'
+    third += '[[axis]]\nfield = "max_ticks"\nvalues = [1, 2, 3, 4]\npaired = false\n'
     (folder / "four.toml").write_text(BOTH + third)
     axis_figures.draw(played(folder, "four.toml", "out", trials=1), folder / "figures")
 

@@ -95,7 +95,7 @@ class Plan(NamedTuple):
     question: Question
 
 
-class Reach(NamedTuple):
+class ReachableEnds(NamedTuple):
     """The S x W manoeuvres that are compared, and their end points in the frame of the mover's anchor."""
 
     v: Array
@@ -110,7 +110,7 @@ class Reach(NamedTuple):
 class Compared(NamedTuple):
     """The value of each manoeuvre in `reach`."""
 
-    reach: Reach
+    reach: ReachableEnds
     gap: Array
     """J in m^2, (S, W). For one candidate: the decrease of the squared range."""
     value: Array
@@ -235,7 +235,7 @@ def most_informative_manoeuvre(
     return Plan(Controls(float(reach.v[row, 0]), float(reach.omega[column])), None, question)
 
 
-def _keeps_apart(question: Question, reach: Reach, mission: Mission) -> NDArray[np.bool]:
+def _keeps_apart(question: Question, reach: ReachableEnds, mission: Mission) -> NDArray[np.bool]:
     """Return which manoeuvres keep the safety distance for every candidate; (S, W)."""
     mover, a, b, candidates = question
     v, omega = np.broadcast_arrays(reach.v, reach.omega)
@@ -264,14 +264,14 @@ def _best(value: Array) -> tuple[int, int]:
     return row, column
 
 
-def reachable(pose: Pose, mission: Mission, speeds: tuple[float, ...] | None) -> Reach:
+def reachable(pose: Pose, mission: Mission, speeds: tuple[float, ...] | None) -> ReachableEnds:
     """Return the manoeuvres that are compared, from `pose`, at `speeds` in A_0 / T_s (None: at v_max)."""
     speed, omega, half, chords = _arcs(mission, speeds)
     course = pose.heading + half
     x, y = chords * np.cos(course), chords * np.sin(course)
     x += pose.x
     y += pose.y
-    return Reach(speed, omega, x, y)
+    return ReachableEnds(speed, omega, x, y)
 
 
 @cache

@@ -1,4 +1,4 @@
-"""How this process was started, so that the commands that Tandem prints can be copied."""
+"""The command with which this process was started, so that the commands that Tandem prints can be copied."""
 
 from __future__ import annotations
 

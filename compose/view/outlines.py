@@ -51,7 +51,7 @@ def _sigmas(covariance: Covariance) -> tuple[float, float]:
 
 
 class Reach(NamedTuple):
-    """Where a robot can be by its contact with a peer."""
+    """The places where a robot can be by its contact with a peer."""
 
     places: Sequence[Point]
     """The possible positions of the peer."""

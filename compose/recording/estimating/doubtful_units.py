@@ -80,7 +80,7 @@ def doubtful_units(recording: RangeRecording) -> str:
 
 
 class _Factors(NamedTuple):
-    """What the ranges of robots to anchors tell of the units."""
+    """The factors between units that the ranges of robots to anchors tell."""
 
     degrees: bool
     """True if the turns of odometry are in degrees."""

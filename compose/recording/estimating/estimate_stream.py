@@ -23,6 +23,7 @@ from compose.recording.estimating.noise_files import ToldNoise
 from compose.recording.estimating.pair_measurements import NoAnchors
 from compose.recording.estimating.prepared_steps import EPOCH_S
 from compose.recording.ranging.range_recording import SAME_TIME_S
+from compose.recording.ranging.range_steps import NoSteps
 from compose.recording.ranging.recording_rows import (
     AnyRow,
     OdometryRow,
@@ -101,8 +102,8 @@ class StreamEstimate:
                 ticks=STREAM_TICKS,
                 doubtful=examined,
             )
-        except NoAnchors:
-            return  # there will be ranges
+        except (NoAnchors, NoSteps):
+            return  # there will be ranges and odometry
         if examined:
             self._examined_after_s = 2.0 * (end - begin)
             if problem.doubt and problem.doubt != self._doubt:

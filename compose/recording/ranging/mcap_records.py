@@ -74,7 +74,7 @@ class Channel(NamedTuple):
     encoding: str
 
 
-class Message(NamedTuple):
+class RawMessage(NamedTuple):
     """The content of a message, and the id of its channel."""
 
     channel: int
@@ -88,7 +88,7 @@ class _Chunk(NamedTuple):
     data: bytes
 
 
-def entries(file: BinaryIO, path: object, size: int | None) -> Iterator[Begin | Channel | Message]:
+def entries(file: BinaryIO, path: object, size: int | None) -> Iterator[Begin | Channel | RawMessage]:
     """Yield the channels and messages in `file`, which has `size` bytes; None for a stream.
 
     Files after each other, as `cat` joins them, are read one by one. Raises BadRecording, which names `path`
@@ -105,7 +105,7 @@ def entries(file: BinaryIO, path: object, size: int | None) -> Iterator[Begin | 
         raise source.wrong("it is empty", EndOfStream)
 
 
-def _of_file(source: _Source) -> Iterator[Channel | Message]:
+def _of_file(source: _Source) -> Iterator[Channel | RawMessage]:
     """Yield the channels and messages up to the end of one file, after its first magic bytes."""
     expanded, crc = 0, source.crc
     while kind := source.next():
@@ -133,7 +133,7 @@ def _of_file(source: _Source) -> Iterator[Channel | Message]:
     raise source.wrong(f"it ends at byte {source.at} without a Footer: it was cut off", EndOfStream)
 
 
-def _of_chunk(data: bytes, source: _Source) -> Iterator[Channel | Message]:
+def _of_chunk(data: bytes, source: _Source) -> Iterator[Channel | RawMessage]:
     inner = _Source(BytesIO(data), f"{source.path}: in {source.place}", len(data))
     while kind := inner.next():
         if kind not in IN_CHUNKS:
@@ -221,10 +221,10 @@ def _channel(content: bytes) -> Channel:
     return Channel(int.from_bytes(content[:2], "little"), topic, encoding)
 
 
-def _message(content: bytes) -> Message:
+def _message(content: bytes) -> RawMessage:
     if len(content) < MESSAGE_HEAD_BYTES:
         raise ValueError(f"it has {len(content)} bytes")
-    return Message(int.from_bytes(content[:2], "little"), content[MESSAGE_HEAD_BYTES:])
+    return RawMessage(int.from_bytes(content[:2], "little"), content[MESSAGE_HEAD_BYTES:])
 
 
 MESSAGE_HEAD_BYTES = 22

@@ -11,7 +11,7 @@ from typing import BinaryIO
 import msgspec
 
 from compose.errors import BadRecording
-from compose.recording.ranging.mcap_records import Channel, EndOfStream, Message, entries
+from compose.recording.ranging.mcap_records import Channel, EndOfStream, RawMessage, entries
 from compose.recording.ranging.range_csv import TABLES
 from compose.recording.ranging.range_recording import RangeRecording
 from compose.recording.ranging.recording_rows import (
@@ -64,7 +64,7 @@ def _rows(
     counts = dict.fromkeys(TOPICS, 0)
     for entry in entries(file, path, size):
         match entry:
-            case Message(channel, data):
+            case RawMessage(channel, data):
                 topic = topics.get(channel)
                 if topic is None:
                     raise BadRecording(

@@ -132,6 +132,10 @@ def steps_of(
     )
 
 
+class NoSteps(BadRecording):
+    """The odometry of the robots has no step in common."""
+
+
 def _step_at(times: Numbers, t: Numbers) -> Places:
     """Return the step of each time, where `t` are the ends of the steps."""
     return np.clip(np.searchsorted(t, times, side="right") - 1, 0, len(t) - 2)
@@ -153,8 +157,10 @@ def _common_times(
     if steps < 1:
         between = f"{first:.15g} s to {last:.15g} s" if last > first else "none"
         what = f"less than a step of {period_s:g} s in which there is odometry of {' and '.join(robots)}"
-        raise BadRecording(f"{recording.source}: there is {what} ({between})")
+        raise NoSteps(f"{recording.source}: there is {what} ({between})")
     number = np.concatenate([np.arange(*part) for part in _numbers(paths, first, steps, period_s)])
+    if len(number) < 2:
+        raise NoSteps(f"{recording.source}: there is no odometry but in a gap of more than {LONG_GAP_S:g} s")
     times: Numbers = first + period_s * number
     times[-1] = min(times[-1], last)
     left_out: Numbers = np.multiply(period_s, number - np.arange(len(number)), dtype=np.float64)

@@ -53,7 +53,7 @@ class _Answer(msgspec.Struct, frozen=True):
 
     result: Any = None
     error: str | None = None
-    """Why there is no result; None if there is one."""
+    """The reason why there is no result; None if there is one."""
 
 
 class RequestedWork:
