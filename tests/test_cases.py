@@ -14,6 +14,7 @@ import tandem
 from compose.errors import LOCALISED, NOT_LOCALISED, USER_ERROR, BadRecording
 from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.range_mcap import rows_as_they_arrive
+from tests.commands import tandem as command
 from tests.mutated_recordings import (
     End,
     Tables,
@@ -123,6 +124,19 @@ def test_the_number_of_estimates_is_bounded_by_that_of_the_measurements(tmp_path
     found = tandem.estimate(written(tmp_path, tables))
     assert len(found.rows["t_s"]) <= 3 * len(tables["odometry"])
     assert all(t % 9.5 in (0.0, 0.5, 1.0) for t in found.rows["t_s"])
+
+
+def test_a_stream_that_begins_with_a_gap_is_estimated_after_it(tmp_path: Path) -> None:
+    tables, gap_s = recording(1, random.Random(1)), 20.0
+    for rows in tables.values():
+        for row in rows:
+            row.update({stamp: row[stamp] + gap_s for stamp in ("t", "t0", "t1") if row.get(stamp)})
+    path = tmp_path / "it.mcap"
+    path.write_bytes(mcap_bytes(tables, random.Random(1), stream=True))
+    found = command("estimate", path, "--follow")
+    assert "Traceback" not in found.err
+    assert found.status in (LOCALISED, NOT_LOCALISED), found.err
+    assert float(found.out.splitlines()[-1].partition(",")[0]) > gap_s
 
 
 def test_numbers_are_read_as_c_and_spreadsheets_write_them(tmp_path: Path) -> None:

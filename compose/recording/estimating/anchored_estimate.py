@@ -9,7 +9,6 @@ from agent.estimation.gaussian.fitted_poses import poses
 from agent.estimation.gaussian.hypotheses import Hypothesis, ScoredHypothesis
 from agent.estimation.gaussian.known_anchors import FEWEST, AnchoredRobot, blocking_reason, follow, search
 from agent.estimation.gaussian.range_model import Ranges
-from compose.errors import UserError
 from compose.recording.estimating.estimate_epoch import (
     GIVEN_UP,
     MOST_SEARCHES,
@@ -18,7 +17,7 @@ from compose.recording.estimating.estimate_epoch import (
     EstimateEpoch,
     of_centres,
 )
-from compose.recording.estimating.pair_measurements import listed
+from compose.recording.estimating.pair_measurements import NoAnchors, listed
 from compose.recording.estimating.prepared_steps import (
     Measurements,
     OneRobot,
@@ -77,7 +76,7 @@ def anchored_measurements(
 ) -> AnchoredMeasurements:
     """Return the measurements of one `robot`, with the noise that is `assumed`.
 
-    `ticks` is the number of them in an epoch; None: by the speed of the robot. Raises UserError unless it has
+    `ticks` is the number of them in an epoch; None: by the speed of the robot. Raises NoAnchors unless it has
     ranges to two anchors at different places.
     """
     prepared = prepared_steps(recording, [robot], assumed, ticks)
@@ -88,7 +87,7 @@ def anchored_measurements(
     anchors = tuple([part.anchors[k] for k in order])
     if len({(one.x, one.y) for one in anchors}) < 2:
         names = listed([one.id for one in anchors]) or "no anchor"
-        raise UserError(
+        raise NoAnchors(
             f"{recording.source}: one robot needs ranges to two anchors at different places: "
             f"{robot} has ranges to {names}"
         )
