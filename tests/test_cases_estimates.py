@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 import tandem as api
 from agent.planning.pair_claim import PairInference, inferred
-from compose.errors import ENDED, NOT_LOCALISED, USER_ERROR
+from compose.errors import ENDED, NOT_LOCALISED, USER_ERROR, UserError
 from compose.recording.estimating import pair_estimate
+from compose.recording.estimating.calibration import calibrated
 from compose.recording.estimating.estimate_epoch import ClaimRule
 from compose.recording.estimating.estimate_rows import true_pose
 from compose.recording.estimating.estimate_run import estimated, measurements
@@ -131,6 +132,21 @@ def test_two_robots_with_an_anchor_each_are_suspected_too() -> None:
     in_mm = with_ranges(recording, 1e3 * recording.ranges.range)
     assert "ranges are about 1 000 times what odometry" in measurements(in_mm, None, None, None).doubt
     assert not measurements(recording, None, None, None).doubt
+
+
+@pytest.mark.parametrize(("factor", "says"), [(1e3, "1 000 times"), (1e-3, "1/1 000 of")])
+def test_ranges_between_two_robots_in_another_unit_than_those_to_anchors_are_named(
+    factor: float, says: str, metres: Path
+) -> None:
+    recording = read_ranges(metres)
+    ranges = recording.ranges
+    mutual = ranges.second < 2
+    changed_ranges = with_ranges(recording, np.where(mutual, factor, 1.0) * ranges.range)
+    doubt = measurements(changed_ranges, None, None, None).doubt
+    assert f"ranges of r and s are about {says}" in doubt
+    assert re.search("are (they|ranges to anchors) in mm", doubt)
+    with pytest.raises(UserError, match=f"ranges of r and s are about {says} what true poses"):
+        calibrated(changed_ranges, None, None)
 
 
 def test_the_suspicion_is_said_while_a_stream_arrives_and_no_estimate_is_printed(tmp_path: Path) -> None:

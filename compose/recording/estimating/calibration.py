@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from compose.errors import UserError
-from compose.recording.estimating.doubtful_units import TINY, doubtful_lengths
+from compose.recording.estimating.doubtful_units import doubtful_lengths
 from compose.recording.estimating.estimate_epoch import ClaimRule
 from compose.recording.estimating.estimate_rows import names_of
 from compose.recording.estimating.estimate_run import estimated, measurements, numerics
@@ -52,10 +50,8 @@ def calibrated(
         errors = {} if by_fit else true_errors(part)
         if not errors:
             return _by_fit(recording, chosen, window)
-        measured = [float(np.median(one.measured)) for one in errors.values()]
-        true = [float(np.median(one.measured - one.error)) for one in errors.values()]
-        doubt = doubtful_lengths(sum(measured) / max(sum(true), TINY), "true poses and anchors")
-        if doubt:
+        lengths = {pair: (one.measured, one.measured - one.error) for pair, one in errors.items()}
+        if doubt := doubtful_lengths(lengths, "true poses and anchors"):
             raise UserError(f"{recording.source}: {doubt}")
         return range_calibration(errors, "the truth")
 

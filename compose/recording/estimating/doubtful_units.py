@@ -8,7 +8,7 @@ between ranges and positions of anchors. Nothing is converted: a user is told wh
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from itertools import combinations
 from typing import NamedTuple
@@ -68,6 +68,9 @@ def doubtful_units(recording: RangeRecording) -> str:
     for robot in range(len(recording.robots)):
         if one := _of_robot(recording, robot):
             robots[recording.robots[robot].id] = one
+    between = _between_robots(recording)
+    if between and not any(one.doubt(1.0) for one in robots.values()):
+        return between
     bound = _by_polygon(recording)
     doubts = {name: doubt for name, one in robots.items() if (doubt := one.doubt(bound))}
     factors = [one.odometry for one in robots.values()]
@@ -134,10 +137,38 @@ def _factor(logarithm: float) -> float:
     return math.exp(min(max(-MOST_LOG, logarithm), MOST_LOG)) if math.isfinite(logarithm) else 1.0
 
 
-def doubtful_lengths(factor: float, others: str) -> str:
-    """Return the suspicion that ranges are `factor` times what `others` allow; an empty text near 1."""
-    factor = max(factor, TINY)
-    return _sentence("ranges", factor, others) if max(factor, 1.0 / factor) > DOUBTFUL else ""
+def doubtful_lengths(lengths: Mapping[tuple[str, str], tuple[Numbers, Numbers]], others: str) -> str:
+    """Return the suspicion that the ranges of some pairs of radios are in another unit than `others`.
+
+    `lengths` has the measured and the true ranges of each pair, in m. An empty text if none are doubtful.
+    """
+    doubts = {pair: factor for pair, both in lengths.items() if (factor := _doubtful_factor(*both))}
+    logarithms = [math.log(factor) for factor in doubts.values()]
+    if len(doubts) == len(lengths) > 0 and max(logarithms) - min(logarithms) < LOG_ALIKE:
+        return _sentence("ranges", math.exp(float(np.median(logarithms))), others)
+    return "; ".join(
+        _sentence(f"ranges of {' and '.join(pair)}", factor, others) for pair, factor in doubts.items()
+    )
+
+
+def _doubtful_factor(measured: Numbers, true: Numbers) -> float:
+    """Return the factor of the ranges of a pair to true ones; 0 unless it explains them better than a bias.
+
+    Where both explain them alike, as those of radios that stand, the difference decides.
+    """
+    length, off = float(np.median(measured)), measured - true
+    factor = max(length, TINY) / max(float(np.median(true)), TINY)
+    if max(factor, 1.0 / factor) <= DOUBTFUL:
+        return 0.0
+    bias = float(np.median(off))
+    by_bias = float(np.median(np.abs(off - bias))) + ROUNDING * length
+    by_factor = float(np.median(np.abs(measured - factor * true))) + ROUNDING * length
+    decided = by_bias > DECISIVE * by_factor
+    return factor if decided or (abs(bias) > MOST_BIAS and by_factor < DECISIVE * by_bias) else 0.0
+
+
+MOST_BIAS = 10.0
+"""The largest bias in m of radios whose ranges are all alike, so that a factor may explain them, too."""
 
 
 def _suspicion(by_odometry: float, by_anchors: float, located: bool) -> str:
@@ -157,11 +188,11 @@ def _suspicion(by_odometry: float, by_anchors: float, located: bool) -> str:
     return ""
 
 
-def _sentence(subject: str, factor: float, others: str) -> str:
+def _sentence(subject: str, factor: float, others: str, near_unit: float = NEAR_UNIT) -> str:
     """Return the sentence that `subject` is `factor` times what `others` allow."""
     ratio = max(factor, 1.0 / factor)
     unit = min(UNITS, key=lambda one: abs(math.log(ratio / one)))
-    near = max(ratio / unit, unit / ratio) < NEAR_UNIT
+    near = max(ratio / unit, unit / ratio) < near_unit
     number = unit if near else float(f"{ratio:.2g}")
     many = f"{round(number, 1 if number < 10.0 else 0):,.15g}".replace(",", " ")
     name = UNITS[unit] if near else "another unit"
@@ -331,19 +362,28 @@ TINY, MOST_LOG = 1e-12, 20.0
 # --- ranges between robots ----------------------------------------------------------------------------------
 
 
-def _by_polygon(recording: RangeRecording) -> float:
-    """Return a bound on the factor of ranges to positions of anchors, from robots that have one anchor each.
+class _Polygon(NamedTuple):
+    """Two robots beside one anchor each: the corners of a polygon.
 
-    Two anchors, and two robots beside them, are the corners of a polygon, and no side is longer than all
-    others together. It is 1 if that is so.
+    No side is longer than all others together.
     """
+
+    pair: tuple[str, str]
+    """The names of the robots."""
+    apart: float
+    """The distance in m of the anchors by their positions."""
+    lengths: Numbers
+    """Ranges between the robots, and at those times of each to its anchor, in m; shape (3, N)."""
+
+
+def _polygons(recording: RangeRecording) -> Iterator[_Polygon]:
+    """Yield a polygon of each pair of robots with that anchor of each that has the most ranges."""
     pairs, ranges = recording.pairs(), recording.ranges
-    anchors = {one.id: complex(one.x, one.y) for one in recording.anchors}
+    anchors = {one.id: np.array((one.x, one.y, one.height)) for one in recording.anchors}
     most = {pair[0]: pair[1] for pair in sorted(pairs, key=lambda one: len(pairs[one])) if pair[1] in anchors}
     for (a, b), rows in pairs.items():
         if a not in most or b not in most:
             continue
-        apart = abs(anchors[most[a]] - anchors[most[b]])
         sides, together = [ranges.range[rows]], np.ones(len(rows), bool)
         for robot in (a, b):
             own = pairs[robot, most[robot]]
@@ -352,15 +392,46 @@ def _by_polygon(recording: RangeRecording) -> float:
             together &= np.abs(ranges.t[nearest] - ranges.t[rows]) <= SAME_PLACE_S
             sides.append(ranges.range[nearest])
         if np.count_nonzero(together) >= FEWEST:
-            lengths = np.stack(sides)[:, together]
-            whole = float(np.median(np.sum(lengths, 0)))
-            excess = float(np.median(2.0 * np.max(lengths, 0) - np.sum(lengths, 0)))
-            if apart > DOUBTFUL * whole > 0.0:
-                return max(TINY, whole / apart)
-            if excess > DOUBTFUL * apart > 0.0:
-                return excess / apart
+            apart = float(np.linalg.norm(anchors[most[a]] - anchors[most[b]]))
+            yield _Polygon((a, b), apart, np.stack(sides)[:, together])
+
+
+def _by_polygon(recording: RangeRecording) -> float:
+    """Return a bound on the factor of ranges to positions of anchors; 1 if all polygons close."""
+    for _, apart, lengths in _polygons(recording):
+        whole = float(np.median(np.sum(lengths, 0)))
+        excess = float(np.median(2.0 * np.max(lengths, 0) - np.sum(lengths, 0)))
+        if apart > DOUBTFUL * whole > 0.0:
+            return max(TINY, whole / apart)
+        if excess > DOUBTFUL * apart > 0.0:
+            return excess / apart
     return 1.0
 
+
+def _between_robots(recording: RangeRecording) -> str:
+    """Return the suspicion that ranges between two robots are in a larger or a smaller unit than all others.
+
+    It takes that the ranges to anchors, and the positions of these, are right.
+    """
+    doubts = []
+    for (a, b), apart, lengths in _polygons(recording):
+        between, first, second = lengths
+        most = first + second + apart
+        least = 2.0 * np.maximum(np.maximum(first, second), apart) - most
+        if np.median(between - DOUBTFUL * most) > 0.0 or np.median(least - DOUBTFUL * between) > LEAST_GAP:
+            usual = np.sqrt(np.square(first) + np.square(second) + apart**2)
+            factor = float(np.median(np.maximum(between, TINY) / np.maximum(usual, TINY)))
+            doubts.append(
+                _sentence(f"ranges of {a} and {b}", factor, "ranges to anchors", NEAR_UNIT_OF_USUAL)
+            )
+    return "; ".join(doubts)
+
+
+NEAR_UNIT_OF_USUAL = 3.0
+"""As NEAR_UNIT, for a factor to the usual distance of two robots, which is about as far from the true one."""
+
+LEAST_GAP = 1.0
+"""The length in m by which ranges between robots must be too short: outliers to anchors are longer."""
 
 SAME_PLACE_S = 1.0
 """The time in s between two ranges in which a robot hardly moves."""
