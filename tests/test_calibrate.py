@@ -59,6 +59,17 @@ def test_without_outliers_there_are_none(sample: RangeRecording) -> None:
     assert all(abs(one.bias) < 0.03 for one in found.pairs.values())
 
 
+@pytest.mark.parametrize("stray", [30.0, 1e3, 1e7, 1e12])
+def test_a_stray_range_changes_neither_bias_nor_scale(stray: float, sample: RangeRecording) -> None:
+    lengths = sample.ranges.range.copy()
+    lengths[sample.pairs()["A", "B"][5]] = stray
+    expected, found = calibrated(sample, None, None), calibrated(with_ranges(sample, lengths), None, None)
+    assert found.scale == pytest.approx(expected.scale, abs=1e-3)
+    for pair, one in expected.pairs.items():
+        assert found.pairs[pair].bias == pytest.approx(one.bias, abs=1e-2)
+        assert found.pairs[pair].sigma == pytest.approx(one.sigma, abs=1e-2)
+
+
 def test_slow_errors_are_told_from_white_ones(sample: RangeRecording) -> None:
     def slow(lengths: Numbers) -> float:
         return calibrated(with_ranges(sample, lengths), None, None).pairs["A", "B"].slow_sigma

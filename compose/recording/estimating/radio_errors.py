@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from compose.recording.estimating.estimate_rows import TRUTH_GAP_S
 from compose.recording.ranging.range_recording import Numbers, Places, RangeRecording, RecordedRobot
@@ -129,7 +130,7 @@ def range_calibration(errors: Mapping[tuple[str, str], PairErrors], source: str)
     measured = np.concatenate([errors[name].measured for name in names])
     error = np.concatenate([errors[name].error for name in names])
     repeated = np.array([_repeated(errors[name].t) for name in names])
-    good = np.ones(len(error), bool)
+    good = np.concatenate([_no_strays(errors[name].error) for name in names])
     variance = np.ones(count)
     for step in range(ROUNDS):
         design = _Design(which, measured, np.where(good, 1.0, 0.0) / (variance * repeated)[which])
@@ -153,6 +154,17 @@ def range_calibration(errors: Mapping[tuple[str, str], PairErrors], source: str)
             1.0 - float(np.count_nonzero(inliers)) / float(np.count_nonzero(own)),
         )
     return RangeCalibration(pairs, float(found[-1]), math.sqrt(covariance[-1, -1]), source)
+
+
+def _no_strays(error: Numbers) -> NDArray[np.bool_]:
+    """Return True for the errors from which the first line is drawn: a stray would turn it to itself."""
+    return np.abs(error - np.median(error)) <= STRAY_SIGMAS * _robust_sigma(error)
+
+
+STRAY_SIGMAS = 20.0
+"""The distance from the median, in sigmas, from which on an error has no part in the first line.
+
+With less, the errors of radios with a scale would be left out; with more, strays would turn the line."""
 
 
 def _repeated(t: Numbers) -> float:
