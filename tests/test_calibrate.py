@@ -138,6 +138,10 @@ def test_the_command_prints_a_table_and_writes_the_profile(tmp_path: Path) -> No
         ((str(SAMPLE), "--robots", "C"), "has no robot C; it has A, B"),
         ((str(SAMPLE), "--out", "radios"), "--out: radios is not the path of a .toml file"),
         ((str(SAMPLE), "--without-truth", "--window", "0..5"), "without true poses, an estimate of A and B"),
+        (
+            (str(CASES / "wrapped-yaw"), "--without-truth", "--window", "0..6"),
+            "8 ranges of a pair of radios are needed, and the estimate uses at most 7: one a second",
+        ),
         ((str(SAMPLE), "--without-truth", "--robots", "A"), "one robot needs ranges to two anchors"),
     ],
 )

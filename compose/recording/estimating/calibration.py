@@ -70,14 +70,18 @@ def _by_fit(
             f"and there is none: {why}"
         )
     fit, used = last.fitted
-    errors, ranges = {}, used.ranges
+    errors, ranges, most = {}, used.ranges, 0
     ranged = [pair for pair, count in zip(problem.measured.pairs, last.ranges, strict=True) if count]
     for pair, rows in zip(ranged, ranges.pairs, strict=True):
         t = problem.measured.time_of(ranges.tick[rows])
+        most = max(most, len(t))
         if len(t) >= FEWEST:
             errors[pair] = PairErrors(t, ranges.rho[rows], fit.residuals[rows])
     if not errors:
-        raise UserError(f"{recording.source}: no pair of radios has {FEWEST} ranges")
+        raise UserError(
+            f"{recording.source}: without true poses, {FEWEST} ranges of a pair of radios are needed, and "
+            f"the estimate uses at most {most}: one a second of each pair, and of many ranges only a part"
+        )
     names = names_of(used, problem.measured.sides)
     found = range_calibration(errors, "the fit")
     learned = learned_errors(fit, names, ["-".join(pair) for pair in ranged])
