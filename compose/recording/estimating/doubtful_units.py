@@ -418,7 +418,7 @@ def _between_robots(recording: RangeRecording) -> str:
         between, first, second = lengths
         most = first + second + apart
         least = 2.0 * np.maximum(np.maximum(first, second), apart) - most
-        if np.median(between - DOUBTFUL * most) > 0.0 or np.median(least - DOUBTFUL * between) > LEAST_GAP:
+        if max(np.median(between - DOUBTFUL * most), np.median(least - DOUBTFUL * between)) > LEAST_GAP:
             usual = np.sqrt(np.square(first) + np.square(second) + apart**2)
             factor = float(np.median(np.maximum(between, TINY) / np.maximum(usual, TINY)))
             doubts.append(
@@ -431,7 +431,7 @@ NEAR_UNIT_OF_USUAL = 3.0
 """As NEAR_UNIT, for a factor to the usual distance of two robots, which is about as far from the true one."""
 
 LEAST_GAP = 1.0
-"""The length in m by which ranges between robots must be too short: outliers to anchors are longer."""
+"""The length in m by which ranges between robots must be off: below it, motion and biases count."""
 
 SAME_PLACE_S = 1.0
 """The time in s between two ranges in which a robot hardly moves."""
