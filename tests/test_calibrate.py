@@ -19,6 +19,7 @@ from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.range_recording import Numbers, RangeRecording
 from protocol.noise import Noise
 from tests.commands import tandem
+from tests.test_cases_estimates import CASES
 from tests.test_estimate import NEES_99_9, SAMPLE, with_ranges
 
 BIAS, MORE, SCALE, OUTLIERS = 0.35, 0.15, 0.05, 0.05
