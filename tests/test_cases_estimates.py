@@ -177,6 +177,7 @@ def test_radios_whose_unit_is_suspected_are_not_calibrated(flags: tuple[str, ...
 # --- the search -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_recording_that_contradicts_itself_is_searched_a_bounded_number_of_times(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -128,6 +128,7 @@ def test_a_document_that_is_too_large_is_not_read(tmp_path: Path) -> None:
         sweep_page.contents(tmp_path)
 
 
+@pytest.mark.long
 def test_no_other_module_parses_documents() -> None:
     root = Path(__file__).parents[1]
     for package in ("agent", "compose", "protocol", "tandem", "world"):
