@@ -58,14 +58,14 @@ COMMENTS = {
     ".js": r"(?m)^\s*//.*$|/\*(?s:.*?)\*/",
     ".css": r"/\*(?s:.*?)\*/",
 }
-"""What is no code, by the ending of a file; spaces in these files are none either."""
+"""The parts that are no code, by the ending of a file, beside the spaces."""
 STILL = ("distance that a configuration predicts", (1360, 840))
 """The mark of the legend that page.png shows, and its size in pixels."""
 RECORDED = "tests/data/uwb/tiers-a-b-30-s.pyfg"
 
 
 class Source(NamedTuple):
-    """What some figures show: a mission, a recording, a sweep or an example."""
+    """The subject of some figures: a mission, a recording, a sweep or an example."""
 
     figures: Mapping[str, str]
     """The files in docs/, each with the name of the figure in the source."""

@@ -31,7 +31,7 @@ _TOML = re.compile(
     rb'"[^"\\\n]*(?:\\.[^"\\\n]*)*"?|' + rb"'[^'\n]*'?|#[^\n]*|[][{}.,\n]",
     re.DOTALL,
 )
-"""The same of TOML, and the characters that begin or end a nested value or a part of a key."""
+"""The strings and comments of TOML, and the characters that begin or end a nested value or a key."""
 _STEPS = bytes.maketrans(b"[{]}", b"\x01\x01\xff\xff")
 """The change of the depth by each bracket, as a signed byte."""
 _NO_BRACKETS = bytes({*range(256)} - {*b"[]{}"})

@@ -116,7 +116,7 @@ def test_nothing_is_computed_in_a_gap_and_the_estimate_goes_on_after_it(robots: 
 
 
 def test_the_number_of_estimates_is_bounded_by_that_of_the_measurements(tmp_path: Path) -> None:
-    """The same rows over nineteen times the time; an increment then lasts 9.5 s."""
+    """Nineteen times the time for equal rows; an increment then lasts 9.5 s."""
     tables = recording(1, random.Random(1))
     for rows in tables.values():
         for row in rows:

@@ -55,7 +55,7 @@ class Jump(NamedTuple):
     begin_s: float
     """The end of the increment before it, or its own start if that is within LONGEST_GAP_S."""
     end_s: float
-    """Its start, or its end if it lasts too long itself."""
+    """The start of this increment, or its end if it lasts too long itself."""
     why: str
     """The row, and what is wrong, in one line."""
 

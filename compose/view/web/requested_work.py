@@ -45,7 +45,7 @@ class _Request(msgspec.Struct, frozen=True):
     trusted: frozenset[str]
     """The classes that the user of the server has named."""
     models: tuple[str, ...]
-    """Those of them that are range or radio models."""
+    """The names among them of range and radio models."""
 
 
 class _Answer(msgspec.Struct, frozen=True):
