@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from tandem.results import open_recording as open  # noqa: A004  # used as tandem.open
     from tandem.scenarios import Scenario
     from tandem.sweeps import SweepIncomplete, SweepResults, sweep
+    from tandem.worlds import World
 
 __all__ = [
     "BadFault",
@@ -57,6 +58,7 @@ __all__ = [
     "Unworkable",
     "UserError",
     "Violation",
+    "World",
     "estimate",
     "open",
     "run",
@@ -74,6 +76,7 @@ _PLACES = {
     "SweepIncomplete": "tandem.sweeps:SweepIncomplete",
     "SweepResults": "tandem.sweeps:SweepResults",
     "Table": "tandem.columns:Table",
+    "World": "tandem.worlds:World",
     "Findings": "compose.audit.findings:Findings",
     "Violation": "compose.audit.findings:Violation",
     "ModuleClash": "tandem.clash:ModuleClash",

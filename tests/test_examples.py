@@ -23,7 +23,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "estimate_ranges": {},
 }
 """The arguments with which `main` of each example takes seconds."""
-WITHOUT_FIGURE = ("last_manoeuvre", "own_driver", "own_radio")
+WITHOUT_FIGURE = ("last_manoeuvre", "own_driver", "own_radio", "seek")
 """The examples that only print."""
 MAX_LINES = 100
 

@@ -42,7 +42,7 @@ PRIVATE_WORDS = {
 HISTORY = ("CHANGELOG.md", "docs/changelog.md")
 """The pages that list the old names."""
 IMPORT_ONLY_NAMES = {"__init__", "__main__"}
-PUBLIC_NAMES = {"Run", "Scenario"}
+PUBLIC_NAMES = {"Run", "Scenario", "World"}
 """The classes of the Python API that wrap one of the same name: the name that a user expects."""
 
 

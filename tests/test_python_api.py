@@ -24,12 +24,25 @@ from compose.recording.estimating.estimate_rows import PoseEstimateRow
 from compose.recording.run import read
 from compose.recording.summary_json import summary
 from compose.recording.ticks_csv import rows
+from protocol.messages import Command
+from protocol.motion import REST
 from tandem import scenarios
 from tandem.columns import Table
 from tests.commands import tandem as command
 from tests.series import series
 
-MODULES = ("", ".clash", ".columns", ".missions", ".results", ".rows", ".scenarios", ".sweeps", ".estimates")
+MODULES = (
+    "",
+    ".clash",
+    ".columns",
+    ".missions",
+    ".results",
+    ".rows",
+    ".scenarios",
+    ".sweeps",
+    ".worlds",
+    ".estimates",
+)
 SAMPLE = Path(__file__).parent / "data" / "uwb" / "tiers-a-b-30-s.pyfg"
 TABLES = ("truth", "observations", "commands", "estimates", "messages", "claims")
 
@@ -66,6 +79,54 @@ def test_every_public_name_is_there_and_listed() -> None:
         assert getattr(tandem, name) is not None
     with pytest.raises(AttributeError, match="module 'tandem' has no attribute 'rnu'"):
         _ = tandem.rnu
+
+
+# --- the simulator ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scenario", ["noisy", "group-8"])
+def test_a_world_that_gets_the_commands_of_a_run_gives_its_observations_truth_and_outcome(
+    scenario: str,
+) -> None:
+    lossy = tandem.Scenario.load(scenario).with_faults({"loss": 0.3})
+    run = tandem.run(lossy)
+    world, seen, there = tandem.World(lossy), [], []
+    for tick in run.model.ticks:
+        seen += [one.anchor_range for one in world.observe().values()]
+        there += [pose.x for pose in world.truth.values()]
+        assert world.observe() == world.observe()
+        world = world.step(tick.commands)
+    assert np.array_equal(np.array(seen, float), run.observations["anchor_range"], equal_nan=True)
+    assert there == run.truth["x"].tolist()
+    assert (world.outcome, world.tick) == (run.outcome, run.ticks)
+    with pytest.raises(tandem.UserError, match="the world has ended: localised"):
+        world.step({})
+
+
+def test_steps_from_one_world_are_futures_of_it_and_leave_it_as_it_is() -> None:
+    world = tandem.World("noisy", seed=7)
+    before = world.truth, world.observe()
+    ahead = [world.step({"a": command}) for command in ((1.0, 0.0), np.array([1.0, 0.0]), REST, (9.0, 0.0))]
+    assert ahead[0].observe() == ahead[1].observe()
+    assert ahead[0].truth == ahead[3].truth  # limited to v_max
+    assert ahead[2].truth == world.truth
+    assert (world.truth, world.observe()) == before
+
+
+@pytest.mark.parametrize(
+    ("commands", "why"),
+    [
+        ({"aa": (0.0, 0.0)}, "commands: no robot 'aa'; there are a, b"),
+        ({"a": (0.0,)}, "commands: a: not (v, omega) in m/s and rad/s: (0.0,)"),
+        ({"a": "up"}, "commands: a: not (v, omega) in m/s and rad/s: 'up'"),
+        ({"a": (float("nan"), 0.0)}, "commands: a: not (v, omega) in m/s and rad/s: (nan, 0.0)"),
+        ({"b": np.zeros(3)}, "commands: b: not (v, omega) in m/s and rad/s: array([0., 0., 0.])"),
+        ({"b": Command(3, "b", 0.0, 0.0, 1, "")}, "commands: b: a Command of b in tick 3, not 0"),
+    ],
+)
+def test_a_command_that_is_none_is_refused_in_one_line(commands: dict[str, Any], why: str) -> None:
+    with pytest.raises(tandem.UserError, match=re.escape(why)):
+        tandem.World("noisy").step(commands)
 
 
 # --- runs ---------------------------------------------------------------------------------------------

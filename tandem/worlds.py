@@ -1,0 +1,109 @@
+"""The simulator of the true robots, their sensors and their radio, one tick at a time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from compose.errors import UserError
+from protocol.messages import Command, Observation
+from protocol.motion import Controls, Pose
+from protocol.spelling import did_you_mean
+from tandem.scenarios import Scenario, plain, scenario_of
+from world.referee import MissionOutcome
+from world.tick import advance, observations, release
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+class World:
+    """The simulated world at one tick, for controllers of one's own.
+
+    It is immutable: two steps from one world are two futures of it, with the same noise in each sensor.
+
+    >>> import tandem
+    >>> world = tandem.World("noisy")
+    >>> there = world.step({"a": (0.25, 0.0)})
+    >>> there.tick, there.truth["b"] == world.truth["b"]
+    (1, True)
+    >>> there.observe()["a"].anchor_range
+    2.494...
+    """
+
+    def __init__(
+        self, scenario: Scenario | str | Path | Mapping[str, Any], *, seed: int | None = None
+    ) -> None:
+        """`scenario` and `seed` are those of `tandem.run`; its planner has no effect. Raises UserError."""
+        chosen = scenario_of(scenario)
+        self.scenario = chosen if seed is None else chosen.with_(seed=seed)
+        """The scenario."""
+        self._state = release(self.scenario.template.scenario)
+        self._end: MissionOutcome | None = None
+
+    @property
+    def tick(self) -> int:
+        """The tick k."""
+        return self._state.truth.tick
+
+    @property
+    def truth(self) -> dict[str, Pose]:
+        """The true pose of each robot in the world frame: m, m and rad."""
+        return dict(zip(self.scenario.robots, self._state.truth.poses, strict=True))
+
+    @property
+    def outcome(self) -> str | None:
+        """The outcome, as that of `tandem.run`; None until all robots have results, or at `max_ticks`."""
+        return None if self._end is None else self._end.outcome
+
+    @property
+    def reason(self) -> str | None:
+        """The reason for an outcome other than `localised`."""
+        return None if self._end is None else self._end.reason
+
+    def observe(self) -> dict[str, Observation]:
+        """Return what each robot measures and receives in this tick; the same whenever it is called."""
+        return {one.robot: one for one in observations(self._state)}
+
+    def step(self, commands: Mapping[str, Sequence[float] | NDArray[Any] | Controls | Command]) -> World:
+        """Return the world one tick later, or with its outcome, after which there is no further step.
+
+        A command is (v, omega) in m/s and rad/s, `Controls`, or a `Command` whose verdict is the robot's
+        claim. A robot without one rests. Velocities are limited to those of the mission. Raises UserError
+        for an unknown robot, for a command that is none of these, and after the end.
+        """
+        if self._end is not None:
+            raise UserError(f"the world has ended: {self._end.outcome}")
+        after = World.__new__(World)
+        after.scenario, after._state, after._end = self.scenario, self._state, None
+        onward = advance(self._state, {robot: self._command(robot, one) for robot, one in commands.items()})
+        if isinstance(onward, MissionOutcome):
+            after._end = onward
+        else:
+            after._state = onward
+        return after
+
+    def _command(self, robot: str, given: object) -> Command:
+        """Return the command `given` to `robot`. Raises UserError."""
+        if robot not in self.scenario.robots:
+            ids = self.scenario.robots
+            raise UserError(
+                f"commands: no robot '{robot}'; there are {', '.join(ids)}{did_you_mean(robot, ids)}"
+            )
+        match plain(given):
+            case Command(robot=sender, tick=tick) as command:
+                if (sender, tick) != (robot, self.tick):
+                    raise UserError(
+                        f"commands: {robot}: a Command of {sender} in tick {tick}, not {self.tick}"
+                    )
+                return command
+            case Controls(v=v, omega=omega) | [int() | float() as v, int() | float() as omega] if all(
+                map(math.isfinite, (v, omega))
+            ):
+                return Command(self.tick, robot, float(v), float(omega), 1, "")
+        raise UserError(f"commands: {robot}: not (v, omega) in m/s and rad/s: {given!r}")
+
+    def __repr__(self) -> str:
+        return f"<World {self.scenario.name}, seed {self.scenario.seed}: tick {self.tick}>"
