@@ -465,7 +465,7 @@ def frames_changed(frames: list[bytes], draw: random.Random) -> str:
             frames[i - 1], frames[i] = frames[i], frames[i - 1]
             return "frames swapped"
         case "end":
-            del frames[draw.randrange(5, len(frames)) :]
+            del frames[draw.randrange(5, max(6, len(frames))) :]
             return "frames cut off"
     try:
         content = msgspec.to_builtins(decode(frames[i], KINDS, MAX_FRAME_BYTES))
