@@ -24,7 +24,7 @@ BUG = 70
 """The exit status of a command that ended with an unexpected exception; its traceback is printed."""
 BROKEN_PIPE = 141
 """The exit status of a command whose output was closed by its reader."""
-STOPPED = 130
+STOPPED_STATUS = 130
 """The exit status of a command that was stopped by Ctrl-C or an equivalent signal."""
 FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """The errors of writing for which nothing is wrong with the path."""

@@ -8,8 +8,8 @@ from importlib.util import find_spec
 from typing import NamedTuple
 
 from compose.errors import UserError
+from protocol import PACKAGE
 
-PACKAGE = "tandem-ranging"
 """The name of the distribution."""
 
 

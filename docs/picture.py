@@ -37,7 +37,7 @@ from compose.figures import PICTURES, catalogue  # noqa: E402
 from compose.figures.agent_replay import agent_replay  # noqa: E402
 from compose.figures.pair import pairs_of  # noqa: E402
 from compose.figures.sheet import Absent  # noqa: E402
-from compose.figures.style import SCREEN, SWEEP, look, save  # noqa: E402
+from compose.figures.style import SCREEN, SWEEP_MEDIUM, look, save  # noqa: E402
 from compose.launch import in_process  # noqa: E402
 from compose.recording.run import Run, read  # noqa: E402
 from compose.scenario import scenario_file  # noqa: E402
@@ -172,7 +172,7 @@ def radios(folder: Path, wanted: Mapping[str, str] = {}, trials: int = 200) -> s
     from docs.examples import planners_and_radios  # noqa: PLC0415  # an example of the Python API
 
     printed = io.StringIO()
-    with look(SWEEP), contextlib.redirect_stdout(printed):
+    with look(SWEEP_MEDIUM), contextlib.redirect_stdout(printed):
         os.environ["SOURCE_DATE_EPOCH"] = "0"  # for the date that Matplotlib writes
         for file in wanted or ["radios.svg"]:
             planners_and_radios.main(str(folder / file), trials)

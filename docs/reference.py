@@ -235,7 +235,7 @@ def wire_keys() -> str:
     """Return the table of Zenoh keys: their form, and the participants that may send and receive on them."""
     ways = {"put": "put", "answer": "queryable", "show": "liveliness token"}
     rows = []
-    for kind, rule in keys.RULES.items():
+    for kind, rule in keys.KEY_RULES.items():
         names = {name: name.upper() for name in inspect.signature(kind).parameters}
         receivers = ", ".join(_participant(one) for one in rule.to)
         rows.append([f"`{kind(**names)}`", ways[rule.way], _participant(rule.by), receivers])

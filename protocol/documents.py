@@ -17,7 +17,7 @@ from protocol import files
 Syntax = Literal["JSON", "JSON5", "TOML"]
 MOST_NESTED = 64
 """The maximum depth of nested values. Tandem's own documents, and those of Zenoh, have at most 10."""
-MOST_BYTES = 16 << 20
+MOST_DOCUMENT_BYTES = 16 << 20
 """The maximum size of a document. The largest, the files of a sweep of 10^4 cells, have some MB."""
 
 _STRING = rb'"[^"\\]*(?:\\.[^"\\]*)*"?'
@@ -60,7 +60,7 @@ def json_value(text: bytes | str, kind: Any = Any) -> Any:
 
 def json_file(path: Path, kind: Any = Any) -> Any:
     """Return the value of type `kind` in the JSON file at `path`. Raises OSError and msgspec.DecodeError."""
-    return json_value(files.read_bytes(path, MOST_BYTES), kind)
+    return json_value(files.read_bytes(path, MOST_DOCUMENT_BYTES), kind)
 
 
 def toml_table(text: str) -> dict[str, Any]:

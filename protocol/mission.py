@@ -11,7 +11,7 @@ from msgspec import Meta
 
 from protocol.motion import TAU
 from protocol.noise import Noise
-from protocol.rounding import EPSILON, SAME, SURE, required_anchor_error, rounding
+from protocol.rounding import EPSILON, SAME_ANCHORS, SURE, required_anchor_error, rounding
 from protocol.units import Clearance, Coordinate, Duration, Finite, Integer, Length, Speed, TurnRate
 
 PlannerName = Annotated[
@@ -31,6 +31,8 @@ Options = Annotated[dict[Option, OptionValue], Meta(max_length=32)]
 
 Role = Literal["a", "b"]
 """The role of a robot in its pair: when the two meet, a moves first, and b stops (Section III.C)."""
+ROLES: tuple[Role, Role] = ("a", "b")
+"""The two roles."""
 
 OPTIMAL_TURN = 2.331122370414423
 """The angle omega_1 T_s in rad that maximises eq. (4): the positive root of tan(u / 2) = u."""
@@ -52,7 +54,7 @@ AMPLIFIED = 500.0
 found on random settings: `assured` localises in all settings that it allows.
 """
 
-MOST_RANGES = 1e4
+MOST_RANGES_NEEDED = 1e4
 """The maximum of (sigma / accuracy)^2, the number of ranges whose mean has the required accuracy.
 
 Each range takes a tick. A typical mission has about a hundred.
@@ -148,7 +150,7 @@ def infeasibility(mission: Mission, distance: float) -> str | None:
     size = distance + reach
     if AMPLIFIED * EPSILON * size * max(1.0, reach / distance) * max(1.0, size) / step > SURE:
         which = "mutual"
-    elif MARGIN * _anchor_error(mission, size) > required_anchor_error(size, distance, reach):
+    elif PHASE_1_MARGIN * _anchor_error(mission, size) > required_anchor_error(size, distance, reach):
         which = "anchor"
     else:
         return None
@@ -159,7 +161,7 @@ def infeasibility(mission: Mission, distance: float) -> str | None:
     )
 
 
-MARGIN = 1.2
+PHASE_1_MARGIN = 1.2
 """The factor by which the best anchor error of phase 1 must be below the required one.
 
 The manoeuvres of phase 1 are not optimal, so it does not reach the best error.
@@ -184,12 +186,12 @@ def _anchor_error(mission: Mission, size: float) -> float:
         y = min(y + step * math.sin((k - 0.5) * turn) * math.sin(0.5 * turn) / (0.5 * turn), 0.5 * reach)
         across, moment = across + 2.0 * reach * y, moment + y * y
         floor = rounding(size, k + 2, (k + 2) * step, k * turn)
-        radial = min(radial, floor * (1.0 + SAME + across / moment))
-        if floor * (1.0 + SAME + 4.0) > radial:  # y is at most R / 2, so the ratio stays above 4
+        radial = min(radial, floor * (1.0 + SAME_ANCHORS + across / moment))
+        if floor * (1.0 + SAME_ANCHORS + 4.0) > radial:  # y is at most R / 2, so the ratio stays above 4
             break
     round_it = 0.5 * math.pi + 2.0 * TAU / 3.0
     floor = rounding(size, 6, (TAU + 4.0) * step, round_it)
-    return max(radial, floor * (1.0 + SAME + 2.0 * reach / step))
+    return max(radial, floor * (1.0 + SAME_ANCHORS + 2.0 * reach / step))
 
 
 def safety_infeasibility(mission: Mission) -> str | None:
@@ -207,15 +209,15 @@ MOST_OUTLIERS = 0.25
 """The maximum fraction of outliers among all ranges. With 0.5, 2 of 23 claims were wrong."""
 
 
-SMALLEST = 1e-300
+SMALLEST_NOISE = 1e-300
 """The smallest positive value of a field of the noise: half of the smallest floating-point number is 0."""
 
 
 def too_small(noise: Noise) -> str | None:
     """Return the field of `noise` that is too small to compute with, and why; None if there is none."""
     for name, value in (("sigma_degrees", noise.sigma_degrees), ("strays", noise.strays)):
-        if 0.0 < value < SMALLEST:
-            return f"noise.{name}: set 0 or at least {SMALLEST:g}: {value:g} is too small to divide"
+        if 0.0 < value < SMALLEST_NOISE:
+            return f"noise.{name}: set 0 or at least {SMALLEST_NOISE:g}: {value:g} is too small to divide"
     return None
 
 
@@ -230,9 +232,9 @@ def noise_infeasibility(mission: Mission) -> str | None:
                 f"noise.{name}: a range with an error of {sigma:.6g} m contains no more information than its "
                 f"detection within mission.sensing_range = {reach:.6g} m"
             )
-        if (sigma / accuracy) ** 2 > MOST_RANGES:
+        if (sigma / accuracy) ** 2 > MOST_RANGES_NEEDED:
             return (
-                f"accuracy: {accuracy:.3g} m takes the mean of more than {MOST_RANGES:g} ranges with "
+                f"accuracy: {accuracy:.3g} m takes the mean of more than {MOST_RANGES_NEEDED:g} ranges with "
                 f"mission.noise.{name} = {sigma:.3g} m"
             )
     if noise.outliers > MOST_OUTLIERS:

@@ -25,7 +25,7 @@ EPSILON = 2.0**-52
 RANGED = 4.0
 """The rounding of a range, in u `size`: two differences, the hypotenuse, and the rotation of a frame."""
 
-SAME = 2.0
+SAME_ANCHORS = 2.0
 """The distance, in floors, below which no range distinguishes two anchors.
 
 A measured range differs from the two that they predict by at most one floor each, on either side.

@@ -19,21 +19,21 @@ Place = tuple[float, float]
 HALF_WIDTH = 0.8
 """The largest distance of a robot from the middle of its strip, as a fraction of R."""
 
-NEAR = 0.9
+STRIP_REACH = 0.9
 """The largest range at which a sweeping robot stops for another one, as a fraction of R."""
 
 STEP = 0.5
 """The largest distance driven in a tick of a sweep, as a fraction of R.
 
 A robot at HALF_WIDTH, on a square of its own, is at most 0.84 R from the middle line, and 0.63 R of the line
-are within NEAR R of it. That is more than STEP, so a tick ends there. At the end of a strip it is half as
-much, and contains the end, where a tick ends because robots turn.
+are within STRIP_REACH R of it. That is more than STEP, so a tick ends there. At the end of a strip it is half
+as much, and contains the end, where a tick ends because robots turn.
 """
 
 SIDE = 0.03
 """The side of the square that a robot drives in range of another one, as a fraction of R.
 
-If both drive one, their range grows from NEAR R by at most the two diagonals, and stays within R.
+If both drive one, their range grows from STRIP_REACH R by at most the two diagonals, and stays within R.
 """
 
 NOISY_HALF_WIDTH = 0.65

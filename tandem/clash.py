@@ -8,7 +8,7 @@ from importlib.machinery import PathFinder
 
 PACKAGES = ("protocol", "world", "agent", "compose")
 """The import names of Tandem's packages beside this one."""
-ROOT = os.path.dirname(os.path.dirname(os.path.realpath(__file__)))
+PACKAGE_ROOT = os.path.dirname(os.path.dirname(os.path.realpath(__file__)))
 """The folder that contains all packages of Tandem."""
 
 
@@ -22,9 +22,10 @@ def check() -> None:
         found = _found(name)
         if found is None:
             raise ModuleClash(
-                f"the package '{name}' of Tandem is missing in {ROOT}; install Tandem again", name=name
+                f"the package '{name}' of Tandem is missing in {PACKAGE_ROOT}; install Tandem again",
+                name=name,
             )
-        if os.path.realpath(found) != os.path.join(ROOT, name, "__init__.py"):
+        if os.path.realpath(found) != os.path.join(PACKAGE_ROOT, name, "__init__.py"):
             raise ModuleClash(
                 f"the module '{name}' is {found}, but Tandem has a package of that name; rename yours, or "
                 f"remove {_folder(found)} from PYTHONPATH (or from the folder of your script)",

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from compose.extras import need
 from protocol.spelling import did_you_mean
 
-SHOWN = 10
+SHOWN_ROWS = 10
 """The number of rows that a notebook shows."""
 EXTRA = "tables"
 """The extra with the libraries that tables convert to."""
@@ -111,9 +111,9 @@ class Table:
         head = "".join([f"<th>{html.escape(name)}</th>" for name in self._columns])
         rows = [
             "".join([f"<td>{html.escape(_text(column[row]))}</td>" for column in self._columns.values()])
-            for row in range(min(len(self), SHOWN))
+            for row in range(min(len(self), SHOWN_ROWS))
         ]
-        more = f"<p>{len(self)} rows</p>" if len(self) > SHOWN else ""
+        more = f"<p>{len(self)} rows</p>" if len(self) > SHOWN_ROWS else ""
         lines = "".join([f"<tr>{row}</tr>" for row in rows])
         return f"<table><thead><tr>{head}</tr></thead><tbody>{lines}</tbody></table>{more}"
 

@@ -20,7 +20,7 @@ from compose.launch.class_loader import name_of, trust
 from compose.recording import run as recorded
 from compose.recording.group_localisation import MeetingResult, meeting_results
 from compose.recording.recording_files import make_folder, user_errors
-from compose.recording.summary_json import SUMMARY, Mode, leave, summary
+from compose.recording.summary_json import SUMMARY_JSON, Mode, leave, summary
 from protocol import documents, files
 from protocol.journal.journal_file import CorruptJournal, packed
 from protocol.messages import Outcome
@@ -285,7 +285,7 @@ def open_recording(
     with user_errors(path):
         model = recorded.read(path)
     try:
-        known = documents.json_file(path / SUMMARY, _Launch)
+        known = documents.json_file(path / SUMMARY_JSON, _Launch)
     except (OSError, ValueError):  # a recording may be without it
         known = _Launch()
     return Run(model, known.mode, known.wall_s)

@@ -25,7 +25,7 @@ from tandem.scenarios import Scenario, plain, scenario_of
 if TYPE_CHECKING:
     from compose.sweep.execution import ExecutionOptions, Results
 
-TRIALS = 20
+DEFAULT_TRIALS = 20
 """The default number of trials per cell of a sweep that is given by a scenario and axes."""
 
 
@@ -144,7 +144,7 @@ def _sweep_of(
         table: Mapping[str, Any] = {
             "name": scenario.name,
             "scenario": scenario,
-            "trials": TRIALS,
+            "trials": DEFAULT_TRIALS,
             "axis": [
                 {"field": field, "values": plain([*values]), "paired": chosen[field]}
                 for field, values in axes.items()

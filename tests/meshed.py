@@ -10,7 +10,7 @@ import sys
 
 from protocol.network import keys, session
 from protocol.network.endpoints import Endpoints
-from protocol.network.inbox import NOTHING, Inbox
+from protocol.network.inbox import NO_ARRIVAL, Inbox
 from protocol.output import leave
 
 RUN = "mesh"
@@ -29,7 +29,7 @@ if __name__ == "__main__":
             arrival = inbox.next(0.05)
             if arrival.topic == "alive":
                 awaited.discard(arrival.source.robot)
-            elif arrival is NOTHING:
+            elif arrival is NO_ARRIVAL:
                 starts.put(b"")
         assert token is not None  # a token that is not kept is withdrawn
         print("linked", flush=True)

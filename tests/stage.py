@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import pytest
 
 from protocol.network import keys
-from protocol.network.inbox import NOTHING, Arrival, Inbox, Topic
+from protocol.network.inbox import NO_ARRIVAL, Arrival, Inbox, Topic
 from world.hardware import bridge, group_termination, termination
 
 TRANSPORT_S = 1e-4
@@ -59,12 +59,12 @@ class Stage(Inbox):
             (
                 self.now + after,
                 len(self._coming),
-                Arrival(topic, key, frame, keys.parse(key) or keys.NOWHERE),
+                Arrival(topic, key, frame, keys.parse(key) or keys.UNKNOWN_KEY),
             ),
         )
 
     def next(self, timeout: float | None) -> Arrival:
-        """Return the next arrival at its time; NOTHING if there is none within `timeout` seconds."""
+        """Return the next arrival at its time; NO_ARRIVAL if there is none within `timeout` seconds."""
         assert timeout is not None
         until = self.now + max(timeout, 0.0)
         if self._coming and self._coming[0][0] <= until:
@@ -72,7 +72,7 @@ class Stage(Inbox):
             self.now = max(self.now, when)
             return arrival
         self.now = until
-        return NOTHING
+        return NO_ARRIVAL
 
     def _on_put(self, key: str, frame: bytes) -> None:
         self.put_frames.append((key, frame))

@@ -63,14 +63,14 @@ def key_functions() -> set[Callable[..., str]]:
 
 
 def test_every_key_has_a_rule_and_is_tried() -> None:
-    assert key_functions() == set(keys.RULES)
+    assert key_functions() == set(keys.KEY_RULES)
     whose = {"run": "r", "robot": "a", "peer": "b"}
     made = {one(*(whose[name] for name in inspect.signature(one).parameters)) for one in key_functions()}
     assert made == set(KEYS.values())
 
 
 def test_every_role_of_a_rule_is_one_that_there_is() -> None:
-    for key, rule in keys.RULES.items():
+    for key, rule in keys.KEY_RULES.items():
         there = {"world", "viewer", "robots", *inspect.signature(key).parameters} - {"run"}
         assert {rule.by, *rule.to} <= there
 

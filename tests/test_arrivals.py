@@ -22,7 +22,7 @@ from protocol.messages import Command, Observation, Report
 from protocol.motion import ORIGIN
 from protocol.network import keys, session
 from protocol.network.endpoints import listening
-from protocol.network.inbox import COMPLAINTS, NOTHING, Arrival, Inbox, Interrupted
+from protocol.network.inbox import COMPLAINTS, NO_ARRIVAL, Arrival, Inbox, Interrupted
 from protocol.wire import encode
 from tests.commands import BOUND_S, TandemProcess, several_pairs, tandem, until, world
 from tests.storm import stranger_at
@@ -30,10 +30,11 @@ from tests.storm import stranger_at
 RUN = "mine"
 NAMED = {"run": RUN, "robot": "a", "peer": "b"}
 KEYS = {
-    kind.__name__: kind(*[NAMED[name] for name in inspect.signature(kind).parameters]) for kind in keys.RULES
+    kind.__name__: kind(*[NAMED[name] for name in inspect.signature(kind).parameters])
+    for kind in keys.KEY_RULES
 }
 
-by_kind = pytest.mark.parametrize("kind", keys.RULES, ids=lambda kind: str(kind.__name__))
+by_kind = pytest.mark.parametrize("kind", keys.KEY_RULES, ids=lambda kind: str(kind.__name__))
 
 
 # --- the parser ---------------------------------------------------------------------------------------
@@ -207,7 +208,7 @@ def test_a_flood_of_invalid_keys_is_counted_and_reported_a_bounded_number_of_tim
     inbox = Inbox("test")
     for number in range(10 * COMPLAINTS):
         inbox.turn_away("command", f"tandem/*/{number}/{'x' * 1000}", session.NO_KEY)
-    assert inbox.next(0.0) is NOTHING
+    assert inbox.next(0.0) is NO_ARRIVAL
     assert inbox.refused == {"command": 10 * COMPLAINTS}
     said = capsys.readouterr().err.splitlines()
     assert len(said) <= COMPLAINTS
@@ -231,7 +232,7 @@ def test_a_frame_under_a_wildcard_key_is_not_delivered(capsys: pytest.CaptureFix
         )
         token.undeclare()
         until(
-            lambda: inbox.next(0.0) is NOTHING and inbox.refused == {"command": 2, "alive": 1, "gone": 1},
+            lambda: inbox.next(0.0) is NO_ARRIVAL and inbox.refused == {"command": 2, "alive": 1, "gone": 1},
             "all told",
         )
     assert "tandem/**: not a key of one mission and robot" in capsys.readouterr().err
@@ -250,7 +251,7 @@ def test_a_wait_for_a_line_ends_with_a_frame_another_event_or_the_timeout() -> N
     with taking_from_a_line() as (inbox, link):
         for timeout in (0.0, 0.01, 0.3, 0.02):
             began = time.monotonic()
-            assert inbox.next(timeout) is NOTHING
+            assert inbox.next(timeout) is NO_ARRIVAL
             assert time.monotonic() >= began + timeout
         threading.Timer(0.01, link.put, (keys.command(RUN, "a"), FRAMES[2])).start()
         assert inbox.next(None).frame == FRAMES[2]
@@ -261,7 +262,7 @@ def test_a_wait_for_a_line_ends_with_a_frame_another_event_or_the_timeout() -> N
             inbox.next(BOUND_S)
     inbox.put("ended", "agent b")
     assert inbox.next(BOUND_S) == Arrival("ended", "agent b"), "without a session"
-    assert inbox.next(0.01) is NOTHING
+    assert inbox.next(0.01) is NO_ARRIVAL
 
 
 def test_a_flood_of_a_line_and_a_flood_of_events_wait_for_each_other() -> None:
@@ -270,7 +271,7 @@ def test_a_flood_of_a_line_and_a_flood_of_events_wait_for_each_other() -> None:
             inbox.put("ended", "agent a")
             link.put(keys.command(RUN, "a"), FRAMES[2])
         topics = [inbox.next(BOUND_S).topic for _ in range(20)]
-        assert inbox.next(0.0) is NOTHING
+        assert inbox.next(0.0) is NO_ARRIVAL
     assert all(len(set(topics[i : i + 4])) == 2 for i in range(0, 12, 4)), topics
 
 
@@ -278,7 +279,7 @@ def test_what_a_line_has_no_room_for_replaces_the_oldest() -> None:
     with taking_from_a_line() as (inbox, link):
         for number in range(session.LINE_FRAMES + 3):
             link.put(keys.command(RUN, "a"), str(number).encode())
-        came = list(iter(partial(inbox.next, 0.0), NOTHING))
+        came = list(iter(partial(inbox.next, 0.0), NO_ARRIVAL))
     assert [int(arrival.frame) for arrival in came] == [*range(3, session.LINE_FRAMES + 3)]
 
 

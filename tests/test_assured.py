@@ -20,7 +20,7 @@ from agent.estimation.exact import PairObservation, turn_error, weigh_placements
 from agent.estimation.mutual_ranges import base, solve
 from agent.estimation.precision import combined_error, odometry_rounding
 from agent.planning.assured import AssuredExact
-from agent.planning.phase3_last_manoeuvre import SPEEDS, TURN_RATES, LastManoeuvre
+from agent.planning.phase3_last_manoeuvre import LAST_SPEEDS, TURN_RATES, LastManoeuvre
 from agent.planning.state import RobotState
 from compose.launch.in_process import run_mission
 from compose.recording.run import Run
@@ -395,7 +395,7 @@ def grid(mission: Mission) -> Iterator[tuple[float, float]]:
     """Yield some of the manoeuvres from which b chooses."""
     unit = mission.first_straight / mission.period
     rates = [mission.max_turn_rate * (2 * i / (TURN_RATES - 1) - 1) for i in range(0, TURN_RATES, 24)]
-    return ((unit * speed, rate) for speed, rate in product(SPEEDS, rates))
+    return ((unit * speed, rate) for speed, rate in product(LAST_SPEEDS, rates))
 
 
 def test_the_last_manoeuvre_leaves_no_more_placements_out_of_range_than_it_must(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from agent.planning.state import RobotState
 from agent.process import agent_journal as reader_of_agent
 from agent.process.robot import Robot
 from compose.audit.findings import Findings, Violation
-from compose.audit.rules import RULES, audit_run
+from compose.audit.rules import AUDIT_RULES, audit_run
 from compose.launch import in_process
 from compose.launch.planner_loader import planner_of
 from compose.recording.recording_files import KINDS, WORLD_JOURNAL, agent_journal
@@ -133,7 +133,7 @@ def test_an_honest_run_violates_no_rule(scenario: Scenario) -> None:
     findings = audit_run(of_frames(journals))
     assert findings.violations == ()
     made, ticks, robots = checks(findings), findings.ticks + 1, len(scenario.robots)
-    assert list(made) == [rule.__name__ for rule in RULES]
+    assert list(made) == [rule.__name__ for rule in AUDIT_RULES]
     assert made["config"] == robots
     assert made["observation"] == robots * ticks
     assert (
@@ -183,8 +183,8 @@ def test_a_run_as_processes_violates_no_rule_and_the_command_reports_it(tmp_path
     lines = ended.out.splitlines()
     last = read(tmp_path / "out").ticks[-1].truth.tick
     assert lines[:3] == [f"noisy: no violations over {last} ticks", "", "rule        checks  violations"]
-    assert [line.split()[0] for line in lines[3:]] == [rule.__name__ for rule in RULES]
-    assert [line.split()[2] for line in lines[3:]] == ["0"] * len(RULES)
+    assert [line.split()[0] for line in lines[3:]] == [rule.__name__ for rule in AUDIT_RULES]
+    assert [line.split()[2] for line in lines[3:]] == ["0"] * len(AUDIT_RULES)
     assert lines[6].split() == ["observation", str(2 * (last + 1)), "0"]
 
 

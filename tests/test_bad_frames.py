@@ -356,7 +356,7 @@ def test_a_flood_of_frames_is_bounded_counted_and_reported_once(
 ) -> None:
     full, dropped = flooded("report", "some/key", size)
     waiting = 0
-    while full.next(0.0) is not inbox.NOTHING:
+    while full.next(0.0) is not inbox.NO_ARRIVAL:
         waiting += 1
     assert inbox.ROOM_BYTES / 2 < waiting * (size + 208) <= inbox.ROOM_BYTES
     assert full.refused == {"report": dropped}
@@ -371,7 +371,7 @@ def test_a_flood_leaves_other_topics_their_room() -> None:
     full.put("stop", "SIGTERM")
     came: list[Arrival] = []
     with pytest.raises(Interrupted, match="SIGTERM"):
-        came.extend(iter(partial(full.next, 0.0), inbox.NOTHING))
+        came.extend(iter(partial(full.next, 0.0), inbox.NO_ARRIVAL))
     assert came[-1] == Arrival("observation", "another", b"needed")
 
 

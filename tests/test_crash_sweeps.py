@@ -20,7 +20,7 @@ from compose.launch import in_process
 from compose.launch.supervisor import ChildFailed
 from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
 from compose.recording.run import Run
-from compose.scenario.kills import POINTS, WORLD, KillTable, drawn
+from compose.scenario.kills import KILL_POINTS, WORLD, KillTable, drawn
 from compose.scenario.scenario_file import load, parse, validate
 from compose.scenario.toml_file import table_in
 from compose.sweep import spec
@@ -142,7 +142,7 @@ def test_open_fields_of_a_kill_follow_from_the_seed() -> None:
     assert setting.kills(7) == setting.kills(7)
     found = [setting.kills(seed) for seed in range(200)]
     assert {one.tick for one, _, _ in found} == set(range(3, 41))
-    assert set(product(("a", "b", WORLD), POINTS)) == {(one.who, one.point) for one, _, _ in found}
+    assert set(product(("a", "b", WORLD), KILL_POINTS)) == {(one.who, one.point) for one, _, _ in found}
     assert all([(a.who, b.who), a.tick] == [("a", "b"), b.tick] for _, a, b in found)
     assert {(a.point, a.after, a.text) for _, a, _ in found} == {
         ("observation", 0.25, f"a@{tick}:observation+0.250000s") for tick in range(49)
@@ -212,7 +212,9 @@ def test_the_sweep_of_crashes_kills_everyone_in_every_tick_at_every_point() -> N
     end = in_process.run_mission(load("paper-1")).end
     assert end is not None
     ticks = range(end.tick + 1)
-    everything = {((who, tick, point),) for who in ("a", "b", WORLD) for tick in ticks for point in POINTS}
+    everything = {
+        ((who, tick, point),) for who in ("a", "b", WORLD) for tick in ticks for point in KILL_POINTS
+    }
     assert Counter(killed("crash", 1)) == Counter(everything) + Counter({(): len(ticks)})
 
 

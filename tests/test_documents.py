@@ -124,7 +124,7 @@ def test_brackets_in_strings_and_comments_do_not_nest(text: str, syntax: Syntax)
 def test_a_document_that_is_too_large_is_not_read(tmp_path: Path) -> None:
     with (tmp_path / "sweep.json").open("wb") as file:
         file.truncate(10 << 30)
-    with pytest.raises(UserError, match=f"larger than {documents.MOST_BYTES} bytes"):
+    with pytest.raises(UserError, match=f"larger than {documents.MOST_DOCUMENT_BYTES} bytes"):
         sweep_page.contents(tmp_path)
 
 

@@ -23,10 +23,10 @@ from agent.estimation.gaussian.odometry_noise import track
 from agent.estimation.gaussian.range_model import PairRanges, Ranges
 from compose.errors import NOT_LOCALISED, USER_ERROR, UserError
 from compose.recording.estimating.estimate_epoch import ClaimRule
-from compose.recording.estimating.estimate_files import COLUMNS, estimate_csv
+from compose.recording.estimating.estimate_files import ESTIMATE_COLUMNS, estimate_csv
 from compose.recording.estimating.estimate_rows import PoseEstimate, true_pose
 from compose.recording.estimating.estimate_run import RecordingEstimate, estimated, measurements
-from compose.recording.estimating.group_measurements import MOST_ANCHORS
+from compose.recording.estimating.group_measurements import MOST_USED_ANCHORS
 from compose.recording.estimating.noise_files import RangeCorrection, told_noise
 from compose.recording.estimating.prepared_steps import EPOCH_S
 from compose.recording.estimating.sound_odometry import GAP_MOTION_S, sound
@@ -404,9 +404,10 @@ def test_the_anchors_with_the_most_ranges_are_found_among_thousands_and_the_othe
     many = [(10.0 + number, 0.0) for number in range(20_000)]
     measured = measurements(with_a_range_to_each(simulated(), many), None, "uwb", None).measured
     assert [side.anchors[0].id for side in measured.sides] == ["M1", "M2"]
-    assert [len(side.anchors) for side in measured.sides] == [MOST_ANCHORS, 1]
+    assert [len(side.anchors) for side in measured.sides] == [MOST_USED_ANCHORS, 1]
     assert (
-        measured.unused[f"to others than the {MOST_ANCHORS} anchors with the most"] == 20_001 - MOST_ANCHORS
+        measured.unused[f"to others than the {MOST_USED_ANCHORS} anchors with the most"]
+        == 20_001 - MOST_USED_ANCHORS
     )
 
 
@@ -519,7 +520,7 @@ def test_the_command_writes_a_table_a_summary_and_figures(tmp_path: Path) -> Non
     assert names <= {path.name for path in (tmp_path / "found").iterdir()}
     with (tmp_path / "found" / "estimate.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert tuple(rows[0]) == COLUMNS
+    assert tuple(rows[0]) == ESTIMATE_COLUMNS
     assert {row["robot"] for row in rows} == {"A", "B"}
     summary = json.loads((tmp_path / "found" / "estimate.json").read_text())
     claim = summary["robots"]["A"]["first_claim"]

@@ -48,7 +48,7 @@ from compose.recording.run import Run, read
 from compose.scenario.scenario_file import load
 from compose.view.export.folder import export
 from compose.view.foxglove.gate import GUESTS, GUESTS_FILES
-from compose.view.foxglove.views import LEAST
+from compose.view.foxglove.views import LEAST_OPACITY
 from protocol import wire
 from protocol.journal import journal_file
 from protocol.messages import Estimate, Observation
@@ -245,7 +245,7 @@ def test_viewers_see_an_ellipse_where_there_is_a_covariance(noisy: Path) -> None
         (entity,) = belief.entities
         assert len(entity.arrows) == len(one.world or one.local)
         assert [arrow.color.a for arrow in entity.arrows] == [
-            max(LEAST, share) for share in one.probabilities
+            max(LEAST_OPACITY, share) for share in one.probabilities
         ]
         assert bool(entity.lines) == (one.covariance is not None and bool(one.world))
         for point in entity.lines[0].points if one.covariance is not None and entity.lines else ():

@@ -18,9 +18,8 @@ from matplotlib.path import Path as PlanePath
 
 from compose.figures import one_robot, over_time
 from compose.figures.one_robot import outline_of
-from compose.figures.pair import ROLES
 from compose.figures.sheet import Absent
-from compose.figures.style import PLACES, SCREEN, look, save
+from compose.figures.style import DECIMALS, SCREEN, look, save
 from compose.launch.in_process import run_mission
 from compose.recording.run import read
 from compose.scenario.scenario_file import load, parse
@@ -29,6 +28,7 @@ from compose.view.recorded import Journals, scenes_of
 from protocol.journal.journal_file import CorruptJournal
 from protocol.journal.journal_file import read as frames
 from protocol.messages import Estimate
+from protocol.mission import ROLES
 from protocol.motion import Covariance, Pose
 from tests.commands import PAPER_1, Ended, several_pairs, tandem
 from tests.series import series
@@ -271,7 +271,7 @@ def test_where_panels_stand_does_not_depend_on_the_last_bits_of_their_layout(
         save(figure, tmp_path / "robot-a", ["svg"])
     corners = np.array([axes.get_position(original=True).get_points() for axes in figure.axes])
     assert len({place.tobytes() for place in corners}) == len(figure.axes)
-    assert np.array_equal(corners, corners.round(PLACES))
+    assert np.array_equal(corners, corners.round(DECIMALS))
 
 
 @pytest.mark.long

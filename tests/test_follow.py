@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 from mcap.writer import Writer
 
-from compose.errors import BROKEN_PIPE, STOPPED, USER_ERROR
+from compose.errors import BROKEN_PIPE, STOPPED_STATUS, USER_ERROR
 from compose.recording.estimating import estimate_stream
 from compose.recording.estimating.estimate_epoch import ClaimRule
-from compose.recording.estimating.estimate_files import COLUMNS, estimate_csv
+from compose.recording.estimating.estimate_files import ESTIMATE_COLUMNS, estimate_csv
 from compose.recording.estimating.estimate_run import estimated, measurements
 from compose.recording.estimating.estimate_stream import StreamEstimate
 from compose.recording.estimating.noise_files import told_noise
@@ -142,7 +142,7 @@ def test_estimates_are_printed_while_the_stream_is_open(messages: Messages, tmp_
         first = written(early, whole=False)
         process.stdin.write(first)
         process.stdin.flush()
-        assert process.stdout.readline().decode().strip() == ",".join(COLUMNS)
+        assert process.stdout.readline().decode().strip() == ",".join(ESTIMATE_COLUMNS)
         lines = [process.stdout.readline().decode().split(",") for _ in range(10)]
         assert {line[1] for line in lines} == {"A", "B"}
         assert process.poll() is None
@@ -154,7 +154,7 @@ def test_estimates_are_printed_while_the_stream_is_open(messages: Messages, tmp_
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("how", [STOPPED, BROKEN_PIPE])
+@pytest.mark.parametrize("how", [STOPPED_STATUS, BROKEN_PIPE])
 def test_a_stream_is_ended_by_ctrl_c_and_by_the_end_of_its_reader_and_the_files_are_written(
     how: int, messages: Messages, tmp_path: Path
 ) -> None:
@@ -166,7 +166,7 @@ def test_a_stream_is_ended_by_ctrl_c_and_by_the_end_of_its_reader_and_the_files_
         process.stdin.flush()
         for _ in range(3):
             process.stdout.readline()
-        if how == STOPPED:
+        if how == STOPPED_STATUS:
             process.send_signal(signal.SIGINT)
         else:
             process.stdout.close()

@@ -15,7 +15,7 @@ import pytest
 from compose.launch.processes import free_endpoint
 from compose.network import KEYED
 from compose.scenario.scenario_file import load
-from compose.view.web.live import AHEAD, LEAP, ReceivedMission, RefusedFrame
+from compose.view.web.live import FRAMES_AHEAD, MOST_TICKS_MISSED, ReceivedMission, RefusedFrame
 from protocol.messages import (
     Command,
     Estimate,
@@ -114,14 +114,14 @@ def test_the_tick_is_unknown_before_the_first_message_of_the_world(received: Rec
     unheard, own, observation = ReceivedMission(RUN), OF_A[0], Key(keys.observation, RUN, "a")
     unheard.take(own, encode(command(LAST, "a")))
     assert unheard.known.last == -1
-    received.take(own, encode(command(AHEAD, "a")))
+    received.take(own, encode(command(FRAMES_AHEAD, "a")))
     with pytest.raises(RefusedFrame):
-        received.take(own, encode(command(AHEAD + 1, "a")))
+        received.take(own, encode(command(FRAMES_AHEAD + 1, "a")))
     with pytest.raises(RefusedFrame):
-        received.take(observation, encode(Observation(LEAP + 1, "a", None, 1.0)))
-    received.take(observation, encode(Observation(LEAP, "a", None, 1.0)))
-    received.take(own, encode(command(LEAP + AHEAD, "a")))
-    assert received.known.last == LEAP + AHEAD
+        received.take(observation, encode(Observation(MOST_TICKS_MISSED + 1, "a", None, 1.0)))
+    received.take(observation, encode(Observation(MOST_TICKS_MISSED, "a", None, 1.0)))
+    received.take(own, encode(command(MOST_TICKS_MISSED + FRAMES_AHEAD, "a")))
+    assert received.known.last == MOST_TICKS_MISSED + FRAMES_AHEAD
 
 
 def test_a_report_to_a_robot_outside_the_mission_is_refused(received: ReceivedMission) -> None:

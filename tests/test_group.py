@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from agent.planning import group_transitions
-from agent.planning.group import TRAVELLING
+from agent.planning.group import TRAVELLING_MODE
 from agent.planning.group_state import Fix
-from agent.planning.group_transitions import SILENT_AFTER
+from agent.planning.group_transitions import PEER_LOST_AFTER
 from agent.planning.phase2_orbit import Travelling, next_leg, travel_controls
 from agent.planning.state import Done
 from agent.planning.visit import MOST_SIDES
@@ -82,7 +82,7 @@ def test_a_noisy_visitor_states_no_covariance_on_its_way(tmp_path: Path) -> None
         for one in agent.steps:
             assert one.command is not None
             assert one.estimate is not None
-            if one.command.state == TRAVELLING:
+            if one.command.state == TRAVELLING_MODE:
                 assert one.estimate.covariance is None
                 on_the_way += 1
             elif one.command.state == "localised":
@@ -179,7 +179,7 @@ def test_a_robot_in_phase_1_goes_on_with_it_when_its_peer_ends_their_meeting(sig
 
 @pytest.mark.parametrize(
     ("silence", "refused", "leaves"),
-    [(SILENT_AFTER, False, False), (SILENT_AFTER + 1, False, True), (0, True, True)],
+    [(PEER_LOST_AFTER, False, False), (PEER_LOST_AFTER + 1, False, True), (0, True, True)],
     ids=["the peer may still report its result", "the peer is silent", "the peer has ended the meeting"],
 )
 def test_a_localised_robot_waits_for_its_peer_beside_it_for_a_bounded_time(

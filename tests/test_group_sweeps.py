@@ -12,7 +12,7 @@ from compose.launch.in_process import run_mission
 from compose.scenario.scenario_file import load, scenario_table, validate
 from compose.sweep import spec
 from compose.sweep.cells import cells
-from compose.sweep.group_columns import OF_GROUP, group_columns
+from compose.sweep.group_columns import GROUP_COLUMNS, group_columns
 from compose.sweep.statistics import columns_of
 from compose.sweep.table import schema_of
 from compose.sweep.trial import Trial, run_trial
@@ -103,8 +103,8 @@ def test_the_robot_r1_of_a_drawn_group_may_have_an_attack() -> None:
 def test_only_sweeps_of_groups_have_the_columns_of_groups(name: str, of_group: bool) -> None:
     sweep = spec.load(name)
     names = set(schema_of(sweep, list(cells(sweep))[:1]).names)
-    assert (set(OF_GROUP) <= names) == of_group
-    assert bool(set(OF_GROUP) & names) == of_group
+    assert (set(GROUP_COLUMNS) <= names) == of_group
+    assert bool(set(GROUP_COLUMNS) & names) == of_group
     assert ("makespan_p50" in columns_of(sweep)) == of_group
     assert ("honest_wrong" in columns_of(sweep)) == of_group
 

@@ -30,6 +30,9 @@ BELOW = {
 }
 """The packages of the project that each package may import."""
 
+BUDGETS = {"protocol": 4_350, "agent": 15_450, "world": 4_650, "compose": 33_500, "tandem": 1_800}
+"""The largest number of lines of Python of each package: a larger change lowers it; raising it needs a reason."""
+
 SHELL = {
     "protocol.network.session",
     "protocol.journal.journal_file",
@@ -303,6 +306,30 @@ def test_no_planner_asks_for_its_name_or_for_exact_sensors(field: str) -> None:
         if isinstance(node, ast.Attribute) and node.attr == field
     }
     assert asking == ASKED_IN[field]
+
+
+# --- size and names -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("package", BUDGETS)
+def test_no_package_exceeds_its_budget_of_lines(package: str) -> None:
+    lines = sum(len(path.read_text("utf-8").splitlines()) for path in (HOUSE / package).rglob("*.py"))
+    assert lines <= BUDGETS[package]
+
+
+def test_no_constant_is_defined_twice() -> None:
+    """Type variables are no constants."""
+    found: dict[str, list[str]] = {}
+    for module in [module for package in BELOW for module in modules(package)]:
+        for node in tree(module).body:
+            match node:
+                case (
+                    ast.Assign(targets=[ast.Name(name)])
+                    | ast.AnnAssign(target=ast.Name(name), value=ast.expr())
+                ):
+                    if name.isupper() and len(name) > 1:
+                        found.setdefault(name, []).append(module)
+    assert not {name: places for name, places in found.items() if len(places) > 1}
 
 
 # --- processes load only what they use ----------------------------------------------------------------

@@ -31,7 +31,7 @@ from agent.estimation.gaussian.least_squares import COARSE_STILL, fit, fits
 from agent.estimation.gaussian.odometry_noise import Array, constant_errors, track
 from agent.estimation.gaussian.placement_guesses import Residuals, _encounter, _likeliest
 from agent.estimation.gaussian.range_model import (
-    MOST_RANGES,
+    MOST_CORRELATED_RANGES,
     MOST_RANGES_BY_EXACT_ODOMETRY,
     PairRanges,
     Ranges,
@@ -401,7 +401,7 @@ def test_the_evidence_of_three_ranges_grows_as_they_get_more_accurate() -> None:
 
 def test_the_ranges_of_a_fit_are_bounded_and_the_recent_ones_are_all_among_them() -> None:
     many = [(tick, 1.0 + 1e-3 * tick) for tick in range(2 * MOST_RANGES_BY_EXACT_ODOMETRY)]
-    for noise, most in ((GYRO, MOST_RANGES), (RANGES, MOST_RANGES_BY_EXACT_ODOMETRY)):
+    for noise, most in ((GYRO, MOST_CORRELATED_RANGES), (RANGES, MOST_RANGES_BY_EXACT_ODOMETRY)):
         for count in (10, most, most + 1, 500, 1000):
             ranges = Ranges.of_lists(many[:count], many[:7], many[:count], noise)
             left = ranges.thinned(noise)
@@ -420,9 +420,9 @@ def test_what_is_left_of_old_ranges_seldom_changes() -> None:
         {
             tick
             for tick in Ranges.of_lists(many[:count], (), (), GYRO).thinned(GYRO).tick.tolist()
-            if tick < count - MOST_RANGES
+            if tick < count - MOST_CORRELATED_RANGES
         }
-        for count in range(MOST_RANGES, 1000)
+        for count in range(MOST_CORRELATED_RANGES, 1000)
     ]
     assert sum(not before <= after for before, after in pairwise(old)) <= 5, (
         "as often as their number doubles"

@@ -108,7 +108,7 @@ def test_a_journal_of_any_size_is_read_in_pieces(frames: int, tmp_path: Path) ->
 
 
 def test_frames_in_several_pieces_are_all_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(journal_file, "PIECE_BYTES", 1000)
+    monkeypatch.setattr(journal_file, "JOURNAL_PIECE_BYTES", 1000)
     few = [frame for frame in FRAMES if len(frame) < 900] * 3
     written(tmp_path / "it", few)
     assert list(journal_file.read(tmp_path / "it")) == few

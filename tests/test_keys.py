@@ -220,7 +220,9 @@ def last(own: Path, keys: Path, lasts: timedelta) -> None:
     key = load_pem_private_key((own / "key.pem").read_bytes(), None)
     assert isinstance(key, ec.EllipticCurvePrivateKey)
     name = "world" if own.name == "world" else "agent-a"
-    issued = certificates.issue(authority_of(keys), name, key.public_key(), certificates.LOOPBACK, lasts)
+    issued = certificates.issue(
+        authority_of(keys), name, key.public_key(), certificates.CERTIFIED_HOSTS, lasts
+    )
     (own / "cert.pem").write_bytes(issued.public_bytes(Encoding.PEM))
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from compose.recording.kills_file import KILLS, MOST_BYTES, Killed
+from compose.recording.kills_file import KILLS, MOST_KILLS_BYTES, Killed
 from compose.recording.recording_files import KINDS, WORLD_JOURNAL
 from compose.recording.run import Run, of_frames, read
 from compose.view.recorded import Journals, scenes, scenes_of
@@ -115,7 +115,7 @@ def test_a_robot_is_gone_until_it_meets_a_deadline_again(paper_1: Path) -> None:
             b'{"who":"a","tick":1,"point":"report","after":-1,"replayed_ticks":1}\n',
             "line 1: Expected `float` >= 0.0",
         ),
-        (b" " * (MOST_BYTES + 1), f"it is larger than {MOST_BYTES} bytes"),
+        (b" " * (MOST_KILLS_BYTES + 1), f"it is larger than {MOST_KILLS_BYTES} bytes"),
     ],
 )
 def test_a_damaged_file_is_one_note_and_the_recording_is_read_without_it(

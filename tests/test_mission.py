@@ -14,7 +14,7 @@ from agent.estimation.closed_forms import Placement
 from agent.planning.assured import AssuredExact
 from agent.planning.paper import Paper
 from agent.planning.phase1_anchor import third_point
-from agent.planning.phase3_last_manoeuvre import SPEEDS, TURN_RATES, last_manoeuvre
+from agent.planning.phase3_last_manoeuvre import LAST_SPEEDS, TURN_RATES, last_manoeuvre
 from compose.launch.in_process import run_mission
 from compose.recording.run import Run
 from compose.scenario.scenario_file import load, parse
@@ -323,7 +323,7 @@ def test_the_assured_last_manoeuvre_keeps_as_many_candidates_in_range_as_it_can(
         distances = predicted(b, a, found, v, omega)
         return -sum(distance > rim for distance in distances), least(distances)
 
-    fewest, best = max(value(speed, omega) for speed in SPEEDS for omega in grid())
+    fewest, best = max(value(speed, omega) for speed in LAST_SPEEDS for omega in grid())
     outside, attained = value(plan.command.v, plan.command.omega)
     assert outside == fewest
     assert attained == pytest.approx(best, abs=1e-9)

@@ -21,7 +21,7 @@ from compose.scenario.scenario_change import ScenarioChange, changed, values_of
 from compose.scenario.scenario_file import load, parse
 from compose.scenario.toml_file import field_first
 from compose.view.web import changed_missions
-from compose.view.web.changed_missions import MOST_TICKS, ChangedMissions
+from compose.view.web.changed_missions import MOST_MISSION_TICKS, ChangedMissions
 from compose.view.web.requested_work import RequestedWork
 from compose.view.web.sources import Recorded
 from tests.browser import Open, chromium_only, shot, until_loaded, until_shown
@@ -51,7 +51,7 @@ def test_a_mission_that_takes_too_long_is_ended(tmp_path: Path, monkeypatch: pyt
     show.load()
     missions = ChangedMissions(work)
     change = msgspec.convert(missions.values(show), ScenarioChange)
-    monkeypatch.setattr(changed_missions, "LONGEST_S", 0.0)
+    monkeypatch.setattr(changed_missions, "MISSION_S", 0.0)
     with pytest.raises(UserError, match="the mission has not ended after 0 s: save it"):
         missions.run(show, change)
     missions.close()
@@ -155,7 +155,7 @@ start = [11.0, 0.0, 100.0]
     "scenario", [load("paper-1", faults=FAULTS), load("noisy"), parse(EVERYTHING, "everything")]
 )
 def test_without_a_change_the_file_describes_the_same_scenario(scenario: Scenario) -> None:
-    table = changed(scenario, values_of(scenario), MOST_TICKS).table
+    table = changed(scenario, values_of(scenario), MOST_MISSION_TICKS).table
     again = parse(json_as_toml(table), "saved")
     assert replace(again, name=scenario.name) == scenario
 
@@ -167,7 +167,10 @@ def json_as_toml(table: dict[str, Any]) -> str:
 def test_sigma_is_that_of_all_ranges_and_zero_is_exact() -> None:
     noisy = load("noisy")
     found = [
-        parse(json_as_toml(changed(noisy, replace(values_of(noisy), sigma=sigma), MOST_TICKS).table), "saved")
+        parse(
+            json_as_toml(changed(noisy, replace(values_of(noisy), sigma=sigma), MOST_MISSION_TICKS).table),
+            "saved",
+        )
         for sigma in (0.02, 0.0)
     ]
     noise = found[0].mission.noise
@@ -177,7 +180,10 @@ def test_sigma_is_that_of_all_ranges_and_zero_is_exact() -> None:
 
 def test_a_planner_that_the_user_has_not_named_is_not_run_again() -> None:
     scenario = replace(PAPER_1, planner_name="os:popen")
-    for refused in (lambda: values_of(scenario), lambda: changed(scenario, values_of(PAPER_1), MOST_TICKS)):
+    for refused in (
+        lambda: values_of(scenario),
+        lambda: changed(scenario, values_of(PAPER_1), MOST_MISSION_TICKS),
+    ):
         with pytest.raises(UserError, match="the planner is os:popen; to run its code, add --planner"):
             refused()
 

@@ -385,7 +385,7 @@ def test_a_run_with_another_seed_does_nothing_twice(monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.long
 def test_the_benchmark_compares_the_api_with_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(api_missions, "MISSIONS", {"random": 50})
+    monkeypatch.setattr(api_missions, "MISSIONS_PER_SCENARIO", {"random": 50})
     cells = [[*column.cells] for column in api_missions.missions_by_api(3, lambda: None).columns]
     assert cells[0][2] == "tandem.run / engine (at most 1.6)"
     assert float(str(cells[1][2])) < 2.0

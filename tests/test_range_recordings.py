@@ -18,7 +18,7 @@ from compose.recording.ranging.pyfg import written_pyfg
 from compose.recording.ranging.range_csv import read_csv
 from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.range_recording import RangeRecording
-from compose.recording.ranging.run_ranges import LEAST_SIGMA, increment_covariance, ranges_of_run
+from compose.recording.ranging.run_ranges import ADDED_SIGMA, increment_covariance, ranges_of_run
 from compose.recording.run import Run
 from compose.scenario.scenario_file import load
 from docs import plaza_csv
@@ -276,7 +276,7 @@ def test_a_run_gives_what_its_robots_measured(noisy: Run) -> None:
     mutual = recording.pairs()["a", "b"]
     contacts = [noisy.contact("a", tick) for tick in range(noisy.length)]
     assert list(ranges.range[mutual]) == [one.range for one in contacts if one is not None and one.range]
-    assert ranges.sigma[mutual[0]] == math.hypot(mission.noise.mutual_sigma, LEAST_SIGMA)
+    assert ranges.sigma[mutual[0]] == math.hypot(mission.noise.mutual_sigma, ADDED_SIGMA)
 
 
 def test_a_run_in_hardware_mode_has_no_truth_and_a_robot_alone_no_mutual_ranges(

@@ -186,7 +186,7 @@ def working_for(page: int) -> bool:
 def test_work_beyond_its_deadline_is_ended_with_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(trials, "LONGEST_S", 0.2)
+    monkeypatch.setattr(trials, "TRIAL_S", 0.2)
     work = RequestedWork()
     with pytest.raises(UserError, match=r"^the trial has not ended after 0.2 s: print its scenario with"):
         (slow := trials.Trials(results(tmp_path, ENDLESS), work)).worst(0)

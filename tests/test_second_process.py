@@ -117,7 +117,7 @@ def test_tasks_of_a_second_process_that_is_killed_are_done_by_the_first(
 def test_tasks_of_a_suspended_second_process_are_done_by_the_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(second_process, "WAIT_S", 0.2)
+    monkeypatch.setattr(second_process, "SECOND_PROCESS_S", 0.2)
     monkeypatch.setattr(second_process, "END_S", 0.2)
     task = by_second(tmp_path, nothing, lambda: os.kill(os.getpid(), signal.SIGSTOP))
     assert shared([task] * 5) == [str(os.getpid())] * 5

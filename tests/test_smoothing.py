@@ -18,7 +18,7 @@ from agent.estimation.gaussian import odometry_noise
 from agent.estimation.gaussian.consistency import FINISHED
 from agent.estimation.gaussian.fitted import Fit
 from agent.estimation.gaussian.fitted_poses import deviation, poses
-from agent.estimation.gaussian.least_squares import STILL, fit, fits
+from agent.estimation.gaussian.least_squares import LAST_STEP, fit, fits
 from agent.estimation.gaussian.linear_model import Start
 from agent.estimation.gaussian.odometry_noise import (
     OdometryNoiseModel,
@@ -330,7 +330,7 @@ def nudged(told: Told, seed: int, by: float) -> Array:
 
 
 def converged(one: Fit) -> bool:
-    return float(one.system.change @ one.information @ one.system.change) < STILL**2
+    return float(one.system.change @ one.information @ one.system.change) < LAST_STEP**2
 
 
 @some
@@ -434,7 +434,7 @@ def test_a_fit_ends_where_no_pose_and_no_error_of_the_odometry_is_likelier(seed:
     one = told(seed, noise)
     assume(clear(one))
     found = fitted(one, one.guess)
-    assume(found.last_step < STILL)
+    assume(found.last_step < LAST_STEP)
     information, gradient, _ = information_of(one, found)
     covariance = np.linalg.inv(information)
     left = (covariance @ gradient) / np.sqrt(np.diagonal(covariance))
@@ -533,7 +533,7 @@ def test_a_fit_begins_on_the_path_that_it_is_given(seed: int) -> None:
     one = told(seed, DRIFTING)
     assume(clear(one))
     first = fit(one.guess, one.measured, one.ranges, one.noise, one.apart, steps=30)
-    assume(first.last_step < STILL)
+    assume(first.last_step < LAST_STEP)
     there = fit(first.guess, one.measured, one.ranges, one.noise, one.apart, steps=0, begun=first.errors)
     assert there.last_step < 0.3, (
         "the last step has been taken; among 938 draws, the next one had at most 0.073"
@@ -650,7 +650,7 @@ def test_exact_ranges_and_strides_of_a_kilometre_leave_a_covariance_that_can_be_
     found = fit(anchor + (1.0, -1.0, 0.0), [path], ranges, Noise(odometry=VelocityNoise(0.01, 0.01)).as_told)
     assert found.guess == pytest.approx(anchor, abs=1e-3)
     assert np.min(np.linalg.eigvalsh(found.covariance)) > 0.0
-    assert found.last_step < STILL
+    assert found.last_step < LAST_STEP
 
 
 @few

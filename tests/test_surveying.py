@@ -16,7 +16,7 @@ from agent.planning.active_sensing import plan_alone, plan_together
 from agent.planning.phase2_orbit import pursuit
 from agent.planning.range_seeking import Homing, homing_controls
 from agent.planning.state import estimator_for
-from agent.planning.strides import AHEAD, choice, stride
+from agent.planning.strides import STRIDES_AHEAD, choice, stride
 from protocol.mission import Mission
 from protocol.motion import REST, Controls, Pose, step
 from protocol.noise import Noise, VelocityNoise
@@ -105,7 +105,7 @@ def test_of_mirror_images_a_robot_drives_where_their_ranges_differ(along: float,
     tight = np.eye(2) * 1e-6
     command = plan_alone([held(one, 0.5, tight), held(other, 0.5, tight)], MISSION)
     gaps = []
-    for _ in range(AHEAD):
+    for _ in range(STRIDES_AHEAD):
         one, other = after(one, command), after(other, command)
         gaps.append(math.hypot(one.x, one.y) - math.hypot(other.x, other.y))
     assert math.hypot(*gaps) > 4.0 * SIGMA

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from agent.planning.group import TRAVELLING
+from agent.planning.group import TRAVELLING_MODE
 from agent.planning.unanchored import UnanchoredPlanner, UnanchoredState
 from compose.audit.replay import replayed
 from compose.errors import UserError
@@ -236,7 +236,7 @@ def test_a_robot_without_an_anchor_that_claims_to_visit_is_not_met() -> None:
     for tick in range(done + 1):
         state = planner.decide(planner.observe(state, run.observations[tick]["a"]))
     assert state.verdict is None
-    visit = Report(done, "u", 3, TRAVELLING, ORIGIN, 0, 1, (Segment(1, 0.0, 0.0),), 0, (), 0, 0)
+    visit = Report(done, "u", 3, TRAVELLING_MODE, ORIGIN, 0, 1, (Segment(1, 0.0, 0.0),), 0, (), 0, 0)
     assert visit.has_log
     met = Observation(done + 1, "a", REST, None, (Contact("u", 1.0, (done,)),))
     after = planner.decide(planner.observe(state, met), [visit])

@@ -13,7 +13,7 @@ from agent.planning import sweep
 from agent.planning.sweep import Looping, Sweeping
 from protocol.mission import Mission
 from protocol.motion import ORIGIN, Pose, compose, step
-from protocol.sweep_strips import NEAR, SIDE, SweptArea
+from protocol.sweep_strips import SIDE, STRIP_REACH, SweptArea
 from protocol.sweep_ticks import way_ticks
 from tests.groups import R
 
@@ -44,7 +44,7 @@ def measured(found: Pose, finder: Pose, error: float = 0.0) -> Ranges:
 ANGLES = st.floats(-math.pi, math.pi)
 
 
-@given(ANGLES, ANGLES, ANGLES, st.floats(0.05 * R, NEAR * R))
+@given(ANGLES, ANGLES, ANGLES, st.floats(0.05 * R, STRIP_REACH * R))
 def test_two_squares_leave_one_pose_which_is_the_true_one(
     own: float, other: float, bearing: float, apart: float
 ) -> None:
@@ -56,7 +56,7 @@ def test_two_squares_leave_one_pose_which_is_the_true_one(
     assert abs(math.remainder(found[0].heading - own, math.tau)) < 1e-9
 
 
-@given(ANGLES, st.floats(0.1 * R, NEAR * R))
+@given(ANGLES, st.floats(0.1 * R, STRIP_REACH * R))
 def test_no_pose_explains_the_ranges_to_a_robot_that_scales_its_path(bearing: float, apart: float) -> None:
     true = Pose(apart * math.cos(bearing), apart * math.sin(bearing), 1.0)
     assert poses(*measured(true, ORIGIN, error=0.1), FLOOR) == ()
@@ -108,7 +108,7 @@ def test_a_sweep_comes_near_each_place_of_the_area_in_a_tick(
     path = driven(area.path(0, R), Pose(0.0, 0.0, 1.0), Mission(R, 1.0, speed, 0.7))
     place = (5.0 + x * wide, -3.0 + y * high)
     # the robot may be on a square of its own, because another one has passed
-    assert min(math.dist((pose.x, pose.y), place) for pose in path) <= NEAR * R - math.sqrt(2.0) * FAR
+    assert min(math.dist((pose.x, pose.y), place) for pose in path) <= STRIP_REACH * R - math.sqrt(2.0) * FAR
 
 
 @given(LENGTHS, LENGTHS, st.floats(0.1, 7.0), st.floats(0.1, 7.0))

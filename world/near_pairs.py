@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-ROUNDING = 1e-9
+CELL_ROUNDING = 1e-9
 """The part by which a cell is wider than the reach: rounding must not put near places two cells apart."""
 
 
@@ -14,7 +14,7 @@ def near_pairs(places: Sequence[tuple[float, float]], reach: float) -> list[tupl
 
     Each pair is its two indices, the smaller one first. The pairs are sorted.
     """
-    width = reach * (1.0 + ROUNDING)
+    width = reach * (1.0 + CELL_ROUNDING)
     cells: dict[tuple[int, int], list[int]] = {}
     found: list[tuple[int, int]] = []
     for j, (x, y) in enumerate(places):

@@ -23,7 +23,7 @@ import zenoh
 from protocol.messages import Command, FinalReport, GroundTruth, Message, MissionEnd, Observation
 from protocol.network import diagnosis, keys, session
 from protocol.network.endpoints import Endpoints
-from protocol.network.inbox import NOTHING, Arrival, Inbox
+from protocol.network.inbox import NO_ARRIVAL, Arrival, Inbox
 from protocol.spelling import did_you_mean
 from protocol.wire import MalformedFrame, decode, encode
 from world.referee import MissionOutcome
@@ -201,7 +201,7 @@ class WorldProcess:
                 self._put_all_again(frames, frames.keys() - commands.keys(), now)
             if len(commands) < len(self._robots) and now - self._answered > self._timeout + self._tick_s:
                 raise NoAnswer(self._who_is_missing(commands))
-            if due is not None and now >= due and (arrival is NOTHING or now >= due + self._tick_s):
+            if due is not None and now >= due and (arrival is NO_ARRIVAL or now >= due + self._tick_s):
                 break
         return commands
 
@@ -236,7 +236,7 @@ class WorldProcess:
     def _next(self, timeout: float) -> Arrival:
         now = time.monotonic()
         arrival = self._inbox.next(min(timeout, self._link_deadline - now))
-        if arrival is not NOTHING:
+        if arrival is not NO_ARRIVAL:
             self._link_deadline = now + self._link_timeout
             if self._check is not None and self._check.is_mute(now):
                 raise RobotsLinkLost
@@ -367,7 +367,7 @@ class WorldProcess:
             now = time.monotonic()
 
 
-POLL_S = 0.05
+WORLD_POLL_S = 0.05
 """The time in s between two attempts to reach a router."""
 
 
@@ -399,7 +399,7 @@ class WorldLinks:
             if time.monotonic() >= give_up:
                 why = diagnosis.why(self.endpoints)
                 raise NoRouter(f"no router at {self.endpoints}; gave up after {self._timeout:g} s: {why}")
-            self._inbox.next(POLL_S)
+            self._inbox.next(WORLD_POLL_S)
 
         if self.endpoints.connect:
             later = threading.Timer(diagnosis.FIRST_WORD_S, self._warn_without_link)

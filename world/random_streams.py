@@ -10,7 +10,7 @@ import hashlib
 import math
 from functools import lru_cache
 
-_WORD = 1 << 52
+_UNIFORM_VALUES = 1 << 52
 """The number of values of a uniform number. All of them are exact floats, and none is 0 or 1."""
 
 
@@ -29,9 +29,9 @@ def correlated(seed: int, sensor: str, robot: str, tick: int, correlation: float
     """Return the value at `tick` of a stationary AR(1) process with mean 0 and variance 1.
 
     The process is the sum of the Gaussian numbers of this and of earlier ticks, with weights that fall by
-    `correlation` a tick. Ticks whose weights are below NEGLIGIBLE are left out.
+    `correlation` a tick. Ticks whose weights are below NEGLIGIBLE_CORRELATION are left out.
     """
-    length = math.ceil(math.log(NEGLIGIBLE) / math.log(correlation))
+    length = math.ceil(math.log(NEGLIGIBLE_CORRELATION) / math.log(correlation))
     total = 0.0
     for age in range(length - 1, -1, -1):
         total = correlation * total + _remembered(seed, sensor, robot, tick - age)
@@ -59,7 +59,7 @@ def random_walk(seed: int, sensor: str, robot: str, tick: int) -> float:
     return at_begin if tick == begin else at_end
 
 
-NEGLIGIBLE = 1e-5
+NEGLIGIBLE_CORRELATION = 1e-5
 """The weight in `correlated` below which a tick is left out."""
 
 
@@ -71,4 +71,4 @@ def _remembered(seed: int, sensor: str, robot: str, tick: int) -> float:
 def _uniforms(seed: int, sensor: str, robot: str, tick: int) -> tuple[float, float]:
     digest = hashlib.blake2b(f"{seed}/{sensor}/{robot}/{tick}".encode(), digest_size=16).digest()
     one, other = int.from_bytes(digest[:8], "big"), int.from_bytes(digest[8:], "big")
-    return (one % _WORD + 0.5) / _WORD, (other % _WORD + 0.5) / _WORD
+    return (one % _UNIFORM_VALUES + 0.5) / _UNIFORM_VALUES, (other % _UNIFORM_VALUES + 0.5) / _UNIFORM_VALUES

@@ -14,10 +14,10 @@ from protocol.rounding import TOLERANCE
 from world.scenario import Death, Scenario
 from world.truth import Truth
 
-SIGMAS = 5.0
+TOLERATED_SIGMAS = 5.0
 """The number of claimed standard deviations by which a claim may differ from the truth, with noise."""
 
-NAMED = 4
+MOST_NAMED = 4
 """The most robots that are named at the end of a reason; the summary of a run has all of them."""
 
 
@@ -43,8 +43,8 @@ def tolerances(claim: Localised, mission: Mission) -> tuple[float, float]:
     if claim.covariance is None or mission.noise.exact:
         return TOLERANCE, TOLERANCE
     return (
-        max(TOLERANCE, SIGMAS * min(claim.covariance.position_sigma, mission.accuracy)),
-        max(TOLERANCE, SIGMAS * min(claim.covariance.heading_sigma, HEADING_ACCURACY)),
+        max(TOLERANCE, TOLERATED_SIGMAS * min(claim.covariance.position_sigma, mission.accuracy)),
+        max(TOLERANCE, TOLERATED_SIGMAS * min(claim.covariance.heading_sigma, HEADING_ACCURACY)),
     )
 
 
@@ -151,8 +151,8 @@ def _others_not_localised(
 
 def either(robots: Sequence[str]) -> str:
     """Return the clause that `robots` are not localised either, which names some of them."""
-    more = len(robots) - NAMED
-    names = ", ".join(robots[:NAMED]) + (f" and {more} more" if more > 0 else "")
+    more = len(robots) - MOST_NAMED
+    names = ", ".join(robots[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
     return f"{names} {'is' if len(robots) == 1 else 'are'} not localised either"
 
 

@@ -33,13 +33,13 @@ from world.faults import Fault
 from world.radio_models import RADIO_MODELS
 from world.range_models import RANGE_MODELS
 from world.sensor_model import SensorModel, sensor_model
-from world.world_models import OWN, ModelSpec, RadioModel, RangeModel
+from world.world_models import OWN_MODELS, ModelSpec, RadioModel, RangeModel
 from world.world_noise import WorldNoise
 
 
 def model_class(name: str, shipped: Mapping[str, Any]) -> Any:
     """Return the class of a model that is shipped, or that the user has named. Raises LookupError."""
-    found = shipped.get(name) or OWN.get(name)
+    found = shipped.get(name) or OWN_MODELS.get(name)
     if found is None:
         raise LookupError(f"the world uses the model {name}; to run its code, add --model {name}")
     return found

@@ -15,7 +15,7 @@ from world.random_streams import correlated, gaussian, random_walk, uniform
 from world.world_models import Radios, RangeModel
 from world.world_noise import WorldNoise, of_robot
 
-LONGEST = 1e7
+LONGEST_RANGE = 1e7
 """The largest measured range in m, which is the bound of `units.Range`."""
 
 
@@ -135,7 +135,7 @@ class SensorModel(msgspec.Struct, frozen=True):
             rho -= least + (most - least) * uniform(seed, f"{sensor}-short-bias", robot, tick)
         if sigma:
             rho += sigma * self._error(sensor, robot, tick)
-        return min(max(0.0, rho), LONGEST)
+        return min(max(0.0, rho), LONGEST_RANGE)
 
     def _error(self, sensor: str, robot: str, tick: int) -> float:
         """Return the error of a range as a multiple of its sigma, with variance 1.

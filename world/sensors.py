@@ -14,7 +14,7 @@ from protocol.noise import VelocityNoise
 from world.near_pairs import near_pairs
 from world.random_streams import gaussian
 from world.scenario import Scenario
-from world.sensor_model import LONGEST
+from world.sensor_model import LONGEST_RANGE
 from world.truth import Truth
 from world.world_models import Radios, RangeModel
 
@@ -128,7 +128,7 @@ def _modelled(rho: float | None, model: RangeModel | None, radios: Radios | None
     if rho is None or model is None or radios is None:
         return rho
     found = model.measured(radios, rho)
-    return None if found is None else min(max(0.0, float(found)), LONGEST)
+    return None if found is None else min(max(0.0, float(found)), LONGEST_RANGE)
 
 
 def executed(limited_controls: Controls, scenario: Scenario, robot: str, tick: int) -> Controls:

@@ -122,5 +122,5 @@ class RadioModel(Generic[S]):
         return state, 0
 
 
-OWN: dict[str, Any] = {}
+OWN_MODELS: dict[str, Any] = {}
 """The classes of models that the user of this process has named, by name (see `compose.launch`)."""

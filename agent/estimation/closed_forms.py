@@ -11,14 +11,14 @@ from typing import NamedTuple
 
 from protocol.motion import Pose, compose, wrap
 
-SLACK = 1e-7
+TRIANGLE_SLACK = 1e-7
 """The fraction of a triangle's perimeter by which rounding may violate the triangle inequality.
 
 A later test of the residuals rejects whatever this admits wrongly. A side is the sum of some thousand terms,
 each up to a thousand times as long as the side, and 1e-16 of 1e6 is less than this fraction.
 """
 
-SAME = 1e-9
+SAME_PLACEMENT = 1e-9
 """The angle in rad, and the fraction of a length, below which two placements are the same (a double root)."""
 
 
@@ -31,7 +31,7 @@ def included_angle(near: float, far: float, moved: float) -> float | None:
     """
     if near == 0.0:
         return 0.0
-    slack = SLACK * (near + far + moved)
+    slack = TRIANGLE_SLACK * (near + far + moved)
     if not abs(far - near) - slack <= moved <= far + near + slack:
         return None
     long, short = max(near, moved), min(near, moved)
@@ -91,7 +91,7 @@ def placements(
         for tx, ty in circle_intersections(p1b.x, p1b.y, radius, distance):
             spin = math.atan2(ty - p1b.y, tx - p1b.x) - math.atan2(anchor_y, anchor_x)
             candidate = Placement(wrap(turn + spin), tx, ty)
-            if not any(same_placement(candidate, other, SAME) for other in found):
+            if not any(same_placement(candidate, other, SAME_PLACEMENT) for other in found):
                 found.append(candidate)
     return found
 
@@ -110,7 +110,7 @@ def circle_intersections(x: float, y: float, radius: float, distance: float) -> 
     the first is a point, each up to rounding.
     """
     apart = math.hypot(x, y)
-    if min(apart, radius) < SAME * (apart + radius + distance):
+    if min(apart, radius) < SAME_PLACEMENT * (apart + radius + distance):
         return []
     away = included_angle(apart, radius, distance)
     if away is None:

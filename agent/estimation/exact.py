@@ -15,7 +15,7 @@ import msgspec
 
 from agent.estimation.closed_forms import Placement, included_angle, same_placement
 from protocol.motion import Pose, compose, wrap
-from protocol.rounding import SAME, same_turn
+from protocol.rounding import SAME_ANCHORS, same_turn
 
 POLISHING_STEPS = 12
 """The maximum number of Gauss-Newton steps; most fits stop improving after one."""
@@ -23,7 +23,7 @@ POLISHING_STEPS = 12
 FITTED = 3
 """The number of anchor ranges from which the heading is fitted to all of them; two are met exactly."""
 
-DAMPING = 1e-9
+ADDED_CURVATURE = 1e-9
 """The fraction of a fit's curvature that is added to it, so that a step stays within what is determined."""
 
 CLOSEST = 1e-12
@@ -96,7 +96,7 @@ def weigh_branches(
         if (
             _branch_meets(branch, ranged, floor)
             and _branch_misses(branch, undetected, sensing_range - 0.5 * margin)
-            and not any(math.dist(branch.anchor, other.anchor) < SAME * floor for other in left)
+            and not any(math.dist(branch.anchor, other.anchor) < SAME_ANCHORS * floor for other in left)
         ):
             left.append(branch)
     return tuple(left)
@@ -119,7 +119,7 @@ def anchor_error(start: Pose, ranged: Sequence[tuple[Pose, float, float]]) -> fl
         moment += y * y
         across += floor * y * (rho + rho0)
     turned = across / moment if moment > 0.0 else math.inf
-    return (1.0 + SAME) * ranged[-1][2] + min(2.0 * rho0, turned)
+    return (1.0 + SAME_ANCHORS) * ranged[-1][2] + min(2.0 * rho0, turned)
 
 
 def _branch_meets(branch: Branch, ranged: Iterable[tuple[Pose, float]], floor: float) -> bool:
@@ -332,7 +332,7 @@ def _polished_placement(placement: Placement, measured: Sequence[tuple[Positions
         if cost >= best:
             break
         best, fitted = cost, Placement(wrap(phi), tx, ty)
-        pp, qq = pp * (1.0 + DAMPING), qq * (1.0 + DAMPING)
+        pp, qq = pp * (1.0 + ADDED_CURVATURE), qq * (1.0 + ADDED_CURVATURE)
         determinant = pp * qq - pq * pq
         if determinant == 0.0:
             break

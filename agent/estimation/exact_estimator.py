@@ -21,7 +21,7 @@ from agent.estimation.knowledge import Belief, Knowledge, off_anchor
 from agent.estimation.mutual_ranges import base, redundant, solve
 from protocol.messages import Inconsistent, Localised, Observation, Verdict
 from protocol.motion import ORIGIN, REST
-from protocol.rounding import SAME
+from protocol.rounding import SAME_ANCHORS
 
 
 class ExactEstimator(msgspec.Struct, frozen=True):
@@ -47,7 +47,7 @@ class ExactEstimator(msgspec.Struct, frozen=True):
 
     def on_anchor(self, knowledge: Knowledge, rho0: float) -> FittedBranch | None:
         """Return the branch of a robot on its anchor: its heading is radial by definition."""
-        if rho0 > SAME * precision.range_rounding(knowledge, knowledge.log, knowledge.tick):
+        if rho0 > SAME_ANCHORS * precision.range_rounding(knowledge, knowledge.log, knowledge.tick):
             return None
         known = precision.anchor(knowledge, ORIGIN, knowledge.log)
         return FittedBranch(Branch(0.0, ORIGIN), known.error, known.enough)
@@ -140,4 +140,4 @@ def _with_placements(
     return replace(belief, placements=remaining, candidates=candidates, observations=tuple(observations))
 
 
-EXACT: Estimator = ExactEstimator()
+EXACT_ESTIMATOR: Estimator = ExactEstimator()

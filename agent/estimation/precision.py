@@ -17,7 +17,7 @@ from agent.estimation.knowledge import Belief, Knowledge
 from agent.peer.motion_log import MotionLog
 from protocol.mission import RANGE_MARGIN, Mission
 from protocol.motion import ORIGIN, Pose, Segment, follow
-from protocol.rounding import BETTER, OUT_AND_BACK, SAME, SURE, WELL, required_anchor_error, rounding
+from protocol.rounding import BETTER, OUT_AND_BACK, SAME_ANCHORS, SURE, WELL, required_anchor_error, rounding
 
 
 def size(knowledge: Knowledge) -> float:
@@ -95,7 +95,7 @@ def anchor(knowledge: Knowledge, start: Pose, log: MotionLog) -> Known:
         if error < least or len(ranged) <= FITTED:
             least, ranges, used, least_floor = error, count, len(ranged), floor
         # Branches that `weigh_branches` merged later differ by its larger floor.
-        known = least + SAME * (floor - least_floor)
+        known = least + SAME_ANCHORS * (floor - least_floor)
         stalled = len(ranged) >= FITTED and error > BETTER * before
         spent = len(ranged) - used == OUT_AND_BACK
         if known <= WELL * enough or (stalled and known <= enough) or spent:

@@ -13,19 +13,19 @@ from typing import NamedTuple
 
 from protocol.motion import Pose, compose, wrap
 
-STEPS = 12
+RESECTION_STEPS = 12
 """The maximum number of Gauss-Newton steps; most fits stop improving after one."""
 
 REDUNDANT = 1
 """The number of ranges more than unknowns that a pose needs, so that a false report is found."""
 
-SPREAD = 0.02
+LEAST_POSITION_INFORMATION = 0.02
 """The least root of the information about a position in its worst direction, for ranges with sigma 1 m.
 
 From four corners of a square with a side of 0.03 R, 0.9 R away, it is 0.033; from a line, about 0.
 """
 
-LEVER = 0.02
+LEAST_HEADING_INFORMATION = 0.02
 """The least information about the heading, in units of the squared distance driven.
 
 A range contains 1 if the robot has driven across the line to the other one, and 0 if along it.
@@ -78,7 +78,7 @@ def positions(standing: Sequence[RangedPlace], floor: float) -> tuple[Point, ...
 def _fitted_position(place: Point, standing: Sequence[RangedPlace]) -> Point:
     """Return the position near `place` that fits all ranges best (Gauss-Newton)."""
     best, fitted = math.inf, place
-    for _ in range(STEPS):
+    for _ in range(RESECTION_STEPS):
         cost = xx = xy = yy = gx = gy = 0.0
         for (x, y), _, rho in standing:
             dx, dy = place[0] - x, place[1] - y
@@ -122,11 +122,12 @@ def poses(standing: Sequence[RangedPlace], moved: Sequence[RangedPlace], floor: 
 def is_certain(standing: Sequence[RangedPlace], moved: Sequence[RangedPlace], found: Sequence[Pose]) -> bool:
     """Return whether one pose is left that redundant ranges have confirmed, and that they determine well.
 
-    A rounding error of the ranges is amplified by at most 1 / SPREAD, in position and heading.
+    A rounding error of the ranges is amplified by at most 1 / LEAST_POSITION_INFORMATION, in position and
+    heading.
     """
     if len(found) != 1 or len(moved) < 1 + REDUNDANT or not is_fixed(standing, (found[0].x, found[0].y)):
         return False
-    least = math.sqrt(LEVER) * _reach(moved)
+    least = math.sqrt(LEAST_HEADING_INFORMATION) * _reach(moved)
     return sum([_slope(found[0], one) ** 2 for one in moved]) >= least * least
 
 
@@ -136,7 +137,7 @@ def is_fixed(standing: Sequence[RangedPlace], place: Point) -> bool:
         return False
     xx, xy, yy = _information(place, standing)
     least = 0.5 * (xx + yy) - math.hypot(0.5 * (xx - yy), xy)
-    return least >= SPREAD * SPREAD
+    return least >= LEAST_POSITION_INFORMATION * LEAST_POSITION_INFORMATION
 
 
 def _information(place: Point, standing: Sequence[RangedPlace]) -> tuple[float, float, float]:
@@ -179,7 +180,7 @@ def _headings(place: Point, moved: Sequence[RangedPlace]) -> tuple[float, ...]:
 def _fitted_heading(place: Point, heading: float, moved: Sequence[RangedPlace]) -> float:
     """Return the heading near `heading` that fits all ranges best (Gauss-Newton)."""
     best, fitted = math.inf, heading
-    for _ in range(STEPS):
+    for _ in range(RESECTION_STEPS):
         cost = gradient = curvature = 0.0
         for one in moved:
             here = compose(Pose(*place, heading), one.odometry)

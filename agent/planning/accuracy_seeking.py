@@ -22,7 +22,7 @@ from agent.planning import active_sensing, exchange, phase2_orbit, range_seeking
 from agent.planning.active_sensing import CONTINUED, STALLED, Listening, Objective, Retreating, Surveying
 from agent.planning.assured import AssuredExact
 from agent.planning.pair_claim import (
-    FEWEST_MUTUAL_RANGES,
+    FEWEST_FOR_CLAIM,
     inferred,
     may_claim,
     required_mutual_ranges,
@@ -374,7 +374,7 @@ def _decide_phase3(state: RobotState, planned: JointManoeuvres) -> RobotState:
     state = _of_this_attempt(state)
     pair = inference.pair_of(state)
     mutual = pair.ranges.counts[2]
-    if mutual < FEWEST_MUTUAL_RANGES:
+    if mutual < FEWEST_FOR_CLAIM:
         return _drive_without_hypotheses(state)
     scored, hypotheses, belief, searched = inferred(state, pair)
     if searched:

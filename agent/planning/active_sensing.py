@@ -21,11 +21,11 @@ from agent.estimation.gaussian.odometry_noise import Array, Places
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
 from agent.planning import separation
 from agent.planning.range_seeking import Beacon
-from agent.planning.strides import AHEAD, Choice, choice, stride
+from agent.planning.strides import STRIDES_AHEAD, Choice, choice, stride
 from protocol.mission import Mission, Role
 from protocol.motion import REST, Controls
 
-NEGLIGIBLE = 0.03
+NEGLIGIBLE_GAIN = 0.03
 """The standard deviation below which a further improvement has no value, as a fraction of the accuracy."""
 
 CONFUSION_COST = 10.0
@@ -55,7 +55,7 @@ class Objective(NamedTuple):
     """The cost of standing still."""
 
 
-CONTINUED = Objective(AHEAD, OUTSIDE_COST, 0.0)
+CONTINUED = Objective(STRIDES_AHEAD, OUTSIDE_COST, 0.0)
 """The objective of robots that get further with each plan."""
 
 STALLED = Objective(1, OUTSIDE_COST_ALONE, STALLED_COST)
@@ -109,7 +109,7 @@ def plan_alone(
         distances.append(np.maximum(np.hypot(x, y), SIGMA_FLOOR))
         if one is best:
             ux, uy = x / distances[0], y / distances[0]
-    sigma = max(mission.noise.anchor_sigma, NEGLIGIBLE * mission.accuracy)
+    sigma = max(mission.noise.anchor_sigma, NEGLIGIBLE_GAIN * mission.accuracy)
     weight = (distances[0] <= reach) / sigma**2
     information = _information(best.covariance, mission)
     xx = information[0, 0] + np.sum(weight * ux * ux, 1)
@@ -189,8 +189,8 @@ def _best_of(
     In the last pair, the robot that has several manoeuvres stands still.
     """
     reach = mission.sensing_range
-    own_sigma = max(mission.noise.anchor_sigma, NEGLIGIBLE * mission.accuracy)
-    sigma = max(mission.noise.mutual_sigma, NEGLIGIBLE * mission.accuracy)
+    own_sigma = max(mission.noise.anchor_sigma, NEGLIGIBLE_GAIN * mission.accuracy)
+    sigma = max(mission.noise.mutual_sigma, NEGLIGIBLE_GAIN * mission.accuracy)
     anchors = ((0.0, 0.0), m2)
     count = max(len(of_a), len(of_b))
     distances = []
@@ -203,8 +203,8 @@ def _best_of(
         distances.append(distance)
         off_anchor = np.hypot(bx[:, 0] - m2[0], by[:, 0] - m2[1])
         for beyond, loss in (
-            (distance[:, 0] - FARTHEST * reach, objective.outside_cost),
-            (off_anchor - FARTHEST * reach, objective.outside_cost),
+            (distance[:, 0] - FARTHEST_PLANNED * reach, objective.outside_cost),
+            (off_anchor - FARTHEST_PLANNED * reach, objective.outside_cost),
             (NEAREST * reach - np.min(distance, 1), OUTSIDE_COST),
             (NEAREST_TO_ANCHOR * reach - off_anchor, OUTSIDE_COST),
         ):
@@ -267,7 +267,7 @@ def _keep_apart(
     for one in hypotheses:
         (ax, ay), (bx, by) = ways.way(one.poses[:3], of_a), ways.way(one.poses[3:], of_b)
         relative = one.covariance[:2, :2] + one.covariance[3:5, 3:5] - 2.0 * one.covariance[:2, 3:5]
-        uncertainty = separation.SIGMAS * math.sqrt(max(0.0, float(np.trace(relative))))
+        uncertainty = separation.LARGEST_ERROR_SIGMAS * math.sqrt(max(0.0, float(np.trace(relative))))
         least = (
             np.min(np.hypot(ax - bx, ay - by), 1) - 0.5 * lengths_of_both / separation.CHORDS - uncertainty
         )
@@ -278,7 +278,7 @@ def _keep_apart(
 STANDING_COST = 1e300
 """The cost of standing still where every manoeuvre, this one included, might violate the safety distance."""
 
-FARTHEST = 0.9
+FARTHEST_PLANNED = 0.9
 """The largest planned distance between the robots, and from b to its anchor, as a fraction of R."""
 
 NEAREST = 0.2
@@ -299,7 +299,7 @@ def _information(covariance: Array, mission: Mission) -> Array:
     variances, axes = np.linalg.eigh(covariance)
     most = max(4.0 * mission.sensing_range**2, math.pi**2)
     information: Array = (
-        axes / (np.clip(variances, 0.0, most) + (NEGLIGIBLE * mission.accuracy) ** 2) @ axes.T
+        axes / (np.clip(variances, 0.0, most) + (NEGLIGIBLE_GAIN * mission.accuracy) ** 2) @ axes.T
     )
     return information
 

@@ -14,7 +14,7 @@ from agent.planning import exchange, phase3_last_manoeuvre, transitions
 from agent.planning.log_exchange import LogPlanner
 from agent.planning.manoeuvres import Manoeuvres
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent, Travelling
-from agent.planning.phase3_last_manoeuvre import SPEEDS, Standing, Waiting
+from agent.planning.phase3_last_manoeuvre import LAST_SPEEDS, Standing, Waiting
 from agent.planning.state import MODE_NAMES, Done, RobotState
 from protocol.messages import Command, Localised, Observation, Report
 from protocol.mission import Mission
@@ -31,7 +31,7 @@ class AssuredExact(LogPlanner):
     """The planner `assured` with exact sensors. Subclasses may plan another last manoeuvre."""
 
     MANOEUVRES = Manoeuvres(
-        directions=(1.0, -1.0), sides=(1.0, -1.0), last_speeds=SPEEDS, fewest_out_of_range=True
+        directions=(1.0, -1.0), sides=(1.0, -1.0), last_speeds=LAST_SPEEDS, fewest_out_of_range=True
     )
     """Both ways, to both sides in phase 1, and at several speeds."""
 

@@ -18,7 +18,7 @@ from agent.estimation.gaussian.claim_agreement import agreement
 from agent.estimation.gaussian.covariance_union import covariance_union
 from agent.estimation.gaussian.later_pose import later_pose
 from agent.planning import group_transitions
-from agent.planning.group import TRAVELLING, GroupPlanner
+from agent.planning.group import TRAVELLING_MODE, GroupPlanner
 from agent.planning.group_state import Fix, GroupState
 from agent.planning.state import UNCONFIRMED
 from protocol.messages import Command, Localised, Report, RobotConfigWithConfirmation, Undecided
@@ -30,7 +30,7 @@ RANGES_AGAIN, SHARE_AGAIN = 6, 1.1
 BEGINS_WITHIN = 0.3
 """The fraction of the time of a visit within which it may begin, if the robot is not free at once."""
 
-SILENT_AFTER = 8
+MEETING_OVER_AFTER = 8
 """The ticks in range without a log of a visitor after which a robot takes its meeting with it for over."""
 
 
@@ -59,7 +59,7 @@ class ConfirmingPlanner(GroupPlanner):
         """Return `state` with what `report` says: a robot that travels need not have claimed its pose."""
         known = state.other(report.robot)
         claims = not report.has_log and isinstance(report.verdict, Localised)
-        known = replace(known, travels=report.state == TRAVELLING, localised=known.localised or claims)
+        known = replace(known, travels=report.state == TRAVELLING_MODE, localised=known.localised or claims)
         return state.with_other(report.robot, known)
 
     def with_pose(self, state: GroupState, pose: Localised) -> GroupState:
@@ -108,7 +108,7 @@ def _in_due_visit(state: GroupState) -> GroupState:
 
 def _is_free(state: GroupState) -> bool:
     """Return whether this robot knows a pose, waits beside its anchor, and is in no meeting."""
-    alone = state.alone or not state.pair.in_contact or state.silence > SILENT_AFTER
+    alone = state.alone or not state.pair.in_contact or state.silence > MEETING_OVER_AFTER
     return state.fix is not None and state.waits and alone
 
 

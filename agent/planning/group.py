@@ -40,7 +40,7 @@ from protocol.messages import (
 from protocol.mission import Mission
 from protocol.motion import Controls, compose
 
-TRAVELLING = MODE_NAMES[Travelling]
+TRAVELLING_MODE = MODE_NAMES[Travelling]
 """The mode of a robot that is localised, and drives to another one."""
 
 
@@ -107,7 +107,9 @@ class GroupPlanner(Planner[GroupState, Report]):
             state = self.with_sender(state, one)
         anchored = [one.robot for one in state.config.members]
         logs = [one for one in reports if one.has_log and one.robot in anchored]  # others are in no meeting
-        state = group_transitions.answering(state, [one.robot for one in logs if one.state == TRAVELLING])
+        state = group_transitions.answering(
+            state, [one.robot for one in logs if one.state == TRAVELLING_MODE]
+        )
         peer, before = state.pair.config.peer, state.pair
         alone = not state.meets or group_transitions.refused(state, peer)
         of_peer = [] if alone else [one for one in logs if one.robot == peer]
@@ -199,7 +201,7 @@ def _is_out_of_range_again(before: RobotState, after: RobotState) -> bool:
 
 def with_sender(state: GroupState, report: Report) -> GroupState:
     """Return `state` with what `report` says about its sender: whether it travels, is localised or served."""
-    known, travels = state.other(report.robot), report.state == TRAVELLING
+    known, travels = state.other(report.robot), report.state == TRAVELLING_MODE
     localised = known.localised or travels or (not report.has_log and isinstance(report.verdict, Localised))
     served = known.served or report.state == UNCONFIRMED
     if (travels, localised, served) == (known.travels, known.localised, known.served):

@@ -36,7 +36,7 @@ In range, it waits for the verdict of the peer. Out of range, it may have missed
 has received that of this robot before.
 """
 
-SILENT_AFTER = 200
+PEER_LOST_AFTER = 200
 """The ticks in contact without a report after which a robot takes its peer for lost."""
 
 LINGERING = 6
@@ -77,7 +77,7 @@ def _is_met(state: GroupState) -> bool:
 
 def _is_silent(state: GroupState) -> bool:
     """Return whether this robot takes its peer, which is in range, for lost."""
-    return state.silence > SILENT_AFTER
+    return state.silence > PEER_LOST_AFTER
 
 
 def refused(state: GroupState, robot: str) -> bool:
@@ -411,5 +411,5 @@ def _must_linger(state: GroupState) -> bool:
     if not state.config.mission.safety_distance or state.config.role == "a" or not pair.in_contact:
         return False
     if state.other(state.config.peer).travels:
-        return state.lingering < SILENT_AFTER
+        return state.lingering < PEER_LOST_AFTER
     return state.lingering < LINGERING

@@ -16,7 +16,7 @@ from protocol.messages import Estimate, Observation, Report, RobotConfig
 from protocol.mission import Mission
 from protocol.motion import Controls
 
-PLACES = 3
+KEPT_PLACES = 3
 """The number of relative placements that a claim from exact ranges needs; two leave several solutions."""
 
 
@@ -25,7 +25,7 @@ class LogPlanner(Planner[RobotState, Report]):
 
     BODY = Report
     MANOEUVRES: Manoeuvres
-    REQUIRED_PLACES = PLACES
+    REQUIRED_PLACES = KEPT_PLACES
 
     def start(self, config: RobotConfig) -> RobotState:
         """Return the state of a robot that has measured nothing yet."""

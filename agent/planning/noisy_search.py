@@ -20,7 +20,7 @@ from agent.planning.state import Done
 from agent.planning.sweep import Sweeping
 from protocol.messages import Localised, Report, ReportWithReference, RobotConfigWithSweep, Undecided
 from protocol.motion import inverse
-from protocol.sweep_strips import ALONG, ASIDE, NEAR, surveyed_path
+from protocol.sweep_strips import ALONG, ASIDE, STRIP_REACH, surveyed_path
 from protocol.sweep_ticks import contact_ticks
 
 LINGER = 10
@@ -187,7 +187,7 @@ def _stops_for(state: GroupState, robot: str) -> bool:
     reference, mission = state.own_pose.reference, state.config.mission
     if reference is None or reference.covariance.position_sigma > WORTH * mission.accuracy:
         return False
-    return _has_passed(state.other(robot), state.pair.tick, NEAR * mission.sensing_range)
+    return _has_passed(state.other(robot), state.pair.tick, STRIP_REACH * mission.sensing_range)
 
 
 def _has_passed(known: Other, tick: int, near: float) -> bool:

@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from agent.estimation.gaussian.contact_fit import ContactEstimate, ContactRanges, estimated, is_definite
 from agent.estimation.gaussian.gaussian_estimator import GAUSSIAN
 from agent.estimation.gaussian.inference import MUTUAL_RANGES, MUTUAL_RANGES_WITH_OUTLIERS
-from agent.estimation.gaussian.known_anchors import FEWEST
+from agent.estimation.gaussian.known_anchors import FEWEST_FOR_POSE
 from agent.estimation.gaussian.odometry_noise import Track, track
 from agent.peer import peer_state
 from agent.peer.motion_log import MotionLog
@@ -230,7 +230,10 @@ def _estimated(state: NoisyUnanchoredState) -> NoisyUnanchoredState:
             if ends[0] <= one.tick <= ends[1]
         ]
     )
-    if len(ranges) < max(FEWEST, state.ranges_at_estimate + EACH) or state.tick < state.estimated_tick + EACH:
+    if (
+        len(ranges) < max(FEWEST_FOR_POSE, state.ranges_at_estimate + EACH)
+        or state.tick < state.estimated_tick + EACH
+    ):
         return state
     contact = ContactRanges(
         finder.pose,

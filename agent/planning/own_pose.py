@@ -60,7 +60,7 @@ In a group whose fit was right, it was 1.6. With less, fewer robots are found in
 the ellipse has little to do with the likelihood.
 """
 
-TINY = 1e-6
+SMALLEST_LOSS = 1e-6
 """The smallest difference of log-likelihoods by which another one is divided."""
 
 MOST_FITS = 4
@@ -213,7 +213,7 @@ def _reference(state: GroupState, estimate: _Estimate) -> Reference | None:
     if not is_sound:
         return None
     rival = likeliest_rival(first.fit, fitted.measured, estimate.hypothesis, (_index(pair),))
-    widened = NORMAL_RATIO / min(rival.log_likelihood_ratio, -TINY)
+    widened = NORMAL_RATIO / min(rival.log_likelihood_ratio, -SMALLEST_LOSS)
     if widened > MOST_WIDENED:
         return None
     factor = max(widened, 1.0)

@@ -27,7 +27,7 @@ from agent.planning.state import Done, RobotState
 from protocol.messages import Localised
 from protocol.mission import Mission
 
-FEWEST_MUTUAL_RANGES = 3
+FEWEST_FOR_CLAIM = 3
 """The minimum number of mutual ranges for hypotheses, and before a claim.
 
 With fewer, there are too many hypotheses, and no range checks them. How many more a claim needs depends on
@@ -40,7 +40,7 @@ EARLY_RANGES = 16
 Few ranges leave room for a wrong hypothesis that fits by chance. With more, only the p-value of the search
 counts. The bound delays one of a hundred right claims by a few ticks."""
 
-SEARCH_AT = frozenset((FEWEST_MUTUAL_RANGES, *(8 * 2**n for n in range(12))))
+PAIR_SEARCHES = frozenset((FEWEST_FOR_CLAIM, *(8 * 2**n for n in range(12))))
 """The numbers of mutual ranges at which the whole plane is searched again for hypotheses.
 
 They only bound how long a missed hypothesis stays missed: the plane is also searched before each claim, and
@@ -50,7 +50,7 @@ whenever the best fit still moves. More searches cost time; with fewer, robots p
 
 def required_mutual_ranges(mission: Mission) -> int:
     """Return the minimum number of mutual ranges before a claim."""
-    return inference.MUTUAL_RANGES_WITH_OUTLIERS if mission.noise.outliers else FEWEST_MUTUAL_RANGES
+    return inference.MUTUAL_RANGES_WITH_OUTLIERS if mission.noise.outliers else FEWEST_FOR_CLAIM
 
 
 class PairInference(NamedTuple):
@@ -66,11 +66,11 @@ class PairInference(NamedTuple):
 def inferred(state: Knowledge, pair: PairRanges) -> PairInference:
     """Return the hypotheses about both robots, from those of the last tick or from a search.
 
-    The whole plane is searched if nothing is known, at the counts SEARCH_AT, if the best fit still moves,
+    The whole plane is searched if nothing is known, at the counts PAIR_SEARCHES, if the best fit still moves,
     because it may be on its way to another mode, and before a claim or a suspicion.
     """
     known, mutual = state.belief.pair, pair.ranges.counts[2]
-    if known and not any(state.belief.ranges_at_last_search < count <= mutual for count in SEARCH_AT):
+    if known and not any(state.belief.ranges_at_last_search < count <= mutual for count in PAIR_SEARCHES):
         scored = follow(known, pair)
         if scored and scored[0].fit.last_step <= FINISHED:
             followed = weighed(state, pair, scored, searched=False)

@@ -16,10 +16,10 @@ from protocol.motion import Controls, Pose, chord, compose
 PREFERENCE = 1e-9
 """The relative improvement, above rounding errors, that a later candidate needs to replace an earlier one."""
 
-SHORTEST = 1e-9
+SHORTEST_MANOEUVRE = 1e-9
 """The length of a manoeuvre, relative to A_0, up to which it counts as none."""
 
-SIGMAS = 3.0
+IN_RANGE_SIGMAS = 3.0
 """The distance inside R, in standard deviations of a range, at which a noisy point counts as in range."""
 
 
@@ -54,8 +54,8 @@ def third_point(
     """
     best: Controls | None = None
     best_value = 0.0
-    shortest = SHORTEST * mission.first_straight
-    rim = mission.sensing_range - max(margin, SIGMAS * mission.noise.anchor_sigma)
+    shortest = SHORTEST_MANOEUVRE * mission.first_straight
+    rim = mission.sensing_range - max(margin, IN_RANGE_SIGMAS * mission.noise.anchor_sigma)
     turn_rate = third_point_turn_rate(mission)
     turn_rates = [side * turn_rate for side in manoeuvres.sides]
     # A single branch was found on a radius. A straight manoeuvre along that radius would check nothing.

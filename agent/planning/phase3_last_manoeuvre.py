@@ -29,7 +29,7 @@ TURN_RATES = 721
 With the parameters of Section IV, there is one every half degree.
 """
 
-SPEEDS = (1.0, -1.0, 0.75, -0.75, 0.5, -0.5, 0.25, -0.25, 0.1, -0.1)
+LAST_SPEEDS = (1.0, -1.0, 0.75, -0.75, 0.5, -0.5, 0.25, -0.25, 0.1, -0.1)
 """The values of v_2 compared, in units of A_0 / T_s: v_max, or less if one tick would come near R."""
 
 REGULARISATION = 1e-8
@@ -216,7 +216,7 @@ def most_informative_manoeuvre(
     matrix. Both robots have to move to raise it.
     """
     question = Question(mover, a, b, (placement,))
-    reach = reachable(a if mover == "a" else b, mission, SPEEDS)
+    reach = reachable(a if mover == "a" else b, mission, LAST_SPEEDS)
     (ax, ay), (bx, by) = _positions_in_b(mover, a, b, placement, reach.x, reach.y)
     dx, dy = ax - bx, ay - by
     apart = np.maximum(np.hypot(dx, dy), ELSEWHERE)

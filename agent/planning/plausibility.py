@@ -15,7 +15,7 @@ from protocol.messages import Inconsistent, Report, RobotConfig
 from protocol.mission import Mission
 from protocol.motion import wrap
 
-SLACK = 1e-9
+SPEED_SLACK = 1e-9
 """The relative tolerance of v_max and omega_max for rounding."""
 
 NOISY = 6.0
@@ -86,7 +86,7 @@ def _largest_measurement(limit: float, relative: tuple[float, ...], floor: float
 
     `relative` are the sigmas of the actuation, of the odometry and of its scale, as fractions of the speed.
     """
-    return limit * (1.0 + SLACK + NOISY * math.hypot(*relative)) + floor
+    return limit * (1.0 + SPEED_SLACK + NOISY * math.hypot(*relative)) + floor
 
 
 def _ranges_off_path(

@@ -20,10 +20,10 @@ class Assured(AssuredExact):
         return AssuredExact() if mission.noise.exact else AccuracySeeking()
 
 
-SHIPPED: dict[str, type[Planner[Any, Any]]] = {"assured": Assured, "paper": Paper}
+PLANNER_CLASSES: dict[str, type[Planner[Any, Any]]] = {"assured": Assured, "paper": Paper}
 """The classes of the shipped planners."""
 
 
 def planner(name: str, mission: Mission) -> Planner[Any, Any]:
     """Return the shipped planner `name` for the noise of `mission`. Raises KeyError if there is none."""
-    return SHIPPED[name]().suited(mission)
+    return PLANNER_CLASSES[name]().suited(mission)

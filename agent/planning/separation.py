@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 CHORDS = 16
 """The number of chords per arc. Half a circle of 1 m arc length is at most 1.5 mm from its chords."""
 
-SIGMAS = 3.0
+LARGEST_ERROR_SIGMAS = 3.0
 """The assumed largest error of a noisy range, in standard deviations."""
 
 SHARE_OF_EACH = 0.5
@@ -26,7 +26,7 @@ def leeway(rho: float, mission: Mission) -> float:
     """Return how far in m a robot may go in any direction, `rho` m from a peer that stands still."""
     if not mission.safety_distance:
         return math.inf
-    return max(0.0, rho - SIGMAS * mission.noise.mutual_sigma - mission.safety_distance)
+    return max(0.0, rho - LARGEST_ERROR_SIGMAS * mission.noise.mutual_sigma - mission.safety_distance)
 
 
 def slowed(controls: Controls, metres: float, mission: Mission) -> Controls:

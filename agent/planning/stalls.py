@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from agent.estimation.gaussian.odometry_noise import Track
-from agent.estimation.gaussian.range_model import ELSEWHERE
+from agent.estimation.gaussian.range_model import MOVED
 from protocol.mission import Mission
 
 PLANS = 6
@@ -42,6 +42,6 @@ def is_stalled(paths: Sequence[Track], since: int, stride: int, mission: Mission
         return False
     ticks = now - stride * np.arange(PLANS + 1)
     where = np.stack([one for path in paths for one in (path.x[ticks], path.y[ticks])])
-    apart = np.abs(where[:, :, None] - where[:, None, :]).max(0) > ELSEWHERE * mission.sensing_range
+    apart = np.abs(where[:, :, None] - where[:, None, :]).max(0) > MOVED * mission.sensing_range
     is_new = [all(apart[i, :i].tolist()) for i in range(len(ticks))]
     return sum(is_new) <= STALLED_PLACES

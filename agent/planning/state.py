@@ -6,7 +6,7 @@ import msgspec
 from msgspec.structs import replace
 
 from agent.estimation.estimator import Estimator
-from agent.estimation.exact_estimator import EXACT
+from agent.estimation.exact_estimator import EXACT_ESTIMATOR
 from agent.estimation.gaussian.gaussian_estimator import GAUSSIAN
 from agent.estimation.knowledge import Knowledge
 from agent.planning.active_sensing import Listening, Retreating, Surveying
@@ -24,7 +24,7 @@ from protocol.orbits import Orbit
 
 def estimator_for(mission: Mission) -> Estimator:
     """Return the estimator for the noise of `mission`."""
-    return EXACT if mission.noise.exact else GAUSSIAN
+    return EXACT_ESTIMATOR if mission.noise.exact else GAUSSIAN
 
 
 class Asleep(msgspec.Struct, frozen=True):
@@ -72,7 +72,7 @@ MODE_NAMES: dict[type, str] = {
 }
 
 
-PHASES: dict[type, int] = {
+PHASE_OF_TASK: dict[type, int] = {
     Asleep: 1,
     ThirdPoint: 1,
     Homing: 1,
@@ -118,7 +118,7 @@ class RobotState(Knowledge, frozen=True):
     def phase(self) -> int:
         """Return the phase of the paper: 1, 2 or 3."""
         mode = self.mode
-        phase = PHASES.get(type(mode))
+        phase = PHASE_OF_TASK.get(type(mode))
         if phase is not None:
             return phase
         if isinstance(mode, Done):

@@ -15,13 +15,13 @@ from protocol.mission import Mission
 STRIDE_LENGTH = 0.25
 """The minimum length of a manoeuvre, as a fraction of R. A manoeuvre lasts as many ticks as that takes."""
 
-AHEAD = 3
+STRIDES_AHEAD = 3
 """The number of strides over which a manoeuvre is evaluated, as if it were continued."""
 
-TURNS = 17
+TURN_COUNT = 17
 """The number of values of omega that are compared, from -omega_max to omega_max."""
 
-SPEEDS = (1.0, -1.0, 0.5, -0.5)
+STRIDE_SPEEDS = (1.0, -1.0, 0.5, -0.5)
 """The values of v that are compared, in units of A_0 / T_s."""
 
 SLOW = (0.1, -0.1)
@@ -63,13 +63,13 @@ def _placed(pose: Array, along: Array, across: Array) -> tuple[Array, Array]:
 
 
 @cache
-def choice(mission: Mission, strides: int = AHEAD) -> Choice:
+def choice(mission: Mission, strides: int = STRIDES_AHEAD) -> Choice:
     """Return all manoeuvres of a robot, continued for `strides`. The last one is to stand still."""
     period = stride(mission) * mission.period
     fastest = min(mission.max_turn_rate, math.pi / period)
-    speeds = SPEEDS + SLOW if mission.safety_distance else SPEEDS
+    speeds = STRIDE_SPEEDS + SLOW if mission.safety_distance else STRIDE_SPEEDS
     omega, speed = np.meshgrid(
-        np.linspace(-fastest, fastest, TURNS), mission.first_straight / mission.period * np.array(speeds)
+        np.linspace(-fastest, fastest, TURN_COUNT), mission.first_straight / mission.period * np.array(speeds)
     )
     v = np.append(speed.ravel(), 0.0)
     turn = np.append(omega.ravel(), 0.0)

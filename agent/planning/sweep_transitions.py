@@ -14,7 +14,7 @@ from agent.planning.group_state import GroupState
 from agent.planning.sweep import LOOPS_FOR, Looping, Sweeping
 from protocol.messages import RobotConfigWithSweep
 from protocol.motion import inverse
-from protocol.sweep_strips import NEAR, Place
+from protocol.sweep_strips import STRIP_REACH, Place
 
 
 def wanted(state: GroupState) -> bool:
@@ -115,5 +115,6 @@ def _is_near(state: GroupState, robot: str) -> bool:
     if known.failed or not known.mutual or known.mutual[-1].tick != pair.tick:
         return False
     return (
-        isinstance(pair.mode, Looping) or known.mutual[-1].range <= NEAR * state.config.mission.sensing_range
+        isinstance(pair.mode, Looping)
+        or known.mutual[-1].range <= STRIP_REACH * state.config.mission.sensing_range
     )

@@ -18,7 +18,7 @@ import msgspec
 from msgspec.structs import replace
 
 from agent.estimation import resection
-from agent.estimation.exact_estimator import EXACT
+from agent.estimation.exact_estimator import EXACT_ESTIMATOR
 from agent.estimation.resection import RangedPlace
 from agent.peer.motion_log import MotionLog
 from agent.planning import exchange, sweep
@@ -41,7 +41,7 @@ from protocol.mission import Mission
 from protocol.motion import ORIGIN, REST, Pose, compose, inverse, wrap
 from protocol.rounding import SURE
 
-EXPLAINED = 0.1 * SURE
+LARGEST_MISFIT = 0.1 * SURE
 """The largest difference in m between a measured range and the one that a possible pose predicts.
 
 It is far above the rounding errors of the poses of both robots, and far below what a wrong pose predicts.
@@ -56,7 +56,7 @@ AGREE = SURE
 One of them is honest, so the error of both is smaller than the tolerance of a claim, 2 SURE.
 """
 
-PLACES = 5
+FEWEST_PLACES = 5
 """The number of relative placements that a claim needs: three for a position, two for a heading."""
 
 
@@ -130,7 +130,7 @@ class UnanchoredPlanner(Planner[UnanchoredState, Report]):
     """The planner of a robot without an anchor, with exact sensors."""
 
     BODY = Report
-    REQUIRED_PLACES = PLACES
+    REQUIRED_PLACES = FEWEST_PLACES
 
     def start(self, config: RobotConfig) -> UnanchoredState:
         """Return the state of a robot that has measured nothing yet."""
@@ -188,7 +188,7 @@ class UnanchoredPlanner(Planner[UnanchoredState, Report]):
 
     def command(self, state: UnanchoredState) -> Command:
         """Return the command for the next tick, with the phase, the mode and the verdict."""
-        return state.command(EXACT.pose_tolerance)
+        return state.command(EXACT_ESTIMATOR.pose_tolerance)
 
     def estimate(self, state: UnanchoredState) -> Estimate:
         """Return the poses in <W> that agree with all ranges, or those that robots have not confirmed yet."""
@@ -225,10 +225,10 @@ def _resected(state: UnanchoredState) -> UnanchoredState:
         standing = [one for one in known if one.odometry == ORIGIN]
         moved = [one for one in known if one.odometry != ORIGIN]
         if isinstance(state.mode, Standing):
-            found = resection.positions(standing, EXPLAINED)
+            found = resection.positions(standing, LARGEST_MISFIT)
             if len(found) == 1 and resection.is_fixed(standing, found[0]):
                 return replace(state, mode=sweep.looping(state.odometry, state.config.mission, state.tick))
-        elif moved and (possible := resection.poses(standing, moved, EXPLAINED)):
+        elif moved and (possible := resection.poses(standing, moved, LARGEST_MISFIT)):
             state = replace(state, possible=possible)
             if resection.is_certain(standing, moved, possible):
                 state = _with_candidate(state, robot, _now(state, possible[0]))
@@ -271,7 +271,7 @@ def _moved_on(state: UnanchoredState) -> UnanchoredState:
     """
     assert isinstance(state.mode, Looping)
     mission, since = state.config.mission, state.mode.since
-    mode = sweep.onward(state.mode, state.odometry, mission, EXACT.pose_tolerance)
+    mode = sweep.onward(state.mode, state.odometry, mission, EXACT_ESTIMATOR.pose_tolerance)
     if mode.places:
         return replace(state, mode=mode)
     latest = max([tick for robot, tick in state.places if robot not in state.candidates], default=-KEPT)

@@ -10,9 +10,9 @@ import zenoh
 
 from protocol.messages import RobotConfig, RobotConfigInGroup
 from protocol.network import keys, session
-from protocol.network.inbox import NOTHING, Arrival, Inbox
+from protocol.network.inbox import NO_ARRIVAL, Arrival, Inbox
 
-SILENCE_S = 3.0
+WORLD_SILENCE_S = 3.0
 """The seconds without a frame from the world after which a session is replaced.
 
 Zenoh itself drops a link after `session.LEASE_S` and reconnects, but occasionally nothing ever arrives over
@@ -34,7 +34,7 @@ class AgentLink:
         """The robots whose Reports are received: the peer, or in a group all robots."""
         self._run = run
         self._inbox = inbox
-        self._link_timeout = SILENCE_S + (config.tick_s or 0.0)
+        self._link_timeout = WORLD_SILENCE_S + (config.tick_s or 0.0)
         self.estimate_wanted = False
         """True while any viewer subscribes to estimates."""
 
@@ -55,7 +55,7 @@ class AgentLink:
         self._received_at = time.monotonic()
 
     def next(self, until: float) -> Arrival:
-        """Return the next arrival, or NOTHING once the monotonic clock reaches `until`.
+        """Return the next arrival, or NO_ARRIVAL once the monotonic clock reaches `until`.
 
         Raises WorldLinkLost if no Observation has arrived for too long, or if the session cannot send.
         """
@@ -65,7 +65,7 @@ class AgentLink:
             self._received_at = time.monotonic()
             if self._check.is_mute(self._received_at):
                 raise WorldLinkLost
-        elif arrival is NOTHING and time.monotonic() >= lost:
+        elif arrival is NO_ARRIVAL and time.monotonic() >= lost:
             raise WorldLinkLost
         return arrival
 

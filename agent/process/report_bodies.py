@@ -18,7 +18,7 @@ _encoder = msgspec.msgpack.Encoder()
 _decoders: dict[Any, msgspec.msgpack.Decoder[Any]] = {}
 
 
-SHORT = 24
+SHORT_REASON = 24
 """The maximum number of characters of a reason in a PlannerReport, so that most of it is the body."""
 
 
@@ -33,9 +33,9 @@ def report_of(
         return body
     match verdict:
         case Undecided(reason):
-            verdict = Undecided(reason[:SHORT])
+            verdict = Undecided(reason[:SHORT_REASON])
         case Inconsistent(claim, residual, p_value):
-            verdict = Inconsistent(claim[:SHORT], residual, p_value)
+            verdict = Inconsistent(claim[:SHORT_REASON], residual, p_value)
     return PlannerReport(tick, robot, heard, verdict, _encoder.encode(body))
 
 

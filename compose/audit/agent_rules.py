@@ -18,7 +18,7 @@ from protocol.mission import Mission
 from protocol.motion import Controls
 from protocol.wire import MalformedFrame, decode, encode
 
-ROUNDING = 1e-12
+LIMIT_ROUNDING = 1e-12
 """The part of a limit by which rounding may move a quotient of a length and a period beyond it."""
 
 
@@ -102,9 +102,9 @@ def _within(
     tick: int, robot: str, how: str, controls: Command | Controls, mission: Mission
 ) -> Violation | None:
     speed, turn_rate = mission.max_speed, mission.max_turn_rate
-    if abs(controls.v) > speed * (1.0 + ROUNDING):
+    if abs(controls.v) > speed * (1.0 + LIMIT_ROUNDING):
         what = f"it {how} v = {controls.v:g}, expected at most {speed:g}"
-    elif abs(controls.omega) > turn_rate * (1.0 + ROUNDING):
+    elif abs(controls.omega) > turn_rate * (1.0 + LIMIT_ROUNDING):
         what = f"it {how} omega = {controls.omega:g}, expected at most {turn_rate:g}"
     else:
         return None

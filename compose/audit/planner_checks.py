@@ -24,9 +24,9 @@ from protocol.messages import RobotConfig
 from protocol.network.inbox import Inbox
 from world.scenario import Scenario
 
-TIMEOUT_S = 30.0
+CHECK_TIMEOUT_S = 30.0
 """The time in s without an answer after which a run as processes has failed."""
-POINTS = ("observation", "report", "journal", "command")
+CHECKED_POINTS = ("observation", "report", "journal", "command")
 """The points of a tick at which processes are killed, in turn."""
 
 
@@ -137,11 +137,12 @@ def _audited(run: Run) -> Check:
 def _kills(scenario: Scenario, run: Run) -> tuple[Kill, ...]:
     """Return kills of each robot and of the world, spread over the mission and the points of a tick."""
     names = [*[robot.id for robot in scenario.robots], "world"]
-    found = [
-        parse(f"{name}@{tick}:{POINTS[i % len(POINTS)] if tick in _contact(run, name) else 'journal'}")
-        for i, name in enumerate(names * 2)
-        if (tick := run.length * (i + 1) // (2 * len(names) + 1)) > 0
-    ]
+    found = []
+    for i, name in enumerate(names * 2):
+        tick = run.length * (i + 1) // (2 * len(names) + 1)
+        point = CHECKED_POINTS[i % len(CHECKED_POINTS)] if tick in _contact(run, name) else "journal"
+        if tick > 0:
+            found.append(parse(f"{name}@{tick}:{point}"))
     return tuple(found)
 
 
@@ -162,7 +163,7 @@ def _as_processes(scenario: Scenario, first: Journals, kills: tuple[Kill, ...], 
                 inbox,
                 run=run_name(scenario),
                 rate=None,
-                timeout=TIMEOUT_S,
+                timeout=CHECK_TIMEOUT_S,
                 kills=kills,
             )
         except ChildFailed as error:

@@ -17,9 +17,9 @@ from compose.audit.journal_rules import config, order
 from compose.audit.rules import Rules, audit_run
 from compose.recording.run import Run
 
-RULES: Rules = (config, observation, contact, report, decision, order, outcome)
+REPLAY_RULES: Rules = (config, observation, contact, report, decision, order, outcome)
 """The rules of a replay, in the order of a tick: the first difference is the cause of later ones."""
-HARDWARE_RULES: Rules = (report, decision, order)
+HARDWARE_REPLAY_RULES: Rules = (report, decision, order)
 """The rules of a replay in hardware mode."""
 
 
@@ -46,7 +46,7 @@ def replayed(run: Run) -> Replay:
 
     Raises CorruptJournal if a frame cannot be decoded or is in the journal of another robot.
     """
-    findings = audit_run(run, RULES, HARDWARE_RULES)
+    findings = audit_run(run, REPLAY_RULES, HARDWARE_REPLAY_RULES)
     return Replay(
         findings.scenario,
         findings.ticks,

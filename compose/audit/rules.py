@@ -17,7 +17,7 @@ from compose.recording.run import Run
 from protocol.journal.environment import of_robot, of_world, otherwise
 
 Rules = Sequence[Callable[[Run], Checks]]
-RULES: Rules = (
+AUDIT_RULES: Rules = (
     order,
     scenario,
     config,
@@ -36,7 +36,7 @@ HARDWARE_RULES: Rules = (order, scenario_rules.config, report, decision, limits,
 from its inputs, and it received what its peer sent."""
 
 
-def audit_run(run: Run, rules: Rules = RULES, hardware_rules: Rules = HARDWARE_RULES) -> Findings:
+def audit_run(run: Run, rules: Rules = AUDIT_RULES, hardware_rules: Rules = HARDWARE_RULES) -> Findings:
     """Return the findings in `run`: of `rules`, or of `hardware_rules` if there is no world's journal.
 
     Raises OSError and CorruptJournal if a robot's journal cannot be read.

@@ -33,7 +33,7 @@ from protocol.messages import MissionEnd, RobotConfig
 from protocol.network.inbox import Inbox
 from protocol.output import leave, say
 
-MISSING = "--connect ENDPOINT is required, such as tcp/127.0.0.1:7447"
+CONNECT_MISSING = "--connect ENDPOINT is required, such as tcp/127.0.0.1:7447"
 ENDED_SEARCH_S = 3.0
 """s for which an agent that resumes after its MissionEnd looks for a world that may lack its FinalReport."""
 ENDED_TIMEOUT_S = 10.0
@@ -68,7 +68,7 @@ def main(options: argparse.Namespace) -> int:
 
 def _run(options: argparse.Namespace, inbox: Inbox) -> MissionEnd:
     """Run the agent, resumed from its journal if there is one, and return the MissionEnd."""
-    endpoints = endpoints_of(options, f"agent-{options.id}", MISSING)
+    endpoints = endpoints_of(options, f"agent-{options.id}", CONNECT_MISSING)
     old = old_journal(options, agent_journal(options.id))
     for planner in options.planner:
         trust(planner)

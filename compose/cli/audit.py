@@ -17,7 +17,7 @@ from compose.terminal import text_width
 from compose.terminal.text_width import tell
 from protocol.output import say
 
-SHOWN = 20
+SHOWN_VIOLATIONS = 20
 """The number of violations that are printed in full."""
 
 
@@ -55,10 +55,10 @@ def _show(findings: Findings) -> None:
         tell("", f"{findings.versions}: that alone can lead to other decisions")
     if findings.violations:
         say("")
-    for violation in findings.violations[:SHOWN]:
+    for violation in findings.violations[:SHOWN_VIOLATIONS]:
         tell(violation.line)
-    if len(findings.violations) > SHOWN:
-        say(f"and {len(findings.violations) - SHOWN} more")
+    if len(findings.violations) > SHOWN_VIOLATIONS:
+        say(f"and {len(findings.violations) - SHOWN_VIOLATIONS} more")
 
 
 def _count(violations: int) -> str:

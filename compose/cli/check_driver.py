@@ -15,9 +15,6 @@ from compose.terminal import text_width
 from compose.terminal.text_width import tell
 from protocol.output import one_line, say
 
-MARKED = len("wrong  ")
-"""The width of the mark before each check."""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `tandem check-driver`."""
@@ -56,5 +53,5 @@ def main(options: argparse.Namespace) -> int:
     found = check_results(trial)
     for one in found:
         line = f"wrong  {one.check}: {one.wrong}" if one.wrong else f"ok     {one.check}"
-        say(*text_width.wrapped(one_line(line), MARKED))
+        say(*text_width.wrapped(one_line(line), text_width.MARKED))
     return VIOLATED if any(one.wrong for one in found) else CLEAN

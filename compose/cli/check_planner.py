@@ -11,9 +11,6 @@ from compose.scenario.scenario_file import setting
 from compose.terminal import text_width
 from protocol.output import one_line, say
 
-MARKED = len("wrong  ")
-"""The width of the mark before each check."""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `tandem check-planner`."""
@@ -54,6 +51,6 @@ def main(options: argparse.Namespace) -> int:
     failed = False
     for one in check_planner(scenario, QuietInbox("tandem check-planner")):
         line = f"wrong  {one.what}: {one.wrong}" if one.wrong else f"ok     {one.what}"
-        say(*text_width.wrapped(one_line(line), MARKED))
+        say(*text_width.wrapped(one_line(line), text_width.MARKED))
         failed |= one.wrong is not None
     return VIOLATED if failed else CLEAN

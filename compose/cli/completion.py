@@ -14,7 +14,7 @@ from protocol.output import say
 SHELLS = ("bash", "zsh")
 ZSH = "autoload -U +X bashcompinit && bashcompinit"
 """The line with which zsh runs completions of bash."""
-SHIPPED = {"SCENARIO": "scenario", "SPEC": "sweep"}
+SHIPPED_ARGUMENTS = {"SCENARIO": "scenario", "SPEC": "sweep"}
 """The package with the names that an argument may have, by its metavar."""
 
 
@@ -71,8 +71,8 @@ def _completions(parser: argparse.ArgumentParser) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {"": []}
     for action in parser._actions:
         values = [str(one) for one in action.choices or ()]
-        if isinstance(action.metavar, str) and action.metavar in SHIPPED:
-            values += shipped(SHIPPED[action.metavar])
+        if isinstance(action.metavar, str) and action.metavar in SHIPPED_ARGUMENTS:
+            values += shipped(SHIPPED_ARGUMENTS[action.metavar])
         if action.help == argparse.SUPPRESS:
             continue
         found[""] += [flag for flag in action.option_strings if flag.startswith("--")]

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from compose.cli.arguments import add_closing, add_part_of_recording, confidence, folder, names, positive
-from compose.errors import BROKEN_PIPE, ENDED, NOT_LOCALISED, STOPPED, CannotWrite, UserError
+from compose.errors import BROKEN_PIPE, ENDED, NOT_LOCALISED, STOPPED_STATUS, CannotWrite, UserError
 from compose.extras import need
 from compose.launch.signals import until_signal
 from compose.recording.recording_files import make_folder
@@ -89,7 +89,7 @@ def main(options: argparse.Namespace) -> int:
     """Estimate, print a table and write the files.
 
     Return NOT_LOCALISED if a robot may not claim its pose at the end; if a stream was ended by a signal
-    STOPPED, and BROKEN_PIPE if the reader of the output has gone.
+    STOPPED_STATUS, and BROKEN_PIPE if the reader of the output has gone.
     """
     from compose.recording.estimating import estimate_epoch  # noqa: PLC0415
     from compose.recording.estimating.estimate_run import estimated, measurements  # noqa: PLC0415  # numpy
@@ -123,7 +123,7 @@ def _followed(
 ) -> tuple[EstimationProblem, RecordingEstimate, int | None]:
     """Print the estimates of a stream until it ends; return all of them, and the status if it did not end."""
     need("mcap")
-    from compose.recording.estimating.estimate_files import COLUMNS, csv_line  # noqa: PLC0415
+    from compose.recording.estimating.estimate_files import ESTIMATE_COLUMNS, csv_line  # noqa: PLC0415
     from compose.recording.estimating.estimate_stream import StreamEstimate  # noqa: PLC0415
     from compose.recording.estimating.noise_files import told_noise  # noqa: PLC0415
     from compose.recording.ranging.range_mcap import rows_as_they_arrive  # noqa: PLC0415
@@ -138,14 +138,14 @@ def _followed(
     except OSError as error:
         raise UserError(f"{name} cannot be read: {error.strerror or error}") from None
     with stream, until_signal() as stopped:
-        say(",".join(COLUMNS))
+        say(",".join(ESTIMATE_COLUMNS))
         try:
             for row in estimate.rows(rows_as_they_arrive(stream, name)):
                 say(csv_line(row))
         except BrokenPipeError:  # the files are of the estimates so far
             discard(sys.stdout)
             return *estimate.result(), BROKEN_PIPE
-    return *estimate.result(), STOPPED if stopped else None
+    return *estimate.result(), STOPPED_STATUS if stopped else None
 
 
 def _doubted(name: str, doubt: str) -> None:

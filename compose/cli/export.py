@@ -8,7 +8,7 @@ from pathlib import Path
 from compose.cli.arguments import add_closing, add_recording, folder
 from compose.cli.export_bar import MODULES, exported
 from compose.cli.recording import note, read_noted
-from compose.errors import ENDED, FAILED, STOPPED, CannotWrite
+from compose.errors import ENDED, FAILED, STOPPED_STATUS, CannotWrite
 from compose.extras import need
 from compose.launch.signals import stop_by_signal
 from compose.recording.recording_files import make_folder, user_errors
@@ -120,7 +120,7 @@ def _film(recording: Path, out: Path, kind: str) -> int:
         content = (film.gif if kind == "gif" else film.mp4)(page.html, program, lambda: inbox.next(0.0))
     except Interrupted as signal_name:
         inbox.say(f"stopped by {signal_name}")
-        return STOPPED
+        return STOPPED_STATUS
     say(str(_written(out, f"run.{kind}", content)))
     return ENDED
 

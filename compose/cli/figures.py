@@ -13,7 +13,7 @@ from compose.cli.arguments import add_closing, add_recording, add_trusted_planne
 from compose.cli.recording import read_noted
 from compose.errors import ENDED, FAILED, CannotWrite
 from compose.extras import need
-from compose.figures import FORMATS, PICTURES
+from compose.figures import FIGURE_FORMATS, PICTURES
 from compose.launch.class_loader import trust
 from compose.launch.second_process import OutputLine, Task, share
 from compose.recording.meetings import PastMeeting, past_meetings
@@ -42,8 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--format",
         action="append",
-        choices=FORMATS,
-        help=f"write only this format; may be repeated [default: all of {', '.join(FORMATS)}]",
+        choices=FIGURE_FORMATS,
+        help=f"write only this format; may be repeated [default: all of {', '.join(FIGURE_FORMATS)}]",
     )
     parser.add_argument(
         "--paper",
@@ -67,7 +67,7 @@ def main(options: argparse.Namespace) -> int:
         run = read_noted(options.recording, "figures")
     folder, status = options.recording / "figures", ENDED
     kinds = [kind for kind in PICTURES if kind in (options.only or PICTURES)]
-    formats = [one for one in FORMATS if one in (options.format or FORMATS)]
+    formats = [one for one in FIGURE_FORMATS if one in (options.format or FIGURE_FORMATS)]
     past = past_meetings(run)
     pairs: list[tuple[Sequence[str], PastMeeting | None]] = [((one.a, one.b), one) for one in past]
     pairs = pairs or [(robots, None) for robots in run.pairs]

@@ -16,7 +16,7 @@ from functools import cache
 from importlib import import_module
 from typing import NamedTuple, NoReturn
 
-from compose.errors import BROKEN_PIPE, BUG, FAILED, STOPPED, USER_ERROR, UserError
+from compose.errors import BROKEN_PIPE, BUG, FAILED, STOPPED_STATUS, USER_ERROR, UserError
 from compose.launch.interruption import INTERRUPTION
 from compose.terminal import text_width
 from protocol import limits
@@ -127,7 +127,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     forked = sys.modules.get("compose.launch.forked")
     if forked is not None:
         forked.close()
-    if status == STOPPED or "protocol.network.session" in sys.modules:
+    if status == STOPPED_STATUS or "protocol.network.session" in sys.modules:
         leave(status)
     sys.exit(status)
 
@@ -138,7 +138,7 @@ def _status_of(error: BaseException, command: str) -> int:
     if INTERRUPTION.signal_name is not None or isinstance(error, KeyboardInterrupt):
         discard(sys.stdout)  # a part of a line may be in its buffer
         say(f"{command}: stopped by {INTERRUPTION.signal_name or 'SIGINT'}", error=True)
-        return STOPPED
+        return STOPPED_STATUS
     match error:
         case UserError():
             say(f"{command}: {error}", error=True)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from compose.cli import arguments
-from compose.errors import FAILED, STOPPED, UserError
+from compose.errors import FAILED, STOPPED_STATUS, UserError
 from compose.launch.signals import stop_with_launcher
 from compose.network import beyond, reach
 from compose.recording.recording_files import not_recorded
@@ -17,13 +17,15 @@ from protocol.network import session
 from protocol.network.endpoints import Endpoints
 from protocol.network.inbox import Inbox, Interrupted
 
-ROUTER = "endpoint on which this process is a Zenoh router"
+LISTEN_PURPOSE = "endpoint on which this process is a Zenoh router"
 """The purpose of `--listen` of a world and an agent."""
 RELISTEN_S = 5.0
 """s to wait for the port of a participant that has just been killed to become free."""
 
 
-def add_participation(parser: argparse.ArgumentParser, default_run: str, listen: str = ROUTER) -> None:
+def add_participation(
+    parser: argparse.ArgumentParser, default_run: str, listen: str = LISTEN_PURPOSE
+) -> None:
     """Add the flags of every participant; `default_run` and `listen` describe `--run` and `--listen`."""
     arguments.add_running(parser)
     parser.add_argument(
@@ -51,7 +53,7 @@ def participate(
 
     `body` must call `stop_by_signal` before it runs the mission; until then, a signal raises an exception. A
     process that is `launched` also stops with its launcher. An exception of `failures` is printed, and the
-    status is FAILED; after a signal it is STOPPED. Raises UserError if a flag cannot be followed.
+    status is FAILED; after a signal it is STOPPED_STATUS. Raises UserError if a flag cannot be followed.
     """
     inbox = Inbox(owner)
     if launched:
@@ -68,7 +70,7 @@ def participate(
         raise UserError(f"--out: {error}; choose another folder") from None
     except Interrupted as signal_name:
         inbox.say(f"stopped by {signal_name}")
-        return STOPPED
+        return STOPPED_STATUS
     except failures as error:
         inbox.say(str(error))
         return FAILED

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from compose.cli import arguments, export_bar
-from compose.errors import FAILED, STOPPED, UserError
+from compose.errors import FAILED, STOPPED_STATUS, UserError
 from compose.extras import need
 from compose.launch import processes, supervisor
 from compose.launch.interruption import INTERRUPTION
@@ -182,7 +182,7 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
         except Interrupted as signal_name:
             break_off(options, folder, f"stopped by {signal_name}", began)
             inbox.say(f"stopped by {signal_name}")
-            return STOPPED
+            return STOPPED_STATUS
         for kill in spared:
             inbox.say(f"--kill {kill.text}: not reached")
         return _finish(options, read(folder), folder, "processes", began, viewers, inbox)
@@ -231,7 +231,7 @@ def _finish(
             exported = _export(options, folder, inbox, None if options.in_process else run)
     except Interrupted as signal_name:
         inbox.say(f"stopped by {signal_name} before the export was complete")
-        return STOPPED
+        return STOPPED_STATUS
     served = stay(viewers, inbox)
     return FAILED if not served or (options.export and not exported) else status
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from compose.errors import FAILED, STOPPED, UserError
+from compose.errors import FAILED, STOPPED_STATUS, UserError
 from compose.launch.interruption import INTERRUPTION
 from compose.recording.summary_json import outcome_line
 from compose.scenario.scenario_file import setting
@@ -44,7 +44,7 @@ def run_all(
         if options.quiet:
             say(*[f"{name}: {outcome_line(result)}" for result in results])
         rows.append(_row(name, results[0] if results else None, statuses[-1]))
-        if statuses[-1] == STOPPED:
+        if statuses[-1] == STOPPED_STATUS:
             break
     if not options.quiet:
         _show(rows)

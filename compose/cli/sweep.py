@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from compose.cli.arguments import add_closing, cell_and_trial, count, folder, natural, trials
-from compose.errors import FAILED, LOCALISED, NOT_LOCALISED, STOPPED, UserError
+from compose.errors import FAILED, LOCALISED, NOT_LOCALISED, STOPPED_STATUS, UserError
 from compose.extras import need
 from compose.launch.interruption import INTERRUPTION
 from compose.launch.signals import stop_by_signal
@@ -97,7 +97,7 @@ def main(options: argparse.Namespace) -> int:
         )
         if len(results.table) == results.trials:
             report.show(results, out, quiet=True)
-        return STOPPED if results.interrupted else FAILED
+        return STOPPED_STATUS if results.interrupted else FAILED
     INTERRUPTION.begin("tandem sweep")
     try:
         axis_figures.draw(results, out / "figures")

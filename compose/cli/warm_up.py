@@ -17,7 +17,7 @@ from protocol.messages import (
 )
 from world.scenario import RecordedScenario
 
-MISSION = "paper-1"
+WARM_UP_MISSION = "paper-1"
 FORKED = ("world", "agent")
 """The commands that forked processes run."""
 RECEIVED = (
@@ -36,7 +36,7 @@ def missions() -> None:
     for command in COMMANDS:
         if command.name in FORKED:
             command_parser(command)
-    in_process.run_mission(load(MISSION))
+    in_process.run_mission(load(WARM_UP_MISSION))
     for kind in RECEIVED:
         wire.prepare(kind)
     environment.of_world()

@@ -22,7 +22,7 @@ from compose.cli.arguments import (
     folder,
 )
 from compose.cli.recording import note
-from compose.errors import ENDED, STOPPED, UserError
+from compose.errors import ENDED, STOPPED_STATUS, UserError
 from compose.extras import need
 from compose.launch.class_loader import trust
 from compose.launch.viewers import OVER
@@ -102,7 +102,7 @@ def main(options: argparse.Namespace) -> int:
         server.serve(shown, taken, ready)
     finally:
         shown.stop()
-    return ENDED if options.launched else STOPPED  # alone, only a signal ends it
+    return ENDED if options.launched else STOPPED_STATUS  # alone, only a signal ends it
 
 
 def _recorded(folders: Sequence[Path], launched: bool) -> Site:

@@ -35,7 +35,7 @@ from world.process import NoRouter, WorldLinks, WorldProcess
 from world.scenario import Scenario
 from world.simulation import Simulation, resumed
 
-MISSING = "--listen ENDPOINT is required, such as tcp/127.0.0.1:7447, or --connect to a router"
+LISTEN_MISSING = "--listen ENDPOINT is required, such as tcp/127.0.0.1:7447, or --connect to a router"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -52,7 +52,7 @@ def main(options: argparse.Namespace) -> int:
     check_rate(scenario, options.rate)
 
     def take_part(inbox: Inbox) -> int:
-        endpoints = endpoints_of(options, "world", MISSING)
+        endpoints = endpoints_of(options, "world", LISTEN_MISSING)
         recording = old_journal(options, WORLD_JOURNAL)
         simulation = resumed(scenario, recording) if recording is not None else None
         limits.need_files(limits.SESSION_FILES + len(scenario.robots), "a world with a link to each robot")

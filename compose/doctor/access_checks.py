@@ -28,7 +28,7 @@ from protocol.wire import MalformedFrame, decode
 
 ASK_S = 2.0
 """Time in s to wait for one answer."""
-POLL_S = 0.01
+ACCESS_POLL_S = 0.01
 """The polling interval in s."""
 MATCHED_S = 0.5
 """Time in s that a world has to learn of a subscriber to its ground truth."""
@@ -116,7 +116,7 @@ def _forbidden(run: str, robot: str, other: str) -> Iterator[tuple[str, str]]:
 
     A shortened key is robot/b/command, for example.
     """
-    for key, rule in keys.RULES.items():
+    for key, rule in keys.KEY_RULES.items():
         if rule.way == "put":
             named = {"run": run, "robot": other if rule.by == "robot" else robot, "peer": robot}
             yield _short(full := key(*(named[name] for name in signature(key).parameters))), full
@@ -165,7 +165,7 @@ def _reading(pair: SessionPair, run: str, robot: str, wait: float) -> Iterator[F
     now = time.monotonic()
     matched, until = now + MATCHED_S, now + MATCHED_S + wait
     while len(ticks) < TICKS and len(received) < len(subscribers) and now < until:
-        time.sleep(POLL_S)
+        time.sleep(ACCESS_POLL_S)
         now = time.monotonic()
         if (sample := _under(keys.observation(run, robot), own)) is not None and now >= matched:
             ticks |= _ticks(sample.payload.to_bytes())

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 
 from compose import extras
 from compose.doctor.finding import Finding, fix, ok
-from compose.extras import PACKAGE
 from compose.network import beyond
+from protocol import PACKAGE
 from protocol.network.endpoints import Endpoints, place
 from protocol.wire import VERSION
 

@@ -11,7 +11,7 @@ import zenoh
 from protocol.network import diagnosis, session
 from protocol.network.endpoints import Endpoints
 
-TIMEOUT_S = 3.0
+ROUTER_TIMEOUT_S = 3.0
 """Time in s after which no new attempt to connect is made."""
 
 
@@ -22,7 +22,7 @@ class Unreached(OSError):
 @contextmanager
 def linked(endpoints: Endpoints) -> Iterator[zenoh.Session]:
     """Yield a client session. Raises Unreached."""
-    give_up = time.monotonic() + TIMEOUT_S
+    give_up = time.monotonic() + ROUTER_TIMEOUT_S
 
     def unanswered() -> None:
         if time.monotonic() >= give_up:

@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 import zenoh
 
+from compose.doctor.access_checks import ASK_S
 from protocol.messages import (
     AnyRobotConfig,
     Command,
@@ -27,13 +28,11 @@ from protocol.network import keys, session
 from protocol.network.keys import Key
 from protocol.wire import MalformedFrame, decode, version_of
 
-ASK_S = 2.0
-"""Time in s to wait for one answer."""
 FIND_S = 0.5
 """Time in s to look for a mission if there is none: routers may just have connected to each other."""
-POLL_S = 0.02
+MISSIONS_POLL_S = 0.02
 """The polling interval in s."""
-AHEAD = 4
+COMMAND_AHEAD = 4
 """The number of ticks by which a Command may be ahead of the latest received Observation."""
 
 
@@ -92,7 +91,7 @@ def _alive(link: zenoh.Session) -> dict[str, frozenset[str]]:
         robots = session.alive(link, keys.robot_alive("*", "*"), ASK_S)
         if worlds or robots or time.monotonic() >= until:
             break
-        time.sleep(POLL_S)
+        time.sleep(MISSIONS_POLL_S)
     found: dict[str, set[str]] = {}
     for key in (*worlds, *robots):
         found.setdefault(key.run, set()).add(key.robot)
@@ -118,7 +117,7 @@ class _LatestFrames:
         ]
         until = time.monotonic() + wait
         while not all(map(self._is_complete, self._alive)) and time.monotonic() < until:
-            time.sleep(POLL_S)
+            time.sleep(MISSIONS_POLL_S)
         self._over = True
         for one in declared:
             one.undeclare()
@@ -216,7 +215,7 @@ def _participant(
     robot: str, alive: bool, latest: int | None, command: Command | FinalReport | None
 ) -> Participant:
     """Return the state of a robot; a `command` too far ahead of tick `latest` is ignored."""
-    if not isinstance(command, Command) or (latest is not None and command.tick > latest + AHEAD):
+    if not isinstance(command, Command) or (latest is not None and command.tick > latest + COMMAND_AHEAD):
         return Participant(robot, alive)
     return Participant(robot, alive, command.tick, command.phase, command.state)
 

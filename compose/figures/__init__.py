@@ -6,4 +6,4 @@ figures by kind.
 
 PICTURES = ("meetings", "trajectory", "phase-1", "plan", "encounter", "ranges", "errors", "robot")
 """The kinds of figures: that of a group, those of Figs. 3 and 4 of the paper, then those over time."""
-FORMATS = ("svg", "pdf", "png")
+FIGURE_FORMATS = ("svg", "pdf", "png")

@@ -11,18 +11,18 @@ from matplotlib.figure import Figure
 from agent.planning.active_sensing import Surveying
 from agent.planning.state import RobotState
 from agent.planning.strides import stride
-from compose.figures.pair import ROLES, PairRecord
+from compose.figures.pair import PairRecord
 from compose.figures.sheet import NO_ENCOUNTER, Absent, Sheet, Window, circle, some, square
-from compose.figures.style import INK, MARKS, PALE, PALER, SCREEN, Medium
+from compose.figures.style import INK, PALE, PALER, ROLE_MARKERS, SCREEN, Medium
 from compose.view.colours import COLOURS
-from protocol.mission import Role
+from protocol.mission import ROLES, Role
 from protocol.motion import Pose, step
 
-FINE = 12
+SEGMENTS_PER_TICK = 12
 """The number of line segments per tick of a drawn manoeuvre."""
-LIKELY = 1e-3
+SHOWN_PROBABILITY = 1e-3
 """The minimum probability of a hypothesis that the panels' window must contain."""
-FARTHEST = 4.0
+FARTHEST_SHOWN = 4.0
 """The maximum distance of such a hypothesis from the second anchor, in units of D + R.
 
 The first fit of a meeting after a long way may be farther off, with a sigma as large.
@@ -79,14 +79,14 @@ def _window(pair: PairRecord, shown: list[PairDecision]) -> Window:
         for one in shown
         for state in one.states.values()
         for pose, held in zip(state.belief.poses, state.belief.pair, strict=True)
-        if held.probability >= LIKELY
+        if held.probability >= SHOWN_PROBABILITY
     ]
     for one in shown:
         ends = list(_places(pair, one.tick).values())
         ends += [end for state in one.states.values() for end in _ends(state, pair)]
         points += [(end.x, end.y) for end in ends]
     a, b = [(pair.robot(role).anchor.x, pair.robot(role).anchor.y) for role in ROLES]
-    farthest = FARTHEST * (math.dist(a, b) + pair.mission.sensing_range)
+    farthest = FARTHEST_SHOWN * (math.dist(a, b) + pair.mission.sensing_range)
     points = [point for point in points if math.dist(point, b) <= farthest]
     return square(points, 0.16, 0.5 * pair.mission.sensing_range)
 
@@ -118,7 +118,7 @@ def _panel(axes: Axes, pair: PairRecord, one: PairDecision) -> None:
     for role, state in one.states.items():
         for i, (pose, held) in enumerate(zip(state.belief.poses, state.belief.pair, strict=True)):
             axes.plot(
-                pose.x, pose.y, MARKS[role]["marker"], ms=2.5 + 4.5 * math.sqrt(held.probability),
+                pose.x, pose.y, ROLE_MARKERS[role]["marker"], ms=2.5 + 4.5 * math.sqrt(held.probability),
                 mfc=COLOURS[role] if i == 0 else "white", mec=COLOURS[role], mew=0.9, zorder=4 + (i == 0),
                 gid=f"hypothesis-{one.tick}-{role}-{i + 1}",
             )  # fmt: skip
@@ -164,7 +164,7 @@ def _ends(state: RobotState, pair: PairRecord) -> list[Pose]:
     if not isinstance(state.mode, Surveying) or not state.belief.poses:
         return []
     command, ticks = state.mode.command, stride(pair.mission)
-    pieces = FINE * ticks
+    pieces = SEGMENTS_PER_TICK * ticks
     period = ticks * pair.mission.period
     return [
         step(state.belief.poses[0], command.v, command.omega, period * i / pieces) for i in range(pieces + 1)
@@ -174,7 +174,7 @@ def _ends(state: RobotState, pair: PairRecord) -> list[Pose]:
 def _key(axes: Axes, pair: PairRecord) -> None:
     for role in ROLES:
         axes.plot(
-            [], [], MARKS[role]["marker"], ls="", ms=7, color=COLOURS[role],
+            [], [], ROLE_MARKERS[role]["marker"], ls="", ms=7, color=COLOURS[role],
             label=f"{pair.robot(role).id}, most probable",
         )  # fmt: skip
     axes.plot([], [], "o", ls="", ms=4, mfc="white", mec=PALE, label="less probable")

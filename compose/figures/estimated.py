@@ -15,24 +15,23 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
 from compose.figures.sheet import EDGE, FOOT, GAP, Sheet, around
-from compose.figures.style import INK, MARKS, PALE, SCREEN, Medium
+from compose.figures.style import INK, PALE, ROLE_MARKERS, SCREEN, Medium
 from compose.recording.estimating.estimate_rows import PoseEstimateRow
 from compose.recording.estimating.estimate_run import EstimationProblem, RecordingEstimate
 from compose.recording.estimating.pair_measurements import listed
 from compose.recording.ranging.range_recording import Numbers, TruePath
 from compose.view.colours import COLOURS
-from compose.view.outlines import SIGMAS, outline
-from protocol.mission import Role
+from compose.view.outlines import OUTLINE_SIGMAS, outline
+from protocol.mission import ROLES
 from protocol.motion import Covariance, Pose
 
 AXIS, TALL, TALLEST = 0.6, 1.0, 5.0
 """The space left of a panel over time, its height, and the largest height of the plane, in inches."""
-ROLES: tuple[Role, Role] = ("a", "b")
-OUTLINES = 12
+OUTLINES_PER_PATH = 12
 """The largest number of outlines along a path of where the robot is."""
 NEES_BOUND = 11.34
 """The NEES that 99 % of right covariances do not exceed: chi-square of three degrees of freedom."""
-MARGIN = 0.03
+PATH_MARGIN = 0.03
 LEAST_ERROR = 1e-3
 """The smallest error drawn, in m."""
 OUTLIER = 0.5
@@ -69,7 +68,7 @@ class Drawn(NamedTuple):
         """The colour and the marker of each robot; those of one and of two are those of the paper's roles."""
         count = len(self.problem.robots)
         if count <= len(ROLES):
-            return [Look(COLOURS[role], MARKS[role]) for role in ROLES[:count]]
+            return [Look(COLOURS[role], ROLE_MARKERS[role]) for role in ROLES[:count]]
         colours = matplotlib.colormaps["tab10" if count <= len(TEN) else "turbo"]
         hues = [colours(i if count <= len(TEN) else (i + 0.5) / count) for i in range(count)]
         return [Look(to_hex(hue), {"marker": TEN[i % len(TEN)], "color": hue}) for i, hue in enumerate(hues)]
@@ -144,7 +143,7 @@ def _path(drawn: Drawn, medium: Medium) -> Figure:
             [row.x for row in rows], [row.y for row in rows], color=colour, lw=1.0, label=f"{name}, {since}"
         )
         points += [(row.x, row.y) for row in rows]
-        for row in rows[:: math.ceil(len(rows) / OUTLINES)]:
+        for row in rows[:: math.ceil(len(rows) / OUTLINES_PER_PATH)]:
             if math.sqrt(row.xx + row.yy) <= TOO_WIDE:
                 around_it = outline(Pose(row.x, row.y, row.heading), _covariance(row))
                 axes.add_patch(Polygon(around_it, facecolor=colour, edgecolor=colour, alpha=0.18, lw=0.8))
@@ -154,7 +153,7 @@ def _path(drawn: Drawn, medium: Medium) -> Figure:
         axes.plot(anchor.x, anchor.y, ls="", marker=marker, ms=5, color=INK, label=f"anchor {anchor.id}")
         points.append((anchor.x, anchor.y))
     axes.plot([], [], color=PALE, lw=6.0, alpha=0.3, label="3 sigma")
-    sheet.plane(axes, around(points, MARGIN), TALLEST)
+    sheet.plane(axes, around(points, PATH_MARGIN), TALLEST)
     return sheet.finished()
 
 
@@ -203,7 +202,7 @@ def _claim_line(axes: Axes, drawn: Drawn, i: int, colour: str) -> None:
 def _sigmas(axes: Axes, drawn: Drawn) -> None:
     for i, (colour, _) in enumerate(drawn.looks):
         name = drawn.problem.robots[i].id
-        bounds = [SIGMAS * math.sqrt(max(row.xx + row.yy, 0.0)) for row in drawn.rows(i)]
+        bounds = [OUTLINE_SIGMAS * math.sqrt(max(row.xx + row.yy, 0.0)) for row in drawn.rows(i)]
         axes.plot(_times(drawn, i), bounds, color=colour, ls="--", lw=1.0, label=f"{name}, 3 sigma")
         _claim_line(axes, drawn, i, colour)
     axes.set_yscale("log")

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from agent.estimation.closed_forms import Placement
 from agent.planning.phase3_last_manoeuvre import Array, Compared, LastManoeuvre, Plan, compared
-from compose.figures.pair import ROLES, PairRecord
+from compose.figures.pair import PairRecord
 from compose.figures.sheet import (
     ANCHORS,
     EDGE,
@@ -28,17 +28,17 @@ from compose.figures.sheet import (
     circle,
     named,
 )
-from compose.figures.style import INK, MARKS, PALE, PALER, SCREEN, Medium
+from compose.figures.style import INK, PALE, PALER, ROLE_MARKERS, SCREEN, Medium
 from compose.figures.trajectory import heading
 from compose.view.colours import COLOURS
-from protocol.mission import Mission, Role
+from protocol.mission import ROLES, Mission, Role
 from protocol.motion import ORIGIN, Pose, compose, step
 
 PLANE = 3.4
 """The width and height of the plane's panel, in inches; the panel with the value of eq. (8) is beside it."""
-AROUND = 1.14
+WINDOW_MARGIN = 1.14
 """The half-width of the window, as a multiple of the largest distance from the robot that must be visible."""
-FINE = 24
+ARC_SEGMENTS = 24
 """The number of line segments of the drawn arc of the manoeuvre."""
 OTHER: dict[Role, Role] = {"a": "b", "b": "a"}
 
@@ -114,7 +114,7 @@ def _figure(pair: PairRecord, one: Planned, medium: Medium) -> Figure:
     ways = compared(plan.question, mission, pair.planner.MANOEUVRES)
     sheet = Sheet(medium, False, [pair.title, _title(pair, one)])
     axes, value = sheet.panel(), sheet.panel()
-    half = AROUND * max(
+    half = WINDOW_MARGIN * max(
         mission.max_speed * mission.period,
         *[math.hypot(p.x - seen.mover.x, p.y - seen.mover.y) for p in seen.others],
     )
@@ -173,8 +173,8 @@ def _candidates(axes: Axes, pair: PairRecord, one: Planned, seen: ManoeuvreView,
     for i, place in enumerate(seen.others, start=1):
         away = math.hypot(place.x - x, place.y - y) or 1.0
         axes.plot(
-            place.x, place.y, MARKS[other]["marker"], ms=7, mfc=COLOURS[other], mec="white", mew=0.6, ls="",
-            gid=f"candidate-{i}", zorder=5,
+            place.x, place.y, ROLE_MARKERS[other]["marker"], ms=7, mfc=COLOURS[other], mec="white", mew=0.6,
+            ls="", gid=f"candidate-{i}", zorder=5,
             label=f"{i}: predicted range {math.hypot(place.x - end.x, place.y - end.y):.4f} m",
         )  # fmt: skip
         axes.annotate(
@@ -230,8 +230,8 @@ def _reach(axes: Axes, pair: PairRecord, plan: Plan, seen: ManoeuvreView, ways: 
         gid="reach", label=f"reachable with $v_2$ = {v:g} m/s",
     )  # fmt: skip
     ends = [
-        step(seen.mover, plan.command.v, plan.command.omega, pair.mission.period * i / FINE)
-        for i in range(FINE + 1)
+        step(seen.mover, plan.command.v, plan.command.omega, pair.mission.period * i / ARC_SEGMENTS)
+        for i in range(ARC_SEGMENTS + 1)
     ]
     axes.plot([p.x for p in ends], [p.y for p in ends], "-", lw=2.0, color=colour, zorder=4, gid="chosen")
     axes.plot(

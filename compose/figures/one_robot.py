@@ -32,7 +32,7 @@ from compose.figures.style import INK, PALE, SCREEN, Medium
 from compose.figures.trajectory import draw_plane, window
 from compose.recording.run import ended
 from compose.view.colours import COLOURS
-from compose.view.outlines import SIGMAS, Point, Reach, outline
+from compose.view.outlines import OUTLINE_SIGMAS, Point, Reach, outline
 from protocol.messages import Estimate
 from protocol.mission import Role
 from protocol.motion import ORIGIN, Pose
@@ -45,15 +45,15 @@ AGES: dict[Role, LinearSegmentedColormap] = {
     "b": LinearSegmentedColormap.from_list("ages-b", ["#f2b79f", COLOURS["b"], "#4a1608"]),
 }
 """The colours of estimates over time by role, from the first to the last: the robot's hue, ever darker."""
-OUTLINES = 5
+OUTLINES_PER_ROBOT = 5
 """The maximum number of outlines of where the robot is."""
 SMALLER = 0.75
 """The largest size ratio, later over earlier, at which two overlapping outlines are both legible."""
-AROUND = 2.2
+LARGEST_PANEL = 2.2
 """The maximum half-width of the enlarged panel, as a multiple of the last outline's size."""
 EXACTLY = 0.02
 """The minimum half-width of the enlarged panel with exact sensors, as a fraction of the sensing range."""
-ARROW = 0.55
+PANEL_ARROW = 0.55
 """The length of a heading arrow, as a fraction of that half-width."""
 
 
@@ -157,13 +157,13 @@ def _ages(one: Side, role: Role) -> dict[int, str]:
 def legible(pair: PairRecord, role: Role) -> list[tuple[Estimate, Pose]]:
     """Return the estimates whose outlines are drawn, with the true poses, in order of time.
 
-    These are the last one and earlier ones that later outlines do not hide, OUTLINES at most. Outlines
-    larger than the sensing range R are omitted, because they carry no information.
+    These are the last one and earlier ones that later outlines do not hide, OUTLINES_PER_ROBOT at most.
+    Outlines larger than the sensing range R are omitted, because they carry no information.
     """
     chosen: list[tuple[Estimate, Pose]] = []
     largest = pair.mission.sensing_range
     for estimate, truth in reversed(pair.robot(role).likeliest):
-        if estimate.covariance is None or len(chosen) == OUTLINES:
+        if estimate.covariance is None or len(chosen) == OUTLINES_PER_ROBOT:
             continue
         if _size(pair, role, estimate) > largest:
             continue
@@ -238,11 +238,17 @@ def draw_near(axes: Axes, pair: PairRecord, role: Role) -> None:
     off = last.world[0].x - truth.x, last.world[0].y - truth.y
     _heading(axes, off, last.world[0].heading, half, AGES[role](1.0))
     if last.covariance is not None:
-        spread = math.degrees(min(math.pi, SIGMAS * last.covariance.heading_sigma))
+        spread = math.degrees(min(math.pi, OUTLINE_SIGMAS * last.covariance.heading_sigma))
         middle = math.degrees(last.world[0].heading)
         axes.add_patch(
             Wedge(
-                off, ARROW * half, middle - spread, middle + spread, color=AGES[role](1.0), alpha=0.15, lw=0
+                off,
+                PANEL_ARROW * half,
+                middle - spread,
+                middle + spread,
+                color=AGES[role](1.0),
+                alpha=0.15,
+                lw=0,
             )
         )
     axes.set_xlim(-half, half)
@@ -261,11 +267,11 @@ def _half(pair: PairRecord, role: Role) -> float:
     last = size(*pair.robot(role).likeliest[-1])
     most = max([size(*one) for one in legible(pair, role)], default=last)
     least = EXACTLY * pair.mission.sensing_range if pair.exact else TOLERANCE
-    return max(min(1.1 * most, AROUND * last), least)
+    return max(min(1.1 * most, LARGEST_PANEL * last), least)
 
 
 def _heading(axes: Axes, at: tuple[float, float], heading: float, half: float, colour: ColorType) -> None:
-    tip = at[0] + ARROW * half * math.cos(heading), at[1] + ARROW * half * math.sin(heading)
+    tip = at[0] + PANEL_ARROW * half * math.cos(heading), at[1] + PANEL_ARROW * half * math.sin(heading)
     axes.add_patch(
         FancyArrowPatch(
             at, tip, arrowstyle="-|>", mutation_scale=8, color=colour, lw=1.1, shrinkA=0, shrinkB=0

@@ -11,40 +11,40 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
-from compose.figures.pair import ROLES, PairRecord, Span, error, others
+from compose.figures.pair import PairRecord, Span, error, others
 from compose.figures.sheet import ANCHORS, EDGE, FOOT, GAP, NO_TRUTH, WORDS, Absent, Sheet, measured
-from compose.figures.style import INK, MARKS, PALE, SCREEN, SHADE, Medium
+from compose.figures.style import INK, PALE, ROLE_MARKERS, SCREEN, SHADE, Medium
 from compose.recording.claim import Claim
 from compose.view.colours import COLOURS
-from protocol.mission import Role
+from protocol.mission import ROLES, Role
 from protocol.motion import Covariance, Pose, wrap
 from protocol.rounding import TOLERANCE
 
 AXIS, TALL = 0.72, 1.9
 """The space left of a panel over time for its axis, and the height of the panel, in inches."""
-PHASES = {1: "own anchor", 2: "search for the peer", 3: "encounter"}
+PHASE_TITLES = {1: "own anchor", 2: "search for the peer", 3: "encounter"}
 SHADES = {1: "0.93", 2: "1.0", 3: "0.97"}
 NARROW = 0.18
 """The fraction of the width below which a phase is too narrow, so that each phase gets its own scale."""
-SHARES = (0.3, 0.45)
+PHASE_SHARES = (0.3, 0.45)
 """The bounds of a phase's fraction of the width in that case, before normalisation."""
 DIGIT, LABELS = 0.078, 3.2
 """The width of a digit of a tick label, in inches, and the approximate number of tick labels per inch."""
 DENSE = 30
 """The number of ticks in a phase from which on single ticks get no marker."""
-LEAST = 1e-16
+SMALLEST_ERROR = 1e-16
 """The smallest error drawn, in m or rad. Smaller errors are drawn at this value."""
-LINES: dict[Role, Any] = {"a": "-", "b": (0, (4, 1.5))}
-ALONE: dict[Role, Any] = {"a": "-.", "b": (0, (1, 1))}
+ROLE_LINES: dict[Role, Any] = {"a": "-", "b": (0, (4, 1.5))}
+LONE_LINES: dict[Role, Any] = {"a": "-.", "b": (0, (1, 1))}
 CLAIMED: dict[Role, Any] = {"a": (0, (6, 1.5, 1, 1.5, 1, 1.5)), "b": (0, (1, 3))}
-"""Line styles by role: LINES of the most probable pose, ALONE before the encounter, CLAIMED of sigmas.
+"""Line styles by role: ROLE_LINES of the likeliest pose, LONE_LINES before the encounter, CLAIMED of sigmas.
 
 No two are the same, so the lines differ without colour. The phase is that of the axis.
 """
-SIGMAS = 3.0
+BAND_SIGMAS = 3.0
 ROOM = 4.0
 """The factor by which the error scale extends beyond the drawn values."""
-SHORT = 20.0
+SHORT_DECADES = 20.0
 """The ratio of a logarithmic scale's ends below which powers of ten give too few tick labels."""
 RANKS = 6
 """The number of hypotheses drawn as lines."""
@@ -85,7 +85,7 @@ def timed(
         )  # fmt: skip
     if phases:
         for span, left, right in zip(spans, shares, shares[1:], strict=False):
-            named = f"phase {span.phase}" if pair.own_planner else f"{span.phase}: {PHASES[span.phase]}"
+            named = f"phase {span.phase}" if pair.own_planner else f"{span.phase}: {PHASE_TITLES[span.phase]}"
             names = (named, f"phase {span.phase}", str(span.phase))
             fit = next((name for name in names[:2] if measured(name) < (right - left) * width), names[2])
             axes.text((left + right) / 2, 1.03, fit, transform=axes.transAxes, ha="center", color="0.3")
@@ -110,7 +110,7 @@ def _edges(spans: Sequence[Span]) -> tuple[list[float], list[float]]:
     ticks = [spans[0].first - 0.5, *[span.last + 0.5 for span in spans]]
     shares = np.diff(ticks) / (ticks[-1] - ticks[0])
     if min(shares) < NARROW:
-        shares = np.clip(shares, *SHARES)
+        shares = np.clip(shares, *PHASE_SHARES)
         shares = shares / shares.sum()
     return ticks, [0.0, *np.cumsum(shares).tolist()]
 
@@ -183,7 +183,7 @@ def _ranges(axes: Axes, pair: PairRecord) -> None:
     for role in ROLES:
         one = pair.robot(role)
         _measured(
-            axes, one.anchor_ranges, f"anchor-range-{one.id}", COLOURS[role], MARKS[role],
+            axes, one.anchor_ranges, f"anchor-range-{one.id}", COLOURS[role], ROLE_MARKERS[role],
             rf"$\rho$ of {one.id} to ${ANCHORS[role]}$, measured", pair.first,
         )  # fmt: skip
     diamonds = {"marker": "D", "markerfacecolor": INK, "markeredgecolor": INK}
@@ -269,8 +269,8 @@ def draw_errors(axes: Axes, pair: PairRecord, quantity: Quantity, *roles: Role) 
         low, _ = axes.get_ylim()
         ticks, values = np.array(sigmas).T
         axes.fill_between(
-            ticks, low, np.maximum(SIGMAS * values, low), color=COLOURS[roles[0]], alpha=0.12, lw=0, zorder=0,
-            gid="envelope",
+            ticks, low, np.maximum(BAND_SIGMAS * values, low), color=COLOURS[roles[0]], alpha=0.12, lw=0,
+            zorder=0, gid="envelope",
         )  # fmt: skip
     axes.set_ylabel(f"{quantity} error [{'m' if quantity == 'position' else 'rad'}]")
 
@@ -291,23 +291,24 @@ def _errors(
         for one, truth in robot.estimates
         if one.local and not one.world
     ]  # fmt: skip
-    _line(axes, alone, ls=ALONE[role], lw=1.0, color=colour, gid=f"{quantity}-alone-{robot.id}",
+    _line(axes, alone, ls=LONE_LINES[role], lw=1.0, color=colour, gid=f"{quantity}-alone-{robot.id}",
           label=f"{robot.id}, relative to its anchor")  # fmt: skip
     _line(axes, [(one.tick, off(pose, truth)) for one, truth in robot.placed for pose in others(one)],
           ls="", marker="x" if role == "a" else "+", ms=4, mew=0.8, color=colour, alpha=0.75,
           gid=f"{quantity}-others-{robot.id}", label=f"{robot.id}, other possible poses")  # fmt: skip
     likeliest = [(one.tick, off(one.world[0], truth)) for one, truth in robot.likeliest]
-    _line(axes, likeliest, lw=1.2, ls=LINES[role], ms=3.6, color=colour, gid=f"{quantity}-{robot.id}",
+    _line(axes, likeliest, lw=1.2, ls=ROLE_LINES[role], ms=3.6, color=colour, gid=f"{quantity}-{robot.id}",
           label=f"{robot.id}, {'pose' if pair.exact else 'most probable pose'}",
-          markevery=_marked(pair, role, [tick for tick, _ in likeliest]), **MARKS[role])  # fmt: skip
+          markevery=_marked(pair, role, [tick for tick, _ in likeliest]), **ROLE_MARKERS[role])  # fmt: skip
     sigmas = [(one.tick, _sigma(one.covariance, quantity)) for one, _ in robot.likeliest if one.covariance]
-    _line(axes, [(tick, SIGMAS * sigma) for tick, sigma in sigmas], lw=0.9, ls=CLAIMED[role], color=colour,
-          gid=f"{quantity}-sigma-{robot.id}", label=rf"{robot.id}, claimed 3 $\sigma$")  # fmt: skip
+    _line(axes, [(tick, BAND_SIGMAS * sigma) for tick, sigma in sigmas], lw=0.9, ls=CLAIMED[role],
+          color=colour, gid=f"{quantity}-sigma-{robot.id}",
+          label=rf"{robot.id}, claimed 3 $\sigma$")  # fmt: skip
     if robot.claim is not None:
         axes.plot(
-            robot.claim.tick, max(_of_claim(robot.claim, quantity), LEAST), MARKS[role]["marker"], ms=9,
-            mfc="none", mec=INK, mew=1.1, ls="", clip_on=False, zorder=5, gid=f"claim-{robot.id}",
-            label=f"claim of {robot.id}, tick {robot.claim.tick}",
+            robot.claim.tick, max(_of_claim(robot.claim, quantity), SMALLEST_ERROR),
+            ROLE_MARKERS[role]["marker"], ms=9, mfc="none", mec=INK, mew=1.1, ls="", clip_on=False, zorder=5,
+            gid=f"claim-{robot.id}", label=f"claim of {robot.id}, tick {robot.claim.tick}",
         )  # fmt: skip
     return sigmas
 
@@ -338,7 +339,7 @@ def _line(axes: Axes, points: Points, **looks: Any) -> None:
     if len(points) == 1:
         looks = {"marker": ".", **looks}
     if points:
-        axes.plot([tick for tick, _ in points], [max(value, LEAST) for _, value in points], **looks)
+        axes.plot([tick for tick, _ in points], [max(value, SMALLEST_ERROR) for _, value in points], **looks)
 
 
 def _scale(axes: Axes) -> None:
@@ -348,7 +349,7 @@ def _scale(axes: Axes) -> None:
     low, high = (min(values) / ROOM, max(values) * ROOM) if values else (0.1 * TOLERANCE, 10.0)
     axes.set_ylim(low, high)
     axes.yaxis.set_major_locator(
-        LogLocator(subs=(1.0, 2.0, 5.0) if high < SHORT * low else (1.0,), numticks=7)
+        LogLocator(subs=(1.0, 2.0, 5.0) if high < SHORT_DECADES * low else (1.0,), numticks=7)
     )
     axes.yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}".replace("e-0", "e-")))
     axes.yaxis.set_minor_locator(NullLocator())
@@ -381,7 +382,7 @@ def _probabilities(axes: Axes, pair: PairRecord, role: Role) -> None:
     for rank in reversed(range(RANKS)):
         for placed in (False, True):
             _rank(axes, pair, role, rank, placed, edge)
-    marker, colour = MARKS[role], COLOURS[role]
+    marker, colour = ROLE_MARKERS[role], COLOURS[role]
     axes.plot([], [], "-", ms=3.6, lw=1.2, color=colour, label="most probable hypothesis", **marker)
     if any(len(one.probabilities) > 1 for one, _ in pair.robot(role).estimates):
         axes.plot([], [], "-x", ms=3.6, mew=0.8, lw=0.7, color=colour, alpha=0.5, label="other hypotheses")
@@ -417,7 +418,7 @@ def _rank(axes: Axes, pair: PairRecord, role: Role, rank: int, placed: bool, edg
     else:
         axes.plot(
             ticks, probability, "-", ms=3.6, lw=1.2, color=COLOURS[role], gid=gid, clip_on=False, zorder=4,
-            markevery=_marked(pair, role, ticks), **MARKS[role],
+            markevery=_marked(pair, role, ticks), **ROLE_MARKERS[role],
         )  # fmt: skip
 
 
@@ -433,7 +434,7 @@ def _count(axes: Axes, pair: PairRecord, role: Role) -> None:
         ticks, held = zip(*counts, strict=True)
         axes.plot(
             ticks, held, "-", ms=3.6, lw=1.2, drawstyle="steps-post", color=COLOURS[role], gid="count",
-            markevery=_marked(pair, role, ticks), label="possible poses", **MARKS[role],
+            markevery=_marked(pair, role, ticks), label="possible poses", **ROLE_MARKERS[role],
         )  # fmt: skip
     axes.axhline(1.0, color=PALE, lw=0.9, ls="-.", label="one pose")
     known = [count for _, count in counts if not math.isnan(count)]

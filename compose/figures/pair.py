@@ -18,11 +18,9 @@ from compose.recording.claim import Claim
 from compose.recording.meetings import PastMeeting, past_meetings
 from compose.recording.run import Run
 from protocol.messages import Command, Estimate, RobotConfig, RobotConfigInGroup
-from protocol.mission import Anchor, Mission, PlannerName, Role
+from protocol.mission import ROLES, Anchor, Mission, PlannerName, Role
 from protocol.motion import Pose
 from protocol.orbits import Orbit
-
-ROLES: tuple[Role, Role] = ("a", "b")
 
 
 class Span(msgspec.Struct, frozen=True):

@@ -13,19 +13,19 @@ from agent.estimation.exact import Branch
 from agent.planning.state import RobotState
 from compose.figures.pair import PairRecord
 from compose.figures.sheet import ANCHORS, LABEL, Absent, Sheet, around, circle
-from compose.figures.style import INK, MARKS, PALE, PALER, SCREEN, Medium
+from compose.figures.style import INK, PALE, PALER, ROLE_MARKERS, SCREEN, Medium
 from compose.view.colours import COLOURS
 from protocol.messages import BranchKind
 from protocol.mission import Role
 from protocol.motion import Pose, compose, travelled
 
-TALLEST = 4.2
+TALLEST_PHASE_ONE = 4.2
 """The maximum height of the plane, in inches."""
 FEW = 4
 """The maximum number of ranges for which each circle has an entry in the key."""
-SAME = 0.1
+SHARED_LABEL = 0.1
 """The distance below which two positions share a label, as a fraction of the longest range."""
-EXPLAINED = 1e-9
+CONSISTENT_RESIDUAL = 1e-9
 """The largest residual of a consistent range or missing detection, as a fraction of R."""
 Track = list[tuple[Pose, float | None]]
 """The odometry pose and the anchor range in m, or None out of range, at each tick."""
@@ -34,7 +34,7 @@ Track = list[tuple[Pose, float | None]]
 Status = Literal["kept", "rejected", "possible"]
 """The status of a branch at the end of phase 1; "possible" if phase 1 has not ended."""
 WORDS: dict[Status, str] = {"kept": "selected", "rejected": "ruled out", "possible": "possible"}
-LINES: dict[Status, str] = {"kept": "-", "rejected": ":", "possible": "--"}
+CIRCLE_LINES: dict[Status, str] = {"kept": "-", "rejected": ":", "possible": "--"}
 
 
 class DrawnBranch(NamedTuple):
@@ -72,7 +72,7 @@ def draw(pair: PairRecord, role: Role, medium: Medium = SCREEN) -> Figure | Abse
         if one.status == "rejected" and pair.exact:
             _contradictions(axes, one.branch, track, reach)
     _name_points(axes, track, branches[0].branch)
-    sheet.plane(axes, around(points, 0.05), TALLEST)
+    sheet.plane(axes, around(points, 0.05), TALLEST_PHASE_ONE)
     return sheet.finished()
 
 
@@ -169,7 +169,7 @@ def _draw(axes: Axes, role: Role, one: DrawnBranch, track: Track, exact: bool, n
     colour = COLOURS[role] if selected else INK
     status = "discarded" if one.status == "rejected" and not exact else WORDS[one.status]
     axes.plot(
-        [p.x for p in places], [p.y for p in places], LINES[one.status], lw=1.5 if selected else 1.3,
+        [p.x for p in places], [p.y for p in places], CIRCLE_LINES[one.status], lw=1.5 if selected else 1.3,
         color=colour, zorder=3 if selected else 2, gid=one.status,
         label=f"{one.name}, {status}" if named else None,
     )  # fmt: skip
@@ -178,7 +178,7 @@ def _draw(axes: Axes, role: Role, one: DrawnBranch, track: Track, exact: bool, n
     for points, face, gid in ((ranged, colour, "ranged"), (undetected, "white", "silent")):
         if points:
             axes.plot(
-                [p.x for p in points], [p.y for p in points], MARKS[role]["marker"], ms=4, mfc=face,
+                [p.x for p in points], [p.y for p in points], ROLE_MARKERS[role]["marker"], ms=4, mfc=face,
                 mec=colour, mew=1.0, ls="", zorder=4 if selected else 2.5, gid=f"{gid}-{one.status}",
                 label=("range measured" if gid == "ranged" else "no detection") if selected else None,
             )  # fmt: skip
@@ -201,9 +201,9 @@ def contradicted(branch: Branch, track: Track, reach: float) -> list[int]:
         tick
         for tick, (pose, rho) in enumerate(track)
         if (
-            branch.distance(pose) <= reach * (1.0 - EXPLAINED)
+            branch.distance(pose) <= reach * (1.0 - CONSISTENT_RESIDUAL)
             if rho is None
-            else abs(branch.distance(pose) - rho) > EXPLAINED * reach
+            else abs(branch.distance(pose) - rho) > CONSISTENT_RESIDUAL * reach
         )
     ]
 
@@ -215,7 +215,7 @@ def _name_points(axes: Axes, track: Track, branch: Branch) -> None:
     named = [tick for tick, (_, rho) in enumerate(track) if rho is not None][:3]
     for i, tick in enumerate(named):
         place = places[tick]
-        if any(travelled(place, places[other]) < SAME * rim for other in named[:i]):
+        if any(travelled(place, places[other]) < SHARED_LABEL * rim for other in named[:i]):
             continue  # the robot has returned to a labelled position
         away = math.hypot(place.x, place.y) or 1.0
         axes.annotate(

@@ -23,7 +23,7 @@ from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Bbox
 
-from compose.figures.style import INK, PAGE, PLACES, SCREEN, TEXT, Medium
+from compose.figures.style import DECIMALS, INK, PAGE, SCREEN, TEXT, Medium
 from protocol.mission import Role
 
 EDGE, GAP = 0.06, 0.12
@@ -32,7 +32,7 @@ LEFT, FOOT, HEAD, WORDS = 0.48, 0.36, 0.06, 0.155
 """The space left of a panel for its axis, below it, above it, and per line of a text, in inches."""
 HANDLE, SPACE, BETWEEN = 2.2, 0.5, 1.0
 """The lengths of a key's handles and of the gaps after handles and between columns, in font sizes."""
-BESIDE = 0.6
+KEY_BESIDE = 0.6
 """The least fraction of the width that a plane has if its key is beside it."""
 ROW = 0.165
 """The height of a row of a key, in inches."""
@@ -40,21 +40,21 @@ PANELS, ACROSS = 6, 3
 """The maximum number of panels of a series, in total and in a row."""
 HINTED = 1.03
 """The largest ratio of the widths of a text at two resolutions, which differ by its hinting."""
-FINE = SCREEN.dpi
+TEXT_DPI = SCREEN.dpi
 """The resolution at which texts are measured, in dots per inch."""
 NO_ENCOUNTER = "the robots had no encounter (phase 3)"
 NO_TRUTH = "a recording in hardware mode has no ground truth"
 NO_PLACES = "in hardware mode, positions follow from claims, and not both robots made one"
 ANCHORS: dict[Role, str] = {"a": "M_1", "b": "M_2"}
 """The anchors' names in the paper, for use between two `$`."""
-STEPS = (1, 2, 5, 10)
+AXIS_STEPS = (1, 2, 5, 10)
 """The steps between two ticks of an axis, times a power of 10 m. Numbers such as -7.5 do not fit in LEFT."""
 LABEL = {"facecolor": "white", "alpha": 0.75, "pad": 0.6, "lw": 0}
 """The background of a text within a panel."""
 Window = tuple[float, float, float, float]
 """A window of the plane: left, right, low and high, in m."""
 Moment = TypeVar("Moment")
-_WORD = re.compile(r"(?:\\\$|\$[^$]*\$|[^\s$])+")
+_TITLE_WORD = re.compile(r"(?:\\\$|\$[^$]*\$|[^\s$])+")
 """A word of a title; spaces between two `$` do not end it."""
 
 
@@ -128,7 +128,7 @@ class Sheet:
         """Place a plane that shows `window`, with its key beside it if there is room, and below it else."""
         _, labels = axes.get_legend_handles_labels()
         beside = _width(labels, len(labels)) + GAP
-        if (left := self.room - beside) < BESIDE * self.room:
+        if (left := self.room - beside) < KEY_BESIDE * self.room:
             left = self.room
         width, height = fitted(window, left, tallest)
         top = self.top + HEAD
@@ -172,7 +172,7 @@ class Sheet:
         self.figure.set_size_inches(wide, tall)
         for axes, (left, top, width, height) in self._panels:
             corners = (left / wide, 1.0 - (top + height) / tall), ((left + width) / wide, 1.0 - top / tall)
-            axes.set_position(Bbox(np.round(corners, PLACES)))
+            axes.set_position(Bbox(np.round(corners, DECIMALS)))
         for key, left, top in self._keys:
             key.set_bbox_to_anchor((left / wide, 1.0 - top / tall), transform=self.figure.transFigure)
         for text, top in self._lines:
@@ -189,12 +189,12 @@ def measured(text: str) -> float:
 def _measured(text: str, family: str) -> float:
     font, symbols = FontProperties(family=family, size=TEXT), text.replace(r"\$", "").count("$") > 0
     size = _renderer().get_text_width_height_descent(text, font, symbols)  # type: ignore[no-untyped-call]
-    return math.ceil(100.0 * float(size[0]) / FINE) / 100.0
+    return math.ceil(100.0 * float(size[0]) / TEXT_DPI) / 100.0
 
 
 @cache
 def _renderer() -> RendererAgg:
-    return RendererAgg(1, 1, FINE)  # type: ignore[no-untyped-call]
+    return RendererAgg(1, 1, TEXT_DPI)  # type: ignore[no-untyped-call]
 
 
 def wrapped(words: Iterable[str], width: float, between: str) -> list[str]:
@@ -242,7 +242,7 @@ def named(axes: Axes, window: Window, *, low: bool = True) -> None:
     axes.set_ylim(*window[2:])
     axes.set_aspect("equal", adjustable="box")
     for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(MaxNLocator("auto", steps=STEPS))
+        axis.set_major_locator(MaxNLocator("auto", steps=AXIS_STEPS))
     axes.set_xlabel("x [m]")
     if low:
         axes.set_ylabel("y [m]")

@@ -32,19 +32,19 @@ from protocol.messages import Command, Localised
 from protocol.mission import Role
 from protocol.motion import Pose
 
-TALLEST = 4.6
+TALLEST_SPREAD = 4.6
 """The maximum height of the plane, in inches."""
 LANE, MOST_LANES = 0.17, 8.0
 """The height of a robot's lane, and the maximum height of all of them, in inches."""
 AXIS, BOUND = 0.72, 0.45
 """The space left of the lanes for the robots' names, and right of them for their bounds, in inches."""
-MOST_TICKS = 16
+MOST_AXIS_TICKS = 16
 """The largest number of robots with whose anchors the ticks of their claims are written."""
-HUES: dict[bool, Role] = {False: "b", True: "a"}
+LANE_COLOURS: dict[bool, Role] = {False: "b", True: "a"}
 """The colours of robots before and after they are localised, by role as in other figures."""
-WIDTHS = {False: 1.6, True: 4.5}
+LANE_WIDTHS = {False: 1.6, True: 4.5}
 """The widths of lanes, in points: wide in meetings."""
-NAMED = {False: "not yet localised", True: "localised"}
+LANE_NAMES = {False: "not yet localised", True: "localised"}
 
 
 class GroupRobot(msgspec.Struct, frozen=True):
@@ -76,11 +76,11 @@ def draw(run: Run, medium: Medium = SCREEN) -> Figure | Absent:
     axes = sheet.panel()
     reach = setup.mission.sensing_range
     for one in robots:
-        _home(axes, one, reach, ticks=len(robots) <= MOST_TICKS)
+        _home(axes, one, reach, ticks=len(robots) <= MOST_AXIS_TICKS)
         _path(axes, one)
     _tree(axes, setup, robots)
     _key(axes, reach, unanchored=any(one.anchor is None for one in robots))
-    sheet.plane(axes, _window(robots, reach), TALLEST)
+    sheet.plane(axes, _window(robots, reach), TALLEST_SPREAD)
     lanes = sheet.panel()
     _lanes(lanes, setup, robots)
     sheet.top += GAP + WORDS
@@ -122,7 +122,7 @@ def _home(axes: Axes, one: GroupRobot, reach: float, *, ticks: bool) -> None:
 
     A robot without an anchor has a triangle where it starts.
     """
-    hue = COLOURS[HUES[one.localised is not None]]
+    hue = COLOURS[LANE_COLOURS[one.localised is not None]]
     if one.anchor is not None:
         axes.plot(*one.anchor, "x", color="k", ms=4, mew=1.2, ls="", zorder=4, gid=f"anchor-{one.id}")
         circle(axes, one.anchor, reach, ls="-", lw=0.8, color=hue, gid=f"range-{one.id}")
@@ -144,8 +144,8 @@ def _path(axes: Axes, one: GroupRobot) -> None:
     for known, poses in ((False, one.path[: since + 1]), (True, one.path[since:])):
         if len(poses) > 1:
             axes.plot(
-                [p.x for p in poses], [p.y for p in poses], "-", lw=1.1, color=COLOURS[HUES[known]], zorder=3,
-                gid=f"path-{one.id}-{NAMED[known].replace(' ', '-')}",
+                [p.x for p in poses], [p.y for p in poses], "-", lw=1.1, color=COLOURS[LANE_COLOURS[known]],
+                zorder=3, gid=f"path-{one.id}-{LANE_NAMES[known].replace(' ', '-')}",
             )  # fmt: skip
 
 
@@ -178,7 +178,9 @@ def _key(axes: Axes, reach: float, *, unanchored: bool) -> None:
         axes.plot([], [], "^", color=COLOURS["a"], ms=5, ls="", label="start of a robot without an anchor")
     axes.plot([], [], "-", lw=0.8, color=COLOURS["a"], label=f"sensing range, {reach:g} m")
     for known in (False, True):
-        axes.plot([], [], "-", lw=1.4, color=COLOURS[HUES[known]], label=f"true path, {NAMED[known]}")
+        axes.plot(
+            [], [], "-", lw=1.4, color=COLOURS[LANE_COLOURS[known]], label=f"true path, {LANE_NAMES[known]}"
+        )
     axes.plot([], [], "-", marker=">", ms=4, lw=0.7, color=PALE, label="meeting: visitor to visited")
     axes.plot([], [], "*", ms=7, color=INK, ls="", label="localised")
 
@@ -190,8 +192,9 @@ def _lanes(axes: Axes, setup: RunSetup, robots: list[GroupRobot]) -> None:
         for (known, meets), group in groupby(enumerate(one.commands), key=lambda two: _state(two[1])):
             ticks = [tick for tick, _ in group]
             axes.plot(
-                [ticks[0], ticks[-1] + 1], [row, row], "-", lw=WIDTHS[meets], color=COLOURS[HUES[known]],
-                solid_capstyle="butt", zorder=2, gid=f"lane-{one.id}-{ticks[0]}",
+                [ticks[0], ticks[-1] + 1], [row, row], "-", lw=LANE_WIDTHS[meets],
+                color=COLOURS[LANE_COLOURS[known]], solid_capstyle="butt", zorder=2,
+                gid=f"lane-{one.id}-{ticks[0]}",
             )  # fmt: skip
         if one.localised is not None:
             axes.plot(one.localised, row, "*", ms=7, color=INK, mec="white", mew=0.4, ls="", zorder=4)

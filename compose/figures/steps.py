@@ -5,16 +5,16 @@ from __future__ import annotations
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from compose.figures.pair import ROLES, PairRecord
+from compose.figures.pair import PairRecord
 from compose.figures.sheet import NO_ENCOUNTER, NO_PLACES, Absent, Sheet, Window, circle, some, square
-from compose.figures.style import INK, MARKS, PALE, SCREEN, Medium
+from compose.figures.style import INK, PALE, ROLE_MARKERS, SCREEN, Medium
 from compose.figures.trajectory import draw_trail, heading
 from compose.view.colours import COLOURS, line_style
-from protocol.mission import Role
+from protocol.mission import ROLES, Role
 
 BEFORE = 2
 """The number of ticks shown before the encounter."""
-ARROW = 0.12
+WINDOW_ARROW = 0.12
 """The length of a heading arrow, as a fraction of the window's width."""
 
 
@@ -85,20 +85,28 @@ def _panel(axes: Axes, pair: PairRecord, first: int, before: int, tick: int) -> 
             _places(axes, pair, role, ticks, ranged=ranged)
         now = one.path[tick]
         axes.plot(
-            now.x, now.y, MARKS[role]["marker"], ms=6.5, mfc=colour, mec="white", mew=0.7, ls="", zorder=5
+            now.x,
+            now.y,
+            ROLE_MARKERS[role]["marker"],
+            ms=6.5,
+            mfc=colour,
+            mec="white",
+            mew=0.7,
+            ls="",
+            zorder=5,
         )
     ends = [pair.robot(role).path[tick] for role in ROLES]
     axes.plot([p.x for p in ends], [p.y for p in ends], ":", color=INK, lw=1.3, zorder=3, gid=f"rho-{tick}")
     left, right, _, _ = _window(pair, first, tick)
     for role, pose in zip(ROLES, ends, strict=True):
-        heading(axes, pose, ARROW * (right - left), COLOURS[role], zorder=6)
+        heading(axes, pose, WINDOW_ARROW * (right - left), COLOURS[role], zorder=6)
 
 
 def _places(axes: Axes, pair: PairRecord, role: Role, ticks: list[int], *, ranged: bool) -> None:
     """Mark earlier positions, filled if a mutual range was measured there."""
     poses, colour = [pair.robot(role).path[k] for k in ticks], COLOURS[role]
     axes.plot(
-        [p.x for p in poses], [p.y for p in poses], MARKS[role]["marker"], ms=3.6,
+        [p.x for p in poses], [p.y for p in poses], ROLE_MARKERS[role]["marker"], ms=3.6,
         mfc=colour if ranged else "white", mec=colour, mew=0.9, ls="", zorder=4,
     )  # fmt: skip
 
@@ -108,7 +116,7 @@ def _key(axes: Axes, pair: PairRecord) -> None:
         axes.plot(
             [],
             [],
-            MARKS[role]["marker"],
+            ROLE_MARKERS[role]["marker"],
             ls="-",
             lw=1.6,
             ms=5,

@@ -14,12 +14,12 @@ from matplotlib import _mathtext
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
-from compose.figures import FORMATS
+from compose.figures import FIGURE_FORMATS
 from compose.view.colours import COLOURS
 from protocol import files
 from protocol.mission import Role
 
-MARKS: dict[Role, dict[str, Any]] = {
+ROLE_MARKERS: dict[Role, dict[str, Any]] = {
     "a": {"marker": "o", "markerfacecolor": COLOURS["a"], "markeredgecolor": COLOURS["a"]},
     "b": {"marker": "^", "markerfacecolor": "white", "markeredgecolor": COLOURS["b"]},
 }
@@ -30,11 +30,11 @@ SHADE = "#f3e6bd"
 """The background colour of ticks in contact."""
 TEXT = 8.0
 """The font size of all text, in points."""
-SMALLEST = 6.0
+SMALLEST_FONT = 6.0
 """The font size of subscripts and superscripts, in points."""
 COLUMN, PAGE = 3.5, 7.16
 """The widths of one column and of two columns of a paper (IEEE), in inches."""
-PLACES = 6
+DECIMALS = 6
 """The number of decimal places of panel positions, which are fractions of the figure's size."""
 
 LAYOUT_TABLES = ["GSUB", "GPOS", "GDEF", "BASE", "JSTF", "MATH", "kern"]
@@ -42,7 +42,7 @@ LAYOUT_TABLES = ["GSUB", "GPOS", "GDEF", "BASE", "JSTF", "MATH", "kern"]
 _DATES: dict[str, dict[str, None]] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {}}
 
 # Matplotlib has no setting for the size of subscripts, which its 0.7 would make 5.6 points.
-_mathtext.SHRINK_FACTOR = SMALLEST / TEXT
+_mathtext.SHRINK_FACTOR = SMALLEST_FONT / TEXT
 # fontTools warns of the dates in the STIX fonts when it embeds them.
 logging.getLogger("fontTools").setLevel(logging.ERROR)
 
@@ -75,7 +75,7 @@ PAPER = Medium(
     False, COLUMN, 300, {**_SIZES, **_FINE, "font.family": "STIXGeneral", "mathtext.fontset": "stix"}
 )
 """Figures to put in a paper, whose captions are their titles: COLUMN or PAGE wide, in a Times typeface."""
-SWEEP = Medium(False, PAGE, 160, {"font.size": 9, "text.parse_math": False})
+SWEEP_MEDIUM = Medium(False, PAGE, 160, {"font.size": 9, "text.parse_math": False})
 """Figures of sweeps, whose labels are text of sweep files and hence printed literally."""
 
 
@@ -102,7 +102,7 @@ def look(medium: Medium) -> Iterator[None]:
 
 
 def save(
-    figure: Figure, path: Path, formats: Sequence[str] = FORMATS, dpi: int = SWEEP.dpi
+    figure: Figure, path: Path, formats: Sequence[str] = FIGURE_FORMATS, dpi: int = SWEEP_MEDIUM.dpi
 ) -> tuple[Path, ...]:
     """Save `figure` as `path` with each of `formats` as its extension, without dates; return the paths.
 
@@ -127,7 +127,7 @@ def _leave_out_layout_tables() -> None:
 
 
 def _settle(figure: Figure) -> None:
-    """Fix the panels' positions from a constrained layout, rounded to PLACES.
+    """Fix the panels' positions from a constrained layout, rounded to DECIMALS.
 
     The last bits of a constrained layout vary between processes, so unrounded files would differ.
     """
@@ -137,4 +137,4 @@ def _settle(figure: Figure) -> None:
     figure.set_layout_engine("none")
     for axes in figure.axes:
         corners = axes.get_position(original=True).get_points()
-        axes.set_position(Bbox(corners.round(PLACES)), "original")
+        axes.set_position(Bbox(corners.round(DECIMALS)), "original")

@@ -9,18 +9,18 @@ from itertools import groupby
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from compose.figures.pair import ROLES, PairRecord, Side
+from compose.figures.pair import PairRecord, Side
 from compose.figures.sheet import ANCHORS, LABEL, NO_PLACES, Absent, Sheet, Window, around, circle
-from compose.figures.style import INK, MARKS, PALE, SCREEN, Medium
+from compose.figures.style import INK, PALE, ROLE_MARKERS, SCREEN, Medium
 from compose.view.colours import COLOURS, line_style
-from protocol.mission import Role
+from protocol.mission import ROLES, Role
 from protocol.motion import Pose
 
-TALLEST = 4.6
+TALLEST_TRAJECTORY = 4.6
 """The maximum height of the plane, in inches."""
 MANY = 160
 """The maximum number of markers on a path."""
-ARROW = 0.35
+RANGE_ARROW = 0.35
 """The length of a heading arrow, as a fraction of the sensing range."""
 
 
@@ -31,7 +31,7 @@ def draw(pair: PairRecord, medium: Medium = SCREEN) -> Figure | Absent:
     sheet = Sheet(medium, True, [pair.title])
     axes = sheet.panel()
     draw_plane(axes, pair)
-    sheet.plane(axes, window(pair), TALLEST)
+    sheet.plane(axes, window(pair), TALLEST_TRAJECTORY)
     return sheet.finished()
 
 
@@ -90,16 +90,19 @@ def _path(axes: Axes, pair: PairRecord, role: Role, *, pale: bool) -> None:
     draw_trail(axes, one, role, range(one.first, len(one.path)), alpha=alpha)
     axes.plot(
         [p.x for p in one.way], [p.y for p in one.way], ls="", ms=2.6, mew=0.7, color=colour, alpha=alpha,
-        markevery=max(1, math.ceil(len(one.way) / MANY)), gid=f"path-{one.id}", zorder=3, **MARKS[role],
+        markevery=max(1, math.ceil(len(one.way) / MANY)), gid=f"path-{one.id}", zorder=3,
+        **ROLE_MARKERS[role],
     )  # fmt: skip
     label = f"true path of {one.id}" if pair.true else f"path of {one.id}, from its claim"
-    axes.plot([], [], "-", lw=1.2, ms=3.5, mew=0.8, color=colour, alpha=alpha, label=label, **MARKS[role])
+    axes.plot(
+        [], [], "-", lw=1.2, ms=3.5, mew=0.8, color=colour, alpha=alpha, label=label, **ROLE_MARKERS[role]
+    )
     start = one.path[one.first]
     axes.plot(
         start.x, start.y, "s", ms=6, mfc="white", mec=colour, mew=1.2, zorder=4, gid=f"released-{one.id}",
         alpha=alpha,
     )  # fmt: skip
-    heading(axes, start, ARROW * pair.mission.sensing_range, colour)
+    heading(axes, start, RANGE_ARROW * pair.mission.sensing_range, colour)
 
 
 def draw_trail(

@@ -13,7 +13,7 @@ from pathlib import Path
 from compose.scenario.shipped_files import shipped
 from world.scenario import Scenario
 
-SOURCE = Path(__file__).parents[2]
+CLONE_FOLDER = Path(__file__).parents[2]
 """The folder from which an image is built: that of a clone of the repository."""
 MOUNTED = "/scenario.toml"
 """The place of a scenario file in the container of the world."""
@@ -44,7 +44,7 @@ def compose_file(source: str, scenario: Scenario, place: Path) -> str:
         "name: tandem\n": f"name: tandem-{scenario.name.lower()}\n",
         f"{agent}\n\n{other}": agents,
         "  agent-a: {}\n  agent-b: {}\n": "".join([f"  agent-{one}: {{}}\n" for one in ids]),
-        "context: ../../..\n": f"context: {_quoted(_from(place, SOURCE))}\n",
+        "context: ../../..\n": f"context: {_quoted(_from(place, CLONE_FOLDER))}\n",
     }
     if source in shipped():
         changes["${TANDEM_SCENARIO:-random}"] = source

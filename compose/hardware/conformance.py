@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares  # type: ignore[import-untyped]
 
-from compose.hardware.exercise import FIRST_HALF, SECOND_HALF, STOPPED, ExerciseRun, Try
+from compose.hardware.exercise import FIRST_HALF, SECOND_HALF, STOPPED_HALF_WAY, ExerciseRun, Try
 from protocol.mission import Mission
 from protocol.motion import ORIGIN, REST, Controls, Pose, step
 from world.hardware.driver import SENSING
@@ -24,11 +24,11 @@ PROMPT = 0.05
 """The part of a manoeuvre that `drive` may take to return."""
 LIKE = 0.25
 """The relative difference allowed between measured and commanded speeds, because wheels accelerate."""
-STILL = 0.02
+REST_SPEED = 0.02
 """The part of the maximum speeds below which a robot is at rest."""
-EXACT = 1e-6
+EXACT_TOLERANCE = 1e-6
 """The tolerance in m with which ranges without noise must agree with the path."""
-SIGMAS = 6.0
+CONFORMING_SIGMAS = 6.0
 """The number of standard deviations by which ranges with noise may differ from the path."""
 
 
@@ -98,7 +98,7 @@ def lasts(_: Mission, tries: Sequence[Try]) -> str | None:
 def stops(_: Mission, tries: Sequence[Try]) -> str | None:
     """stop ends a manoeuvre, and odometry measures what was driven, not what was commanded"""
     for tick, one in enumerate(tries):
-        if one.what == STOPPED:
+        if one.what == STOPPED_HALF_WAY:
             part = one.reading.executed.v / one.asked.v
             if abs(part - one.share) > LIKE:
                 return (
@@ -180,7 +180,7 @@ def _text(controls: Controls) -> str:
 def _slack(mission: Mission) -> tuple[float, float]:
     """Return the speeds in m/s and rad/s up to which a robot is at rest, odometry noise included."""
     v, omega = mission.noise.standstill_bound
-    return STILL * mission.max_speed + v, STILL * mission.max_turn_rate + omega
+    return REST_SPEED * mission.max_speed + v, REST_SPEED * mission.max_turn_rate + omega
 
 
 def _still(done: Controls, mission: Mission) -> bool:
@@ -206,7 +206,7 @@ def _path(tries: Sequence[Try], mission: Mission) -> tuple[list[Pose], float]:
         along, across = along + v, across + omega
         farthest = max(farthest, math.hypot(path[-1].x, path[-1].y))
     sigma = mission.period * math.sqrt(along + across * farthest * farthest)
-    return path, EXACT + SIGMAS * math.hypot(mission.noise.anchor_sigma, sigma)
+    return path, EXACT_TOLERANCE + CONFORMING_SIGMAS * math.hypot(mission.noise.anchor_sigma, sigma)
 
 
 def _fit(some: Sequence[tuple[Pose, float]], *, scaled: bool) -> tuple[tuple[float, float], float]:

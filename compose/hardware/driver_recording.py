@@ -23,7 +23,7 @@ from world.hardware.driver_journal import DriverHistory, ProcessStart, boot, dri
 
 RELEASE_S = 10.0
 """Time in s that the agent of a killed launcher has to end, which unlocks its journal."""
-POLL_S = 0.02
+RECORDING_POLL_S = 0.02
 """The polling interval in s."""
 
 
@@ -94,7 +94,7 @@ def _frames(path: Path, inbox: Inbox) -> list[bytes]:
         except CannotRecord:
             if time.monotonic() >= give_up:
                 raise
-            inbox.next(POLL_S)
+            inbox.next(RECORDING_POLL_S)
         else:
             old.close()
             return old.frames

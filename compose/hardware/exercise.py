@@ -14,10 +14,10 @@ from protocol.motion import REST, Controls
 from world.hardware.driver import Driver, Reading
 from world.hardware.measurements import InvalidReading, mark_frames, observation_frame
 
-SETTLED = 0.1
+SETTLING_SHARE = 0.1
 """The part of a manoeuvre to wait after its end before sensing."""
 FIRST_HALF, SECOND_HALF = "first half of a straight", "second half of a straight"
-STOPPED = "stopped half-way"
+STOPPED_HALF_WAY = "stopped half-way"
 
 
 class Try(NamedTuple):
@@ -80,7 +80,7 @@ class ExerciseRun:
             share = self._share()
             self._driver.stop()
             self._wait(1.0)
-            self._observation(STOPPED, asked, share)
+            self._observation(STOPPED_HALF_WAY, asked, share)
             self._try("at rest after the stop", REST)
             for _ in range(math.ceil(2.0 * mission.sensing_range / (v * mission.period)) + 2):
                 self._try("away from the anchor", Controls(v, 0.0))
@@ -109,7 +109,7 @@ class ExerciseRun:
         return min(1.0, (time.monotonic() - self._began) / self._manoeuvre_s)
 
     def _wait(self, share: float) -> None:
-        until = self._began + (share + (SETTLED if share == 1.0 else 0.0)) * self._manoeuvre_s
+        until = self._began + (share + (SETTLING_SHARE if share == 1.0 else 0.0)) * self._manoeuvre_s
         time.sleep(max(0.0, until - time.monotonic()))
 
     def _observation(self, what: str, asked: Controls, share: float, driving_s: float = 0.0) -> None:

@@ -15,7 +15,7 @@ KILL_S = 5.0
 """Time in s that a killed process has to end; then its fork server is considered hung, and is killed."""
 SEND_S = 60.0
 """Time in s that a process has to read what is sent to it; then it is considered hung, and is killed."""
-LOOK_S = 0.1
+END_CHECK_S = 0.1
 """Interval in s at which a wait for the output of a process checks whether it has ended."""
 READ_BYTES = 1 << 16
 """The largest number of bytes in one read from a process."""
@@ -119,7 +119,7 @@ class ChildProcess:
         """Return the next bytes of its standard output, none at the end. Raises TimeoutError."""
         assert self._stdout is not None
         give_up = time.monotonic() + timeout
-        while not _polled(self._stdout, select.POLLIN, min(give_up - time.monotonic(), LOOK_S)):
+        while not _polled(self._stdout, select.POLLIN, min(give_up - time.monotonic(), END_CHECK_S)):
             if not self.running and not _polled(self._stdout, select.POLLIN, 0.0):
                 return b""  # the fork server still has the other end if it ended before it began
             if time.monotonic() >= give_up:

@@ -13,7 +13,7 @@ from world.hardware.driver import THINKING, Driver
 from world.hardware.driver_journal import DriverHistory
 from world.scenario import Scenario
 
-METHODS = ("sense", "drive", "stop", "close")
+DRIVER_METHODS = ("sense", "drive", "stop", "close")
 """The methods that a driver must have."""
 
 Maker = Callable[..., Driver]
@@ -24,7 +24,7 @@ def driver_class(name: str) -> Maker:
     """Return the class that the user has named, also of the working directory. Raises UserError."""
     trust(name)
     found = named(name, "driver")
-    missing = [method for method in METHODS if not callable(getattr(found, method, None))]
+    missing = [method for method in DRIVER_METHODS if not callable(getattr(found, method, None))]
     if not callable(found) or missing:
         raise UserError(f"{name}: is not a driver: it has no {', '.join(missing) or 'constructor'}")
     maker: Maker = found

@@ -54,7 +54,7 @@ class Signal(msgspec.Struct, frozen=True, tag=True):
 
 TAKE_S = 60.0
 """Time in s for retries of a request to fork: the fork server may still import."""
-LOOK_S = 1.0
+FORKS_CHECK_S = 1.0
 """The interval in s at which processes are checked while the fork server reports nothing."""
 TRY_AGAIN_S = 0.001
 """The interval in s between these retries."""
@@ -225,7 +225,7 @@ class ForkServer:
         overdue: float | None = None
         news = select.poll()
         news.register(self._socket, select.POLLIN)
-        while not news.poll(1e3 * LOOK_S):
+        while not news.poll(1e3 * FORKS_CHECK_S):
             if not any(process.hung_up for process in tuple(self._running.values())):
                 overdue = None
             elif overdue is None:

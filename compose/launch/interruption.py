@@ -1,4 +1,4 @@
-"""SIGINT, SIGTERM and SIGHUP of a command that does not handle them itself: they end it with STOPPED."""
+"""SIGINT, SIGTERM and SIGHUP of a command that does not handle them: they end it with STOPPED_STATUS."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from contextlib import suppress
 from types import FrameType
 from typing import NoReturn
 
-from compose.errors import STOPPED
+from compose.errors import STOPPED_STATUS
 
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """The signals that stop a command."""
@@ -68,7 +68,7 @@ class Interruption:
         """Say what stopped the command, and end the process at once, whatever it is doing."""
         with suppress(OSError):  # not through sys.stderr, which the signal may have interrupted
             os.write(2, f"{self._command}: stopped by {self.signal_name}\n".encode())
-        os._exit(STOPPED)
+        os._exit(STOPPED_STATUS)
 
 
 INTERRUPTION = Interruption()

@@ -10,9 +10,9 @@ from protocol.spelling import did_you_mean
 from world.radio_models import RADIO_MODELS
 from world.range_models import RANGE_MODELS
 from world.scenario import Scenario
-from world.world_models import OWN, ModelSpec, RadioModel, RangeModel
+from world.world_models import OWN_MODELS, ModelSpec, RadioModel, RangeModel
 
-KINDS: dict[str, tuple[type, dict[str, Any]]] = {
+MODEL_KINDS: dict[str, tuple[type, dict[str, Any]]] = {
     "range": (RangeModel, RANGE_MODELS),
     "radio": (RadioModel, RADIO_MODELS),
 }
@@ -25,7 +25,7 @@ def check(kind: str, spec: ModelSpec) -> None:
     Raises UserError, whose text begins with the field of the model's table, if that is not possible, or not
     permitted.
     """
-    contract, shipped = KINDS[kind]
+    contract, shipped = MODEL_KINDS[kind]
     if spec.model in shipped:
         maker = shipped[spec.model]
     elif ":" not in spec.model:
@@ -54,7 +54,7 @@ def _loaded(name: str) -> type:
     found = class_loader.named(name, "model")
     if not isinstance(found, type) or not issubclass(found, RangeModel | RadioModel):
         raise UserError(f"{name} is not a range model or a radio model")
-    OWN[name] = found
+    OWN_MODELS[name] = found
     return found
 
 

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 
 GROUP = "tandem.planners"
 """The group of entry points with which packages add planners."""
-SHIPPED = tuple(sorted(RENDEZVOUS))
+PLANNER_NAMES = tuple(sorted(RENDEZVOUS))
 """The names of the shipped planners. Their orbits are known without loading them."""
-METHODS = ("start", "observe", "decide", "command", "estimate")
+PLANNER_METHODS = ("start", "observe", "decide", "command", "estimate")
 """The methods that a planner must define."""
 
 GROUP_PLANNER = "assured"
@@ -35,12 +35,12 @@ GROUP_PLANNER = "assured"
 
 def is_shipped(name: str) -> bool:
     """Return whether `name` is a planner that is shipped with Tandem."""
-    return name in SHIPPED
+    return name in PLANNER_NAMES
 
 
 def installed() -> dict[str, Any]:
     """Return the entry points of installed packages that add planners, by name."""
-    return {name: one for name, one in entry_points(GROUP).items() if name not in SHIPPED}
+    return {name: one for name, one in entry_points(GROUP).items() if name not in PLANNER_NAMES}
 
 
 def check(name: str, options: Mapping[str, Any]) -> None:
@@ -131,18 +131,18 @@ def planner_class(name: str) -> type[Planner[Any, Any]]:
     from agent.planning.planner import Planner  # noqa: PLC0415  # it imports numpy
 
     if is_shipped(name):
-        from agent.planning.registry import SHIPPED as CLASSES  # noqa: PLC0415
+        from agent.planning.registry import PLANNER_CLASSES  # noqa: PLC0415
 
-        return CLASSES[name]
+        return PLANNER_CLASSES[name]
     try:
         found = named(name, "planner", GROUP)
     except KeyError:
-        names = [*SHIPPED, *installed()]
+        names = [*PLANNER_NAMES, *installed()]
         near = did_you_mean(name, names) or "; a planner of your own is MODULE:CLASS"
         raise UserError(f"there is no '{name}'; there are {', '.join(names)}{near}") from None
     if not isinstance(found, type) or not issubclass(found, Planner):
         raise UserError(f"{name}: is not a planner: not a subclass of tandem.planning.Planner")
-    missing = [method for method in METHODS if getattr(found, method) is getattr(Planner, method)]
+    missing = [method for method in PLANNER_METHODS if getattr(found, method) is getattr(Planner, method)]
     if missing:
         raise UserError(f"{name}: is not a planner: it does not define {', '.join(missing)}")
     return found

@@ -19,13 +19,13 @@ import msgspec
 from compose.launch.interruption import STOPPING
 from compose.launch.parent_end import end_with_parent
 
-NUMBER = struct.Struct("<H")
+FRAME_NUMBER = struct.Struct("<H")
 """The number of a task in the pipe from which both processes take the next one."""
-MAX_TASKS = select.PIPE_BUF // NUMBER.size
+MAX_TASKS = select.PIPE_BUF // FRAME_NUMBER.size
 """The largest number of tasks: all their numbers are written to the pipe before one is read."""
-LOOK_S = 0.05
+SECOND_SIGNAL_S = 0.05
 """The time in s between two looks for a signal while this process waits for the second one."""
-WAIT_S = 60.0
+SECOND_PROCESS_S = 60.0
 """The time in s that the second process has once this one has no more tasks; then it is killed."""
 END_S = 2.0
 """The time in s that the second process has to remove the files that it is writing; then it is killed."""
@@ -105,7 +105,7 @@ class _SecondProcess:
             # again and again: a signal that arrives just before a system call does not interrupt it
             os.kill(self._pid, signal.SIGTERM if time.monotonic() < give_up else signal.SIGKILL)
             os.kill(self._pid, signal.SIGCONT)
-            time.sleep(LOOK_S / 10)
+            time.sleep(SECOND_SIGNAL_S / 10)
 
 
 def _finished(
@@ -123,10 +123,10 @@ def _finished(
         check()
         yield number, missing.pop(number)()
         yield from from_second(0.0)
-    give_up = time.monotonic() + WAIT_S
+    give_up = time.monotonic() + SECOND_PROCESS_S
     while second is not None and second.running and time.monotonic() < give_up:
         check()
-        yield from from_second(LOOK_S)
+        yield from from_second(SECOND_SIGNAL_S)
     if second is not None:
         second.end()
     for number, task in missing.items():
@@ -139,7 +139,7 @@ def _numbered(tasks: Sequence[Task]) -> Iterator[int]:
     """Yield a pipe from which each read takes the number of the next task."""
     assert len(tasks) <= MAX_TASKS
     waiting, numbers = os.pipe()
-    os.write(numbers, b"".join([NUMBER.pack(number) for number in range(len(tasks))]))
+    os.write(numbers, b"".join([FRAME_NUMBER.pack(number) for number in range(len(tasks))]))
     os.close(numbers)
     try:
         yield waiting
@@ -149,8 +149,8 @@ def _numbered(tasks: Sequence[Task]) -> Iterator[int]:
 
 def _taken(waiting: int) -> Iterator[int]:
     """Take the next task's number from the pipe `waiting`, until there is none."""
-    while taken := os.read(waiting, NUMBER.size):
-        yield NUMBER.unpack(taken)[0]
+    while taken := os.read(waiting, FRAME_NUMBER.size):
+        yield FRAME_NUMBER.unpack(taken)[0]
 
 
 @contextmanager

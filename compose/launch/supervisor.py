@@ -16,7 +16,7 @@ STOP_S = 3.0
 """Time in s that a process has to end after SIGTERM; then it is killed."""
 COMMAND = "compose.cli.main:main"
 """The function that runs a `tandem` command."""
-MISSIONS = "compose.cli.warm_up:missions"
+PREPARE_MISSIONS = "compose.cli.warm_up:missions"
 """The function that prepares a fork server for worlds and agents."""
 
 
@@ -26,7 +26,7 @@ class ChildFailed(RuntimeError):
 
 def fork_server() -> ForkServer:
     """Return the fork server of this process's worlds and agents."""
-    return forked.fork_server(MISSIONS)
+    return forked.fork_server(PREPARE_MISSIONS)
 
 
 class Supervisor:
@@ -35,7 +35,7 @@ class Supervisor:
     A signal such as Ctrl-C reaches only this process, and its children by `stop`.
     """
 
-    def __init__(self, inbox: Inbox, warm_up: str = MISSIONS) -> None:
+    def __init__(self, inbox: Inbox, warm_up: str = PREPARE_MISSIONS) -> None:
         """Put "ended", with the name of the child, into `inbox` whenever a child ends.
 
         `warm_up` is the function that prepares the fork server of the children.

@@ -17,7 +17,7 @@ from protocol.network import keys, session
 from protocol.network.endpoints import at
 from protocol.network.inbox import Inbox
 
-TIMEOUT_S = 30.0
+BASELINE_TIMEOUT_S = 30.0
 """Time in s without an answer before giving up."""
 RUN = "barrier"
 """The run name in the keys."""
@@ -31,7 +31,7 @@ def drop(frames: SimpleQueue[bytes], sample: zenoh.Sample) -> None:
 def world(link: zenoh.Session, robots: Sequence[str], size: int, ticks: int) -> float:
     """Wait for all robots, and return the time in s that `ticks` rounds with frames of `size` bytes take.
 
-    Raises queue.Empty after TIMEOUT_S without an answer.
+    Raises queue.Empty after BASELINE_TIMEOUT_S without an answer.
     """
     frames: SimpleQueue[bytes] = SimpleQueue()
     there = Inbox("barrier")
@@ -39,21 +39,21 @@ def world(link: zenoh.Session, robots: Sequence[str], size: int, ticks: int) -> 
     publishers = [session.publisher(link, keys.observation(RUN, robot)) for robot in robots]
     session.watch_liveliness(link, keys.robot_alive(RUN, "*"), there)
     for _ in robots:
-        there.next(TIMEOUT_S)
+        there.next(BASELINE_TIMEOUT_S)
     frame = bytes(size)
     began = time.perf_counter()
     for _ in range(ticks):
         for publisher in publishers:
             publisher.put(frame)
         for _ in publishers:
-            frames.get(timeout=TIMEOUT_S)
+            frames.get(timeout=BASELINE_TIMEOUT_S)
     return time.perf_counter() - began
 
 
 def robot(endpoint: str, name: str, size: int, ticks: int) -> None:
     """Answer each of `ticks` frames with one of `size` bytes."""
     frames: SimpleQueue[bytes] = SimpleQueue()
-    give_up = time.monotonic() + TIMEOUT_S
+    give_up = time.monotonic() + BASELINE_TIMEOUT_S
 
     def unanswered() -> None:
         if time.monotonic() > give_up:
@@ -65,7 +65,7 @@ def robot(endpoint: str, name: str, size: int, ticks: int) -> None:
         _token = session.show_alive(link, keys.robot_alive(RUN, name))
         frame = bytes(size)
         for _ in range(ticks):
-            frames.get(timeout=TIMEOUT_S)
+            frames.get(timeout=BASELINE_TIMEOUT_S)
             publisher.put(frame)
 
 

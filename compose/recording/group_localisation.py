@@ -9,7 +9,7 @@ import msgspec
 
 from compose.recording.run import Run
 
-ROUNDING = 1e-6
+TICK_ROUNDING = 1e-6
 """The rounding error in ticks up to which a bound in ticks counts as a whole number."""
 
 
@@ -49,7 +49,7 @@ def search_results(run: Run) -> Iterator[SearchResult]:
     for robot in run.scenario.unanchored:
         claim, ticks = run.claim(robot), planned.ends / run.scenario.mission.period
         yield SearchResult(
-            robot, planned.ends, math.ceil(ticks - ROUNDING), claim.tick if claim is not None else None
+            robot, planned.ends, math.ceil(ticks - TICK_ROUNDING), claim.tick if claim is not None else None
         )
 
 
@@ -67,6 +67,6 @@ def meeting_results(run: Run) -> Iterator[MeetingResult]:
             one.visitor,
             one.visited,
             ends,
-            math.ceil(ends / period - ROUNDING),
+            math.ceil(ends / period - TICK_ROUNDING),
             max(ticks) if len(ticks) == 2 else None,
         )

@@ -21,7 +21,7 @@ from protocol.wire import MAX_FRAME_BYTES, decode
 
 KILLS = "kills.jsonl"
 """The file's name."""
-MOST_BYTES = 1 << 20
+MOST_KILLS_BYTES = 1 << 20
 """The greatest size of the file that is read, about 14 000 lines."""
 _Count = Annotated[int, Meta(ge=0)]
 
@@ -76,15 +76,15 @@ def _listed(path: Path) -> tuple[Killed, ...]:
     """Return the processes in the file at `path`; none if there is no file.
 
     Raises OSError if the file cannot be read, and CorruptJournal if a line is not that of a process or there
-    are more than MOST_BYTES.
+    are more than MOST_KILLS_BYTES.
     """
     try:
         with files.open_file(path) as file:
-            content = file.read(MOST_BYTES + 1)
+            content = file.read(MOST_KILLS_BYTES + 1)
     except FileNotFoundError:
         return ()
-    if len(content) > MOST_BYTES:
-        raise CorruptJournal(f"{path}: it is larger than {MOST_BYTES} bytes")
+    if len(content) > MOST_KILLS_BYTES:
+        raise CorruptJournal(f"{path}: it is larger than {MOST_KILLS_BYTES} bytes")
     found = []
     for number, line in enumerate(content.split(b"\n")[:-1], 1):  # a line without an end is being written
         try:

@@ -30,7 +30,7 @@ from world.scenario import Scenario
 from world.sensors import in_contact
 
 Mode = Literal["processes", "in-process"]
-SUMMARY = "summary.json"
+SUMMARY_JSON = "summary.json"
 
 
 def summary(run: Run, mode: Mode | None, wall_s: float | None) -> dict[str, Any]:
@@ -126,7 +126,7 @@ def _robot_summary(run: Run, robot: str) -> dict[str, Any]:
         "position_sigma_m": covariance.position_sigma if covariance is not None else None,
         "heading_sigma_rad": covariance.heading_sigma if covariance is not None else None,
         "nees": claimed.nees if claimed is not None else None,
-        **{field: getattr(final_report, field, None) for field in _COUNTS},
+        **{field: getattr(final_report, field, None) for field in _FINAL_REPORT_COUNTS},
         "no_farewell": None if final_report is not None else _missing_final_report(run, robot),
         "deadlines_missed": sum([robot not in tick.commands for tick in run.ticks[:-1]]),
     }
@@ -144,7 +144,7 @@ def _missing_final_report(run: Run, robot: str) -> str:
     return "it did not answer the MissionEnd"
 
 
-_COUNTS = [field for field in FinalReport.__struct_fields__ if field != "robot"]
+_FINAL_REPORT_COUNTS = [field for field in FinalReport.__struct_fields__ if field != "robot"]
 
 
 def _listed(pose: Pose) -> list[float]:
@@ -163,7 +163,7 @@ def versions() -> dict[str, str | None]:
 def leave(run: Run, summary: Mapping[str, Any], folder: Path) -> None:
     """Write `ticks.csv` and `summary.json` into `folder`."""
     files.write(folder / "ticks.csv", ticks_csv(run))
-    files.write(folder / SUMMARY, msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n")
+    files.write(folder / SUMMARY_JSON, msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n")
 
 
 def outcome_line(summary: Mapping[str, Any]) -> str:

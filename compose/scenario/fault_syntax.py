@@ -15,7 +15,7 @@ from protocol.spelling import did_you_mean
 from world.faults import MAX_DELAY, MAX_FAULTS, Delay, Fault, LinkSelector
 
 _LINK = re.compile(r"\s*(?P<one>[A-Za-z0-9_-]+)\s*(?P<way><->|->)\s*(?P<other>[A-Za-z0-9_-]+)\s*")
-_NUMBER = re.compile(r"-?[0-9]*\.?[0-9]+(?:[eE]-?[0-9]+)?")
+_FAULT_NUMBER = re.compile(r"-?[0-9]*\.?[0-9]+(?:[eE]-?[0-9]+)?")
 EVERYWHERE = "*"
 """The text of a link that selects all links."""
 
@@ -112,7 +112,7 @@ def _value(name: str, text: str) -> bool | float | list[float]:
     if text in ("true", "false"):
         return text == "true"
     numbers = text.split("..")
-    if len(numbers) > 2 or not all(_NUMBER.fullmatch(number) for number in numbers):
+    if len(numbers) > 2 or not all(_FAULT_NUMBER.fullmatch(number) for number in numbers):
         raise BadFault(f"{name}: '{text}' is neither a number nor a range such as 0..3")
     values = [int(number) if number.isdigit() else float(number) for number in numbers]
     return values if len(values) == 2 else values[0]

@@ -31,7 +31,7 @@ The search for hypotheses takes the measured path for nearly right. With 0.003 r
 RETRIES = 2
 """The least number of pairs that try again, in turn. With three robots, they are all other pairs."""
 
-SLOWER = 2.0
+VISITS_SLOWER = 2.0
 """The time for the visits after them, in units of the planned one: robots are not where they were planned."""
 
 ALLOWED_SIDES = 3
@@ -136,11 +136,11 @@ def group_meetings(
         first[b] = FirstMeeting(a, "b", orbits)
     seeds = [(one.visitor, one.visited) for one in plan.meetings if one.first]
     spread = bound - min(one.ends for one in meetings if one.first)
-    begins, retries = bound + SLOWER * spread, []
+    begins, retries = bound + VISITS_SLOWER * spread, []
     for i, j in _retried(seeds, len(robots), pair_time, tolerates):
         lasts = pair_time(i, j) + extra[0] * mission.period
         retries.append(PlannedRetry(ids[i], ids[j], rendezvous(i, j), begins, lasts))
-        begins += lasts + SLOWER * spread
+        begins += lasts + VISITS_SLOWER * spread
     return GroupMeetings(planned, first, bound, tuple(retries), begins)
 
 

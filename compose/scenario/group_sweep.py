@@ -23,7 +23,7 @@ LEAVING_TICKS = 10
 LEAVES_WITHIN = 2.0
 """The largest distance from the anchor of its last meeting at which a robot goes on, in units of R."""
 
-SLOWER = 3.0
+SWEEPS_SLOWER = 3.0
 """The time for sweeps in `max_ticks`, in units of the planned bound: others sweep the parts of the dead."""
 
 MOST_WANDERED = 1.25
@@ -133,7 +133,7 @@ def with_sweep(
     return meetings._replace(
         first={**meetings.first, **dict.fromkeys(unanchored, waiting)},
         bound=planned.ends,
-        latest=meetings.latest + SLOWER * planned.ends,
+        latest=meetings.latest + SWEEPS_SLOWER * planned.ends,
         sweep=planned,
     )
 

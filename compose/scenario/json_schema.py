@@ -35,7 +35,7 @@ def json_schema(file: type[msgspec.Struct]) -> dict[str, Any]:
             if text := described(struct, field):
                 found["description"] = text
             if struct.__annotations__.get(field) == "PlannerName":
-                known = [*planner_loader.SHIPPED, *planner_loader.installed()]
+                known = [*planner_loader.PLANNER_NAMES, *planner_loader.installed()]
                 definition["properties"][field] = _one_of(known, found)
     return {"$schema": DIALECT, **schema}
 

@@ -26,9 +26,9 @@ Point = Literal["observation", "report", "journal", "command"]
 | command | the Command has been sent | all Commands have arrived and are not journaled |
 """
 
-POINTS: tuple[Point, ...] = get_args(Point)
+KILL_POINTS: tuple[Point, ...] = get_args(Point)
 WORLD = "world"
-DRAWN = "?"
+DRAWN_VALUE = "?"
 """The value of `who` or `point` that is drawn from the seed."""
 _Tick = Annotated[int, Meta(ge=0, le=999_999_999)]
 _FORM = re.compile(
@@ -63,7 +63,7 @@ class Kill(msgspec.Struct, frozen=True):
 class KillTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A `[[kill]]` table: the fields of `--kill`, each of which can be drawn from the seed."""
 
-    who: str | list[str] = DRAWN
+    who: str | list[str] = DRAWN_VALUE
     """The id of a robot, `world`, or `?` for one that is drawn; or a list, killed in the same tick."""
     tick: _Tick | Annotated[list[_Tick], Meta(min_length=2, max_length=2)] = 0
     """The tick, or the bounds between which it is drawn, both included."""
@@ -85,11 +85,11 @@ class KillTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         after = f"+{self.after:.6f}s" if self.after != "never" else "+never"
         found = []
         for name in named:
-            who = draw.choice(anyone) if name == DRAWN else name
+            who = draw.choice(anyone) if name == DRAWN_VALUE else name
             if who not in anyone:
                 near = did_you_mean(who, anyone)
                 raise BadKill(f"who: there is no '{who}'; there are {', '.join(anyone)}{near}")
-            point = draw.choice(POINTS) if self.point == DRAWN else self.point
+            point = draw.choice(KILL_POINTS) if self.point == DRAWN_VALUE else self.point
             found.append(parse(f"{who}@{tick}:{point}{after if self.after else ''}"))
         return found
 

@@ -18,7 +18,7 @@ from world.faults import Fault
 from world.scenario import Scenario
 from world.world_noise import WorldNoise
 
-SOURCE = "the changed scenario"
+CHANGED_SOURCE = "the changed scenario"
 """The name of the changed scenario in error messages; those of `changed` leave it out."""
 SUFFIX = "-changed"
 """The end of the name of a changed scenario."""
@@ -100,9 +100,9 @@ def changed(scenario: Scenario, change: ScenarioChange, most_ticks: int) -> Chan
     if _has_default_ticks(scenario):
         del table["max_ticks"]
     try:
-        found = validate(table, SOURCE).scenario
+        found = validate(table, CHANGED_SOURCE).scenario
     except BadScenario as error:
-        raise UserError(str(error).removeprefix(f"{SOURCE}: ")) from None
+        raise UserError(str(error).removeprefix(f"{CHANGED_SOURCE}: ")) from None
     if found.max_ticks > most_ticks:
         table["max_ticks"] = most_ticks
         found = replace(found, max_ticks=most_ticks)
@@ -141,7 +141,7 @@ def _has_default_ticks(scenario: Scenario) -> bool:
     table = file_table(scenario)
     del table["max_ticks"]
     try:
-        return validate(table, SOURCE).scenario.max_ticks == scenario.max_ticks
+        return validate(table, CHANGED_SOURCE).scenario.max_ticks == scenario.max_ticks
     except BadScenario:
         return False
 

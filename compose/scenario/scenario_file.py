@@ -51,7 +51,7 @@ from world.world_noise import world_noise_infeasibility, world_noise_mistake
 
 EXCHANGES = 20
 """The number of reports for each of which `max_ticks` allows the full `delivery_time_bound`."""
-WITHIN = 1.0 - 1e-9
+STARTS_WITHIN = 1.0 - 1e-9
 """The part of R within which starts are drawn, so that rounding cannot move one outside."""
 
 
@@ -416,7 +416,7 @@ def _start(robot: RobotTable, mission: MissionTable, seed: int) -> Pose:
         assert mission.area is not None
         x_min, y_min, x_max, y_max = mission.area
         return Pose(x_min + (x_max - x_min) * draw(), y_min + (y_max - y_min) * draw(), TAU * draw())
-    radius = WITHIN * mission.sensing_range * math.sqrt(draw())
+    radius = STARTS_WITHIN * mission.sensing_range * math.sqrt(draw())
     bearing, heading = TAU * draw(), TAU * draw()
     return Pose(
         robot.anchor[0] + radius * math.cos(bearing), robot.anchor[1] + radius * math.sin(bearing), heading

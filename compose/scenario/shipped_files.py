@@ -17,21 +17,21 @@ def shipped(package: str = "scenario") -> dict[str, Path]:
     return {file.stem: file for file in sorted(path.glob("*.toml"), key=lambda file: file.stem)}
 
 
-SHIPPED = {"scenario": ("scenario", "run"), "sweep": ("sweep", "sweep")}
+SHIPPED_KINDS = {"scenario": ("scenario", "run"), "sweep": ("sweep", "sweep")}
 """The kind of file in each package, and the command that runs it."""
-MARKS = {"scenario": {"mission", "robot"}, "sweep": {"scenario", "trials"}}
+REQUIRED_FIELDS = {"scenario": {"mission", "robot"}, "sweep": {"scenario", "trials"}}
 """The required fields of the files in each package that files of the other kind cannot have."""
 
 
 def unknown(source: str, folder: str) -> str:
     """Return an error message: `source` is neither a file nor a shipped file of the package `folder`."""
-    names = {one: shipped(one) for one in SHIPPED}
-    for other, (kind, command) in SHIPPED.items():
+    names = {one: shipped(one) for one in SHIPPED_KINDS}
+    for other, (kind, command) in SHIPPED_KINDS.items():
         if other != folder and source in names[other]:
             return _other_kind(source, kind, command)
     near = did_you_mean(source, [name for found in names.values() for name in found])
     ships = ", ".join(names[folder])
-    return f"{source}: neither a file nor a shipped {SHIPPED[folder][0]} ({ships}){near}"
+    return f"{source}: neither a file nor a shipped {SHIPPED_KINDS[folder][0]} ({ships}){near}"
 
 
 def misplaced(source: str, table: Mapping[str, Any], folder: str) -> str | None:
@@ -39,9 +39,9 @@ def misplaced(source: str, table: Mapping[str, Any], folder: str) -> str | None:
 
     Return None if `table` has a field that marks the kind of file in `folder`, or no mark at all.
     """
-    if MARKS[folder].isdisjoint(table):
-        for other, (kind, command) in SHIPPED.items():
-            if not MARKS[other].isdisjoint(table):
+    if REQUIRED_FIELDS[folder].isdisjoint(table):
+        for other, (kind, command) in SHIPPED_KINDS.items():
+            if not REQUIRED_FIELDS[other].isdisjoint(table):
                 return _other_kind(source, kind, command)
     return None
 

@@ -21,7 +21,7 @@ def read_text(path: Path) -> str:
     Raises FileNotFoundError, and ValueError whose text says why the file cannot be read.
     """
     try:
-        return files.read_text(path, documents.MOST_BYTES)
+        return files.read_text(path, documents.MOST_DOCUMENT_BYTES)
     except FileNotFoundError:
         raise
     except OSError as error:

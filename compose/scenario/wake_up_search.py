@@ -8,18 +8,18 @@ from collections.abc import Callable
 from compose.scenario.open_forest import OpenForest
 from compose.scenario.wake_up_tree import MeetingTimes, WakeUpForest
 
-STEPS = 1000
+SEARCH_STEPS = 1000
 """The changes that are tried."""
 MOST_RELEASED = 10
 """The most robots that a change takes out of the forest, without their partners."""
-SLACK = 0.05
+STEP_SLACK = 0.05
 """The share by which a step may exceed the shortest forest at the start of the search; it falls to zero."""
 BLINKS = 0.1
 """The share of possible meetings that a step does not consider, so that steps differ."""
-SEED = 21
+SEARCH_SEED = 21
 
 
-def short_forest(times: MeetingTimes, steps: int = STEPS) -> WakeUpForest:
+def short_forest(times: MeetingTimes, steps: int = SEARCH_STEPS) -> WakeUpForest:
     """Return the shortest forest that the search finds.
 
     A step releases robots near one of those on which the last end depends, and inserts them again in another
@@ -30,7 +30,7 @@ def short_forest(times: MeetingTimes, steps: int = STEPS) -> WakeUpForest:
     have all within a distance r localised within 4.31 r / v, and for some positions no sooner than 3.82 r / v
     (arXiv 2507.16269); this search does not guarantee the former.
     """
-    draw = random.Random(SEED).random
+    draw = random.Random(SEARCH_SEED).random
 
     def skip() -> bool:
         return draw() < BLINKS
@@ -49,7 +49,7 @@ def short_forest(times: MeetingTimes, steps: int = STEPS) -> WakeUpForest:
         count = 2 + int(draw() * (MOST_RELEASED - 1))
         parts = changed.release([centre, *(robot for robot in near[centre][: 2 * count] if draw() < 0.5)])
         changed.insert(_shuffled(parts, draw), skip)
-        slack = 1.0 + SLACK * (1.0 - step / steps)
+        slack = 1.0 + STEP_SLACK * (1.0 - step / steps)
         if changed.length() <= max(forest.length(), best.length() * slack):
             forest = changed
         if changed.length() < best.length():

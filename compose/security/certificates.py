@@ -40,7 +40,7 @@ SKEW = timedelta(days=1)
 SECRET = 0o600
 """The mode with which a secret file is created: only its owner can read it."""
 GITIGNORE = ".gitignore"
-LOOPBACK = ("localhost", "127.0.0.1", "::1")
+CERTIFIED_HOSTS = ("localhost", "127.0.0.1", "::1")
 """The host names in every certificate."""
 
 
@@ -66,8 +66,8 @@ def make(folder: Path, robots: Sequence[str], hosts: Sequence[str], days: int) -
     agents = sorted(known | set(robots))
     created, existing = [], []
     for name in (
-        access_control.ROUTER,
-        access_control.WORLD,
+        access_control.ROUTER_NAME,
+        access_control.WORLD_NAME,
         access_control.VIEWER,
         *(access_control.agent(robot) for robot in agents),
     ):
@@ -148,7 +148,7 @@ def _authority(folder: Path) -> Authority:
 def _participant(own: Path, name: str, authority: Authority, hosts: Sequence[str], days: int) -> None:
     """Create the folder `own` with the key and certificates of a participant, completely or not at all."""
     private = ec.generate_private_key(ec.SECP256R1())
-    names = (*LOOPBACK, *hosts) if name in access_control.CARRIERS else LOOPBACK
+    names = (*CERTIFIED_HOSTS, *hosts) if name in access_control.CARRIERS else CERTIFIED_HOSTS
     issued = issue(authority, name, private.public_key(), names, timedelta(days=days))
     draft = Path(tempfile.mkdtemp(prefix=f".{name}-", dir=own.parent))
     try:

@@ -18,7 +18,7 @@ FIELD = ".attack"
 HONEST = "honest"
 """The label of missions without an attack, with which the others are compared."""
 
-OUTCOMES = (("inconsistent", "#0b3c6f", ""), ("undecided", "#c9c9c9", ""), ("localised", "#9fc8a9", ".."))
+OUTCOME_BARS = (("inconsistent", "#0b3c6f", ""), ("undecided", "#c9c9c9", ""), ("localised", "#9fc8a9", ".."))
 """The outcome, colour and hatch of each part of a bar. The remaining part is `wrong`."""
 
 WRONG = "#d9541e"
@@ -42,7 +42,7 @@ def outcomes(results: Results, place: int) -> Figure:
     panels = figure.subplots(1, len(groups), sharey=True, squeeze=False)[0]
     for panel, (name, cells) in zip(panels, groups, strict=True):
         left = np.zeros(len(labels))
-        for outcome, colour, hatch in OUTCOMES:
+        for outcome, colour, hatch in OUTCOME_BARS:
             share = np.array([_share(results.of(cell), outcome) for cell in cells])
             panel.barh(labels, share, left=left, color=colour, hatch=hatch, edgecolor="white", label=outcome)
             left += share

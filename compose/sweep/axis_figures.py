@@ -18,7 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 
-from compose.figures.style import SWEEP, look, save
+from compose.figures.style import SWEEP_MEDIUM, look, save
 from compose.sweep import attack_figures, crash_figures
 from compose.sweep.execution import Results
 from compose.sweep.spec import Axis
@@ -37,17 +37,17 @@ LOGARITHMIC = 20.0
 """The ratio of the largest to the smallest value from which on an axis is logarithmic."""
 FITTING = 60
 """The total length in characters up to which the labels below an axis are horizontal."""
-BESIDE = 96
+WIDEST_LEGEND = 96
 """The length in characters of the widest row of a legend."""
-_NUMBER = re.compile(r"[0-9]+(?:\.[0-9]+)?").fullmatch
-SPREAD = 0.45
+_AXIS_NUMBER = re.compile(r"[0-9]+(?:\.[0-9]+)?").fullmatch
+POINTS_SPREAD = 0.45
 """The fraction of the space of a label over which the points of several lines are spread."""
 
 
 def draw(results: Results, folder: Path) -> None:
     """Draw all figures of the sweep into `folder`, each as SVG, PDF and PNG."""
     folder.mkdir(exist_ok=True)
-    with look(SWEEP):
+    with look(SWEEP_MEDIUM):
         for place, axis in enumerate(results.sweep.axes):
             if len(axis.values) > 1:
                 name = re.sub(r"[^A-Za-z0-9_-]+", "-", axis.name).strip("-")
@@ -265,7 +265,7 @@ def _against(axis: Axis) -> tuple[Figure, Axes, list[float]]:
 def _numbers(axis: Axis) -> list[float] | None:
     """Return the values or labels of the axis as numbers; None if they are not numbers."""
     if axis.labels is not None:
-        return [float(label) for label in axis.labels] if all(map(_NUMBER, axis.labels)) else None
+        return [float(label) for label in axis.labels] if all(map(_AXIS_NUMBER, axis.labels)) else None
     if len(axis.fields) > 1:
         return None
     values = [value for (value,) in axis.values]
@@ -281,7 +281,7 @@ def _joined(axis: Axis, style: Any) -> Any:
 
 def _aside(axis: Axis, i: int, lines: int) -> float:
     """Return the horizontal offset of the points of line `i`; 0 on a numeric axis."""
-    return 0.0 if _numbers(axis) is not None else SPREAD / lines * (i - 0.5 * (lines - 1))
+    return 0.0 if _numbers(axis) is not None else POINTS_SPREAD / lines * (i - 0.5 * (lines - 1))
 
 
 def _unpaired(results: Results, place: int | None) -> str | None:
@@ -296,7 +296,7 @@ def _legend(figure: Figure, axes: Axes, title: str | None) -> None:
     handles, labels = axes.get_legend_handles_labels()
     if any(labels):
         longest = max(map(len, labels))
-        columns = next((count for count in (4, 2) if count * longest < BESIDE), 1)
+        columns = next((count for count in (4, 2) if count * longest < WIDEST_LEGEND), 1)
         figure.legend(
             handles,
             labels,

@@ -31,21 +31,21 @@ from protocol.output import one_line
 
 T = TypeVar("T")
 
-AHEAD = 2
+CHUNKS_PER_THREAD = 2
 """The number of chunks submitted per worker thread: one that runs, and one that waits."""
 SCHEMES = ("tcp", "tls", "ws", "wss")
 """The schemes that the address of a scheduler may have."""
-CONNECT_S = 5.0
+SCHEDULER_S = 5.0
 """The time in s within which a scheduler must answer."""
 SLICE_S = 0.1
 """The time in s of which a wait for the scheduler is made up."""
 RESULT_S = 60.0
 """The time in s within which a worker must deliver a result that it has; generous for busy machines."""
-LOOK_S = 1.0
+THREADS_COUNT_S = 1.0
 """The time in s between two counts of the worker threads."""
-RETRIES = 2
+CHUNK_RETRIES = 2
 """The number of retries of a chunk whose worker could not start a process for trials."""
-LOOPBACK = "127.0.0.1:0"
+SCHEDULER_ADDRESS = "127.0.0.1:0"
 
 
 @contextmanager
@@ -54,14 +54,14 @@ def connect(workers: int, scheduler: str | None) -> Iterator[Client]:
 
     Raises UserError if the scheduler cannot be reached.
     """
-    dask.config.set({"distributed.comm.timeouts.connect": CONNECT_S, "distributed.admin.tick.limit": "1h"})
+    dask.config.set({"distributed.comm.timeouts.connect": SCHEDULER_S, "distributed.admin.tick.limit": "1h"})
     for name in ["distributed", *logging.root.manager.loggerDict]:
         if name.partition(".")[0] == "distributed":
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # this program reports errors itself
     if scheduler is not None:
         try:
             asyncio.run(_look_for(scheduler))
-            client = Client(scheduler, timeout=CONNECT_S, set_as_default=False)
+            client = Client(scheduler, timeout=SCHEDULER_S, set_as_default=False)
         except (OSError, ValueError, TypeError, RuntimeError, ImportError) as error:
             why = one_line(str(error).splitlines()[0] if str(error) else type(error).__name__)
             raise UserError(f"--scheduler: {scheduler} cannot be reached: {why}") from None
@@ -77,8 +77,8 @@ def connect(workers: int, scheduler: str | None) -> Iterator[Client]:
             n_workers=1,
             threads_per_worker=workers,
             processes=False,  # the trials have processes of their own
-            dashboard_address=LOOPBACK,
-            worker_dashboard_address=LOOPBACK,
+            dashboard_address=SCHEDULER_ADDRESS,
+            worker_dashboard_address=SCHEDULER_ADDRESS,
             memory_limit=0,
             silence_logs=logging.CRITICAL + 1,
         ) as cluster,
@@ -102,18 +102,18 @@ def _system_errors() -> Iterator[None]:
 
 
 async def _look_for(address: str) -> None:
-    """Raise an error unless a scheduler answers within CONNECT_S. A Client would wait for ever."""
+    """Raise an error unless a scheduler answers within SCHEDULER_S. A Client would wait for ever."""
     scheme, location = parse_address(address)
     if scheme not in SCHEMES:
         raise ValueError(f"the scheme '{scheme}' is none of {', '.join(SCHEMES)}")
     parse_host_port(location)
     try:
-        async with asyncio.timeout(CONNECT_S):
+        async with asyncio.timeout(SCHEDULER_S):
             arguments = Security().get_connection_args("client")
-            async with rpc(address, timeout=CONNECT_S, connection_args=arguments) as there:
+            async with rpc(address, timeout=SCHEDULER_S, connection_args=arguments) as there:
                 known = await there.identity()
     except TimeoutError:
-        raise TimeoutError(f"no answer within {CONNECT_S:g} s") from None
+        raise TimeoutError(f"no answer within {SCHEDULER_S:g} s") from None
     if known.get("type") != "Scheduler":
         raise ValueError(f"the process at this address is a {known.get('type', 'stranger')}, not a scheduler")
 
@@ -138,22 +138,25 @@ def play(
             inbox.say("the scheduler has no workers yet")
         chunks = chunks_of(work, orders, lambda: max(threads, 1))
         while True:
-            while len(submitted) < AHEAD * max(threads, 1) and (following := next(chunks, None)) is not None:
+            while (
+                len(submitted) < CHUNKS_PER_THREAD * max(threads, 1)
+                and (following := next(chunks, None)) is not None
+            ):
                 chunk, source = following
                 future = client.submit(
-                    worker_pool.run, sweep, msgspec.msgpack.encode(chunk), pure=False, retries=RETRIES
+                    worker_pool.run, sweep, msgspec.msgpack.encode(chunk), pure=False, retries=CHUNK_RETRIES
                 )
                 submitted[str(future.key)] = future, chunk, source
                 future.add_done_callback(lambda ended: inbox.put("ended", str(ended.key)))
             if not submitted:
                 return
-            arrival = inbox.next(LOOK_S)
+            arrival = inbox.next(THREADS_COUNT_S)
             if arrival.key in submitted:
                 future, chunk, source = submitted.pop(arrival.key)
                 rows = _rows(future, chunk)
                 source.took(rows, orders.timeout)
                 done(rows)
-            if time.monotonic() - looked > LOOK_S:
+            if time.monotonic() - looked > THREADS_COUNT_S:
                 if client.status not in ("running", "connecting"):
                     raise EngineFailed("the connection to the scheduler is lost")
                 threads, looked = _threads(client), time.monotonic()
@@ -186,9 +189,9 @@ def _rows(future: Future[Any], chunk: Chunk) -> list[TrialRow]:
 
 def _threads(client: Client) -> int:
     """Return the number of worker threads. Raises EngineFailed if the scheduler does not answer."""
-    known = _within(CONNECT_S, client.nthreads)
+    known = _within(SCHEDULER_S, client.nthreads)
     if known is None:
-        raise EngineFailed(f"the scheduler has not answered for {CONNECT_S:g} s")
+        raise EngineFailed(f"the scheduler has not answered for {SCHEDULER_S:g} s")
     return sum(known.values())
 
 
@@ -217,5 +220,5 @@ def _leave(client: Client, sweep: str, submitted: Sequence[Future[Any]]) -> None
         client.cancel(submitted, force=True)
         client.run(worker_pool.dismiss, sweep)
 
-    _within(CONNECT_S, dismiss)  # if the scheduler is lost, its workers' processes end by themselves
+    _within(SCHEDULER_S, dismiss)  # if the scheduler is lost, its workers' processes end by themselves
     worker_pool.dismiss(sweep)

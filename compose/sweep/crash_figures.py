@@ -15,7 +15,7 @@ from compose.sweep.statistics import column
 
 BASELINE = "nobody"
 """The label of missions without a kill, against which the wall time of the others is compared."""
-TICK = re.compile(r"kill\[[0-9]+\]\.tick").fullmatch
+KILL_TICK = re.compile(r"kill\[[0-9]+\]\.tick").fullmatch
 ABOVE = 95.0
 """The percentile of the wall times above which a field has the darkest colour."""
 LEAST_INCHES = 3.2
@@ -28,7 +28,7 @@ def kill_tick_axis(results: Results) -> int | None:
     """Return the index of the axis whose first field is the tick of a kill; None if there is none."""
     for place, axis in enumerate(results.sweep.axes):
         whole = all(isinstance(values[0], int) for values in axis.values)
-        if len(axis.values) > 1 and whole and TICK(axis.fields[0]):
+        if len(axis.values) > 1 and whole and KILL_TICK(axis.fields[0]):
             return place
     return None
 

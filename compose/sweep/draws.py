@@ -22,7 +22,7 @@ Place = Literal["inside", "on-anchor", "near-anchor", "rim", "collinear", "coinc
 Heading = Literal["any", "radial", "tangential", "collinear"]
 Start = tuple[float, float, float]
 
-NEAR = (1e-12, 1e-6)
+ALLOWED_ROUNDING = (1e-12, 1e-6)
 """The interval in m of the distance between anchor and start for `near-anchor`, log-uniform."""
 OFF = (1e-16, 1e-3)
 """The interval of the deviation from a special heading, in rad, or from the rim, as a fraction of R.
@@ -177,7 +177,7 @@ def _polar(place: Place, draw: Callable[[], float], line: float, reach: float) -
         case "on-anchor":
             return 0.0, bearing
         case "near-anchor":
-            return _between(draw, NEAR), bearing
+            return _between(draw, ALLOWED_ROUNDING), bearing
         case "rim":
             return reach * (1.0 - abs(_off(draw))), bearing
         case "collinear":

@@ -13,6 +13,7 @@ import pyarrow as pa
 
 from compose.errors import BadSpec
 from compose.scenario.scenario_file import trust_classes
+from compose.sweep import SUMMARY_CSV
 from compose.sweep.cells import Cell, RefusedCell, setting_of
 from compose.sweep.paired_differences import PairedDifference, differences_csv, paired_differences
 from compose.sweep.remaining_work import EngineFailed, TrialOptions, Work
@@ -24,8 +25,6 @@ from compose.sweep.worker import PLAY
 from protocol import files
 from protocol.network.inbox import Inbox, Interrupted
 
-SUMMARY = "summary.csv"
-"""The name of the table of cells in the results folder."""
 DIFFERENCES = "differences.csv"
 """The name of the table of differences between cells of paired axes."""
 
@@ -210,7 +209,7 @@ def _gathered(folder: Folder, stopped: str | None, interrupted: bool) -> Results
     differences = paired_differences(folder.sweep, cells, table)
     try:
         folder.gather(table)
-        files.write(folder.path / SUMMARY, summary_csv(folder.sweep, cells, figures))
+        files.write(folder.path / SUMMARY_CSV, summary_csv(folder.sweep, cells, figures))
         if differences:
             files.write(folder.path / DIFFERENCES, differences_csv(differences))
     except OSError as error:

@@ -19,7 +19,7 @@ from protocol.spelling import did_you_mean
 Steps = tuple[str | int, ...]
 """A parsed path: table keys and list indices, from the top of the file."""
 _STEP = re.compile(r"(?P<dot>\.?)(?:(?P<key>[A-Za-z0-9_-]+)|\[(?P<place>[0-9]{1,4})\])")
-DRAWN = "seed"
+SEED_FIELD = "seed"
 """The field that a sweep cannot vary, because every trial has its own seed."""
 
 
@@ -29,7 +29,7 @@ def steps(path: str, base: Mapping[str, Any]) -> Steps:
     Raises NoSuchField, also for the seed.
     """
     found = field_steps(path, base)
-    if found == (DRAWN,):
+    if found == (SEED_FIELD,):
         raise NoSuchField("every trial has its own seed")
     return found
 

@@ -19,7 +19,7 @@ User = Literal["world", "robots", "both"]
 """The user of a field: `world`, also if something is drawn from it or moves by it; `robots`, also if only the
 referee or the launcher uses it; `both`: the robots, and the world unless its own noise has the field."""
 
-FIELDS: Mapping[User, Mapping[str, str]] = {
+FIELDS_OF_USERS: Mapping[User, Mapping[str, str]] = {
     "world": {
         "": "seed world fault",
         "robot.": "id anchor start peer dies",
@@ -42,7 +42,7 @@ FIELDS: Mapping[User, Mapping[str, str]] = {
 
 USERS: Mapping[str, User] = {
     table + name: user
-    for user, tables in FIELDS.items()
+    for user, tables in FIELDS_OF_USERS.items()
     for table, names in tables.items()
     for name in names.split()
 }

@@ -32,7 +32,7 @@ class GroupColumns(msgspec.Struct, frozen=True):
     attacker_found: int | None
 
 
-OF_GROUP = GroupColumns.__struct_fields__
+GROUP_COLUMNS = GroupColumns.__struct_fields__
 """The names of these columns."""
 
 

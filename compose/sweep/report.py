@@ -13,8 +13,9 @@ from rich import progress as bars
 from rich.table import Column, Table
 from rich.text import Text
 
+from compose.sweep import SUMMARY_CSV
 from compose.sweep.cells import Cell
-from compose.sweep.execution import SUMMARY, Progress, Results
+from compose.sweep.execution import Progress, Results
 from compose.sweep.paired_differences import PairedDifference
 from compose.sweep.results_folder import CELLS
 from compose.sweep.statistics import CellSummary, noted, refusals
@@ -25,9 +26,9 @@ from protocol.output import one_line, say
 
 RATE_OVER_S = 10.0
 """The time in s over which the rate of trials is averaged."""
-OUTCOMES = ("localised", "undecided", "inconsistent", "wrong", "failed")
+OUTCOME_COLUMNS = ("localised", "undecided", "inconsistent", "wrong", "failed")
 """The columns that count outcomes."""
-NOTES = (
+COLUMN_NOTES = (
     ("rate_low", "rate: 95 % interval (Wilson)"),
     ("p50", "p50, p95, max: ticks of trials that localised"),
     ("error p50", "error: position error in m of the worse robot"),
@@ -40,18 +41,29 @@ NOTES = (
     ("nees low", "nees: mean, and the 99 % band for consistent covariances"),
 )
 """The footnotes of the table, each with the column whose presence requires it."""
-WIDEST = (*OUTCOMES, "clean", "rate", "rate_low", "rate_high", "p50", "p95", "max", "error p50", "error max")
+WIDEST = (
+    *OUTCOME_COLUMNS,
+    "clean",
+    "rate",
+    "rate_low",
+    "rate_high",
+    "p50",
+    "p95",
+    "max",
+    "error p50",
+    "error max",
+)
 """The columns of the widest table, except for `trials`."""
-CHOICES = (
+COLUMN_CHOICES = (
     ("trials", *WIDEST),
     ("trials", *WIDEST[:-2]),
-    ("trials", *OUTCOMES, "clean", "rate", "p50", "max"),
-    ("trials", *OUTCOMES, "rate"),
-    ("trials", *OUTCOMES),
-    OUTCOMES,
+    ("trials", *OUTCOME_COLUMNS, "clean", "rate", "p50", "max"),
+    ("trials", *OUTCOME_COLUMNS, "rate"),
+    ("trials", *OUTCOME_COLUMNS),
+    OUTCOME_COLUMNS,
 )
 """The possible choices of columns. The first that fits the terminal is used. Outcomes are never dropped."""
-OF_GROUP = ("share p50", "share max", "corrected", "travel p50", "travel p95", "honest")
+SHOWN_GROUP_COLUMNS = ("share p50", "share max", "corrected", "travel p50", "travel p95", "honest")
 """The additional columns of sweeps of groups."""
 OF_ATTACKED_GROUP = ("found",)
 """The additional column of sweeps of groups with an attacker."""
@@ -113,7 +125,7 @@ def progress(name: str, say: Callable[[str], None], visible: bool) -> Iterator[P
 
 def show(results: Results, out: Path, *, quiet: bool) -> None:
     """Print the results: with `quiet` only the counts, otherwise also the table and the trial to look at."""
-    total = {name: sum([getattr(one, name) for one in results.figures.values()]) for name in OUTCOMES}
+    total = {name: sum([getattr(one, name) for one in results.figures.values()]) for name in OUTCOME_COLUMNS}
     total["refused"] = sum([one.refused_trials for one in results.figures.values()])
     counts = ", ".join([f"{count} {name}" for name, count in total.items() if count])
     tell(f"{results.sweep.name}: {counts} of {len(results.table)} trials in {_cells(len(results.cells))}")
@@ -125,9 +137,9 @@ def show(results: Results, out: Path, *, quiet: bool) -> None:
     if shown:
         lines, columns = _lines(results)
         say("", *lines)
-        _block(text_width.notes(NOTES, columns))
+        _block(text_width.notes(COLUMN_NOTES, columns))
     if shown < len(results.cells):
-        tell(f"{len(results.cells) - shown} cells without a problem are not listed; see {out / SUMMARY}")
+        tell(f"{len(results.cells) - shown} cells without a problem are not listed; see {out / SUMMARY_CSV}")
     _block(_difference_lines(results))
     _block([line for reason in _refused(results) for line in text_width.wrapped(one_line(reason))])
     say("")
@@ -245,7 +257,7 @@ def _lines(results: Results) -> tuple[list[str], Sequence[str]]:
         place = [
             f"{name} {label}" for name, label in zip(["cell", *names], _axes(results, cell), strict=True)
         ]
-        counts = [f"{texts[one]} {one}" for one in ("trials", *OUTCOMES)]
+        counts = [f"{texts[one]} {one}" for one in ("trials", *OUTCOME_COLUMNS)]
         sentence = f"{', '.join(place)}: {', '.join(counts)}"
         if figures.rate is not None:
             sentence += f"; rate {texts['rate']} ({texts['rate_low']} to {texts['rate_high']})"
@@ -277,13 +289,13 @@ def _noisy(results: Results) -> bool:
 def _choices(results: Results) -> tuple[tuple[str, ...], ...]:
     """Return the possible choices of columns, the widest first."""
     more = (
-        *(OF_GROUP if results.sweep.of_group else ()),
+        *(SHOWN_GROUP_COLUMNS if results.sweep.of_group else ()),
         *(OF_ATTACKED_GROUP if any(one.attacker_met for one in results.figures.values()) else ()),
         *(OF_NOISE if _noisy(results) else ()),
     )
     if not more:
-        return CHOICES
-    return tuple((*columns, *more) for columns in CHOICES) + CHOICES[2:]
+        return COLUMN_CHOICES
+    return tuple((*columns, *more) for columns in COLUMN_CHOICES) + COLUMN_CHOICES[2:]
 
 
 def _table(results: Results, columns: Sequence[str]) -> Table:
@@ -303,7 +315,7 @@ def _axes(results: Results, cell: Cell) -> list[str]:
 def _figures(figures: CellSummary) -> dict[str, str]:
     return {
         "trials": str(figures.trials),
-        **{name: str(getattr(figures, name)) for name in OUTCOMES},
+        **{name: str(getattr(figures, name)) for name in OUTCOME_COLUMNS},
         "clean": str(figures.clean) if figures.audited else "-",
         "rate": _number(figures.rate, ".4f"),
         "rate_low": _number(figures.rate_low, ".4f"),

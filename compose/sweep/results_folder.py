@@ -20,6 +20,7 @@ import tomli_w
 
 from compose.errors import UserError
 from compose.recording.recording_files import make_folder
+from compose.sweep import PARTS, SWEEP_JSON
 from compose.sweep.cells import Cell, cells, label
 from compose.sweep.field_paths import canonical
 from compose.sweep.spec import Sweep
@@ -27,12 +28,8 @@ from compose.sweep.table import encoded, gathered, of_rows, read, schema_of
 from compose.sweep.trial import TrialRow
 from protocol import documents, files
 
-TRIALS = "trials.parquet"
+TRIALS_PARQUET = "trials.parquet"
 """The name of the merged table of trials."""
-SWEEP = "sweep.json"
-"""The name of the manifest."""
-PARTS = "parts"
-"""The name of the folder of parts."""
 CELLS = "cells"
 """The name of the folder of the cells' scenario files."""
 MAX_DIFFERENCE = 60
@@ -78,7 +75,7 @@ class Folder:
         """Write the manifest with the refused cells, and the scenario file of each cell."""
         self.refused = dict(refused)
         manifest = msgspec.json.encode(Manifest(self.sweep, self.refused))
-        files.write(self.path / SWEEP, msgspec.json.format(manifest, indent=2) + b"\n")
+        files.write(self.path / SWEEP_JSON, msgspec.json.format(manifest, indent=2) + b"\n")
         (self.path / CELLS).mkdir(exist_ok=True)
         self._parts.mkdir(exist_ok=True)
         for cell in self.cells.values():
@@ -98,7 +95,7 @@ class Folder:
 
     def gather(self, table: pa.Table) -> None:
         """Replace `trials.parquet` by `table`, and delete the parts."""
-        files.write(self.path / TRIALS, encoded(table))
+        files.write(self.path / TRIALS_PARQUET, encoded(table))
         for part in self._parts.glob("*"):
             part.unlink()
         if self._parts.exists():
@@ -109,7 +106,7 @@ class Folder:
 
         Raises UserError if `trials.parquet` cannot be read. Parts that cannot be read are added to `ignored`.
         """
-        gathered = self.path / TRIALS
+        gathered = self.path / TRIALS_PARQUET
         if gathered.exists():
             try:
                 yield read(gathered, self.schema, columns)
@@ -154,13 +151,13 @@ def _refused_before(path: Path, sweep: Sweep) -> dict[int, str]:
     Raises UserError if the folder belongs to another sweep.
     """
     try:
-        manifest: Manifest = documents.json_file(path / SWEEP, Manifest)
+        manifest: Manifest = documents.json_file(path / SWEEP_JSON, Manifest)
     except FileNotFoundError:
-        if (path / TRIALS).exists() or (path / PARTS).exists():
+        if (path / TRIALS_PARQUET).exists() or (path / PARTS).exists():
             raise UserError(f"--out: {path} contains rows of an unknown sweep") from None
         return {}
     except ValueError as error:
-        raise UserError(f"--out: {path / SWEEP} cannot be read: {error}") from None
+        raise UserError(f"--out: {path / SWEEP_JSON} cannot be read: {error}") from None
     difference = _difference(_identity(manifest.sweep), _identity(sweep))
     if difference is not None:
         raise UserError(f"--out: {path} contains another sweep: {difference}; choose another folder")

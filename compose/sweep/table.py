@@ -13,20 +13,20 @@ import pyarrow.parquet as pq
 from compose.scenario.scenario_tables import MAX_ROBOTS
 from compose.sweep.cells import Cell
 from compose.sweep.field_paths import canonical
-from compose.sweep.group_columns import OF_GROUP
+from compose.sweep.group_columns import GROUP_COLUMNS
 from compose.sweep.spec import Sweep
 from compose.sweep.trial import RobotRow, TrialRow
 from protocol.files import open_file
 from protocol.motion import Covariance
 
-_KINDS: dict[str, pa.DataType] = {
+_TRIAL_TYPES: dict[str, pa.DataType] = {
     "cell": pa.int32(),
     "trial": pa.int32(),
     "seed": pa.int64(),
     **dict.fromkeys(("outcome", "reason", "error", "branch", "first_violation"), pa.string()),
     **dict.fromkeys(("ticks", "first_contact_tick", "orbiting_tick", "meeting_tick"), pa.int64()),
     **dict.fromkeys(("t_max_ticks", "candidates", "candidates_left"), pa.int64()),
-    **dict.fromkeys(OF_GROUP, pa.int64()),
+    **dict.fromkeys(GROUP_COLUMNS, pa.int64()),
     "travel_ticks": pa.float64(),
     **dict.fromkeys(("hypotheses", "claims", "claims_within", "violations"), pa.int64()),
     **dict.fromkeys(("reports_sent", "reports_heard", "reports_refused"), pa.int64()),
@@ -44,17 +44,19 @@ _OF_ALL = [field for field in TrialRow.__struct_fields__ if field not in ("cell"
 
 def schema_of(sweep: Sweep, cells: Sequence[Cell]) -> pa.Schema:
     """Return the schema of the table of trials, which the sweep and its cells determine."""
-    fields = [pa.field("cell", _KINDS["cell"])]
+    fields = [pa.field("cell", _TRIAL_TYPES["cell"])]
     for axis in sweep.axes:
         if axis.labels is not None:
             fields.append(pa.field(axis.name, pa.string()))
         for i, field in enumerate(axis.fields):
             fields.append(pa.field(field, _kind([one[i] for one in axis.values if one[i] is not None])))
     fields += [pa.field(draw.field, pa.float64()) for draw in sweep.draws.fields]
-    fields.append(pa.field("trial", _KINDS["trial"]))
-    fields += [pa.field(name, _KINDS[name]) for name in _OF_ALL if name not in OF_GROUP or sweep.of_group]
+    fields.append(pa.field("trial", _TRIAL_TYPES["trial"]))
+    fields += [
+        pa.field(name, _TRIAL_TYPES[name]) for name in _OF_ALL if name not in GROUP_COLUMNS or sweep.of_group
+    ]
     for robot in _robots(cells):
-        fields += [pa.field(f"{robot}_{name}", _KINDS[name]) for name in RobotRow.__struct_fields__]
+        fields += [pa.field(f"{robot}_{name}", _TRIAL_TYPES[name]) for name in RobotRow.__struct_fields__]
     return pa.schema(fields)
 
 
@@ -105,7 +107,7 @@ def of_rows(rows: Sequence[TrialRow], sweep: Sweep, cells: Mapping[int, Cell], s
     for draw in sweep.draws.fields:
         columns[draw.field] = [row.drawn.get(draw.field) for row in rows]
     columns["trial"] = [row.trial for row in rows]
-    for name in _OF_ALL if sweep.of_group else [name for name in _OF_ALL if name not in OF_GROUP]:
+    for name in _OF_ALL if sweep.of_group else [name for name in _OF_ALL if name not in GROUP_COLUMNS]:
         columns[name] = [getattr(row, name) for row in rows]
     nothing = RobotRow()
     for robot in _robots(list(cells.values())):

@@ -11,6 +11,7 @@ from msgspec.structs import asdict, replace
 from compose.audit.findings import Findings
 from compose.recording.claim import Claim
 from compose.recording.closest_approach import nearest
+from compose.recording.group_localisation import TICK_ROUNDING
 from compose.recording.run import Run
 from compose.recording.summary_json import first_contact
 from compose.scenario.kills import Kill
@@ -23,10 +24,8 @@ from world.scenario import Scenario
 TrialOutcome = Literal["localised", "undecided", "inconsistent", "wrong", "failed", "refused"]
 """The outcome of a mission, or `refused`: the scenario with the drawn values is infeasible."""
 N = TypeVar("N", int, float)
-WITHIN = 3.0
+CLAIMS_WITHIN = 3.0
 """The factor of mission.accuracy within which a position error counts in `claims_within`."""
-ROUNDING = 1e-6
-"""The rounding error in ticks up to which T_max / T_s counts as a whole number."""
 
 
 class Trial(msgspec.Struct, frozen=True):
@@ -248,7 +247,7 @@ def row(trial: Trial, run: Run, wall_s: float, findings: Findings | None = None)
         meeting_tick=_last([meeting for _, meeting in encounters]),
         period_s=scenario.mission.period,
         t_max_s=t_max_s,
-        t_max_ticks=math.ceil(t_max_s / scenario.mission.period - ROUNDING),
+        t_max_ticks=math.ceil(t_max_s / scenario.mission.period - TICK_ROUNDING),
         **(asdict(group) if group is not None else {}),
         candidates=_most([robot.candidates for robot in robots.values()]),
         candidates_left=_most([robot.candidates_left for robot in robots.values()]),
@@ -257,7 +256,7 @@ def row(trial: Trial, run: Run, wall_s: float, findings: Findings | None = None)
         hypotheses=_most([robot.hypotheses for robot in robots.values()]),
         nearest_m=nearest(run) if scenario.mission.safety_distance else None,
         claims=len(errors),
-        claims_within=sum([error <= WITHIN * scenario.mission.accuracy for error in errors]),
+        claims_within=sum([error <= CLAIMS_WITHIN * scenario.mission.accuracy for error in errors]),
         nees=sum(nees) / len(nees) if nees else None,
         truth_held=all(held) if held else None,
         reports_sent=sum([final_report.reports_sent for final_report in final_reports]),

@@ -21,7 +21,7 @@ from protocol.network.inbox import Inbox
 from protocol.wire import EncodedMessages
 from world.scenario import Scenario
 
-TIMEOUT_S = 30.0
+PROCESSES_TIMEOUT_S = 30.0
 """The time in s that the processes of a trial wait for each other."""
 
 
@@ -70,7 +70,7 @@ def as_processes(scenario: Scenario, *, audit: bool, kills: Sequence[Kill] | Non
             Inbox("tandem sweep"),
             run=run_name(scenario),
             rate=None,
-            timeout=TIMEOUT_S,
+            timeout=PROCESSES_TIMEOUT_S,
             kills=kills or (),
             agents_journal=audit or kills is not None,
         )

@@ -37,7 +37,7 @@ READY = b""
 LENGTH_BYTES = 4
 MAX_ERROR = 300
 """The largest length of an error text, in characters."""
-IDLE_S = 300.0
+WORKER_IDLE_S = 300.0
 """The time in s without work after which the process ends.
 
 The command that started the sweep may have been killed while the Dask worker that owns this process lives on.
@@ -76,7 +76,7 @@ def warm_up() -> None:
 
 
 def main() -> None:
-    """Run trials until standard input is closed, or until there has been no work for IDLE_S."""
+    """Run trials until standard input is closed, or until there has been no work for WORKER_IDLE_S."""
     folder = sys.argv[1]
     tempfile.tempdir = folder  # removed by the owner, with all files that trials leave in it
     answers = os.fdopen(os.dup(1), "wb")
@@ -85,7 +85,7 @@ def main() -> None:
     threading.Thread(target=_listen, args=(chunks, folder), daemon=True).start()
     try:
         _play(chunks, answers)
-    finally:  # the reader of the rows is gone, or there was no work for IDLE_S
+    finally:  # the reader of the rows is gone, or there was no work for WORKER_IDLE_S
         shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -95,7 +95,7 @@ def _play(chunks: SimpleQueue[Chunk], answers: BinaryIO) -> None:
     encoder = msgspec.msgpack.Encoder()
     while True:
         try:
-            chunk = chunks.get(timeout=IDLE_S)
+            chunk = chunks.get(timeout=WORKER_IDLE_S)
         except Empty:
             return
         for number, seed in zip(chunk.trials, chunk.seeds, strict=True):

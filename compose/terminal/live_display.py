@@ -34,9 +34,9 @@ REFRESHED = 10
 """The number of displays each second."""
 LEAST_ROWS, MOST_ROWS = 6, 30
 """The height of a map in lines. On a terminal with less room there is none."""
-TRAIL = 400
+PATH_POSITIONS = 400
 """The number of latest positions in a robot's path."""
-HUES: dict[Role, str] = {"a": "blue", "b": "red"}
+ROLE_COLOURS: dict[Role, str] = {"a": "blue", "b": "red"}
 LEGEND = "anchor +  hypothesis o  path and range lines; the circle is the anchor's range"
 UNDECIDED = "no verdict yet"
 
@@ -97,7 +97,7 @@ class RobotMap:
         self._console = console
         self._journals = Journals(folder)
         self._scene: Scene | None = None
-        self._paths: dict[str, deque[Point]] = {one: deque(maxlen=TRAIL) for one in self._setup.ids}
+        self._paths: dict[str, deque[Point]] = {one: deque(maxlen=PATH_POSITIONS) for one in self._setup.ids}
 
     def display(self) -> RenderableType:
         """Return the map at the latest complete tick, with the new frames of the journals."""
@@ -160,7 +160,7 @@ class RobotMap:
 
     def _hue(self, player: Player) -> str:
         """Return the colour of a robot."""
-        return HUES[player.hue(self._setup.robot_setup(player.robot))]
+        return ROLE_COLOURS[player.hue(self._setup.robot_setup(player.robot))]
 
     def _hypotheses(self, player: Player) -> list[Point]:
         """Return the positions of a robot's hypotheses in the world frame."""

@@ -11,11 +11,11 @@ from compose.terminal.text_width import tell
 from protocol.output import say
 
 TRUTH, ESTIMATE, ERROR, SIGMA = "true x, y, heading", "estimate", "error m", "sigma m"
-TICK = "tick"
+TICK_COLUMN = "tick"
 RANGES, REPORTS, LATE = "ranges", "reports", "late"
 TRUTH_AT_CLAIM = "true at the claim"
-NOTES = (
-    (TICK, "tick: of the claim; the robot may have driven on"),
+TABLE_NOTES = (
+    (TICK_COLUMN, "tick: of the claim; the robot may have driven on"),
     (SIGMA, "sigma: claimed, of the position"),
     (LATE, "late: ticks in which the robot stopped because its command was late"),
     (ERROR, "poses in m and rad"),
@@ -23,7 +23,7 @@ NOTES = (
     (REPORTS, "reports sent / received"),
 )
 """The footnotes, each with its column."""
-CHOICES = (
+COLUMN_SETS = (
     (TRUTH, ESTIMATE, ERROR, SIGMA, RANGES, REPORTS, LATE),
     (ESTIMATE, ERROR, SIGMA, RANGES, REPORTS, LATE),
     (ERROR, SIGMA, RANGES, REPORTS, LATE),
@@ -31,12 +31,13 @@ CHOICES = (
 )
 """Sets of columns, of which the first that fits is shown; empty columns SIGMA and LATE are omitted."""
 GROUP_CHOICES = tuple(
-    (TICK, *[TRUTH_AT_CLAIM if column == TRUTH else column for column in columns]) for columns in CHOICES
+    (TICK_COLUMN, *[TRUTH_AT_CLAIM if column == TRUTH else column for column in columns])
+    for columns in COLUMN_SETS
 )
 """The sets of columns for a group, whose robots drive on after their claims."""
 LISTED = 4
 """The largest number of robots that are shown as a list if the table of all columns does not fit."""
-NAMED = 10
+MOST_NAMED_ROBOTS = 10
 """The largest number of robots named in a sentence."""
 
 
@@ -50,7 +51,7 @@ def result(summary: Mapping[str, Any], rate: float | None = None) -> None:
     exact = all(robot["covariance"] is None for robot in robots.values())
     late = {name: missed for name, robot in robots.items() if (missed := robot["deadlines_missed"])}
     omitted = {*([SIGMA] if exact else []), *([] if late else [LATE])}
-    for choice in CHOICES if group is None else GROUP_CHOICES:
+    for choice in COLUMN_SETS if group is None else GROUP_CHOICES:
         columns = [column for column in choice if column not in omitted]
         cells = {name: _cells(robot, columns) for name, robot in robots.items()}
         rows = [(name, *of_robot.values()) for name, of_robot in cells.items()]
@@ -61,7 +62,7 @@ def result(summary: Mapping[str, Any], rate: float | None = None) -> None:
     else:
         lines = tables.lines(made, text_width.room())
     tell(f"{summary['scenario']}: {outcome_line(summary)}")
-    say("", *lines, "", *text_width.notes(NOTES, columns))
+    say("", *lines, "", *text_width.notes(TABLE_NOTES, columns))
     if group is not None:
         say(*text_width.wrapped(_bound(group, robots)))
     if late:
@@ -73,7 +74,7 @@ def _bound(group: Mapping[str, Any], robots: Mapping[str, Mapping[str, Any]]) ->
     bound = f"the computed bound is {group['bound_ticks']} ticks"
     for one in group["corrected_bounds"]:
         were = "was" if len(one["late"]) == 1 else "were"
-        late = f", as {', '.join(one['late'])} {were} late" if len(one["late"]) <= NAMED else ""
+        late = f", as {', '.join(one['late'])} {were} late" if len(one["late"]) <= MOST_NAMED_ROBOTS else ""
         bound += f", corrected in tick {one['tick']} to {one['bound_ticks']}{late}"
     ticks = {name: one["localised_tick"] for name, one in robots.items()}
     left = [name for name, tick in ticks.items() if tick is None]
@@ -82,15 +83,17 @@ def _bound(group: Mapping[str, Any], robots: Mapping[str, Mapping[str, Any]]) ->
         return f"all robots were localised by tick {last}; {bound}"
     if last is None:
         return f"no robot is localised; {bound}"
-    names = ", ".join(left[:NAMED]) + (f" and {len(left) - NAMED} more" if len(left) > NAMED else "")
+    names = ", ".join(left[:MOST_NAMED_ROBOTS]) + (
+        f" and {len(left) - MOST_NAMED_ROBOTS} more" if len(left) > MOST_NAMED_ROBOTS else ""
+    )
     return f"all robots but {names} were localised by tick {last}; {bound}"
 
 
 def _missed(late: Mapping[str, int], ticks: int, rate: float | None) -> str:
     """Return the sentence on missed deadlines: the number of each robot, and the advice."""
     worst = sorted(late.items(), key=lambda one: -one[1])
-    names = ", ".join([f"{name} {missed}" for name, missed in worst[:NAMED]])
-    more = f" and {len(worst) - NAMED} more robots" if len(worst) > NAMED else ""
+    names = ", ".join([f"{name} {missed}" for name, missed in worst[:MOST_NAMED_ROBOTS]])
+    more = f" and {len(worst) - MOST_NAMED_ROBOTS} more robots" if len(worst) > MOST_NAMED_ROBOTS else ""
     slower = f", such as --rate {rate / 2:g}," if rate is not None else ""
     return f"deadlines missed, of {ticks}: {names}{more}; a lower --rate{slower} gives each robot more time"
 
@@ -99,7 +102,7 @@ def _cells(robot: Mapping[str, Any], columns: Sequence[str]) -> dict[str, str]:
     """Return the cells of the robot's row, by column."""
     cells = {
         TRUTH: _pose(robot["truth"]),
-        TICK: _number(robot["localised_tick"]),
+        TICK_COLUMN: _number(robot["localised_tick"]),
         TRUTH_AT_CLAIM: _pose(robot.get("truth_at_claim")),
         ESTIMATE: _pose(robot["estimate"]),
         ERROR: _number(robot["position_error_m"], ".1e"),

@@ -9,7 +9,9 @@ from collections.abc import Iterable
 from protocol import output
 from protocol.output import UNLIMITED, one_line, say
 
-LEAST = 20
+MARKED = len("wrong  ")
+"""The width of the mark before each check of a planner or a driver."""
+FEWEST_COLUMNS = 20
 """The minimum number of columns beside an indent."""
 
 
@@ -29,7 +31,7 @@ def wrapped(text: str, indent: int = 0) -> list[str]:
     """Return the lines of `text`, wrapped at the terminal's width; all but the first are indented."""
     if not sys.stdout.isatty():
         return [text]
-    return output.wrapped(text, max(room(), indent + LEAST), indent)
+    return output.wrapped(text, max(room(), indent + FEWEST_COLUMNS), indent)
 
 
 def tell(*texts: str, indent: int = 0) -> None:

@@ -15,7 +15,7 @@ from protocol.motion import ORIGIN, Pose, compose, inverse
 
 FITTING_M = 1e-3
 """The largest difference in m between an exact range and the distance of two poses of one configuration."""
-MOST = 60
+MOST_CONFIGURATIONS = 60
 """The largest number of configurations; with more, there are none.
 
 Robots hold far fewer. The manoeuvres are compared by each pair of configurations: with thousands in a damaged
@@ -54,7 +54,7 @@ class Configurations(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def configurations(setup: RunSetup, before: TickData | None, now: TickData) -> Iterator[Configurations]:
-    """Yield the configurations of each pair whose robots hold the same ones, at most MOST."""
+    """Yield the configurations of each pair whose robots hold the same ones, at most MOST_CONFIGURATIONS."""
     for robots in setup.pairs():
         pair = PairData(robots, setup.mission.noise.exact, before, now)
         poses = _joined(pair)
@@ -71,7 +71,7 @@ def _joined(pair: PairData) -> list[tuple[Pose, Pose]]:
     robots held as many poses then.
     """
     held = [pair.held(robot)[1] for robot in pair.ids]
-    if not _as_many(held) or any(one is not None and len(one.world) > MOST for one in held):
+    if not _as_many(held) or any(one is not None and len(one.world) > MOST_CONFIGURATIONS for one in held):
         return []
     poses = list(zip(*[one.world for one in held if one is not None], strict=True))
     earlier = [pair.held(robot)[0] for robot in pair.ids]
@@ -129,9 +129,9 @@ def _compared(
 ) -> ComparedManoeuvre | None:
     from agent.estimation.closed_forms import Placement  # noqa: PLC0415  # numpy, for few ticks only
     from agent.planning.phase3_last_manoeuvre import Question, compared  # noqa: PLC0415
-    from agent.planning.registry import SHIPPED  # noqa: PLC0415
+    from agent.planning.registry import PLANNER_CLASSES  # noqa: PLC0415
 
-    planner = SHIPPED.get(setup.planner_name)
+    planner = PLANNER_CLASSES.get(setup.planner_name)
     manoeuvres = planner().suited(setup.mission).MANOEUVRES if planner is not None else None
     if manoeuvres is None:
         return None

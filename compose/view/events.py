@@ -130,7 +130,7 @@ def _deciding(
     if command is None or (before is not None and earlier is None):
         return
     if earlier is None or command.phase != earlier.phase:
-        name = "" if robot_setup.own_planner else f": {PHASES[command.phase]}"
+        name = "" if robot_setup.own_planner else f": {PHASE_NAMES[command.phase]}"
         yield Event(tick, "phase", robot, f"{robot} begins phase {command.phase}{name}")
     active = command.verdict is None or (grouped and command.state != "localised")
     if active and (earlier is None or command.state != earlier.state):
@@ -156,7 +156,7 @@ def _verdict(robot_setup: RobotSetup, command: Command, now: TickData) -> Event:
             return Event(now.tick, kind, robot, doing(robot_setup, command.phase, command.state, verdict))
 
 
-PHASES = {1: "localisation relative to its anchor", 2: "search for its peer", 3: "encounter"}
+PHASE_NAMES = {1: "localisation relative to its anchor", 2: "search for its peer", 3: "encounter"}
 """The names of the paper's phases, by number."""
 
 

@@ -7,7 +7,7 @@ import math
 import msgspec
 from msgspec import UNSET, UnsetType
 
-from compose.view.outlines import SIGMAS
+from compose.view.outlines import OUTLINE_SIGMAS
 from compose.view.scene import HeldPoses, Player
 from protocol.mission import Anchor
 from protocol.motion import Pose
@@ -62,7 +62,7 @@ class Numbers(msgspec.Struct, frozen=True):
             hypotheses=len(hypotheses) if held is not None else UNSET,
             probability=_probability(held) if held is not None and hypotheses else UNSET,
             position_error_m=(max(distances) if own is None else distances[0]) if distances else UNSET,
-            position_bound_m=SIGMAS * covariance.position_sigma if covariance is not None else UNSET,
+            position_bound_m=OUTLINE_SIGMAS * covariance.position_sigma if covariance is not None else UNSET,
             anchor_range_m=player.anchor_range if player.anchor_range is not None else UNSET,
             mutual_range_m=ranges[0] if ranges else UNSET,
             anchor_residual_m=_residual(player.anchor_range, expected),

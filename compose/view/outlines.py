@@ -18,9 +18,9 @@ from protocol.motion import Covariance, Pose, compose
 
 CORNERS = 72
 """The number of corners of a polygon drawn for a circle."""
-SIGMAS = 3.0
+OUTLINE_SIGMAS = 3.0
 """The size of an error ellipse, and the bound of an error, in standard deviations."""
-BENT = 0.5
+BENT_ARC = 0.5
 """The largest deviation of an arc from its tangent that an ellipse shows, in its lesser semi-axes."""
 Point = tuple[float, float]
 """x and y in m."""
@@ -33,12 +33,12 @@ def circle(centre: tuple[float, float], radius: float) -> list[tuple[float, floa
 
 
 def ellipse(centre: Pose, covariance: Covariance) -> list[tuple[float, float]]:
-    """Return the points of the error ellipse of a position, SIGMAS standard deviations large.
+    """Return the points of the error ellipse of a position, OUTLINE_SIGMAS standard deviations large.
 
     Its axes follow from the eigenvalues of the position block of the covariance.
     """
     axis = Pose(centre.x, centre.y, math.atan2(2.0 * covariance.xy, covariance.xx - covariance.yy) / 2.0)
-    long, short = (SIGMAS * sigma for sigma in _sigmas(covariance))
+    long, short = (OUTLINE_SIGMAS * sigma for sigma in _sigmas(covariance))
     points = [compose(axis, Pose(long * x, short * y, 0.0)) for x, y in circle((0.0, 0.0), 1.0)]
     return [(point.x, point.y) for point in points]
 
@@ -61,7 +61,11 @@ class Reach(NamedTuple):
     @staticmethod
     def of(mission: Mission, measured: float | None, peer: Pose, covariance: Covariance | None) -> Reach:
         """Return the reach of a robot in contact with a peer; `measured` is the range, if there is one."""
-        length = mission.sensing_range if measured is None else measured + SIGMAS * mission.noise.mutual_sigma
+        length = (
+            mission.sensing_range
+            if measured is None
+            else measured + OUTLINE_SIGMAS * mission.noise.mutual_sigma
+        )
         turn = Turn.of(peer, covariance) if covariance is not None else None
         places = [(peer.x, peer.y)] if turn is None else [turn.at(angle) for angle in turn.angles]
         return Reach(places, length)
@@ -95,12 +99,12 @@ class Turn(NamedTuple):
         across = math.sqrt(max(0.0, along * along * xx + 2.0 * along * up * xy + up * up * yy))
         found = Turn(pose.x - x, pose.y - y, radius, bearing, covariance.heading_sigma, across)
         bend = radius * (1.0 - math.cos(found.largest))
-        return found if math.inf > bend > BENT * SIGMAS * _sigmas(covariance)[1] else None
+        return found if math.inf > bend > BENT_ARC * OUTLINE_SIGMAS * _sigmas(covariance)[1] else None
 
     @property
     def largest(self) -> float:
         """The largest angle in rad by which the position is turned."""
-        return min(SIGMAS * self.heading_sigma, math.pi)
+        return min(OUTLINE_SIGMAS * self.heading_sigma, math.pi)
 
     @property
     def angles(self) -> list[float]:
@@ -132,7 +136,7 @@ class Turn(NamedTuple):
 def arc(pose: Pose, covariance: Covariance, reach: Reach | None = None) -> tuple[Point, ...]:
     """Return the outline of the arc along which a position lies; empty if its ellipse shows as much.
 
-    It has SIGMAS standard deviations, as far as the position is within `reach`.
+    It has OUTLINE_SIGMAS standard deviations, as far as the position is within `reach`.
     """
     turn = Turn.of(pose, covariance)
     if turn is None:
@@ -141,8 +145,8 @@ def arc(pose: Pose, covariance: Covariance, reach: Reach | None = None) -> tuple
     near: list[Point] = []
     angles = turn.within(reach)
     for angle in angles:
-        left = 1.0 - (angle / (SIGMAS * turn.heading_sigma)) ** 2
-        wide = SIGMAS * turn.across * math.sqrt(max(0.0, left))
+        left = 1.0 - (angle / (OUTLINE_SIGMAS * turn.heading_sigma)) ** 2
+        wide = OUTLINE_SIGMAS * turn.across * math.sqrt(max(0.0, left))
         far.append(turn.at(angle, wide))
         near.append(turn.at(angle, -wide) if wide < turn.radius else (turn.x, turn.y))
     if angles[-1] - angles[0] == 2.0 * math.pi and set(near) == {(turn.x, turn.y)}:
@@ -151,7 +155,7 @@ def arc(pose: Pose, covariance: Covariance, reach: Reach | None = None) -> tuple
 
 
 def outline(pose: Pose, covariance: Covariance, reach: Reach | None = None) -> Sequence[Point]:
-    """Return the closed outline of where a position is, SIGMAS standard deviations large."""
+    """Return the closed outline of where a position is, OUTLINE_SIGMAS standard deviations large."""
     bent = arc(pose, covariance, reach)
     return (*bent, bent[0]) if bent else ellipse(pose, covariance)
 

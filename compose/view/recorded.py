@@ -12,7 +12,7 @@ from compose.recording.kills_file import kills_in
 from compose.recording.recording_files import WORLD_JOURNAL, agent_journal, journals_in, robot_of
 from compose.recording.run import Run
 from compose.recording.run_setup import RunSetup, of_configs, of_scenario
-from compose.recording.summary_json import SUMMARY
+from compose.recording.summary_json import SUMMARY_JSON
 from compose.view.reported import reported_paths
 from compose.view.run_data import RunData
 from compose.view.scene import Scene, scene
@@ -178,7 +178,7 @@ class Journals:
 
     def _mode(self) -> str | None:
         try:
-            summary = documents.json_file(self.folder / SUMMARY)
+            summary = documents.json_file(self.folder / SUMMARY_JSON)
             return str(summary["mode"])
         except (OSError, msgspec.MsgspecError, TypeError, KeyError):
             return None

@@ -8,7 +8,7 @@ from compose.recording.run_setup import RobotSetup, RunSetup
 from compose.view.run_data import RunData
 from protocol.motion import Pose, compose, inverse
 
-LONGEST = 100_000
+LAST_DRAWN_TICK = 100_000
 """The largest tick up to which a path is computed: a frame may report any number of ticks."""
 
 
@@ -22,7 +22,7 @@ def reported_paths(setup: RunSetup, known: RunData, last: int) -> dict[str, Sequ
     for robot in setup.robots:
         start, log = _reported_start(robot, known), known.reported_logs.get(robot.id)
         if start is not None and log is not None:
-            end = min(last, log.through, LONGEST)
+            end = min(last, log.through, LAST_DRAWN_TICK)
             paths[robot.id] = log.track(start, 0, end, setup.mission.period)
     return paths
 

@@ -14,13 +14,13 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from protocol import PACKAGE
 from protocol.messages import Environment
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 
-PACKAGE = "tandem-ranging"
-LONGEST = 64
+LONGEST_VERSION = 64
 """The maximum number of characters of a version."""
-LEVELS = (
+X86_LEVELS = (
     ("x86-64-v4", {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}),
     ("x86-64-v3", {"avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "movbe"}),
     ("x86-64-v2", {"sse4_1", "sse4_2", "ssse3", "popcnt"}),
@@ -45,8 +45,8 @@ def of_robot() -> Environment:
         _version(),
         _c_library(),
         _instructions(),
-        f"{np.__version__} ({used[-1]})"[:LONGEST],
-        (_kernels(Path(np.__file__).parent.parent / "numpy.libs") or _library(built))[:LONGEST],
+        f"{np.__version__} ({used[-1]})"[:LONGEST_VERSION],
+        (_kernels(Path(np.__file__).parent.parent / "numpy.libs") or _library(built))[:LONGEST_VERSION],
     )
 
 
@@ -93,7 +93,7 @@ def _c_library() -> str:
 
 
 def _system() -> str:
-    return f"{platform.system()} {platform.release()}"[:LONGEST]
+    return f"{platform.system()} {platform.release()}"[:LONGEST_VERSION]
 
 
 def _instructions() -> str:
@@ -104,11 +104,11 @@ def _instructions() -> str:
     except OSError:
         flags = set()
     below = set[str]()
-    for i, (name, _) in enumerate(LEVELS):
-        below = set.union(*[wanted for _, wanted in LEVELS[i:]])
+    for i, (name, _) in enumerate(X86_LEVELS):
+        below = set.union(*[wanted for _, wanted in X86_LEVELS[i:]])
         if below <= flags:
             return name
-    return platform.machine()[:LONGEST]
+    return platform.machine()[:LONGEST_VERSION]
 
 
 def _kernels(folder: Path) -> str | None:

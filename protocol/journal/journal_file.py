@@ -27,7 +27,7 @@ _HEADS = {0xC4: 1, 0xC5: 2, 0xC6: 4}
 """The first byte of a msgpack byte string -> the number of bytes of its length field."""
 
 
-PIECE_BYTES = 16 << 20
+JOURNAL_PIECE_BYTES = 16 << 20
 """The maximum number of bytes of a journal that are read at once: more than the longest frame has."""
 
 MOST_CHECKED = 1 << 30
@@ -263,7 +263,7 @@ class Tail:
         """True if the last read has left bytes to be read by the next one."""
 
     def news(self) -> list[bytes]:
-        """Return the frames that have been added since the last call, of at most PIECE_BYTES.
+        """Return the frames that have been added since the last call, of at most JOURNAL_PIECE_BYTES.
 
         An incomplete frame is read later.
 
@@ -272,7 +272,7 @@ class Tail:
         """
         with open_file(self.path) as file:
             file.seek(self.whole)
-            data = file.read(PIECE_BYTES)
+            data = file.read(JOURNAL_PIECE_BYTES)
         self.more = False
         frames: list[bytes] = []
         whole = 0
@@ -286,5 +286,5 @@ class Tail:
         if self.whole == 0 and frames and (version := other_version(frames[0])) is not None:
             raise OtherVersion(self.path, version)
         self.whole += whole
-        self.more = len(data) == PIECE_BYTES
+        self.more = len(data) == JOURNAL_PIECE_BYTES
         return frames

@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 
 from protocol.network import keys
 
-ROUTER = "router"
+ROUTER_NAME = "router"
 """The common name in the certificate of a router."""
-WORLD = "world"
+WORLD_NAME = "world"
 """The common name in the certificate of the world."""
 VIEWER = "viewer"
 """The common name in the certificate of viewers."""
-CARRIERS = (ROUTER, WORLD)
+CARRIERS = (ROUTER_NAME, WORLD_NAME)
 """The participants that forward messages of others."""
 
 
@@ -82,7 +82,7 @@ def permits(participant: str) -> set[Permit]:
     """Return all permissions of a participant: a robot ("agent-ID") or a viewer."""
     return {
         Permit(one.flow, one.message, _key(key, {}) if one.every else own)
-        for key, rule in keys.RULES.items()
+        for key, rule in keys.KEY_RULES.items()
         for roles, passing in (((rule.by,), BY), (rule.to, TO))
         for own in _own(key, roles, participant)
         for one in passing[rule.way]
@@ -107,7 +107,7 @@ def _key(key: Callable[..., str], named: dict[str, str]) -> str:
 def access_control(robots: Iterable[str]) -> dict[str, Any]:
     """Return the section `access_control` of the Zenoh configuration of a router, for these robots."""
     messages = sorted({one.message for ways in (BY, TO) for passing in ways.values() for one in passing})
-    rules = [_rule("carried", ["ingress", "egress"], messages, [f"{keys.ROOT}/**"])]
+    rules = [_rule("carried", ["ingress", "egress"], messages, [f"{keys.KEY_ROOT}/**"])]
     policies = [{"subjects": list(CARRIERS), "rules": ["carried"]}]
     names = [VIEWER, *(agent(robot) for robot in robots)]
     for name in names:

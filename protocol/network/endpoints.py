@@ -205,7 +205,7 @@ def _for_mode(endpoints: Any, mode: str) -> tuple[str, ...]:
 def _read(file: Path) -> str:
     """Return the text of the Zenoh configuration in `file`. Raises BadConfiguration."""
     try:
-        text = read_text(file, documents.MOST_BYTES)
+        text = read_text(file, documents.MOST_DOCUMENT_BYTES)
         documents.check_nesting(text, "JSON5")
         zenoh.Config.from_json5(text)
     except OSError as error:

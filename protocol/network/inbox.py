@@ -9,7 +9,7 @@ from collections import Counter
 from queue import Empty, SimpleQueue
 from typing import Literal, NamedTuple, Protocol
 
-from protocol.network.keys import NOWHERE, Key
+from protocol.network.keys import UNKNOWN_KEY, Key
 from protocol.network.timer import Timer
 from protocol.output import say
 
@@ -27,7 +27,7 @@ ARRIVAL_BYTES = 200
 """The approximate memory that a queued frame takes in addition to its own bytes."""
 
 
-LOOK_S = 0.5
+SIGNAL_S = 0.5
 """The longest wait in s without a look for signals. One that arrives just before a wait does not end it."""
 
 
@@ -44,11 +44,11 @@ class Arrival(NamedTuple):
     """The key of the frame or token; for "stop", the name of the signal."""
     frame: bytes = b""
     """The received frame; empty for other events."""
-    source: Key = NOWHERE
+    source: Key = UNKNOWN_KEY
     """The parsed `key`."""
 
 
-NOTHING = Arrival("nothing")
+NO_ARRIVAL = Arrival("nothing")
 """The result of `Inbox.next` after its timeout."""
 
 
@@ -103,7 +103,7 @@ class Inbox:
         """Take frames from `line`, too, until its session is closed. It replaces an earlier line."""
         self._line = line
 
-    def put(self, topic: Topic, key: str = "", frame: bytes = b"", source: Key = NOWHERE) -> None:
+    def put(self, topic: Topic, key: str = "", frame: bytes = b"", source: Key = UNKNOWN_KEY) -> None:
         """Add an event. This may be called from any thread and from a signal handler."""
         arrival = Arrival(topic, key, frame, source)
         with self._lock:
@@ -129,21 +129,21 @@ class Inbox:
             self._turned_away[entry] += 1
 
     def next(self, timeout: float | None) -> Arrival:
-        """Return the next event, or NOTHING after `timeout` s. Raises Interrupted for the topic "stop"."""
+        """Return the next event, or NO_ARRIVAL after `timeout` s. Raises Interrupted for the topic "stop"."""
         arrival = self._queued(timeout) if self._line is None else self._from(self._line, timeout)
         if self._turned_away:
             self._count_turned_away()
         return arrival
 
     def _queued(self, timeout: float | None) -> Arrival:
-        """Return the next event of the queue, or NOTHING after `timeout` s. Raises Interrupted."""
+        """Return the next event of the queue, or NO_ARRIVAL after `timeout`. Raises Interrupted."""
         until = time.monotonic() + timeout if timeout is not None else math.inf
         while True:
             try:
-                arrival = self._queue.get(timeout=min(max(until - time.monotonic(), 0.0), LOOK_S))
+                arrival = self._queue.get(timeout=min(max(until - time.monotonic(), 0.0), SIGNAL_S))
             except Empty:
                 if time.monotonic() >= until:
-                    return NOTHING
+                    return NO_ARRIVAL
             else:
                 break
         with self._lock:
@@ -153,7 +153,7 @@ class Inbox:
         return arrival
 
     def _from(self, line: Line, timeout: float | None) -> Arrival:
-        """Return the next event of `line` or the queue, or NOTHING after `timeout` s. Raises Interrupted."""
+        """Return the next event of `line` or the queue, or NO_ARRIVAL after `timeout`. Raises Interrupted."""
         until = time.monotonic() + timeout if timeout is not None else math.inf
         while True:
             idle = self._queue.empty()
@@ -175,7 +175,7 @@ class Inbox:
             if self._turned_away:
                 self._count_turned_away()
             if time.monotonic() >= until:
-                return NOTHING
+                return NO_ARRIVAL
 
     def refuse(self, arrival: Arrival, why: object) -> None:
         """Count a refused frame, and print a message for the first with this key and reason."""

@@ -14,17 +14,17 @@ from typing import Literal, NamedTuple
 
 from protocol.units import MAX_ROBOT_ID, NAME
 
-ROOT = "tandem"
+KEY_ROOT = "tandem"
 
 
 def truth(run: str) -> str:
     """Return the key on which the world sends true poses to viewers."""
-    return f"{ROOT}/{run}/world/truth"
+    return f"{KEY_ROOT}/{run}/world/truth"
 
 
 def config(run: str, robot: str) -> str:
     """Return the key of the world's queryable for that robot's RobotConfig; the world declares it for "*"."""
-    return f"{ROOT}/{run}/world/config/{robot}"
+    return f"{KEY_ROOT}/{run}/world/config/{robot}"
 
 
 def observation(run: str, robot: str) -> str:
@@ -33,37 +33,37 @@ def observation(run: str, robot: str) -> str:
     The world then sends the robot's FinalReport back, once it is in the recording. In hardware mode, a driver
     that waits for other robots sends a TickStart of the tick that cannot begin yet.
     """
-    return f"{ROOT}/{run}/robot/{robot}/observation"
+    return f"{KEY_ROOT}/{run}/robot/{robot}/observation"
 
 
 def command(run: str, robot: str) -> str:
     """Return the key on which that robot sends Commands, and a FinalReport at the end, to the world."""
-    return f"{ROOT}/{run}/robot/{robot}/command"
+    return f"{KEY_ROOT}/{run}/robot/{robot}/command"
 
 
 def report(run: str, robot: str, peer: str) -> str:
     """Return the key on which that robot sends Reports to its peer while they are in contact."""
-    return f"{ROOT}/{run}/robot/{robot}/to/{peer}"
+    return f"{KEY_ROOT}/{run}/robot/{robot}/to/{peer}"
 
 
 def tick_start(run: str, robot: str) -> str:
     """Return the key on which a robot's driver sends the start of a tick to its peer's, in hardware mode."""
-    return f"{ROOT}/{run}/robot/{robot}/tick-start"
+    return f"{KEY_ROOT}/{run}/robot/{robot}/tick-start"
 
 
 def estimate(run: str, robot: str) -> str:
     """Return the key on which that robot sends its Estimate to viewers."""
-    return f"{ROOT}/{run}/robot/{robot}/estimate"
+    return f"{KEY_ROOT}/{run}/robot/{robot}/estimate"
 
 
 def world_alive(run: str) -> str:
     """Return the key of the world's liveliness token; a run of "*" matches all runs."""
-    return f"{ROOT}/{run}/alive/world"
+    return f"{KEY_ROOT}/{run}/alive/world"
 
 
 def robot_alive(run: str, robot: str) -> str:
     """Return the key of a robot's liveliness token; a robot of "*" matches all robots of the run."""
-    return f"{ROOT}/{run}/alive/robot/{robot}"
+    return f"{KEY_ROOT}/{run}/alive/robot/{robot}"
 
 
 class Rule(NamedTuple):
@@ -81,7 +81,7 @@ class Rule(NamedTuple):
     """The participants that may subscribe, query, or look for the token."""
 
 
-RULES: Mapping[Callable[..., str], Rule] = MappingProxyType(
+KEY_RULES: Mapping[Callable[..., str], Rule] = MappingProxyType(
     {
         truth: Rule("put", "world", ("viewer",)),
         config: Rule("answer", "world", ("robot", "viewer")),
@@ -101,7 +101,7 @@ class Key(NamedTuple):
     """The parsed key of a received message."""
 
     kind: Callable[..., str] | None
-    """The function above that returns such keys; None for NOWHERE."""
+    """The function above that returns such keys; None for UNKNOWN_KEY."""
     run: str
     robot: str = ""
     """The robot of the key; for a Report, its sender."""
@@ -109,7 +109,7 @@ class Key(NamedTuple):
     """The receiver of a Report; empty for other keys."""
 
 
-NOWHERE = Key(None, "")
+UNKNOWN_KEY = Key(None, "")
 """The key of messages that did not come over the network."""
 
 _LONGEST = 256
@@ -117,7 +117,7 @@ _LONGEST = 256
 _NAME = re.compile(NAME)
 _PATTERNS = {
     kind: re.compile(kind(**{name: f"(?P<{name}>[^/]+)" for name in signature(kind).parameters}))
-    for kind in RULES
+    for kind in KEY_RULES
 }
 
 

@@ -33,7 +33,7 @@ from protocol.messages import (
     Verdict,
 )
 from protocol.network import keys, session
-from protocol.network.inbox import NOTHING, Arrival, Inbox
+from protocol.network.inbox import NO_ARRIVAL, Arrival, Inbox
 from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode, encode
 from world.hardware.driver import THINKING, Driver
 from world.hardware.driver_journal import DriverHistory
@@ -42,14 +42,14 @@ from world.hardware.measurements import InvalidReading, mark_frames, observation
 from world.hardware.termination import Ending, Termination
 from world.hardware.tick_source import UNHEARD, TickSource
 
-REPEAT_S = 0.25
+MISSION_END_REPEAT_S = 0.25
 """The period in s in which the MissionEnd is repeated."""
 WAITING_S = 1.0
 """The period in s in which the agent is told that its driver waits for other robots.
 
 It is shorter than the time after which an agent replaces its link.
 """
-FINAL_REPORT_TIMEOUT_S = 2.0
+AGENT_FINAL_REPORT_S = 2.0
 """The time in s to wait for the agent's FinalReport."""
 PUT_S = 2.0
 """The time in s that Zenoh has to take a frame at the end of a mission.
@@ -62,7 +62,7 @@ ASTRAY = 64
 
 One of a much earlier tick was sent by a robot that has been restarted without its journal.
 """
-AHEAD = 2
+MOST_TICKS_AHEAD = 2
 """The maximum number of ticks by which a robot may be ahead of the one that it follows, and wait for it."""
 
 AT_ONCE = 1000
@@ -320,7 +320,7 @@ class Field:
         """Process the messages that have arrived, so that this is also done if `sense` takes a whole tick."""
         for _ in range(AT_ONCE):
             arrival = self._inbox.next(0.0)
-            if arrival is NOTHING:
+            if arrival is NO_ARRIVAL:
                 return
             self._take(arrival)
 
@@ -374,15 +374,17 @@ class Field:
 
         The next tick begins as many ticks later as its number is higher, and at once if it is lower. A robot
         that is behind sets its clock from any other one: if it was restarted, and in a group also if it
-        begins late or is more than AHEAD ticks behind.
+        begins late or is more than MOST_TICKS_AHEAD ticks behind.
         """
         start: TickStart | None = self._accepted(arrival, TickStart | TickStartInGroup)
         if start is None:
             return
         left, now, in_group = self._tick + 1 - start.tick, time.monotonic(), self._source.joins
-        fits = -self._astray <= left <= (AHEAD if self._resumed or self._astray == ASTRAY else ASTRAY)
+        fits = (
+            -self._astray <= left <= (MOST_TICKS_AHEAD if self._resumed or self._astray == ASTRAY else ASTRAY)
+        )
         begins = in_group and self._next == UNKNOWN
-        behind = left < 0 and (self._resumed or (in_group and left < -AHEAD))
+        behind = left < 0 and (self._resumed or (in_group and left < -MOST_TICKS_AHEAD))
         if fits:
             self._source.hear(start.robot, now)
             if behind or (begins and left < 0):
@@ -426,12 +428,12 @@ class Field:
 
     def _finish(self, end: MissionEnd) -> None:
         """Send `end` to the agent until it sends its FinalReport, and acknowledge that."""
-        give_up = time.monotonic() + FINAL_REPORT_TIMEOUT_S
+        give_up = time.monotonic() + AGENT_FINAL_REPORT_S
         while (now := time.monotonic()) < give_up and self._id in self._alive:
             if not self._is_taken(encode(end)):
                 self._inbox.say(f"no FinalReport of {self._id}: Zenoh does not take the MissionEnd")
                 return
-            repeat = min(now + REPEAT_S, give_up)
+            repeat = min(now + MISSION_END_REPEAT_S, give_up)
             while (left := repeat - time.monotonic()) > 0.0:
                 arrival = self._inbox.next(left)
                 if arrival.topic == "gone":

@@ -26,7 +26,7 @@ from world.hardware.driver import SENSING, Reading
 
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 ODOMETRY, RANGE = "nav_msgs/msg/Odometry", "sensor_msgs/msg/Range"
-CONNECT_S = 10.0
+BRIDGE_S = 10.0
 """The time in s to wait for the bridge."""
 REPEATS = 10
 """The number of Twists in a manoeuvre. A mobile base stops if it receives none for a while, as it should."""
@@ -142,7 +142,7 @@ class Ros2:
         In a group, the range to robot ID is on the topic `peer_range`/ID. If `stamped` is "true", messages on
         `cmd_vel` are TwistStamped, otherwise Twist.
 
-        Raises TimeoutError if there is no bridge within CONNECT_S, and ValueError.
+        Raises TimeoutError if there is no bridge within BRIDGE_S, and ValueError.
         """
         if stamped not in ("true", "false"):
             raise ValueError(f"stamped: '{stamped}', expected true or false")
@@ -173,7 +173,7 @@ class Ros2:
         self._peers = {one: f"{peer_range}/{one}" if in_group else peer_range for one in config.others}
         """The topic of the range to each other robot."""
         self._open = ExitStack()
-        give_up = time.monotonic() + CONNECT_S
+        give_up = time.monotonic() + BRIDGE_S
 
         def unanswered() -> None:
             if time.monotonic() >= give_up:
@@ -195,7 +195,7 @@ class Ros2:
         """
         now = time.monotonic()
         since = min(self._rest_since, now)
-        give_up = now + (SENSING * self._manoeuvre_s if tick else CONNECT_S)
+        give_up = now + (SENSING * self._manoeuvre_s if tick else BRIDGE_S)
         with self._changed:
             self._changed.wait_for(lambda: self._unsuitable or self._is_all_here(since), give_up - now)
             if self._unsuitable is not None:

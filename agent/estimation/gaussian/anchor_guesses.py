@@ -29,13 +29,13 @@ SEED_RANGES = 10
 With more ranges to the anchor, only the remaining hypotheses about its position are followed.
 """
 
-NEAR = 0.02
+SAME_POSITION = 0.02
 """The expected error of an initial guess, as a fraction of R; guesses closer than this are merged."""
 
 POLISHINGS = 4
 """The least number of Gauss-Newton steps on an initial guess, after that on the rotations of a placement."""
 
-FINER = 0.1
+POSITION_FINER = 0.1
 """The factor by which the expected error of a position decreases at each of these steps."""
 
 TWINS = 0.3
@@ -44,7 +44,7 @@ TWINS = 0.3
 UNLIKELY = 25.0
 """The difference in log-likelihood to the best guess beyond which a guess is dropped."""
 
-MOST = 6
+MOST_FOLLOWED = 6
 """The maximum number of hypotheses that are followed at once."""
 
 
@@ -136,7 +136,7 @@ def _polished(
 ) -> Array:
     """Return the most likely of `points` after refinement on all ranges, without duplicates; shape (n, 2)."""
     x, y, rho = path.x[ranges.tick], path.y[ranges.tick], ranges.rho
-    near = NEAR * sensing_range
+    near = SAME_POSITION * sensing_range
 
     def residuals_at(points: Array) -> tuple[Array, Array, Array, Array]:
         dx, dy = x - points[:, :1], y - points[:, 1:]
@@ -144,7 +144,7 @@ def _polished(
         return rho - distance, dx / distance, dy / distance, distance
 
     for step in range(POLISHINGS):
-        s = np.hypot(sigma, near * FINER**step)
+        s = np.hypot(sigma, near * POSITION_FINER**step)
         residual, ux, uy, _ = residuals_at(points)
         weight = inlier_probability(residual, s, noise) / np.square(s)
         wx, wy = weight * ux, weight * uy
@@ -156,8 +156,8 @@ def _polished(
         change = np.stack(((yy * gx - xy * gy) / determinant, (xx * gy - xy * gx) / determinant), 1)
         longest = np.maximum(np.abs(change).max(1, keepdims=True), 1e-12)
         points = points + change * np.minimum(1.0, 0.5 * sensing_range / longest)
-    likely = mixture(residuals_at(points)[0], np.hypot(sigma, near * FINER**POLISHINGS), noise)[0]
-    return _best(points, likely, near * FINER + TWINS * float(np.min(sigma)))
+    likely = mixture(residuals_at(points)[0], np.hypot(sigma, near * POSITION_FINER**POLISHINGS), noise)[0]
+    return _best(points, likely, near * POSITION_FINER + TWINS * float(np.min(sigma)))
 
 
 def _best(points: Array, likely: Array, near: float) -> Array:
@@ -165,7 +165,7 @@ def _best(points: Array, likely: Array, near: float) -> Array:
     left = np.flatnonzero(likely >= np.max(likely) - UNLIKELY)
     left = left[np.argsort(-likely[left], kind="stable")]
     chosen: list[int] = []
-    while len(left) and len(chosen) < MOST:
+    while len(left) and len(chosen) < MOST_FOLLOWED:
         chosen.append(int(left[0]))
         left = left[np.abs(points[left] - points[left[0]]).sum(1) > near]
     return points[chosen]

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from agent.estimation.gaussian.known_anchors import COARSE, TURNS, AnchoredRobot, ranges_places, refined
+from agent.estimation.gaussian.known_anchors import COARSE, ROTATIONS, AnchoredRobot, ranges_places, refined
 from agent.estimation.gaussian.odometry_noise import Array
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, mixture
 
@@ -27,7 +27,7 @@ def beacon_guesses(robot: AnchoredRobot) -> list[Array]:
     They contain the place of the origin in the frame of the odometry, and the rotation of this frame in <W>.
     """
     ranges, path = robot.ranges, robot.path
-    turns = np.linspace(-math.pi, math.pi, TURNS, endpoint=False)
+    turns = np.linspace(-math.pi, math.pi, ROTATIONS, endpoint=False)
     c, s = np.cos(turns)[:, None], np.sin(turns)[:, None]
     px, py = path.x[ranges.tick], path.y[ranges.tick]
     place = ranges_places(robot)

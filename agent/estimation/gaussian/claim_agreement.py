@@ -37,7 +37,7 @@ class ClaimDifference(NamedTuple):
     """The probability of a difference that is as improbable, if both claims are right (chi-square test)."""
 
 
-STEPS = 8
+AGREEMENT_STEPS = 8
 """The Gauss-Newton steps to the pose that both claims suggest. Three suffice for errors of 0.3 rad."""
 
 
@@ -74,7 +74,7 @@ def _least_chi2(
     heading = float(path.heading[since])
     first = np.linalg.inv(matrix(earlier))
     best, chi2 = earlier.pose, math.inf
-    for _ in range(STEPS):
+    for _ in range(AGREEMENT_STEPS):
         begin, end = minus(best, earlier.pose), compose(best, way)
         left = minus(end, now.pose)
         drift = _drift(path, since, best.heading - heading, noise)

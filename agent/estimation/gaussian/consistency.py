@@ -284,10 +284,10 @@ def _distance_score(fitted: Fit, pair: PairRanges) -> float:
     score = float(by_distance @ system.multipliers)
     level = max(min(fitted.level, HIGHEST_LEVEL), 1.0)
     surveyed = 2.0 * pair.noise.priors.survey_error**2  # the variance of the known distance
-    if information <= LEAST:
+    if information <= LEAST_INFORMATION:
         return 0.0
     return score / math.sqrt(information * (level + surveyed * information))
 
 
-LEAST = 1e-3
+LEAST_INFORMATION = 1e-3
 """The information (1 / m^2) below which the ranges do not determine the distance, and the score is 0."""

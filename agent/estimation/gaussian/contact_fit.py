@@ -29,7 +29,7 @@ from agent.estimation.gaussian.joint_search import (
     certainties,
     with_probability,
 )
-from agent.estimation.gaussian.known_anchors import FEWEST, AnchoredRobot, scored_fits
+from agent.estimation.gaussian.known_anchors import FEWEST_FOR_POSE, AnchoredRobot, scored_fits
 from agent.estimation.gaussian.linear_model import Start
 from agent.estimation.gaussian.odometry_noise import Errors, Track
 from agent.estimation.gaussian.own_sensors import DOUBTFUL_CLAIM, claim_profiles
@@ -44,7 +44,7 @@ FINDER, OWN = 0, 1
 HOLDING = 1e-3
 """The sigma with which a coordinate of a rival is held, as a fraction of its distance from the claim."""
 
-SMALLEST = 1e-12
+SMALLEST_EIGENVALUE = 1e-12
 """The smallest eigenvalue of a covariance that is accepted, as a fraction of its largest one."""
 
 SAME_LEVEL = 0.05
@@ -85,13 +85,13 @@ def is_definite(covariance: Covariance) -> bool:
     if not np.all(np.isfinite(values)):
         return False
     least, _, most = np.linalg.eigvalsh(values).tolist()
-    return bool(least > max(SMALLEST * most, SMALLEST**2))
+    return bool(least > max(SMALLEST_EIGENVALUE * most, SMALLEST_EIGENVALUE**2))
 
 
 def estimated(contact: ContactRanges, mission: Mission) -> ContactEstimate | None:
     """Return the possible poses of this robot; None if there are too few ranges, or no pose explains them."""
     measured = _measured(contact, mission)
-    if len(measured.ranges.rho) < FEWEST:
+    if len(measured.ranges.rho) < FEWEST_FOR_POSE:
         return None
     fits = [joint_fit(measured, start) for start in _starts(measured, mission)]
     found = with_probability(fits)

@@ -11,7 +11,7 @@ from agent.estimation.gaussian.fitted import NormalEquations
 from agent.estimation.gaussian.linear_model import ErrorSizes, LinearModel, Point, Problem, product
 from agent.estimation.gaussian.odometry_noise import Array, Places
 
-LEAP = 1.0
+LARGEST_STEP = 1.0
 """The largest change of an unknown, in m and rad, in one step."""
 
 SHORTER_STEPS = (0.5, 0.25, 0.0625)
@@ -37,9 +37,11 @@ def stepped(
 def full_step(
     problem: Problem, point: Point, linear: LinearModel, system: NormalEquations
 ) -> tuple[Array, ErrorSizes]:
-    """Return the guesses and errors after a step by `system`, whose unknowns change by at most LEAP."""
+    """Return the guesses and errors after a step by `system`, of at most LARGEST_STEP each."""
     change = system.change
-    change = change * np.minimum(1.0, LEAP / np.maximum(np.abs(change).max(-1, keepdims=True), LEAP))
+    change = change * np.minimum(
+        1.0, LARGEST_STEP / np.maximum(np.abs(change).max(-1, keepdims=True), LARGEST_STEP)
+    )
     guess = point.guess.copy()
     guess[:, problem.free] += change
     left_over = system.weighted[..., -1] - product(system.weighted[..., :-1], change)

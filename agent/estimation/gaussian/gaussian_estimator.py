@@ -18,7 +18,7 @@ from protocol.messages import Localised, Observation, Undecided, Verdict
 from protocol.mission import RANGE_MARGIN
 from protocol.motion import ORIGIN, wrap
 
-LIKELY = 0.05
+LIKELY_BRANCH = 0.05
 """The probability from which on a branch takes part in the planning of a manoeuvre."""
 
 FEWEST_MUTUAL_RANGES = 2
@@ -46,7 +46,7 @@ class GaussianEstimator(msgspec.Struct, frozen=True):
         return None
 
     def anchor(self, knowledge: Knowledge, candidates: tuple[Branch, ...]) -> AnchorEstimate:
-        """Return the branches of at least the probability LIKELY, whatever the `candidates` were."""
+        """Return the branches of at least the probability LIKELY_BRANCH, whatever the `candidates` were."""
         del candidates
         scored = inference.own_anchor(knowledge)
         if not scored:
@@ -55,7 +55,7 @@ class GaussianEstimator(msgspec.Struct, frozen=True):
         likely = [
             branch
             for branch, one in zip(belief.branches, belief.own, strict=True)
-            if one.probability >= LIKELY
+            if one.probability >= LIKELY_BRANCH
         ]
         return AnchorEstimate(belief, tuple(likely), likely[0] if likely else None, RANGE_MARGIN)
 

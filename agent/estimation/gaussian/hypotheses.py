@@ -14,10 +14,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.gaussian.anchor_guesses import MOST, SEED_RANGES, UNLIKELY, anchors
+from agent.estimation.gaussian.anchor_guesses import MOST_FOLLOWED, SEED_RANGES, UNLIKELY, anchors
 from agent.estimation.gaussian.detections import anchor_log_likelihood, detection_log_likelihood
 from agent.estimation.gaussian.fitted import Fit
-from agent.estimation.gaussian.least_squares import COARSE_STILL, STEPS, WARM_DECREASE, fits, without_outliers
+from agent.estimation.gaussian.least_squares import (
+    COARSE_STILL,
+    FIT_STEPS,
+    WARM_DECREASE,
+    fits,
+    without_outliers,
+)
 from agent.estimation.gaussian.linear_model import Start
 from agent.estimation.gaussian.odometry_noise import Errors, Places, Track
 from agent.estimation.gaussian.placement_guesses import STARTS, placements
@@ -97,7 +103,7 @@ def with_probability(found: Sequence[tuple[Fit, float]]) -> tuple[ScoredHypothes
     scored.sort(key=lambda one: -one[0])
     left: list[tuple[float, Fit, float]] = []
     for weight, one, silent in scored:
-        if scored[0][0] - weight > -math.log(NEGLIGIBLE_PROBABILITY) or len(left) == MOST:
+        if scored[0][0] - weight > -math.log(NEGLIGIBLE_PROBABILITY) or len(left) == MOST_FOLLOWED:
             break
         if not any(_same(one, other) for _, other, _ in left):
             left.append((math.exp(weight - scored[0][0]), one, silent))
@@ -147,7 +153,7 @@ def of_anchor(
         places = [one.guess[:2] for one in known]
         points = anchors(path, ranges, sensing_range, noise, places)
         starts = [Start(np.array([*point, 0.0])) for point in points]
-    steps, decrease = (WARM_STEPS, WARM_DECREASE) if warm else (STEPS, 1.0)
+    steps, decrease = (WARM_STEPS, WARM_DECREASE) if warm else (FIT_STEPS, 1.0)
     found = fits(starts, [path], ranges, noise, steps=steps, shortest=COARSE_STILL, decrease=decrease)
     return with_probability(
         [(one, anchor_log_likelihood(one, 0, silent, ranges.tick, sensing_range, noise)) for one in found]

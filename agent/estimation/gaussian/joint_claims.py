@@ -16,10 +16,10 @@ from agent.estimation.gaussian.joint_search import (
     JointHypotheses,
     beacons,
 )
-from agent.estimation.gaussian.known_anchors import MOST_STRAYS, inaccuracy
+from agent.estimation.gaussian.known_anchors import LARGEST_STRAY_SHARE, inaccuracy
 from agent.estimation.gaussian.noise_level import INLIER
 from agent.estimation.gaussian.odometry_noise import Places
-from agent.estimation.gaussian.range_model import ELSEWHERE
+from agent.estimation.gaussian.range_model import MOVED
 
 OPEN = 0.5
 """The sigma of a position from which on a robot has no pose, as a fraction of the longest range."""
@@ -55,7 +55,7 @@ def blocking_reason(
         return f"the residuals are too large: chi-square {fit.chi2:.3g} for {free} degrees of freedom"
     own = ranges.of(robot)
     total, strays = int(np.count_nonzero(own)), int(np.count_nonzero(fit.weights[own] <= INLIER))
-    if strays > (MOST_STRAYS + used.noise.outliers) * total:
+    if strays > (LARGEST_STRAY_SHARE + used.noise.outliers) * total:
         return f"{strays} of {total} ranges fit no other"
     return inaccuracy(fit.covariance[3 * robot : 3 * robot + 3, 3 * robot : 3 * robot + 3], accuracy)
 
@@ -83,7 +83,7 @@ def _places(ends: tuple[int, int], ticks: Places, used: JointMeasurements, reach
     for end in ends:
         if end >= 0:
             x, y = used.paths[end].x[ticks], used.paths[end].y[ticks]
-            moved[1:] |= np.hypot(np.diff(x), np.diff(y)) > ELSEWHERE * reach
+            moved[1:] |= np.hypot(np.diff(x), np.diff(y)) > MOVED * reach
     return int(np.count_nonzero(moved))
 
 
@@ -129,10 +129,10 @@ def _linked(robot: int, measured: JointMeasurements) -> list[int]:
     return sorted(found)
 
 
-MOST_LISTED = 6
+MOST_LISTED_RIVALS = 6
 """The largest number of robots that a reason names."""
 
 
 def _listed(names: list[str]) -> str:
-    more = len(names) - MOST_LISTED
-    return ", ".join(names[:MOST_LISTED]) + (f" and {more} more" if more > 0 else "")
+    more = len(names) - MOST_LISTED_RIVALS
+    return ", ".join(names[:MOST_LISTED_RIVALS]) + (f" and {more} more" if more > 0 else "")

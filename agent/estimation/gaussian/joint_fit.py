@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.gaussian.descent import DESCENT, LEAP, SHORTER_STEPS
+from agent.estimation.gaussian.descent import DESCENT, LARGEST_STEP, SHORTER_STEPS
 from agent.estimation.gaussian.joint_covariance import JointCovariance
 from agent.estimation.gaussian.joint_problem import (
     JointErrorSizes,
@@ -21,7 +21,7 @@ from agent.estimation.gaussian.joint_problem import (
     JointProblem,
 )
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
-from agent.estimation.gaussian.least_squares import RIDGE, SETTLED, SOFT, STEPS, STILL
+from agent.estimation.gaussian.least_squares import FIT_STEPS, LAST_STEP, RIDGE, SETTLED_WEIGHT, SOFT
 from agent.estimation.gaussian.noise_level import (
     INLIER,
     misfit_log_likelihood,
@@ -128,7 +128,7 @@ class _System(NamedTuple):
     chi2: float
 
 
-def joint_fit(measured: JointMeasurements, start: JointStart, steps: int = STEPS) -> JointFit:
+def joint_fit(measured: JointMeasurements, start: JointStart, steps: int = FIT_STEPS) -> JointFit:
     """Return the fit to all ranges in `measured` that begins at `start`, after at most `steps` steps."""
     problem = JointProblem.of(measured)
     noise, sigma = problem.noise, problem.ranges.sigma
@@ -143,8 +143,10 @@ def joint_fit(measured: JointMeasurements, start: JointStart, steps: int = STEPS
         updated = _inlier_probabilities(system, weights, sigma, noise) if problem.robust else weights
         length = _length(problem, system, weights)
         before = length if step == 0 else before
-        expected = length**2 / max(length, before, STILL)
-        still = float(np.max(np.abs(updated - weights), initial=0.0)) < SETTLED and expected < STILL
+        expected = length**2 / max(length, before, LAST_STEP)
+        still = (
+            float(np.max(np.abs(updated - weights), initial=0.0)) < SETTLED_WEIGHT and expected < LAST_STEP
+        )
         if step == steps:
             return _fit(problem, point, point, linear, system, weights, length)
         begun, point = point, _stepped(problem, point, linear, system, variance)
@@ -206,8 +208,8 @@ def _stepped(
     change = system.solution[:size]
     largest = float(np.max(np.abs(change), initial=0.0))
     constants, multipliers = system.solution[size:], system.multipliers
-    if largest > LEAP:
-        change = np.asarray(change * (LEAP / largest), np.float64)
+    if largest > LARGEST_STEP:
+        change = np.asarray(change * (LARGEST_STEP / largest), np.float64)
         left = system.gradient[size:] - system.information[size:, :size] @ change
         constants = np.asarray(np.linalg.solve(system.information[size:, size:], left), np.float64)
         multipliers = system.weighted[:, -1] - system.weighted[:, :-1] @ np.concatenate((change, constants))

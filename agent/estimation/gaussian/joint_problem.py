@@ -28,7 +28,7 @@ from agent.estimation.gaussian.odometry_noise import (
     wander,
 )
 from agent.estimation.gaussian.range_covariance import GRAIN
-from agent.estimation.gaussian.range_model import TINY
+from agent.estimation.gaussian.range_model import SMALLEST_DISTANCE
 from protocol.noise import Noise
 
 
@@ -193,7 +193,7 @@ class JointProblem(NamedTuple):
         ox, oy = turned(ranges.second)
         dx = wx + poses[ranges.first, 0] - np.where(two, ox + poses[ranges.second, 0], ranges.place[:, 0])
         dy = wy + poses[ranges.first, 1] - np.where(two, oy + poses[ranges.second, 1], ranges.place[:, 1])
-        distance = np.maximum(np.hypot(dx, dy), TINY)
+        distance = np.maximum(np.hypot(dx, dy), SMALLEST_DISTANCE)
         nx, ny = dx / distance, dy / distance
         jacobian, directions = np.zeros((len(every), robots, 3)), np.zeros((robots, 2, len(every)))
         for rows, which, mx, my, x, y in (

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from agent.estimation.facts import AnchorPlace, Facts, Manoeuvre, MeasuredRange
 from agent.estimation.gaussian.odometry_noise import Array, Places, Track, track
-from agent.estimation.gaussian.range_model import IMPOSSIBLE, MOST_RANGES, SIGMA_FLOOR, Ranges
+from agent.estimation.gaussian.range_model import IMPOSSIBLE, MOST_CORRELATED_RANGES, SIGMA_FLOOR, Ranges
 from protocol.noise import Noise
 
 MOST_MUTUAL_RANGES = 1024
-"""The most ranges between robots in one fit, of all pairs together; see MOST_RANGES.
+"""The most ranges between robots in one fit, of all pairs together; see MOST_CORRELATED_RANGES.
 
 The cost of a fit is cubic in their number: with so many, a step takes about 0.2 s. A group of 16 robots that
 meet as planned has about 500. With less, 16 robots that all range each other would use fewer than 8 ranges of
@@ -123,11 +123,11 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
         ranges = ranges.rows(ranges.rho <= reach + IMPOSSIBLE * loose)
         pairs = ranges.pairs
         mutual = sum(1 for own in pairs if ranges.second[np.argmax(own)] >= 0)
-        most = min(MOST_RANGES, max(MOST_MUTUAL_RANGES // max(mutual, 1), FEWEST_OF_PAIR))
+        most = min(MOST_CORRELATED_RANGES, max(MOST_MUTUAL_RANGES // max(mutual, 1), WEIGHED_OF_PAIR))
         left = np.zeros(len(ranges.rho), bool)
         for own in pairs:
             rows = np.flatnonzero(own)
-            bound = most if ranges.second[rows[0]] >= 0 else MOST_RANGES
+            bound = most if ranges.second[rows[0]] >= 0 else MOST_CORRELATED_RANGES
             left[rows[_recent(len(rows), bound)]] = True
         return msgspec.structs.replace(self, ranges=ranges if left.all() else ranges.rows(left))
 
@@ -147,7 +147,7 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
         )
 
 
-FEWEST_OF_PAIR = 8
+WEIGHED_OF_PAIR = 8
 """The number of ranges of a pair of robots that are always weighed."""
 
 

@@ -38,7 +38,7 @@ the most probable ones are fitted; see `_representative`.
 MOST_POSES = 24
 """The largest number of joint hypotheses. The time of an estimate is proportional to it."""
 
-FEWEST_OF_PAIR = 3
+FEWEST_TO_ANCHORS = 3
 """The least number of ranges of each robot of a pair to its anchor."""
 
 
@@ -65,7 +65,7 @@ class JointHypotheses(NamedTuple):
     """The hypotheses, the most probable first."""
 
 
-NOTHING = JointHypotheses(())
+NO_HYPOTHESES = JointHypotheses(())
 
 
 class Candidate(NamedTuple):
@@ -79,7 +79,7 @@ class Candidate(NamedTuple):
 
 def search(measured: JointMeasurements, reach: float) -> JointHypotheses:
     """Return the hypotheses of a search of the whole plane; `reach` (m) bounds the ranges."""
-    return extended(NOTHING, measured, reach)
+    return extended(NO_HYPOTHESES, measured, reach)
 
 
 def follow(known: JointHypotheses, measured: JointMeasurements, steps: int = WARM_STEPS) -> JointHypotheses:
@@ -156,7 +156,9 @@ def _paired(located: Sequence[int], measured: JointMeasurements) -> Iterator[Can
 
 def _anchors_of_pair(a: int, b: int, measured: JointMeasurements) -> tuple[Places, Places] | None:
     """Return the ranges of each robot to its anchor: those with the most ranges, at different places."""
-    own = [[rows for rows in _of_anchors(robot, measured) if len(rows) >= FEWEST_OF_PAIR] for robot in (a, b)]
+    own = [
+        [rows for rows in _of_anchors(robot, measured) if len(rows) >= FEWEST_TO_ANCHORS] for robot in (a, b)
+    ]
     place = measured.ranges.place
     choices = [
         (len(one) + len(other), one, other)

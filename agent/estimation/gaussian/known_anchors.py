@@ -22,14 +22,14 @@ from agent.estimation.gaussian.hypotheses import (
     with_probability,
 )
 from agent.estimation.gaussian.inference import MUTUAL_RANGES, MUTUAL_RANGES_WITH_OUTLIERS
-from agent.estimation.gaussian.least_squares import STEPS, fits
+from agent.estimation.gaussian.least_squares import FIT_STEPS, fits
 from agent.estimation.gaussian.linear_model import Start
 from agent.estimation.gaussian.odometry_noise import Array, Places, Track
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges, mixture, predicted
 from protocol.mission import HEADING_ACCURACY
 from protocol.noise import Noise
 
-TURNS = 72
+ROTATIONS = 72
 """The number of rotations that are tried. The refinement bridges half of the 5 degrees between them."""
 
 REFINEMENTS = 8
@@ -38,7 +38,7 @@ REFINEMENTS = 8
 COARSE = 0.1
 """The expected error of a candidate's ranges at first, as a fraction of the longest range."""
 
-FINER = 0.4
+ERROR_FINER = 0.4
 """The factor by which it decreases in each step."""
 
 CANDIDATES = 8
@@ -47,10 +47,10 @@ CANDIDATES = 8
 APART, TURNED = 0.05, 0.2
 """The distance (as a fraction of the longest range) and the angle (rad) within which candidates are one."""
 
-FEWEST = 4
+FEWEST_FOR_POSE = 4
 """The least number of ranges for hypotheses: there are three unknowns, and one range checks them."""
 
-MOST_STRAYS = 0.15
+LARGEST_STRAY_SHARE = 0.15
 """The largest fraction of ranges that may be strays, in addition to the outliers that were told."""
 
 FEWEST_OF_ANCHOR = 3
@@ -70,7 +70,7 @@ class AnchoredRobot(NamedTuple):
 
 def search(robot: AnchoredRobot, known: Sequence[Hypothesis] = ()) -> tuple[ScoredHypothesis, ...]:
     """Return the hypotheses of a search of the whole plane, and those `known`, the likeliest first."""
-    if len(robot.ranges.rho) < FEWEST:
+    if len(robot.ranges.rho) < FEWEST_FOR_POSE:
         return ()
     starts = [one.start for one in known] + [Start(guess) for guess in _candidates(robot)]
     return scored_fits(robot, starts)
@@ -82,7 +82,7 @@ def follow(robot: AnchoredRobot, known: Sequence[Hypothesis]) -> tuple[ScoredHyp
 
 
 def scored_fits(
-    robot: AnchoredRobot, starts: Sequence[Start], steps: int = STEPS
+    robot: AnchoredRobot, starts: Sequence[Start], steps: int = FIT_STEPS
 ) -> tuple[ScoredHypothesis, ...]:
     """Return the hypotheses of the fits that begin at `starts`, the likeliest first."""
     found = fits(starts, [robot.path], robot.ranges, robot.noise, steps=steps)
@@ -92,7 +92,7 @@ def scored_fits(
 def _candidates(robot: AnchoredRobot) -> list[Array]:
     """Return initial guesses: each place of an anchor by its ranges alone, with all rotations, refined."""
     ranges, places = robot.ranges, ranges_places(robot)
-    turns = np.linspace(-math.pi, math.pi, TURNS, endpoint=False)
+    turns = np.linspace(-math.pi, math.pi, ROTATIONS, endpoint=False)
     guesses = []
     for own in sorted(ranges.pairs, key=lambda rows: -int(np.count_nonzero(rows)))[:2]:
         count = int(np.count_nonzero(own))
@@ -119,7 +119,7 @@ def refined(guesses: Array, robot: AnchoredRobot) -> list[Array]:
     sigma = np.sqrt(np.square(ranges.sigma) + ranges.loosened(robot.noise.priors))
     longest = max(float(np.max(ranges.rho)), SIGMA_FLOOR)
     for step in range(REFINEMENTS):
-        s = np.hypot(sigma, COARSE * longest * FINER**step)
+        s = np.hypot(sigma, COARSE * longest * ERROR_FINER**step)
         model = predicted(guesses, np.broadcast_to(at, (len(guesses), *at.shape)), ranges, (0.0, 0.0))
         residuals = ranges.rho - model.distance
         weight = mixture(residuals, s, robot.noise)[1] / np.square(s)
@@ -182,7 +182,7 @@ def blocking_reason(
     if chi2_p_value(best.fit.chi2 / HIGHEST_LEVEL, free) < CLAIM_P_VALUE:
         return f"the residuals are too large: chi-square {best.fit.chi2:.3g} for {free} degrees of freedom"
     strays = len(ranges.rho) - best.fit.inliers
-    if strays > (MOST_STRAYS + robot.noise.outliers) * len(ranges.rho):
+    if strays > (LARGEST_STRAY_SHARE + robot.noise.outliers) * len(ranges.rho):
         return f"{strays} of {len(ranges.rho)} ranges fit no other"
     return inaccuracy(covariance, accuracy)
 

@@ -12,7 +12,7 @@ from agent.estimation.knowledge import Knowledge
 from protocol.messages import Localised
 from protocol.motion import Pose
 
-MOST_FITS = 4
+MOST_LATER_FITS = 4
 """The most fits: after a long way, the steps of one do not suffice to correct the path."""
 
 
@@ -29,7 +29,7 @@ def later_pose(met: Knowledge, now: Knowledge) -> Localised | None:
     met = replace(met, tick=now.tick, odometry=now.odometry, log=now.log)
     measured = inference.pair_of(met)
     known = tuple([one.hypothesis for one in search(measured, met.belief.pair)])
-    for _ in range(MOST_FITS):
+    for _ in range(MOST_LATER_FITS):
         scored = follow(known, measured)
         if not scored:
             return None

@@ -32,10 +32,10 @@ from agent.estimation.gaussian.range_model import Ranges, outliers
 from agent.estimation.gaussian.range_weights import inlier_probabilities, weighted_variance, weights_by_errors
 from protocol.noise import Noise
 
-STEPS = 8
+FIT_STEPS = 8
 """The maximum number of Gauss-Newton steps."""
 
-STILL = 3e-3
+LAST_STEP = 3e-3
 """The expected length in sigmas of the next step from which on a step is the last.
 
 Steps of Gauss-Newton decrease by a constant factor, about 0.1 with ranges of a tenth of their length. The
@@ -43,15 +43,15 @@ linear model is not computed again after the last step.
 """
 
 COARSE_STILL = 0.05
-"""The value of STILL for fits on which only the robot's way depends.
+"""The value of LAST_STEP for fits on which only the robot's way depends.
 
-No claim does: each search fits all ranges again. With STILL, such a fit takes twice as long.
+No claim does: each search fits all ranges again. With LAST_STEP, such a fit takes twice as long.
 """
 
 WARM_DECREASE = 0.1
 """The expected decrease of the first step of a fit that begins at the last one, which has one range less."""
 
-SETTLED = 1e-2
+SETTLED_WEIGHT = 1e-2
 """The change of a weight below which the weights have converged."""
 
 RIDGE = 1e-12
@@ -67,7 +67,7 @@ def fit(
     ranges: Ranges,
     noise: Noise,
     apart: tuple[float, float] = (0.0, 0.0),
-    steps: int = STEPS,
+    steps: int = FIT_STEPS,
     begun: Sequence[Errors] = (),
 ) -> Fit:
     """Return the one fit that begins at `guess`, with the odometry errors `begun`; see `fits`."""
@@ -87,9 +87,9 @@ def fits(
     ranges: Ranges,
     noise: Noise,
     apart: tuple[float, float] = (0.0, 0.0),
-    steps: int = STEPS,
+    steps: int = FIT_STEPS,
     *,
-    shortest: float = STILL,
+    shortest: float = LAST_STEP,
     decrease: float = 1.0,
 ) -> list[Fit]:
     """Return the Gauss-Newton fits that begin at `starts`, in this order.
@@ -117,8 +117,8 @@ def fits(
         quality = _quality(system, weights, noise)
         if step == 0:
             before = quality.last_step / decrease
-        expected = np.square(quality.last_step) / np.maximum(np.maximum(quality.last_step, before), STILL)
-        settled = np.maximum.reduce(np.abs(updated - weights), -1) < SETTLED
+        expected = np.square(quality.last_step) / np.maximum(np.maximum(quality.last_step, before), LAST_STEP)
+        settled = np.maximum.reduce(np.abs(updated - weights), -1) < SETTLED_WEIGHT
         still = settled & (expected < shortest)
         still &= step > 0 or decrease < 1.0 or not problem.noisy  # the path is corrected at least once
         if step == steps:

@@ -16,13 +16,13 @@ from agent.estimation.gaussian.anchor_guesses import anchors
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, consistency_test
 from agent.estimation.gaussian.fitted import Fit
 from agent.estimation.gaussian.hypotheses import search
-from agent.estimation.gaussian.least_squares import STEPS, fit, fits
+from agent.estimation.gaussian.least_squares import FIT_STEPS, fit, fits
 from agent.estimation.gaussian.linear_model import Start
 from agent.estimation.gaussian.odometry_noise import Track, rescaled
 from agent.estimation.gaussian.range_model import PairRanges, Ranges
 from protocol.noise import PROFILES, UNTOLD_SIGMA, Noise, ProfileName
 
-DOUBTFUL = 3.0
+DOUBTED_EVIDENCE = 3.0
 """The log evidence for another profile from which on a robot doubts what it was told of its own sensors.
 
 With less, robots doubt their own sensors where a peer attacks; with more, honest peers are suspected where
@@ -79,7 +79,7 @@ class Doubt(NamedTuple):
         )
 
 
-OWN = "the own ranges to the anchor and the own odometry"
+OWN_SENSORS = "the own ranges to the anchor and the own odometry"
 """The measurements that do not depend on the peer."""
 
 BOTH = "the ranges and the odometry of both robots"
@@ -106,7 +106,7 @@ def doubt(
         name: _log_evidence(path, ranges, sensing_range, _profile(name, noise)) - told
         for name in _others(noise)
     }
-    found = _best(OWN, others, DOUBTFUL)
+    found = _best(OWN_SENSORS, others, DOUBTED_EVIDENCE)
     if found is not None or pair is None:
         return found
     possible = [name for name in others if others[name] > NOT_AGAINST]
@@ -128,7 +128,7 @@ def claim_doubt(fitted: Fit, pair: PairRanges) -> Doubt | None:
     others = {}
     for name, other in claim_profiles(noise):
         begun = [rescaled(errors, noise, other) for errors in fitted.errors]
-        for steps in (0, STEPS):
+        for steps in (0, FIT_STEPS):
             again = fit(fitted.guess, pair.paths, pair.ranges, other, pair.apart, steps, begun)
             others[name] = _evidence(again) - told
             if others[name] < DOUBTFUL_CLAIM - ONE_MODEL_ERROR:

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from agent.estimation.gaussian.anchor_guesses import (
-    NEAR,
     POLISHINGS,
+    SAME_POSITION,
     SEED_RANGES,
     TWINS,
     UNLIKELY,
@@ -41,7 +41,7 @@ SCAN = 72
 
 With several radii of the other robot's circle, half as many."""
 
-BENT = 0.1
+MERGED_WITHIN = 0.1
 """The distance, as a fraction of R, below which placements are merged.
 
 A fit moves by itself along directions that the ranges leave undetermined.
@@ -60,7 +60,7 @@ RIDGE_BETWEEN = 2.0
 
 Without it, two exact placements 0.01 rad apart are one; with much less, rounding makes one candidate two."""
 
-DAMPING = 1e-3
+HEADING_DAMPING = 1e-3
 """The damping of headings in the first refinement, as a fraction of their information."""
 
 CROWD = 60
@@ -78,7 +78,7 @@ FINER_TURN = 0.2
 TURN = 0.3
 """The largest change of a heading (rad) in one of these steps."""
 
-SHORTEST = 0.1
+SHORTEST_LEVER = 0.1
 """The least lever (m) that is assumed for a heading."""
 
 
@@ -182,7 +182,7 @@ def placements(own: tuple[Fit, Fit], pair: PairRanges) -> list[Placed]:
     near, far = (0, 1) if radii[0] < radii[1] else (1, 0)
     sign = 1.0 if far == 0 else -1.0
     apart = (sign * pair.apart[0], sign * pair.apart[1])  # from the far robot's anchor to the near one's
-    lever = np.array([max(radii[robot], SHORTEST) for robot in (near, far)])
+    lever = np.array([max(radii[robot], SHORTEST_LEVER) for robot in (near, far)])
     ends = sorted({0, len(ticks) - 1})
     z = np.concatenate([_scanned(robots[near], robots[far], i, float(rho[i]), apart, lever) for i in ends])
     z, likely = _turned(z, (robots[near], robots[far]), middle, rho, sigma, apart, lever, pair)
@@ -257,7 +257,7 @@ def _turned(
         gradient[:, 2:] -= z[:, 2:unknowns]
         diagonal = np.einsum("...ii->...i", information)
         diagonal[:, 2:] += 1.0
-        diagonal[:, :2] += DAMPING * FINER_TURN**step * diagonal[:, :2].sum(1, keepdims=True) + 1e-12
+        diagonal[:, :2] += HEADING_DAMPING * FINER_TURN**step * diagonal[:, :2].sum(1, keepdims=True) + 1e-12
         change = np.linalg.solve(information, gradient[..., None])[..., 0]
         longest = np.maximum(np.abs(change[:, :2]).max(1, keepdims=True), 1e-12)
         z[:, :unknowns] += change * np.minimum(1.0, TURN / longest)
@@ -265,7 +265,7 @@ def _turned(
             likely, gap = _likelihood(
                 z, np.hypot(sigma, coarse * FINER_TURN ** (step + 1)), residuals_at, pair
             )
-            z = z[_thinned(z, likely, gap, lever, NEAR * pair.sensing_range)]
+            z = z[_thinned(z, likely, gap, lever, SAME_POSITION * pair.sensing_range)]
     return _likeliest(z, np.hypot(sigma, coarse * FINER_TURN**steps), residuals_at, lever, pair)
 
 
@@ -336,11 +336,11 @@ def _likeliest(
 ) -> tuple[Array, Array]:
     """Return the most likely of `z`, at most STARTS, and their log-likelihoods, the likeliest first.
 
-    Two candidates are merged if the robots' positions differ by less than BENT R, unless the likelihood falls
-    between them.
+    Two candidates are merged if the robots' positions differ by less than MERGED_WITHIN R, unless the
+    likelihood falls between them.
     """
     likely, gap = _likelihood(z, sigma, residuals_at, pair)
-    near = BENT * pair.sensing_range + TWINS * float(np.min(sigma))
+    near = MERGED_WITHIN * pair.sensing_range + TWINS * float(np.min(sigma))
     left = np.flatnonzero(likely >= np.max(likely) - UNLIKELY)
     left = left[np.argsort(-likely[left], kind="stable")]
     chosen: list[int] = []

@@ -22,14 +22,14 @@ from protocol.noise import Noise, Priors, VelocityNoise
 SIGMA_FLOOR = 1e-6
 """The least standard deviation (m) that is assumed for a range."""
 
-ELSEWHERE = 0.01
+MOVED = 0.01
 """The fraction of R that a robot must have moved for a range to count as one from another place."""
 
 IMPOSSIBLE = 6.0
 """The number of sigmas beyond R from which a range is an outlier under any guess."""
 
 
-MOST_RANGES = 96
+MOST_CORRELATED_RANGES = 96
 """The most ranges of a kind that a fit weighs if odometry is noisy.
 
 The cost of a fit is cubic in their number: with 3 x 96, a search takes about 0.2 s. Old ranges tell little of
@@ -161,12 +161,14 @@ class Ranges(NamedTuple):
         return self._only(self.rho <= sensing_range + IMPOSSIBLE * sigma)
 
     def thinned(self, noise: Noise) -> Ranges:
-        """Return at most MOST_RANGES of each kind, or MOST_RANGES_BY_EXACT_ODOMETRY: all recent, some older.
+        """Return at most MOST_CORRELATED_RANGES of each kind, or MOST_RANGES_BY_EXACT_ODOMETRY.
+
+        All recent ones are among them, and some older ones.
 
         It bounds the cost of a tick. Which of the older ones are left changes only when their number doubles.
         """
         correlated = noise.odometry != VelocityNoise() or noise.priors.slow_sigma > 0.0
-        most = MOST_RANGES if correlated else MOST_RANGES_BY_EXACT_ODOMETRY
+        most = MOST_CORRELATED_RANGES if correlated else MOST_RANGES_BY_EXACT_ODOMETRY
         return self if max(self.counts) <= most else self.thinned_after(-1, most)
 
     def thinned_after(self, tick: int, most: int) -> Ranges:
@@ -234,7 +236,7 @@ class PairRanges(msgspec.Struct, frozen=True, eq=False, dict=True):
         moved[:1] = True
         for path in self.paths:
             x, y = path.x[ticks], path.y[ticks]
-            moved[1:] |= np.hypot(np.diff(x), np.diff(y)) > ELSEWHERE * self.sensing_range
+            moved[1:] |= np.hypot(np.diff(x), np.diff(y)) > MOVED * self.sensing_range
         return np.flatnonzero(moved)
 
 
@@ -276,7 +278,7 @@ def predicted(guess: Array, places: Array, ranges: Ranges, apart: tuple[float, f
     away = places - anchors[..., :2, None]
     if ranges.place is not None and robots == 1:
         return _to_places(anchors[..., 0, 2:], away[..., 0, :, :], ranges.place)
-    distances = np.maximum(np.hypot(away[..., 0, :], away[..., 1, :]), TINY)
+    distances = np.maximum(np.hypot(away[..., 0, :], away[..., 1, :]), SMALLEST_DISTANCE)
     directions = away / distances[..., None, :]
     distance, jacobian = distances[..., 0, :], np.zeros((*guess.shape[:-1], n, 3 * robots))
     if robots == 2:
@@ -287,7 +289,7 @@ def predicted(guess: Array, places: Array, ranges: Ranges, apart: tuple[float, f
         x, y = away[..., 0, mutual], away[..., 1, mutual]
         wx, wy = c * x - s * y, s * x + c * y
         dx, dy = wx[..., 0, :] - wx[..., 1, :] - apart[0], wy[..., 0, :] - wy[..., 1, :] - apart[1]
-        gap = np.maximum(np.hypot(dx, dy), TINY)
+        gap = np.maximum(np.hypot(dx, dy), SMALLEST_DISTANCE)
         distance[..., mutual] = gap
         nx, ny = (dx / gap)[..., None, :] * SIGNS, (dy / gap)[..., None, :] * SIGNS
         jacobian[..., mutual, 2::3] = (ny * wx - nx * wy).mT
@@ -314,14 +316,14 @@ def _to_places(rotation: Array, away: Array, place: Array) -> Predicted:
     x, y = away[..., 0, :], away[..., 1, :]
     wx, wy = c * x - s * y, s * x + c * y
     dx, dy = wx - place[:, 0], wy - place[:, 1]
-    distance = np.maximum(np.hypot(dx, dy), TINY)
+    distance = np.maximum(np.hypot(dx, dy), SMALLEST_DISTANCE)
     nx, ny = dx / distance, dy / distance
     along, across = c * nx + s * ny, c * ny - s * nx
     jacobian = np.stack((-along, -across, ny * wx - nx * wy), -1)
     return Predicted(distance, jacobian, np.stack((along, across), -2)[..., None, :, :])
 
 
-TINY = 1e-12
+SMALLEST_DISTANCE = 1e-12
 """The distance (m) below which a direction is not defined."""
 
 

@@ -10,12 +10,12 @@ from typing import Any
 from rich.table import Table
 
 from compose.cli.benchmark.bench_table import add_row, new_table
-from compose.cli.benchmark.exact_missions import SEED
+from compose.cli.benchmark.exact_missions import FIRST_SEED
 from compose.launch import in_process
 
 API = "tandem"
 """The package that is measured. It is found by its name, because it is above this one."""
-MISSIONS = {"random": 50, "noisy": 5}
+MISSIONS_PER_SCENARIO = {"random": 50, "noisy": 5}
 """The scenarios, with the number of missions per round: more than the robots' caches of searches hold."""
 
 
@@ -25,11 +25,14 @@ def missions_by_api(rounds: int, done: Callable[[], None]) -> Table:
     Processor times are compared: this process does nothing else.
     """
     api = import_module(API)
-    scenarios = {name: api.Scenario.load(name) for name in MISSIONS}
-    found: dict[str, list[tuple[float, float]]] = {name: [] for name in MISSIONS}
+    scenarios = {name: api.Scenario.load(name) for name in MISSIONS_PER_SCENARIO}
+    found: dict[str, list[tuple[float, float]]] = {name: [] for name in MISSIONS_PER_SCENARIO}
     for draw in range(-1, rounds):
         for name, scenario in scenarios.items():
-            seeds = range(SEED + draw * MISSIONS[name], SEED + (draw + 1) * MISSIONS[name])
+            seeds = range(
+                FIRST_SEED + draw * MISSIONS_PER_SCENARIO[name],
+                FIRST_SEED + (draw + 1) * MISSIONS_PER_SCENARIO[name],
+            )
             if draw < 0:  # imports and warms up
                 _by_engine(scenario, seeds[:1]), _by_api(api, scenario, seeds[:1])
             else:

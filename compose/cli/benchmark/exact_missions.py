@@ -14,15 +14,15 @@ from compose.scenario import scenario_file
 from compose.sweep.trial_mission import run_in_process
 from world.simulation import Simulation
 
-MISSIONS = 200
+MISSIONS_PER_ROUND = 200
 """The number of random missions per round, in one process."""
-SEED = 1000
+FIRST_SEED = 1000
 """The seed of the first of them."""
 
 
 def missions_per_second(rounds: int, done: Callable[[], None]) -> Table:
     """Measure random missions in one process on one core, the world's share of them, and their audit."""
-    scenarios = [scenario_file.load("random", seed=SEED + i) for i in range(MISSIONS)]
+    scenarios = [scenario_file.load("random", seed=FIRST_SEED + i) for i in range(MISSIONS_PER_ROUND)]
     whole: list[float] = []
     world_part: list[float] = []
     audited: list[float] = []
@@ -39,10 +39,20 @@ def missions_per_second(rounds: int, done: Callable[[], None]) -> Table:
         audited.append(time.perf_counter() - began)
         done()
     table = new_table("In-process, one core")
-    add_row(table, f"{MISSIONS} random missions (at least 300)", [MISSIONS / s for s in whole], "missions/s")
-    add_row(table, f"one tick ({ticks / MISSIONS:.1f} per mission)", [1e6 * s / ticks for s in whole], "us")
+    add_row(
+        table,
+        f"{MISSIONS_PER_ROUND} random missions (at least 300)",
+        [MISSIONS_PER_ROUND / s for s in whole],
+        "missions/s",
+    )
+    add_row(
+        table,
+        f"one tick ({ticks / MISSIONS_PER_ROUND:.1f} per mission)",
+        [1e6 * s / ticks for s in whole],
+        "us",
+    )
     add_row(table, "of that, the world", [1e6 * s / ticks for s in world_part], "us")
-    add_row(table, "the same missions, audited", [MISSIONS / s for s in audited], "missions/s")
+    add_row(table, "the same missions, audited", [MISSIONS_PER_ROUND / s for s in audited], "missions/s")
     add_row(table, "audited / not audited", [plain / s for plain, s in zip(whole, audited, strict=True)], "")
     return table
 

@@ -10,7 +10,7 @@ from statistics import median
 from rich.table import Table
 
 from compose.cli.benchmark.bench_table import add_row, new_table
-from compose.cli.benchmark.exact_missions import SEED
+from compose.cli.benchmark.exact_missions import FIRST_SEED
 from compose.launch import in_process
 from compose.scenario import scenario_file
 from world.scenario import Scenario
@@ -23,8 +23,8 @@ GROUPS = 4
 
 def missions_of_groups(rounds: int, done: Callable[[], None]) -> Table:
     """Measure the time of a tick of groups of two sizes, and how it grows; the baseline are random pairs."""
-    groups = [[_group(robots, SEED + i) for i in range(GROUPS)] for robots in SIZES]
-    pairs = [scenario_file.load("random", seed=SEED + i) for i in range(GROUPS * SIZES[0])]
+    groups = [[_group(robots, FIRST_SEED + i) for i in range(GROUPS)] for robots in SIZES]
+    pairs = [scenario_file.load("random", seed=FIRST_SEED + i) for i in range(GROUPS * SIZES[0])]
     of_pairs: list[float] = []
     of_groups: list[list[float]] = [[] for _ in SIZES]
     for _ in range(rounds):

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from agent.process.robot import Robot
 from compose.cli.benchmark.bench_table import add_row, new_table
-from compose.cli.benchmark.exact_missions import SEED
+from compose.cli.benchmark.exact_missions import FIRST_SEED
 from compose.launch.planner_loader import planner_of
 from compose.scenario import scenario_file
 from protocol.messages import RobotConfig
@@ -32,9 +32,9 @@ def noisy_missions(rounds: int, done: Callable[[], None]) -> Table:
     """Measure random missions with range noise of NOISY_SIGMA in one process on one core, by their parts."""
     noise = Noise(anchor_sigma=NOISY_SIGMA, mutual_sigma=NOISY_SIGMA)
     scenarios = [
-        _with_noise(scenario_file.load("random", seed=SEED + i), noise) for i in range(NOISY_MISSIONS)
+        _with_noise(scenario_file.load("random", seed=FIRST_SEED + i), noise) for i in range(NOISY_MISSIONS)
     ]
-    exact = [scenario_file.load("random", seed=SEED + i) for i in range(NOISY_MISSIONS)]
+    exact = [scenario_file.load("random", seed=FIRST_SEED + i) for i in range(NOISY_MISSIONS)]
     parts: list[tuple[float, float, float]] = []
     baseline: list[float] = []
     searches: list[float] = []

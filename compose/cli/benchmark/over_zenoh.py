@@ -26,7 +26,7 @@ from world.process import WorldProcess
 from world.scenario import Scenario
 from world.simulation import Simulation
 
-MISSION = "far"
+LONG_MISSION = "far"
 """A scenario of thousands of ticks, so that the start of the processes does not affect the rate."""
 BARRIER_TICKS = 5000
 """The number of ticks of the baseline, about as many as the mission has."""
@@ -34,7 +34,7 @@ BARRIER_TICKS = 5000
 
 def ticks_per_second(rounds: int, done: Callable[[], None]) -> Table:
     """Measure a mission as processes; the baseline only exchanges frames of the same size over Zenoh."""
-    scenario = scenario_file.load(MISSION)
+    scenario = scenario_file.load(LONG_MISSION)
     sizes = _frame_sizes(scenario)
     missions: list[float] = []
     bare: list[float] = []
@@ -49,7 +49,7 @@ def ticks_per_second(rounds: int, done: Callable[[], None]) -> Table:
         barriers.append(_barrier_rate(scenario, sizes))
         done()
     table = new_table("Ticks/s as processes, two robots")
-    add_row(table, f"a mission ({MISSION}), with journals", missions, "ticks/s")
+    add_row(table, f"a mission ({LONG_MISSION}), with journals", missions, "ticks/s")
     add_row(table, "the same, without journals", bare, "ticks/s")
     add_row(table, "the same, with a client of the page", watched, "ticks/s")
     add_row(table, "the same, over TLS with access control", secured, "ticks/s")

@@ -13,7 +13,7 @@ from pathlib import Path
 from rich.table import Table
 
 from compose.cli.benchmark.bench_table import add_row, new_table
-from compose.cli.benchmark.exact_missions import SEED
+from compose.cli.benchmark.exact_missions import FIRST_SEED
 
 ROBOTS = 200
 """The number of robots in the scenario of many pairs."""
@@ -101,7 +101,7 @@ def _pairs(robots: int) -> str:
         f'[[robot]]\nid = "r{i}"\npeer = "r{i ^ 1}"\nanchor = [{10.0 * (i % 2)}, {40.0 * (i // 2)}]\n'
         for i in range(robots)
     ]
-    return f'name = "pairs"\nseed = {SEED}\n{MANY_MISSION}' + "".join(tables)
+    return f'name = "pairs"\nseed = {FIRST_SEED}\n{MANY_MISSION}' + "".join(tables)
 
 
 def _used(arguments: Sequence[str]) -> tuple[float, float]:

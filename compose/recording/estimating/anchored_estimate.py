@@ -7,7 +7,13 @@ import numpy as np
 from agent.estimation.gaussian.consistency import FINISHED
 from agent.estimation.gaussian.fitted_poses import poses
 from agent.estimation.gaussian.hypotheses import Hypothesis, ScoredHypothesis
-from agent.estimation.gaussian.known_anchors import FEWEST, AnchoredRobot, blocking_reason, follow, search
+from agent.estimation.gaussian.known_anchors import (
+    FEWEST_FOR_POSE,
+    AnchoredRobot,
+    blocking_reason,
+    follow,
+    search,
+)
 from agent.estimation.gaussian.range_model import Ranges
 from compose.recording.estimating.estimate_epoch import (
     GIVEN_UP,
@@ -113,7 +119,7 @@ def anchored_measurements(
     )
 
 
-SEARCH_AT = frozenset((FEWEST, *(8 * 2**n for n in range(12))))
+ANCHORED_SEARCHES = frozenset((FEWEST_FOR_POSE, *(8 * 2**n for n in range(12))))
 """The numbers of ranges at which the whole plane is searched again, as in a mission."""
 
 
@@ -133,11 +139,11 @@ class AnchoredEstimator:
         radio = robot.ranges.radio
         assert radio is not None
         counts = tuple([int(np.count_nonzero(radio == k)) for k in range(len(measured.anchors))])
-        due = any(self._searched < at <= count for at in SEARCH_AT)
+        due = any(self._searched < at <= count for at in ANCHORED_SEARCHES)
         scored = follow(robot, self._known) if self._known and not due else ()
         reason = "" if not scored else self._reason(robot, scored)
         moving = not scored or scored[0].fit.last_step > FINISHED
-        wanted = count >= FEWEST and (moving or (not reason and not self._claimed))
+        wanted = count >= FEWEST_FOR_POSE and (moving or (not reason and not self._claimed))
         if wanted and not due and self._searches >= MOST_SEARCHES:
             reason = reason or GIVEN_UP
         elif wanted:
@@ -145,7 +151,7 @@ class AnchoredEstimator:
             self._searched, self._searches = count, self._searches + 1
             reason = self._reason(robot, scored) if scored else ""
         if not scored:
-            what = "no hypothesis explains the ranges" if count >= FEWEST else "too few ranges"
+            what = "no hypothesis explains the ranges" if count >= FEWEST_FOR_POSE else "too few ranges"
             return EstimateEpoch(t, counts, (), (False,), what, None)
         self._known = tuple([one.hypothesis for one in scored])
         self._claimed = self._claimed or not reason

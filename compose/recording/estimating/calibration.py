@@ -11,7 +11,7 @@ from compose.recording.estimating.estimate_rows import names_of
 from compose.recording.estimating.estimate_run import estimated, measurements, numerics
 from compose.recording.estimating.learned_errors import learned_errors
 from compose.recording.estimating.radio_errors import (
-    FEWEST,
+    FEWEST_ERRORS,
     PairErrors,
     RangeCalibration,
     range_calibration,
@@ -75,12 +75,12 @@ def _by_fit(
     for pair, rows in zip(ranged, ranges.pairs, strict=True):
         t = problem.measured.time_of(ranges.tick[rows])
         most = max(most, len(t))
-        if len(t) >= FEWEST:
+        if len(t) >= FEWEST_ERRORS:
             errors[pair] = PairErrors(t, ranges.rho[rows], fit.residuals[rows])
     if not errors:
         raise UserError(
-            f"{recording.source}: without true poses, {FEWEST} ranges of a pair of radios are needed, and "
-            f"the estimate uses at most {most}: one a second of each pair, and of many ranges only a part"
+            f"{recording.source}: without true poses, {FEWEST_ERRORS} ranges of a pair of radios are needed, "
+            f"and the estimate uses at most {most}: one a second of each pair, and of many ranges only a part"
         )
     names = names_of(used, problem.measured.sides)
     found = range_calibration(errors, "the fit")

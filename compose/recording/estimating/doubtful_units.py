@@ -20,22 +20,22 @@ from compose.recording.estimating.sound_odometry import at_antenna, sound
 from compose.recording.ranging.range_recording import Numbers, Places, RangeRecording, locked
 from compose.recording.ranging.range_steps import NEARLY_ALL, dead_reckoned, speeds
 
-PART_S, PARTS = 40.0, 3
+PART_S, PARTS_OF_PATH = 40.0, 3
 """The length in s of a part, in which odometry hardly drifts, and the largest number that are examined."""
 
 FEWEST, MOST = 8, 48
 """The least number of ranges of a robot to an anchor in a part, and the largest that is used."""
 
-MOST_ANCHORS = 3
+MOST_EXAMINED_ANCHORS = 3
 """The largest number of anchors of a robot that are examined in a part: those with the most ranges."""
 
-DOUBTFUL = 2.5
+LEAST_FACTOR = 2.5
 """The least factor that is suspicious: a foot is 0.3 m.
 
 With 2, a window of 10 s of a real recording whose odometry slips was suspected; with more, feet would not be.
 """
 
-LOG_ALIKE = math.log(DOUBTFUL)
+LOG_ALIKE = math.log(LEAST_FACTOR)
 """The difference of the logarithms of two robots' factors below which they are of one unit."""
 
 DECISIVE = 3.0
@@ -43,7 +43,7 @@ DECISIVE = 3.0
 
 With less, noise and slip would be taken for units; with more, robots that hardly move would be let pass."""
 
-ROUNDING = 1e-3
+SAME_FIT = 1e-3
 """The residuals below which fits do not differ, as a fraction of the ranges."""
 
 SLOW_TURN = 0.5
@@ -158,11 +158,11 @@ def _doubtful_factor(measured: Numbers, true: Numbers) -> float:
     """
     length, off = float(np.median(measured)), measured - true
     factor = max(length, TINY) / max(float(np.median(true)), TINY)
-    if max(factor, 1.0 / factor) <= DOUBTFUL:
+    if max(factor, 1.0 / factor) <= LEAST_FACTOR:
         return 0.0
     bias = float(np.median(off))
-    by_bias = float(np.median(np.abs(off - bias))) + ROUNDING * length
-    by_factor = float(np.median(np.abs(measured - factor * true))) + ROUNDING * length
+    by_bias = float(np.median(np.abs(off - bias))) + SAME_FIT * length
+    by_factor = float(np.median(np.abs(measured - factor * true))) + SAME_FIT * length
     decided = by_bias > DECISIVE * by_factor
     return factor if decided or (abs(bias) > MOST_BIAS and by_factor < DECISIVE * by_bias) else 0.0
 
@@ -176,7 +176,7 @@ def _suspicion(by_odometry: float, by_anchors: float, located: bool) -> str:
 
     `located` is true if the second is measured; otherwise it is 1, or a bound.
     """
-    doubtful = [max(one, 1.0 / one) > DOUBTFUL for one in (by_odometry, by_anchors)]
+    doubtful = [max(one, 1.0 / one) > LEAST_FACTOR for one in (by_odometry, by_anchors)]
     if doubtful == [True, True] and (by_odometry > 1.0) == (by_anchors > 1.0):
         return _sentence("ranges", by_odometry, "odometry and anchors")
     if doubtful == [True, False] and by_odometry > 1.0 and not located:
@@ -233,17 +233,19 @@ class _Fit(NamedTuple):
 
 
 def _groups(recording: RangeRecording, robot: int) -> Iterator[_Group]:
-    """Yield the ranges of `robot` in at most PARTS parts of its path."""
+    """Yield the ranges of `robot` in at most PARTS_OF_PATH parts of its path."""
     ranges, base, own = recording.ranges, len(recording.robots), recording.robots[robot]
     if not len(own.odometry.t0):
         return
     begin, end = float(own.odometry.t0[0]), float(own.odometry.t1[-1])
     rows = np.flatnonzero((ranges.first == robot) & (ranges.second >= base))
-    starts = np.linspace(begin, max(end - PART_S, begin), PARTS if end - begin > PARTS * PART_S else 1)
+    starts = np.linspace(
+        begin, max(end - PART_S, begin), PARTS_OF_PATH if end - begin > PARTS_OF_PATH * PART_S else 1
+    )
     for part, start in enumerate(starts.tolist()):
         inside = rows[(ranges.t[rows] >= start) & (ranges.t[rows] <= min(start + PART_S, end))]
         counts = np.bincount(ranges.second[inside] - base, minlength=len(recording.anchors))
-        for k in np.argsort(-counts, kind="stable")[:MOST_ANCHORS].tolist():
+        for k in np.argsort(-counts, kind="stable")[:MOST_EXAMINED_ANCHORS].tolist():
             if counts[k] < FEWEST:
                 continue
             some: Places = inside[ranges.second[inside] == base + k]
@@ -278,7 +280,7 @@ def _fit(group: _Group, path: Numbers) -> _Fit:
     ]
     free, free_cost = _least(partial(_ranges_to_one, path), np.concatenate(starts), rho)
     factor = _factor(float(free[2]))
-    if plain_cost > DECISIVE * free_cost and max(factor, 1.0 / factor) > DOUBTFUL:
+    if plain_cost > DECISIVE * free_cost and max(factor, 1.0 / factor) > LEAST_FACTOR:
         return _Fit(group.part, group.anchor, path, rho, factor, complex(free[0], free[1]), free_cost)
     return _Fit(group.part, group.anchor, path, rho, 1.0, complex(plain[0], plain[1]), plain_cost)
 
@@ -290,7 +292,7 @@ def _to_anchors(one: _Fit, other: _Fit, apart: float) -> float:
     """
     scale = math.sqrt(one.factor * other.factor)
     found = max(TINY, scale * abs(one.place - other.place) / apart)
-    if max(found, 1.0 / found) <= DOUBTFUL:
+    if max(found, 1.0 / found) <= LEAST_FACTOR:
         return 1.0
     around = _around(one.path, float(np.mean(one.rho)) / scale)
     turns = math.tau * np.arange(BEARINGS) / BEARINGS
@@ -339,7 +341,7 @@ def _least(model: _Model, unknowns: Numbers, rho: Numbers) -> tuple[Numbers, flo
     for _ in range(STEPS):
         predicted, jacobian = model(unknowns)
         residuals = rho - predicted
-        width = 2.0 * np.median(np.abs(residuals), 1, keepdims=True) + ROUNDING * usual
+        width = 2.0 * np.median(np.abs(residuals), 1, keepdims=True) + SAME_FIT * usual
         weighted = (jacobian / (1.0 + np.square(residuals / width))[..., None]).mT
         information = weighted @ jacobian
         diagonal = np.einsum("...ii->...i", information)
@@ -349,7 +351,7 @@ def _least(model: _Model, unknowns: Numbers, rho: Numbers) -> tuple[Numbers, flo
         unknowns = unknowns + change / np.maximum(np.max(effect, 1, keepdims=True), 1.0)
     cost = np.mean(np.abs(rho - model(unknowns)[0]), 1)
     best = int(np.argmin(cost))
-    return unknowns[best], float(cost[best]) + ROUNDING * usual
+    return unknowns[best], float(cost[best]) + SAME_FIT * usual
 
 
 DAMPING, LONGEST_STEP = 1e-3, 0.5
@@ -401,9 +403,9 @@ def _by_polygon(recording: RangeRecording) -> float:
     for _, apart, lengths in _polygons(recording):
         whole = float(np.median(np.sum(lengths, 0)))
         excess = float(np.median(2.0 * np.max(lengths, 0) - np.sum(lengths, 0)))
-        if apart > DOUBTFUL * whole > 0.0:
+        if apart > LEAST_FACTOR * whole > 0.0:
             return max(TINY, whole / apart)
-        if excess > DOUBTFUL * apart > 0.0:
+        if excess > LEAST_FACTOR * apart > 0.0:
             return excess / apart
     return 1.0
 
@@ -418,7 +420,10 @@ def _between_robots(recording: RangeRecording) -> str:
         between, first, second = lengths
         most = first + second + apart
         least = 2.0 * np.maximum(np.maximum(first, second), apart) - most
-        if max(np.median(between - DOUBTFUL * most), np.median(least - DOUBTFUL * between)) > LEAST_GAP:
+        if (
+            max(np.median(between - LEAST_FACTOR * most), np.median(least - LEAST_FACTOR * between))
+            > LEAST_GAP
+        ):
             usual = np.sqrt(np.square(first) + np.square(second) + apart**2)
             factor = float(np.median(np.maximum(between, TINY) / np.maximum(usual, TINY)))
             doubts.append(

@@ -13,13 +13,13 @@ from compose.recording.estimating.estimate_rows import EstimateSummary, PoseEsti
 from protocol import files
 
 CSV_NAME, JSON_NAME = "estimate.csv", "estimate.json"
-COLUMNS = PoseEstimateRow.__struct_fields__
+ESTIMATE_COLUMNS = PoseEstimateRow.__struct_fields__
 """The columns of `estimate.csv`."""
 
 
 def estimate_csv(rows: Sequence[PoseEstimateRow]) -> str:
     """Return the table of `rows`, with a line of column names; numbers are exact."""
-    return "\n".join([",".join(COLUMNS), *map(csv_line, rows), ""])
+    return "\n".join([",".join(ESTIMATE_COLUMNS), *map(csv_line, rows), ""])
 
 
 def csv_line(row: PoseEstimateRow) -> str:

@@ -8,7 +8,7 @@ from agent.estimation.gaussian.consistency import FINISHED
 from agent.estimation.gaussian.joint_claims import blocking_reason, open_position, undetermined
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.joint_search import (
-    NOTHING,
+    NO_HYPOTHESES,
     Certainty,
     JointHypotheses,
     JointHypothesis,
@@ -19,7 +19,7 @@ from agent.estimation.gaussian.joint_search import (
     merged,
     search,
 )
-from agent.estimation.gaussian.least_squares import STEPS
+from agent.estimation.gaussian.least_squares import FIT_STEPS
 from compose.recording.estimating.estimate_epoch import (
     GIVEN_UP,
     MOST_SEARCHES,
@@ -31,7 +31,7 @@ from compose.recording.estimating.estimate_epoch import (
 )
 from compose.recording.estimating.group_measurements import GroupMeasurements
 
-SEARCH_AT = tuple(8 * 2**n for n in range(16))
+GROUP_SEARCHES = tuple(8 * 2**n for n in range(16))
 """The numbers of ranges at which the whole plane is searched again."""
 
 MORE_RANGES = 1.5
@@ -41,13 +41,13 @@ MORE_RANGES = 1.5
 class GroupEstimator:
     """The estimate of several robots, which goes on from epoch to epoch.
 
-    Robots that are located are followed. The whole plane is searched at the numbers of ranges SEARCH_AT, and
-    before the first claim of each robot.
+    Robots that are located are followed. The whole plane is searched at the numbers of ranges GROUP_SEARCHES,
+    and before the first claim of each robot.
     """
 
     def __init__(self, rule: ClaimRule) -> None:
         self._rule = rule
-        self._known: JointHypotheses = NOTHING
+        self._known: JointHypotheses = NO_HYPOTHESES
         self._searched = self._searches = 0
         self._failed: dict[tuple[int, ...], int] = {}
         self._claimed: set[str] = set()
@@ -57,7 +57,7 @@ class GroupEstimator:
         t, (used, reach) = measured.end(number), measured.until(number)
         found = self._extended(self._followed(used), used, reach)
         count = len(used.ranges.rho)
-        due = found.scored and any(self._searched < at <= count for at in SEARCH_AT)
+        due = found.scored and any(self._searched < at <= count for at in GROUP_SEARCHES)
         reasons = self._reasons(found, used, reach)
         claiming = {name for name, reason in reasons.items() if not reason} - self._claimed
         if claiming and not due and self._searches >= MOST_SEARCHES:
@@ -73,10 +73,10 @@ class GroupEstimator:
     def _followed(self, used: JointMeasurements) -> JointHypotheses:
         """Return the known hypotheses with the latest ranges; a fit that still moves takes more steps."""
         if not self._known.scored:
-            return NOTHING
+            return NO_HYPOTHESES
         found = follow(self._known, used)
         moving = found.scored[0].fit.last_step > FINISHED
-        return follow(found, used, STEPS) if moving else found
+        return follow(found, used, FIT_STEPS) if moving else found
 
     def _extended(self, found: JointHypotheses, used: JointMeasurements, reach: float) -> JointHypotheses:
         """Return `found` with further robots; those that failed are tried again with more ranges."""

@@ -74,7 +74,7 @@ def group_measurements(
         known += _manoeuvres(one.id, one.path)
     joint = joint_measurements(Facts(frozenset(known)), assumed.noise, EPOCH_S / prepared.ticks_per_epoch)
     unused = {
-        f"to others than the {MOST_ANCHORS} anchors with the most": len(steps.ranges.t) - len(ranges),
+        f"to others than the {MOST_USED_ANCHORS} anchors with the most": len(steps.ranges.t) - len(ranges),
         "within a second after another": steps.thinned,
         "without odometry of all robots": steps.outside,
         "in a gap of the odometry": steps.in_gaps,
@@ -95,15 +95,15 @@ def group_measurements(
 
 
 def _anchors_of(robot: int, prepared: PreparedSteps) -> tuple[FixedAnchor, ...]:
-    """Return the anchors to which a robot has ranges, at most MOST_ANCHORS, that with the most first."""
+    """Return the anchors to which a robot has ranges, at most MOST_USED_ANCHORS, that with the most first."""
     part, ranges = prepared.part, prepared.steps.ranges
     seconds = ranges.second[ranges.first == robot] - len(part.robots)
     counts = np.bincount(seconds[seconds >= 0], minlength=len(part.anchors)).tolist()
     order = sorted([k for k, count in enumerate(counts) if count], key=lambda k: -counts[k])
-    return tuple([part.anchors[k] for k in order[:MOST_ANCHORS]])
+    return tuple([part.anchors[k] for k in order[:MOST_USED_ANCHORS]])
 
 
-MOST_ANCHORS = 32
+MOST_USED_ANCHORS = 32
 """The largest number of anchors of a robot that are used. Each has a bias of its own, which a fit learns."""
 
 

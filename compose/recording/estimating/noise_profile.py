@@ -58,12 +58,12 @@ def noise_table(calibration: RangeCalibration, anchors: frozenset[str]) -> dict[
         "slow_time": SLOW_TIME_S,
         "wheel_scale": PROFILES[WHEELS]["wheel_scale"],
         "gyro_bias": PROFILES[WHEELS]["gyro_bias"],
-        "strays": min(max(outliers, LEAST_STRAYS), MOST_STRAYS),
+        "strays": min(max(outliers, LEAST_STRAYS), LARGEST_OUTLIER_SHARE),
     }
     return {name: round(value, DIGITS) for name, value in found.items()}
 
 
-MOST_STRAYS = 0.5
+LARGEST_OUTLIER_SHARE = 0.5
 """The largest fraction of outliers for which a profile is written."""
 
 

@@ -10,8 +10,8 @@ from agent.estimation.gaussian.inference import to_second_order
 from agent.estimation.gaussian.range_model import PairRanges
 from agent.estimation.knowledge import Belief, Knowledge
 from agent.planning.pair_claim import (
-    FEWEST_MUTUAL_RANGES,
-    SEARCH_AT,
+    FEWEST_FOR_CLAIM,
+    PAIR_SEARCHES,
     PairInference,
     inferred,
     may_claim,
@@ -29,10 +29,8 @@ from compose.recording.estimating.pair_measurements import PairMeasurements
 from compose.recording.estimating.prepared_steps import OneRobot
 from compose.recording.ranging.range_recording import Numbers
 from protocol.messages import RobotConfig
-from protocol.mission import Anchor, Mission, Role
+from protocol.mission import ROLES, Anchor, Mission, Role
 from protocol.orbits import Orbit, Rendezvous
-
-ROLES: tuple[Role, Role] = ("a", "b")
 
 FREE_SPEED = 10.0
 """The speed (m/s) and turn rate (rad/s) of the mission that stands for a recording; nothing is planned."""
@@ -63,7 +61,7 @@ class PairEstimator:
         pair, t = measured.until(number), measured.end(number)
         known = [_knowledge(measured, role, self._belief, pair, self._rule) for role in ROLES]
         mutual = pair.ranges.counts[2]
-        due = any(self._searched < count <= mutual for count in SEARCH_AT)
+        due = any(self._searched < count <= mutual for count in PAIR_SEARCHES)
         spent = self._searches >= MOST_SEARCHES and not due
         if spent and not self._belief.pair:
             return EstimateEpoch(t, pair.ranges.counts, (), (False, False), GIVEN_UP, None)
@@ -123,7 +121,7 @@ def _inferred(
 ) -> tuple[PairInference | None, list[Belief]]:
     """Return the hypotheses about both robots, and what each of the two makes of them."""
     mutual = pair.ranges.counts[2]
-    if mutual < FEWEST_MUTUAL_RANGES:
+    if mutual < FEWEST_FOR_CLAIM:
         return None, []
     before = known[0].belief.pair
     if follow_only and before:

@@ -146,11 +146,11 @@ def ranged_anchors(recording: RangeRecording, robots: Sequence[str]) -> list[tup
     return found
 
 
-MOST_LISTED = 8
+MOST_LISTED_ANCHORS = 8
 """The largest number of names in a list for a user."""
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return `names` in one line: the first MOST_LISTED, and the number of the others."""
-    more = len(names) - MOST_LISTED
-    return ", ".join(names[:MOST_LISTED]) + (f" and {more} more" if more > 0 else "")
+    """Return `names` in one line: the first MOST_LISTED_ANCHORS, and the number of the others."""
+    more = len(names) - MOST_LISTED_ANCHORS
+    return ", ".join(names[:MOST_LISTED_ANCHORS]) + (f" and {more} more" if more > 0 else "")

@@ -39,13 +39,13 @@ The errors of a radio's ranges within a second are correlated: more of them woul
 tell. With less, claims are too confident.
 """
 
-SILENCE_S = 1.0
+RANGE_SILENCE_S = 1.0
 """The time in s without a range and without the end of an increment after which there are no estimates.
 
 So the measurements bound the number of estimates, not the time between them.
 """
 
-MOST_TICKS = 50
+MOST_TICKS_APART = 50
 """The largest number of ticks in an epoch."""
 
 SHARE = 0.25
@@ -107,10 +107,10 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     """The times in s of all ranges and of the ends of all increments, in order."""
 
     def is_silent(self, epoch: int) -> bool:
-        """Return whether nothing was measured in SILENCE_S before the end of `epoch`: it has no estimate."""
+        """Return whether nothing was measured in RANGE_SILENCE_S before the end of `epoch`: no estimate."""
         end = self.end(epoch)
         before = int(np.searchsorted(self.arrivals, end + SAME_TIME_S))
-        return not before or float(self.arrivals[before - 1]) < end - SILENCE_S
+        return not before or float(self.arrivals[before - 1]) < end - RANGE_SILENCE_S
 
     def end(self, epoch: int) -> float:
         """Return the time in s of the end of `epoch`; the first is 1."""
@@ -209,7 +209,7 @@ def ticks_per_epoch(recording: RangeRecording, noise: Noise) -> int:
     """Return the number of ticks in an epoch, by the speed of the fastest robot (see SHARE)."""
     least = min(noise.anchor_sigma, noise.mutual_sigma)
     fastest = max(float(np.percentile(speeds(one.odometry)[0], NEARLY_ALL)) for one in recording.robots)
-    return min(max(math.ceil(0.5 * EPOCH_S * fastest / (SHARE * max(least, 1e-3))), 1), MOST_TICKS)
+    return min(max(math.ceil(0.5 * EPOCH_S * fastest / (SHARE * max(least, 1e-3))), 1), MOST_TICKS_APART)
 
 
 def levelled(measured: Numbers, higher: Numbers) -> tuple[Numbers, Numbers]:

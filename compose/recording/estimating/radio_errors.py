@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.estimation.gaussian.range_weights import MEDIAN
 from compose.recording.estimating.estimate_rows import TRUTH_GAP_S
 from compose.recording.ranging.range_recording import Numbers, Places, RangeRecording, RecordedRobot
 
@@ -19,16 +20,14 @@ A Gaussian error is so far off once in 16 000. With less, honest errors become o
 make the sigma larger.
 """
 
-MEDIAN = 0.6745
-"""The median of the absolute value of a standard normal variable."""
 
 ROUNDS = 20
 """The largest number of rounds in which outliers are found. Most recordings need five."""
 
-FEWEST = 8
+FEWEST_ERRORS = 8
 """The least number of ranges of a pair from which its errors are determined."""
 
-LEVER = 0.5
+LEAST_SPREAD = 0.5
 """The least spread (m, one sigma) of a pair's ranges from which its own scale follows."""
 
 SLOW_LAG_S, SLOW_TIME_S = 1.0, 2.0
@@ -100,7 +99,7 @@ def true_errors(recording: RangeRecording) -> dict[tuple[str, str], PairErrors]:
                 ends.append(np.tile(np.array((one.x, one.y, one.height)), (len(t), 1)))
         distance = np.sqrt(np.sum(np.square(ends[0] - ends[1]), 1))
         known = np.isfinite(distance)
-        if np.count_nonzero(known) >= FEWEST:
+        if np.count_nonzero(known) >= FEWEST_ERRORS:
             found[pair] = PairErrors(t[known], measured[known], (measured - distance)[known])
     return found
 
@@ -197,15 +196,15 @@ SCALE_PRIOR = 0.05
 
 def _robust_sigma(off: Numbers) -> float:
     """Return the standard deviation by the median of the absolute values, in m."""
-    return max(float(np.median(np.abs(off - np.median(off)))) / MEDIAN, LEAST_SIGMA)
+    return max(float(np.median(np.abs(off - np.median(off)))) / MEDIAN, LEAST_RANGE_SIGMA)
 
 
-LEAST_SIGMA = 1e-4
+LEAST_RANGE_SIGMA = 1e-4
 """The least sigma of ranges in m."""
 
 
 def _own_scale(measured: Numbers, error: Numbers) -> float | None:
-    if np.std(measured) < LEVER:
+    if np.std(measured) < LEAST_SPREAD:
         return None
     return float(np.polyfit(measured, error, 1)[0])
 
@@ -216,7 +215,7 @@ def _slow_sigma(t: Numbers, off: Numbers) -> float:
     inside = after < len(t)
     first, second = np.flatnonzero(inside), after[inside]
     near = np.abs(t[second] - t[first] - SLOW_LAG_S) <= LAG_SHARE * SLOW_LAG_S
-    if np.count_nonzero(near) < FEWEST:
+    if np.count_nonzero(near) < FEWEST_ERRORS:
         return 0.0
     centred = off - np.mean(off)
     common = float(np.mean(centred[first[near]] * centred[second[near]])) * math.exp(SLOW_LAG_S / SLOW_TIME_S)

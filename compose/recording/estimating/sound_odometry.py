@@ -22,7 +22,7 @@ from compose.recording.ranging.range_steps import (
 )
 from protocol.noise import VelocityNoise
 
-UNSTATED = VelocityNoise(v=0.05, omega=0.05, v_floor=0.01, omega_floor=0.01)
+UNSTATED_NOISE = VelocityNoise(v=0.05, omega=0.05, v_floor=0.01, omega_floor=0.01)
 """The noise of odometry whose recording states none, over one second.
 
 It is that of wheels without calibration and of a cheap gyro, and white: a scale or a bias has a prior of its
@@ -113,10 +113,10 @@ def _finite(bound: float) -> float:
 
 
 def _covariance(odometry: RobotOdometry, told: VelocityNoise | None) -> Numbers:
-    """Return the covariance of each increment: `told`, else stated, else UNSTATED; shape (N, 3, 3)."""
+    """Return the covariance of each increment: `told`, else stated, else UNSTATED_NOISE; shape (N, 3, 3)."""
     covariance = odometry.covariance.copy()
     silent = ~np.all(np.isfinite(covariance), axis=(1, 2))
-    noise = told or UNSTATED
+    noise = told or UNSTATED_NOISE
     if told is not None:
         silent[:] = True
     if np.any(silent):

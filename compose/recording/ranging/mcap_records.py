@@ -29,7 +29,7 @@ EXPANSION, SMALL_BYTES = 1000, 1 << 22
 
 JSON has 5 to 50. With zstd, 65 kB can hold 2 GB.
 """
-PIECE_BYTES = 1 << 20
+MCAP_PIECE_BYTES = 1 << 20
 """The number of bytes that are passed over at once."""
 
 
@@ -200,7 +200,7 @@ class _Source:
             self.content = self.upto(length)
             left -= len(self.content)
         else:
-            while left and (passed := len(self.upto(min(left, PIECE_BYTES)))):
+            while left and (passed := len(self.upto(min(left, MCAP_PIECE_BYTES)))):
                 left -= passed
         if left:
             why = f"{self.place} has {length} bytes, of which {length - left} are there: it was cut off"

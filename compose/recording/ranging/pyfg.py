@@ -34,7 +34,7 @@ POSE = re.compile(r"(?P<robot>[A-KM-Za-km-z][A-Za-z]*)(?P<index>[0-9]{1,15})\Z")
 """The name of a pose: the robot and a number. Names with L are those of landmarks."""
 
 COVARIANCE_FIELDS = ("cov_xx", "cov_xy", "cov_xh", "cov_yy", "cov_yh", "cov_hh")
-FIELDS = {
+LINE_FIELDS = {
     "VERTEX_SE2": ("t", "name", "x", "y", "heading"),
     "VERTEX_XY": ("anchor", "x", "y"),
     "EDGE_SE2": ("t", "from", "to", "dx", "dy", "dheading", *COVARIANCE_FIELDS),
@@ -101,12 +101,12 @@ def _take(
     if kind in UNUSED:
         builder.unused[kind] += 1
         return
-    if kind not in FIELDS:
+    if kind not in LINE_FIELDS:
         why = "; only two-dimensional files are read" if re.search("SE3|XYZ", kind) else ""
         raise BadRecording(f"{place}: unknown kind of line {kind[:40]!a}{why}")
-    if len(words) != len(FIELDS[kind]):
-        raise BadRecording(f"{place}: {kind} has {len(words)} fields and needs {len(FIELDS[kind])}")
-    values = dict(zip(FIELDS[kind], words, strict=True))
+    if len(words) != len(LINE_FIELDS[kind]):
+        raise BadRecording(f"{place}: {kind} has {len(words)} fields and needs {len(LINE_FIELDS[kind])}")
+    values = dict(zip(LINE_FIELDS[kind], words, strict=True))
     match kind:
         case "VERTEX_SE2":
             _take_vertex(values, place, graph)
@@ -163,10 +163,10 @@ def _is_covariance(xx: float, xy: float, xh: float, yy: float, yh: float, hh: fl
         return False
     a, b, c = xy / x / y, xh / x / h, yh / y / h
     determinant = 1.0 + 2.0 * a * b * c - a * a - b * b - c * c
-    return max(abs(a), abs(b), abs(c)) <= 1.0 + ROUNDING and determinant >= -ROUNDING
+    return max(abs(a), abs(b), abs(c)) <= 1.0 + DECIMALS_ROUNDING and determinant >= -DECIMALS_ROUNDING
 
 
-ROUNDING = 1e-6
+DECIMALS_ROUNDING = 1e-6
 """The error of correlations from the decimals of a file."""
 
 

@@ -15,12 +15,14 @@ from compose.recording.ranging.run_ranges import ranges_of_run
 from compose.recording.recording_files import journals_in, user_errors
 from compose.recording.run import read
 
-FORMATS = "a .pyfg file, an .mcap file, a folder with odometry.csv and ranges.csv, or a recording of Tandem"
+READABLE_FORMATS = (
+    "a .pyfg file, an .mcap file, a folder with odometry.csv and ranges.csv, or a recording of Tandem"
+)
 """The formats that can be read."""
 
 
 def read_ranges(path: Path, anchors_csv: Path | None = None) -> RangeRecording:
-    """Return the range recording at `path`, one of FORMATS.
+    """Return the range recording at `path`, one of READABLE_FORMATS.
 
     The anchors in the file `anchors_csv` are added, and replace those of the same names.
 
@@ -40,7 +42,7 @@ def read_ranges(path: Path, anchors_csv: Path | None = None) -> RangeRecording:
         path.stat()
     except OSError as error:
         raise BadRecording(f"{error.filename or path} cannot be read: {error.strerror or error}") from None
-    raise BadRecording(f"{path}: it is not {FORMATS}")
+    raise BadRecording(f"{path}: it is not {READABLE_FORMATS}")
 
 
 def _anchors(path: Path) -> list[AnchorRow]:
@@ -58,4 +60,4 @@ def _folder(folder: Path, anchors: Sequence[AnchorRow]) -> RangeRecording:
     if journals_in(folder):
         with user_errors(folder):
             return ranges_of_run(read(folder), anchors)
-    raise BadRecording(f"{folder}: it is not {FORMATS}")
+    raise BadRecording(f"{folder}: it is not {READABLE_FORMATS}")

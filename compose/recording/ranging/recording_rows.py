@@ -134,13 +134,13 @@ UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 """The place in a Covariance6 of each element of the matrix."""
 
 
-NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?", re.ASCII)
+IS_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?", re.ASCII)
 """A number in a text, as C and spreadsheets write it; JSON allows none of `.5`, `5.`, `+3` and `05`."""
 
 
 def number_of(text: str) -> float | str:
     """Return the number in `text`, or `text` if it is none."""
-    return float(text) if NUMBER.fullmatch(text) else text
+    return float(text) if IS_NUMBER.fullmatch(text) else text
 
 
 def row_of(values: dict[str, str], kind: type[RowKind], place: object) -> RowKind:
@@ -282,7 +282,7 @@ class RecordingBuilder:
                 _column([row.t0 for row, _ in rows]),
                 _column([row.t1 for row, _ in rows]),
                 _table([(row.dx, row.dy, row.dheading) for row, _ in rows], 3),
-                locked(_table([stated or UNSTATED for _, stated in rows], 6)[:, UPPER]),
+                locked(_table([stated or UNSTATED_COVARIANCE for _, stated in rows], 6)[:, UPPER]),
             ),
             TruePath(
                 _column([row.t for row in truth]), _table([(row.x, row.y, row.heading) for row in truth], 3)
@@ -314,7 +314,7 @@ class RecordingBuilder:
         return unsorted.rows(np.argsort(times, kind="stable"))
 
 
-UNSTATED = (np.nan,) * 6
+UNSTATED_COVARIANCE = (np.nan,) * 6
 
 
 def _diagonal(dx: float, dy: float, dheading: float) -> Covariance6:

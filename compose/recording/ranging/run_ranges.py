@@ -23,7 +23,7 @@ from protocol.mission import Anchor, Mission
 from protocol.motion import ORIGIN, Controls, step
 from protocol.noise import VelocityNoise
 
-LEAST_SIGMA = 1e-6
+ADDED_SIGMA = 1e-6
 """The standard deviation that is added to every one, in m and rad.
 
 With exact sensors those of the robots are 0, and those of odometry are correlated without it, so that their
@@ -84,8 +84,8 @@ def _ranged(
     mission: Mission,
 ) -> Iterator[RangeRow]:
     """Yield the ranges of one tick; those between two robots once."""
-    sigma = math.hypot(mission.noise.mutual_sigma, LEAST_SIGMA)
-    anchor_sigma = math.hypot(mission.noise.anchor_sigma, LEAST_SIGMA)
+    sigma = math.hypot(mission.noise.mutual_sigma, ADDED_SIGMA)
+    anchor_sigma = math.hypot(mission.noise.anchor_sigma, ADDED_SIGMA)
     seen: set[frozenset[str]] = set()
     for robot, observation in observations.items():
         t = observation.tick * mission.period
@@ -101,7 +101,7 @@ def _ranged(
 def increment_covariance(executed: Controls, period: float, noise: VelocityNoise) -> Covariance6:
     """Return the covariance of the increment of eq. (1a) over `period` s, for `noise` in v and omega.
 
-    LEAST_SIGMA is added, also to the sideways error, which eq. (1a) does not have by itself.
+    ADDED_SIGMA is added, also to the sideways error, which eq. (1a) does not have by itself.
     """
     turn = executed.omega * period
     if abs(turn) < SMALL_TURN:
@@ -115,7 +115,7 @@ def increment_covariance(executed: Controls, period: float, noise: VelocityNoise
         np.array([executed.v * period * ahead_by_turn, executed.v * period * left_by_turn, 1.0]) * period
     )
     q_v, q_omega = noise.variances(executed.v, executed.omega)
-    matrix = q_v * np.outer(by_v, by_v) + q_omega * np.outer(by_omega, by_omega) + LEAST_SIGMA**2 * np.eye(3)
+    matrix = q_v * np.outer(by_v, by_v) + q_omega * np.outer(by_omega, by_omega) + ADDED_SIGMA**2 * np.eye(3)
     xx, xy, xh, yy, yh, hh = [float(value) for value in matrix[np.triu_indices(3)]]
     return (xx, xy, xh, yy, yh, hh)
 

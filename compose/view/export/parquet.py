@@ -22,7 +22,7 @@ from protocol.motion import Covariance, Pose
 from world.referee import errors
 
 _POSE = pa.struct([(name, pa.float64()) for name in Pose.__struct_fields__])
-_KINDS: dict[str, pa.DataType] = {
+_TICK_TYPES: dict[str, pa.DataType] = {
     "tick": pa.int32(),
     "time_s": pa.float64(),
     **dict.fromkeys(("robot", "state", "verdict"), pa.string()),
@@ -33,7 +33,7 @@ _KINDS: dict[str, pa.DataType] = {
 """The types of columns. All others are float64."""
 _MEASURES = ["position_error_m", "heading_error_rad", "position_sigma_m", "heading_sigma_rad", "nees"]
 _COVARIANCE = [f"cov_{name}" for name in Covariance.__struct_fields__]
-COLUMNS = [
+TICK_COLUMNS = [
     *("tick", "time_s"),
     *TickRow.__struct_fields__[1:],
     *("verdict", "local", "world", "probability"),
@@ -58,7 +58,7 @@ def write_ticks(run: Run, rows: Iterable[TickRow], period: float, path: Path) ->
             "verdict": _tag(command.verdict if command is not None else None),
         }
         lines.append(asdict(row) | extra | _estimate(estimates.get((row.robot, row.tick)), row.pose))
-    schema = pa.schema([pa.field(name, _KINDS.get(name, pa.float64())) for name in COLUMNS])
+    schema = pa.schema([pa.field(name, _TICK_TYPES.get(name, pa.float64())) for name in TICK_COLUMNS])
     pq.write_table(pa.Table.from_pylist(lines, schema=schema), path)
 
 

@@ -24,7 +24,7 @@ from protocol.motion import Pose, compose
 
 TICK, TIME = "tick", "time"
 """The timelines."""
-BODY = 0.045
+BODY_OF_SCENE = 0.045
 """The drawn length of a robot, as a fraction of the extent of the scene."""
 RANGES_SHOWN = 1.8
 """The top of the plot of ranges, as a multiple of R; the legend takes the upper part."""
@@ -32,10 +32,10 @@ FPS = 8.0
 """The ticks played each second."""
 HEIGHT = 1.1
 """The height of the eye above the scene, as a multiple of its extent."""
-WIDTHS = {"thin": -0.8, "path": -1.8, "contact": -3.0}
+LINE_RADII = {"thin": -0.8, "path": -1.8, "contact": -3.0}
 """The radii of lines. Negative radii are in pixels of the window."""
 GREEN, GREY = (0, 128, 90), (128, 128, 128)
-LEVELS = {
+RERUN_LEVELS = {
     **dict.fromkeys(("report-lost", "report-damaged", "late", "undecided"), "WARN"),
     "inconsistent": "ERROR",
 }
@@ -132,7 +132,7 @@ class _Drawing:
     def __init__(self, setup: RunSetup, stream: rr.RecordingStream) -> None:
         self._setup = setup
         self._stream = stream
-        self._unit = BODY * box(setup).extent
+        self._unit = BODY_OF_SCENE * box(setup).extent
         self._last: dict[str, Pose] = {}
         self._shown: set[str] = set()
         """The entities of `_while` that are displayed."""
@@ -188,7 +188,7 @@ class _Drawing:
                         self._log(f"plots/{robot.id}/{number}", rr.Scalars(known))
         self._draw_contacts(scene)
         for event in scene.events:
-            self._log("log", rr.TextLog(event.text, level=LEVELS.get(event.kind, "INFO")))
+            self._log("log", rr.TextLog(event.text, level=RERUN_LEVELS.get(event.kind, "INFO")))
 
     def _draw_robot(self, robot: RobotSetup, player: Player) -> None:
         pose = player.pose
@@ -281,6 +281,6 @@ def _lines(
     return rr.LineStrips3D(
         [[(x, y, 0.0) for x, y in strip] for strip in strips],
         colors=[colour],
-        radii=[WIDTHS[width]],
+        radii=[LINE_RADII[width]],
         labels=[label] if label is not None else None,
     )

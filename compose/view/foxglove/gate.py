@@ -23,7 +23,7 @@ HEAD_BYTES = 1 << 14
 """The maximum size of a request's head in bytes."""
 HEAD_S = 10.0
 """The maximum time in s for a request's head to arrive."""
-PIECE_BYTES = 1 << 16
+GATE_PIECE_BYTES = 1 << 16
 """The maximum size in bytes of a forwarded piece."""
 GUESTS = 64
 """The maximum number of forwarded connections; more are refused.
@@ -32,7 +32,7 @@ Without a limit, the SDK's server would run out of descriptors, and accept no mo
 """
 REFUSED = 32
 """The maximum number of connections that are being refused. Further ones wait until they are accepted."""
-REFUSED_S = 1.0
+REFUSED_REQUEST_S = 1.0
 """The time in s for the head of a refused request to arrive, and for the end of an answer to be read."""
 RETRY_S = 0.1
 """The time in s until a connection is accepted after one could not be."""
@@ -91,14 +91,14 @@ class Gate:
                 await self._answer(guest, reader, writer)
             writer.close()
             with suppress(OSError):
-                await asyncio.wait_for(writer.wait_closed(), REFUSED_S)
+                await asyncio.wait_for(writer.wait_closed(), REFUSED_REQUEST_S)
             writer.transport.abort()  # it may hold data that nobody reads
         finally:
             self._guests -= guest
             self._room.release()
 
     async def _answer(self, guest: bool, reader: StreamReader, writer: StreamWriter) -> None:
-        head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), HEAD_S if guest else REFUSED_S)
+        head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), HEAD_S if guest else REFUSED_REQUEST_S)
         if not guest:
             await _refuse(writer, "503 Service Unavailable", "too many connections")
             return
@@ -138,6 +138,6 @@ async def _refuse(writer: StreamWriter, status: str, why: str) -> None:
 
 
 async def _copy(reader: StreamReader, writer: StreamWriter) -> None:
-    while piece := await reader.read(PIECE_BYTES):
+    while piece := await reader.read(GATE_PIECE_BYTES):
         writer.write(piece)
         await writer.drain()

@@ -13,13 +13,13 @@ import msgspec
 
 from compose.recording.run_setup import RunSetup
 from compose.view import colours
-from compose.view.foxglove.views import WORLD, topics
+from compose.view.foxglove.views import WORLD_FRAME, topics
 from compose.view.numbers import PLOTS, PLOTTED
 from compose.view.outlines import box
 
 VISIBLE = ("/stage", "/contact", "body", "belief")
 """The topics, or the ends of a robot's topics, that the scene shows; they contain what the others have."""
-MARGIN = 1.15
+HEIGHT_MARGIN = 1.15
 """The shown height, as a multiple of the extent of the sensing ranges and orbits."""
 FAR_M = 5000.0
 """The least distance of the camera's far plane."""
@@ -58,11 +58,11 @@ def _scene(setup: RunSetup) -> fl.ThreeDeeConfig:
     """Return the scene, which follows nothing and contains all sensing ranges and orbits."""
     scene = box(setup)
     shown = {topic: topic.endswith(VISIBLE) for topic in topics(setup.ids) if topic not in ("/tf", "/log")}
-    frames = [WORLD, *[frame for robot in setup.ids for frame in (robot, f"{robot}/anchor")]]
+    frames = [WORLD_FRAME, *[frame for robot in setup.ids for frame in (robot, f"{robot}/anchor")]]
     return fl.ThreeDeeConfig(
         camera_state=fl.ThreeDeeCameraState(
             perspective=False,
-            distance=MARGIN * scene.extent,
+            distance=HEIGHT_MARGIN * scene.extent,
             phi=0.0,
             theta_offset=0.0,
             target=(0.0, 0.0, 0.0),
@@ -73,7 +73,7 @@ def _scene(setup: RunSetup) -> fl.ThreeDeeConfig:
             far=max(FAR_M, 10.0 * scene.extent),
         ),
         follow_mode="follow-none",
-        follow_tf=WORLD,
+        follow_tf=WORLD_FRAME,
         transforms={f"frame:{one}": fl.BaseRendererLayerSettingsTransform(visible=False) for one in frames},
         topics={
             topic: fl.BaseRendererSceneUpdateTopicSettings(visible=visible)

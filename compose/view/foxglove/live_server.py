@@ -36,9 +36,9 @@ from protocol.network.inbox import Inbox, Interrupted
 from protocol.output import say
 
 HOST = "127.0.0.1"
-LOOK_S = 0.05
+JOURNALS_S = 0.05
 """The interval in s at which the journals are read."""
-WAIT_S = 0.5
+INCOMPLETE_TICK_S = 0.5
 """The time in s to wait for the rest of an incomplete tick once the next tick has begun."""
 SETTLED_S = 1.0
 """The time in s after which a new subscriber certainly receives messages."""
@@ -106,7 +106,7 @@ class Live:
                     self._channels.frame(one, nanoseconds(setup, one.tick))
 
     def _ready(self, setup: RunSetup, now: float) -> list[Scene]:
-        """Return the next scenes that are complete, or incomplete for longer than WAIT_S.
+        """Return the next scenes that are complete, or incomplete for longer than INCOMPLETE_TICK_S.
 
         The last tick is ready only after the mission's end, because its data may still be arriving.
         """
@@ -118,7 +118,7 @@ class Live:
         found = []
         for scene in there:
             whole = all(player.held is not None and player.pose is not None for player in scene.players)
-            if not whole and now - self._since[scene.tick] < WAIT_S:
+            if not whole and now - self._since[scene.tick] < INCOMPLETE_TICK_S:
                 break
             found.append(scene)
         for scene in found:
@@ -185,7 +185,7 @@ def _serve(live: Live, server: WebSocketServer, inbox: Inbox) -> None:
     running = True
     while running:
         try:
-            inbox.next(LOOK_S)
+            inbox.next(JOURNALS_S)
         except Interrupted:
             running = False
         at = live.look(time.monotonic())

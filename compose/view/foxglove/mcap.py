@@ -30,7 +30,7 @@ CHUNK_BYTES = 1 << 18
 """The size of a chunk. Trails of consecutive ticks are similar, so large chunks compress ten times better."""
 NUMBERS = Schema(name="tandem.Numbers", encoding="jsonschema", data=object_schema(Numbers))
 """The schema of the numbers of a robot, which are JSON objects."""
-LONGEST_S = 2**32
+LAST_TIMESTAMP_S = 2**32
 """The largest time in s that Foxglove's timestamps can represent."""
 
 
@@ -126,8 +126,10 @@ def write_mcap(
     run is too long.
     """
     last = max([scene.tick for scene in scenes], default=0)
-    if nanoseconds(setup, last) >= LONGEST_S * 1_000_000_000:
-        raise TooLong(f"the run lasts {last * setup.mission.period:g} s; MCAP can represent {LONGEST_S} s")
+    if nanoseconds(setup, last) >= LAST_TIMESTAMP_S * 1_000_000_000:
+        raise TooLong(
+            f"the run lasts {last * setup.mission.period:g} s; MCAP can represent {LAST_TIMESTAMP_S} s"
+        )
     context = Context()
     channels = Channels(context)
     try:

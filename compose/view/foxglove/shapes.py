@@ -10,7 +10,7 @@ from foxglove import messages as fox
 
 from protocol.motion import Pose
 
-NOWHERE = fox.Pose(position=fox.Vector3(), orientation=fox.Quaternion(w=1.0))
+ORIGIN_POSE = fox.Pose(position=fox.Vector3(), orientation=fox.Quaternion(w=1.0))
 """The pose of the reference frame in itself."""
 CACHED = 1000
 """The number of colours that are stored, since most are used in every tick."""
@@ -51,7 +51,7 @@ def line(points: Sequence[fox.Point3], tint: fox.Color, width: float) -> fox.Lin
     """Return a line through Foxglove points, `width` pixels wide."""
     return fox.LinePrimitive(
         type=fox.LinePrimitiveLineType.LineStrip,
-        pose=NOWHERE,
+        pose=ORIGIN_POSE,
         thickness=width,
         scale_invariant=True,
         points=list(points),

@@ -22,17 +22,17 @@ from compose.view.scene import HeldPoses, Player, Scene
 from protocol.mission import Role
 from protocol.motion import Pose
 
-WORLD = "world"
-TRAIL = 200
+WORLD_FRAME = "world"
+TRAIL_POSES = 200
 """The number of latest poses in a trail."""
-BODY = 0.12
+BODY_OF_RANGE = 0.12
 """The drawn length of a robot, as a fraction of the sensing range R."""
-LEAST = 0.06
+LEAST_OPACITY = 0.06
 """The minimum opacity of a hypothesis."""
-COLOURS: dict[Role, tuple[float, float, float]] = {"a": colours.rgb("a"), "b": colours.rgb("b")}
+RGB_COLOURS: dict[Role, tuple[float, float, float]] = {"a": colours.rgb("a"), "b": colours.rgb("b")}
 GREY = (0.5, 0.5, 0.5)
 GREEN = (0.0, 0.5, 0.35)
-LEVELS = {
+FOXGLOVE_LEVELS = {
     **dict.fromkeys(("report-lost", "report-damaged", "late", "undecided"), fox.LogLevel.Warning),
     "inconsistent": fox.LogLevel.Error,
 }
@@ -73,11 +73,11 @@ def nanoseconds(setup: RunSetup, tick: int) -> int:
 
 
 class Trail:
-    """The latest TRAIL true poses of a robot. Each is converted once for all messages that contain it."""
+    """The latest TRAIL_POSES true poses of a robot. Each is converted once for all its messages."""
 
     def __init__(self) -> None:
-        self.points: deque[fox.Point3] = deque(maxlen=TRAIL)
-        self._poses: deque[bytes] = deque(maxlen=TRAIL)
+        self.points: deque[fox.Point3] = deque(maxlen=TRAIL_POSES)
+        self._poses: deque[bytes] = deque(maxlen=TRAIL_POSES)
         """The encoded poses."""
 
     def add(self, pose: Pose) -> None:
@@ -102,7 +102,7 @@ class Joined(NamedTuple):
 
 def _poses(poses: Sequence[fox.Pose], at: fox.Timestamp | None = None) -> fox.PosesInFrame:
     """Return a part of a message of poses in the world frame; the first part has a time `at`."""
-    return fox.PosesInFrame(timestamp=at, frame_id=WORLD if at is not None else "", poses=list(poses))
+    return fox.PosesInFrame(timestamp=at, frame_id=WORLD_FRAME if at is not None else "", poses=list(poses))
 
 
 class Views:
@@ -110,7 +110,7 @@ class Views:
 
     def __init__(self, setup: RunSetup) -> None:
         self.setup = setup
-        self._unit = BODY * setup.mission.sensing_range
+        self._unit = BODY_OF_RANGE * setup.mission.sensing_range
         self._trails = {robot: Trail() for robot in setup.ids}
         self._latest: Scene | None = None
 
@@ -170,7 +170,7 @@ class Views:
             for child, pose in frames.items():
                 yield fox.FrameTransform(
                     timestamp=at,
-                    parent_frame_id=WORLD,
+                    parent_frame_id=WORLD_FRAME,
                     child_frame_id=child,
                     translation=fox.Vector3(x=pose.x, y=pose.y, z=0.0),
                     rotation=shapes.turned(pose.heading),
@@ -179,7 +179,7 @@ class Views:
     def _robot(self, player: Player, at: fox.Timestamp) -> Iterator[Shown]:
         robot, robot_setup = player.robot, self.setup.robot_setup(player.robot)
         if player.pose is not None:
-            pose = fox.PoseInFrame(timestamp=at, frame_id=WORLD, pose=shapes.pose(player.pose))
+            pose = fox.PoseInFrame(timestamp=at, frame_id=WORLD_FRAME, pose=shapes.pose(player.pose))
             yield Shown(f"/{robot}/pose", pose)
             yield Shown(f"/{robot}/trail", self._trails[robot].message(at))
             yield Shown(f"/{robot}/body", fox.SceneUpdate(entities=[self._body(robot_setup, player, at)]))
@@ -193,7 +193,7 @@ class Views:
     def _body(self, robot_setup: RobotSetup, player: Player, at: fox.Timestamp) -> fox.SceneEntity:
         """Return the drawing of a robot with its activity, its trail, and its anchor range if it has one."""
         assert player.pose is not None
-        hue = COLOURS[player.hue(robot_setup)]
+        hue = RGB_COLOURS[player.hue(robot_setup)]
         colour = shapes.colour(hue)
         lines = []
         texts = [shapes.words(f"{robot_setup.id}: {player.activity}", player.pose, self._unit, colour)]
@@ -207,7 +207,7 @@ class Views:
             texts.append(shapes.words(f"{player.anchor_range:.3f} m", middle, self._unit, colour))
         return fox.SceneEntity(
             timestamp=at,
-            frame_id=WORLD,
+            frame_id=WORLD_FRAME,
             id=robot_setup.id,
             arrows=[shapes.arrow(player.pose, self._unit, colour)],
             lines=lines,
@@ -217,13 +217,13 @@ class Views:
     # --- anchors and contacts ---
 
     def _anchor(self, robot_setup: RobotSetup) -> fox.SceneEntity:
-        colour = GREY if self.setup.visits else COLOURS[robot_setup.role]
+        colour = GREY if self.setup.visits else RGB_COLOURS[robot_setup.role]
         centre = (robot_setup.anchor.x, robot_setup.anchor.y)
         here = Pose(*centre, 0.0)
         size = fox.Vector3(x=self._unit, y=self._unit, z=self._unit)
         return fox.SceneEntity(
             timestamp=shapes.timestamp(0),
-            frame_id=WORLD,
+            frame_id=WORLD_FRAME,
             id=f"{robot_setup.id}/anchor",
             cubes=[fox.CubePrimitive(pose=shapes.pose(here), size=size, color=shapes.colour(colour))],
             lines=[
@@ -241,7 +241,7 @@ class Views:
         ends = [((a.anchor.x, a.anchor.y), (b.anchor.x, b.anchor.y)) for a, b in self.setup.links()]
         return fox.SceneEntity(
             timestamp=shapes.timestamp(0),
-            frame_id=WORLD,
+            frame_id=WORLD_FRAME,
             id="meetings",
             lines=[shapes.strip(two, grey, 1.0) for two in ends],
         )
@@ -264,7 +264,7 @@ class Views:
                 middle = Pose((a.pose.x + b.pose.x) / 2, (a.pose.y + b.pose.y) / 2, 0.0)
                 texts = [shapes.words("\n".join(words), middle, self._unit, shapes.colour(GREEN))]
             yield fox.SceneEntity(
-                timestamp=at, frame_id=WORLD, id=f"{one.id}-{other.id}", lines=lines, texts=texts
+                timestamp=at, frame_id=WORLD_FRAME, id=f"{one.id}-{other.id}", lines=lines, texts=texts
             )
 
     # --- hypotheses ---
@@ -279,12 +279,12 @@ class Views:
         hue: Role,
     ) -> fox.SceneEntity:
         """Return an arrow for each hypothesis, paler if less probable, and where the first one may be."""
-        colour = COLOURS[hue]
+        colour = RGB_COLOURS[hue]
         probability = held.probability or (1.0 / max(1, len(poses)),) * len(poses)
         lines = []
         if held.outline:
             lines.append(shapes.strip(held.outline, shapes.colour(colour), 1.5))
-        shades = [shapes.colour(colour, max(LEAST, share)) for share in probability]
+        shades = [shapes.colour(colour, max(LEAST_OPACITY, share)) for share in probability]
         texts = [
             shapes.words(f"{share:.3g}", pose, self._unit, shade)
             for pose, share, shade in zip(poses, probability, shades, strict=False)
@@ -304,7 +304,7 @@ class Views:
 
 def _hypotheses(robot: str, held: HeldPoses) -> tuple[str, tuple[Pose, ...]]:
     """Return the frame of a robot's hypotheses, and their poses in it."""
-    return (WORLD, held.world) if held.world else (f"{robot}/anchor", held.local)
+    return (WORLD_FRAME, held.world) if held.world else (f"{robot}/anchor", held.local)
 
 
 def _frame(robot_setup: RobotSetup) -> Pose:
@@ -313,7 +313,7 @@ def _frame(robot_setup: RobotSetup) -> Pose:
 
 
 def _line(event: Event, at: fox.Timestamp) -> fox.Log:
-    level = LEVELS.get(event.kind, fox.LogLevel.Info)
+    level = FOXGLOVE_LEVELS.get(event.kind, fox.LogLevel.Info)
     return fox.Log(
         timestamp=at, level=level, message=event.text, name=event.robot or "world", file=event.kind
     )

@@ -10,7 +10,7 @@ from compose.view.pair_data import PairData
 from compose.view.story.caption import Caption, count_word, sentence
 from protocol.messages import Estimate
 
-ALONE = ("straight", "turning", "circling")
+STATES_OF_ONE_MOVER = ("straight", "turning", "circling")
 """The states in which one robot drives to get a second mutual range, while the other stands."""
 
 
@@ -47,7 +47,7 @@ def _alone(pair: PairData) -> str:
     commands = [pair.now.commands.get(robot) for robot in pair.ids]
     if pair.own_planner or len(commands) < 2 or any(one is None or one.phase != 3 for one in commands):
         return ""
-    driving = [robot for robot in pair.ids if pair.state(robot) in ALONE]
+    driving = [robot for robot in pair.ids if pair.state(robot) in STATES_OF_ONE_MOVER]
     standing = [robot for robot in pair.ids if pair.state(robot) == "standing"]
     if not driving or not standing:
         return ""

@@ -13,7 +13,7 @@ from compose.view.story.caption import Caption, attacked, stopped
 from compose.view.words import end_reason
 from protocol.messages import Inconsistent, Localised, MissionEnd, Undecided
 
-MOST_LINKS = 2
+MOST_LISTED_LINKS = 2
 """The largest number of links that a sentence names."""
 
 
@@ -97,7 +97,7 @@ def _silent_links(setup: RunSetup) -> str | None:
         for robot in setup.robots
         if any(fault.on(robot.id, robot.peer) for fault in dead)
     ]
-    if len(links) > MOST_LINKS:
+    if len(links) > MOST_LISTED_LINKS:
         return f"No report arrives on {len(links)} of the {len(setup.robots)} links between robots."
     return f"No report {' or '.join(links)} ever arrives." if links else None
 

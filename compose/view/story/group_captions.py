@@ -17,7 +17,7 @@ from compose.view.words import end_reason
 from protocol.messages import Inconsistent, Localised, MissionEnd, Undecided
 from protocol.motion import travelled
 
-MOST_LISTED = 4
+MOST_LISTED_ROBOTS = 4
 """The largest number of robots or meetings that a sentence names."""
 
 
@@ -157,6 +157,6 @@ def _end(setup: RunSetup, now: TickData, end: MissionEnd) -> Caption:
 
 def _listed(names: Sequence[str], what: str) -> str:
     """Return `names` as a list, or their number if they are many."""
-    if len(names) > MOST_LISTED:
+    if len(names) > MOST_LISTED_ROBOTS:
         return f"{len(names)} {what}"
     return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)

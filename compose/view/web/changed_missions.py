@@ -23,11 +23,11 @@ from world.scenario import RecordedScenario, Scenario
 
 MOST_CHANGED = 8
 """The number of changed missions that a server stores. Of more, the oldest is deleted."""
-MOST_TICKS = 20_000
+MOST_MISSION_TICKS = 20_000
 """The last tick of a changed mission."""
-LONGEST_S = 8.0
+MISSION_S = 8.0
 """The wall time in s after which a mission that has not ended is stopped."""
-LATE = f"the scenario has not been computed after {LONGEST_S:g} s"
+LATE = f"the scenario has not been computed after {MISSION_S:g} s"
 _ARRAY = re.compile(r"\[\n((?: +[-+.\de]+,\n)+) *\]")
 """An array of numbers with one number a line."""
 
@@ -44,13 +44,13 @@ class ChangedMissions:
 
     def values(self, show: WatchedRun) -> Any:
         """Return the values of `show` that can be changed. Raises UserError if it is not run again."""
-        return self._work.result(values_in, _framed(show), within=LONGEST_S, late=LATE)
+        return self._work.result(values_in, _framed(show), within=MISSION_S, late=LATE)
 
     def text(self, show: WatchedRun, change: ScenarioChange) -> str:
         """Return the scenario file of the mission of `show` with the values of `change`. Raises UserError."""
         need("tomli_w")
         found: str = self._work.result(
-            changed_text, _framed(show), msgspec.json.encode(change), within=LONGEST_S, late=LATE
+            changed_text, _framed(show), msgspec.json.encode(change), within=MISSION_S, late=LATE
         )
         return found
 
@@ -64,9 +64,9 @@ class ChangedMissions:
             self._folder = tempfile.TemporaryDirectory(prefix="tandem-")
         out = tempfile.mkdtemp(dir=self._folder.name)
         try:
-            late = f"the mission has not ended after {LONGEST_S:g} s: save it, and run it with `tandem run`"
+            late = f"the mission has not ended after {MISSION_S:g} s: save it, and run it with `tandem run`"
             self._work.result(
-                run_changed, frame, msgspec.json.encode(change), out, within=LONGEST_S, late=late
+                run_changed, frame, msgspec.json.encode(change), out, within=MISSION_S, late=late
             )
             found = Recorded("", Path(out))
             found.load(lambda: self._work.over)
@@ -132,7 +132,7 @@ def run_changed(frame: bytes, change: bytes, out: str) -> None:
 
 
 def _changed(scenario: Scenario, change: bytes) -> ChangedScenario:
-    return changed(scenario, documents.json_value(change, ScenarioChange), MOST_TICKS)
+    return changed(scenario, documents.json_value(change, ScenarioChange), MOST_MISSION_TICKS)
 
 
 def _scenario(frame: bytes) -> Scenario:

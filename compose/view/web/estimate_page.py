@@ -22,7 +22,7 @@ def contents(folder: Path) -> dict[str, Any]:
     """Return the summary and the figures for the page. Raises UserError if the folder cannot be read."""
     try:
         summary = documents.json_value(
-            files.read_inside(folder, ESTIMATE, most=documents.MOST_BYTES), dict[str, Any]
+            files.read_inside(folder, ESTIMATE, most=documents.MOST_DOCUMENT_BYTES), dict[str, Any]
         )
         return {
             "folder": str(folder),

@@ -50,7 +50,7 @@ header, aside, #further, #legend summary, #transport button, #pace { display: no
 #caption { min-height: 2.8rem; }
 """
 """The style that hides the parts of the page which are not the story, or are for the mouse."""
-SHARES = (1.0, 0.72, 0.45, 0.2)
+COLOUR_SHARES = (1.0, 0.72, 0.45, 0.2)
 """The shares of a colour of the page on its background that are colours of the picture."""
 MIXED = (("robot-a", "ink", 0.8), ("robot-b", "ink", 0.8), ("accent", "paper", 0.05))
 """Further colours of the picture, each a share of one colour on another.
@@ -59,7 +59,7 @@ They are those of contact on the time line, and of the range of an anchor.
 """
 REMOVE_S = 2.0
 """The time in s in which the processes of a browser that has been stopped end."""
-SAME = 255
+SAME_PIXEL = 255
 """The colour of pixels that are as in the frame before."""
 
 
@@ -196,14 +196,14 @@ def _gif(frames: list[bytes], check: Callable[[], object]) -> bytes:
     palette = Image.new("P", (1, 1))
     palette.putpalette(_colours())
     shown = [np.asarray(image.quantize(palette=palette, dither=Image.Dither.NONE)) for image in images]
-    changes = [shown[0], *[np.where(now == was, SAME, now) for was, now in pairwise(shown)]]
+    changes = [shown[0], *[np.where(now == was, SAME_PIXEL, now) for was, now in pairwise(shown)]]
     first, *rest = [Image.fromarray(change.astype(np.uint8)) for change in changes]
     for image in (first, *rest):
         image.putpalette(_colours())
     file = BytesIO()
     first.save(
         file, "GIF", save_all=True, append_images=rest, duration=durations, loop=0,
-        transparency=SAME, disposal=1, optimize=False,
+        transparency=SAME_PIXEL, disposal=1, optimize=False,
     )  # fmt: skip
     return file.getvalue()
 
@@ -229,7 +229,7 @@ def _colours() -> list[int]:
     """Return the red, green and blue of all colours of the page's light theme, their shares and MIXED."""
     theme = (PAGE / "style.css").read_text("utf-8").partition("@media")[0]
     named = {name: bytes.fromhex(colour) for name, colour in re.findall(r"--([\w-]+): #([0-9a-f]{6})", theme)}
-    mixed = [(name, "paper", share) for name in named for share in SHARES] + list(MIXED)
+    mixed = [(name, "paper", share) for name in named for share in COLOUR_SHARES] + list(MIXED)
     parts = [
         round(share * part + (1.0 - share) * back)
         for name, under, share in mixed

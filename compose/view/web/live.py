@@ -50,9 +50,9 @@ CARRIED: Mapping[Callable[..., str] | None, Any] = {
 """The message types that each kind of key carries."""
 OF_WORLD = (keys.truth, keys.observation)
 """The kinds of keys under which the world publishes."""
-AHEAD = UNANSWERED - 1
+FRAMES_AHEAD = UNANSWERED - 1
 """The number of ticks by which a robot's frame may precede the world's, which may take another route."""
-LEAP = 100_000
+MOST_TICKS_MISSED = 100_000
 """The number of ticks by which the world may advance between two received frames.
 
 It is more than a world can run while a link is down.
@@ -61,11 +61,11 @@ MOST_RUNS = 1000
 """The maximum number of listed missions."""
 MOST_APPEARING = 10_000
 """The maximum number of robots that wait for the query of their configuration."""
-MOST_LINKS = 100_000
+MOST_COUNTED_LINKS = 100_000
 """The maximum number of robots and of links between them of which frames of one mission are stored."""
-POLL_S = 0.25
+STOP_POLL_S = 0.25
 """The interval in s between checks for the stop request, and between attempts to connect."""
-QUERY_S = 2.0
+LIVE_QUERY_S = 2.0
 """The timeout of a query in s."""
 STALE_SESSION_S = 10.0
 """The time in s without any received frame after which the session is replaced."""
@@ -105,7 +105,7 @@ class ReceivedMission(WatchedRun):
         config = self.known.configs.get(source.robot)
         if source.peer and config is not None and source.peer not in _named_in(config):
             raise RefusedFrame(f"it is for '{source.peer}', which is not in the mission")
-        if len(self._links) >= MOST_LINKS and source[2:] not in self._links:
+        if len(self._links) >= MOST_COUNTED_LINKS and source[2:] not in self._links:
             raise RefusedFrame("there are too many robots")
         self._links.add(source[2:])
         if tick is not None and not self._timely(tick, by_world=source.kind in OF_WORLD):
@@ -124,7 +124,7 @@ class ReceivedMission(WatchedRun):
         Raises RefusedFrame if `tick` is too far in the future.
         """
         latest = self._tick
-        if latest is not None and tick > latest + (LEAP if by_world else AHEAD):
+        if latest is not None and tick > latest + (MOST_TICKS_MISSED if by_world else FRAMES_AHEAD):
             raise RefusedFrame("its tick is in the future")
         if by_world:
             self._tick = max(tick, latest or 0)
@@ -231,7 +231,7 @@ class Listener:
         elif not self._reported and time.monotonic() >= self._looking_since + diagnosis.FIRST_WORD_S:
             self._reported = True
             self._inbox.say(f"no router at {self.endpoint} yet: {diagnosis.why(self._endpoints)}")
-        if self._stop.wait(POLL_S):
+        if self._stop.wait(STOP_POLL_S):
             raise Interrupted("stop")
 
     def _attend(self, link: zenoh.Session) -> None:
@@ -253,9 +253,9 @@ class Listener:
         idle_s = 0.0
         while not self._stop.is_set():
             try:
-                robot = appeared.get(timeout=POLL_S)
+                robot = appeared.get(timeout=STOP_POLL_S)
             except Empty:
-                idle_s = 0.0 if received.is_set() else idle_s + POLL_S
+                idle_s = 0.0 if received.is_set() else idle_s + STOP_POLL_S
                 received.clear()
                 if idle_s >= STALE_SESSION_S:
                     return
@@ -274,6 +274,6 @@ class Listener:
         if known is not None and robot in known.known.configs:
             return
         key = keys.config(run, robot)
-        answer = session.ask(link, key, QUERY_S)
+        answer = session.ask(link, key, LIVE_QUERY_S)
         if isinstance(answer, bytes):
             self._answers.put(Arrival("command", key, answer, Key(keys.config, run, robot)))

@@ -9,7 +9,7 @@ import time
 from contextlib import suppress
 from urllib.parse import quote, urlsplit
 
-TIMEOUT_S = 30.0
+PAGE_TIMEOUT_S = 30.0
 BETWEEN_S = 0.05
 """The time in s that a page waits between two requests while the mission runs (see `page/store.js`)."""
 
@@ -17,8 +17,8 @@ BETWEEN_S = 0.05
 def visit(address: str) -> None:
     """Request the updates and all scenes of the first listed mission until the server ends."""
     place = urlsplit(address).netloc
-    news = http.client.HTTPConnection(place, timeout=TIMEOUT_S)
-    scenes = http.client.HTTPConnection(place, timeout=TIMEOUT_S)
+    news = http.client.HTTPConnection(place, timeout=PAGE_TIMEOUT_S)
+    scenes = http.client.HTTPConnection(place, timeout=PAGE_TIMEOUT_S)
     name, last = "", -1
     while not name:
         news.request("GET", "/api/news")

@@ -19,20 +19,20 @@ import msgspec
 
 from compose.errors import UserError
 from compose.launch import class_loader, model_loader
-from compose.launch.child import LOOK_S, ChildProcess
+from compose.launch.child import END_CHECK_S, ChildProcess
 from compose.launch.forked import ForkServer
 from protocol.output import one_line
-from world.world_models import OWN
+from world.world_models import OWN_MODELS
 
-LENGTH_BYTES = 4
+REQUEST_LENGTH_BYTES = 4
 """The number of bytes of the length before a request."""
-MOST_BYTES = 4 << 30
+MOST_MEMORY_BYTES = 4 << 30
 """The largest size in bytes of the data of a process."""
 MOST_FILE_BYTES = 1 << 30
 """The largest size in bytes of a file that it writes."""
 FUNCTIONS = ("compose.view.web.changed_missions", "compose.view.web.trials", "compose.view.web.site")
 """The modules of the functions that are called."""
-MISSIONS = ("compose.launch.in_process", "compose.scenario.scenario_file")
+MISSION_MODULES = ("compose.launch.in_process", "compose.scenario.scenario_file")
 """The modules that run a mission. They import numpy, which the server itself does not need."""
 
 
@@ -72,12 +72,12 @@ class RequestedWork:
         `late` after the deadline, or if the server has been stopped.
         """
         request = _Request(
-            f"{function.__module__}:{function.__name__}", arguments, class_loader.trusted(), tuple(OWN)
+            f"{function.__module__}:{function.__name__}", arguments, class_loader.trusted(), tuple(OWN_MODELS)
         )
         body = msgspec.msgpack.encode(request)
         child = self._forked()
         try:
-            child.send(len(body).to_bytes(LENGTH_BYTES, "big") + body)
+            child.send(len(body).to_bytes(REQUEST_LENGTH_BYTES, "big") + body)
             answer = self._received(child, within, late)
         finally:
             child.end()
@@ -119,7 +119,7 @@ class RequestedWork:
         while (left := give_up - time.monotonic()) > 0.0:
             with suppress(TimeoutError):
                 if not (part := child.receive(left)):
-                    child.wait(LOOK_S)
+                    child.wait(END_CHECK_S)
                     self._check()
                     return answer
                 answer += part
@@ -135,7 +135,7 @@ def warm_up() -> None:
     """Prepare a fork server for this work: import its functions, and what a mission needs by running one."""
     for module in FUNCTIONS:
         import_module(module)
-    in_process, scenario_file = map(import_module, MISSIONS)
+    in_process, scenario_file = map(import_module, MISSION_MODULES)
     in_process.run_mission(scenario_file.load("paper-1"))
 
 
@@ -143,9 +143,9 @@ def main() -> None:
     """Call the function of the request on standard input, and write its result to standard output."""
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # whatever else is printed must not mix with the answer
-    resource.setrlimit(resource.RLIMIT_DATA, (MOST_BYTES, MOST_BYTES))
+    resource.setrlimit(resource.RLIMIT_DATA, (MOST_MEMORY_BYTES, MOST_MEMORY_BYTES))
     resource.setrlimit(resource.RLIMIT_FSIZE, (MOST_FILE_BYTES, MOST_FILE_BYTES))
-    size = int.from_bytes(sys.stdin.buffer.read(LENGTH_BYTES), "big")
+    size = int.from_bytes(sys.stdin.buffer.read(REQUEST_LENGTH_BYTES), "big")
     request = msgspec.msgpack.decode(sys.stdin.buffer.read(size), type=_Request)
     answers.write(msgspec.msgpack.encode(_answer(request)))
     answers.close()
@@ -162,6 +162,6 @@ def _answer(request: _Request) -> _Answer:
     except UserError as error:
         return _Answer(error=str(error))
     except MemoryError:
-        return _Answer(error=f"it takes more than {MOST_BYTES >> 30} GB of memory")
+        return _Answer(error=f"it takes more than {MOST_MEMORY_BYTES >> 30} GB of memory")
     except Exception as error:  # noqa: BLE001  # of whatever the files of a folder contain
         return _Answer(error=one_line(f"it cannot be computed: {type(error).__name__}: {error}"))

@@ -42,9 +42,9 @@ from compose.view.web.thumbnail import thumbnail
 from protocol import documents
 
 LOOPBACK = "127.0.0.1"
-POLL_S = 0.05
+LIVE_POLL_S = 0.05
 """The interval in s at which runs are polled and updates are sent to pages while a mission is live."""
-IDLE_S = 0.5
+IDLE_POLL_S = 0.5
 """The interval in s at which runs are polled and updates are sent to pages while no mission is live."""
 PLAYERS_AT_ONCE = 4000
 """The maximum number of robots times ticks in one answer: some megabytes and some 10 ms of work."""
@@ -359,7 +359,7 @@ async def _news(site: Site, name: str | None, version: int) -> AsyncIterator[byt
                 }
         if event:
             yield b"data: " + msgspec.json.encode(event) + b"\n\n"
-        await asyncio.sleep(POLL_S if site.waiting else IDLE_S)
+        await asyncio.sleep(LIVE_POLL_S if site.waiting else IDLE_POLL_S)
 
 
 # --- serving ----------------------------------------------------------------------------------------
@@ -432,7 +432,7 @@ async def _serve(site: Site, taken: socket.socket, ready: Ready) -> None:
         if server.started and not announced:
             announced = True
             ready(lambda: _soon(loop, stop))
-        await asyncio.wait([serving], timeout=POLL_S if site.waiting or not announced else IDLE_S)
+        await asyncio.wait([serving], timeout=LIVE_POLL_S if site.waiting or not announced else IDLE_POLL_S)
         site.poll()
     await serving
 

@@ -25,7 +25,7 @@ from protocol.network.endpoints import Endpoints
 
 MOST_FIGURE_BYTES = 64 << 20
 """The largest size of a figure that is shown."""
-LONGEST_S = 60.0
+COMPARISON_S = 60.0
 """The wall time in s that a comparison of two recordings may take."""
 
 
@@ -90,8 +90,8 @@ class Site:
         if not self.compared:
             raise UserError("this server does not show two recordings side by side")
         folders = [str(show.folder) for show in self.recorded]
-        late = f"the recordings are not compared after {LONGEST_S:g} s: use `tandem.open`"
-        return {**self.work.result(compared, *folders, within=LONGEST_S, late=late), "names": folders}
+        late = f"the recordings are not compared after {COMPARISON_S:g} s: use `tandem.open`"
+        return {**self.work.result(compared, *folders, within=COMPARISON_S, late=late), "names": folders}
 
     def start(self) -> None:
         """Start listening on the network."""

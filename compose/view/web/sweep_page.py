@@ -10,17 +10,15 @@ from typing import Any
 import msgspec
 
 from compose.errors import UserError
+from compose.sweep import PARTS, SUMMARY_CSV, SWEEP_JSON
 from protocol import documents, files
 
-SWEEP = "sweep.json"
-SUMMARY = "summary.csv"
-PARTS = "parts"
 FIGURES = "figures"
 
 
 def is_sweep(folder: Path) -> bool:
     """Return whether `folder` contains the results of a sweep."""
-    return (folder / SWEEP).is_file()
+    return (folder / SWEEP_JSON).is_file()
 
 
 def contents(folder: Path) -> dict[str, Any]:
@@ -29,7 +27,9 @@ def contents(folder: Path) -> dict[str, Any]:
     Raises UserError if the folder cannot be read.
     """
     try:
-        manifest = documents.json_value(files.read_inside(folder, SWEEP, most=documents.MOST_BYTES))
+        manifest = documents.json_value(
+            files.read_inside(folder, SWEEP_JSON, most=documents.MOST_DOCUMENT_BYTES)
+        )
         sweep = manifest["sweep"]
         axes = [
             {
@@ -41,8 +41,10 @@ def contents(folder: Path) -> dict[str, Any]:
             for axis in sweep["axes"]
         ]
         rows: list[dict[str, str]] = []
-        if (folder / SUMMARY).is_file():
-            text = files.read_inside(folder, SUMMARY, most=documents.MOST_BYTES).decode("utf-8-sig")
+        if (folder / SUMMARY_CSV).is_file():
+            text = files.read_inside(folder, SUMMARY_CSV, most=documents.MOST_DOCUMENT_BYTES).decode(
+                "utf-8-sig"
+            )
             rows = list(csv.DictReader(StringIO(text, newline="")))
         return {
             "folder": str(folder),
@@ -58,7 +60,9 @@ def contents(folder: Path) -> dict[str, Any]:
     except OSError as error:
         raise UserError(f"{folder} cannot be read: {error.strerror or error}") from None
     except (msgspec.MsgspecError, KeyError, TypeError, UnicodeDecodeError, csv.Error) as error:
-        raise UserError(f"{folder / SWEEP} is not a valid sweep manifest: {documents.flaw(error)}") from None
+        raise UserError(
+            f"{folder / SWEEP_JSON} is not a valid sweep manifest: {documents.flaw(error)}"
+        ) from None
 
 
 def figures(folder: Path) -> list[str]:

@@ -17,7 +17,7 @@ from protocol import documents, files
 MANIFEST, TRIALS = "sweep.json", "trials.parquet"
 MOST_TABLE_BYTES = 1 << 30
 """The largest size of the table of trials that is read."""
-LONGEST_S = 60.0
+TRIAL_S = 60.0
 """The wall time in s after which a trial that has not ended is stopped."""
 
 
@@ -43,9 +43,9 @@ class Trials:
         """Return the worst trial of `cell`; the first call runs it. Raises UserError if that fails."""
         if cell not in self._worst:
             out = tempfile.mkdtemp(dir=self._recordings.name)
-            late = f"the trial has not ended after {LONGEST_S:g} s: print its scenario with `tandem sweep`"
+            late = f"the trial has not ended after {TRIAL_S:g} s: print its scenario with `tandem sweep`"
             outcome, trial, seed = self._work.result(
-                run_worst, str(self._folder), cell, out, within=LONGEST_S, late=f"{late}, and run it"
+                run_worst, str(self._folder), cell, out, within=TRIAL_S, late=f"{late}, and run it"
             )
             show = Recorded(f"cell-{cell}-trial-{trial}", Path(out))
             show.load(lambda: self._work.over)
@@ -76,7 +76,7 @@ def run_worst(folder: str, cell: int, out: str) -> tuple[str, int, int]:
     from compose.sweep.statistics import noted  # noqa: PLC0415
 
     try:
-        manifest = files.read_inside(Path(folder), MANIFEST, most=documents.MOST_BYTES)
+        manifest = files.read_inside(Path(folder), MANIFEST, most=documents.MOST_DOCUMENT_BYTES)
         sweep = documents.json_value(manifest, Manifest).sweep
         found = cell_at(sweep, cell)
         table = BytesIO(files.read_inside(Path(folder), TRIALS, most=MOST_TABLE_BYTES))
