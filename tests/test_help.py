@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import subprocess
 import sys
 
@@ -11,6 +12,12 @@ import pytest
 from compose.cli.main import COMMANDS, CommandEntry, command_parser
 from tests.commands import tandem
 from tests.test_house import HOUSE
+
+
+def test_without_a_command_one_line_says_where_the_commands_are_listed() -> None:
+    ended = tandem()
+    assert (ended.status, ended.out) == (2, "")
+    assert re.fullmatch(r"tandem: COMMAND is missing; `.*tandem --help` lists the commands\n", ended.err)
 
 
 def test_help_lists_every_command_once_under_its_group() -> None:

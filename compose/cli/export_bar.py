@@ -36,7 +36,7 @@ def exported(
 
     # a process with a run of its own may have sessions and threads, with which a fork is not safe
     alone = run is not None
-    with user_errors(folder), counting("tandem export", 0 if quiet else len(FILES)) as done:
+    with user_errors(folder), counting("export", 0 if quiet else len(FILES)) as done:
         run = run or read_noted(folder, "export")
         gc.freeze()  # else each garbage collection goes through all messages again
         return export(run, out, done=done, check=check, alone=alone)

@@ -19,6 +19,7 @@ from typing import NamedTuple, NoReturn
 from compose.errors import BROKEN_PIPE, BUG, FAILED, STOPPED_STATUS, USER_ERROR, UserError
 from compose.launch.interruption import INTERRUPTION
 from compose.terminal import text_width
+from compose.terminal.invocation import program
 from protocol import limits
 from protocol.files import error_text
 from protocol.output import discard, leave, one_line, say
@@ -187,7 +188,10 @@ def _split(arguments: Sequence[str]) -> tuple[CommandEntry, Sequence[str]]:
     place = next(
         (i for i, word in enumerate(arguments) if word == "-" or not word.startswith("-")), len(arguments)
     )
-    named = _top_parser().parse_all(arguments[: place + 1]).command
+    parser = _top_parser()
+    if not arguments:
+        parser.error(f"COMMAND is missing; `{program('tandem')} --help` lists the commands")
+    named = parser.parse_all(arguments[: place + 1]).command
     command = next(one for one in COMMANDS if one.name == named)
     return command, arguments[place + 1 :]
 
