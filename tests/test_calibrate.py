@@ -15,8 +15,9 @@ from compose.recording.estimating.estimate_epoch import ClaimRule
 from compose.recording.estimating.estimate_run import estimated, measurements
 from compose.recording.estimating.noise_files import told_noise
 from compose.recording.estimating.noise_profile import correction_of, noise_table, profile_toml
+from compose.recording.estimating.radio_errors import true_errors
 from compose.recording.ranging.range_files import read_ranges
-from compose.recording.ranging.range_recording import Numbers, RangeRecording
+from compose.recording.ranging.range_recording import Numbers, RangeRecording, TruePath
 from protocol.noise import Noise
 from tests.commands import tandem
 from tests.test_cases_estimates import CASES
@@ -69,6 +70,45 @@ def test_a_stray_range_changes_neither_bias_nor_scale(stray: float, sample: Rang
     for pair, one in expected.pairs.items():
         assert found.pairs[pair].bias == pytest.approx(one.bias, abs=1e-2)
         assert found.pairs[pair].sigma == pytest.approx(one.sigma, abs=1e-2)
+
+
+def with_true_distances(sample: RangeRecording, spread: float, sigma: float) -> RangeRecording:
+    """Return the sample with robots that turn in place, but for a way of `spread` m of A, and noise."""
+    robots = []
+    for one in sample.robots:
+        truth = one.truth
+        assert truth is not None
+        poses = truth.poses.copy()
+        poses[:, :2] = poses[0, :2]
+        poses[:, 0] += spread * np.sin(truth.t) if one.id == "A" else 0.0
+        robots.append(one._replace(truth=TruePath(truth.t, poses)))
+    moved = sample._replace(robots=tuple(robots))
+    exact = sample.ranges.range.copy()
+    errors = true_errors(moved)
+    for pair, rows in moved.pairs().items():
+        known = np.isin(sample.ranges.t[rows], errors[pair].t)
+        exact[rows[known]] = errors[pair].measured - errors[pair].error
+    draws = np.random.default_rng(1)
+    return with_ranges(moved, exact + 0.2 + sigma * draws.normal(size=len(exact)))
+
+
+def test_from_ranges_of_one_length_no_scale_is_told(sample: RangeRecording) -> None:
+    alike = calibrated(with_true_distances(sample, 0.0, 0.05), None, None)
+    assert (alike.scale, alike.scale_told) == (0.0, False)
+    for one in alike.pairs.values():
+        assert one.bias == pytest.approx(0.2, abs=0.02)
+    ended = tandem("calibrate", CASES / "standing")
+    assert ended.status == 0
+    assert "no common scale: the distances of each pair are too much alike" in ended.out
+    assert "range_scale = 0.0\n" in ended.out
+
+
+def test_noise_of_ranges_is_not_taken_for_a_scale(sample: RangeRecording) -> None:
+    found = calibrated(with_true_distances(sample, 4.0, 0.5), None, None)
+    assert found.scale_told
+    assert abs(found.scale) < 0.01
+    for one in found.pairs.values():
+        assert abs(one.bias - 0.2) < 4.0 * one.bias_sigma
 
 
 def test_slow_errors_are_told_from_white_ones(sample: RangeRecording) -> None:

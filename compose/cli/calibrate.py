@@ -90,5 +90,8 @@ def _lines(found: RangeCalibration) -> list[str]:
         for pair, one in found.pairs.items()
     ]
     right = ("ranges", "bias m", "+-", "own scale %", "sigma m", "slow m", "outliers %")
+    if not found.scale_told:
+        alike = "the distances of each pair are too much alike to tell a scale from a bias"
+        return [*shown(("radios",), right, rows), f"no common scale: {alike}; against {found.source}"]
     common = f"common scale {100.0 * found.scale:+.2f} % +- {100.0 * found.scale_sigma:.2f} %"
     return [*shown(("radios",), right, rows), f"{common}; against {found.source}"]

@@ -70,6 +70,8 @@ class RangeCalibration(NamedTuple):
     """The reference: the truth, or the fit."""
     bias_sigma: float = 0.0
     """The standard deviation (m) of what all biases have in common, if it is more than the lines tell."""
+    scale_told: bool = True
+    """False if the distances of each pair are too much alike to tell a scale from a bias: it is 0 then."""
 
 
 class PairErrors(NamedTuple):
@@ -124,21 +126,16 @@ def _antenna(robot: RecordedRobot, t: Numbers) -> Numbers:
 def range_calibration(errors: Mapping[tuple[str, str], PairErrors], source: str) -> RangeCalibration:
     """Return a line through the errors of each pair, with one slope for all, and what is off the lines."""
     names = list(errors)
-    count = len(names)
     which = np.concatenate([np.full(len(errors[name].t), i, np.intp) for i, name in enumerate(names)])
     measured = np.concatenate([errors[name].measured for name in names])
     error = np.concatenate([errors[name].error for name in names])
     repeated = np.array([_repeated(errors[name].t) for name in names])
-    good = np.concatenate([_no_strays(errors[name].error) for name in names])
-    variance = np.ones(count)
-    for step in range(ROUNDS):
-        design = _Design(which, measured, np.where(good, 1.0, 0.0) / (variance * repeated)[which])
-        found, covariance = design.solve(error, count)
-        off = error - found[which] - found[-1] * measured
-        variance = np.square([_robust_sigma(off[which == i]) for i in range(count)])
-        before, good = good, np.square(off) <= OUTLIER_SIGMAS**2 * variance[which]
-        if step and np.array_equal(before, good):
-            break
+    first = np.concatenate([_no_strays(errors[name].error) for name in names])
+    reference = measured - error
+    found, covariance, off, good = _lines(which, reference, error, repeated, first)
+    told = bool(covariance[-1, -1] <= TOLD_SCALE**2)
+    if not told:
+        found, covariance, off, good = _lines(which, np.zeros_like(reference), error, repeated, first)
     pairs = {}
     for i, name in enumerate(names):
         own = which == i
@@ -147,12 +144,33 @@ def range_calibration(errors: Mapping[tuple[str, str], PairErrors], source: str)
             int(np.count_nonzero(own)),
             float(found[i]),
             math.sqrt(covariance[i, i]),
-            _own_scale(measured[inliers], error[inliers]),
+            _own_scale(reference[inliers], error[inliers]),
             float(np.std(off[inliers])),
             _slow_sigma(errors[name].t[good[own]], off[inliers]),
             1.0 - float(np.count_nonzero(inliers)) / float(np.count_nonzero(own)),
         )
-    return RangeCalibration(pairs, float(found[-1]), math.sqrt(covariance[-1, -1]), source)
+    return RangeCalibration(pairs, float(found[-1]), math.sqrt(covariance[-1, -1]), source, scale_told=told)
+
+
+def _lines(
+    which: Places, reference: Numbers, error: Numbers, repeated: Numbers, good: NDArray[np.bool_]
+) -> tuple[Numbers, Numbers, Numbers, NDArray[np.bool_]]:
+    """Return the bias of each pair and the scale, their covariance, and what is off the lines.
+
+    `good` is False for the errors without a part in the first line. The last result is False for outliers.
+    The line is one of the reference, since noise in measured ranges would look like a scale.
+    """
+    count = len(repeated)
+    variance = np.ones(count)
+    for step in range(ROUNDS):
+        design = _Design(which, reference, np.where(good, 1.0, 0.0) / (variance * repeated)[which])
+        line, covariance = design.solve(error, count)
+        off = error - line[which] - line[-1] * reference
+        variance = np.square([_robust_sigma(off[which == i]) for i in range(count)])
+        before, good = good, np.square(off) <= OUTLIER_SIGMAS**2 * variance[which]
+        if step and np.array_equal(before, good):
+            break
+    return line / (1.0 + line[-1]), covariance, off / (1.0 + line[-1]), good
 
 
 def _no_strays(error: Numbers) -> NDArray[np.bool_]:
@@ -175,7 +193,7 @@ class _Design(NamedTuple):
     """The linear model of all errors: a bias for each pair, and a common scale."""
 
     which: Places
-    measured: Numbers
+    reference: Numbers
     weight: Numbers
     """The inverse variance (1 / m^2) of each error; 0 for outliers."""
 
@@ -183,7 +201,7 @@ class _Design(NamedTuple):
         """Return the bias (m) of each pair and the scale, (count + 1,), and their covariance."""
         design = np.zeros((len(error), count + 1))
         design[np.arange(len(error)), self.which] = 1.0
-        design[:, -1] = self.measured
+        design[:, -1] = self.reference
         information = design.T @ (self.weight[:, None] * design)
         information[-1, -1] += 1.0 / SCALE_PRIOR**2
         covariance = np.asarray(np.linalg.inv(information), np.float64)
@@ -192,6 +210,9 @@ class _Design(NamedTuple):
 
 SCALE_PRIOR = 0.05
 """The prior of the common scale: ranges of one length do not tell it from a bias."""
+
+TOLD_SCALE = 0.5 * SCALE_PRIOR
+"""The largest sigma of a scale that is told from a bias. With more, most of it would be the prior."""
 
 
 def _robust_sigma(off: Numbers) -> float:
@@ -203,10 +224,11 @@ LEAST_RANGE_SIGMA = 1e-4
 """The least sigma of ranges in m."""
 
 
-def _own_scale(measured: Numbers, error: Numbers) -> float | None:
-    if np.std(measured) < LEAST_SPREAD:
+def _own_scale(reference: Numbers, error: Numbers) -> float | None:
+    if np.std(reference) < LEAST_SPREAD:
         return None
-    return float(np.polyfit(measured, error, 1)[0])
+    slope = float(np.polyfit(reference, error, 1)[0])
+    return slope / (1.0 + slope)
 
 
 def _slow_sigma(t: Numbers, off: Numbers) -> float:
