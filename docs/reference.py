@@ -64,6 +64,9 @@ PARTS = (
     messages.Localised,
     messages.Undecided,
     messages.Inconsistent,
+    messages.PosePrior,
+    messages.Member,
+    messages.Retry,
 )
 """structs that messages contain, and that have no tables on other pages"""
 NAMES = {
@@ -126,6 +129,8 @@ def _typed(kind: types.Type) -> str:  # noqa: C901, PLR0912  # one line a kind
             return f"number{_bounds(kind)}"
         case types.StrType(max_length=longest):
             return f"text of at most {longest} characters" if longest is not None else "text"
+        case types.BytesType(max_length=longest):
+            return f"at most {longest} bytes"
         case types.LiteralType(values=values):
             return ", ".join(f"`{value}`" for value in values)
         case types.UnionType(types=several):

@@ -4,8 +4,9 @@ The journal of a world also contains its scenario (`world/scenario.py`), and tha
 (`world/hardware/driver_journal.py`).
 
 A message is a frozen struct. It is encoded as a msgpack array: first the tag (the class name in kebab case,
-such as "robot-config"), then the fields in the order in which they are declared here. `protocol/wire.py`
-adds the version and the checksum. `protocol/network/keys.py` defines the key on which each message is sent.
+such as "robot-config"), then the fields in the order in which they are declared here. An optional field that
+is not set takes one byte. `protocol/wire.py` adds the version and the checksum. `protocol/network/keys.py`
+defines the key on which each message is sent.
 
 Units are SI: m, s, rad, and their quotients. Positions and headings are given either in <W>, the world
 frame, or in a robot's anchor frame, which has its origin at the robot's anchor. Tick k begins at k T_s.
@@ -14,13 +15,9 @@ Decoding checks the type and the bounds of every field, which are part of the ty
 ============== ====================================== ==========================================
 Message        Direction                              When
 ============== ====================================== ==========================================
-RobotConfig    world -> robot                         once, in answer to the robot's query; with
-                                                      options of the planner, or in a group, its
-                                                      own kind
+RobotConfig    world -> robot                         once, in answer to the robot's query
 Observation    world -> robot                         every tick
-Report         robot -> its peer                      every tick in which the two are in contact; with a
-                                                      pose or a reference, its own kind
-PlannerReport  robot -> its peer                      in place of Report, by planners with own reports
+Report         robot -> its peer                      every tick in which the two are in contact
 Command        robot -> world                         every tick
 Estimate       robot -> viewers                       every tick
 GroundTruth    world -> viewers                       every tick with a subscriber
@@ -28,7 +25,7 @@ MissionEnd     world -> robot                         once, after the last tick
 FinalReport    robot -> world, and back as an         once, in answer to MissionEnd
                acknowledgement
 TickStart      driver -> driver of the peer; in a     every tick, in hardware mode
-               group, its own kind, to all drivers
+               group, to all drivers
 DeadlineMissed journals only                          each missed deadline, in real time
 Environment    journals only                          once, as the first frame
 ============== ====================================== ==========================================
@@ -50,7 +47,7 @@ from msgspec.structs import force_setattr
 
 from protocol.attack import Attack
 from protocol.mission import HEADING_ACCURACY, Anchor, Mission, Options, PlannerName, Role
-from protocol.motion import ORIGIN, Controls, Covariance, Pose, Segment
+from protocol.motion import Controls, Covariance, Pose, Segment
 from protocol.orbits import Orbit, Rendezvous, visiting
 from protocol.sweep_strips import SweptArea, widest_distance
 from protocol.units import (
@@ -104,7 +101,7 @@ MAX_MEMBERS = 1000
 """The maximum number of robots of a group."""
 
 MAX_BODY_BYTES = 3890
-"""The maximum size of the body of a PlannerReport, so that its frame fits in `wire.MAX_REPORT_BYTES`."""
+"""The maximum size of the body of a Report, so that its frame fits in `wire.MAX_REPORT_BYTES`."""
 
 
 def _cut(struct: msgspec.Struct, field: str) -> None:
@@ -227,78 +224,6 @@ class DeadlineMissed(Message, frozen=True):
 # --- from the world to a robot ---
 
 
-class RobotConfig(Message, frozen=True, dict=True):
-    """The configuration of a robot: everything that its agent needs to start."""
-
-    robot: RobotId
-    """The robot that is configured."""
-    peer: RobotId
-    """The robot that it has to meet."""
-    role: Role
-    """The role of this robot in the pair; its peer has the other one."""
-    anchor: Anchor
-    """The position of the robot's own anchor in <W>, in m."""
-    peer_anchor: Anchor
-    """The position of the peer's anchor in <W>, in m."""
-    mission: Mission
-    """The parameters of the mission, the same for all robots."""
-    planner_name: PlannerName
-    """The name of the planner."""
-    rendezvous: Rendezvous
-    """The orbits of both robots in phase 2."""
-    attack: Attack | None
-    """The false data that the robot injects into its Reports; None for an honest robot."""
-    tick_s: Annotated[float, Meta(gt=0.0, le=1e6)] | None
-    """The duration of a tick in s of wall time; None in lockstep, where a tick has no deadline."""
-
-    @property
-    def planner_options(self) -> Options:
-        """The options of the planner; here, none."""
-        return {}
-
-    @property
-    def heading_accuracy(self) -> float:
-        """The largest sigma (rad) of its heading with which this robot claims its pose."""
-        return HEADING_ACCURACY
-
-    @property
-    def m1(self) -> Anchor:
-        """The anchor M1 of robot a in <W>, in m: the origin of the poses in a fit of the pair."""
-        return self.anchor if self.role == "a" else self.peer_anchor
-
-    @cached_property
-    def anchor_distance(self) -> float:
-        """The distance D between the two anchors, in m."""
-        return math.hypot(self.anchor.x - self.peer_anchor.x, self.anchor.y - self.peer_anchor.y)
-
-    @property
-    def others(self) -> tuple[str, ...]:
-        """The robots that this one may be in contact with, in the order of the mission; here, its peer."""
-        return (self.peer,)
-
-    @property
-    def widest_distance(self) -> float:
-        """The largest distance in m between the anchors of two robots that may meet; here, D."""
-        return self.anchor_distance
-
-    @cached_property
-    def orbit(self) -> Orbit:
-        """The orbit of this robot in phase 2."""
-        return self.rendezvous.of(self.role)
-
-    @property
-    def begins_again(self) -> bool:
-        """True if a robot a that has not met b begins again at phase 1; False if the plan of a group says."""
-        return self.rendezvous.a_searches
-
-
-class RobotConfigWithOptions(RobotConfig, frozen=True, dict=True):
-    """The configuration of a robot whose planner has options."""
-
-    planner_options: Options = {}
-    """The options of the planner, by name."""
-
-
 class Member(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """A robot of a group, as all of them know it."""
 
@@ -310,12 +235,8 @@ class Member(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields
     """The last tick within the planned bound of the time at which it is localised."""
 
 
-NO_SWEEP = SweptArea(0.0, 0.0, 0.0, 0.0, 1)
-"""The sweep of an area without any extent."""
-
-
 class Retry(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """A meeting of a pair that is only needed if earlier ones have failed."""
+    """A meeting of a pair at a given time: one that repeats a failed one, or that confirms a pose."""
 
     peer: RobotId
     """The other robot."""
@@ -336,41 +257,119 @@ Five sigmas are within reach of its search.
 """
 
 
-class RobotConfigInGroup(RobotConfigWithOptions, frozen=True, dict=True):
-    """The configuration of a robot in a group, which meets one robot after another.
+class RobotConfig(Message, frozen=True, dict=True):
+    """The configuration of a robot: everything that its agent needs to start.
 
-    `peer`, `role`, `peer_anchor` and `rendezvous` are those of its first meeting.
+    In a group, `peer`, `role`, `peer_anchor` and `rendezvous` are those of its first meeting. A robot without
+    an anchor is in no meeting: `peer` is the first of the robots that search for it.
     """
 
+    robot: RobotId
+    """The robot that is configured."""
+    peer: RobotId
+    """The robot that it has to meet."""
+    role: Role
+    """The role of this robot in the pair; its peer has the other one."""
+    given_anchor: Anchor | None = msgspec.field(name="anchor")
+    """The position of the robot's own anchor in <W>, in m; None if it has none."""
+    peer_anchor: Anchor
+    """The position of the peer's anchor in <W>, in m."""
+    mission: Mission
+    """The parameters of the mission, the same for all robots."""
+    planner_name: PlannerName
+    """The name of the planner."""
+    rendezvous: Rendezvous
+    """The orbits of both robots in phase 2."""
+    attack: Attack | None = None
+    """The false data that the robot injects into its Reports; None for an honest robot."""
+    tick_s: Annotated[float, Meta(gt=0.0, le=1e6)] | None = None
+    """The duration of a tick in s of wall time; None in lockstep, where a tick has no deadline."""
+    planner_options: Options = {}
+    """The options of the planner, by name."""
     members: Annotated[tuple[Member, ...], Meta(max_length=MAX_MEMBERS)] = ()
-    """All robots of the group that have an anchor, in the order of the scenario."""
+    """All robots of the group that have an anchor, in the order of the scenario; empty in a pair."""
     visits: Annotated[tuple[RobotId, ...], Meta(max_length=MAX_MEMBERS)] = ()
     """The robots that this one visits after its first meeting, in their order."""
     retries: Annotated[tuple[Retry, ...], Meta(max_length=MAX_MEMBERS)] = ()
     """The meetings in which it tries again if it is not localised by then, in their order."""
     gives_up: Time = 0.0
-    """The time in s after which it gives up if it is not localised."""
+    """The time in s after which a robot of a group gives up if it is not localised."""
+    tolerates: Annotated[int, Meta(ge=0, le=MAX_MEMBERS)] = 0
+    """The number of robots that may report false data: one more must agree on a pose before it is claimed."""
+    confirmations: Annotated[tuple[Retry, ...], Meta(max_length=3 * MAX_MEMBERS)] = ()
+    """The visits that it makes for this, in their order. Each lasts until the robot is back at its anchor."""
+    unanchored: Annotated[tuple[RobotId, ...], Meta(max_length=MAX_MEMBERS)] = ()
+    """The robots of the group without an anchor, in the order of the scenario."""
+    sweep: SweptArea | None = None
+    """The area in which they are, and the number of its parts; None if there are none."""
+    part: Count = 0
+    """The part that this robot sweeps first, after its visits."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError if the fields contradict each other; a frame with such fields is refused."""
+        if (self.given_anchor is None) != (self.robot in self.unanchored):
+            raise ValueError("anchor: only the robots in unanchored have none")
+        if bool(self.unanchored) != (self.sweep is not None) or (self.unanchored and not self.members):
+            raise ValueError("unanchored: such robots need members, and a sweep that finds them")
 
     @property
-    def begins_again(self) -> bool:
-        """False: the plan of the group says which robots meet after a missed encounter."""
-        return False
+    def anchor(self) -> Anchor:
+        """The position of the robot's own anchor in <W>, in m. Raises LookupError if it has none."""
+        if self.given_anchor is None:
+            raise LookupError(f"{self.robot} has no anchor")
+        return self.given_anchor
 
     @property
-    def group(self) -> tuple[str, ...]:
-        """All robots of the group, in the order of the mission."""
-        return tuple([one.robot for one in self.members])
+    def m1(self) -> Anchor:
+        """The anchor M1 of robot a in <W>, in m: the origin of the poses in a fit of the pair."""
+        return self.anchor if self.role == "a" else self.peer_anchor
 
-    @property
-    def others(self) -> tuple[str, ...]:
-        """All other robots of the group, in the order of the mission."""
-        return tuple([one for one in self.group if one != self.robot])
+    @cached_property
+    def anchor_distance(self) -> float:
+        """The distance D between the two anchors, in m."""
+        return math.hypot(self.anchor.x - self.peer_anchor.x, self.anchor.y - self.peer_anchor.y)
 
     @cached_property
     def widest_distance(self) -> float:
-        """The largest distance between two anchors of the group, in m."""
-        places = tuple([(one.anchor.x, one.anchor.y) for one in self.members])
-        return widest_distance(places) if len(places) > 1 else self.anchor_distance
+        """The largest distance in m between the anchors of two robots that may meet.
+
+        The corners of the swept area count, too: the poses of robots in it follow from those of robots with
+        an anchor.
+        """
+        places = [(one.anchor.x, one.anchor.y) for one in self.members]
+        if self.sweep is not None:
+            places += self.sweep.corners
+        return widest_distance(tuple(places)) if len(places) > 1 else self.anchor_distance
+
+    @property
+    def group(self) -> tuple[str, ...]:
+        """All robots that this one may be in contact with, and itself, in the order of the mission.
+
+        Robots without an anchor are last.
+        """
+        if self.members:
+            return (*[member.robot for member in self.members], *self.unanchored)
+        return (self.robot, self.peer) if self.role == "a" else (self.peer, self.robot)
+
+    @property
+    def others(self) -> tuple[str, ...]:
+        """The robots that this one may be in contact with, in the order of the mission."""
+        return tuple([robot for robot in self.group if robot != self.robot])
+
+    @cached_property
+    def orbit(self) -> Orbit:
+        """The orbit of this robot in phase 2."""
+        return self.rendezvous.of(self.role)
+
+    @property
+    def begins_again(self) -> bool:
+        """True if a robot a that has not met b begins again at phase 1; False if the plan of a group says."""
+        return not self.members and self.rendezvous.a_searches
+
+    @property
+    def confirms(self) -> bool:
+        """True if the robots meet to confirm poses: some may report false data, and all have an anchor."""
+        return self.tolerates > 0 and not self.unanchored
 
     @cached_property
     def heading_accuracy(self) -> float:
@@ -387,13 +386,13 @@ class RobotConfigInGroup(RobotConfigWithOptions, frozen=True, dict=True):
 
     def member(self, robot: str) -> Member:
         """Return the robot of the group with this id. Raises KeyError if there is none."""
-        for one in self.members:
-            if one.robot == robot:
-                return one
+        for member in self.members:
+            if member.robot == robot:
+                return member
         raise KeyError(robot)
 
-    def in_meeting(self, peer: str, role: Role, orbits: Rendezvous | None = None) -> RobotConfigInGroup:
-        """Return the configuration for a meeting with `peer`, in which this robot has `role`.
+    def in_meeting(self, peer: str, role: Role, orbits: Rendezvous | None = None) -> RobotConfig:
+        """Return the configuration for a meeting with `peer` of the group, in which this robot has `role`.
 
         Without `orbits`, the robot of role a knows its pose, and visits the other one. Raises KeyError if
         there is no such peer.
@@ -403,61 +402,6 @@ class RobotConfigInGroup(RobotConfigWithOptions, frozen=True, dict=True):
             distance = math.hypot(self.anchor.x - anchor.x, self.anchor.y - anchor.y)
             orbits = visiting(self.mission, distance)
         return msgspec.structs.replace(self, peer=peer, role=role, peer_anchor=anchor, rendezvous=orbits)
-
-
-class RobotConfigWithConfirmation(RobotConfigInGroup, frozen=True, dict=True):
-    """The configuration of a robot in a group that tolerates false data: its claim needs several peers."""
-
-    tolerates: Annotated[int, Meta(ge=0, le=MAX_MEMBERS)] = 0
-    """The number of robots that may report false data: one more must agree on a pose before it is claimed."""
-    confirmations: Annotated[tuple[Retry, ...], Meta(max_length=3 * MAX_MEMBERS)] = ()
-    """The visits that it makes for this, in their order. Each lasts until the robot is back at its anchor."""
-
-
-class RobotConfigWithSweep(RobotConfigInGroup, frozen=True, dict=True):
-    """The configuration of a robot that sweeps an area for robots without an anchor, after its visits."""
-
-    unanchored: Annotated[tuple[RobotId, ...], Meta(max_length=MAX_MEMBERS)] = ()
-    """The robots without an anchor, in the order of the scenario."""
-    sweep: SweptArea = NO_SWEEP
-    """The area in which they are, and the number of its parts."""
-    part: Count = 0
-    """The part that this robot sweeps first."""
-    tolerates: Annotated[int, Meta(ge=0, le=MAX_MEMBERS)] = 0
-    """The number of robots that may report false data: one more must agree on a pose before it is claimed."""
-
-    @property
-    def group(self) -> tuple[str, ...]:
-        """All robots of the group: those with an anchor, then those without one."""
-        return (*super().group, *self.unanchored)
-
-    @cached_property
-    def widest_distance(self) -> float:
-        """The largest distance between two anchors of the group or corners of the area, in m.
-
-        The poses of robots in the area follow from those of robots with an anchor.
-        """
-        anchors = [(one.anchor.x, one.anchor.y) for one in self.members]
-        return widest_distance((*anchors, *self.sweep.corners))
-
-
-class RobotConfigWithoutAnchor(RobotConfigWithSweep, frozen=True, dict=True):
-    """The configuration of a robot without an anchor, which waits until a localised robot finds it.
-
-    `anchor` and `peer_anchor` are the centre of the area in which it is. `peer` is the first of the robots
-    that sweep it. There are no visits and retries.
-    """
-
-
-AnyRobotConfig = (
-    RobotConfig
-    | RobotConfigWithOptions
-    | RobotConfigInGroup
-    | RobotConfigWithConfirmation
-    | RobotConfigWithSweep
-    | RobotConfigWithoutAnchor
-)
-"""The kinds of configurations."""
 
 
 class Observation(Message, frozen=True):
@@ -492,93 +436,70 @@ class MissionEnd(Message, frozen=True):
 # --- from a robot ---
 
 
+class PosePrior(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """The pose that a localised robot tells one that has no anchor, and cannot compute it itself."""
+
+    tick: Tick
+    """The tick of `pose`."""
+    pose: Pose
+    """The sender's pose at that tick in <W>: m, m and rad."""
+    covariance: Covariance | None = None
+    """The covariance of the error of `pose`; None with exact sensors."""
+
+
 class Report(Message, frozen=True):
     """The part of a robot's motion log, up to tick k, that its peer has not acknowledged.
 
     Manoeuvres and ranges are acknowledged separately, so that a long backlog of ranges never delays the
     manoeuvres, from which the peer computes where this robot is.
+
+    To a robot without an anchor it has a `prior` instead; with noisy sensors also the manoeuvres since its
+    tick, which stays the same while the two are in contact. So the error of the pose at that tick is one
+    unknown, which counts once.
+
+    With a planner that has reports of its own, it has a `body`, and of the other fields only the verdict and
+    the acknowledgement.
     """
 
     tick: Tick
     """The tick k in which this is sent."""
     robot: RobotId
     """The sender."""
-    phase: Phase
+    phase: Phase = 1
     """The phase of the sender's planner."""
-    state: Word
+    state: Word = ""
     """The state of the sender's planner."""
-    start: Pose | None
+    start: Pose | None = None
     """The sender's pose at tick 0 in its anchor frame: m, m and rad; None until phase 1 is done."""
-    since: Tick
+    since: Tick = 0
     """The tick at which `runs` begins."""
-    through: Tick
+    through: Tick = 0
     """The tick at which `runs` ends: it contains the manoeuvres over [since, through]."""
-    runs: Annotated[tuple[Segment, ...], Meta(max_length=MAX_REPORT_RUNS)]
+    runs: Annotated[tuple[Segment, ...], Meta(max_length=MAX_REPORT_RUNS)] = ()
     """The measured manoeuvres over [since, through], run-length encoded, in m/s and rad/s."""
-    ranges_since: Count
+    ranges_since: Count = 0
     """The number of the sender's anchor ranges that precede `ranges`."""
-    ranges: Annotated[tuple[Ranged, ...], Meta(max_length=MAX_REPORT_RANGES)]
+    ranges: Annotated[tuple[Ranged, ...], Meta(max_length=MAX_REPORT_RANGES)] = ()
     """The sender's ranges to its own anchor, in m, in increasing order of their ticks."""
-    heard: Tick
-    """The acknowledgement of manoeuvres: the sender has the receiver's manoeuvres over [0, heard]."""
-    ranges_heard: Count
+    heard: Tick = 0
+    """The acknowledgement of manoeuvres: the sender has the receiver's manoeuvres over [0, heard].
+
+    With a `body`, it is the tick of the receiver's latest report that the sender has received.
+    """
+    ranges_heard: Count = 0
     """The acknowledgement of ranges: the sender has this many of the receiver's anchor ranges."""
     verdict: Verdict | None = None
-    """The sender's final result; None until it has one."""
+    """The sender's final result; None until it has one. With a `body`, that of the tick before, its reason
+    cut short."""
+    prior: PosePrior | None = None
+    """The sender's pose, for a receiver without an anchor; None to others."""
+    body: Annotated[bytes, Meta(max_length=MAX_BODY_BYTES)] | None = None
+    """The value that `Planner.report` returns, in msgpack; None from the shipped planners."""
 
     @property
     def has_log(self) -> bool:
         """True if this contains the log of the sender; False to a robot that it is not in a meeting with."""
-        return self.start is not None or self.through > 0
-
-
-class ReportWithPose(Report, frozen=True):
-    """The report of a localised robot to one without an anchor, with exact sensors. It has no log.
-
-    The other robot believes the pose: it cannot compute it itself.
-    """
-
-    pose: Pose = ORIGIN
-    """The sender's pose at tick k in <W>: m, m and rad."""
-
-
-class ReportWithReference(Report, frozen=True):
-    """The report of a localised robot to one without an anchor, with noisy sensors.
-
-    Its log begins at the reference tick, which stays the same while the two are in contact. So the error of
-    the pose at that tick is one unknown, which counts once.
-    """
-
-    reference: Tick = 0
-    """The tick of `pose`; `since` is not before it."""
-    pose: Pose = ORIGIN
-    """The sender's estimate of its pose at that tick in <W>: m, m and rad."""
-    covariance: Covariance = Covariance(1.0, 0.0, 0.0, 1.0, 0.0, 1.0)
-    """The covariance of the error of `pose`."""
-
-    @property
-    def has_log(self) -> bool:
-        """Return False: the two are in no meeting."""
-        return False
-
-
-class PlannerReport(Message, frozen=True):
-    """A report whose content only the planners of the two robots understand."""
-
-    tick: Tick
-    """The tick k in which this is sent."""
-    robot: RobotId
-    """The sender."""
-    heard: Tick | None
-    """The tick of the receiver's latest report that the sender has received; None if there is none."""
-    verdict: Verdict | None
-    """The sender's final result until the tick before, with a short reason; None until it has one."""
-    body: Annotated[bytes, Meta(max_length=MAX_BODY_BYTES)]
-    """The content, in msgpack: the value that `Planner.report` returns."""
-
-
-PeerReport = Report | ReportWithPose | ReportWithReference | PlannerReport
-"""The messages from a robot to its peer."""
+        return self.prior is None and (self.start is not None or self.through > 0)
 
 
 class Command(Message, frozen=True):
@@ -690,37 +611,25 @@ class GroundTruth(Message, frozen=True):
 class TickStart(Message, frozen=True):
     """The start of tick k at one robot's driver, from which the peer's driver sets its clock.
 
-    A driver also sends it to its own agent, while it waits for other robots and tick k cannot begin yet.
+    A driver also sends it to its own agent, while it waits for other robots and tick k cannot begin yet. In a
+    group, it also contains what ends the mission of others.
     """
 
     tick: Tick
     """The tick k."""
     robot: RobotId
     """The robot of the sending driver."""
-
-
-class TickStartInGroup(TickStart, frozen=True):
-    """The start of tick k at the driver of a robot in a group, with what ends the mission of others."""
-
     verdict: Verdict | None = None
-    """The final result of the robot; None until it has one."""
+    """The final result of a robot of a group; None until it has one, and in a pair."""
     complete: bool = False
-    """True if the robot has its result, and waits for no other robot."""
+    """True if a robot of a group has its result, and waits for no other robot."""
 
 
 OfRobot = (
     Environment
     | RobotConfig
-    | RobotConfigWithOptions
-    | RobotConfigInGroup
-    | RobotConfigWithConfirmation
-    | RobotConfigWithSweep
-    | RobotConfigWithoutAnchor
     | Observation
     | Report
-    | ReportWithPose
-    | ReportWithReference
-    | PlannerReport
     | Command
     | Estimate
     | DeadlineMissed

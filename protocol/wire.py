@@ -12,9 +12,9 @@ from typing import Any, TypeVar, overload
 
 import msgspec
 
-VERSION = 2
+VERSION = 3
 """The version of the protocol."""
-RELEASES = {1: "0.1"}
+RELEASES = {1: "0.1", 2: "0.2"}
 """The minor version of Tandem that has each earlier version of the protocol."""
 MAX_SENT_BYTES = 1 << 15
 """The maximum size of a frame on the network. From about 48 kB on, a low-latency Zenoh link breaks."""

@@ -160,10 +160,9 @@ def _sweep_of(
         for value in axis.get("values", ()):
             if isinstance(value, str):
                 need_module(value)
-    given = table.get("scenario")
-    within = given.table if isinstance(given, Scenario) else None
+    given, within = table.get("scenario"), None
     if isinstance(given, Scenario):
-        table = {**table, "scenario": given.source}
+        table, within = {**table, "scenario": given.source}, given.table
     numbers = {name: value for name, value in (("trials", trials), ("seed", seed)) if value is not None}
     return spec.validated({**table, **numbers}, str(table.get("name", "sweep")), Path(), base=within)
 

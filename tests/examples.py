@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from msgspec.structs import asdict
+from msgspec.structs import replace
 
 from compose.scenario.scenario_file import load
 from protocol.messages import (
@@ -18,14 +18,10 @@ from protocol.messages import (
     Message,
     MissionEnd,
     Observation,
-    PlannerReport,
+    PosePrior,
     Ranged,
     Report,
-    ReportWithPose,
-    ReportWithReference,
-    RobotConfigWithOptions,
     TickStart,
-    TickStartInGroup,
     Undecided,
 )
 from protocol.motion import Controls, Covariance, Pose, Segment
@@ -53,25 +49,19 @@ EXAMPLES: tuple[Message, ...] = (
         ranges_heard=2,
         verdict=Undecided("no pose explains the anchor ranges"),
     ),
-    Report(0, "a", 1, "asleep", None, 0, 0, (), 0, (), 0, 0),
-    ReportWithPose(9, "a", 2, "sweeping", None, 0, 0, (), 3, (), 0, 0, Localised(POSE), POSE),
-    ReportWithReference(
+    Report(0, "a", 1, "asleep"),
+    Report(9, "a", 2, "sweeping", ranges_since=3, verdict=Localised(POSE), prior=PosePrior(9, POSE)),
+    Report(
         tick=9,
         robot="a",
         phase=3,
         state="looping",
-        start=None,
         since=7,
         through=9,
         runs=(Segment(2, 0.5, -0.25),),
         ranges_since=3,
-        ranges=(),
-        heard=0,
-        ranges_heard=0,
         verdict=Localised(POSE),
-        reference=6,
-        pose=POSE,
-        covariance=Covariance(0.5, 0.25, 0.0, 0.75, -0.5, 1.0),
+        prior=PosePrior(6, POSE, Covariance(0.5, 0.25, 0.0, 0.75, -0.5, 1.0)),
     ),
     Command(3, "b", 0.5, 0.25, 3, "localised", Localised(POSE, Covariance(0.5, 0.25, 0.0, 0.75, -0.5, 1.0))),
     Command(5, "b", 0.0, 0.0, 3, "localised", Localised(POSE)),
@@ -91,13 +81,11 @@ EXAMPLES: tuple[Message, ...] = (
     Mark(4, "a", (0.5, -1.0)),
     ProcessStart("6f1c2a", synced=True),
     TickStart(7, "a"),
-    TickStartInGroup(7, "a", Localised(POSE), complete=True),
+    TickStart(7, "a", Localised(POSE), complete=True),
     Command(
         4, "b", 0.0, 0.0, 3, "inconsistent", Inconsistent("a start that it told otherwise before", 0.5, 0.25)
     ),
-    RobotConfigWithOptions(
-        **asdict(CONFIG), planner_options={"step": 2, "gain": 0.5, "way": "left", "on": True}
-    ),
-    PlannerReport(9, "a", 8, Undecided("no pose"), b"\x93\x01\x02\x03"),
-    PlannerReport(0, "a", None, None, b""),
+    replace(CONFIG, planner_options={"step": 2, "gain": 0.5, "way": "left", "on": True}),
+    Report(9, "a", heard=8, verdict=Undecided("no pose"), body=b"\x93\x01\x02\x03"),
+    Report(0, "a", body=b""),
 )

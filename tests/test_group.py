@@ -26,7 +26,7 @@ from compose.launch.in_process import run_mission
 from compose.launch.planner_loader import planner_of
 from compose.recording.run import Run, read
 from compose.scenario.scenario_file import validate
-from protocol.messages import Contact, Localised, Observation, Report, RobotConfigInGroup, Undecided
+from protocol.messages import Contact, Localised, Observation, Report, Undecided
 from protocol.mission import HEADING_ACCURACY, Mission
 from protocol.motion import Pose, step
 from protocol.orbits import SHORT_OF_ANCHOR, search_legs, search_ticks
@@ -217,7 +217,6 @@ def test_the_configuration_of_a_robot_names_its_group_and_its_visits() -> None:
     scenario = group_of(4, 2)
     for robot in scenario.robots:
         config = scenario.config(robot.id)
-        assert isinstance(config, RobotConfigInGroup)
         assert [one.robot for one in config.members] == ["r0", "r1", "r2", "r3"]
         visited = [one.visited for one in scenario.meetings if one.visitor == robot.id]
         assert list(config.visits) == [one for one in visited if one != config.peer]
@@ -397,7 +396,7 @@ def test_pairs_are_no_group() -> None:
     scenario = validate(table, "group.toml").seeded(None)
     assert scenario.meetings == ()
     assert scenario.radio_pairs() == ((0, 1), (2, 3))
-    assert not isinstance(scenario.config("r0"), RobotConfigInGroup)
+    assert scenario.config("r0").others == ("r1",)
     assert replace(scenario, seed=1).pairs() == ((0, 1), (2, 3))
 
 
@@ -405,7 +404,6 @@ def test_a_robot_leaves_for_a_far_visit_only_with_an_accurate_heading() -> None:
     scenario = group_of(8, 16, sigma=0.05)
     for robot in scenario.robots:
         config = scenario.config(robot.id)
-        assert isinstance(config, RobotConfigInGroup)
         if not config.visits:
             assert config.heading_accuracy == HEADING_ACCURACY
             continue

@@ -36,7 +36,7 @@ from compose.scenario.scenario_file import ScenarioTemplate, validate
 from compose.sweep import spec
 from compose.sweep.cells import cells, setting_of
 from compose.sweep.group_columns import group_columns
-from protocol.messages import Localised, Report, RobotConfigWithConfirmation, Undecided
+from protocol.messages import Localised, Report, Undecided
 from protocol.motion import Covariance, Pose
 from tests.groups import random_table, table_of
 from tests.test_audit import kept
@@ -81,7 +81,7 @@ def states(run: Run, robot: str) -> list[GroupState]:
     state, found = planner.start(agent.config), []
     for one in agent.steps:
         state = planner.observe(state, one.observation)
-        state = planner.decide(state, [framed.report for framed in one.received])  # type: ignore[misc]
+        state = planner.decide(state, [framed.report for framed in one.received])
         found.append(state)
     return found
 
@@ -226,7 +226,7 @@ def test_a_robot_compares_its_meetings_once_more_before_it_gives_up() -> None:
     tick = next(tick for tick, one in enumerate(found) if one.verdict is not None)
     before, after, step = found[tick - 1], found[tick], run.agents["r1"].steps[tick]
     config = before.config
-    assert isinstance(config, RobotConfigWithConfirmation)
+    assert config.confirms
     assert isinstance(after.verdict, Localised)
     assert after.fix is not None
     assert after.fix.tick < after.pair.tick  # no meeting has just ended
@@ -314,7 +314,7 @@ def test_a_robot_is_told_the_visits_that_it_makes() -> None:
     assert scenario.confirmation is not None
     for robot in scenario.robots:
         config = scenario.config(robot.id)
-        assert isinstance(config, RobotConfigWithConfirmation)
+        assert config.confirms
         planned = [one.visited for one in scenario.confirmation.visits if one.visitor == robot.id]
         assert [one.peer for one in config.confirmations] == planned
 

@@ -21,9 +21,8 @@ from protocol.messages import (
     Localised,
     MissionEnd,
     Observation,
-    RobotConfigInGroup,
+    RobotConfig,
     TickStart,
-    TickStartInGroup,
     Undecided,
     Verdict,
 )
@@ -45,10 +44,8 @@ TICK_S = (1.0 + THINKING) * MANOEUVRE_S
 LOCALISED = Localised(ORIGIN)
 
 
-def config_in_group(robot: str) -> RobotConfigInGroup:
-    config = config_of(parse(FAR, "four"), robot, MANOEUVRE_S)
-    assert isinstance(config, RobotConfigInGroup)
-    return config
+def config_in_group(robot: str) -> RobotConfig:
+    return config_of(parse(FAR, "four"), robot, MANOEUVRE_S)
 
 
 @pytest.fixture
@@ -103,13 +100,13 @@ class Member:
     def started(self) -> list[int]:
         """Return the ticks of the TickStarts that it has sent."""
         key = keys.tick_start("r", self._robot)
-        return [decode(frame, TickStartInGroup).tick for to, frame in self._stage.put_frames if to == key]
+        return [decode(frame, TickStart).tick for to, frame in self._stage.put_frames if to == key]
 
 
 def begins(stage: Stage, robot: str, ticks: Mapping[int, float]) -> None:
     """Let the driver of `robot` send the TickStart of each of `ticks` at its time."""
     for tick, at in ticks.items():
-        stage.comes("tick-start", keys.tick_start("r", robot), encode(TickStartInGroup(tick, robot)), at)
+        stage.comes("tick-start", keys.tick_start("r", robot), encode(TickStart(tick, robot)), at)
 
 
 # --- whose ticks --------------------------------------------------------------------------------------
@@ -201,8 +198,8 @@ def test_a_robot_of_a_group_that_is_alone_does_not_begin(stage: Stage) -> None:
 # --- the end ------------------------------------------------------------------------------------------
 
 
-def result(robot: str, verdict: Verdict | None = LOCALISED, *, complete: bool = True) -> TickStartInGroup:
-    return TickStartInGroup(7, robot, verdict, complete)
+def result(robot: str, verdict: Verdict | None = LOCALISED, *, complete: bool = True) -> TickStart:
+    return TickStart(7, robot, verdict, complete)
 
 
 @pytest.fixture
@@ -227,7 +224,6 @@ def test_the_own_result_of_a_robot_does_not_end_its_mission_while_others_have_no
         assert ending.receive(result(robot))
     assert ends(ending, range(10, 700)) is None
     start = ending.tick_start(700)
-    assert isinstance(start, TickStartInGroup)
     assert (start.verdict, start.complete) == (LOCALISED, False)
 
 
@@ -235,7 +231,7 @@ def test_the_mission_ends_when_all_know_that_all_have_results(ending: GroupEndin
     for robot in "bcd":
         ending.receive(result(robot, complete=robot != "c"))
     assert ends(ending, range(10, 50)) is None
-    assert ending.tick_start(50) == TickStartInGroup(50, "a", LOCALISED, complete=True)
+    assert ending.tick_start(50) == TickStart(50, "a", LOCALISED, complete=True)
     assert ending.receive(result("c"))
     assert not ending.receive(result("c"))
     assert ends(ending, range(50, 90)) == MissionEnd(50 + LAST_WORDS, "localised", None)

@@ -17,7 +17,7 @@ from compose.launch.processes import free_endpoint
 from compose.scenario.scenario_file import parse
 from docs.rover import BODY
 from protocol.journal import journal_file
-from protocol.messages import Observation, RobotConfigInGroup
+from protocol.messages import Observation
 from protocol.motion import Pose, step
 from protocol.wire import MAX_FRAME_BYTES, decode
 from tests.commands import BOUND_S, SECTION_IV, Ended, TandemProcess, processes_of, size, tandem, until
@@ -160,7 +160,7 @@ def all_are_localised(out: Path, four: Group) -> dict[str, Ended]:
         assert ended.status == 0, ended.out + ended.err
         assert f"{name}: localised after" in ended.out
         agent = told(out, name)
-        assert isinstance(agent.config, RobotConfigInGroup)
+        assert agent.config.members
         found = pose_at_end(out, name)
         assert (found.x, found.y) == pytest.approx(pose(ended, name, "truly at")[:2], abs=1e-6)
         assert [one.observation.tick for one in agent.steps] == list(range(len(agent.steps)))

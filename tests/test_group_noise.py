@@ -21,7 +21,7 @@ from compose.launch.planner_loader import planner_of
 from compose.recording.run import read
 from compose.scenario.group_meetings import ALLOWED_SIDES
 from compose.scenario.scenario_file import validate
-from protocol.messages import Localised, RobotConfigInGroup, Undecided
+from protocol.messages import Localised, Undecided
 from protocol.mission import Mission
 from protocol.motion import ORIGIN, Covariance, Pose, compose, inverse, step
 from protocol.noise import Noise, VelocityNoise
@@ -102,7 +102,6 @@ SMALL = Covariance(0.01, 0.0, 0.0, 0.01, 0.0, 0.01)
 def after_meetings(agreeing: tuple[str, ...]) -> GroupState:
     """Return the state of r0 in a meeting with r1, if those with `agreeing` have given the same pose."""
     config = group_of(5, 1, sigma=SIGMA).config("r0")
-    assert isinstance(config, RobotConfigInGroup)
     planner = planner_of(config)
     assert isinstance(planner, GroupPlanner)
     state = planner.start(config.in_meeting("r1", "a"))

@@ -40,7 +40,7 @@ from tests.commands import OVER, SECTION_IV, TandemProcess, journals, processes_
 from tests.commands import tandem as tandem_command
 from tests.test_audit import kept
 from world.near_pairs import near_pairs
-from world.scenario import PlannedMeeting, Scenario, ScenarioOfGroup
+from world.scenario import PlannedMeeting, Scenario
 
 places = st.lists(st.tuples(*[st.floats(-50.0, 50.0) | st.integers(-9, 9).map(float)] * 2), max_size=30)
 
@@ -160,10 +160,8 @@ def with_scenario(journals: Journals, scenario: Scenario) -> Journals:
     return journals | {WORLD_JOURNAL: world}
 
 
-def scenario_of(journals: Journals) -> ScenarioOfGroup:
-    found = of_frames(journals).scenario
-    assert isinstance(found, ScenarioOfGroup)
-    return found
+def scenario_of(journals: Journals) -> Scenario:
+    return of_frames(journals).scenario
 
 
 def test_a_bound_that_is_not_the_planned_one_is_found(group: Journals) -> None:

@@ -26,7 +26,7 @@ from agent.planning.state import RobotState
 from compose.launch.in_process import played, run_mission
 from compose.recording.run import read
 from compose.view.recorded import scenes_of
-from protocol.messages import Member, Ranged, Report, RobotConfig, RobotConfigInGroup
+from protocol.messages import Member, Ranged, Report, RobotConfig
 from protocol.mission import Mission
 from protocol.noise import Noise
 from protocol.orbits import pair_ticks, rendezvous, tick_budget
@@ -167,8 +167,7 @@ def test_both_robots_know_from_which_tick_on_the_measurements_of_a_count(role: s
 def test_in_a_group_all_measurements_count_as_its_plan_has_the_retries() -> None:
     config = missed(1).config("a")
     members = (Member("a", config.anchor, 100), Member("b", config.peer_anchor, 100))
-    parts = {name: getattr(config, name) for name in RobotConfig.__struct_fields__}
-    assert beginning(knowledge(RobotConfigInGroup(**parts, members=members), [0, 5, 60]), 200) == 0
+    assert beginning(knowledge(replace(config, members=members), [0, 5, 60]), 200) == 0
 
 
 def test_until_that_tick_the_robot_counts_as_at_rest_without_noise() -> None:

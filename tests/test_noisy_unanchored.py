@@ -15,11 +15,10 @@ import pytest
 import tomli_w
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from msgspec.structs import asdict, replace
+from msgspec.structs import replace
 
 from agent.estimation.gaussian.contact_fit import ContactRanges, estimated, is_definite
 from agent.estimation.gaussian.odometry_noise import Track, track
-from agent.planning import exchange
 from agent.planning.accuracy_seeking import AccuracySeeking
 from agent.planning.group_state import GroupState
 from agent.planning.noisy_search import NoisyGroupPlanner
@@ -39,10 +38,10 @@ from protocol.messages import (
     Estimate,
     Localised,
     Observation,
+    PosePrior,
     Ranged,
     Report,
-    ReportWithReference,
-    RobotConfigWithoutAnchor,
+    RobotConfig,
     Undecided,
 )
 from protocol.mission import Mission
@@ -75,28 +74,30 @@ def journals() -> dict[str, list[bytes]]:
     return kept(noisy(four()))
 
 
-def references(run: Run) -> list[tuple[str, ReportWithReference]]:
-    """Return the first report with each reference, with the robot that has received it."""
-    found: dict[tuple[str, str, int], ReportWithReference] = {}
+def references(run: Run) -> list[tuple[str, Report, PosePrior]]:
+    """Return the first report with each pose, with the robot that has received it and that pose."""
+    found: dict[tuple[str, str, int], tuple[str, Report, PosePrior]] = {}
     for robot, agent in run.agents.items():
         for one_step in agent.steps:
             for framed in one_step.received:
-                if isinstance(framed.report, ReportWithReference):
-                    found.setdefault((robot, framed.report.robot, framed.report.reference), framed.report)
-    return [(robot, report) for (robot, _, _), report in found.items()]
+                if (prior := framed.report.prior) is not None:
+                    key = robot, framed.report.robot, prior.tick
+                    found.setdefault(key, (robot, framed.report, prior))
+    return list(found.values())
 
 
 def of_robots(step_: Step) -> list[Report]:
     """Return the reports that a robot has used in a tick."""
-    return [framed.report for framed in step_.received if isinstance(framed.report, Report)]
+    return [framed.report for framed in step_.received]
 
 
 def of_finders(run: Run) -> list[float]:
     """Return the normalised errors squared of the poses that sweeping robots have reported."""
     ids = [robot.id for robot in run.scenario.robots]
     return [
-        nees(one.pose, run.ticks[one.reference].world.truth.poses[ids.index(one.robot)], one.covariance)
-        for _, one in references(run)
+        nees(one.pose, run.ticks[one.tick].world.truth.poses[ids.index(report.robot)], one.covariance)
+        for _, report, one in references(run)
+        if one.covariance is not None
     ]
 
 
@@ -119,15 +120,15 @@ def test_robots_without_an_anchor_are_localised_under_noise_within_the_bound() -
 def test_the_reference_of_a_contact_stays_fixed_and_its_log_begins_there() -> None:
     run = of_frames(journals())
     assert references(run)
-    for robot, first in references(run):
+    for robot, _, first in references(run):
         same = [
             framed.report
             for one_step in run.agents[robot].steps
             for framed in one_step.received
-            if isinstance(framed.report, ReportWithReference) and framed.report.reference == first.reference
+            if framed.report.prior is not None and framed.report.prior.tick == first.tick
         ]
-        assert {(one.pose, one.covariance) for one in same} == {(first.pose, first.covariance)}
-        assert all(first.reference <= one.since <= one.through <= one.tick for one in same)
+        assert {one.prior for one in same} == {first}
+        assert all(first.tick <= one.since <= one.through <= one.tick for one in same)
 
 
 def test_the_audit_and_the_replay_find_nothing_where_nothing_is_wrong() -> None:
@@ -160,11 +161,12 @@ def test_a_recording_with_other_noise_is_audited_and_replayed_without_a_finding(
 
 def test_the_audit_finds_a_reported_covariance_that_is_not_the_computed_one() -> None:
     frames = {name: list(some) for name, some in journals().items()}
-    (_, report), *_ = references(of_frames(frames))
+    (_, report, prior), *_ = references(of_frames(frames))
+    assert prior.covariance is not None
     own = frames[agent_journal(report.robot)]
     place = own.index(encode(report))
-    smaller = replace(report.covariance, xx=0.5 * report.covariance.xx)
-    own[place] = encode(replace(report, covariance=smaller))
+    smaller = replace(prior.covariance, xx=0.5 * prior.covariance.xx)
+    own[place] = encode(replace(report, prior=replace(prior, covariance=smaller)))
     assert (report.tick, report.robot, "decision") in audited(frames)
 
 
@@ -287,8 +289,8 @@ def test_a_claim_that_later_ranges_contradict_is_withdrawn_in_the_search_and_no_
     peers: tuple[str, ...], shift: float
 ) -> None:
     run = of_frames(journals())
-    (finder,) = {report.robot for _, report in references(run)}
-    first = min(report.reference for _, report in references(run))
+    (finder,) = {report.robot for _, report, _ in references(run)}
+    first = min(prior.tick for _, _, prior in references(run))
     agent, planner = run.agents[finder], NoisyGroupPlanner(AccuracySeeking())
     state = planner.start(agent.config)
     for one in agent.steps[: first + 1]:
@@ -314,20 +316,20 @@ def test_a_claim_that_later_ranges_contradict_is_withdrawn_in_the_search_and_no_
 
 def test_a_robot_that_takes_a_finder_anew_receives_the_manoeuvres_since_the_reference_again() -> None:
     run = of_frames(journals())
-    receiver, first = references(run)[0]
-    agent, planner = run.agents[first.robot], NoisyGroupPlanner(AccuracySeeking())
+    receiver, report, first = references(run)[0]
+    agent, planner = run.agents[report.robot], NoisyGroupPlanner(AccuracySeeking())
     state, since = planner.start(agent.config), []
-    for one in agent.steps[: first.reference + 9]:
+    for one in agent.steps[: first.tick + 9]:
         state = planner.decide(planner.observe(state, one.observation), of_robots(one))
         report = planner.report_to(state, receiver)
-        if isinstance(report, ReportWithReference) and report.reference == first.reference:
+        if report.prior is not None and report.prior.tick == first.tick:
             since.append(report.since)
-    assert since[0] == first.reference < since[-1]
+    assert since[0] == first.tick < since[-1]
     acknowledged = [report for report in of_robots(one) if report.robot == receiver]
     anew = planner.decide(state, [replace(report, heard=0) for report in acknowledged])
     again = planner.report_to(anew, receiver)
-    assert isinstance(again, ReportWithReference)
-    assert again.since == first.reference
+    assert again.prior is not None
+    assert again.since == first.tick
 
 
 # --- the scenario -------------------------------------------------------------------------------------
@@ -510,10 +512,8 @@ def test_the_covariances_of_contacts_are_right() -> None:
 # --- a robot without an anchor ------------------------------------------------------------------------
 
 
-def config() -> RobotConfigWithoutAnchor:
-    found = noisy(four()).config("u")
-    assert isinstance(found, RobotConfigWithoutAnchor)
-    return found
+def config() -> RobotConfig:
+    return noisy(four()).config("u")
 
 
 def met(sigma: float, ticks: int = 40) -> Any:
@@ -529,24 +529,8 @@ def met(sigma: float, ticks: int = 40) -> Any:
         state = planner.observe(
             state, Observation(tick, "u", executed, None, (Detection("b", range_, (tick,)),))
         )
-        report = ReportWithReference(
-            tick,
-            "b",
-            2,
-            "looping",
-            None,
-            0,
-            tick,
-            tuple(runs),
-            0,
-            (),
-            0,
-            0,
-            None,
-            reference=0,
-            pose=told,
-            covariance=covariance,
-        )
+        prior = PosePrior(0, told, covariance)
+        report = Report(tick, "b", 2, "looping", through=tick, runs=tuple(runs), prior=prior)
         assert planner.malformed(report) is None
         state = planner.decide(state, [report])
         command = planner.command(state)
@@ -580,17 +564,14 @@ def test_a_robot_that_reports_another_reference_in_each_tick_costs_an_estimate_i
     planner = NoisyUnanchoredPlanner()
     state = planner.start(config())
     covariance = Covariance(0.01, 0.0, 0.0, 0.01, 0.0, 1e-4)
-    without = exchange.report_without_log(state, Localised(Pose(0.0, 0.0, 0.0), covariance))
-    fields = asdict(without) | {"robot": "b", "state": "looping"}
     estimates = set()
     for tick in range(60):
         seen = (Detection("b", 1.0 + 0.01 * tick, (tick,)),)
         state = planner.observe(state, Observation(tick, "u", REST, None, seen))
         here = max(0, tick - 20)
         runs = (Segment(tick - here, 0.1, 0.0),) if tick > here else ()
-        fields |= {"tick": tick, "since": here, "through": tick, "runs": runs}
-        pose = Pose(0.1 * here, 0.0, 0.0)
-        report = ReportWithReference(**fields, reference=here, pose=pose, covariance=covariance)
+        prior = PosePrior(here, Pose(0.1 * here, 0.0, 0.0), covariance)
+        report = Report(tick, "b", 2, "looping", since=here, through=tick, runs=runs, prior=prior)
         assert planner.malformed(report) is None
         state = planner.decide(state, [report])
         estimates.add(state.estimated_tick)
@@ -599,14 +580,14 @@ def test_a_robot_that_reports_another_reference_in_each_tick_costs_an_estimate_i
 
 def test_malformed_references_are_refused() -> None:
     planner = NoisyUnanchoredPlanner()
-    good = decode(encode(references(of_frames(journals()))[0][1]), ReportWithReference)
+    good = decode(encode(references(of_frames(journals()))[0][1]), Report)
+    assert good.prior is not None
     assert planner.malformed(good) is None
     flat = Covariance(1.0, 2.0, 0.0, 1.0, 0.0, 1.0)
     assert not is_definite(flat)
-    assert planner.malformed(replace(good, covariance=flat)) is not None
     tiny = Covariance(1e-300, 0.0, 0.0, 1e-300, 0.0, 1e-300)
-    assert planner.malformed(replace(good, covariance=tiny)) is not None
-    assert planner.malformed(replace(good, reference=good.since + 1)) is not None
+    for wrong in ({"covariance": flat}, {"covariance": tiny}, {"covariance": None}, {"tick": good.since + 1}):
+        assert planner.malformed(replace(good, prior=replace(good.prior, **wrong))) is not None
 
 
 def test_a_contact_is_longer_where_ranges_are_less_accurate() -> None:

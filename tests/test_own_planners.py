@@ -34,7 +34,6 @@ from protocol.messages import (
     Localised,
     MissionEnd,
     Observation,
-    PlannerReport,
     Report,
     Undecided,
 )
@@ -112,8 +111,9 @@ def test_reports_and_options_are_in_the_recording(recording: Path) -> None:
     assert agent.config.planner_options == {"note": "a b", "weight": 2}
     bodies = [framed.report for step in agent.steps for framed in step.received]
     assert bodies
-    assert {type(one) for one in bodies} == {PlannerReport}
-    parcel = msgspec.msgpack.decode(bodies[-1].body, type=Parcel)  # type: ignore[union-attr]
+    body = bodies[-1].body
+    assert body is not None
+    parcel = msgspec.msgpack.decode(body, type=Parcel)
     assert parcel.double == 2 * parcel.log.tick
     assert run.final_reports["a"].blocking_reason == "a b"
     assert run.final_reports["a"].reports_heard == len(bodies)
@@ -325,16 +325,15 @@ def test_a_report_that_its_decoder_refuses_is_refused_on_arrival() -> None:
     planner = planner_of(own("Wrapping").scenario.config("a"))
     state = first_state()
     good = report_of(Wrapping().report(state), 0, "a")
-    assert isinstance(good, PlannerReport)
     assert malformed(good, planner) is None
     assert malformed(replace(good, body=b"\x93"), planner) == "its body: Input data was truncated"
     parcel = msgspec.msgpack.encode(Parcel(AssuredExact().report(state), 3))
     assert malformed(replace(good, body=parcel), planner) == "3 is not twice 0"
     assert malformed(AssuredExact().report(state), planner) == (
-        "a Report, and this robot's planner has reports of its own"
+        "a report without a body, and this robot's planner has reports of its own"
     )
     shipped = planner_of(load("paper-1").config("a"))
-    assert malformed(good, shipped) == "a PlannerReport, and this robot's planner has none"
+    assert malformed(good, shipped) == "a report with a body, and this robot's planner has none"
 
 
 def test_the_agent_counts_and_drops_a_report_that_the_decoder_refuses() -> None:
@@ -373,7 +372,7 @@ def test_a_decoder_that_fails_refuses_the_report() -> None:
 def test_the_largest_body_fits_a_frame_with_any_verdict(verdict: Any) -> None:
     body = b"x" * (MAX_BODY_BYTES - 3)  # msgpack adds its length
     report = report_of(body, 2**31, "r" * 32, 2**31, verdict)
-    assert isinstance(report, PlannerReport)
+    assert report.body is not None
     assert len(report.body) == MAX_BODY_BYTES
     assert len(encode(report)) <= MAX_REPORT_BYTES
 
@@ -384,7 +383,7 @@ def test_without_a_world_the_mission_ends_by_the_verdicts_around_the_bodies() ->
     claim = Localised(Pose(0.0, 0.0, 0.0))
     sent = AssuredExact().command(first_state())
     assert ending.after(5, replace(sent, tick=5, verdict=claim)) is None
-    assert ending.receive(PlannerReport(6, "b", 6, claim, b"\xc0"))
+    assert ending.receive(Report(6, "b", heard=6, verdict=claim, body=b"\xc0"))
     found = [ending.after(tick, sent) for tick in range(6, 11)]
     assert found[-1] == MissionEnd(10, "localised", None)
     assert found[:-1] == [None] * 4
@@ -392,7 +391,7 @@ def test_without_a_world_the_mission_ends_by_the_verdicts_around_the_bodies() ->
 
 def test_a_planner_without_reports_of_its_own_sends_an_empty_body() -> None:
     report = report_of(None, 3, "a")
-    assert report == PlannerReport(3, "a", None, None, b"\xc0")
+    assert report == Report(3, "a", body=b"\xc0")
 
 
 def test_shipped_planners_send_the_same_reports_as_before() -> None:

@@ -29,9 +29,9 @@ from protocol.messages import (
     Contact,
     Localised,
     Observation,
-    ReportWithPose,
-    RobotConfigWithoutAnchor,
-    TickStartInGroup,
+    PosePrior,
+    Report,
+    TickStart,
 )
 from protocol.motion import ORIGIN, REST, Controls, Pose, step
 from protocol.wire import decode, encode
@@ -43,7 +43,7 @@ from tests.test_group_runs import audited, with_scenario
 from world.hardware.driver import Reading
 from world.hardware.group_termination import GroupEnding
 from world.hardware.measurements import observation_frame
-from world.scenario import Scenario, ScenarioWithSweep
+from world.scenario import Scenario
 
 AREA = [-4.0, -4.0, 14.0, 12.0]
 
@@ -122,7 +122,7 @@ def test_a_robot_that_does_not_hear_its_finder_is_localised_by_another_one() -> 
         for robot in ("u", "v")
         for one in run.agents[robot].steps
         for framed in one.received
-        if isinstance(framed.report, ReportWithPose)
+        if framed.report.prior is not None
     ]
     assert {one.robot for one in reports} == {"b"}
 
@@ -150,10 +150,10 @@ def test_reports_in_another_order_lead_to_the_same_claim_to_the_bit() -> None:
     agent = of_frames(kept(scenario_of(four()))).agents["u"]
     planner = UnanchoredPlanner()
     observed = planner.start(agent.config)
-    reports: list[ReportWithPose] = []
+    reports: list[Report] = []
     for one_step in agent.steps:
         observed = planner.observe(observed, one_step.observation)
-        reports += [one.report for one in one_step.received if isinstance(one.report, ReportWithPose)]
+        reports += [one.report for one in one_step.received if one.report.prior is not None]
         if one_step.command is not None and one_step.command.verdict is not None:
             break
     *early, last = reports
@@ -179,22 +179,8 @@ def test_a_robot_that_a_passing_one_has_left_on_a_square_is_localised_by_the_nex
             range_ = math.hypot(6.0 + x - pose.x, 5.0 + y - pose.y)
             contacts = (Contact(finder, range_, (tick,)),) if finder is not None else ()
             state = planner.observe(state, Observation(tick, "u", driven, None, contacts))
-            report = ReportWithPose(
-                tick,
-                finder or "a",
-                2,
-                "sweeping",
-                None,
-                0,
-                0,
-                (),
-                0,
-                (),
-                0,
-                0,
-                None,
-                Pose(6.0 + x, 5.0 + y, 0.0),
-            )
+            prior = PosePrior(tick, Pose(6.0 + x, 5.0 + y, 0.0))
+            report = Report(tick, finder or "a", 2, "sweeping", prior=prior)
             state = planner.decide(state, [report] if finder is not None else [])
             command = planner.command(state)
             driven = Controls(command.v, command.omega)
@@ -220,8 +206,7 @@ def without(table: dict[str, Any], *robots: int) -> dict[str, Any]:
 def test_the_configuration_of_a_robot_without_an_anchor_does_not_depend_on_where_it_is() -> None:
     scenario = scenario_of(four())
     config = scenario.config("u")
-    assert isinstance(config, RobotConfigWithoutAnchor)
-    assert (config.anchor.x, config.anchor.y) == (5.0, 4.0)
+    assert config.given_anchor is None
     moved = [replace(one, start=Pose(1.0, 1.0, 0.0)) if one.id == "u" else one for one in scenario.robots]
     assert replace(scenario, robots=tuple(moved)).config("u") == config
 
@@ -302,16 +287,15 @@ def test_check_driver_refuses_a_robot_without_an_anchor(tmp_path: Path) -> None:
 
 
 def test_a_driver_may_report_the_range_to_an_anchor_that_its_robot_does_not_have() -> None:
-    """The centre of the area is in its configuration in place of an anchor."""
     frame = observation_frame(Reading(REST, 1.0), 3, scenario_of(four()).config("u"))
     assert decode(frame, Observation).anchor_range is None
 
 
 def given_up_after(scenario: Scenario) -> int:
     """Return the tick in which a stops waiting for u, which has sent nothing in hardware mode."""
-    ending = GroupEnding(scenario.config("a"), scenario.max_ticks, 0.0)  # type: ignore[arg-type]
+    ending = GroupEnding(scenario.config("a"), scenario.max_ticks, 0.0)
     for robot in "bv":
-        ending.receive(TickStartInGroup(1, robot, Localised(ORIGIN), complete=True))
+        ending.receive(TickStart(1, robot, Localised(ORIGIN), complete=True))
     localised = Localised(ORIGIN)
     tick = 0
     while (end := ending.after(tick, Command(tick, "a", 0.0, 0.0, 3, "sweeping", localised))) is None:
@@ -356,7 +340,8 @@ def test_the_audit_and_the_replay_find_nothing_where_nothing_is_wrong(tmp_path: 
 
 def _with_pose(frames: list[bytes]) -> list[int]:
     """Return the places of the reports with a pose."""
-    return [i for i, frame in enumerate(frames) if b"report-with-pose" in frame]
+    reports = [(i, decode(frame, Report)) for i, frame in enumerate(frames) if b"\xa6report" in frame]
+    return [i for i, report in reports if report.prior is not None]
 
 
 def test_the_audit_finds_a_reported_pose_that_is_not_the_computed_one() -> None:
@@ -364,16 +349,16 @@ def test_the_audit_finds_a_reported_pose_that_is_not_the_computed_one() -> None:
     finder = next(robot for robot in ("a", "b") if _with_pose(journals[agent_journal(robot)]))
     frames = journals[agent_journal(finder)]
     place = _with_pose(frames)[0]
-    report = decode(frames[place], ReportWithPose)
-    shifted = replace(report, pose=replace(report.pose, x=report.pose.x + 0.5))
-    frames[place] = encode(shifted)
+    report = decode(frames[place], Report)
+    assert report.prior is not None
+    pose = replace(report.prior.pose, x=report.prior.pose.x + 0.5)
+    frames[place] = encode(replace(report, prior=replace(report.prior, pose=pose)))
     assert (report.tick, finder, "decision") in audited(journals)
 
 
 def test_the_audit_finds_a_sweep_that_is_not_the_planned_one() -> None:
     journals = kept(parse(FILE, "four"))
     scenario = of_frames(journals).scenario
-    assert isinstance(scenario, ScenarioWithSweep)
     assert scenario.planned_sweep is not None
     later = replace(scenario.planned_sweep, ends=scenario.planned_sweep.ends + 1.0)
     found = audited(with_scenario(journals, replace(scenario, planned_sweep=later)))
@@ -386,7 +371,6 @@ def test_the_audit_finds_a_sweep_that_is_not_the_planned_one() -> None:
 def test_a_recording_whose_searching_robots_are_not_those_with_an_anchor_is_refused() -> None:
     journals = kept(parse(FILE, "four"))
     scenario = of_frames(journals).scenario
-    assert isinstance(scenario, ScenarioWithSweep)
     assert scenario.planned_sweep is not None
     for planned in (None, replace(scenario.planned_sweep, sweepers=("a", "u"))):
         with pytest.raises(CorruptJournal, match="the robots that search are not those with an anchor"):

@@ -24,9 +24,8 @@ from protocol.messages import (
     Contact,
     Localised,
     Observation,
+    PosePrior,
     Report,
-    ReportWithPose,
-    RobotConfigInGroup,
     Undecided,
 )
 from protocol.motion import ORIGIN, REST, Controls, Pose, Segment, compose, step, wrap
@@ -229,7 +228,6 @@ def test_a_robot_without_an_anchor_that_claims_to_visit_is_not_met() -> None:
     scenario = scenario_of(five())
     config = scenario.config("a")
     planner = planner_of(config)
-    assert isinstance(config, RobotConfigInGroup)
     run = run_mission(scenario)
     done = next(tick for tick, one in enumerate(run.ticks) if one.commands["a"].phase > 1)
     state = planner.start(config)
@@ -263,8 +261,8 @@ def met(state: UnanchoredState, pose: Pose, finder: str, offset: Pose) -> tuple[
             distance = math.hypot(place.x - pose.x, place.y - pose.y)
         contact = Contact(finder, distance, (tick,))
         state = planner.observe(state, Observation(tick, "u", driven, None, (contact,)))
-        without_log = (tick, finder, 2, "sweeping", None, 0, 0, (), 0, (), 0, 0, None)
-        state = planner.decide(state, [ReportWithPose(*without_log, compose(offset, place))])
+        prior = PosePrior(tick, compose(offset, place))
+        state = planner.decide(state, [Report(tick, finder, 2, "sweeping", prior=prior)])
         if state.verdict is not None:
             break
     return state, pose
@@ -291,8 +289,8 @@ def test_a_pose_is_claimed_when_one_more_finder_than_may_lie_agrees_on_it() -> N
 def test_a_finder_that_has_heard_that_it_is_not_needed_sends_no_pose_and_does_not_stop_again() -> None:
     agent = of_frames(kept(scenario_of(five("a")))).agents["u"]
     received = [framed.report for one in agent.steps for framed in one.received]
-    reports = [one for one in received if isinstance(one, Report) and one.robot == "a"]
-    assert {type(one) for one in reports} == {Report, ReportWithPose}
+    reports = [one for one in received if one.robot == "a"]
+    assert {one.prior is None for one in reports} == {True, False}
     stops = [one.state == "looping" for one in reports]
     begins = [here and not before for before, here in zip([False, *stops], stops, strict=False)]
     assert sum(begins) == 1
@@ -318,11 +316,11 @@ def poses_of(scenario: Scenario) -> dict[int, Pose]:
     """Return the poses that a reports to robots without an anchor, by tick; its anchor is the origin."""
     run = of_frames(kept(scenario))
     return {
-        framed.report.tick: framed.report.pose
+        prior.tick: prior.pose
         for robot in scenario.unanchored
         for one in run.agents[robot].steps
         for framed in one.received
-        if isinstance(framed.report, ReportWithPose) and framed.report.robot == "a"
+        if (prior := framed.report.prior) is not None and framed.report.robot == "a"
     }
 
 

@@ -25,7 +25,6 @@ from protocol.messages import (
     Message,
     MissionEnd,
     Observation,
-    PlannerReport,
     Report,
 )
 from protocol.mission import Mission
@@ -33,10 +32,12 @@ from protocol.wire import MAX_FRAME_BYTES, VERSION, MalformedFrame, decode, enco
 from tests.examples import EXAMPLES
 from world.scenario import Scenario
 
-KINDS = {kind for one in Message.__subclasses__() for kind in (one, *one.__subclasses__())}
+KINDS = {*Message.__subclasses__()}
 ANY: Any = reduce(or_, sorted(KINDS, key=lambda kind: kind.__name__))
 OPTIONS = ("step", "gain", "way", "on")
-"""The options in an example of a RobotConfigWithOptions."""
+"""The options in an example of a RobotConfig."""
+BODY = (1 + Report.__struct_fields__.index("body"),)
+"""The path of the body in a Report."""
 HEAD = 5
 """The number of bytes before the body: the version and the CRC-32."""
 
@@ -89,7 +90,7 @@ def test_any_msgpack_library_reads_what_we_send(message: Message) -> None:
     frame = encode(message)
     assert frame[0] == VERSION
     assert frame[1:HEAD] == zlib.crc32(frame[HEAD:]).to_bytes(4, "big")
-    if not isinstance(message, PlannerReport):  # JSON has no bytes
+    if getattr(message, "body", None) is None:  # JSON has no bytes
         assert plain(message) == msgspec.json.decode(msgspec.json.encode(message))
     assert plain(message)[0] == type(message).__struct_config__.tag
     assert decode(framed(packed(plain(message))), ANY) == message
@@ -195,7 +196,7 @@ def test_what_is_no_finite_number_within_bounds_is_refused(message: Message) -> 
 def test_a_value_of_the_wrong_type_is_refused(message: Message) -> None:
     tree = plain(message)
     for path, value in parts(tree):
-        if isinstance(value, bytes) or (path and isinstance(path[-1], str) and path[-1] in OPTIONS):
+        if (tree[0] == "report" and path == BODY) or (path and path[-1] in OPTIONS):
             continue  # the body of a report, and the value of an option, may be of several types
         wrong: list[object] = [b"\x00", {1: 1}, [[[]]], msgpack.ExtType(5, b"")]
         if not isinstance(value, bool):
@@ -221,7 +222,7 @@ def test_an_extra_field_is_refused_wherever_it_stands(message: Message) -> None:
     tree = plain(message)
     for path, value in parts(tree):
         if isinstance(value, list):
-            refuses(framed(packed(changed(tree, path, [*value, "extra"]))))
+            refuses(framed(packed(changed(tree, path, [*value, {}]))))
         if isinstance(value, dict):
             refuses(framed(packed(changed(tree, path, value | {"no field": 1.0}))))
 

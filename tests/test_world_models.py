@@ -25,7 +25,7 @@ from world.radio_models import (
     WalledRadio,
 )
 from world.range_models import FadingRange, WalledRange
-from world.scenario import Scenario, ScenarioWithOptions
+from world.scenario import Scenario
 from world.world_models import RadioModel, Radios, RangeModel, Transmission
 
 OWN = "tests.own_models"
@@ -141,7 +141,6 @@ def journals(scenario: Scenario) -> list[list[bytes]]:
 
 def test_the_disc_is_what_the_world_does_without_a_model() -> None:
     with_disc = scenario_of("noisy", range={"model": "disc"}, radio={"model": "disc"})
-    assert isinstance(with_disc, ScenarioWithOptions)
     without = scenario_of("noisy")
     agents, plain = journals(with_disc)[:2], journals(without)[:2]
     assert agents == plain

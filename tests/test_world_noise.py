@@ -45,7 +45,7 @@ from tests.test_noise import (
 )
 from world import random_streams
 from world.random_streams import correlated, random_walk
-from world.scenario import RecordedScenario, Scenario, ScenarioWithWorldNoise
+from world.scenario import Scenario
 from world.sensors import anchor_ranges, executed, mutual_ranges, odometry
 from world.tick import World, advance, observations, release
 from world.truth import Truth
@@ -128,7 +128,6 @@ def test_a_field_that_is_left_out_has_the_value_of_the_mission() -> None:
 @by_effect
 def test_no_robot_is_told_what_its_sensors_do(world: str) -> None:
     as_told, other = near(""), near(world)
-    assert isinstance(other, ScenarioWithWorldNoise)
     for robot in ("a", "b"):
         assert encode(other.config(robot)) == encode(as_told.config(robot))
 
@@ -467,8 +466,7 @@ def test_the_audit_and_the_replay_accept_each_effect_and_find_a_forged_range(wor
 
 def test_the_audit_recomputes_ranges_with_the_table_in_the_recording() -> None:
     recorded = frames_of(near("anchor_bias = 0.1", max_ticks=10))
-    scenario = decode(recorded["world.journal"][1], RecordedScenario, MAX_FRAME_BYTES)
-    assert isinstance(scenario, ScenarioWithWorldNoise)
+    scenario = decode(recorded["world.journal"][1], Scenario, MAX_FRAME_BYTES)
     other = encode(replace(scenario, world_noise=WorldNoise(anchor_bias=0.2)))
     found = audit_run(
         of_frames(
@@ -483,7 +481,7 @@ def test_the_audit_recomputes_ranges_with_the_table_in_the_recording() -> None:
 
 def test_the_audit_finds_a_table_that_no_run_accepts() -> None:
     recorded = frames_of(near("anchor_bias = 0.1", max_ticks=3))
-    scenario = decode(recorded["world.journal"][1], RecordedScenario, MAX_FRAME_BYTES)
+    scenario = decode(recorded["world.journal"][1], Scenario, MAX_FRAME_BYTES)
     for noise, says in (
         (
             WorldNoise(anchor_bias={"c": 0.1}),

@@ -10,20 +10,9 @@ from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta
-from msgspec.structs import asdict
 
 from protocol.attack import Attack
-from protocol.messages import (
-    MAX_MEMBERS,
-    Member,
-    Retry,
-    RobotConfig,
-    RobotConfigInGroup,
-    RobotConfigWithConfirmation,
-    RobotConfigWithOptions,
-    RobotConfigWithoutAnchor,
-    RobotConfigWithSweep,
-)
+from protocol.messages import MAX_MEMBERS, Member, Retry, RobotConfig
 from protocol.mission import Anchor, Mission, Options, PlannerName, Role
 from protocol.motion import Pose
 from protocol.orbits import Rendezvous
@@ -105,6 +94,12 @@ class PlannedRetry(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_
     lasts: Time
     """The bound in s of the time until both are localised."""
 
+    def of(self, robot: str) -> Retry:
+        """Return this meeting as `robot`, one of the two, knows it."""
+        role: Role = "a" if robot == self.visitor else "b"
+        peer = self.visited if role == "a" else self.visitor
+        return Retry(peer, role, self.rendezvous, self.begins, self.lasts)
+
 
 class PlannedSweep(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """The search of localised robots for those without an anchor."""
@@ -159,25 +154,27 @@ class Scenario(
     faults: tuple[Fault, ...] = ()
     """The fault plan of the radio."""
 
-    @property
-    def world_noise(self) -> WorldNoise:
-        """The noise of the simulated sensors; here, what the robots are told."""
-        return WorldNoise()
+    world_noise: WorldNoise = WorldNoise()
+    """The noise of the simulated sensors, where it is another one than the robots are told."""
+    planner_options: Options = {}
+    """The options of the planner, by name."""
+    range_model: ModelSpec | None = None
+    """The model of detection and ranges; None for the disc of R."""
+    radio_model: ModelSpec | None = None
+    """The model of the delivery of reports; None if all are delivered."""
+    meetings: tuple[PlannedMeeting, ...] = ()
+    """The meetings of a group, in the order in which they end; empty if the robots form pairs.
 
-    @property
-    def planner_options(self) -> Options:
-        """The options of the planner; here, none."""
-        return {}
-
-    @property
-    def range_model(self) -> ModelSpec | None:
-        """The model of detection and ranges; here, the disc of R."""
-        return None
-
-    @property
-    def radio_model(self) -> ModelSpec | None:
-        """The model of the delivery of reports; here, all are delivered."""
-        return None
+    Each robot meets one that is localised, then others that are not.
+    """
+    retries: tuple[PlannedRetry, ...] = ()
+    """The meetings with which a group tries again, in the order in which they begin."""
+    deaths: tuple[Death, ...] = ()
+    """The robots of a group that die, in the order of the scenario."""
+    planned_sweep: PlannedSweep | None = None
+    """The search for robots without an anchor; None if all robots have one."""
+    confirmation: PlannedConfirmation | None = None
+    """The meetings that confirm poses; None if robots claim the pose that they know."""
 
     @cached_property
     def ranging(self) -> RangeModel | None:
@@ -198,29 +195,9 @@ class Scenario(
         return sensor_model(self.mission, self.world_noise, ids, self.radio_pairs(), self.seed)
 
     @property
-    def meetings(self) -> tuple[PlannedMeeting, ...]:
-        """The meetings of a group, in the order in which they end; here, none: the robots form pairs."""
-        return ()
-
-    @property
-    def planned_sweep(self) -> PlannedSweep | None:
-        """The search for robots without an anchor; here, None: all robots have one."""
-        return None
-
-    @property
-    def confirmation(self) -> PlannedConfirmation | None:
-        """The meetings that confirm poses; here, None: robots claim the pose that they know."""
-        return None
-
-    @property
     def unanchored(self) -> tuple[str, ...]:
         """The robots without an anchor, in the order of the scenario."""
         return tuple([robot.id for robot in self.robots if robot.given_anchor is None])
-
-    @property
-    def deaths(self) -> tuple[Death, ...]:
-        """The robots of a group that die; here, none."""
-        return ()
 
     @cached_property
     def _dead_from(self) -> dict[str, int]:
@@ -261,81 +238,34 @@ class Scenario(
 
         Raises KeyError if there is no such robot.
         """
-        own = self.robot(robot)
-        config = RobotConfig(
+        own, planned = self.robot(robot), self.planned_sweep or self.confirmation
+        visits = [one.visited for one in self.meetings if one.visitor == robot and one.visited != own.peer]
+        retries = [one.of(robot) for one in self.retries if robot in (one.visitor, one.visited)]
+        confirming = self.confirmation.visits if self.confirmation is not None else ()
+        sweep = self.planned_sweep.sweep if self.planned_sweep is not None else None
+        sweepers = self.planned_sweep.sweepers if self.planned_sweep is not None else ()
+        return RobotConfig(
             robot=own.id,
             peer=own.peer,
             role=own.role,
-            anchor=own.given_anchor or self._centre,
-            peer_anchor=self._centre if own.given_anchor is None else self.robot(own.peer).anchor,
+            given_anchor=own.given_anchor,
+            peer_anchor=self.robot(own.peer).anchor,
             mission=self.mission,
             planner_name=self.planner_name,
             rendezvous=own.rendezvous,
             attack=own.attack,
             tick_s=tick_s,
+            planner_options=self.planner_options,
+            members=self.members,
+            visits=tuple(visits),
+            retries=tuple(retries),
+            gives_up=self.max_ticks * self.mission.period * GIVES_UP if self.meetings else 0.0,
+            tolerates=planned.tolerates if planned is not None else 0,
+            confirmations=tuple([one.of(robot) for one in confirming if one.visitor == robot]),
+            unanchored=self.unanchored,
+            sweep=sweep,
+            part=sweepers.index(robot) if robot in sweepers else 0,
         )
-        if self.meetings:
-            visits = [
-                one.visited for one in self.meetings if one.visitor == own.id and one.visited != own.peer
-            ]
-            in_group = RobotConfigInGroup(
-                **asdict(config),
-                planner_options=self.planner_options,
-                members=self.members,
-                visits=tuple(visits),
-                retries=self._retries_of(own.id),
-                gives_up=self.max_ticks * self.mission.period * GIVES_UP,
-            )
-            if (planned := self.confirmation) is not None:
-                return RobotConfigWithConfirmation(
-                    **asdict(in_group),
-                    tolerates=planned.tolerates,
-                    confirmations=tuple(
-                        [
-                            Retry(one.visited, "a", one.rendezvous, one.begins, one.lasts)
-                            for one in planned.visits
-                            if one.visitor == own.id
-                        ]
-                    ),
-                )
-            return in_group if self.planned_sweep is None else self._sweeping(in_group, self.planned_sweep)
-        if not self.planner_options:
-            return config
-        return RobotConfigWithOptions(**asdict(config), planner_options=self.planner_options)
-
-    @property
-    def _centre(self) -> Anchor:
-        """The centre of the area in which robots without an anchor are."""
-        assert self.planned_sweep is not None
-        area = self.planned_sweep.sweep
-        return Anchor(0.5 * (area.x_min + area.x_max), 0.5 * (area.y_min + area.y_max))
-
-    def _sweeping(self, config: RobotConfigInGroup, planned: PlannedSweep) -> RobotConfigWithSweep:
-        """Return `config` with what the robot knows about robots without an anchor, or as one of these."""
-        known = {
-            **asdict(config),
-            "unanchored": self.unanchored,
-            "sweep": planned.sweep,
-            "tolerates": planned.tolerates,
-        }
-        if config.robot in self.unanchored:
-            return RobotConfigWithoutAnchor(**known)
-        return RobotConfigWithSweep(**known, part=planned.sweepers.index(config.robot))
-
-    @property
-    def retries(self) -> tuple[PlannedRetry, ...]:
-        """The meetings with which a group tries again; here, none."""
-        return ()
-
-    def _retries_of(self, robot: str) -> tuple[Retry, ...]:
-        """Return the meetings in which `robot` tries again."""
-        found = []
-        for one in self.retries:
-            if one.visitor == robot:
-                found.append(Retry(one.visited, "a", one.rendezvous, one.begins, one.lasts))
-            elif one.visited == robot:
-                found.append(Retry(one.visitor, "b", one.rendezvous, one.begins, one.lasts))
-        return tuple(found)
 
     @cached_property
     def members(self) -> tuple[Member, ...]:
@@ -357,75 +287,3 @@ def _last_tick(moment: float, period: float) -> int:
     while tick * period > moment:
         tick -= 1
     return tick
-
-
-class ScenarioWithWorldNoise(
-    Scenario, frozen=True, array_like=True, forbid_unknown_fields=True, tag="scenario-with-world-noise"
-):
-    """A mission in which the robots are told another noise than the simulated sensors have."""
-
-    world_noise: WorldNoise = WorldNoise()
-    """The noise of the simulated sensors."""
-
-
-class ScenarioWithOptions(
-    ScenarioWithWorldNoise,
-    frozen=True,
-    array_like=True,
-    forbid_unknown_fields=True,
-    tag="scenario-with-options",
-):
-    """A mission whose planner has options, or whose world has other models than the disc."""
-
-    planner_options: Options = {}
-    """The options of the planner, by name."""
-    range_model: ModelSpec | None = None
-    """The model of detection and ranges; None for the disc of R."""
-    radio_model: ModelSpec | None = None
-    """The model of the delivery of reports; None if all are delivered."""
-
-
-class ScenarioOfGroup(
-    ScenarioWithOptions, frozen=True, array_like=True, forbid_unknown_fields=True, tag="scenario-of-group"
-):
-    """A mission whose robots form a group: each meets a robot that is localised, then others that are not."""
-
-    meetings: tuple[PlannedMeeting, ...] = ()
-    """The meetings, in the order in which they end."""
-    retries: tuple[PlannedRetry, ...] = ()
-    """The meetings with which the group tries again, in the order in which they begin."""
-    deaths: tuple[Death, ...] = ()
-    """The robots that die, in the order of the scenario."""
-
-
-class ScenarioWithSweep(
-    ScenarioOfGroup, frozen=True, array_like=True, forbid_unknown_fields=True, tag="scenario-with-sweep"
-):
-    """A mission of a group in which some robots have no anchor: others find them in an area."""
-
-    planned_sweep: PlannedSweep | None = None
-    """The search for robots without an anchor."""
-
-
-class ScenarioWithConfirmation(
-    ScenarioOfGroup,
-    frozen=True,
-    array_like=True,
-    forbid_unknown_fields=True,
-    tag="scenario-with-confirmation",
-):
-    """A mission of a group in which some robots may report false data."""
-
-    confirmation: PlannedConfirmation | None = None
-    """The meetings that confirm poses."""
-
-
-RecordedScenario = (
-    Scenario
-    | ScenarioWithWorldNoise
-    | ScenarioWithOptions
-    | ScenarioOfGroup
-    | ScenarioWithSweep
-    | ScenarioWithConfirmation
-)
-"""The kinds of scenario in a world's journal."""

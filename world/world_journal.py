@@ -13,7 +13,7 @@ from protocol.messages import Command, DeadlineMissed, Environment, FinalReport,
 from protocol.mission import Role
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 from world.referee import MissionOutcome
-from world.scenario import RecordedScenario, Scenario
+from world.scenario import Scenario
 from world.tick import World, advance, release
 from world.truth import Truth
 
@@ -149,7 +149,7 @@ class WorldJournalReading:
             return
         scenario = self._shared.get(frame)
         if not isinstance(scenario, Scenario):
-            scenario = decode(frame, RecordedScenario, MAX_FRAME_BYTES)
+            scenario = decode(frame, Scenario, MAX_FRAME_BYTES)
         problem = _unpaired(scenario)
         if problem is not None:
             raise MalformedFrame(problem)
@@ -196,6 +196,8 @@ def _unpaired(scenario: Scenario) -> str | None:
         return "its scenario has no robots, or several of the same name"
     if scenario.meetings:
         return _unplanned(scenario)
+    if scenario.retries or scenario.deaths or scenario.planned_sweep or scenario.confirmation:
+        return "its scenario has the plan of a group, and no meetings"
     if scenario.unanchored:
         return f"in its scenario {scenario.unanchored[0]} has no anchor"
     for robot in scenario.robots:
@@ -224,6 +226,8 @@ def _unplanned(scenario: Scenario) -> str | None:
     if bool(unanchored) != (sweep is not None) or (sweep is not None and set(sweep.sweepers) != first.keys()):
         return "in its scenario the robots that search are not those with an anchor"
     for robot in scenario.robots:
+        if robot.peer not in first:
+            return f"in its scenario {robot.id} has no peer"
         if robot.id in first and first[robot.id] != (robot.peer, robot.role):
             return f"in its scenario {robot.id} has another peer than in its first meeting"
     return None

@@ -21,7 +21,7 @@ from agent.planning import group_transitions
 from agent.planning.group import TRAVELLING_MODE, GroupPlanner
 from agent.planning.group_state import Fix, GroupState
 from agent.planning.state import UNCONFIRMED
-from protocol.messages import Command, Localised, Report, RobotConfigWithConfirmation, Undecided
+from protocol.messages import Command, Localised, Report, Undecided
 from protocol.mission import HEADING_ACCURACY
 
 RANGES_AGAIN, SHARE_AGAIN = 6, 1.1
@@ -74,11 +74,6 @@ class ConfirmingPlanner(GroupPlanner):
         ).with_frame(pose.pose)
 
 
-def _config(state: GroupState) -> RobotConfigWithConfirmation:
-    assert isinstance(state.config, RobotConfigWithConfirmation)
-    return state.config
-
-
 def _now(state: GroupState) -> float:
     """Return the time since tick 0 in s."""
     return state.pair.tick * state.config.mission.period
@@ -89,7 +84,7 @@ def _now(state: GroupState) -> float:
 
 def _in_due_visit(state: GroupState) -> GroupState:
     """Return `state` on the visit whose time has come, or on the way back from one whose time is over."""
-    config, confirming, now = _config(state), state.confirming, _now(state)
+    config, confirming, now = state.config, state.confirming, _now(state)
     if state.visiting and confirming.until is not None:
         if now < confirming.until or state.pair.verdict is not None:
             return state
@@ -140,7 +135,7 @@ def _with_verdict(state: GroupState) -> GroupState:
     """Return `state` with a claim if enough meetings agree, or Undecided if the robot gives up."""
     if state.verdict is not None or state.fix is None:
         return state
-    config = _config(state)
+    config = state.config
     is_late = _now(state) >= config.gives_up
     if is_late or _is_comparison_due(state):
         state = _confirmed(state)
@@ -163,7 +158,7 @@ def _is_comparison_due(state: GroupState) -> bool:
 
 def _confirmed(state: GroupState) -> GroupState:
     """Return `state` with a claim that covers the poses of enough meetings which agree, if it is accurate."""
-    config, confirming, pair = _config(state), state.confirming, state.pair
+    config, confirming, pair = state.config, state.confirming, state.pair
     needed = config.tolerates + 1
     if len(confirming.meetings) < needed:
         return state

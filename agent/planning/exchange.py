@@ -156,14 +156,7 @@ def report_without_log(state: Reporting, verdict: Verdict | None) -> Report:
         robot=state.config.robot,
         phase=state.phase,
         state=state.mode_name,
-        start=None,
-        since=0,
-        through=0,
-        runs=(),
         ranges_since=len(state.log.ranges),
-        ranges=(),
-        heard=0,
-        ranges_heard=0,
         verdict=verdict,
     )
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from msgspec.structs import asdict, replace
+from msgspec.structs import replace
 
 from agent.planning import exchange, group_transitions, sweep_transitions, visit
 from agent.planning.active_sensing import Retreating
@@ -31,9 +31,9 @@ from protocol.messages import (
     Inconsistent,
     Localised,
     Observation,
+    PosePrior,
     Ranged,
     Report,
-    ReportWithPose,
     RobotConfig,
     Undecided,
 )
@@ -99,7 +99,8 @@ class GroupPlanner(Planner[GroupState, Report]):
         without_log = exchange.report_without_log(state.pair, state.verdict)
         if not (sweep_transitions.is_helped(state, peer) and isinstance(state.verdict, Localised)):
             return without_log
-        return ReportWithPose(**asdict(without_log), pose=exchange.reported_pose(state.pair, state.frame))
+        pose = exchange.reported_pose(state.pair, state.frame)
+        return replace(without_log, prior=PosePrior(state.pair.tick, pose))
 
     def decide(self, state: GroupState, reports: Sequence[Report] = ()) -> GroupState:
         """Return `state` with the `reports` of others, and in the next meeting if this one has ended."""

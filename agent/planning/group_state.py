@@ -10,8 +10,8 @@ from msgspec.structs import replace
 from agent.planning.passing import Bypass
 from agent.planning.state import RobotState
 from agent.planning.sweep import Looping, Sweeping
-from protocol.messages import Localised, Ranged, RobotConfigInGroup, Verdict
-from protocol.motion import ORIGIN, Covariance, Pose, compose, inverse
+from protocol.messages import Localised, PosePrior, Ranged, RobotConfig, Verdict
+from protocol.motion import ORIGIN, Pose, compose, inverse
 
 
 class Other(msgspec.Struct, frozen=True):
@@ -34,16 +34,6 @@ class Other(msgspec.Struct, frozen=True):
     """The last tick of this robot's manoeuvres that it has acknowledged, if it has no anchor."""
 
 
-class Reference(msgspec.Struct, frozen=True):
-    """The pose of a sweeping robot with noisy sensors as it has estimated it when a contact began."""
-
-    tick: int
-    pose: Pose
-    """The pose at `tick` in <W>."""
-    covariance: Covariance
-    """The covariance of the error of `pose`."""
-
-
 class OwnPose(msgspec.Struct, frozen=True):
     """The latest estimates of its own pose that a sweeping robot with noisy sensors has made."""
 
@@ -57,8 +47,9 @@ class OwnPose(msgspec.Struct, frozen=True):
     """The number of ranges that it had when sigma was last too large and further ones came; None if never."""
     searched_tick: int | None = None
     """The tick of the latest search of the whole plane, when a contact began; None before the first."""
-    reference: Reference | None = None
-    """The pose that it reports to robots without an anchor in this contact; None if it reports none."""
+    reference: PosePrior | None = None
+    """The pose when this contact with robots without an anchor began, which it reports to them; None if it
+    reports none."""
 
 
 class Fix(msgspec.Struct, frozen=True):
@@ -152,9 +143,8 @@ class GroupState(msgspec.Struct, frozen=True):
         return isinstance(self.pair.mode, Sweeping | Looping)
 
     @property
-    def config(self) -> RobotConfigInGroup:
+    def config(self) -> RobotConfig:
         """The configuration, with the peer and the role of the present meeting."""
-        assert isinstance(self.pair.config, RobotConfigInGroup)
         return self.pair.config
 
     def with_frame(self, pose: Pose) -> GroupState:

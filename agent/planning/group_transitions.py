@@ -21,7 +21,6 @@ from protocol.messages import (
     Localised,
     Member,
     Retry,
-    RobotConfigWithConfirmation,
     Undecided,
     Verdict,
 )
@@ -296,7 +295,7 @@ def next_visit(state: GroupState) -> GroupState:
         if not (state.other(peer).localised or state.other(peer).failed):
             return on_visit(replace(state, visits=visits), peer)
     state = replace(state, visits=visits)
-    if isinstance(config, RobotConfigWithConfirmation):
+    if config.confirms:
         return at_anchor(state)
     seeks = sweep_transitions.wanted(state)
     if seeks and state.parts == 0:

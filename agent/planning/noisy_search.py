@@ -10,15 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from msgspec.structs import asdict, replace
+from msgspec.structs import replace
 
 from agent.estimation.gaussian.claim_agreement import difference
 from agent.planning import exchange, group_transitions, own_pose, sweep, sweep_transitions
 from agent.planning.group import GroupPlanner, with_sender
-from agent.planning.group_state import GroupState, Other, Reference
+from agent.planning.group_state import GroupState, Other
 from agent.planning.state import Done
 from agent.planning.sweep import Sweeping
-from protocol.messages import Localised, Report, ReportWithReference, RobotConfigWithSweep, Undecided
+from protocol.messages import Localised, PosePrior, Report, Undecided
 from protocol.motion import inverse
 from protocol.sweep_strips import ALONG, ASIDE, STRIP_REACH, surveyed_path
 from protocol.sweep_ticks import contact_ticks
@@ -48,10 +48,7 @@ class NoisyGroupPlanner(GroupPlanner):
             return without_log
         since = max(reference.tick, min(state.other(peer).acknowledged, state.pair.log.through))
         part = state.pair.log.after(since, len(state.pair.log.ranges))
-        fields = asdict(without_log) | {"since": since, "through": part.through, "runs": part.runs}
-        return ReportWithReference(
-            **fields, reference=reference.tick, pose=reference.pose, covariance=reference.covariance
-        )
+        return replace(without_log, since=since, through=part.through, runs=part.runs, prior=reference)
 
     def decide(self, state: GroupState, reports: Sequence[Report] = ()) -> GroupState:
         """Return `state` with the `reports` of others, and in the next meeting if this one has ended."""
@@ -72,7 +69,7 @@ class NoisyGroupPlanner(GroupPlanner):
 def _is_beacon(state: GroupState) -> bool:
     """Return whether this robot stays where it is: it sweeps no part, and its planned meetings are over."""
     config = state.config
-    assert isinstance(config, RobotConfigWithSweep)
+    assert config.sweep is not None
     if config.part < config.sweep.parts or state.visits < len(config.visits):
         return False
     return isinstance(state.pair.verdict, Localised) and isinstance(state.verdict, Localised)
@@ -81,7 +78,7 @@ def _is_beacon(state: GroupState) -> bool:
 def _begun(state: GroupState) -> GroupState:
     """Return `state`, which begins a part of the sweep, on its way; or still, if it sweeps none."""
     config, pair = state.config, state.pair
-    assert isinstance(config, RobotConfigWithSweep)
+    assert config.sweep is not None
     assert isinstance(state.verdict, Localised)
     if config.part >= config.sweep.parts:
         return replace(state, pair=replace(pair, mode=Done(3, state.verdict)))
@@ -143,11 +140,11 @@ def _with_contact(state: GroupState) -> GroupState:
     return _agreed(state, reference) if reference is not None else state
 
 
-def _with_reference(state: GroupState, reference: Reference | None) -> GroupState:
+def _with_reference(state: GroupState, reference: PosePrior | None) -> GroupState:
     return replace(state, own_pose=replace(state.own_pose, reference=reference))
 
 
-def _agreed(state: GroupState, reference: Reference) -> GroupState:
+def _agreed(state: GroupState, reference: PosePrior) -> GroupState:
     """Return `state` with `reference`, if the claim of this robot does not contradict it.
 
     The ranges since the claim may have ruled out the hypothesis on which it rests. A claim from a single
@@ -167,11 +164,9 @@ def _agreed(state: GroupState, reference: Reference) -> GroupState:
 
 def _helped(state: GroupState) -> list[str]:
     """Return the robots without an anchor that are not localised, and with which no contact has failed."""
-    config = state.config
-    assert isinstance(config, RobotConfigWithSweep)
     return [
         one
-        for one in config.unanchored
+        for one in state.config.unanchored
         if sweep_transitions.is_helped(state, one) and not state.other(one).failed
     ]
 
@@ -185,7 +180,8 @@ def _ticks_since(state: GroupState, robot: str) -> int:
 def _stops_for(state: GroupState, robot: str) -> bool:
     """Return whether this robot stops for `robot`: it has just passed it, and knows its own pose well."""
     reference, mission = state.own_pose.reference, state.config.mission
-    if reference is None or reference.covariance.position_sigma > WORTH * mission.accuracy:
+    covariance = reference.covariance if reference is not None else None
+    if covariance is None or covariance.position_sigma > WORTH * mission.accuracy:
         return False
     return _has_passed(state.other(robot), state.pair.tick, STRIP_REACH * mission.sensing_range)
 

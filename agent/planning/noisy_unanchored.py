@@ -34,9 +34,7 @@ from protocol.messages import (
     Observation,
     Ranged,
     Report,
-    ReportWithReference,
     RobotConfig,
-    RobotConfigWithoutAnchor,
     Undecided,
 )
 from protocol.mission import Mission
@@ -100,7 +98,6 @@ class NoisyUnanchoredPlanner(Planner[NoisyUnanchoredState, Report]):
 
     def start(self, config: RobotConfig) -> NoisyUnanchoredState:
         """Return the state of a robot that has measured nothing yet."""
-        assert isinstance(config, RobotConfigWithoutAnchor)
         return NoisyUnanchoredState(config)
 
     def observe(self, state: NoisyUnanchoredState, observation: Observation) -> NoisyUnanchoredState:
@@ -134,8 +131,10 @@ class NoisyUnanchoredPlanner(Planner[NoisyUnanchoredState, Report]):
         if state.tick * state.config.mission.period >= state.config.gives_up:
             return replace(state, verdict=Undecided(state.failure))
         for one in reports:
-            if isinstance(one, ReportWithReference):
-                state = _with_reference(state, one)
+            if (prior := one.prior) is not None and prior.covariance is not None:
+                log = MotionLog(through=prior.tick)
+                finder = Finder(one.robot, prior.tick, prior.pose, prior.covariance, log, one.tick)
+                state = _with_finder(state, finder, one)
             elif state.finder is None and one.state == SWEEPING:
                 why = f"{one.robot} has passed it, and does not know its own pose well enough"
                 state = replace(state, failure=why)
@@ -161,11 +160,11 @@ class NoisyUnanchoredPlanner(Planner[NoisyUnanchoredState, Report]):
         )
 
     def malformed(self, body: Report) -> str | None:
-        """Return the reason why the log or the reference in a report is malformed, or None."""
-        if isinstance(body, ReportWithReference):
-            if body.reference > body.since:
-                return f"a log from tick {body.since} on, before its reference at tick {body.reference}"
-            if not is_definite(body.covariance):
+        """Return the reason why the log or the pose in a report is malformed, or None."""
+        if (prior := body.prior) is not None:
+            if prior.tick > body.since:
+                return f"a log from tick {body.since} on, before its pose at tick {prior.tick}"
+            if prior.covariance is None or not is_definite(prior.covariance):
                 return "a covariance of a pose that is not positive definite"
         return peer_state.contradiction(body)
 
@@ -191,26 +190,24 @@ def _kept(state: NoisyUnanchoredState) -> int:
     return 2 * contact_ticks(state.config.mission)
 
 
-def _with_reference(state: NoisyUnanchoredState, one: ReportWithReference) -> NoisyUnanchoredState:
-    """Return `state` with the reference of a finder and its manoeuvres since then.
+def _with_finder(state: NoisyUnanchoredState, finder: Finder, report: Report) -> NoisyUnanchoredState:
+    """Return `state` with the reference of `finder`, and the manoeuvres since then in its `report`.
 
     Another reference of the same finder counts if it is later, and another finder once the present one is
     silent or too inaccurate.
     """
     known = state.finder
-    if known is not None and (known.robot, known.reference) != (one.robot, one.reference):
+    if known is not None and (known.robot, known.reference) != (finder.robot, finder.reference):
         accurate = known.covariance.position_sigma <= state.config.mission.accuracy
-        if known.robot != one.robot and accurate and known.latest > state.tick - _kept(state):
+        if known.robot != finder.robot and accurate and known.latest > state.tick - _kept(state):
             return state
-        if known.robot == one.robot and known.reference > one.reference:
+        if known.robot == finder.robot and known.reference > finder.reference:
             return state
         known = None
     if known is None:
-        log = MotionLog(through=one.reference)
-        known = Finder(one.robot, one.reference, one.pose, one.covariance, log, one.tick)
-        state = replace(state, ranges_at_estimate=0, estimate=None)
-    log = known.log.extended(one.since, 0, MotionLog(one.through, one.runs))
-    return replace(state, finder=replace(known, log=log, latest=max(known.latest, one.tick)))
+        known, state = finder, replace(state, ranges_at_estimate=0, estimate=None)
+    log = known.log.extended(report.since, 0, MotionLog(report.through, report.runs))
+    return replace(state, finder=replace(known, log=log, latest=max(known.latest, report.tick)))
 
 
 def _estimated(state: NoisyUnanchoredState) -> NoisyUnanchoredState:

@@ -19,9 +19,10 @@ from agent.estimation.gaussian.hypotheses import Hypothesis, ScoredHypothesis, f
 from agent.estimation.gaussian.inference import PlanningHypothesis
 from agent.estimation.gaussian.range_model import PairRanges
 from agent.planning import sweep
-from agent.planning.group_state import GroupState, Reference
+from agent.planning.group_state import GroupState
 from agent.planning.state import RobotState
 from agent.planning.sweep import Looping, Sweeping
+from protocol.messages import PosePrior
 from protocol.motion import Covariance, Pose, compose, inverse
 from protocol.sweep_strips import Place
 
@@ -77,7 +78,7 @@ def updated(state: GroupState) -> GroupState:
     return _with_estimate(state, _estimate(state, searched=False))
 
 
-def searched(state: GroupState) -> tuple[GroupState, Reference | None]:
+def searched(state: GroupState) -> tuple[GroupState, PosePrior | None]:
     """Return `state` with an estimate from a search of the whole plane, and its pose if it may be reported.
 
     The conditions are those of a claim of a pair: one hypothesis is left, its fit has converged and is
@@ -199,7 +200,7 @@ def _with_estimate(state: GroupState, estimate: _Estimate | None) -> GroupState:
     return replace(framed, pair=pair, own_pose=own_pose)
 
 
-def _reference(state: GroupState, estimate: _Estimate) -> Reference | None:
+def _reference(state: GroupState, estimate: _Estimate) -> PosePrior | None:
     """Return the pose of `estimate` if the robot may report it (see `searched`); None if not."""
     pair, fitted, own_pose = state.pair, estimate.fitted, state.own_pose
     first, lost = fitted.scored[0], own_pose.ranges_when_lost
@@ -218,4 +219,4 @@ def _reference(state: GroupState, estimate: _Estimate) -> Reference | None:
         return None
     factor = max(widened, 1.0)
     covariance = Covariance(*[factor * one for one in astuple(estimate.covariance)])
-    return Reference(pair.tick, estimate.pose, covariance)
+    return PosePrior(pair.tick, estimate.pose, covariance)

@@ -12,25 +12,19 @@ from msgspec.structs import replace
 from agent.planning import sweep
 from agent.planning.group_state import GroupState
 from agent.planning.sweep import LOOPS_FOR, Looping, Sweeping
-from protocol.messages import RobotConfigWithSweep
 from protocol.motion import inverse
 from protocol.sweep_strips import STRIP_REACH, Place
 
 
 def wanted(state: GroupState) -> bool:
     """Return whether there are robots without an anchor that this robot can still help."""
-    return any(is_helped(state, robot) for robot in _unanchored(state))
+    return any(is_helped(state, robot) for robot in state.config.unanchored)
 
 
 def is_helped(state: GroupState, robot: str) -> bool:
     """Return whether `robot` has no anchor, and still needs the poses of this robot, as far as it knows."""
     known = state.other(robot)
-    return robot in _unanchored(state) and not (known.localised or known.served)
-
-
-def _unanchored(state: GroupState) -> tuple[str, ...]:
-    config = state.config
-    return config.unanchored if isinstance(config, RobotConfigWithSweep) else ()
+    return robot in state.config.unanchored and not (known.localised or known.served)
 
 
 def next_part(state: GroupState) -> GroupState:
@@ -39,7 +33,7 @@ def next_part(state: GroupState) -> GroupState:
     It stops again for robots that it has left before.
     """
     config = state.config
-    assert isinstance(config, RobotConfigWithSweep)
+    assert config.sweep is not None
     for robot in config.unanchored:
         state = state.with_other(robot, replace(state.other(robot), failed=False))
     part = (config.part + state.parts) % config.sweep.parts
@@ -62,7 +56,7 @@ def onward(state: GroupState) -> GroupState | None:
     Near robots without an anchor, it drives squares until they are localised or LOOPS_FOR ticks are over.
     """
     mission, odometry = state.config.mission, state.pair.odometry
-    found = [one for one in _unanchored(state) if is_helped(state, one) and _is_near(state, one)]
+    found = [one for one in state.config.unanchored if is_helped(state, one) and _is_near(state, one)]
     moved = moved_on(
         state,
         found,

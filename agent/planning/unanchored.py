@@ -32,9 +32,7 @@ from protocol.messages import (
     Localised,
     Observation,
     Report,
-    ReportWithPose,
     RobotConfig,
-    RobotConfigWithoutAnchor,
     Undecided,
 )
 from protocol.mission import Mission
@@ -63,7 +61,7 @@ FEWEST_PLACES = 5
 class WaitingState(msgspec.Struct, frozen=True):
     """The state of a robot without an anchor, with exact and with noisy sensors."""
 
-    config: RobotConfigWithoutAnchor
+    config: RobotConfig
     tick: int = -1
     odometry: Pose = ORIGIN
     """The pose by dead reckoning, in the frame of the pose at tick 0."""
@@ -134,7 +132,6 @@ class UnanchoredPlanner(Planner[UnanchoredState, Report]):
 
     def start(self, config: RobotConfig) -> UnanchoredState:
         """Return the state of a robot that has measured nothing yet."""
-        assert isinstance(config, RobotConfigWithoutAnchor)
         return UnanchoredState(config)
 
     def observe(self, state: UnanchoredState, observation: Observation) -> UnanchoredState:
@@ -177,11 +174,11 @@ class UnanchoredPlanner(Planner[UnanchoredState, Report]):
         if isinstance(state.mode, Standing):  # a robot that comes back may have corrected its pose
             places = {key: one for key, one in places.items() if key[1] > state.tick - LOOPS_FOR}
         for one in reports:
-            if not isinstance(one, ReportWithPose) or one.robot in state.candidates:
+            if (prior := one.prior) is None or one.robot in state.candidates:
                 continue
-            if (known := ranges.pop((one.robot, one.tick), None)) is not None:
+            if (known := ranges.pop((one.robot, prior.tick), None)) is not None:
                 distance, odometry = known
-                places[one.robot, one.tick] = RangedPlace((one.pose.x, one.pose.y), odometry, distance)
+                places[one.robot, prior.tick] = RangedPlace((prior.pose.x, prior.pose.y), odometry, distance)
         if places.keys() != state.places.keys():
             state = _resected(replace(state, ranges=ranges, places=places))
         return _moved_on(state) if isinstance(state.mode, Looping) and state.verdict is None else state

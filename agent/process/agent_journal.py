@@ -19,8 +19,6 @@ from protocol.messages import (
     MissionEnd,
     Observation,
     OfRobot,
-    PeerReport,
-    PlannerReport,
     Report,
     RobotConfig,
 )
@@ -31,7 +29,7 @@ from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 class FramedReport(msgspec.Struct, frozen=True):
     """A report together with the frame in which it was received or is sent."""
 
-    report: PeerReport
+    report: Report
     frame: bytes
 
 
@@ -139,7 +137,7 @@ class AgentJournalReading:
         message = self._shared.get(frame)
         if message is None:
             message = decode(frame, OfRobot, MAX_FRAME_BYTES)
-            if isinstance(message, PeerReport | Command):
+            if isinstance(message, Report | Command):
                 self._shared[frame] = message
         if not self._fits(message, frame):
             tick: int | None = getattr(message, "tick", None)
@@ -167,7 +165,7 @@ class AgentJournalReading:
                         return False
                     self._steps.append(Step(**step))
                 self._step = {"observation": message, "frame": frame}
-            case Command() | Estimate() | Report() | PlannerReport() | DeadlineMissed():
+            case Command() | Estimate() | Report() | DeadlineMissed():
                 return bool(step) and self._answers(message, frame, step)
             case MissionEnd():
                 self._end = message
@@ -176,7 +174,7 @@ class AgentJournalReading:
         return True
 
     def _answers(
-        self, message: Command | Estimate | PeerReport | DeadlineMissed, frame: bytes, step: dict[str, Any]
+        self, message: Command | Estimate | Report | DeadlineMissed, frame: bytes, step: dict[str, Any]
     ) -> bool:
         """Add `message` to `step`, and return True if it may be next."""
         assert self.config is not None
@@ -186,9 +184,9 @@ class AgentJournalReading:
                 step["command"], step["command_frame"] = message, frame
             case Estimate() if not is_open and is_now and "estimate" not in step:
                 step["estimate"], step["estimate_frame"] = message, frame
-            case Report() | PlannerReport() if message.robot != self.config.robot and is_open:
+            case Report() if message.robot != self.config.robot and is_open:
                 step["received"] = (*step.get("received", ()), FramedReport(message, frame))
-            case Report() | PlannerReport() if (
+            case Report() if (
                 message.robot == self.config.robot
                 and is_now
                 and len(step.get("reports", ())) < max(1, len(step["observation"].contacts))

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import zenoh
 
-from protocol.messages import AnyRobotConfig, RobotConfig
+from protocol.messages import RobotConfig
 from protocol.network import diagnosis, keys, session
 from protocol.network.diagnosis import FIRST_WORD_S
 from protocol.network.endpoints import Endpoints
@@ -148,10 +148,10 @@ def _offers(link: zenoh.Session, worlds: Sequence[str], robot: str, process: byt
             refused = answer
         elif answer is not None and not is_occupied:
             found = _decoded_config(answer, robot)
-            if isinstance(found, RobotConfig):
-                configs[world] = found
-            else:
+            if isinstance(found, str):
                 unusable = found
+            else:
+                configs[world] = found
     return _Offers(configs, occupied, refused, unusable)
 
 
@@ -159,7 +159,7 @@ def _answer(link: zenoh.Session, world: str, robot: str, process: bytes) -> byte
     """Return the answer of `world` to the query of `process` for the RobotConfig of `robot`."""
     key = keys.config(world, robot)
     return session.ask(
-        link, key, QUERY_S, lambda frame: isinstance(_decoded_config(frame, robot), RobotConfig), process
+        link, key, QUERY_S, lambda frame: not isinstance(_decoded_config(frame, robot), str), process
     )
 
 
@@ -179,7 +179,7 @@ def confirm(link: zenoh.Session, run: str, robot: str, search: Search) -> None:
 def _decoded_config(answer: bytes, robot: str) -> RobotConfig | str:
     """Return the RobotConfig of `robot` in the answer of a world, or the reason why there is none."""
     try:
-        config: RobotConfig = decode(answer, AnyRobotConfig)
+        config: RobotConfig = decode(answer, RobotConfig)
     except MalformedFrame as error:
         return f"the world's RobotConfig cannot be decoded: {error}"
     if config.robot != robot:

@@ -8,7 +8,7 @@ from typing import Any
 
 import zenoh
 
-from protocol.messages import RobotConfig, RobotConfigInGroup
+from protocol.messages import RobotConfig
 from protocol.network import keys, session
 from protocol.network.inbox import NO_ARRIVAL, Arrival, Inbox
 
@@ -30,7 +30,7 @@ class AgentLink:
     def __init__(self, config: RobotConfig, run: str, inbox: Inbox) -> None:
         self._id = config.robot
         self._peer = config.peer
-        self._senders = "*" if isinstance(config, RobotConfigInGroup) else config.peer
+        self._senders = "*" if config.members else config.peer
         """The robots whose Reports are received: the peer, or in a group all robots."""
         self._run = run
         self._inbox = inbox

@@ -1,7 +1,7 @@
 """The bodies of reports: what a planner returns and receives, and the messages in which it is sent.
 
 The body of a planner that exchanges motion logs is a `Report`, which is a message itself. Any other body is
-encoded, and sent in a `PlannerReport`.
+encoded, and sent in the field `body` of one.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 
 from agent.planning.planner import Planner
-from protocol.messages import Inconsistent, PeerReport, PlannerReport, Report, Undecided, Verdict
+from protocol.messages import Inconsistent, Report, Undecided, Verdict
 from protocol.wire import MalformedFrame
 
 _encoder = msgspec.msgpack.Encoder()
@@ -19,12 +19,10 @@ _decoders: dict[Any, msgspec.msgpack.Decoder[Any]] = {}
 
 
 SHORT_REASON = 24
-"""The maximum number of characters of a reason in a PlannerReport, so that most of it is the body."""
+"""The maximum number of characters of a reason beside a body, so that most of a report is the body."""
 
 
-def report_of(
-    body: Any, tick: int, robot: str, heard: int | None = None, verdict: Verdict | None = None
-) -> PeerReport:
+def report_of(body: Any, tick: int, robot: str, heard: int = 0, verdict: Verdict | None = None) -> Report:
     """Return the message of `robot` at `tick` with the `body` that its planner has returned.
 
     `heard` is the tick of the peer's latest report, and `verdict` that of the latest Command.
@@ -36,20 +34,20 @@ def report_of(
             verdict = Undecided(reason[:SHORT_REASON])
         case Inconsistent(claim, residual, p_value):
             verdict = Inconsistent(claim[:SHORT_REASON], residual, p_value)
-    return PlannerReport(tick, robot, heard, verdict, _encoder.encode(body))
+    return Report(tick, robot, heard=heard, verdict=verdict, body=_encoder.encode(body))
 
 
-def body_of(report: PeerReport, planner: Planner[Any, Any]) -> Any:
+def body_of(report: Report, planner: Planner[Any, Any]) -> Any:
     """Return the body of `report`, as `planner` receives it.
 
     Raises MalformedFrame if it is not of the planner's type.
     """
-    if isinstance(report, Report):
+    if report.body is None:
         if planner.BODY is not Report:
-            raise MalformedFrame("a Report, and this robot's planner has reports of its own")
+            raise MalformedFrame("a report without a body, and this robot's planner has reports of its own")
         return report
     if planner.BODY is Report:
-        raise MalformedFrame("a PlannerReport, and this robot's planner has none")
+        raise MalformedFrame("a report with a body, and this robot's planner has none")
     decoder = _decoders.get(planner.BODY)
     if decoder is None:
         decoder = _decoders[planner.BODY] = msgspec.msgpack.Decoder(planner.BODY)
@@ -59,7 +57,7 @@ def body_of(report: PeerReport, planner: Planner[Any, Any]) -> Any:
         raise MalformedFrame(f"its body: {error}") from None
 
 
-def malformed(report: PeerReport, planner: Planner[Any, Any]) -> str | None:
+def malformed(report: Report, planner: Planner[Any, Any]) -> str | None:
     """Return why the planner's decoder refuses `report`; None if it does not."""
     try:
         return planner.malformed(body_of(report, planner))

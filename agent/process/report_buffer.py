@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 
 from agent.process.agent_journal import FramedReport
 from agent.process.recovery import REPORTS_KEPT
-from protocol.messages import PeerReport
+from protocol.messages import Report
 from protocol.network.inbox import Arrival, Inbox
 from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode
 
@@ -18,7 +18,7 @@ class ReportBuffer:
         self,
         inbox: Inbox,
         received: Sequence[FramedReport],
-        malformed: Callable[[PeerReport], str | None],
+        malformed: Callable[[Report], str | None],
         *,
         real_time: bool,
     ) -> None:
@@ -38,7 +38,7 @@ class ReportBuffer:
     def take(self, arrival: Arrival, known: int) -> None:
         """Store the report in `arrival`, or refuse it. `known` is the tick of the latest Observation."""
         try:
-            report: PeerReport = decode(arrival.frame, PeerReport, MAX_REPORT_BYTES)
+            report: Report = decode(arrival.frame, Report, MAX_REPORT_BYTES)
         except MalformedFrame as error:
             self._inbox.refuse(arrival, error)
             return

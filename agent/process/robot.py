@@ -108,7 +108,7 @@ class Robot:
             self.damaged += len(contact.damaged)
             self.mutual_ranges += contact.range is not None
             body = self.planner.report_to(self.state, peer)
-            report = report_of(body, self.tick, self.config.robot, self._heard.get(peer), self._verdict)
+            report = report_of(body, self.tick, self.config.robot, self._heard.get(peer, 0), self._verdict)
             framed = self.reports[peer] = FramedReport(report, self._encode(report))
             self.reports_sent += 1
             self.bytes_sent += len(framed.frame)

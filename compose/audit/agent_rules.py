@@ -13,7 +13,7 @@ from agent.process.robot import Robot
 from compose.audit.findings import Checks, Violation, between, difference
 from compose.launch.planner_loader import planner_of
 from compose.recording.run import Run
-from protocol.messages import Command, FinalReport, Message, MissionEnd, Observation, PeerReport
+from protocol.messages import Command, FinalReport, Message, MissionEnd, Observation, Report
 from protocol.mission import Mission
 from protocol.motion import Controls
 from protocol.wire import MalformedFrame, decode, encode
@@ -129,9 +129,7 @@ def log(run: Run) -> Checks:
                 yield Violation("log", tick, robot, what) if what is not None else None
 
 
-def _misreport(
-    planner: Planner[Any, Any], report: PeerReport, observations: Sequence[Observation]
-) -> str | None:
+def _misreport(planner: Planner[Any, Any], report: Report, observations: Sequence[Observation]) -> str | None:
     try:
         return planner.misreport(body_of(report, planner), observations)
     except MalformedFrame as error:

@@ -13,7 +13,7 @@ from agent.process.agent_journal import AgentHistory
 from compose.audit.findings import Checks, Violation, between
 from compose.launch.planner_loader import planner_of
 from compose.recording.run import Run
-from protocol.messages import MissionEnd, PeerReport, Report, ReportWithPose
+from protocol.messages import MissionEnd, Report
 from protocol.motion import Pose, travelled
 from world.referee import inaccuracy, mistake
 from world.scenario import RobotSpec
@@ -76,11 +76,11 @@ def _known_until(agent: AgentHistory, peer: str, tick: int, planner: Planner[Any
     return min(max(ends, default=-1), tick)
 
 
-def _through(report: PeerReport) -> int:
-    """Return the tick up to which a report contains the sender's manoeuvres."""
-    if isinstance(report, ReportWithPose):  # the pose stands for a log
+def _through(report: Report) -> int:
+    """Return the tick up to which a report tells where its sender was: by its log, its pose or its body."""
+    if report.body is not None:
         return report.tick
-    return report.through if isinstance(report, Report) else report.tick
+    return max(report.through, report.prior.tick) if report.prior is not None else report.through
 
 
 def _too_few(tick: int, placed: RobotSpec, what: str, found: int, expected: int) -> Violation | None:

@@ -13,7 +13,7 @@ from agent.planning.planner import Planner, Summary
 from agent.process.report_bodies import body_of, malformed, report_of
 from compose.errors import PlannerFailed
 from compose.launch.planner_guard import GuardedPlanner
-from protocol.messages import Command, Estimate, Observation, PeerReport, Report, RobotConfig
+from protocol.messages import Command, Estimate, Observation, Report, RobotConfig
 from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode, encode
 
 MUTANTS = 24
@@ -174,7 +174,7 @@ class HostilityProbe(Watched):
                 self._try(state, false)
         return super().decide(state, reports)
 
-    def _try(self, state: Any, report: PeerReport) -> None:
+    def _try(self, state: Any, report: Report) -> None:
         why = malformed(report, self.planner)
         if why is not None:
             if why.startswith("the decoder of"):
@@ -193,12 +193,12 @@ def _frame(answer: Any) -> bytes:
     return msgspec.msgpack.encode(answer)
 
 
-def _mutants(report: PeerReport, key: str) -> Iterator[PeerReport]:
+def _mutants(report: Report, key: str) -> Iterator[Report]:
     """Yield reports like `report` with another content that is still a message."""
     draw = random.Random(key)
     for _ in range(MUTANTS):
         try:
-            if isinstance(report, Report):
+            if report.body is None:
                 tree = _changed(msgspec.msgpack.decode(msgspec.msgpack.encode(report)), draw)
                 frame = msgspec.msgpack.decode(msgspec.msgpack.encode(tree), type=Report)
                 yield decode(encode(frame), Report, MAX_REPORT_BYTES)

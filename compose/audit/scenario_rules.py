@@ -15,7 +15,7 @@ from compose.scenario.group_meetings import FirstMeeting, GroupMeetings, group_m
 from compose.scenario.group_sweep import with_sweep
 from compose.scenario.scenario_tables import PlannerTable, RobotTable
 from protocol.attack import OF_THE_START
-from protocol.messages import RobotConfig, RobotConfigInGroup, RobotConfigWithoutAnchor
+from protocol.messages import RobotConfig
 from protocol.mission import (
     Anchor,
     Mission,
@@ -170,11 +170,11 @@ def _off_config(found: RobotConfig) -> str | None:
 
     A robot without an anchor has none: it waits.
     """
-    if isinstance(found, RobotConfigWithoutAnchor):
+    if found.given_anchor is None:
         waits = found.rendezvous.a == found.rendezvous.b == Orbit(0.0, 0.0, 0.0)
         return None if waits else "rendezvous: it has an orbit and no anchor"
     why = _off_plan(found.rendezvous, found, found.anchor, found.peer_anchor)
-    visited = isinstance(found, RobotConfigInGroup) and found.role == "b"
+    visited = bool(found.members) and found.role == "b"
     if visited and found.rendezvous == visiting(found.mission, found.anchor_distance):
         return None
     return why

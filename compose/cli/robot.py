@@ -25,7 +25,7 @@ from compose.recording.recording_files import folder_for
 from compose.recording.run import ended
 from compose.scenario.run_settings import check_rate
 from compose.terminal.text_width import tell
-from protocol.messages import Localised, MissionEnd, RobotConfig, RobotConfigInGroup
+from protocol.messages import Localised, MissionEnd, RobotConfig
 from protocol.motion import wrap
 from protocol.network import access_control, session
 from protocol.network.endpoints import Endpoints
@@ -131,7 +131,7 @@ def _run(
             stop_by_signal(inbox)
             field.attach(link)
             if not options.quiet:
-                whom = "the others" if isinstance(config, RobotConfigInGroup) else "its peer"
+                whom = "the others" if config.members else "its peer"
                 where = f"resumed at tick {field.tick}" if field.tick >= 0 else f"waiting for {whom}"
                 say(f"{options.id}: in run {field.run}, {where}")
             end = field.run_mission(

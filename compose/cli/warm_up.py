@@ -8,23 +8,23 @@ from compose.scenario.scenario_file import load
 from protocol import wire
 from protocol.journal import environment
 from protocol.messages import (
-    AnyRobotConfig,
     Command,
     FinalReport,
     MissionEnd,
     Observation,
-    PeerReport,
+    Report,
+    RobotConfig,
 )
-from world.scenario import RecordedScenario
+from world.scenario import Scenario
 
 WARM_UP_MISSION = "paper-1"
 FORKED = ("world", "agent")
 """The commands that forked processes run."""
 RECEIVED = (
-    AnyRobotConfig,
-    RecordedScenario,
+    RobotConfig,
+    Scenario,
     Observation | MissionEnd,
-    PeerReport,
+    Report,
     Command,
     Command | FinalReport,
 )

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import zenoh
 
 from compose.doctor.finding import Finding, fix, ok, untried
-from protocol.messages import AnyRobotConfig, Observation, RobotConfig
+from protocol.messages import Observation, RobotConfig
 from protocol.network import access_control, keys, session
 from protocol.network.endpoints import Endpoints
 from protocol.wire import MalformedFrame, decode
@@ -188,7 +188,7 @@ def _peer(link: zenoh.Session, run: str, robot: str) -> str | None:
     if not isinstance(answer, bytes):
         return None
     try:
-        config: RobotConfig = decode(answer, AnyRobotConfig)
+        config: RobotConfig = decode(answer, RobotConfig)
     except MalformedFrame:
         return None
     return config.peer

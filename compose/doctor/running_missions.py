@@ -16,13 +16,13 @@ import zenoh
 
 from compose.doctor.access_checks import ASK_S
 from protocol.messages import (
-    AnyRobotConfig,
     Command,
     FinalReport,
     MissionEnd,
     Observation,
     Outcome,
     Phase,
+    RobotConfig,
 )
 from protocol.network import keys, session
 from protocol.network.keys import Key
@@ -161,7 +161,7 @@ def _mission(link: zenoh.Session, latest: _LatestFrames, run: str, alive: frozen
     ]
     answers = _configs(link, run, latest.named(run, keys.observation) | alive - {""}) if "" in alive else {}
     frames += answers.values()
-    configs = [one for frame in answers.values() if (one := _decoded(frame, AnyRobotConfig)) is not None]
+    configs = [one for frame in answers.values() if (one := _decoded(frame, RobotConfig)) is not None]
     named = alive - {""} | latest.named(run, keys.observation) | latest.named(run, keys.command)
     named |= {robot for one in configs for robot in one.others}
     messages = [
@@ -202,11 +202,11 @@ def _configs(link: zenoh.Session, run: str, robots: set[str]) -> dict[str, bytes
                 link,
                 keys.config(run, robot),
                 ASK_S,
-                lambda frame: _decoded(frame, AnyRobotConfig) is not None,
+                lambda frame: _decoded(frame, RobotConfig) is not None,
             )
             if isinstance(answer, bytes):
                 found[robot] = answer
-                config = _decoded(answer, AnyRobotConfig)
+                config = _decoded(answer, RobotConfig)
                 paired.update(config.others if config is not None else ())
     return found
 

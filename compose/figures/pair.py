@@ -17,7 +17,7 @@ from compose.figures.agent_replay import AgentReplay
 from compose.recording.claim import Claim
 from compose.recording.meetings import PastMeeting, past_meetings
 from compose.recording.run import Run
-from protocol.messages import Command, Estimate, RobotConfig, RobotConfigInGroup
+from protocol.messages import Command, Estimate, RobotConfig
 from protocol.mission import ROLES, Anchor, Mission, PlannerName, Role
 from protocol.motion import Pose
 from protocol.orbits import Orbit
@@ -326,6 +326,6 @@ def _in_meeting(config: RobotConfig, meeting: PastMeeting) -> RobotConfig:
     """Return `config`, of a robot of a group, with its peer and its role in `meeting`."""
     role: Role = "a" if config.robot == meeting.a else "b"
     peer = meeting.b if role == "a" else meeting.a
-    if config.peer == peer or not isinstance(config, RobotConfigInGroup):
+    if config.peer == peer or not config.members:
         return config
     return config.in_meeting(peer, role)

@@ -9,10 +9,6 @@ from compose.errors import UserError
 from compose.launch.class_loader import entry_points, named
 from protocol.messages import (
     RobotConfig,
-    RobotConfigInGroup,
-    RobotConfigWithConfirmation,
-    RobotConfigWithoutAnchor,
-    RobotConfigWithSweep,
 )
 from protocol.mission import Mission
 from protocol.orbits import RENDEZVOUS, Rendezvous, rendezvous
@@ -69,7 +65,7 @@ def unguarded_planner_of(config: RobotConfig) -> Planner[Any, Any]:
     """Return a new planner of the robot with this configuration, without a guard. Raises UserError."""
     name = config.planner_name
     found = _suited(name, config.planner_options, config.mission)
-    if not isinstance(config, RobotConfigInGroup):
+    if not config.members:
         return found
     from agent.planning.assured import AssuredExact  # noqa: PLC0415  # it imports numpy
     from agent.planning.confirmation import ConfirmingPlanner  # noqa: PLC0415  # likewise
@@ -79,13 +75,13 @@ def unguarded_planner_of(config: RobotConfig) -> Planner[Any, Any]:
     from agent.planning.unanchored import UnanchoredPlanner  # noqa: PLC0415  # likewise
 
     exact = config.mission.noise.exact
-    if isinstance(config, RobotConfigWithoutAnchor):
+    if config.given_anchor is None:
         return UnanchoredPlanner() if exact else NoisyUnanchoredPlanner()
     if not isinstance(found, AssuredExact):
         raise UserError(f"robots with the planner {name} meet in pairs, not in a group")
-    if isinstance(config, RobotConfigWithConfirmation):
+    if config.confirms:
         return ConfirmingPlanner(found)
-    searches = isinstance(config, RobotConfigWithSweep) and not exact
+    searches = config.unanchored and not exact
     return NoisyGroupPlanner(found) if searches else GroupPlanner(found)
 
 

@@ -20,7 +20,7 @@ from protocol import limits
 from protocol.network.inbox import Inbox
 from protocol.output import say
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
-from world.scenario import RecordedScenario, Scenario
+from world.scenario import Scenario
 
 FOLLOW_S = 2.0
 """Time in s that the agents have to end after the world has ended."""
@@ -66,7 +66,7 @@ def free_endpoint(protocol: str = "tcp") -> str:
 def scenario_from_launcher() -> Scenario:
     """Return the scenario that the launcher sent to the standard input of this child process."""
     size = int.from_bytes(sys.stdin.buffer.read(4), "big")
-    scenario: Scenario = decode(sys.stdin.buffer.read(size), RecordedScenario, MAX_FRAME_BYTES)
+    scenario: Scenario = decode(sys.stdin.buffer.read(size), Scenario, MAX_FRAME_BYTES)
     trust_all(scenario)
     return scenario
 

@@ -23,9 +23,9 @@ from protocol.messages import (
     Observation,
 )
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, body, decode
-from world.scenario import RecordedScenario
+from world.scenario import Scenario
 
-OfWorld = Environment | RecordedScenario | Command | DeadlineMissed | MissionEnd | FinalReport
+OfWorld = Environment | Scenario | Command | DeadlineMissed | MissionEnd | FinalReport
 """The kinds of messages in the world's journal."""
 
 
@@ -67,7 +67,7 @@ def _named(value: Any) -> Any:
         return value
     named = {
         name: one if type(one) in _PLAIN else _named(one)
-        for name, one in zip(value.__struct_fields__, astuple(value), strict=True)
+        for name, one in zip(value.__struct_encode_fields__, astuple(value), strict=True)
     }
     return {"verdict": "localised", **named} if isinstance(value, Localised) else named
 

@@ -18,7 +18,7 @@ from msgspec.structs import replace
 
 from compose.recording.run import Run
 from compose.recording.run_setup import PresentMeeting, RunSetup
-from protocol.messages import Command, Localised, Observation, PeerReport, Report
+from protocol.messages import Command, Localised, Observation
 from protocol.motion import Pose
 
 TRAVELLING = "travelling"
@@ -59,11 +59,6 @@ class PastMeeting(msgspec.Struct, frozen=True):
     """The number of meetings of the two so far, this one included."""
     newcomers: frozenset[str] = frozenset()
     """The robots whose first meeting this is."""
-
-
-def has_log(report: PeerReport) -> bool:
-    """Return whether `report` is to a robot with which its sender is in a meeting."""
-    return isinstance(report, Report) and report.has_log
 
 
 def senders(observation: Observation) -> list[str]:
@@ -207,7 +202,7 @@ def _logs(run: Run, tick: int) -> Iterable[tuple[str, str]]:
         if tick < len(agent.steps):
             step = agent.steps[tick]
             for contact, framed in zip(step.observation.contacts, step.reports, strict=False):
-                if has_log(framed.report):
+                if framed.report.has_log:
                     yield robot, contact.peer
 
 

@@ -15,10 +15,10 @@ from compose.errors import FAILED, FULL_DISK, CannotWrite, UserError
 from protocol.journal import journal_file
 from protocol.journal.journal_file import CannotRecord, CorruptJournal
 from protocol.messages import OfRobot
-from world.scenario import RecordedScenario
+from world.scenario import Scenario
 
 WORLD_JOURNAL = "world.journal"
-KINDS = RecordedScenario | OfRobot
+KINDS = Scenario | OfRobot
 """The kinds of messages in any journal."""
 
 

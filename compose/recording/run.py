@@ -33,7 +33,6 @@ from protocol.messages import (
     Observation,
     Outcome,
     RobotConfig,
-    RobotConfigInGroup,
     Verdict,
 )
 from protocol.motion import Controls, Pose
@@ -434,7 +433,7 @@ def _shared(config: RobotConfig, robot: str) -> tuple[object, ...]:
 
     In a group, a peer may have another one in its first meeting, and all robots share the rest.
     """
-    if isinstance(config, RobotConfigInGroup):
+    if config.members:
         return config.members, config.mission, config.planner_name, config.tick_s
     own = config.robot == robot
     return (

@@ -11,7 +11,7 @@ import msgspec
 from msgspec.structs import replace
 
 from protocol.attack import Attack
-from protocol.messages import RobotConfig, RobotConfigInGroup, RobotConfigWithoutAnchor
+from protocol.messages import RobotConfig
 from protocol.mission import Anchor, Mission, PlannerName, Role
 from protocol.motion import Pose
 from protocol.orbits import RENDEZVOUS, Orbit
@@ -232,7 +232,7 @@ def of_configs(name: str, configs_by_robot: Mapping[str, RobotConfig]) -> RunSet
     """
     configs = list(configs_by_robot.values())
     visits = _visits(configs)
-    unanchored = [one for one in configs if isinstance(one, RobotConfigWithoutAnchor)]
+    unanchored = [one for one in configs if one.given_anchor is None]
     return RunSetup(
         name=name,
         robots=tuple(
@@ -241,7 +241,7 @@ def of_configs(name: str, configs_by_robot: Mapping[str, RobotConfig]) -> RunSet
                     one.robot,
                     one.peer,
                     one.role,
-                    None if isinstance(one, RobotConfigWithoutAnchor) else one.anchor,
+                    one.given_anchor,
                     one.rendezvous.of(one.role),
                     one.attack,
                     own_planner=one.planner_name not in RENDEZVOUS and not visits,
@@ -262,9 +262,8 @@ def of_configs(name: str, configs_by_robot: Mapping[str, RobotConfig]) -> RunSet
 
 def _visits(configs: Sequence[RobotConfig]) -> list[Visit]:
     """Return the planned meetings in the configurations of a group."""
-    grouped = [one for one in configs if isinstance(one, RobotConfigInGroup)]
-    found = [(one, one.peer) for one in grouped if one.role == "a"]  # none without an anchor
-    found += [(one, visited) for one in grouped for visited in one.visits]
+    found = [(one, one.peer) for one in configs if one.role == "a"]  # none without an anchor
+    found += [(one, visited) for one in configs for visited in one.visits]
     visits = [
         Visit(one.robot, visited, one.member(visited).ends * one.mission.period)
         for one, visited in found

@@ -9,20 +9,18 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from msgspec.structs import asdict
 
 from compose.errors import BadFault, BadKill, BadScenario, Unworkable, UserError
 from compose.launch import model_loader, planner_loader
 from compose.launch.class_loader import trust
 from compose.scenario.fault_syntax import FaultTable, added, table_of
 from compose.scenario.first_meetings import in_group, linked, meetings_of, pair_meetings
-from compose.scenario.group_meetings import GroupMeetings
 from compose.scenario.kills import WORLD, Kill, drawn
 from compose.scenario.scenario_tables import MAX_TICKS, MissionTable, PlannerTable, RobotTable, ScenarioFile
 from compose.scenario.shipped_files import misplaced, shipped, unknown
 from compose.scenario.toml_file import field_first, read_text, table_in
 from protocol.attack import OF_THE_START
-from protocol.messages import AnyRobotConfig
+from protocol.messages import RobotConfig
 from protocol.mission import (
     Anchor,
     Mission,
@@ -38,16 +36,10 @@ from protocol.wire import MalformedFrame, decode, encode
 from world.faults import Fault, delivery_time_bound
 from world.scenario import (
     Death,
-    RecordedScenario,
     RobotSpec,
     Scenario,
-    ScenarioOfGroup,
-    ScenarioWithConfirmation,
-    ScenarioWithOptions,
-    ScenarioWithSweep,
-    ScenarioWithWorldNoise,
 )
-from world.world_noise import world_noise_infeasibility, world_noise_mistake
+from world.world_noise import WorldNoise, world_noise_infeasibility, world_noise_mistake
 
 EXCHANGES = 20
 """The number of reports for each of which `max_ticks` allows the full `delivery_time_bound`."""
@@ -60,7 +52,7 @@ class ScenarioTemplate(msgspec.Struct, frozen=True):
 
     file: ScenarioFile
     """The content of the file, with the robots that its `[group]` has with the seed of the file."""
-    scenario: RecordedScenario
+    scenario: Scenario
     """Scenario with the seed of the file."""
     source: str
     """The name or path of the file, for errors."""
@@ -282,6 +274,7 @@ def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scena
     if file.max_ticks is None and budget + delay > MAX_TICKS:
         cause = "mission: the rendezvous" if budget > MAX_TICKS else "fault: the delivery of reports"
         raise Unworkable(f"{source}: {cause} could take {budget + delay} ticks, more than {MAX_TICKS}")
+    noise = file.world.noise
     scenario = Scenario(
         name=file.name,
         seed=file.seed,
@@ -290,44 +283,21 @@ def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scena
         planner_name=file.planner.name,
         robots=tuple(placed),
         faults=faults,
+        world_noise=WorldNoise() if noise.changes_nothing(file.mission.noise) else noise,
+        planner_options=file.planner.options,
+        range_model=file.world.range,
+        radio_model=file.world.radio,
+        meetings=meetings.planned if meetings is not None else (),
+        retries=meetings.retries if meetings is not None else (),
+        deaths=tuple([Death(one.id, one.dies) for one in file.robot if one.dies is not None]),
+        planned_sweep=meetings.sweep if meetings is not None else None,
+        confirmation=meetings.confirmation if meetings is not None else None,
     )
-    scenario = _with_world(scenario, file, meetings)
     try:
         for one in scenario.robots:
-            decode(encode(scenario.config(one.id)), AnyRobotConfig)
+            decode(encode(scenario.config(one.id)), RobotConfig)
     except MalformedFrame as error:
         raise Unworkable(f"{source}: mission: a robot's configuration cannot be encoded: {error}") from None
-    return scenario
-
-
-def _with_world(scenario: Scenario, file: ScenarioFile, meetings: GroupMeetings | None) -> Scenario:
-    """Return `scenario` with what its file says about the group and the world, if it says anything."""
-    if meetings is not None:
-        of_group = ScenarioOfGroup(
-            **asdict(scenario),
-            world_noise=file.world.noise,
-            planner_options=file.planner.options,
-            range_model=file.world.range,
-            radio_model=file.world.radio,
-            meetings=meetings.planned,
-            retries=meetings.retries,
-            deaths=tuple([Death(one.id, one.dies) for one in file.robot if one.dies is not None]),
-        )
-        if meetings.confirmation is not None:
-            return ScenarioWithConfirmation(**asdict(of_group), confirmation=meetings.confirmation)
-        if meetings.sweep is None:
-            return of_group
-        return ScenarioWithSweep(**asdict(of_group), planned_sweep=meetings.sweep)
-    if file.planner.options or file.world.range is not None or file.world.radio is not None:
-        return ScenarioWithOptions(
-            **asdict(scenario),
-            world_noise=file.world.noise,
-            planner_options=file.planner.options,
-            range_model=file.world.range,
-            radio_model=file.world.radio,
-        )
-    if not file.world.noise.changes_nothing(file.mission.noise):
-        return ScenarioWithWorldNoise(**asdict(scenario), world_noise=file.world.noise)
     return scenario
 
 

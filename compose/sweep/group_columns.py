@@ -9,11 +9,10 @@ import msgspec
 from compose.recording.claim import Claim
 from compose.recording.corrected_bounds import corrected_bounds
 from compose.recording.group_localisation import meeting_results, search_results
-from compose.recording.meetings import has_log
 from compose.recording.run import Run
 from compose.scenario.group_plan import least_makespan
 from compose.scenario.wake_up_tree import MeetingTimes
-from protocol.messages import Inconsistent, Localised, Report
+from protocol.messages import Inconsistent, Localised
 from world.referee import mistake
 from world.scenario import Scenario
 
@@ -81,9 +80,9 @@ def _met_and_found(run: Run, honest: list[str]) -> tuple[int, int]:
         for step in run.agents[robot].steps if robot in run.agents else ():
             for contact, framed in zip(step.observation.contacts, step.reports, strict=False):
                 report = framed.report
-                if contact.peer not in attackers or not isinstance(report, Report):
+                if contact.peer not in attackers:
                     continue
-                if has_log(report):
+                if report.has_log:
                     met.add((robot, contact.peer))
                 if isinstance(report.verdict, Inconsistent):
                     found.add((robot, contact.peer))

@@ -26,7 +26,7 @@ from protocol.mission import Role
 from protocol.motion import compose
 from protocol.output import one_line
 from protocol.wire import MAX_FRAME_BYTES, decode
-from world.scenario import RecordedScenario, Scenario
+from world.scenario import Scenario
 
 MAPPED = 8
 """The largest number of robots that are drawn; of more, numbers are shown."""
@@ -67,7 +67,7 @@ class RobotCounts:
 
     def display(self) -> RenderableType:
         """Return the numbers, with the new frames of the world's journal."""
-        known = RecordedScenario | Command | DeadlineMissed | MissionEnd | FinalReport
+        known = Scenario | Command | DeadlineMissed | MissionEnd | FinalReport
         with suppress(OSError, ValueError):
             for frame in self._journal.news():
                 message = decode(frame, known, MAX_FRAME_BYTES)

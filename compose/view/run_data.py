@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import msgspec
 
 from compose.recording.kills_file import Killed
-from compose.recording.meetings import GroupTick, Meetings, has_log, meetings_after, senders
+from compose.recording.meetings import GroupTick, Meetings, meetings_after, senders
 from compose.recording.run_setup import RunSetup
 from compose.scenario.kills import WORLD
 from protocol.messages import (
@@ -22,8 +22,6 @@ from protocol.messages import (
     Message,
     MissionEnd,
     Observation,
-    PeerReport,
-    PlannerReport,
     Report,
     RobotConfig,
 )
@@ -41,7 +39,7 @@ Link = tuple[str, str]
 class SizedReport(msgspec.Struct, frozen=True):
     """A report and the size of its frame."""
 
-    report: PeerReport
+    report: Report
     bytes: int
     """The size of the frame in bytes."""
 
@@ -160,7 +158,7 @@ class RunData:
     def _logs(self, tick: int) -> list[Link]:
         """Return the links of the reports with a log in `tick`."""
         reports = self.ticks[tick].reports if tick in self.ticks else {}
-        return [link for link, sized in reports.items() if has_log(sized.report)]
+        return [link for link, sized in reports.items() if sized.report.has_log]
 
     def _place(self, tick: int, robot: str) -> Pose | None:
         """Return the true pose of a robot in `tick`, or where it believes to be."""
@@ -301,7 +299,7 @@ class RunData:
                 self.at(tick).commands.setdefault(robot, message)
             case Estimate(tick, robot):
                 self.at(tick).estimates.setdefault(robot, message)
-            case Report(tick, robot) | PlannerReport(tick, robot):
+            case Report(tick, robot):
                 to = receiver or (
                     self._receiver(robot, tick) if journal_owner in (None, robot) else journal_owner
                 )
@@ -328,10 +326,10 @@ class RunData:
         config = self.configs.get(sender)
         return config.peer if config is not None else ""
 
-    def _add_reported(self, report: PeerReport) -> None:
+    def _add_reported(self, report: Report) -> None:
         """Extend the reported log of an attacker; a report may change earlier ticks than its own."""
         config = self.configs.get(report.robot)
-        if config is None or config.attack is None or not isinstance(report, Report):
+        if config is None or config.attack is None or report.body is not None:
             return
         if report.through > report.tick:  # nobody can report what has not been yet
             return

@@ -20,7 +20,6 @@ from protocol.messages import (
     Contact,
     Localised,
     MissionEnd,
-    PeerReport,
     Phase,
     Probability,
     Report,
@@ -177,12 +176,10 @@ def scene(
     )
 
 
-def _sent(report: PeerReport, size: int) -> Sent:
-    match report:
-        case Report(phase=phase, state=state, through=through, heard=heard):
-            return Sent(size, phase, state, through, heard)
-        case _:
-            return Sent(size)
+def _sent(report: Report, size: int) -> Sent:
+    if report.body is not None:
+        return Sent(size)
+    return Sent(size, report.phase, report.state, report.through, report.heard)
 
 
 def held_poses(robot: str, now: TickData, mission: Mission) -> HeldPoses | None:

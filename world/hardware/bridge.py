@@ -25,11 +25,9 @@ from protocol.messages import (
     Command,
     FinalReport,
     MissionEnd,
-    PeerReport,
+    Report,
     RobotConfig,
-    RobotConfigInGroup,
     TickStart,
-    TickStartInGroup,
     Verdict,
 )
 from protocol.network import keys, session
@@ -112,7 +110,7 @@ class Field:
         self._max_ticks = max_ticks
         self._ending: Termination = (
             GroupEnding(config, max_ticks, self._timeout)
-            if isinstance(config, RobotConfigInGroup)
+            if config.members
             else Ending(config, max_ticks, self._timeout)
         )
         self._source = TickSource(config, self._tick_s)
@@ -376,7 +374,7 @@ class Field:
         that is behind sets its clock from any other one: if it was restarted, and in a group also if it
         begins late or is more than MOST_TICKS_AHEAD ticks behind.
         """
-        start: TickStart | None = self._accepted(arrival, TickStart | TickStartInGroup)
+        start: TickStart | None = self._accepted(arrival, TickStart)
         if start is None:
             return
         left, now, in_group = self._tick + 1 - start.tick, time.monotonic(), self._source.joins
@@ -402,12 +400,12 @@ class Field:
 
     def _on_report(self, arrival: Arrival) -> None:
         """Use a Report for the end of the mission. One before tick 0 is dropped: they are cumulative."""
-        report: PeerReport | None = self._accepted(arrival, PeerReport)
+        report: Report | None = self._accepted(arrival, Report)
         if report is None or self._tick < 0:
             return
         if not self._is_current(report.tick):
             self._inbox.refuse(arrival, f"it is of tick {report.tick}, this is tick {self._tick}")
-        elif report.heard is not None and report.heard > self._tick:
+        elif report.heard > self._tick:
             self._inbox.refuse(arrival, f"it acknowledges tick {report.heard}, this is tick {self._tick}")
         else:
             self._use(report, arrival.frame)
@@ -416,7 +414,7 @@ class Field:
         """Return whether `tick` is near this robot's, or that of the robots with which it catches up."""
         return abs(tick - max(self._tick, self._ahead)) <= ASTRAY
 
-    def _use(self, message: PeerReport | TickStart, frame: bytes) -> None:
+    def _use(self, message: Report | TickStart, frame: bytes) -> None:
         """Use a message of another robot for the end of the mission, and journal it if it changes something.
 
         The mission begins with tick 0, and its journal with the Observation of that tick.

@@ -16,16 +16,13 @@ import msgspec
 
 from protocol.journal.journal_file import CorruptJournal
 from protocol.messages import (
-    AnyRobotConfig,
     Command,
     Message,
     MissionEnd,
     Observation,
-    PeerReport,
-    PlannerReport,
     Report,
     RobotConfig,
-    TickStartInGroup,
+    TickStart,
 )
 from protocol.units import Finite, RobotId, Tick
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
@@ -75,7 +72,7 @@ class DrivenTick(msgspec.Struct, frozen=True):
     """The frame of the Observation."""
     command: Command | None = None
     """The Command of the agent; None if it missed the deadline."""
-    received: tuple[PeerReport | TickStartInGroup, ...] = ()
+    received: tuple[Report | TickStart, ...] = ()
     """The messages of other robots that affect when the mission ends."""
 
 
@@ -101,9 +98,7 @@ class DriverHistory(msgspec.Struct, frozen=True):
         return self.end is None and start is not None and not start.synced and start.boot != boot()
 
 
-OfDriver = (
-    AnyRobotConfig | ProcessStart | Mark | Observation | Command | PeerReport | TickStartInGroup | MissionEnd
-)
+OfDriver = RobotConfig | ProcessStart | Mark | Observation | Command | Report | TickStart | MissionEnd
 """The kinds of messages in the journal of a driver."""
 
 
@@ -134,7 +129,7 @@ def driver_history(frames: Sequence[bytes], config: RobotConfig, path: Path) -> 
                 ticks and message.tick == ticks[-1].observation.tick and ticks[-1].command is None
             ):
                 ticks[-1] = msgspec.structs.replace(ticks[-1], command=message)
-            case Report() | PlannerReport() | TickStartInGroup() if ticks:
+            case Report() | TickStart() if ticks:
                 ticks[-1] = msgspec.structs.replace(ticks[-1], received=(*ticks[-1].received, message))
             case MissionEnd() if end is None:
                 end = message

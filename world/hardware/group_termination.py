@@ -21,13 +21,9 @@ from protocol.messages import (
     Inconsistent,
     Localised,
     MissionEnd,
-    PeerReport,
-    RobotConfigInGroup,
-    RobotConfigWithConfirmation,
-    RobotConfigWithoutAnchor,
-    RobotConfigWithSweep,
+    Report,
+    RobotConfig,
     TickStart,
-    TickStartInGroup,
     Undecided,
     Verdict,
 )
@@ -47,7 +43,7 @@ A planner that waits for the verdict of its peer goes on 8 ticks after it has le
 class GroupEnding(Termination):
     """The results of all robots of a group, as far as they are known to one of them."""
 
-    def __init__(self, config: RobotConfigInGroup, max_ticks: int, timeout: float) -> None:
+    def __init__(self, config: RobotConfig, max_ticks: int, timeout: float) -> None:
         self.verdict: Verdict | None = None
         self.reporters = ()
         self._me = config.robot
@@ -59,7 +55,7 @@ class GroupEnding(Termination):
         """The tick until which each robot is localised, by the plan."""
         self._plan = max(max(self._ends.values()) + _sweep_ticks(config), _confirmed_tick(config))
         """The tick until which all are; a bound of it if some robots have no anchor."""
-        self._visits = not isinstance(config, RobotConfigWithoutAnchor)
+        self._visits = config.given_anchor is not None
         """True if this robot's planner goes to robots that are late."""
         self._results: dict[str, Verdict] = {}
         """The results that have been received, by robot."""
@@ -78,12 +74,12 @@ class GroupEnding(Termination):
         self._known: int | None = None
         """The tick in which no robot waited for another one any more."""
 
-    def receive(self, message: PeerReport | TickStart) -> bool:
+    def receive(self, message: Report | TickStart) -> bool:
         """Add the TickStart of another robot, and return whether it changes what is known.
 
         What a robot has sent in an earlier tick than another one changes nothing.
         """
-        if not isinstance(message, TickStartInGroup) or message.robot not in self._others:
+        if not isinstance(message, TickStart) or message.robot not in self._others:
             return False
         robot = message.robot
         self._heard[robot] = time.monotonic()
@@ -101,7 +97,7 @@ class GroupEnding(Termination):
     def tick_start(self, tick: int) -> TickStart:
         """Return the TickStart of `tick`, with this robot's result."""
         self._said += self._is_complete
-        return TickStartInGroup(tick, self._me, self.verdict, self._is_complete)
+        return TickStart(tick, self._me, self.verdict, self._is_complete)
 
     def after(self, tick: int, command: Command | None) -> MissionEnd | None:
         """Return the MissionEnd if `tick` was the last; None otherwise. See `Termination.after`.
@@ -166,20 +162,18 @@ class GroupEnding(Termination):
                 return None
 
 
-def _confirmed_tick(config: RobotConfigInGroup) -> int:
+def _confirmed_tick(config: RobotConfig) -> int:
     """Return the tick in which the last visit ends by which this robot confirms poses; 0 if there is none."""
-    if not isinstance(config, RobotConfigWithConfirmation):
-        return 0
     ends = [one.begins + one.lasts for one in config.confirmations]
     return math.ceil(max(ends, default=0.0) / config.mission.period)
 
 
-def _sweep_ticks(config: RobotConfigInGroup) -> int:
+def _sweep_ticks(config: RobotConfig) -> int:
     """Return a bound on the ticks in which each robot with an anchor sweeps its parts; 0 if all have one.
 
     If robots may report false data, it sweeps more than one, and goes to the other robots before each.
     """
-    if not isinstance(config, RobotConfigWithSweep):
+    if config.sweep is None:
         return 0
     mission, widest = config.mission, config.widest_distance
     once = RESTING_TICKS + max(ticks_of_parts(config.sweep, mission, widest, len(config.unanchored)))

@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from protocol.messages import Contact, Message, Observation, RobotConfig, RobotConfigWithoutAnchor
+from protocol.messages import Contact, Message, Observation, RobotConfig
 from protocol.wire import MalformedFrame, decode, encode
 from world.hardware.driver import Reading
 from world.hardware.driver_journal import Mark
@@ -25,7 +25,7 @@ def observation_frame(reading: Any, tick: int, config: RobotConfig) -> bytes:
     if not isinstance(reading, Reading):
         raise InvalidReading(f"returns {type(reading).__name__}, expected a Reading")
     executed = reading.executed if tick > 0 else None
-    anchor_range = None if isinstance(config, RobotConfigWithoutAnchor) else reading.anchor_range
+    anchor_range = None if config.given_anchor is None else reading.anchor_range
     return _checked(Observation(tick, config.robot, executed, anchor_range, _contacts(reading, config)))
 
 

@@ -18,7 +18,7 @@ from typing import Any
 import zenoh
 from rosbags.typesys import Stores, get_typestore
 
-from protocol.messages import RobotConfig, RobotConfigInGroup, RobotConfigWithoutAnchor
+from protocol.messages import RobotConfig
 from protocol.motion import ORIGIN, Controls, Pose, wrap
 from protocol.network import session
 from protocol.network.endpoints import at
@@ -167,8 +167,8 @@ class Ros2:
         self._command = threading.Event()
         """The event that ends the current manoeuvre."""
         self._command.set()  # there is no manoeuvre yet
-        in_group = isinstance(config, RobotConfigInGroup)
-        self._anchors = () if isinstance(config, RobotConfigWithoutAnchor) else (anchor_range,)
+        in_group = bool(config.members)
+        self._anchors = () if config.given_anchor is None else (anchor_range,)
         """The topic of the range to the robot's own anchor, if it has one."""
         self._peers = {one: f"{peer_range}/{one}" if in_group else peer_range for one in config.others}
         """The topic of the range to each other robot."""

@@ -16,7 +16,6 @@ from protocol.messages import (
     Inconsistent,
     Localised,
     MissionEnd,
-    PeerReport,
     Report,
     RobotConfig,
     TickStart,
@@ -37,7 +36,7 @@ class Termination(Protocol):
     reporters: tuple[str, ...]
     """The robots whose Reports contribute to what is known."""
 
-    def receive(self, message: PeerReport | TickStart) -> bool:
+    def receive(self, message: Report | TickStart) -> bool:
         """Add the message of another robot, and return whether it changes what is known."""
 
     def tick_start(self, tick: int) -> TickStart:
@@ -69,17 +68,14 @@ class Ending(Termination):
         self._known: int | None = None
         """The tick in which both results were known and acknowledged."""
 
-    def receive(self, message: PeerReport | TickStart) -> bool:
+    def receive(self, message: Report | TickStart) -> bool:
         """Add the peer's Report, and return whether it changes what is known."""
         before = self._peers, self._is_acknowledged
         match message:
             case TickStart():
                 return False
-            case Report(heard=heard):
-                pass
-            case _:  # of a PlannerReport, the one after the result contains it
-                heard = -1 if message.heard is None else message.heard - 1
-        self._acknowledged = max(self._acknowledged, heard)
+            case Report(heard=heard, body=body):  # of those with a body, the one after the result contains it
+                self._acknowledged = max(self._acknowledged, heard if body is None else heard - 1)
         self._peers = self._peers or message.verdict
         return (self._peers, self._is_acknowledged) != before
 

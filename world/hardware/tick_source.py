@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from protocol.messages import RobotConfig, RobotConfigInGroup
+from protocol.messages import RobotConfig
 
 UNHEARD = 4.0
 """The number of ticks within which a running robot sends a TickStart."""
@@ -20,12 +20,9 @@ class TickSource:
 
     def __init__(self, config: RobotConfig, tick_s: float) -> None:
         """`tick_s` is the duration of a tick in s of wall time."""
-        self.joins = isinstance(config, RobotConfigInGroup)
+        self.joins = bool(config.members)
         """True if a robot that has not begun does so in the tick of any other one that has: in a group."""
-        if isinstance(config, RobotConfigInGroup):
-            self._before = config.group[: config.group.index(config.robot)]
-        else:
-            self._before = (config.peer,) if config.role == "b" else ()
+        self._before = config.group[: config.group.index(config.robot)]
         self._unheard_s = UNHEARD * tick_s
         self._heard: dict[str, float] = {}
         """The time at which each of them was heard last, on the monotonic clock."""

@@ -105,13 +105,11 @@ def _knowledge(
         robot=own.id,
         peer=peer.id,
         role=role,
-        anchor=Anchor(own.anchor.x, own.anchor.y),
+        given_anchor=Anchor(own.anchor.x, own.anchor.y),
         peer_anchor=Anchor(peer.anchor.x, peer.anchor.y),
         mission=mission,
         planner_name="assured",
         rendezvous=Rendezvous(NO_ORBIT, NO_ORBIT, 0.0),
-        attack=None,
-        tick_s=None,
     )
     return Knowledge(config, belief=belief)
 

@@ -19,7 +19,7 @@ from compose.view.web.requested_work import RequestedWork
 from compose.view.web.sources import Recorded, WatchedRun
 from protocol import documents
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
-from world.scenario import RecordedScenario, Scenario
+from world.scenario import Scenario
 
 MOST_CHANGED = 8
 """The number of changed missions that a server stores. Of more, the oldest is deleted."""
@@ -136,5 +136,5 @@ def _changed(scenario: Scenario, change: bytes) -> ChangedScenario:
 
 
 def _scenario(frame: bytes) -> Scenario:
-    found: Scenario = decode(frame, RecordedScenario, MAX_FRAME_BYTES)
+    found: Scenario = decode(frame, Scenario, MAX_FRAME_BYTES)
     return found

@@ -14,7 +14,6 @@ from compose.recording.run_setup import of_configs
 from compose.view.run_data import RunData
 from compose.view.web.sources import UNANSWERED, WatchedRun
 from protocol.messages import (
-    AnyRobotConfig,
     Command,
     Estimate,
     FinalReport,
@@ -22,9 +21,8 @@ from protocol.messages import (
     Message,
     MissionEnd,
     Observation,
-    PeerReport,
+    Report,
     RobotConfig,
-    RobotConfigInGroup,
 )
 from protocol.network import diagnosis, keys, session
 from protocol.network.endpoints import Endpoints
@@ -41,10 +39,10 @@ LISTENED = (
 )
 CARRIED: Mapping[Callable[..., str] | None, Any] = {
     keys.truth: GroundTruth,
-    keys.config: AnyRobotConfig,
+    keys.config: RobotConfig,
     keys.observation: Observation | MissionEnd | FinalReport,
     keys.command: Command | FinalReport,
-    keys.report: PeerReport,
+    keys.report: Report,
     keys.estimate: Estimate,
 }
 """The message types that each kind of key carries."""
@@ -153,8 +151,7 @@ class ReceivedMission(WatchedRun):
 
 def _named_in(config: RobotConfig) -> frozenset[str]:
     """Return the robots of the mission that the configuration of one of them names."""
-    group = config.group if isinstance(config, RobotConfigInGroup) else ()
-    return frozenset((config.peer, *config.others, *group)) - {config.robot}
+    return frozenset((config.peer, *config.others)) - {config.robot}
 
 
 class Listener:
