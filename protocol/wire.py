@@ -66,6 +66,12 @@ def version_of(frame: bytes) -> int | None:
     return frame[0] if len(frame) > _HEAD.size else None
 
 
+def versions(version: int) -> str:
+    """Return text that names another version of the protocol, the release that has it, and this version."""
+    release = f" of Tandem {RELEASES[version]}" if version in RELEASES else ""
+    return f"protocol version {version}{release}, this is version {VERSION}"
+
+
 def other_version(frame: bytes) -> int | None:
     """Return the protocol version of an undamaged `frame` of another version; None for any other frame."""
     if len(frame) <= _HEAD.size:
@@ -89,7 +95,7 @@ def decode(frame: bytes, kind: Any, limit: int = MAX_SENT_BYTES) -> Any:
     payload = frame[_HEAD.size :]
     version, crc = _HEAD.unpack_from(frame)
     if version != VERSION:
-        raise MalformedFrame(f"protocol version {version}, this is version {VERSION}")
+        raise MalformedFrame(versions(version))
     if zlib.crc32(payload) != crc:
         raise MalformedFrame("damaged: the CRC does not match")
     try:

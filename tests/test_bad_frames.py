@@ -101,7 +101,7 @@ def bad_frames(topic: str) -> dict[bytes, str]:
         frame[:-1]: "damaged: the CRC does not match",
         flipped(frame, 9): "damaged: the CRC does not match",
         flipped(frame, 8 * len(frame) - 20): "damaged: the CRC does not match",
-        framed(said, VERSION - 1): f"protocol version {VERSION - 1}, this is version {VERSION}",
+        framed(said, VERSION - 1): f"protocol version {VERSION - 1} of Tandem 0.2, this is version {VERSION}",
         framed(said, VERSION + 1): f"protocol version {VERSION + 1}, this is version {VERSION}",
         with_number(math.nan): "Expected `float` >= .* - at ",
         with_number(math.inf): "Expected `float` <= .* - at ",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -146,27 +147,37 @@ def of_protocol(version: int, folder: Path) -> None:
 
 @pytest.mark.parametrize("command", ["replay", "audit", "figures", "export", "watch"])
 @pytest.mark.parametrize(
-    ("version", "reader"), [(1, "Tandem 0.1"), (VERSION + 1, "the release that wrote it")]
+    ("version", "release"), [(1, " of Tandem 0.1"), (2, " of Tandem 0.2"), (VERSION + 1, "")]
 )
 def test_a_recording_of_another_protocol_is_refused_once_with_the_remedy(
-    command: str, version: int, reader: str, recording: Path
+    command: str, version: int, release: str, recording: Path
 ) -> None:
     of_protocol(version, recording)
     ended = tandem(command, recording)
     assert (ended.status, ended.out, ended.err.count("\n")) == (2, "", 1)
-    said = (
-        f": protocol version {version}, this is version {VERSION}; run its scenario again, or read it with "
-    )
-    assert ended.err.endswith(f"{said}{reader}\n")
+    remedy = "run its scenario again, or read it with the release that wrote it"
+    assert ended.err.endswith(f": protocol version {version}{release}, this is version {VERSION}; {remedy}\n")
     assert ended.err.count("protocol version") == 1
 
 
-def test_a_recording_of_another_protocol_is_not_resumed(recording: Path) -> None:
-    of_protocol(1, recording)
-    ended = tandem("world", "paper-1", "--listen", "tcp/127.0.0.1:7447", "--out", recording)
-    versions = f"protocol version 1, this is version {VERSION}"
-    said = f"tandem world: --out: {recording / WORLD}: {versions}; choose another folder\n"
-    assert ended == (2, "", said)
+@pytest.mark.parametrize(
+    ("process", "journal"),
+    [
+        (("world", "paper-1", "--listen", "tcp/127.0.0.1:7447"), WORLD),
+        (("agent", "a", "--connect", "tcp/127.0.0.1:7447"), A),
+        (("robot", "a", "--mission", "paper-1", "--driver", "docs.rover:Rover"), "driver-a.journal"),
+    ],
+)
+def test_a_recording_of_another_protocol_is_not_resumed(
+    process: tuple[str, ...], journal: str, recording: Path
+) -> None:
+    shutil.copy(recording / A, recording / "driver-a.journal")
+    of_protocol(2, recording)
+    ended = tandem(*process, "--out", recording)
+    versions = f"protocol version 2 of Tandem 0.2, this is version {VERSION}"
+    said = f"--out: {recording / journal}: {versions}; choose another folder\n"
+    assert (ended.status, ended.out, ended.err.count("\n")) == (2, "", 1)
+    assert ended.err.endswith(said)
 
 
 def test_a_robot_resumes_on_another_machine_unless_its_decisions_differ(recording: Path) -> None:

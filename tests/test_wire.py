@@ -15,21 +15,26 @@ import msgspec
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
+from compose.launch import in_process
 from compose.scenario.scenario_file import load
 from protocol.messages import (
     MAX_REPORT_RANGES,
     MAX_REPORT_RUNS,
     Command,
     FinalReport,
+    Member,
     Message,
     MissionEnd,
     Observation,
     Report,
+    RobotConfig,
 )
 from protocol.mission import Mission
+from protocol.sweep_strips import SweptArea
 from protocol.wire import MAX_FRAME_BYTES, VERSION, MalformedFrame, decode, encode
-from tests.examples import EXAMPLES
+from tests.examples import CONFIG, EXAMPLES
 from world.scenario import Scenario
 
 KINDS = {*Message.__subclasses__()}
@@ -317,3 +322,27 @@ def test_a_mission_without_one_of_its_parameters_is_refused() -> None:
             refuses(framed(packed(changed(tree, path, kept))))
         else:
             assert decode(framed(packed(changed(tree, path, kept))), ANY) == EXAMPLES[0]
+
+
+# --- one class of each kind --------------------------------------------------------------------------
+
+
+def test_a_configuration_whose_fields_contradict_each_other_is_refused() -> None:
+    area = SweptArea(-1.0, -1.0, 1.0, 1.0, 2)
+    members = (Member("b", CONFIG.peer_anchor, 9),)
+    alone = {"given_anchor": None, "unanchored": ("a",), "sweep": area, "members": members}
+    sound = replace(CONFIG, **alone)
+    assert decode(encode(sound), RobotConfig) == sound
+    with pytest.raises(LookupError, match="a has no anchor"):
+        _ = sound.anchor
+    for name, value in {"unanchored": ("c",), "sweep": None, "members": ()}.items():
+        position = 1 + RobotConfig.__struct_fields__.index(name)
+        refuses(framed(packed(changed(plain(sound), (position,), msgspec.to_builtins(value)))), RobotConfig)
+    refuses(framed(packed(changed(plain(sound), (4,), [0.0, 0.0]))), RobotConfig)
+
+
+@pytest.mark.parametrize(("name", "before"), [("paper-1", 1266), ("noisy", 4085)])
+def test_the_reports_of_a_pair_are_at_most_a_tenth_larger_than_in_version_2(name: str, before: int) -> None:
+    run = in_process.run_mission(load(name))
+    sent = sum(report.bytes_sent for report in run.final_reports.values())
+    assert before < sent <= 1.1 * before

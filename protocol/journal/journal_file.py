@@ -20,7 +20,7 @@ import msgpack
 import msgspec
 
 from protocol.files import open_file
-from protocol.wire import MAX_FRAME_BYTES, RELEASES, VERSION, MalformedFrame, is_sound, other_version
+from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, is_sound, other_version, versions
 
 _packer = msgpack.Packer()
 _HEADS = {0xC4: 1, 0xC5: 2, 0xC6: 4}
@@ -63,10 +63,9 @@ class OtherVersion(CorruptJournal):
 
     def __init__(self, path: Path, version: int) -> None:
         self.path = path
-        self.versions = f"protocol version {version}, this is version {VERSION}"
+        self.versions = versions(version)
         """Text that names both versions."""
-        release = f"Tandem {RELEASES[version]}" if version in RELEASES else "the release that wrote it"
-        self.remedy = f"run its scenario again, or read it with {release}"
+        self.remedy = "run its scenario again, or read it with the release that wrote it"
         """Text for the user who wants to read the recording."""
         super().__init__(f"{path}: {self.versions}; {self.remedy}")
 
