@@ -864,9 +864,12 @@ def test_journals_that_are_none_are_refused(honest: Path, folder: Path) -> None:
     world, a = list(journal_file.read(honest / WORLD_JOURNAL)), list(journal_file.read(honest / A))
     assert f"{A} is the journal of b" in spoilt(folder, A, list(journal_file.read(honest / B)))
     assert f"{A}: " in spoilt(folder, A, [*a[:5], encode(load("paper-1"))])
-    assert f"{A}: an agent's journal must begin with a RobotConfig" in spoilt(folder, A, [*a[:1], *a[2:]])
+    begins = f"{A}: an agent's journal must begin with its environment and a RobotConfig"
+    assert begins in spoilt(folder, A, [*a[:1], *a[2:]])
+    assert begins in spoilt(folder, A, a[1:])
     assert f"{WORLD_JOURNAL}: " in spoilt(folder, WORLD_JOURNAL, [])
     assert f"{WORLD_JOURNAL}: " in spoilt(folder, WORLD_JOURNAL, [*world[:1], *world[2:]])
+    assert f"{WORLD_JOURNAL}: " in spoilt(folder, WORLD_JOURNAL, world[1:])
     scenario = load("paper-1")
     first, second = scenario.robots
     for robots in ((first,), (first, first), (first, replace(second, role="a")), ()):

@@ -25,6 +25,7 @@ from compose.sweep.cells import cells
 from compose.sweep.statistics import CellSummary, counted
 from compose.sweep.table import of_rows, schema_of
 from compose.terminal.progress import result
+from protocol.journal.environment import of_world
 from protocol.messages import Command, Estimate, FinalReport, Localised, MissionEnd
 from protocol.motion import Covariance, Pose
 from tests.commands import SECTION_IV, tandem
@@ -79,7 +80,9 @@ def claimed(text: str, covariance: Covariance | None, *, by: float = 0.03) -> Ru
     mission_outcome = advance(onward, {})
     assert isinstance(mission_outcome, MissionOutcome)
     end = MissionEnd(1, mission_outcome.outcome, mission_outcome.reason)
-    return Run(WorldHistory(scenario, (Tick(world, first), Tick(onward, {})), None, None, end, {}))
+    return Run(
+        WorldHistory(of_world(), scenario, (Tick(world, first), Tick(onward, {})), None, None, end, {})
+    )
 
 
 # --- NEES ---------------------------------------------------------------------------------------------
@@ -313,7 +316,11 @@ def test_a_trial_with_two_claims_counts_once_in_the_mean_nees() -> None:
         for robot, pose, by in zip("ab", poses, (0.01, 0.05), strict=True)
     }
     row = row_of(
-        Run(WorldHistory(scenario, (Tick(world, commands),), None, None, MissionEnd(0, "localised", None)))
+        Run(
+            WorldHistory(
+                of_world(), scenario, (Tick(world, commands),), None, None, MissionEnd(0, "localised", None)
+            )
+        )
     )
     each = [nees(off(pose, by), pose, SURE) for pose, by in zip(poses, (0.01, 0.05), strict=True)]
     assert row.claims == 2

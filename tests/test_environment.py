@@ -22,7 +22,7 @@ from protocol.journal.journal_file import CorruptJournal
 from protocol.journal.resume import Retrace
 from protocol.messages import Command, Environment, Estimate
 from protocol.wire import VERSION, MalformedFrame, decode, encode
-from tests.commands import Ended, tandem
+from tests.commands import tandem
 
 A, WORLD = "agent-a.journal", "world.journal"
 OLDER = "0.0.9"
@@ -124,18 +124,6 @@ def test_more_than_last_bits_is_a_difference_whatever_the_versions(command: str,
     assert ended.status == 1
     assert f"recorded with tandem {OLDER}" in ended.out
     assert "can lead to other decisions" in ended.out
-
-
-@pytest.mark.parametrize("command", ["replay", "audit", "figures", "export"])
-@pytest.mark.long
-def test_older_recordings_that_name_no_versions_are_read(command: str, recording: Path) -> None:
-    def read() -> Ended:
-        return tandem(command, recording, *(["--only", "ranges"] if command == "figures" else []))
-
-    for path in recording.glob("*.journal"):
-        changed(path, Environment, lambda _: None)
-    ended = read()
-    assert ended.status == 0, ended
 
 
 def of_protocol(version: int, folder: Path) -> None:

@@ -21,6 +21,7 @@ from compose.recording.run import Run, read
 from compose.recording.ticks_csv import ticks_csv
 from compose.scenario.scenario_file import load, parse
 from protocol.journal import journal_file
+from protocol.journal.environment import of_world
 from protocol.messages import Command, Localised, Observation, Undecided
 from protocol.motion import REST, Controls, Covariance, Pose, step
 from protocol.noise import Noise, VelocityNoise
@@ -596,7 +597,7 @@ def test_ticks_has_the_motion_of_a_robot_without_a_command() -> None:
     scenario = near("actuation = {v_floor = 0.1}", max_ticks=1)
     world = release(scenario)
     onward = moved_on(world, {})
-    recording = Run(WorldHistory(scenario, (Tick(world, {}), Tick(onward, {})), None, None))
+    recording = Run(WorldHistory(of_world(), scenario, (Tick(world, {}), Tick(onward, {})), None, None))
     first, *_, last = csv.DictReader(ticks_csv(recording).splitlines())
     assert onward.executed is not None
     assert float(first["v"]) == onward.executed[0].v != 0.0

@@ -723,7 +723,7 @@ def test_the_sensors_of_each_row_of_mismatch_differ_whatever_robots_are_told(nam
     assert len(scenarios) == len(settings)
     assert {cell.key for cell in cells(sweep)} == {"{}"}
     assert scenarios[0].sensors.noise == scenarios[0].mission.noise
-    of_noise: dict[Noise, list[WorldNoise]] = {}
+    of_noise: dict[Noise, list[WorldNoise | None]] = {}
     for one in scenarios:
         of_noise.setdefault(one.mission.noise, []).append(one.world_noise)
     assert len(of_noise) == told
@@ -762,7 +762,7 @@ def test_rows_differ_from_the_base_in_the_fields_that_they_set(folder: Path) -> 
     for setting in settings:
         assert not isinstance(setting, RefusedCell)
         assert setting.scenario.mission.noise == Noise(anchor_sigma=0.01, mutual_sigma=0.01)
-        noise = setting.scenario.world_noise
+        noise = setting.scenario.world_noise or WorldNoise()
         found.append((setting.scenario.mission.accuracy, noise.outliers, noise.anchor_bias))
     assert found == [(0.2, None, 0.0), (0.2, 0.1, 0.0), (0.3, None, {"a": 0.1})]
     fields = ("sensors", "world.noise.outliers", "world.noise.anchor_bias", "mission.accuracy")

@@ -154,8 +154,8 @@ class Scenario(
     faults: tuple[Fault, ...] = ()
     """The fault plan of the radio."""
 
-    world_noise: WorldNoise = WorldNoise()
-    """The noise of the simulated sensors, where it is another one than the robots are told."""
+    world_noise: WorldNoise | None = None
+    """The noise of the simulated sensors; None if it is the one that the robots are told."""
     planner_options: Options = {}
     """The options of the planner, by name."""
     range_model: ModelSpec | None = None
@@ -192,7 +192,9 @@ class Scenario(
     def sensors(self) -> SensorModel:
         """The sensors of all robots, with everything that is drawn once for the mission."""
         ids = [robot.id for robot in self.robots]
-        return sensor_model(self.mission, self.world_noise, ids, self.radio_pairs(), self.seed)
+        return sensor_model(
+            self.mission, self.world_noise or WorldNoise(), ids, self.radio_pairs(), self.seed
+        )
 
     @property
     def unanchored(self) -> tuple[str, ...]:

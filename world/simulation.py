@@ -9,7 +9,7 @@ import msgspec
 from protocol.journal import environment
 from protocol.journal.journal_file import CorruptJournal, Sink
 from protocol.journal.resume import ReplayMismatch, Retrace
-from protocol.messages import Command, DeadlineMissed, Environment, FinalReport, MissionEnd, Observation
+from protocol.messages import Command, DeadlineMissed, FinalReport, MissionEnd, Observation
 from protocol.wire import encode
 from world.referee import MissionOutcome
 from world.scenario import Scenario
@@ -125,22 +125,21 @@ def resumed(scenario: Scenario, recording: Retrace) -> Simulation:
     """
     simulation = Simulation(scenario)
     simulation.append_to(recording)
-    named = environment.named_in(recording.frames)
-    if environment.is_blank(recording.frames):
-        recording.write(encode(named or environment.of_world()), encode(scenario))
+    if len(recording.frames) > 1:
+        _retrace(simulation, recording)
     else:
-        _retrace(simulation, recording, named)
+        recording.write(*(recording.frames or [encode(environment.of_world())]), encode(scenario))
     return simulation
 
 
-def _retrace(simulation: Simulation, recording: Retrace, named: Environment | None) -> None:
+def _retrace(simulation: Simulation, recording: Retrace) -> None:
     recorded = world_history(recording.frames, recording.path)
     if recorded.unexpected is not None:
         raise CorruptJournal(f"{recording.path}: {recorded.unexpected.what}")
     if recorded.scenario != simulation.world.scenario:
         raise CorruptJournal(f"{recording.path}: a recording of another scenario, {recorded.scenario.name}")
     try:
-        recording.write(*[encode(one) for one in (named, recorded.scenario) if one is not None])
+        recording.write(encode(recorded.environment), encode(recorded.scenario))
         for tick in recorded.ticks:
             simulation.command(tick.commands)
         if recorded.end is not None and simulation.mission_end is None:
@@ -150,5 +149,8 @@ def _retrace(simulation: Simulation, recording: Retrace, named: Environment | No
         raise CorruptJournal(
             f"{recording.path}: the recorded world differs from the recomputed one at tick "
             f"{simulation.tick}: "
-            + (environment.otherwise(named, environment.of_world()) or "the journal is another version's")
+            + (
+                environment.otherwise(recorded.environment, environment.of_world())
+                or "the journal is another version's"
+            )
         ) from None

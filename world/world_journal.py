@@ -7,7 +7,6 @@ from typing import Any
 
 import msgspec
 
-from protocol.journal.environment import named_in
 from protocol.journal.journal_file import CorruptJournal, UnexpectedFrame, take_all
 from protocol.messages import Command, DeadlineMissed, Environment, FinalReport, MissionEnd
 from protocol.mission import Role
@@ -38,6 +37,8 @@ class Tick(msgspec.Struct, frozen=True):
 class WorldHistory(msgspec.Struct, frozen=True):
     """The content of a journal, complete or up to where it breaks off."""
 
+    environment: Environment
+    """The environment of the world's process."""
     scenario: Scenario
     """The scenario."""
     ticks: tuple[Tick, ...]
@@ -52,8 +53,6 @@ class WorldHistory(msgspec.Struct, frozen=True):
     """The recorded FinalReports, by robot."""
     unexpected: UnexpectedFrame | None = None
     """The first frame out of order, if any."""
-    environment: Environment | None = None
-    """The environment of the world's process; None in an older recording."""
 
     @property
     def worlds(self) -> tuple[World, ...]:
@@ -141,11 +140,13 @@ class WorldJournalReading:
         return True
 
     def _begin(self, frame: bytes) -> None:
-        """Take the environment, which is missing in older recordings, or the scenario."""
-        named = named_in([frame]) if not self.messages else None
-        if named is not None:
-            self.environment = named
-            self.messages.append(named)
+        """Take the environment, and then the scenario."""
+        if self.environment is None:
+            message = self._shared.get(frame) or decode(frame, Environment, MAX_FRAME_BYTES)
+            if not isinstance(message, Environment):
+                raise MalformedFrame("a world's journal must begin with its environment")
+            self.environment = message
+            self.messages.append(message)
             return
         scenario = self._shared.get(frame)
         if not isinstance(scenario, Scenario):
@@ -175,9 +176,10 @@ class WorldJournalReading:
 
     def content(self) -> WorldHistory | None:
         """Return the content that has been read so far; None if there is no scenario."""
-        if self.world is None:
+        if self.environment is None or self.world is None:
             return None
         return WorldHistory(
+            self.environment,
             self.world.scenario,
             tuple(self.ticks),
             self.world if self.mission_outcome is None else None,
@@ -185,7 +187,6 @@ class WorldJournalReading:
             self.end,
             dict(self.final_reports),
             self.unexpected,
-            self.environment,
         )
 
 

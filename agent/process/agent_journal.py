@@ -60,12 +60,12 @@ class Step(msgspec.Struct, frozen=True):
 class AgentHistory(msgspec.Struct, frozen=True):
     """The content of a journal, complete or up to the point where it ends."""
 
+    environment: Environment
+    """The environment in which the journal was written."""
     config: RobotConfig
     steps: tuple[Step, ...]
     end: MissionEnd | None = None
     final_report: FinalReport | None = None
-    environment: Environment | None = None
-    """The environment in which the journal was written; None for older recordings."""
     unexpected: UnexpectedFrame | None = None
     """The first frame out of order, if any."""
 
@@ -132,7 +132,7 @@ class AgentJournalReading:
     def take(self, frame: bytes) -> bool:
         """Add the next frame, and return whether it is in order. Add no frame after one that is not.
 
-        Raises MalformedFrame, also if the first frame besides the environment is no RobotConfig.
+        Raises MalformedFrame, also if the first two frames are no environment and RobotConfig.
         """
         message = self._shared.get(frame)
         if message is None:
@@ -199,23 +199,23 @@ class AgentJournalReading:
         return True
 
     def _begins(self, message: object) -> bool:
-        """Add the environment, which is missing in older recordings, or the configuration."""
+        """Add the environment, and then the configuration."""
         match message:
-            case Environment() if not self.messages:
+            case Environment() if self.environment is None:
                 self.environment = message
-            case RobotConfig():
+            case RobotConfig() if self.environment is not None:
                 self.config = message
             case _:
-                raise MalformedFrame("an agent's journal must begin with a RobotConfig")
+                raise MalformedFrame("an agent's journal must begin with its environment and a RobotConfig")
         return True
 
     def content(self) -> AgentHistory | None:
         """Return the content that has been read so far; None if there is no RobotConfig."""
-        if self.config is None:
+        if self.environment is None or self.config is None:
             return None
         steps = [*self._steps, Step(**self._step)] if self._step else self._steps
         return AgentHistory(
-            self.config, tuple(steps), self._end, self._final_report, self.environment, self.unexpected
+            self.environment, self.config, tuple(steps), self._end, self._final_report, self.unexpected
         )
 
 

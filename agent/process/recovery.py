@@ -53,11 +53,10 @@ def remember(recording: Retrace, planner_of: Callable[[RobotConfig], Planner[Any
 
     Raises CorruptJournal if the journal is not that of an agent, or if the recorded decisions differ.
     """
-    if environment.is_blank(recording.frames):
+    if len(recording.frames) < 2:  # at most its environment
         return None
     journal = agent_history(recording.frames, recording.path)
-    head = (journal.environment, journal.config)
-    recording.write(*[encode(one) for one in head if one is not None])
+    recording.write(encode(journal.environment), encode(journal.config))
     replay = PlannerReplay(journal, planner_of(journal.config), recording)
     robot = replay.robot
     own_reports: deque[dict[str, FramedReport]] = deque(maxlen=OWN_REPORTS_KEPT)

@@ -9,10 +9,8 @@ from compose.audit.findings import Checks, Violation, difference
 from compose.errors import Unworkable
 from compose.launch import planner_loader
 from compose.recording.run import Run
-from compose.scenario.first_meetings import NEAREST_ANCHORS
-from compose.scenario.group_confirmation import with_confirmation
-from compose.scenario.group_meetings import FirstMeeting, GroupMeetings, group_meetings
-from compose.scenario.group_sweep import with_sweep
+from compose.scenario.first_meetings import NEAREST_ANCHORS, plan_of
+from compose.scenario.group_meetings import FirstMeeting, GroupMeetings
 from compose.scenario.scenario_tables import PlannerTable, RobotTable
 from protocol.attack import OF_THE_START
 from protocol.messages import RobotConfig
@@ -59,20 +57,16 @@ def _group(found: Scenario) -> Checks:
     except Unworkable as error:
         yield Violation("scenario", None, None, str(error))
         return
-    if len(found.meetings) != len(planned.planned):
-        what = f"{len(found.meetings)} meetings are planned, expected {len(planned.planned)}"
-        yield Violation("scenario", None, None, what)
-    if len(found.retries) != len(planned.retries):
-        what = f"{len(found.retries)} retries are planned, expected {len(planned.retries)}"
-        yield Violation("scenario", None, None, what)
-    for name, some, others in (
-        ("meetings", found.meetings, planned.planned),
-        ("retries", found.retries, planned.retries),
-    ):
+    for name in ("meetings", "retries"):
+        some, others = getattr(found, name), getattr(planned, name)
+        if len(some) != len(others):
+            yield _violation(None, f"{len(some)} {name} are planned, expected {len(others)}")
         for i, (given, expected) in enumerate(zip(some, others, strict=False)):
             off = None if given == expected else f"{name}[{i}].{difference(given, expected)}"
             yield _violation(None, off)
-    yield _violation(None, _search_difference(found, planned))
+    for name in ("planned_sweep", "confirmation"):
+        given, expected = getattr(found, name), getattr(planned, name)
+        yield _violation(None, None if given == expected else f"{name}.{difference(given, expected)}")
     for robot in found.robots:
         first = planned.first[robot.id]
         for why in (
@@ -83,32 +77,20 @@ def _group(found: Scenario) -> Checks:
             yield _violation(robot.id, why)
 
 
-def _search_difference(found: Scenario, planned: GroupMeetings) -> str | None:
-    """Return how the sweep for robots without an anchor, or the confirming visits, differ from the plan."""
-    if found.planned_sweep is not None and planned.sweep is not None and found.planned_sweep != planned.sweep:
-        return f"planned_sweep.{difference(found.planned_sweep, planned.sweep)}"
-    if found.confirmation is None or planned.confirmation is None:
-        return None
-    if found.confirmation != planned.confirmation:
-        return f"confirmation.{difference(found.confirmation, planned.confirmation)}"
-    return None
-
-
 def planned_meetings(found: Scenario) -> GroupMeetings:
     """Return the meetings of the group in a scenario. Raises Unworkable if its planner has none."""
     anchors = [(robot.id, robot.given_anchor) for robot in found.robots]
     robots = [RobotTable(robot, (at.x, at.y) if at is not None else None) for robot, at in anchors]
     planner = PlannerTable(found.planner_name, found.planner_options)
-    anchored = [one for one in robots if one.anchor is not None]
-    if (confirmed := found.confirmation) is not None:
-        tolerates = confirmed.tolerates
-        meetings = group_meetings(anchored, found.mission, planner, found.faults, tolerates=tolerates)
-        return with_confirmation(robots, found.mission, meetings, found.faults, tolerates)
-    if (planned := found.planned_sweep) is None:
-        return group_meetings(anchored, found.mission, planner, found.faults)
-    tolerates = planned.tolerates
-    meetings = group_meetings(anchored, found.mission, planner, found.faults, tolerates=tolerates)
-    return with_sweep(robots, planned.sweep.bounds, found.mission, meetings, tolerates=tolerates)
+    sweep, tolerant = found.planned_sweep, found.planned_sweep or found.confirmation
+    return plan_of(
+        robots,
+        found.mission,
+        planner,
+        found.faults,
+        area=sweep.sweep.bounds if sweep is not None else None,
+        tolerates=tolerant.tolerates if tolerant is not None else 0,
+    )
 
 
 def _off_first(robot: RobotSpec, first: FirstMeeting) -> str | None:
@@ -133,12 +115,14 @@ def config(run: Run) -> Checks:
 
 
 def _off_world_noise(found: Scenario) -> str | None:
-    told = found.mission.noise
+    told, noise = found.mission.noise, found.world_noise
+    if noise is None:
+        return None
     pairs = [(found.robots[i].id, found.robots[j].id) for i, j in found.pairs()]
-    mistake = world_noise_mistake(found.world_noise, told, pairs)
+    mistake = world_noise_mistake(noise, told, pairs)
     if mistake is not None:
         return f"world.noise.{mistake[0]}: {mistake[1]}"
-    why = world_noise_infeasibility(found.world_noise, told)
+    why = world_noise_infeasibility(noise, told)
     return why and f"world.noise: {why}"
 
 

@@ -121,7 +121,7 @@ def played(
     simulation.journal_final_reports(final_reports.values())
     mission_outcome = MissionOutcome(end.outcome, end.reason)
     history = WorldHistory(
-        scenario, tuple(ticks), None, mission_outcome, end, final_reports, environment=environment.of_world()
+        environment.of_world(), scenario, tuple(ticks), None, mission_outcome, end, final_reports
     )
     return Run(history, claim_estimates=claims)
 

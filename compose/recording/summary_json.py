@@ -26,7 +26,6 @@ from protocol import files
 from protocol.messages import FinalReport
 from protocol.motion import Pose, wrap
 from world.referee import not_localised
-from world.scenario import Scenario
 from world.sensors import in_contact
 
 Mode = Literal["processes", "in-process"]
@@ -62,7 +61,7 @@ def summary(run: Run, mode: Mode | None, wall_s: float | None) -> dict[str, Any]
             "planner": scenario.planner_name,
             "planner_options": scenario.planner_options,
             "max_ticks": scenario.max_ticks,
-            "world_noise": _world_noise(scenario),
+            "world_noise": msgspec.to_builtins(scenario.world_noise),
             "world_range": msgspec.to_builtins(scenario.range_model),
             "world_radio": msgspec.to_builtins(scenario.radio_model),
         },
@@ -87,13 +86,6 @@ def _group(run: Run) -> dict[str, Any]:
         "meetings": msgspec.to_builtins(meetings),
         **({"without_anchor": msgspec.to_builtins(searches)} if searches else {}),
     }
-
-
-def _world_noise(scenario: Scenario) -> Any:
-    """Return the noise of the sensors; None if it is the one that the robots are told."""
-    if scenario.world_noise.changes_nothing(scenario.mission.noise):
-        return None
-    return msgspec.to_builtins(scenario.world_noise)
 
 
 def first_contact(run: Run) -> int | None:

@@ -12,8 +12,8 @@ from compose.launch import planner_loader
 from compose.scenario.group_confirmation import check_tolerated, with_confirmation
 from compose.scenario.group_meetings import FirstMeeting, GroupMeetings, group_meetings
 from compose.scenario.group_sweep import check_unanchored, with_sweep
-from compose.scenario.scenario_tables import RobotTable, ScenarioFile
-from protocol.mission import infeasibility
+from compose.scenario.scenario_tables import Area, PlannerTable, RobotTable, ScenarioFile
+from protocol.mission import Mission, infeasibility
 from protocol.orbits import Rendezvous
 from protocol.rounding import TOLERANCE
 from protocol.spelling import did_you_mean
@@ -50,14 +50,27 @@ def meetings_of(file: ScenarioFile, faults: Sequence[Fault], source: str) -> Gro
     # least accurate are robots that are very near to each other, and those that have a long way
     _check_accuracy(file, (min(distances), max(distances)), source)
     try:
-        tolerates = file.mission.tolerates
-        anchors = [robots[i] for i in anchored]
-        meetings = group_meetings(anchors, file.mission, file.planner, faults, tolerates=tolerates)
-        if tolerates and len(anchored) == len(robots):
-            return with_confirmation(robots, file.mission, meetings, faults, tolerates)
-        return with_sweep(robots, file.mission.area, file.mission, meetings, tolerates=tolerates)
+        mission = file.mission
+        return plan_of(robots, mission, file.planner, faults, area=mission.area, tolerates=mission.tolerates)
     except Unworkable as error:
         raise Unworkable(f"{source}: {error}") from None
+
+
+def plan_of(
+    robots: Sequence[RobotTable],
+    mission: Mission,
+    planner: PlannerTable,
+    faults: Sequence[Fault],
+    *,
+    area: Area | None,
+    tolerates: int,
+) -> GroupMeetings:
+    """Return all meetings of a group, and the sweep of `area` or the confirming visits. Raises Unworkable."""
+    anchored = [robot for robot in robots if robot.anchor is not None]
+    meetings = group_meetings(anchored, mission, planner, faults, tolerates=tolerates)
+    if tolerates and len(anchored) == len(robots):
+        return with_confirmation(robots, mission, meetings, faults, tolerates)
+    return with_sweep(robots, area, mission, meetings, tolerates=tolerates)
 
 
 def pair_meetings(file: ScenarioFile, source: str) -> dict[str, FirstMeeting]:

@@ -67,7 +67,7 @@ def with_confirmation(
     attacker may have led a visitor astray.
     """
     anchors = {one.id: one.anchor for one in robots if one.anchor is not None}
-    planned = {frozenset((one.visitor, one.visited)) for one in meetings.planned}
+    planned = {frozenset((one.visitor, one.visited)) for one in meetings.meetings}
     begins, ends, visits = meetings.bound, meetings.bound, list[PlannedRetry]()
     each, once = exchange_ticks(faults)
     for number in range(PASSES):

@@ -56,7 +56,7 @@ class FirstMeeting(NamedTuple):
 class GroupMeetings(NamedTuple):
     """The meetings of a group."""
 
-    planned: tuple[PlannedMeeting, ...]
+    meetings: tuple[PlannedMeeting, ...]
     """All meetings, in the order in which they end."""
     first: dict[str, FirstMeeting]
     """The first meeting of each robot."""
@@ -66,7 +66,7 @@ class GroupMeetings(NamedTuple):
     """The meetings with which the group tries again if a first meeting has failed."""
     latest: float
     """The bound in s of the time at which the last of these has localised all robots that can be."""
-    sweep: PlannedSweep | None = None
+    planned_sweep: PlannedSweep | None = None
     """The search for robots without an anchor; None if all have one."""
     confirmation: PlannedConfirmation | None = None
     """The meetings that confirm poses; None if robots claim the pose that they know."""

@@ -134,7 +134,7 @@ def with_sweep(
         first={**meetings.first, **dict.fromkeys(unanchored, waiting)},
         bound=planned.ends,
         latest=meetings.latest + SWEEPS_SLOWER * planned.ends,
-        sweep=planned,
+        planned_sweep=planned,
     )
 
 
@@ -176,7 +176,7 @@ def _last_meetings(
 ) -> tuple[dict[str, Place], dict[str, float]]:
     """Return the place (m) of the last meeting of each robot, and the time (s) at which it ends."""
     places, free = dict(anchors), dict.fromkeys(anchors, 0.0)
-    for meeting in meetings.planned:
+    for meeting in meetings.meetings:
         for robot in (meeting.visitor, meeting.visited):
             places[robot], free[robot] = anchors[meeting.visited], meeting.ends
     return places, free
@@ -185,7 +185,7 @@ def _last_meetings(
 def _last_visitors(meetings: GroupMeetings) -> list[str]:
     """Return the visitors of those meetings that are the last of both robots."""
     last: dict[str, PlannedMeeting] = {}
-    for meeting in meetings.planned:
+    for meeting in meetings.meetings:
         last[meeting.visitor] = last[meeting.visited] = meeting
     return [robot for robot, one in last.items() if one.visitor == robot and last[one.visited] is one]
 

@@ -16,7 +16,6 @@ from protocol.spelling import did_you_mean
 from protocol.units import Finite, RobotId
 from world.faults import Fault
 from world.scenario import Scenario
-from world.world_noise import WorldNoise
 
 CHANGED_SOURCE = "the changed scenario"
 """The name of the changed scenario in error messages; those of `changed` leave it out."""
@@ -117,9 +116,8 @@ def _with_values(scenario: Scenario, before: ScenarioChange, change: ScenarioCha
         sigma = change.sigma
         noise = replace(mission.noise, anchor_sigma=sigma, mutual_sigma=sigma) if sigma else Noise()
         mission = replace(mission, noise=noise)
-        if scenario.world_noise != WorldNoise():
-            own = replace(scenario.world_noise, anchor_sigma=None, mutual_sigma=None)
-            given["world_noise"] = own if sigma else WorldNoise()
+        if (own := scenario.world_noise) is not None:
+            given["world_noise"] = replace(own, anchor_sigma=None, mutual_sigma=None) if sigma else None
     faults = list(scenario.faults)
     if change.loss != before.loss:
         place = _place_of_loss(scenario.faults)
@@ -162,7 +160,7 @@ def file_table(scenario: Scenario) -> dict[str, Any]:
         noise = msgspec.to_builtins(scenario.mission.noise)
         mission["noise"] = {name: value for name, value in noise.items() if value is not None}
     world = {
-        "noise": _given(scenario.world_noise),
+        "noise": _given(scenario.world_noise) if scenario.world_noise is not None else {},
         "range": msgspec.to_builtins(scenario.range_model),
         "radio": msgspec.to_builtins(scenario.radio_model),
     }

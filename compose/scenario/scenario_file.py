@@ -39,7 +39,7 @@ from world.scenario import (
     RobotSpec,
     Scenario,
 )
-from world.world_noise import WorldNoise, world_noise_infeasibility, world_noise_mistake
+from world.world_noise import world_noise_infeasibility, world_noise_mistake
 
 EXCHANGES = 20
 """The number of reports for each of which `max_ticks` allows the full `delivery_time_bound`."""
@@ -283,14 +283,14 @@ def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scena
         planner_name=file.planner.name,
         robots=tuple(placed),
         faults=faults,
-        world_noise=WorldNoise() if noise.changes_nothing(file.mission.noise) else noise,
+        world_noise=None if noise.changes_nothing(file.mission.noise) else noise,
         planner_options=file.planner.options,
         range_model=file.world.range,
         radio_model=file.world.radio,
-        meetings=meetings.planned if meetings is not None else (),
+        meetings=meetings.meetings if meetings is not None else (),
         retries=meetings.retries if meetings is not None else (),
         deaths=tuple([Death(one.id, one.dies) for one in file.robot if one.dies is not None]),
-        planned_sweep=meetings.sweep if meetings is not None else None,
+        planned_sweep=meetings.planned_sweep if meetings is not None else None,
         confirmation=meetings.confirmation if meetings is not None else None,
     )
     try:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -16,7 +16,6 @@ from typing import Any
 
 from protocol import PACKAGE
 from protocol.messages import Environment
-from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 
 LONGEST_VERSION = 64
 """The maximum number of characters of a version."""
@@ -50,23 +49,8 @@ def of_robot() -> Environment:
     )
 
 
-def named_in(frames: Sequence[bytes]) -> Environment | None:
-    """Return the environment in a journal's first frame; None for older journals, which have none."""
-    try:
-        return decode(frames[0], Environment, MAX_FRAME_BYTES) if frames else None
-    except MalformedFrame:
-        return None
-
-
-def is_blank(frames: Sequence[bytes]) -> bool:
-    """Return whether a journal of `frames` contains at most its environment."""
-    return len(frames) <= (named_in(frames) is not None)
-
-
-def otherwise(recorded: Environment | None, here: Environment) -> str | None:
+def otherwise(recorded: Environment, here: Environment) -> str | None:
     """Return how the two environments differ, in a line; None if they are equal."""
-    if recorded is None:
-        return "the recording does not name the versions that it was made with"
     fields = [name for name in here.__struct_fields__ if getattr(recorded, name) != getattr(here, name)]
     if not fields:
         return None
