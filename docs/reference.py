@@ -66,7 +66,7 @@ PARTS = (
     messages.Inconsistent,
     messages.PosePrior,
     messages.Member,
-    messages.Retry,
+    messages.Appointment,
 )
 """structs that messages contain, and that have no tables on other pages"""
 NAMES = {

@@ -235,19 +235,23 @@ class Member(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields
     """The last tick within the planned bound of the time at which it is localised."""
 
 
-class Retry(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """A meeting of a pair at a given time: one that repeats a failed one, or that confirms a pose."""
+class Appointment(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """A meeting of two robots of a group at a given time, which repeats a failed one or confirms a pose."""
 
-    peer: RobotId
-    """The other robot."""
-    role: Role
-    """The role of this robot in the pair."""
+    visitor: RobotId
+    """The robot that drives to the other one or searches for it, with the role a."""
+    visited: RobotId
+    """The robot that waits beside its anchor, with the role b."""
     rendezvous: Rendezvous
     """The orbits of both robots."""
     begins: Time
     """The time in s at which it begins."""
     lasts: Time
     """The bound in s of the time until both are localised."""
+
+    def peer_of(self, robot: str) -> str:
+        """Return the other one of the two robots."""
+        return self.visited if robot == self.visitor else self.visitor
 
 
 MOST_ASIDE = 1.25
@@ -290,13 +294,13 @@ class RobotConfig(Message, frozen=True, dict=True):
     """All robots of the group that have an anchor, in the order of the scenario; empty in a pair."""
     visits: Annotated[tuple[RobotId, ...], Meta(max_length=MAX_MEMBERS)] = ()
     """The robots that this one visits after its first meeting, in their order."""
-    retries: Annotated[tuple[Retry, ...], Meta(max_length=MAX_MEMBERS)] = ()
+    retries: Annotated[tuple[Appointment, ...], Meta(max_length=MAX_MEMBERS)] = ()
     """The meetings in which it tries again if it is not localised by then, in their order."""
     gives_up: Time = 0.0
     """The time in s after which a robot of a group gives up if it is not localised."""
     tolerates: Annotated[int, Meta(ge=0, le=MAX_MEMBERS)] = 0
     """The number of robots that may report false data: one more must agree on a pose before it is claimed."""
-    confirmations: Annotated[tuple[Retry, ...], Meta(max_length=3 * MAX_MEMBERS)] = ()
+    confirmations: Annotated[tuple[Appointment, ...], Meta(max_length=3 * MAX_MEMBERS)] = ()
     """The visits that it makes for this, in their order. Each lasts until the robot is back at its anchor."""
     unanchored: Annotated[tuple[RobotId, ...], Meta(max_length=MAX_MEMBERS)] = ()
     """The robots of the group without an anchor, in the order of the scenario."""

@@ -316,7 +316,7 @@ def test_a_robot_is_told_the_visits_that_it_makes() -> None:
         config = scenario.config(robot.id)
         assert config.confirms
         planned = [one.visited for one in scenario.confirmation.visits if one.visitor == robot.id]
-        assert [one.peer for one in config.confirmations] == planned
+        assert [one.visited for one in config.confirmations] == planned
 
 
 def test_a_changed_scenario_keeps_the_number_of_false_reporters() -> None:

@@ -25,7 +25,7 @@ from protocol.network import diagnosis, keys, session
 from protocol.network.endpoints import Endpoints
 from protocol.network.inbox import NO_ARRIVAL, Arrival, Inbox
 from protocol.spelling import did_you_mean
-from protocol.wire import MalformedFrame, decode, encode
+from protocol.wire import encode
 from world.referee import MissionOutcome
 from world.simulation import Simulation
 
@@ -257,12 +257,8 @@ class WorldProcess:
 
     def _accepted(self, arrival: Arrival, kind: Any) -> Command | FinalReport | None:
         """Return the message that arrived, if it is a `kind` from the robot of its key; None if refused."""
-        try:
-            message: Command | FinalReport = decode(arrival.frame, kind)
-        except MalformedFrame as error:
-            self._inbox.refuse(arrival, error)
-            return None
-        if message.robot not in self._peers or message.robot != arrival.source.robot:
+        message: Command | FinalReport | None = self._inbox.accepted(arrival, kind)
+        if message is not None and message.robot not in self._peers:
             self._inbox.refuse(arrival, f"its sender is given as '{message.robot}'")
             return None
         return message

@@ -12,7 +12,7 @@ import msgspec
 from msgspec import Meta
 
 from protocol.attack import Attack
-from protocol.messages import MAX_MEMBERS, Member, Retry, RobotConfig
+from protocol.messages import MAX_MEMBERS, Appointment, Member, RobotConfig
 from protocol.mission import Anchor, Mission, Options, PlannerName, Role
 from protocol.motion import Pose
 from protocol.orbits import Rendezvous
@@ -80,27 +80,6 @@ class PlannedMeeting(msgspec.Struct, frozen=True, array_like=True, forbid_unknow
     """The bound in s of the time at which both are localised."""
 
 
-class PlannedRetry(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """A meeting of two robots of a group that takes place if neither is localised by then."""
-
-    visitor: RobotId
-    """The robot that searches for the other one, with the role a."""
-    visited: RobotId
-    """The robot that waits beside its anchor, with the role b."""
-    rendezvous: Rendezvous
-    """The orbits of both robots."""
-    begins: Time
-    """The time in s at which it begins."""
-    lasts: Time
-    """The bound in s of the time until both are localised."""
-
-    def of(self, robot: str) -> Retry:
-        """Return this meeting as `robot`, one of the two, knows it."""
-        role: Role = "a" if robot == self.visitor else "b"
-        peer = self.visited if role == "a" else self.visitor
-        return Retry(peer, role, self.rendezvous, self.begins, self.lasts)
-
-
 class PlannedSweep(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """The search of localised robots for those without an anchor."""
 
@@ -119,7 +98,7 @@ class PlannedConfirmation(msgspec.Struct, frozen=True, array_like=True, forbid_u
 
     tolerates: Annotated[int, Meta(ge=1, le=MAX_MEMBERS)]
     """The number of robots that may report false data."""
-    visits: tuple[PlannedRetry, ...]
+    visits: tuple[Appointment, ...]
     """The visits, in the order in which they begin; those of one time are of different robots."""
     ends: Time
     """The bound in s of the time at which all have claimed their poses if no robot reports false data."""
@@ -167,7 +146,7 @@ class Scenario(
 
     Each robot meets one that is localised, then others that are not.
     """
-    retries: tuple[PlannedRetry, ...] = ()
+    retries: tuple[Appointment, ...] = ()
     """The meetings with which a group tries again, in the order in which they begin."""
     deaths: tuple[Death, ...] = ()
     """The robots of a group that die, in the order of the scenario."""
@@ -242,7 +221,7 @@ class Scenario(
         """
         own, planned = self.robot(robot), self.planned_sweep or self.confirmation
         visits = [one.visited for one in self.meetings if one.visitor == robot and one.visited != own.peer]
-        retries = [one.of(robot) for one in self.retries if robot in (one.visitor, one.visited)]
+        retries = [one for one in self.retries if robot in (one.visitor, one.visited)]
         confirming = self.confirmation.visits if self.confirmation is not None else ()
         sweep = self.planned_sweep.sweep if self.planned_sweep is not None else None
         sweepers = self.planned_sweep.sweepers if self.planned_sweep is not None else ()
@@ -263,7 +242,7 @@ class Scenario(
             retries=tuple(retries),
             gives_up=self.max_ticks * self.mission.period * GIVES_UP if self.meetings else 0.0,
             tolerates=planned.tolerates if planned is not None else 0,
-            confirmations=tuple([one.of(robot) for one in confirming if one.visitor == robot]),
+            confirmations=tuple([one for one in confirming if one.visitor == robot]),
             unanchored=self.unanchored,
             sweep=sweep,
             part=sweepers.index(robot) if robot in sweepers else 0,

@@ -95,9 +95,10 @@ def _in_due_visit(state: GroupState) -> GroupState:
         if now < visit.begins or (in_time and not _is_free(state)):
             break
         confirming = replace(confirming, visits=confirming.visits + 1)
-        if in_time and _may_confirm(state, visit.peer):
+        if in_time and _may_confirm(state, visit.visited):
             confirming = replace(confirming, until=visit.begins + visit.lasts)
-            return group_transitions.on_visit(replace(_with_frame(state), confirming=confirming), visit.peer)
+            state = replace(_with_frame(state), confirming=confirming)
+            return group_transitions.on_visit(state, visit.visited)
     return replace(state, confirming=confirming)
 
 

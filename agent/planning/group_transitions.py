@@ -17,10 +17,10 @@ from agent.planning.group_state import Fix, GroupState
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Travelling
 from agent.planning.state import Done, RobotState
 from protocol.messages import (
+    Appointment,
     Contact,
     Localised,
     Member,
-    Retry,
     Undecided,
     Verdict,
 )
@@ -213,7 +213,7 @@ def _resumed(state: GroupState) -> GroupState:
     config = state.config
     if state.retries and state.fix is None:
         retry = config.retries[state.retries - 1]
-        if not refused(state, retry.peer) and _now(state.pair) < retry.begins + retry.lasts:
+        if not refused(state, retry.peer_of(config.robot)) and _now(state.pair) < retry.begins + retry.lasts:
             return _in_retry(state, retry)
     return _waiting(state, config.peer)
 
@@ -239,18 +239,19 @@ def _trying_again(state: GroupState) -> GroupState:
     retry = config.retries[state.retries]
     state = replace(state, retries=state.retries + 1)
     # with its peer, which it has only been near so far, the robot meets in the roles of the retry
-    begun = retry.peer != config.peer or pair.peer_state.latest >= 0
-    if (begun and _is_met(state)) or refused(state, retry.peer):
+    peer = retry.peer_of(config.robot)
+    begun = peer != config.peer or pair.peer_state.latest >= 0
+    if (begun and _is_met(state)) or refused(state, peer):
         return state
     return _in_retry(state, retry)
 
 
-def _in_retry(state: GroupState, retry: Retry) -> GroupState:
+def _in_retry(state: GroupState, retry: Appointment) -> GroupState:
     """Return `state` in the meeting of `retry`, which has begun."""
-    if retry.role == "b":
-        return _waiting(state, retry.peer, retry.rendezvous)
+    if retry.visited == state.config.robot:
+        return _waiting(state, retry.visitor, retry.rendezvous)
     until = retry.begins + retry.lasts
-    return replace(_aligned(_in_meeting(state, retry.peer, "a", retry.rendezvous)), until=until)
+    return replace(_aligned(_in_meeting(state, retry.visited, "a", retry.rendezvous)), until=until)
 
 
 def _now(pair: RobotState) -> float:

@@ -8,7 +8,7 @@ from agent.process.agent_journal import FramedReport
 from agent.process.recovery import REPORTS_KEPT
 from protocol.messages import Report
 from protocol.network.inbox import Arrival, Inbox
-from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode
+from protocol.wire import MAX_REPORT_BYTES
 
 
 class ReportBuffer:
@@ -37,15 +37,10 @@ class ReportBuffer:
 
     def take(self, arrival: Arrival, known: int) -> None:
         """Store the report in `arrival`, or refuse it. `known` is the tick of the latest Observation."""
-        try:
-            report: Report = decode(arrival.frame, Report, MAX_REPORT_BYTES)
-        except MalformedFrame as error:
-            self._inbox.refuse(arrival, error)
+        report: Report | None = self._inbox.accepted(arrival, Report, MAX_REPORT_BYTES)
+        if report is None:
             return
-        wrong = self._malformed(report)
-        if report.robot != arrival.source.robot:
-            wrong = f"its sender is given as '{report.robot}'"
-        if wrong is not None:
+        if (wrong := self._malformed(report)) is not None:
             self._inbox.refuse(arrival, wrong)
             return
         if not self._real_time and report.tick > known + 1:

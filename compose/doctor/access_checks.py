@@ -185,13 +185,8 @@ def _reading(pair: SessionPair, run: str, robot: str, wait: float) -> Iterator[F
 def _peer(link: zenoh.Session, run: str, robot: str) -> str | None:
     """Return the peer of `robot`, from its configuration; None if the world does not answer with one."""
     answer = session.ask(link, keys.config(run, robot), ASK_S)
-    if not isinstance(answer, bytes):
-        return None
-    try:
-        config: RobotConfig = decode(answer, RobotConfig)
-    except MalformedFrame:
-        return None
-    return config.peer
+    config = decoded(answer, RobotConfig) if isinstance(answer, bytes) else None
+    return config.peer if config is not None else None
 
 
 def _under(key: str, subscriber: Any) -> zenoh.Sample | None:
@@ -201,7 +196,13 @@ def _under(key: str, subscriber: Any) -> zenoh.Sample | None:
 
 
 def _ticks(frame: bytes) -> set[int]:
+    observation = decoded(frame, Observation)
+    return {observation.tick} if observation is not None else set()
+
+
+def decoded(frame: bytes | None, kind: Any) -> Any:
+    """Return the message in a frame; None if there is no frame, or it cannot be decoded."""
     try:
-        return {decode(frame, Observation).tick}
+        return decode(frame, kind) if frame is not None else None
     except MalformedFrame:
-        return set()
+        return None

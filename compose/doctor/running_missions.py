@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 import zenoh
 
-from compose.doctor.access_checks import ASK_S
+from compose.doctor.access_checks import ASK_S, decoded
 from protocol.messages import (
     Command,
     FinalReport,
@@ -26,7 +26,7 @@ from protocol.messages import (
 )
 from protocol.network import keys, session
 from protocol.network.keys import Key
-from protocol.wire import MalformedFrame, decode, version_of
+from protocol.wire import version_of
 
 FIND_S = 0.5
 """Time in s to look for a mission if there is none: routers may just have connected to each other."""
@@ -149,7 +149,7 @@ class _LatestFrames:
 
     def message(self, key: Key, messages: Any) -> Any:
         """Return the latest message under `key`, if it is one of `messages` and of the robot in the key."""
-        message = _decoded(self.latest.get(key), messages)
+        message = decoded(self.latest.get(key), messages)
         return message if getattr(message, "robot", key.robot) == key.robot else None
 
 
@@ -161,7 +161,7 @@ def _mission(link: zenoh.Session, latest: _LatestFrames, run: str, alive: frozen
     ]
     answers = _configs(link, run, latest.named(run, keys.observation) | alive - {""}) if "" in alive else {}
     frames += answers.values()
-    configs = [one for frame in answers.values() if (one := _decoded(frame, RobotConfig)) is not None]
+    configs = [one for frame in answers.values() if (one := decoded(frame, RobotConfig)) is not None]
     named = alive - {""} | latest.named(run, keys.observation) | latest.named(run, keys.command)
     named |= {robot for one in configs for robot in one.others}
     messages = [
@@ -202,11 +202,11 @@ def _configs(link: zenoh.Session, run: str, robots: set[str]) -> dict[str, bytes
                 link,
                 keys.config(run, robot),
                 ASK_S,
-                lambda frame: _decoded(frame, RobotConfig) is not None,
+                lambda frame: decoded(frame, RobotConfig) is not None,
             )
             if isinstance(answer, bytes):
                 found[robot] = answer
-                config = _decoded(answer, RobotConfig)
+                config = decoded(answer, RobotConfig)
                 paired.update(config.others if config is not None else ())
     return found
 
@@ -218,11 +218,3 @@ def _participant(
     if not isinstance(command, Command) or (latest is not None and command.tick > latest + COMMAND_AHEAD):
         return Participant(robot, alive)
     return Participant(robot, alive, command.tick, command.phase, command.state)
-
-
-def _decoded(frame: bytes | None, kind: Any) -> Any:
-    """Return the message in a frame; None if there is no frame, or it cannot be decoded."""
-    try:
-        return decode(frame, kind) if frame is not None else None
-    except MalformedFrame:
-        return None

@@ -10,10 +10,11 @@ from compose.errors import Unworkable
 from compose.scenario.group_meetings import ALLOWED_SIDES, GroupMeetings
 from compose.scenario.group_sweep import LEAVING_TICKS
 from compose.scenario.scenario_tables import RobotTable, ScenarioFile
+from protocol.messages import Appointment
 from protocol.mission import Mission
 from protocol.orbits import meeting_ticks, search_ticks, visiting
 from world.faults import Fault, exchange_ticks
-from world.scenario import PlannedConfirmation, PlannedRetry
+from world.scenario import PlannedConfirmation
 
 CONFIRMING = 30
 """The ticks beside its anchor in which a robot that has come back measures its pose."""
@@ -68,7 +69,7 @@ def with_confirmation(
     """
     anchors = {one.id: one.anchor for one in robots if one.anchor is not None}
     planned = {frozenset((one.visitor, one.visited)) for one in meetings.meetings}
-    begins, ends, visits = meetings.bound, meetings.bound, list[PlannedRetry]()
+    begins, ends, visits = meetings.bound, meetings.bound, list[Appointment]()
     each, once = exchange_ticks(faults)
     for number in range(PASSES):
         if number == PASSES - 2:
@@ -83,7 +84,7 @@ def with_confirmation(
             for pair in pairs:
                 a, b = pair if number % 2 == 0 else pair[::-1]
                 orbits = visiting(mission, math.dist(anchors[a], anchors[b]))
-                visits.append(PlannedRetry(a, b, orbits, begins, lasts))
+                visits.append(Appointment(a, b, orbits, begins, lasts))
             begins += lasts
         if number == 0:
             ends = begins

@@ -13,10 +13,11 @@ from compose.errors import Unworkable
 from compose.launch import planner_loader
 from compose.scenario.group_plan import PlannedVisit, group_plan
 from compose.scenario.scenario_tables import PlannerTable, RobotTable
+from protocol.messages import Appointment
 from protocol.mission import Mission, Role
 from protocol.orbits import Rendezvous, meeting_ticks, pair_ticks, search_ticks, visiting
 from world.faults import Fault, exchange_ticks
-from world.scenario import PlannedConfirmation, PlannedMeeting, PlannedRetry, PlannedSweep
+from world.scenario import PlannedConfirmation, PlannedMeeting, PlannedSweep
 
 NEIGHBOURS = 3
 """The number of nearest anchors among which a robot's first peer is chosen, in a large group."""
@@ -62,7 +63,7 @@ class GroupMeetings(NamedTuple):
     """The first meeting of each robot."""
     bound: float
     """The bound in s of the time at which all robots are localised."""
-    retries: tuple[PlannedRetry, ...]
+    retries: tuple[Appointment, ...]
     """The meetings with which the group tries again if a first meeting has failed."""
     latest: float
     """The bound in s of the time at which the last of these has localised all robots that can be."""
@@ -139,7 +140,7 @@ def group_meetings(
     begins, retries = bound + VISITS_SLOWER * spread, []
     for i, j in _retried(seeds, len(robots), pair_time, tolerates):
         lasts = pair_time(i, j) + extra[0] * mission.period
-        retries.append(PlannedRetry(ids[i], ids[j], rendezvous(i, j), begins, lasts))
+        retries.append(Appointment(ids[i], ids[j], rendezvous(i, j), begins, lasts))
         begins += lasts + VISITS_SLOWER * spread
     return GroupMeetings(planned, first, bound, tuple(retries), begins)
 

@@ -7,11 +7,12 @@ import threading
 import time
 from collections import Counter
 from queue import Empty, SimpleQueue
-from typing import Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 from protocol.network.keys import UNKNOWN_KEY, Key
 from protocol.network.timer import Timer
 from protocol.output import say
+from protocol.wire import MAX_SENT_BYTES, MalformedFrame, decode
 
 Topic = Literal["observation", "command", "report", "tick-start", "alive", "gone", "ended", "stop", "nothing"]
 """The kind of an event: a received frame ("observation" to "tick-start"), a liveliness token that appeared or
@@ -176,6 +177,18 @@ class Inbox:
                 self._count_turned_away()
             if time.monotonic() >= until:
                 return NO_ARRIVAL
+
+    def accepted(self, arrival: Arrival, kind: Any, limit: int = MAX_SENT_BYTES) -> Any:
+        """Return the message in `arrival` if it is a `kind` from the robot of its key; None if refused."""
+        try:
+            message = decode(arrival.frame, kind, limit)
+        except MalformedFrame as error:
+            self.refuse(arrival, error)
+            return None
+        if message.robot == arrival.source.robot:
+            return message
+        self.refuse(arrival, f"its sender is given as '{message.robot}'")
+        return None
 
     def refuse(self, arrival: Arrival, why: object) -> None:
         """Count a refused frame, and print a message for the first with this key and reason."""

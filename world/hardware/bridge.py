@@ -16,7 +16,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any
 
 import zenoh
 
@@ -344,20 +343,8 @@ class Field:
                 pass
         return None
 
-    def _accepted(self, arrival: Arrival, kind: Any) -> Any:
-        """Return the message that arrived, if it is a `kind` from the robot of its key; None if refused."""
-        try:
-            message: Any = decode(arrival.frame, kind, MAX_REPORT_BYTES)
-        except MalformedFrame as error:
-            self._inbox.refuse(arrival, error)
-            return None
-        if message.robot != arrival.source.robot:
-            self._inbox.refuse(arrival, f"its sender is given as '{message.robot}'")
-            return None
-        return message
-
     def _on_command(self, arrival: Arrival) -> Command | None:
-        command: Command | None = self._accepted(arrival, Command)
+        command: Command | None = self._inbox.accepted(arrival, Command, MAX_REPORT_BYTES)
         if command is None or command.tick > self._tick:
             if command is not None:
                 self._inbox.refuse(arrival, "its tick is in the future")
@@ -374,7 +361,7 @@ class Field:
         that is behind sets its clock from any other one: if it was restarted, and in a group also if it
         begins late or is more than MOST_TICKS_AHEAD ticks behind.
         """
-        start: TickStart | None = self._accepted(arrival, TickStart)
+        start: TickStart | None = self._inbox.accepted(arrival, TickStart, MAX_REPORT_BYTES)
         if start is None:
             return
         left, now, in_group = self._tick + 1 - start.tick, time.monotonic(), self._source.joins
@@ -400,7 +387,7 @@ class Field:
 
     def _on_report(self, arrival: Arrival) -> None:
         """Use a Report for the end of the mission. One before tick 0 is dropped: they are cumulative."""
-        report: Report | None = self._accepted(arrival, Report)
+        report: Report | None = self._inbox.accepted(arrival, Report, MAX_REPORT_BYTES)
         if report is None or self._tick < 0:
             return
         if not self._is_current(report.tick):
