@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
 
 from msgspec.structs import replace
 
@@ -26,30 +25,6 @@ from protocol.messages import (
     Verdict,
 )
 from protocol.motion import REST, Controls, Pose, compose, inverse, step
-
-
-class Reporting(Protocol):
-    """The state of a robot, as far as a report without a log tells of it."""
-
-    @property
-    def config(self) -> RobotConfig:
-        """The configuration of the robot."""
-
-    @property
-    def tick(self) -> int:
-        """The tick of the latest observation."""
-
-    @property
-    def log(self) -> MotionLog:
-        """The measured motion, and the ranges to the robot's anchor."""
-
-    @property
-    def phase(self) -> int:
-        """The phase of the paper: 1, 2 or 3."""
-
-    @property
-    def mode_name(self) -> str:
-        """The name of the mode that reports, commands and recordings use."""
 
 
 def start(config: RobotConfig) -> RobotState:
@@ -149,7 +124,7 @@ def reported_pose(state: RobotState, frame: Pose) -> Pose:
     return pose
 
 
-def report_without_log(state: Reporting, verdict: Verdict | None) -> Report:
+def report_without_log(state: RobotState, verdict: Verdict | None) -> Report:
     """Return a report to a robot with which this one is not in a meeting: the `verdict` that it has."""
     return Report(
         tick=state.tick,

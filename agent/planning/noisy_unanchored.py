@@ -21,7 +21,7 @@ from agent.estimation.gaussian.known_anchors import FEWEST_FOR_POSE
 from agent.estimation.gaussian.odometry_noise import Track, track
 from agent.peer import peer_state
 from agent.peer.motion_log import MotionLog
-from agent.planning import exchange, sweep
+from agent.planning import sweep
 from agent.planning.phase3_last_manoeuvre import Standing
 from agent.planning.planner import Planner, Summary
 from agent.planning.state import MODE_NAMES
@@ -114,15 +114,13 @@ class NoisyUnanchoredPlanner(Planner[NoisyUnanchoredState, Report]):
         return replace(state, ranges=ranges)
 
     def report(self, state: NoisyUnanchoredState) -> Report:
-        """Return a report without a log: a robot without an anchor is in no meeting."""
-        return exchange.report_without_log(state, state.verdict)
+        """Return the report to a robot that has not found it."""
+        return state.report()
 
     def report_to(self, state: NoisyUnanchoredState, peer: str) -> Report:
         """Return the same report; to its finder, with the acknowledgement of the finder's manoeuvres."""
-        report, finder = self.report(state), state.finder
-        if finder is None or finder.robot != peer:
-            return report
-        return replace(report, heard=finder.log.through)
+        report, finder = state.report(), state.finder
+        return replace(report, heard=finder.log.through) if finder and finder.robot == peer else report
 
     def decide(self, state: NoisyUnanchoredState, reports: Sequence[Report] = ()) -> NoisyUnanchoredState:
         """Return `state` with the data in `reports`, and with a verdict if they determine the own pose."""

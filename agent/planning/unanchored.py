@@ -93,6 +93,10 @@ class WaitingState(msgspec.Struct, frozen=True):
         )
         return replace(self, tick=observation.tick, odometry=odometry, leg=leg, log=log)
 
+    def report(self) -> Report:
+        """Return a report without a log: a robot without an anchor is in no meeting."""
+        return Report(self.tick, self.config.robot, self.phase, self.mode_name, verdict=self.verdict)
+
     def command(self, tolerance: float) -> Command:
         """Return the command for the next tick; a place counts as reached within `tolerance` m."""
         controls = None
@@ -154,15 +158,13 @@ class UnanchoredPlanner(Planner[UnanchoredState, Report]):
         return replace(state, ranges={**recent, **new})
 
     def report(self, state: UnanchoredState) -> Report:
-        """Return a report without a log: a robot without an anchor is in no meeting."""
-        return exchange.report_without_log(state, state.verdict)
+        """Return the report to a robot that has not found it."""
+        return state.report()
 
     def report_to(self, state: UnanchoredState, peer: str) -> Report:
         """Return the report to `peer`, which does not stop any longer once this robot knows a pose by it."""
-        report = self.report(state)
-        if state.verdict is None and peer in state.candidates:
-            return replace(report, state=UNCONFIRMED)
-        return report
+        unconfirmed = state.verdict is None and peer in state.candidates
+        return replace(state.report(), state=UNCONFIRMED) if unconfirmed else state.report()
 
     def decide(self, state: UnanchoredState, reports: Sequence[Report] = ()) -> UnanchoredState:
         """Return `state` with the poses in `reports`, and with a verdict if they determine the own pose."""

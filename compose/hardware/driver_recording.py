@@ -12,11 +12,11 @@ import msgspec
 from compose.launch.driver_loader import resume_driver
 from compose.recording.recording_files import agent_journal
 from compose.terminal.outcome import reopened
-from protocol.journal.journal_file import CannotRecord, CorruptJournal, Journal
+from protocol.journal.journal_file import CannotRecord, CorruptJournal, Journal, message_in
 from protocol.journal.resume import Retrace
 from protocol.messages import Observation, OfRobot, RobotConfig
 from protocol.network.inbox import Inbox
-from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode, encode
+from protocol.wire import encode
 from world.hardware.bridge import Field
 from world.hardware.driver import Driver
 from world.hardware.driver_journal import DriverHistory, ProcessStart, boot, driver_history, driver_journal
@@ -108,11 +108,7 @@ def _known(frames: list[bytes], history: DriverHistory, path: Path) -> int:
     """
     known = -1
     for frame in frames:
-        try:
-            message = decode(frame, OfRobot, MAX_FRAME_BYTES)
-        except MalformedFrame as error:
-            raise CorruptJournal(f"{path}: {error}") from None
-        if isinstance(message, Observation):
+        if isinstance(message_in(frame, OfRobot, path), Observation):
             known += 1
             if known > history.tick:
                 raise CorruptJournal(

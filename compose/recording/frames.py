@@ -10,7 +10,7 @@ from msgspec.structs import astuple
 
 from compose.recording.recording_files import KINDS
 from compose.recording.run import Run
-from protocol.journal.journal_file import CorruptJournal
+from protocol.journal.journal_file import message_in
 from protocol.messages import (
     Command,
     DeadlineMissed,
@@ -22,7 +22,7 @@ from protocol.messages import (
     MissionEnd,
     Observation,
 )
-from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, body, decode
+from protocol.wire import body
 from world.scenario import Scenario
 
 OfWorld = Environment | Scenario | Command | DeadlineMissed | MissionEnd | FinalReport
@@ -108,11 +108,7 @@ class JournalDecoder:
     def decoded(self, frames: Iterable[bytes]) -> Iterator[Journaled]:
         """Yield the next frames of the journal. Raises CorruptJournal if one cannot be decoded."""
         for frame in frames:
-            try:
-                message: Message = decode(frame, KINDS, MAX_FRAME_BYTES)
-            except MalformedFrame as error:
-                raise CorruptJournal(f"{self._name}: {error}") from None
-            yield from self.of([message], [frame])
+            yield from self.of([message_in(frame, KINDS, self._name)], [frame])
 
 
 def in_time(run: Run) -> list[Journaled]:

@@ -421,28 +421,17 @@ def _agree(configs: Mapping[str, RobotConfig], source: object) -> None:
     """Raise CorruptJournal if two peers' configurations are not of the same pair, or group, and mission."""
     for robot, one in configs.items():
         other = configs.get(one.peer)
-        if other is not None and _shared(one, robot) != _shared(other, robot):
+        if other is not None and _shared(one) != _shared(other):
             path = f"{source}/{agent_journal(one.peer)}"
             raise CorruptJournal(
                 f"{path}: belongs to another run: its configuration does not match {robot}'s"
             )
 
 
-def _shared(config: RobotConfig, robot: str) -> tuple[object, ...]:
-    """Return the part of a configuration that both robots of a pair share, in the view of `robot`.
-
-    In a group, a peer may have another one in its first meeting, and all robots share the rest.
-    """
-    if config.members:
-        return config.members, config.mission, config.planner_name, config.tick_s
-    own = config.robot == robot
-    return (
-        config.robot if own else config.peer,
-        (config.role == "a") == own,
-        config.anchor if own else config.peer_anchor,
-        config.peer_anchor if own else config.anchor,
-        config.mission,
-        config.planner_name,
-        config.rendezvous,
-        config.tick_s,
-    )
+def _shared(config: RobotConfig) -> tuple[object, ...]:
+    """Return the part of a configuration that both robots of a pair share, or all robots of a group."""
+    shared = config.group, config.members, config.mission, config.planner_name, config.tick_s
+    if config.members:  # in its first meeting, a peer may have another one
+        return shared
+    anchors = [config.anchor, config.peer_anchor]
+    return (*shared, anchors if config.role == "a" else anchors[::-1], config.rendezvous)

@@ -14,13 +14,13 @@ import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Protocol
+from typing import Any, Protocol
 
 import msgpack
 import msgspec
 
 from protocol.files import open_file
-from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, is_sound, other_version, versions
+from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode, is_sound, other_version, versions
 
 _packer = msgpack.Packer()
 _HEADS = {0xC4: 1, 0xC5: 2, 0xC6: 4}
@@ -47,6 +47,14 @@ class RecordExists(CannotRecord):
 
 class CorruptJournal(ValueError):
     """A journal is damaged before its end, or its content is not valid."""
+
+
+def message_in(frame: bytes, kind: Any, source: object) -> Any:
+    """Return the message in a frame of the journal `source`. Raises CorruptJournal if it is not a `kind`."""
+    try:
+        return decode(frame, kind, MAX_FRAME_BYTES)
+    except MalformedFrame as error:
+        raise CorruptJournal(f"{source}: {error}") from None
 
 
 class UnexpectedFrame(msgspec.Struct, frozen=True):

@@ -31,7 +31,7 @@ from protocol.messages import (
 )
 from protocol.network import keys, session
 from protocol.network.inbox import NO_ARRIVAL, Arrival, Inbox
-from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode, encode
+from protocol.wire import MAX_REPORT_BYTES, encode
 from world.hardware.driver import THINKING, Driver
 from world.hardware.driver_journal import DriverHistory
 from world.hardware.group_termination import GroupEnding
@@ -423,7 +423,9 @@ class Field:
                 arrival = self._inbox.next(left)
                 if arrival.topic == "gone":
                     self._alive.discard(arrival.source.robot)
-                elif arrival.topic == "command" and _is_final_report(arrival.frame, self._id):
+                elif arrival.topic == "command" and isinstance(
+                    self._inbox.accepted(arrival, Command | FinalReport), FinalReport
+                ):
                     self._is_taken(arrival.frame)
                     return
         why = "no answer to the MissionEnd" if self._id in self._alive else "its agent has ended"
@@ -441,10 +443,3 @@ class Field:
 
     def _send(self, frame: bytes) -> None:
         self._observation.put(frame)
-
-
-def _is_final_report(frame: bytes, robot: str) -> bool:
-    try:
-        return decode(frame, FinalReport).robot == robot
-    except MalformedFrame:
-        return False

@@ -14,7 +14,7 @@ from typing import Annotated
 
 import msgspec
 
-from protocol.journal.journal_file import CorruptJournal
+from protocol.journal.journal_file import CorruptJournal, message_in
 from protocol.messages import (
     Command,
     Message,
@@ -25,7 +25,6 @@ from protocol.messages import (
     TickStart,
 )
 from protocol.units import Finite, RobotId, Tick
-from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 
 MAX_MARK = 64
 """The maximum number of values of a mark."""
@@ -113,7 +112,7 @@ def driver_history(frames: Sequence[bytes], config: RobotConfig, path: Path) -> 
     end: MissionEnd | None = None
     start: ProcessStart | None = None
     for place, frame in enumerate(frames):
-        message = _message(frame, path)
+        message = message_in(frame, OfDriver, path)
         match message:
             case RobotConfig() if place == 0:
                 if message != config:
@@ -136,11 +135,3 @@ def driver_history(frames: Sequence[bytes], config: RobotConfig, path: Path) -> 
             case _:
                 raise CorruptJournal(f"{path}: frame {place + 1}, {type(message).__name__}, is out of order")
     return DriverHistory(tuple(ticks), mark, end, start)
-
-
-def _message(frame: bytes, path: Path) -> Message:
-    try:
-        message: Message = decode(frame, OfDriver, MAX_FRAME_BYTES)
-    except MalformedFrame as error:
-        raise CorruptJournal(f"{path}: {error}") from None
-    return message

@@ -101,7 +101,7 @@ class ReceivedMission(WatchedRun):
             raise RefusedFrame(f"it names robot '{robot}' as its sender")
         tick: int | None = getattr(message, "tick", None)
         config = self.known.configs.get(source.robot)
-        if source.peer and config is not None and source.peer not in _named_in(config):
+        if source.peer and config is not None and source.peer not in config.others:
             raise RefusedFrame(f"it is for '{source.peer}', which is not in the mission")
         if len(self._links) >= MOST_COUNTED_LINKS and source[2:] not in self._links:
             raise RefusedFrame("there are too many robots")
@@ -147,11 +147,6 @@ class ReceivedMission(WatchedRun):
             return
         self.live = alive and self.known.end is None
         self.known.present(None, alive)
-
-
-def _named_in(config: RobotConfig) -> frozenset[str]:
-    """Return the robots of the mission that the configuration of one of them names."""
-    return frozenset((config.peer, *config.others)) - {config.robot}
 
 
 class Listener:
