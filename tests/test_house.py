@@ -16,8 +16,10 @@ import pytest
 
 from agent.planning.state import RobotState
 from compose.scenario.scenario_file import load
+from protocol.messages import Message
 from protocol.wire import encode
 from tests.steps import planner_of, steps
+from world.scenario import Scenario
 from world.tick import advance, observations, release
 
 HOUSE = Path(__file__).parents[1]
@@ -306,6 +308,25 @@ def test_no_planner_asks_for_its_name_or_for_exact_sensors(field: str) -> None:
         if isinstance(node, ast.Attribute) and node.attr == field
     }
     assert asking == ASKED_IN[field]
+
+
+def test_a_kind_of_message_is_one_class() -> None:
+    kinds = [*Message.__subclasses__(), Scenario]
+    assert [kind.__name__ for kind in kinds if kind.__subclasses__()] == []
+
+
+def test_few_functions_ask_whether_a_value_is_a_configuration_or_a_scenario() -> None:
+    """They tell a message from another one, or what a user of the Python API gives."""
+    asking = [
+        module
+        for package in BELOW
+        for module in modules(package)
+        for node in ast.walk(tree(module))
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "isinstance"
+        if {"RobotConfig", "Scenario"}
+        & {one.id for one in ast.walk(node.args[1]) if isinstance(one, ast.Name)}
+    ]
+    assert len(asking) <= 4, asking
 
 
 # --- size and names -----------------------------------------------------------------------------------
