@@ -311,7 +311,7 @@ def test_no_planner_asks_for_its_name_or_for_exact_sensors(field: str) -> None:
 
 
 def test_a_kind_of_message_is_one_class() -> None:
-    kinds = [*Message.__subclasses__(), Scenario]
+    kinds: list[type] = [*Message.__subclasses__(), Scenario]
     assert [kind.__name__ for kind in kinds if kind.__subclasses__()] == []
 
 

@@ -75,8 +75,7 @@ def test_honest_robots_are_localised_and_never_wrong_whoever_attacks(attacker: s
 def test_an_attacker_that_is_a_finder_is_believed_by_a_robot_that_tolerates_no_false_report() -> None:
     """This is why a scenario with an attack must say how many are tolerated."""
     scenario = scenario_of(five("a"))
-    assert scenario.planned_sweep is not None
-    believing = replace(scenario, planned_sweep=replace(scenario.planned_sweep, tolerates=0))
+    believing = replace(scenario, tolerates=0)
     assert any(error is not None and error > 0.1 for error in claims(run_mission(believing)).values())
 
 

@@ -89,15 +89,11 @@ class PlannedSweep(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_
     """The robots that sweep it, in the order of the parts that they sweep first."""
     ends: Time
     """The bound in s of the time at which all robots without an anchor are localised."""
-    tolerates: Annotated[int, Meta(ge=0, le=MAX_MEMBERS)] = 0
-    """The number of robots that may report false data."""
 
 
 class PlannedConfirmation(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """The meetings after which robots claim poses on which several peers agree."""
 
-    tolerates: Annotated[int, Meta(ge=1, le=MAX_MEMBERS)]
-    """The number of robots that may report false data."""
     visits: tuple[Appointment, ...]
     """The visits, in the order in which they begin; those of one time are of different robots."""
     ends: Time
@@ -150,6 +146,8 @@ class Scenario(
     """The meetings with which a group tries again, in the order in which they begin."""
     deaths: tuple[Death, ...] = ()
     """The robots of a group that die, in the order of the scenario."""
+    tolerates: Annotated[int, Meta(ge=0, le=MAX_MEMBERS)] = 0
+    """The number of robots of a group that may report false data."""
     planned_sweep: PlannedSweep | None = None
     """The search for robots without an anchor; None if all robots have one."""
     confirmation: PlannedConfirmation | None = None
@@ -219,7 +217,7 @@ class Scenario(
 
         Raises KeyError if there is no such robot.
         """
-        own, planned = self.robot(robot), self.planned_sweep or self.confirmation
+        own = self.robot(robot)
         visits = [one.visited for one in self.meetings if one.visitor == robot and one.visited != own.peer]
         retries = [one for one in self.retries if robot in (one.visitor, one.visited)]
         confirming = self.confirmation.visits if self.confirmation is not None else ()
@@ -241,7 +239,7 @@ class Scenario(
             visits=tuple(visits),
             retries=tuple(retries),
             gives_up=self.max_ticks * self.mission.period * GIVES_UP if self.meetings else 0.0,
-            tolerates=planned.tolerates if planned is not None else 0,
+            tolerates=self.tolerates,
             confirmations=tuple([one for one in confirming if one.visitor == robot]),
             unanchored=self.unanchored,
             sweep=sweep,

@@ -82,14 +82,14 @@ def planned_meetings(found: Scenario) -> GroupMeetings:
     anchors = [(robot.id, robot.given_anchor) for robot in found.robots]
     robots = [RobotTable(robot, (at.x, at.y) if at is not None else None) for robot, at in anchors]
     planner = PlannerTable(found.planner_name, found.planner_options)
-    sweep, tolerant = found.planned_sweep, found.planned_sweep or found.confirmation
+    sweep = found.planned_sweep
     return plan_of(
         robots,
         found.mission,
         planner,
         found.faults,
         area=sweep.sweep.bounds if sweep is not None else None,
-        tolerates=tolerant.tolerates if tolerant is not None else 0,
+        tolerates=found.tolerates,
     )
 
 

@@ -88,9 +88,7 @@ def with_confirmation(
             begins += lasts
         if number == 0:
             ends = begins
-    return meetings._replace(
-        bound=ends, latest=begins, confirmation=PlannedConfirmation(tolerates, tuple(visits), ends)
-    )
+    return meetings._replace(bound=ends, latest=begins, confirmation=PlannedConfirmation(tuple(visits), ends))
 
 
 def _rounds(

@@ -127,7 +127,7 @@ def with_sweep(
     planned = _planned_sweep(anchors, len(unanchored), area, mission, meetings)
     each = _next_sweep_ticks(planned.sweep, mission, widest, len(unanchored))
     ends = planned.ends + (sweepers_of_part(tolerates) - 1) * each * mission.period
-    planned = msgspec.structs.replace(planned, ends=ends, tolerates=tolerates)
+    planned = msgspec.structs.replace(planned, ends=ends)
     still = Orbit(0.0, 0.0, 0.0)
     waiting = FirstMeeting(planned.sweepers[0], "b", Rendezvous(still, still, planned.ends))
     return meetings._replace(

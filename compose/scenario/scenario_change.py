@@ -152,10 +152,8 @@ def file_table(scenario: Scenario) -> dict[str, Any]:
     mission = _given(scenario.mission)
     if scenario.planned_sweep is not None:
         mission["area"] = list(scenario.planned_sweep.sweep.bounds)
-        if scenario.planned_sweep.tolerates:
-            mission["tolerates"] = scenario.planned_sweep.tolerates
-    if scenario.confirmation is not None:
-        mission["tolerates"] = scenario.confirmation.tolerates
+    if scenario.tolerates:
+        mission["tolerates"] = scenario.tolerates
     if scenario.mission.noise.profile is not None:  # a default would have the value of the profile
         noise = msgspec.to_builtins(scenario.mission.noise)
         mission["noise"] = {name: value for name, value in noise.items() if value is not None}

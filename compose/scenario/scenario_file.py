@@ -290,6 +290,7 @@ def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scena
         meetings=meetings.meetings if meetings is not None else (),
         retries=meetings.retries if meetings is not None else (),
         deaths=tuple([Death(one.id, one.dies) for one in file.robot if one.dies is not None]),
+        tolerates=file.mission.tolerates,
         planned_sweep=meetings.planned_sweep if meetings is not None else None,
         confirmation=meetings.confirmation if meetings is not None else None,
     )
