@@ -56,11 +56,10 @@ class Rover:
         """
         self._config = config
         self._manoeuvre_s = manoeuvre_s
-        anchor = config.anchor
         self.pose = (
             Pose(*[float(word) for word in start.split(",")])
             if start
-            else Pose(anchor.x + 0.1, anchor.y - 0.2, 0.7)
+            else Pose(config.anchor.x + 0.1, config.anchor.y - 0.2, 0.7)
         )
         """The true pose, up to the part of the manoeuvre that `_done` counts."""
         self._controls = REST
@@ -92,8 +91,8 @@ class Rover:
         executed, self._driven = self._driven, REST
         self._tick, self._executed, self._is_under_way = tick, executed, True
         self._save()
-        anchor, reach = self._config.anchor, self._config.mission.sensing_range
-        rho = math.hypot(self.pose.x - anchor.x, self.pose.y - anchor.y)
+        anchor, reach = self._config.given_anchor, self._config.mission.sensing_range
+        rho = math.hypot(self.pose.x - anchor.x, self.pose.y - anchor.y) if anchor else math.inf
         return Reading(executed, rho if rho <= reach else None, mutual_ranges=self._mutual_ranges(tick))
 
     def drive(self, v: float, omega: float) -> None:
