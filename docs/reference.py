@@ -64,7 +64,7 @@ PARTS = (
     messages.Localised,
     messages.Undecided,
     messages.Inconsistent,
-    messages.PosePrior,
+    messages.ReportedPose,
     messages.Member,
     messages.Appointment,
 )

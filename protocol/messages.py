@@ -440,7 +440,7 @@ class MissionEnd(Message, frozen=True):
 # --- from a robot ---
 
 
-class PosePrior(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+class ReportedPose(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """The pose that a localised robot tells one that has no anchor, and cannot compute it itself."""
 
     tick: Tick
@@ -495,7 +495,7 @@ class Report(Message, frozen=True):
     verdict: Verdict | None = None
     """The sender's final result; None until it has one. With a `body`, that of the tick before, its reason
     cut short."""
-    prior: PosePrior | None = None
+    prior: ReportedPose | None = None
     """The sender's pose, for a receiver without an anchor; None to others."""
     body: Annotated[bytes, Meta(max_length=MAX_BODY_BYTES)] | None = None
     """The value that `Planner.report` returns, in msgpack; None from the shipped planners."""

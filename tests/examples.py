@@ -18,9 +18,9 @@ from protocol.messages import (
     Message,
     MissionEnd,
     Observation,
-    PosePrior,
     Ranged,
     Report,
+    ReportedPose,
     TickStart,
     Undecided,
 )
@@ -50,7 +50,7 @@ EXAMPLES: tuple[Message, ...] = (
         verdict=Undecided("no pose explains the anchor ranges"),
     ),
     Report(0, "a", 1, "asleep"),
-    Report(9, "a", 2, "sweeping", ranges_since=3, verdict=Localised(POSE), prior=PosePrior(9, POSE)),
+    Report(9, "a", 2, "sweeping", ranges_since=3, verdict=Localised(POSE), prior=ReportedPose(9, POSE)),
     Report(
         tick=9,
         robot="a",
@@ -61,7 +61,7 @@ EXAMPLES: tuple[Message, ...] = (
         runs=(Segment(2, 0.5, -0.25),),
         ranges_since=3,
         verdict=Localised(POSE),
-        prior=PosePrior(6, POSE, Covariance(0.5, 0.25, 0.0, 0.75, -0.5, 1.0)),
+        prior=ReportedPose(6, POSE, Covariance(0.5, 0.25, 0.0, 0.75, -0.5, 1.0)),
     ),
     Command(3, "b", 0.5, 0.25, 3, "localised", Localised(POSE, Covariance(0.5, 0.25, 0.0, 0.75, -0.5, 1.0))),
     Command(5, "b", 0.0, 0.0, 3, "localised", Localised(POSE)),

@@ -38,9 +38,9 @@ from protocol.messages import (
     Estimate,
     Localised,
     Observation,
-    PosePrior,
     Ranged,
     Report,
+    ReportedPose,
     RobotConfig,
     Undecided,
 )
@@ -74,9 +74,9 @@ def journals() -> dict[str, list[bytes]]:
     return kept(noisy(four()))
 
 
-def references(run: Run) -> list[tuple[str, Report, PosePrior]]:
+def references(run: Run) -> list[tuple[str, Report, ReportedPose]]:
     """Return the first report with each pose, with the robot that has received it and that pose."""
-    found: dict[tuple[str, str, int], tuple[str, Report, PosePrior]] = {}
+    found: dict[tuple[str, str, int], tuple[str, Report, ReportedPose]] = {}
     for robot, agent in run.agents.items():
         for one_step in agent.steps:
             for framed in one_step.received:
@@ -529,7 +529,7 @@ def met(sigma: float, ticks: int = 40) -> Any:
         state = planner.observe(
             state, Observation(tick, "u", executed, None, (Detection("b", range_, (tick,)),))
         )
-        prior = PosePrior(0, told, covariance)
+        prior = ReportedPose(0, told, covariance)
         report = Report(tick, "b", 2, "looping", through=tick, runs=tuple(runs), prior=prior)
         assert planner.malformed(report) is None
         state = planner.decide(state, [report])
@@ -570,7 +570,7 @@ def test_a_robot_that_reports_another_reference_in_each_tick_costs_an_estimate_i
         state = planner.observe(state, Observation(tick, "u", REST, None, seen))
         here = max(0, tick - 20)
         runs = (Segment(tick - here, 0.1, 0.0),) if tick > here else ()
-        prior = PosePrior(here, Pose(0.1 * here, 0.0, 0.0), covariance)
+        prior = ReportedPose(here, Pose(0.1 * here, 0.0, 0.0), covariance)
         report = Report(tick, "b", 2, "looping", since=here, through=tick, runs=runs, prior=prior)
         assert planner.malformed(report) is None
         state = planner.decide(state, [report])

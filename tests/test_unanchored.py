@@ -29,8 +29,8 @@ from protocol.messages import (
     Contact,
     Localised,
     Observation,
-    PosePrior,
     Report,
+    ReportedPose,
     TickStart,
 )
 from protocol.motion import ORIGIN, REST, Controls, Pose, step
@@ -179,7 +179,7 @@ def test_a_robot_that_a_passing_one_has_left_on_a_square_is_localised_by_the_nex
             range_ = math.hypot(6.0 + x - pose.x, 5.0 + y - pose.y)
             contacts = (Contact(finder, range_, (tick,)),) if finder is not None else ()
             state = planner.observe(state, Observation(tick, "u", driven, None, contacts))
-            prior = PosePrior(tick, Pose(6.0 + x, 5.0 + y, 0.0))
+            prior = ReportedPose(tick, Pose(6.0 + x, 5.0 + y, 0.0))
             report = Report(tick, finder or "a", 2, "sweeping", prior=prior)
             state = planner.decide(state, [report] if finder is not None else [])
             command = planner.command(state)

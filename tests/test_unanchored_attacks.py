@@ -24,8 +24,8 @@ from protocol.messages import (
     Contact,
     Localised,
     Observation,
-    PosePrior,
     Report,
+    ReportedPose,
     Undecided,
 )
 from protocol.motion import ORIGIN, REST, Controls, Pose, Segment, compose, step, wrap
@@ -260,7 +260,7 @@ def met(state: UnanchoredState, pose: Pose, finder: str, offset: Pose) -> tuple[
             distance = math.hypot(place.x - pose.x, place.y - pose.y)
         contact = Contact(finder, distance, (tick,))
         state = planner.observe(state, Observation(tick, "u", driven, None, (contact,)))
-        prior = PosePrior(tick, compose(offset, place))
+        prior = ReportedPose(tick, compose(offset, place))
         state = planner.decide(state, [Report(tick, finder, 2, "sweeping", prior=prior)])
         if state.verdict is not None:
             break

@@ -31,9 +31,9 @@ from protocol.messages import (
     Inconsistent,
     Localised,
     Observation,
-    PosePrior,
     Ranged,
     Report,
+    ReportedPose,
     RobotConfig,
     Undecided,
 )
@@ -100,7 +100,7 @@ class GroupPlanner(Planner[GroupState, Report]):
         if not (sweep_transitions.is_helped(state, peer) and isinstance(state.verdict, Localised)):
             return without_log
         pose = exchange.reported_pose(state.pair, state.frame)
-        return replace(without_log, prior=PosePrior(state.pair.tick, pose))
+        return replace(without_log, prior=ReportedPose(state.pair.tick, pose))
 
     def decide(self, state: GroupState, reports: Sequence[Report] = ()) -> GroupState:
         """Return `state` with the `reports` of others, and in the next meeting if this one has ended."""

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from agent.planning.passing import Bypass
 from agent.planning.state import RobotState
 from agent.planning.sweep import Looping, Sweeping
-from protocol.messages import Localised, PosePrior, Ranged, RobotConfig, Verdict
+from protocol.messages import Localised, Ranged, ReportedPose, RobotConfig, Verdict
 from protocol.motion import ORIGIN, Pose, compose, inverse
 
 
@@ -47,7 +47,7 @@ class OwnPose(msgspec.Struct, frozen=True):
     """The number of ranges that it had when sigma was last too large and further ones came; None if never."""
     searched_tick: int | None = None
     """The tick of the latest search of the whole plane, when a contact began; None before the first."""
-    reference: PosePrior | None = None
+    reference: ReportedPose | None = None
     """The pose when this contact with robots without an anchor began, which it reports to them; None if it
     reports none."""
 

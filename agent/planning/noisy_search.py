@@ -18,7 +18,7 @@ from agent.planning.group import GroupPlanner, with_sender
 from agent.planning.group_state import GroupState, Other
 from agent.planning.state import Done
 from agent.planning.sweep import Sweeping
-from protocol.messages import Localised, PosePrior, Report, Undecided
+from protocol.messages import Localised, Report, ReportedPose, Undecided
 from protocol.motion import inverse
 from protocol.sweep_strips import ALONG, ASIDE, STRIP_REACH, surveyed_path
 from protocol.sweep_ticks import contact_ticks
@@ -140,11 +140,11 @@ def _with_contact(state: GroupState) -> GroupState:
     return _agreed(state, reference) if reference is not None else state
 
 
-def _with_reference(state: GroupState, reference: PosePrior | None) -> GroupState:
+def _with_reference(state: GroupState, reference: ReportedPose | None) -> GroupState:
     return replace(state, own_pose=replace(state.own_pose, reference=reference))
 
 
-def _agreed(state: GroupState, reference: PosePrior) -> GroupState:
+def _agreed(state: GroupState, reference: ReportedPose) -> GroupState:
     """Return `state` with `reference`, if the claim of this robot does not contradict it.
 
     The ranges since the claim may have ruled out the hypothesis on which it rests. A claim from a single

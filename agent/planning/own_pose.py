@@ -22,7 +22,7 @@ from agent.planning import sweep
 from agent.planning.group_state import GroupState
 from agent.planning.state import RobotState
 from agent.planning.sweep import Looping, Sweeping
-from protocol.messages import PosePrior
+from protocol.messages import ReportedPose
 from protocol.motion import Covariance, Pose, compose, inverse
 from protocol.sweep_strips import Place
 
@@ -78,7 +78,7 @@ def updated(state: GroupState) -> GroupState:
     return _with_estimate(state, _estimate(state, searched=False))
 
 
-def searched(state: GroupState) -> tuple[GroupState, PosePrior | None]:
+def searched(state: GroupState) -> tuple[GroupState, ReportedPose | None]:
     """Return `state` with an estimate from a search of the whole plane, and its pose if it may be reported.
 
     The conditions are those of a claim of a pair: one hypothesis is left, its fit has converged and is
@@ -200,7 +200,7 @@ def _with_estimate(state: GroupState, estimate: _Estimate | None) -> GroupState:
     return replace(framed, pair=pair, own_pose=own_pose)
 
 
-def _reference(state: GroupState, estimate: _Estimate) -> PosePrior | None:
+def _reference(state: GroupState, estimate: _Estimate) -> ReportedPose | None:
     """Return the pose of `estimate` if the robot may report it (see `searched`); None if not."""
     pair, fitted, own_pose = state.pair, estimate.fitted, state.own_pose
     first, lost = fitted.scored[0], own_pose.ranges_when_lost
@@ -219,4 +219,4 @@ def _reference(state: GroupState, estimate: _Estimate) -> PosePrior | None:
         return None
     factor = max(widened, 1.0)
     covariance = Covariance(*[factor * one for one in astuple(estimate.covariance)])
-    return PosePrior(pair.tick, estimate.pose, covariance)
+    return ReportedPose(pair.tick, estimate.pose, covariance)
