@@ -39,7 +39,7 @@ from __future__ import annotations
 import math
 import re
 from functools import cached_property
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import msgspec
 from msgspec import Meta
@@ -147,6 +147,15 @@ class Contact(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_field
     """
     damaged: tuple[Tick, ...] = ()
     """The ticks of the peer's Reports that arrive damaged in this tick, and are refused."""
+
+
+class LostReport(NamedTuple):
+    """A Report that the channel has lost: it never arrives."""
+
+    sender: RobotId
+    """The robot that sent it."""
+    tick: Tick
+    """The tick in which it was sent."""
 
 
 class Localised(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True, tag="localised"):
@@ -421,6 +430,8 @@ class Observation(Message, frozen=True):
     """The measured distance to the robot's own anchor, in m; None out of range, and for a drop-out."""
     contacts: tuple[Contact, ...] = ()
     """The contacts at tick k; empty if no robot is within range R."""
+    lost: tuple[LostReport, ...] = ()
+    """The Reports to this robot that are lost at tick k; empty in hardware mode, where nobody knows."""
 
 
 class MissionEnd(Message, frozen=True):
@@ -588,9 +599,9 @@ class FinalReport(Message, frozen=True):
     reports_refused: Count
     """The number of the peer's Reports refused: damaged, malformed, or not from their stated sender."""
     reports_unheard: Count
-    """The number of the peer's Reports that arrived, but that no Observation listed."""
+    """The number of the peer's Reports that arrived from out of contact, or too late to be used."""
     reports_lost: Count
-    """The number of the peer's Reports that were sent in contact, and never received."""
+    """The number of the peer's Reports that were lost; in hardware mode, of those that did not arrive."""
     frames_refused: Count
     """The number of refused frames of all kinds."""
     bytes_sent: Count

@@ -28,6 +28,8 @@ class InFlight(NamedTuple):
     """True if it arrives damaged."""
     copy: int
     """The identity of the copy: bit i is set if the fault at index i has duplicated it."""
+    arrived: bool = False
+    """True if another copy has arrived before."""
 
 
 class LinkState(msgspec.Struct, frozen=True):
@@ -37,6 +39,8 @@ class LinkState(msgspec.Struct, frozen=True):
     """The ticks of the Reports that are received in this tick, in the order of their arrival."""
     damaged: tuple[int, ...] = ()
     """The ticks of the Reports that arrive damaged in this tick."""
+    lost: tuple[int, ...] = ()
+    """The ticks of the Reports of which no copy has arrived, and from this tick on none can."""
     flying: tuple[InFlight, ...] = ()
     """The copies that are not due yet."""
     contacts: int = 0
@@ -105,9 +109,10 @@ def next_link_state(
     in contact are lost. `delivered` is the answer of the radio model to this Report: the state of the link,
     and the delay in ticks, None if it is lost. The faults apply to what the model delivers.
     """
-    flying = air.flying
+    flying, open_ticks = air.flying, {one.tick for one in air.flying if not one.arrived}
     bursts = air.bursts or (False,) * len(links.faults)
     if in_contact:
+        open_ticks.add(tick)
         active = [fault.active(tick, air.contacts) for _, fault in links.faults]
         bursts = tuple(
             [
@@ -120,10 +125,13 @@ def next_link_state(
             flying += tuple([one for one in sent if one.due - tick <= LATEST])
     due = sorted([one for one in flying if one.due <= tick], key=lambda one: one.overtaken)
     coming, room = _limited(due if in_contact else [], links, air, tick)
+    came = {one.tick for one in coming}
+    left = [one for one in flying if one.due > tick]
     return LinkState(
         heard=tuple([one.tick for one in coming if not one.damaged]),
         damaged=tuple([one.tick for one in coming if one.damaged]),
-        flying=tuple([one for one in flying if one.due > tick]),
+        lost=tuple(sorted(open_ticks - came - {one.tick for one in left})),
+        flying=tuple([one._replace(arrived=True) if one.tick in came else one for one in left]),
         contacts=air.contacts + in_contact,
         bursts=bursts,
         room=room,

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import msgspec
 
-from protocol.messages import Command, Contact, Localised, Observation, Verdict
+from protocol.messages import Command, Contact, Localised, LostReport, Observation, Verdict
 from protocol.motion import REST, Controls, Pose
 from world.channel import LinkState, idle_link_state, link_faults, next_link_state
 from world.referee import MissionOutcome, decide_outcome
 from world.scenario import Scenario
-from world.sensors import anchor_ranges, executed, in_contact, odometry
+from world.sensors import Mutual, anchor_ranges, executed, in_contact, odometry
 from world.truth import Truth, limited_controls
 from world.world_models import Radios, Transmission
 
@@ -32,6 +32,8 @@ class World(msgspec.Struct, frozen=True):
     """The true pose in <W> of each localised robot at the tick of its claim. Noise may move it afterwards."""
     pairs: tuple[tuple[int, int], ...]
     """The pairs of robots that may measure each other, as indices into the scenario's robots."""
+    contacts: dict[tuple[int, int], Mutual]
+    """The measurements of those of `pairs` whose robots are in range of each other."""
     links: dict[tuple[int, int], LinkState] | None = None
     """The state of each link whose robots have been in contact, by the places of sender and receiver.
 
@@ -53,7 +55,9 @@ def release(scenario: Scenario) -> World:
     still: dict[tuple[int, int], LinkState] | None = None
     if scenario.faults or scenario.radio is not None:
         still = {}
-    return World(scenario, truth, None, {}, {}, pairs, _carried(still, scenario, truth, pairs))
+    contacts = in_contact(truth, scenario, pairs)
+    links = _carried(still, scenario, truth, contacts)
+    return World(scenario, truth, None, {}, {}, pairs, contacts, links)
 
 
 def observations(world: World) -> list[Observation]:
@@ -68,7 +72,7 @@ def observations(world: World) -> list[Observation]:
         ]
     contacts: list[tuple[Contact, ...]] = [()] * len(robots)
     at_once = LinkState((tick,))
-    for (one, other), mutual in in_contact(truth, scenario, world.pairs).items():
+    for (one, other), mutual in world.contacts.items():
         to_other, to_one = at_once, at_once
         if world.links is not None:
             to_other, to_one = world.links[one, other], world.links[other, one]
@@ -80,8 +84,13 @@ def observations(world: World) -> list[Observation]:
             None if scenario.is_dead(robot.id, tick) else rho
             for robot, rho in zip(robots, ranges, strict=True)
         ]
+    lost: list[tuple[LostReport, ...]] = [()] * len(robots)
+    for (sender, receiver), link in (world.links or {}).items():
+        if link.lost:
+            lost[receiver] += tuple([LostReport(robots[sender].id, sent) for sent in link.lost])
     return [
-        Observation(tick, robot.id, measured[i], ranges[i], contacts[i]) for i, robot in enumerate(robots)
+        Observation(tick, robot.id, measured[i], ranges[i], contacts[i], lost[i])
+        for i, robot in enumerate(robots)
     ]
 
 
@@ -109,9 +118,10 @@ def advance(world: World, commands: Mapping[str, Command]) -> World | MissionOut
         if mission_outcome is not None:
             return mission_outcome
     moved = truth.moved(driven, scenario.mission.period)
-    links = _carried(world.links, scenario, moved, world.pairs)
+    contacts = in_contact(moved, scenario, world.pairs)
+    links = _carried(world.links, scenario, moved, contacts)
     return World(
-        scenario, moved, tuple(driven), verdicts, claimed, world.pairs, links, executed_before=world.executed
+        scenario, moved, tuple(driven), verdicts, claimed, world.pairs, contacts, links, world.executed
     )
 
 
@@ -137,13 +147,16 @@ def _carried(
     before: Mapping[tuple[int, int], LinkState] | None,
     scenario: Scenario,
     truth: Truth,
-    pairs: Sequence[tuple[int, int]],
+    contacts: Iterable[tuple[int, int]],
 ) -> dict[tuple[int, int], LinkState] | None:
-    """Return the state of each link at the tick of `truth`, given its state in `before` one tick earlier."""
+    """Return the state of each link at the tick of `truth`, given its state in `before` one tick earlier.
+
+    `contacts` are the pairs whose robots are in range of each other.
+    """
     if before is None:
         return None
     ids, radio, tick = [robot.id for robot in scenario.robots], scenario.radio, truth.tick
-    sending = [way for pair in in_contact(truth, scenario, pairs) for way in (pair, pair[::-1])]
+    sending = [way for pair in contacts for way in (pair, pair[::-1])]
     links = {way: link_faults(scenario.faults, ids[way[0]], ids[way[1]]) for way in (*before, *sending)}
     states = dict(before)
     for way in sending:

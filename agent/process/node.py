@@ -256,9 +256,7 @@ class AgentProcess:
             if self._link.estimate_wanted:
                 self._link.estimate(estimate)
         self._report_buffer.list((framed.report.robot, framed.report.tick) for framed in received)
-        for contact in self._observation.contacts:
-            self._report_buffer.list((contact.peer, tick) for tick in contact.damaged)
-        self._report_buffer.forget(command.tick - REPORTS_KEPT, self._robot.unheard)
+        self._report_buffer.forget(command.tick - REPORTS_KEPT, self._robot.contacts)
 
     def _send_reports(self, reports: Mapping[str, FramedReport]) -> None:
         for peer, framed in reports.items():
@@ -297,7 +295,7 @@ class AgentProcess:
             self._send_command(self._robot.command.tick)
 
     def _conclude(self, end: MissionEnd) -> None:
-        self._report_buffer.forget(end.tick + REPORTS_KEPT + 1, self._robot.unheard)
+        self._report_buffer.forget(end.tick + REPORTS_KEPT + 1, self._robot.contacts)
         self._final_report = self._robot.final_report(
             end,
             reports_refused=self._inbox.refused["report"],

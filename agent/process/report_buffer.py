@@ -69,9 +69,9 @@ class ReportBuffer:
         """Mark the reports with these senders and ticks as listed by an Observation."""
         self._listed.update(reports)
 
-    def forget(self, before: int, asked_for: Collection[tuple[str, int]]) -> None:
-        """Delete the reports of ticks below `before`, and count those neither in `asked_for` nor listed."""
+    def forget(self, before: int, contacts: Collection[tuple[str, int]]) -> None:
+        """Delete the reports of ticks below `before`, and count those neither listed nor of `contacts`."""
         for one in [one for one in self._reports if one[1] < before]:
             del self._reports[one]
-            self.unheard += one not in self._listed and one not in asked_for
+            self.unheard += one not in self._listed and one not in contacts
             self._listed.discard(one)

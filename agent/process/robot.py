@@ -62,8 +62,15 @@ class Robot:
         self.reports_sent = 0
         self.damaged = 0
         """The number of reports that were received damaged."""
-        self.unheard: set[tuple[str, int]] = set()
-        """The other robot and the tick of each contact from which its report has not been received yet."""
+        self.contacts: set[tuple[str, int]] = set()
+        """The other robot and the tick of each contact."""
+        self.lost: set[tuple[str, int]] = set()
+        """The sender and the tick of each report that was lost, as the Observations say.
+
+        In hardware mode, where they do not, of each that did not arrive.
+        """
+        self._unlisted: set[str] = set()
+        """The robots in contact in this tick whose reports no Observation lists, in hardware mode."""
         self.bytes_sent = 0
         self._command_frame: bytes | None = None
         self._unwritten: bytes | None = None
@@ -99,12 +106,11 @@ class Robot:
         self.anchor_ranges += observation.anchor_range is not None
         self.command = self._command_frame = None
         self.reports = {}
+        self.lost.update(observation.lost)
+        self._unlisted = {contact.peer for contact in observation.contacts if contact.heard is None}
         for contact in observation.contacts:
             peer = contact.peer
-            self.unheard.add((peer, observation.tick))
-            self.unheard.difference_update(
-                [(peer, tick) for tick in (*(contact.heard or ()), *contact.damaged)]
-            )
+            self.contacts.add((peer, observation.tick))
             self.damaged += len(contact.damaged)
             self.mutual_ranges += contact.range is not None
             body = self.planner.report_to(self.state, peer)
@@ -131,12 +137,13 @@ class Robot:
             if not self._logs:
                 bodies = [body_of(report, self.planner) for report in bodies]
         self.state = self.planner.decide(self.state, bodies)
+        self.lost.update([(peer, self.tick) for peer in missed if peer in self._unlisted])
         if received:
             self.reports_received += len(received)
             for framed in received:
                 sender, tick = framed.report.robot, framed.report.tick
                 self._heard[sender] = max(self._heard.get(sender, 0), tick)
-                self.unheard.discard((sender, tick))
+                self.lost.discard((sender, tick))
         self.command = self.planner.command(self.state)
         self._verdict = self.command.verdict
         if self._journal is not None:
@@ -183,7 +190,7 @@ class Robot:
             reports_heard=_first(found.reports_heard, self.reports_received),
             reports_refused=reports_refused + self.damaged,
             reports_unheard=reports_unheard,
-            reports_lost=len(self.unheard),
+            reports_lost=len(self.lost),
             frames_refused=frames_refused,
             bytes_sent=self.bytes_sent,
         )

@@ -8,7 +8,7 @@ from compose.recording.run import Run
 
 
 def faults(run: Run) -> Checks:
-    """Check that each Observation lists the received and damaged Reports that follow from the world.
+    """Check that each Observation lists the received, damaged and lost Reports that follow from the world.
 
     These are what the radio model delivers, and the fault plan leaves of it.
     """
@@ -16,8 +16,12 @@ def faults(run: Run) -> Checks:
         return
     for robot, agent in run.agents.items():
         for step in agent.steps[: len(run.observations)]:
+            tick, lost = step.observation.tick, step.observation.lost
+            if lost != (planned_losses := run.observations[tick][robot].lost):
+                what = f"lost are {quoted(lost)}, expected {quoted(planned_losses)}"
+                yield Violation("faults", tick, robot, what)
             for found in step.observation.contacts:
-                expected = run.contact(robot, step.observation.tick, found.peer)
+                expected = run.contact(robot, tick, found.peer)
                 if expected is None:
                     continue
                 listed, planned = (found.heard, found.damaged), (expected.heard, expected.damaged)
@@ -25,7 +29,7 @@ def faults(run: Run) -> Checks:
                     yield None
                 else:
                     what = f"heard and damaged are {quoted(listed)}, expected {quoted(planned)}"
-                    yield Violation("faults", step.observation.tick, robot, what)
+                    yield Violation("faults", tick, robot, what)
 
 
 def link_statistics(run: Run) -> tuple[LinkStatistics, ...]:
@@ -59,5 +63,5 @@ def _statistics(agent: AgentHistory, peer: str) -> LinkStatistics:
         late=sum([tick < now for now, tick in received]),
         twice=len(ticks) - len(set(ticks)),
         damaged=len(damaged),
-        lost=len({now for now, _ in contacts} - {*ticks, *damaged}),
+        lost=sum([one.sender == peer for step in agent.steps for one in step.observation.lost]),
     )

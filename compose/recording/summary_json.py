@@ -26,7 +26,6 @@ from protocol import files
 from protocol.messages import FinalReport
 from protocol.motion import Pose, wrap
 from world.referee import not_localised
-from world.sensors import in_contact
 
 Mode = Literal["processes", "in-process"]
 SUMMARY_JSON = "summary.json"
@@ -93,11 +92,7 @@ def first_contact(run: Run) -> int | None:
 
     Robots of different pairs do not count.
     """
-    pairs = run.scenario.radio_pairs()
-    for tick in run.ticks:
-        if in_contact(tick.truth, run.scenario, pairs):
-            return tick.truth.tick
-    return None
+    return next((tick.truth.tick for tick in run.ticks if tick.world.contacts), None)
 
 
 def _robot_summary(run: Run, robot: str) -> dict[str, Any]:

@@ -22,43 +22,33 @@ class Passage(msgspec.Struct, frozen=True):
     tick: int
     """The tick in which the report was sent."""
     what: Passing
-    """The kind of event. "lost" is known only from the world's journal."""
+    """The kind of event."""
 
 
-def passages(setup: RunSetup, before: TickData | None, now: TickData) -> Iterator[Passage]:
+def passages(setup: RunSetup, now: TickData) -> Iterator[Passage]:
     """Yield the deliveries on every link in the tick of `now`, in the order of the senders.
 
     Each link yields the report sent, then those received, damaged and lost.
     """
-    for link in _links(setup, before, now):
+    for link in _links(setup, now):
         sender, receiver = link
-        sent = link in now.reports or contact_of(now, sender, receiver) is not None
-        if sent:
+        if link in now.reports or contact_of(now, sender, receiver) is not None:
             yield Passage(*link, now.tick, "sent")
         contact = contact_of(now, receiver, sender)
         received, damaged = (contact.heard or (), contact.damaged) if contact is not None else ((), ())
         yield from [Passage(*link, tick, "heard") for tick in received]
         yield from [Passage(*link, tick, "damaged") for tick in damaged]
-        if link in now.under_way and (before is None or link in before.under_way):
-            earlier = before.under_way[link] if before is not None else ()
-            accounted = {*received, *damaged, *now.under_way[link]}
-            for tick in sorted({*earlier, *((now.tick,) if sent else ())} - accounted):
-                yield Passage(*link, tick, "lost")
+        lost = now.observations[receiver].lost if receiver in now.observations else ()
+        yield from [Passage(*link, one.tick, "lost") for one in lost if one.sender == sender]
 
 
-def _links(setup: RunSetup, before: TickData | None, now: TickData) -> list[Link]:
-    """Return the links with a delivery in the tick of `now`, in the order of the senders.
-
-    For pairs, these are all links.
-    """
-    if not setup.visits:
-        return [(robot.id, robot.peer) for robot in setup.robots]
+def _links(setup: RunSetup, now: TickData) -> list[Link]:
+    """Return the links with a delivery in the tick of `now`, in the order of the senders."""
     found = {*now.reports}
     for robot, observation in now.observations.items():
+        found |= {(one.sender, robot) for one in observation.lost}
         for contact in observation.contacts:
             found |= {(robot, contact.peer), (contact.peer, robot)}
-    for data in (before, now):
-        found.update([link for link, ticks in data.under_way.items() if ticks] if data is not None else [])
     place = {robot: i for i, robot in enumerate(setup.ids)}
     return sorted(
         [link for link in found if place.keys() >= {*link}], key=lambda link: (place[link[0]], place[link[1]])

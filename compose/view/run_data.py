@@ -58,8 +58,6 @@ class TickData(msgspec.Struct, frozen=True):
     """Robots whose Command missed the deadline."""
     without: set[str] = msgspec.field(default_factory=set)
     """Robots that decided without their peer's report because it missed the deadline."""
-    under_way: dict[Link, tuple[int, ...]] = msgspec.field(default_factory=dict)
-    """The ticks of the reports in flight on each link after this tick; only the world's journal has them."""
     down: set[str | None] = msgspec.field(default_factory=set)
     """Robots whose process ended in this tick; None is the world. Observed by viewers, never journaled."""
     back: set[str | None] = msgspec.field(default_factory=set)
@@ -176,17 +174,11 @@ class RunData:
                 self._touch(end.tick)
 
     def add_world(self, world: World) -> None:
-        """Add the ground truth and the reports in flight of the world's current tick."""
+        """Add the ground truth of the world's current tick."""
         ids = [robot.id for robot in world.scenario.robots]
         data = self.at(world.truth.tick)
         data.truth.update(zip(ids, world.truth.poses, strict=True))
         self.has_truth = True
-        before = self.ticks.get(world.truth.tick - 1)
-        for (sender, receiver), air in (world.links or {}).items():
-            link = ids[sender], ids[receiver]
-            data.under_way[link] = tuple([flying.tick for flying in air.flying])
-            if before is not None:  # the world has no state of a link before its first contact
-                before.under_way.setdefault(link, ())
 
     def add_tick(self, tick: Tick) -> None:
         """Add a complete tick of the world's journal. A robot without a Command is late."""

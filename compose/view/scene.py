@@ -163,7 +163,7 @@ def scene(
     """
     false_poses = reported or {}
     players = tuple([player_of(one, setup, now, false_poses.get(one.id)) for one in setup.robots])
-    deliveries = tuple(passages(setup, before, now))
+    deliveries = tuple(passages(setup, now))
     found = tuple(events(setup, before, now, deliveries, end))
     told = group_captions if setup.visits else captions
     return Scene(
