@@ -115,7 +115,7 @@ def decisions(run: Run) -> dict[str, Any]:
         changes: list[tuple[int, str]] = []
         for tick in range(run.length):
             command = run.command(robot, tick)
-            state = f"{command.phase} {command.state} {held.get(tick, 0)}" if command is not None else "late"
+            state = f"{command.phase} {command.task} {held.get(tick, 0)}" if command is not None else "late"
             if not changes or changes[-1][1] != state:
                 changes.append((tick, state))
         found[robot] = "; ".join(f"{tick}: {state}" for tick, state in changes)

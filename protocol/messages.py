@@ -529,11 +529,17 @@ class Command(Message, frozen=True):
     omega: AngularVelocity
     """The angular velocity, in rad/s, counter-clockwise. The world limits it to +-omega_max."""
     phase: Phase
-    """The phase of the sender's planner."""
-    state: Word
-    """The state of the sender's planner."""
+    """The phase of the sender's task."""
+    task: Word
+    """The name of what the sender is doing, as its planner calls it; the column `state` of files."""
     verdict: Verdict | None = None
     """The sender's final result; None until it has one. The world keeps the first."""
+    peer: RobotId | None = None
+    """The robot that the sender meets, waits for or drives to; None if there is none."""
+    role: Role | None = None
+    """The role of the sender in the meeting with `peer`; None without one."""
+    rests: bool = False
+    """True if the sender has its result, and no robot or area to drive to: it stays where it is."""
 
 
 class Estimate(Message, frozen=True):

@@ -196,7 +196,7 @@ def command_rows(run: recorded.Run, period: float) -> Iterator[CommandRow]:
             one = run.command(robot, tick)
             if one is not None:
                 verdict = str(one.verdict.__struct_config__.tag) if one.verdict is not None else None
-                yield CommandRow(tick, tick * period, robot, one.v, one.omega, one.phase, one.state, verdict)
+                yield CommandRow(tick, tick * period, robot, one.v, one.omega, one.phase, one.task, verdict)
 
 
 def estimate_rows(run: recorded.Run, period: float) -> Iterator[EstimateRow]:

@@ -76,4 +76,4 @@ ROUNDING = 1e-6
 
 def states(recording: Run, robot: str) -> list[str]:
     """Return the state of the robot at every tick."""
-    return [moment.commands[robot].state for moment in recording.ticks]
+    return [moment.commands[robot].task for moment in recording.ticks]

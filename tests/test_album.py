@@ -177,7 +177,7 @@ def test_what_is_compared_is_what_was_chosen_from(recordings: Path) -> None:
     assert (ways.reach.v[row, 0], ways.reach.omega[column]) == (one.plan.command.v, one.plan.command.omega)
     command = told.command(one.plan.question.mover, one.tick)
     assert command is not None
-    assert (command.v, command.omega, command.state) == (
+    assert (command.v, command.omega, command.task) == (
         one.plan.command.v,
         one.plan.command.omega,
         "last-manoeuvre",

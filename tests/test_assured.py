@@ -139,8 +139,8 @@ def states(recording: Run, robot: str) -> list[tuple[int, str]]:
     found: list[tuple[int, str]] = []
     for moment in recording.ticks:
         command = moment.commands[robot]
-        if not found or found[-1] != (command.phase, command.state):
-            found.append((command.phase, command.state))
+        if not found or found[-1] != (command.phase, command.task):
+            found.append((command.phase, command.task))
     return found
 
 
@@ -175,7 +175,7 @@ def test_phase_3_begins_in_the_first_tick_of_contact_in_which_both_know_their_an
         assert met(recording) == first.truth.tick, seed
         assert [command.phase for command in first.commands.values()] == [3, 3], seed
         last = recording.ticks[first.truth.tick - 1]
-        before_orbit += any(command.state != "orbiting" for command in last.commands.values())
+        before_orbit += any(command.task != "orbiting" for command in last.commands.values())
     assert before_orbit >= on_the_way
 
 
@@ -213,7 +213,7 @@ def test_once_both_orbit_phase_3_begins_within_the_bound(setting: Setting) -> No
     for seed in range(60):
         recording = drawn(setting, seed)
         orbits = sum(
-            all(command.state == "orbiting" for command in moment.commands.values())
+            all(command.task == "orbiting" for command in moment.commands.values())
             for moment in recording.ticks
         )
         bound = recording.scenario.robots[0].rendezvous.bound
@@ -228,7 +228,7 @@ def test_the_first_report_has_the_whole_path_however_long_b_has_waited(
     for seed in (0, 2):
         waited = 0
         for moment in steps_of(tmp_path, Setting(reach=reach, period=0.05), seed):
-            waited += moment.commands["b"].state == "orbiting"
+            waited += moment.commands["b"].task == "orbiting"
             if any(moment.heard.values()):
                 break
         assert waited > 300
@@ -248,7 +248,7 @@ def encounter(recording: Run) -> list[Tick]:
     end = next(
         i
         for i, moment in enumerate(moments)
-        if moment.commands["b"].state == "last-manoeuvre" or any(d.verdict for d in moment.commands.values())
+        if moment.commands["b"].task == "last-manoeuvre" or any(d.verdict for d in moment.commands.values())
     )
     return list(moments[: end + 1])
 
@@ -276,7 +276,7 @@ def test_ranges_before_phase_3_make_a_last_manoeuvre_needless() -> None:
         if len(since) < 3:
             assert len(since) == 2
             assert len([tick for tick in ranged if tick <= claimed(recording)]) >= 3
-            assert all(moment.commands["b"].state != "last-manoeuvre" for moment in recording.ticks)
+            assert all(moment.commands["b"].task != "last-manoeuvre" for moment in recording.ticks)
             spared += 1
     assert spared >= 15
 
@@ -342,7 +342,7 @@ def test_a_robot_that_drives_straight_out_of_range_drives_back_before_it_circles
             ways.add((phase, *sought(recording, robot, phase)))
         for moment in recording.ticks:
             for command in moment.commands.values():
-                assert command.state != "backing" or (command.v < 0.0 and command.omega == 0.0)
+                assert command.task != "backing" or (command.v < 0.0 and command.omega == 0.0)
     whole = ("straight", "backing", "turning", "circling")
     assert ways - {(1,)} <= {(phase, *whole[:length]) for phase in (1, 3) for length in (1, 2, 4)}
     assert (1, *whole[:2]) in ways
@@ -354,7 +354,7 @@ def test_the_paper_planner_never_drives_back() -> None:
     for seed in range(100):
         recording = drawn(SECTION_IV, seed, "paper")
         assert all(
-            command.state != "backing" for moment in recording.ticks for command in moment.commands.values()
+            command.task != "backing" for moment in recording.ticks for command in moment.commands.values()
         )
 
 
@@ -420,11 +420,11 @@ def test_no_detection_selects_the_placement_out_of_range_and_b_drives_back_to_re
     seed: int, tmp_path: Path
 ) -> None:
     moments = list(steps_of(tmp_path, SLOW, seed))
-    doing = [moment.commands["b"].state for moment in moments]
+    doing = [moment.commands["b"].task for moment in moments]
     out = doing.index("returning")
     setting_out, silent, back = moments[out - 1], moments[out], moments[out + 1]
     command, returning = setting_out.commands["b"], silent.commands["b"]
-    assert command.state == "last-manoeuvre"
+    assert command.task == "last-manoeuvre"
     assert not silent.heard["b"]
     assert (returning.v, returning.omega) == (-command.v, -command.omega)
     assert math.dist(places_of(back)[1], places_of(setting_out)[1]) < 1e-9
@@ -445,7 +445,7 @@ def places_of(moment: Step) -> list[tuple[float, float]]:
 def test_b_begins_to_move_only_after_a_has_stopped(setting: Setting) -> None:
     for seed in range(100):
         for moment in drawn(setting, seed).ticks:
-            if moment.commands["b"].state == "last-manoeuvre":
+            if moment.commands["b"].task == "last-manoeuvre":
                 assert (moment.commands["a"].v, moment.commands["a"].omega) == (0.0, 0.0), seed
 
 

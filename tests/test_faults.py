@@ -119,7 +119,7 @@ def test_a_robot_without_acknowledgement_stands_still_under_noise() -> None:
     )
     assert localises(recording)
     commands = [moment.commands[robot] for moment in recording.ticks for robot in "ab"]
-    listening = [command for command in commands if command.state == "listening"]
+    listening = [command for command in commands if command.task == "listening"]
     assert len(listening) > 20
     assert all((command.phase, command.v, command.omega) == (3, 0.0, 0.0) for command in listening)
 

@@ -82,10 +82,10 @@ def test_a_noisy_visitor_states_no_covariance_on_its_way(tmp_path: Path) -> None
         for one in agent.steps:
             assert one.command is not None
             assert one.estimate is not None
-            if one.command.state == TRAVELLING_MODE:
+            if one.command.task == TRAVELLING_MODE:
                 assert one.estimate.covariance is None
                 on_the_way += 1
-            elif one.command.state == "localised":
+            elif one.command.task == "localised":
                 assert one.estimate.covariance is not None
                 at_rest += 1
     assert on_the_way > 0
@@ -173,7 +173,7 @@ def test_a_robot_in_phase_1_goes_on_with_it_when_its_peer_ends_their_meeting(sig
     assert after.verdict is None
     assert after.other(config.peer).failed
     command = planner.command(after)
-    assert (command.phase, command.state) == (1, "straight")
+    assert (command.phase, command.task) == (1, "straight")
     assert command.v > 0.0
 
 

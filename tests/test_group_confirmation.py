@@ -29,7 +29,7 @@ from compose.figures.pair import pairs_of
 from compose.launch.in_process import run_mission
 from compose.launch.planner_loader import planner_of
 from compose.recording.corrected_bounds import corrected_bounds
-from compose.recording.meetings import past_meetings
+from compose.recording.group_localisation import past_meetings
 from compose.recording.run import Run, of_frames
 from compose.scenario.scenario_change import file_table
 from compose.scenario.scenario_file import ScenarioTemplate, validate
@@ -121,7 +121,7 @@ def test_a_robot_claims_a_pose_later_than_it_knows_one_and_by_two_peers_that_agr
 def test_a_robot_that_knows_a_pose_says_that_it_is_unconfirmed_and_makes_no_claim() -> None:
     run = of_frames(without_attacker())
     commands = [one.command for one in run.agents["r1"].steps if one.command is not None]
-    unconfirmed = [one for one in commands if one.state == "unconfirmed"]
+    unconfirmed = [one for one in commands if one.task == "unconfirmed"]
     assert unconfirmed
     assert all(one.verdict is None for one in unconfirmed)
     sent = [framed.report for one in run.agents["r1"].steps for framed in one.reports]

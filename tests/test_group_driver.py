@@ -35,7 +35,7 @@ from tests.test_group_field import FAR
 from world.hardware.bridge import Field, NoStart
 from world.hardware.driver import THINKING, Reading
 from world.hardware.driver_journal import driver_history
-from world.hardware.group_termination import RESTING_TICKS, GroupEnding
+from world.hardware.group_termination import GroupEnding
 from world.hardware.measurements import InvalidReading, observation_frame
 from world.hardware.termination import LAST_WORDS
 from world.hardware.tick_source import UNHEARD, TickSource
@@ -207,11 +207,11 @@ def ending(stage: Stage) -> GroupEnding:  # noqa: ARG001  # its clock is that of
     return GroupEnding(config_in_group("a"), 800, 30.0)
 
 
-def ends(ending: GroupEnding, ticks: range, state: str = "localised") -> MissionEnd | None:
+def ends(ending: GroupEnding, ticks: range, *, rests: bool = True) -> MissionEnd | None:
     """Return the first MissionEnd in `ticks`, in which a is localised."""
     for tick in ticks:
         ending.tick_start(tick)
-        end = ending.after(tick, Command(tick, "a", 0.0, 0.0, 3, state, LOCALISED))
+        end = ending.after(tick, Command(tick, "a", 0.0, 0.0, 3, "any", LOCALISED, rests=rests))
         if end is not None:
             return end
     return None
@@ -273,15 +273,15 @@ PLAN = 164
 
 
 @pytest.mark.parametrize(
-    ("state", "silent_s", "tick"),
+    ("rests", "silent_s", "tick"),
     [
-        ("localised", 31.0, PLAN + LAST_WORDS),
-        ("travelling", 31.0, 2 * PLAN - 1 + LAST_WORDS),
-        ("localised", 29.0, 800),
+        (True, 31.0, PLAN + LAST_WORDS),
+        (False, 31.0, 2 * PLAN - 1 + LAST_WORDS),
+        (True, 29.0, 800),
     ],
 )
 def test_a_silent_robot_is_given_up_after_its_planned_time_and_a_visit(
-    state: str, silent_s: float, tick: int, stage: Stage, ending: GroupEnding
+    rests: bool, silent_s: float, tick: int, stage: Stage, ending: GroupEnding
 ) -> None:
     """The timeout is 30 s. The bound of the plan is 163.3 s, at which b is localised."""
     ending.receive(result("c"))
@@ -289,7 +289,7 @@ def test_a_silent_robot_is_given_up_after_its_planned_time_and_a_visit(
     stage.now += silent_s
     ending.receive(result("c"))
     why = "a is localised; no result of b received"
-    assert ends(ending, range(10, 1000), state) == MissionEnd(tick, "undecided", why)
+    assert ends(ending, range(10, 1000), rests=rests) == MissionEnd(tick, "undecided", why)
 
 
 def test_a_robot_that_has_just_been_localised_does_not_give_up_a_silent_one(
@@ -299,9 +299,10 @@ def test_a_robot_that_has_just_been_localised_does_not_give_up_a_silent_one(
     stage.now += 31.0
     for robot in "cd":
         ending.receive(result(robot))
-    end = ends(ending, range(200, 300))
+    assert ends(ending, range(200, 230), rests=False) is None
+    end = ends(ending, range(230, 300))
     assert end is not None
-    assert end.tick == 200 + RESTING_TICKS + LAST_WORDS
+    assert end.tick == 230 + LAST_WORDS
 
 
 @pytest.mark.parametrize(

@@ -258,6 +258,6 @@ def test_a_visitor_searches_where_an_error_of_its_heading_leads(seed: int, visit
     assert len(claims) == 16
     assert max(claims) <= 0.7 * scenario.meetings[-1].ends
     commands = [command for tick in run.ticks if (command := tick.commands.get(visitor)) is not None]
-    states = {command.state for command in commands if isinstance(command.verdict, Localised)}
+    states = {command.task for command in commands if isinstance(command.verdict, Localised)}
     assert "travelling" in states
     assert "homing" not in states

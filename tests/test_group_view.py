@@ -20,7 +20,7 @@ from compose.figures.sheet import Absent
 from compose.figures.style import SCREEN, look
 from compose.launch import in_process
 from compose.launch.planner_loader import planner_of
-from compose.recording.meetings import PastMeeting, past_meetings
+from compose.recording.group_localisation import PastMeeting, past_meetings
 from compose.recording.run import Run
 from compose.recording.run import read as read_run
 from compose.scenario.scenario_file import parse

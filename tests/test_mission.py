@@ -179,8 +179,8 @@ def test_a_range_is_taken_up_to_r_and_at_r() -> None:
 def turns(recording: Run, state: str) -> list[float]:
     """Return the turns of a on the spot before it meets b."""
     commands = [moment.commands["a"] for moment in recording.ticks if moment.commands["a"].phase < 3]
-    assert all(command.v == 0.0 for command in commands if command.state == state)
-    return [command.omega for command in commands if command.state == state]
+    assert all(command.v == 0.0 for command in commands if command.task == state)
+    return [command.omega for command in commands if command.task == state]
 
 
 def test_a_small_omega_max_makes_every_turn_take_several_ticks() -> None:
@@ -214,7 +214,7 @@ def test_the_first_straight_is_shortened_where_it_would_come_near_the_range(
 ) -> None:
     recording = mission_of((0.5, 0.2, 2.0), reach=reach, speed=speed)
     first = recording.ticks[0].commands["a"]
-    assert first.state == "straight"
+    assert first.task == "straight"
     assert (first.v, first.omega) == pytest.approx((straight, 0.0))
     assert recording.scenario.mission.first_straight == pytest.approx(straight)
     assert recording.end is not None
@@ -248,7 +248,7 @@ def _places(moment: Tick) -> list[tuple[float, float]]:
 
 def test_a_single_candidate_is_checked_before_it_is_claimed() -> None:
     """Two mutual ranges and D have no redundancy, so b makes a manoeuvre even with one placement left."""
-    second = next(step for step in steps("paper-1") if step.commands["b"].state == "last-manoeuvre")
+    second = next(step for step in steps("paper-1") if step.commands["b"].task == "last-manoeuvre")
     state, heard = second.observed["b"], second.heard["b"]
     possible = planner_of(state).decide(state, heard).belief.placements
     assert len(possible) == 4
@@ -364,7 +364,7 @@ def test_where_in_the_plane_the_anchors_stand_costs_no_digit() -> None:
             start = [{shift + 9.25}, {1.5 - shift}, 4.0]
             """
         moments = run_mission(parse(text, "far-out")).ticks
-        return [(d.v, d.omega, d.state) for moment in moments for d in moment.commands.values()]
+        return [(d.v, d.omega, d.task) for moment in moments for d in moment.commands.values()]
 
     assert driven(2.0**19) == driven(0.0)
 

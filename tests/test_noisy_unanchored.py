@@ -308,7 +308,7 @@ def test_a_claim_that_later_ranges_contradict_is_withdrawn_in_the_search_and_no_
         return
     command = planner.command(state)
     assert command.verdict is None
-    assert command.state in ("aligning", "radial", "orbiting")
+    assert command.task in ("aligning", "radial", "orbiting")
     assert isinstance(state.failure, Undecided)
     assert state.failure.reason.startswith("its ranges since its claim contradict it by ")
     assert planner.report_to(state, state.config.peer).verdict == state.failure

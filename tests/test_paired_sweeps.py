@@ -114,8 +114,7 @@ def seen(scenario: Scenario) -> list[list[Observation]]:
     for tick in range(25):
         found.append(observations(world))
         commands = {
-            robot.id: Command(tick, robot.id, 0.4, 0.5, phase=1, state="straight")
-            for robot in scenario.robots
+            robot.id: Command(tick, robot.id, 0.4, 0.5, phase=1, task="straight") for robot in scenario.robots
         }
         onward = advance(world, commands)
         assert isinstance(onward, World)

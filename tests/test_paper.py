@@ -46,7 +46,7 @@ def played(name: str) -> Run:
 
 
 def first_tick(recording: Run, robot: str, state: str) -> int:
-    return next(moment.truth.tick for moment in recording.ticks if moment.commands[robot].state == state)
+    return next(moment.truth.tick for moment in recording.ticks if moment.commands[robot].task == state)
 
 
 def command(recording: Run, robot: str, tick: int) -> Command:
@@ -153,7 +153,7 @@ def test_phases_1_and_2_are_those_of_the_table(row: Row) -> None:
 
 def test_in_simulation_1_a_leaves_its_anchors_range_and_circles_for_three_ticks() -> None:
     recording = played("paper-1")
-    assert [command(recording, "a", tick).state for tick in range(6)] == [
+    assert [command(recording, "a", tick).task for tick in range(6)] == [
         "straight",
         "turning",
         "circling",
@@ -165,7 +165,7 @@ def test_in_simulation_1_a_leaves_its_anchors_range_and_circles_for_three_ticks(
 
 def test_in_simulation_2_a_drives_its_third_manoeuvre_at_the_optimum_and_full_speed() -> None:
     third = command(played("paper-2"), "a", 1)
-    assert (third.state, third.v) == ("third-point", 1.0)
+    assert (third.task, third.v) == ("third-point", 1.0)
     assert third.omega == pytest.approx(2.331122, abs=5.1e-7)
 
 
@@ -185,10 +185,10 @@ def test_a_takes_its_second_mutual_range_while_b_stands(
     assert list(mutual) == [first, second, recording.ticks[-1].truth.tick]
     assert mutual[first] == pytest.approx(first_range, abs=5.1e-7)
     assert mutual[second] == pytest.approx(second_range, abs=5.1e-7)
-    assert [command(recording, "a", tick).state for tick in range(first, second)] == way
-    assert {command(recording, "b", tick).state for tick in range(first, second)} == {"standing"}
-    assert command(recording, "a", second).state == "waiting"
-    assert command(recording, "b", second).state == "last-manoeuvre"
+    assert [command(recording, "a", tick).task for tick in range(first, second)] == way
+    assert {command(recording, "b", tick).task for tick in range(first, second)} == {"standing"}
+    assert command(recording, "a", second).task == "waiting"
+    assert command(recording, "b", second).task == "last-manoeuvre"
     assert summary(recording, "in-process", None)["first_contact_tick"] == first
 
 
@@ -262,7 +262,7 @@ def test_phase_1_finds_the_references_branch_and_orientation(case: Phase1) -> No
     assert first_tick(recording, "a", "aligning") == case.k_end
     aligning = command(recording, "a", case.k_end)
     assert (aligning.v, -aligning.omega) == pytest.approx((0.0, case.mu), abs=EXACT)
-    radial = [moment.commands["a"].v for moment in recording.ticks if moment.commands["a"].state == "radial"]
+    radial = [moment.commands["a"].v for moment in recording.ticks if moment.commands["a"].task == "radial"]
     assert sum(radial) == pytest.approx(6.5 - case.r_end, abs=EXACT)
 
 

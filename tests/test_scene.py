@@ -72,7 +72,7 @@ def test_a_scene_shows_where_everyone_is_and_what_everyone_does(paper_1: Path) -
             command = moment.commands[player.robot]
             assert player.pose == replace(pose, heading=wrap(pose.heading))
             assert player.command is not None
-            assert (player.command.v, player.command.state) == (command.v, command.state)
+            assert (player.command.v, player.command.state) == (command.v, command.task)
 
 
 def test_the_first_contact_of_paper_1_is_shown_at_tick_46(paper_1: Path) -> None:

@@ -213,7 +213,7 @@ def test_a_lost_contact_is_found_again() -> None:
         met = next(
             tick
             for tick, moment in enumerate(recording.ticks)
-            if moment.commands["a"].state == "surveying" and moment.commands["a"].phase == 3
+            if moment.commands["a"].task == "surveying" and moment.commands["a"].phase == 3
         )
         lost += not all(contact[met:])
         assert contact[-1]

@@ -190,7 +190,7 @@ def test_a_robot_that_a_passing_one_has_left_on_a_square_is_localised_by_the_nex
                 return
             pose, tick = step(pose, driven.v, driven.omega, 1.0), tick + 1
         if finder == "a":
-            assert command.state == "looping"
+            assert command.task == "looping"
     raise AssertionError("it was not localised")
 
 

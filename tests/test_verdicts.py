@@ -68,7 +68,7 @@ def test_the_paper_planner_gives_up_if_the_third_mutual_range_selects_no_placeme
     assert recording.end is not None
     assert recording.end.outcome == "undecided"
     assert recording.end.reason == "b: the third mutual range does not select a placement"
-    states = [(moment.commands["a"].state, moment.commands["b"].state) for moment in recording.ticks]
+    states = [(moment.commands["a"].task, moment.commands["b"].task) for moment in recording.ticks]
     assert states[-3:] == [("straight", "standing"), ("waiting", "last-manoeuvre"), ("waiting", "undecided")]
 
 

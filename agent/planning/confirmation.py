@@ -49,10 +49,10 @@ class ConfirmingPlanner(GroupPlanner):
         return replace(report, state=UNCONFIRMED)
 
     def command(self, state: GroupState) -> Command:
-        """Return the command for the next tick; its state says if a meeting gave an unconfirmed pose."""
+        """Return the command for the next tick; its task says if a meeting gave an unconfirmed pose."""
         command = super().command(state)
         if state.verdict is None and isinstance(state.pair.verdict, Localised):
-            return replace(command, state=UNCONFIRMED)
+            return replace(command, task=UNCONFIRMED)
         return command
 
     def with_sender(self, state: GroupState, report: Report) -> GroupState:

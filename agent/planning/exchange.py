@@ -175,6 +175,9 @@ def command(state: RobotState, controls: Controls) -> Command:
         state.phase,
         state.mode_name,
         state.verdict,
+        config.peer,
+        config.role,
+        rests=state.verdict is not None,
     )
 
 

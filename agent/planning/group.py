@@ -134,7 +134,15 @@ class GroupPlanner(Planner[GroupState, Report]):
 
     def command(self, state: GroupState) -> Command:
         """Return the command for the next tick, with the phase, the mode and the robot's verdict."""
-        command = replace(self.pair_planner.command(state.pair), verdict=state.verdict)
+        rests, config = group_transitions.rests(state), state.config
+        meets = state.meets and not rests
+        command = replace(
+            self.pair_planner.command(state.pair),
+            verdict=state.verdict,
+            peer=config.peer if meets else None,
+            role=config.role if meets else None,
+            rests=rests,
+        )
         if state.passing.leeway == math.inf:
             return command
         controls = slowed(Controls(command.v, command.omega), state.passing.leeway, state.config.mission)

@@ -154,8 +154,7 @@ def onward(state: GroupState, *, peer_has_left: bool = False) -> GroupState:
     `peer_has_left` says that the peer has a result, and has reported it from outside the meeting.
     """
     pair, peer = state.pair, state.pair.config.peer
-    left = peer_has_left or state.unmet >= PARTED_AFTER or _is_silent(state)
-    over = left or pair.peer_state.verdict is not None
+    over = peer_has_left or _is_over(state)
     if _is_withdrawn(state):
         return _waiting(replace(_after_meeting(state), visiting=False), peer) if over else state
     if state.fix is None:
@@ -180,6 +179,19 @@ def onward(state: GroupState, *, peer_has_left: bool = False) -> GroupState:
         reported = state.lingering > 0 or not pair.in_contact  # to the peer, before this robot leaves
         return next_visit(_after_meeting(state)) if reported else state
     return next_visit(state) if over else state
+
+
+def _is_over(state: GroupState) -> bool:
+    """Return whether the peer has a result in the present meeting, or is not there any more."""
+    has_left = state.unmet >= PARTED_AFTER or _is_silent(state)
+    return has_left or state.pair.peer_state.verdict is not None
+
+
+def rests(state: GroupState) -> bool:
+    """Return whether the robot has its result, its meeting is over, and it has no robot to drive to."""
+    if state.verdict is None or not isinstance(state.pair.mode, Done) or _must_linger(state):
+        return False
+    return _is_over(state)
 
 
 def _after_failure(state: GroupState) -> GroupState:

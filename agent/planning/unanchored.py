@@ -104,7 +104,14 @@ class WaitingState(msgspec.Struct, frozen=True):
             controls = sweep.controls(self.mode, self.odometry, self.config.mission, tolerance)
         driven = controls or REST
         return Command(
-            self.tick, self.config.robot, driven.v, driven.omega, self.phase, self.mode_name, self.verdict
+            self.tick,
+            self.config.robot,
+            driven.v,
+            driven.omega,
+            self.phase,
+            self.mode_name,
+            self.verdict,
+            rests=self.verdict is not None,
         )
 
 

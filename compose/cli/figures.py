@@ -16,7 +16,7 @@ from compose.extras import need
 from compose.figures import FIGURE_FORMATS, PICTURES
 from compose.launch.class_loader import trust
 from compose.launch.second_process import OutputLine, Task, share
-from compose.recording.meetings import PastMeeting, past_meetings
+from compose.recording.group_localisation import PastMeeting, past_meetings
 from compose.recording.recording_files import agent_journal, user_errors
 from compose.recording.run import Run
 from compose.terminal.outcome import counting

@@ -217,4 +217,4 @@ def _participant(
     """Return the state of a robot; a `command` too far ahead of tick `latest` is ignored."""
     if not isinstance(command, Command) or (latest is not None and command.tick > latest + COMMAND_AHEAD):
         return Participant(robot, alive)
-    return Participant(robot, alive, command.tick, command.phase, command.state)
+    return Participant(robot, alive, command.tick, command.phase, command.task)

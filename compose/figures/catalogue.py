@@ -19,7 +19,7 @@ from compose.figures import (
 from compose.figures.pair import PairRecord
 from compose.figures.sheet import Absent
 from compose.figures.style import SCREEN, Medium
-from compose.recording.meetings import past_meetings
+from compose.recording.group_localisation import past_meetings
 
 Picture = tuple[str, Figure | Absent]
 

@@ -15,7 +15,7 @@ from agent.planning.planner import Planner
 from agent.planning.state import RobotState
 from compose.figures.agent_replay import AgentReplay
 from compose.recording.claim import Claim
-from compose.recording.meetings import PastMeeting, past_meetings
+from compose.recording.group_localisation import PastMeeting, past_meetings
 from compose.recording.run import Run
 from protocol.messages import Command, Estimate, RobotConfig
 from protocol.mission import ROLES, Anchor, Mission, PlannerName, Role

@@ -229,4 +229,4 @@ def _state(command: Command | None) -> tuple[bool, bool]:
     """Return whether a robot is localised, and whether it is in a meeting."""
     if command is None:
         return False, False
-    return isinstance(command.verdict, Localised), command.phase == 3 and command.state != "localised"
+    return isinstance(command.verdict, Localised), command.phase == 3 and command.task != "localised"

@@ -68,7 +68,7 @@ def _caption(pair: PairRecord, tick: int, number: int) -> list[str]:
     states = []
     for role in ROLES:
         command = pair.command(role, tick)
-        states.append(f"{pair.robot(role).id}: {command.state if command is not None else 'no command'}")
+        states.append(f"{pair.robot(role).id}: {command.task if command is not None else 'no command'}")
     return [f"({number}) $k$ = {tick}", rf"$\rho$ = {rho:.4f} m", *states]
 
 

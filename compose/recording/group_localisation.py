@@ -1,13 +1,15 @@
-"""The localisation of a group: its planned meetings, and the ticks in which they were over."""
+"""The meetings of a group: those that were planned, when they localised their robots, and those that were."""
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator
 
 import msgspec
 
 from compose.recording.run import Run
+from compose.recording.run_setup import Meetings, PresentMeeting, meetings_after
 
 TICK_ROUNDING = 1e-6
 """The rounding error in ticks up to which a bound in ticks counts as a whole number."""
@@ -70,3 +72,65 @@ def meeting_results(run: Run) -> Iterator[MeetingResult]:
             math.ceil(ends / period - TICK_ROUNDING),
             max(ticks) if len(ticks) == 2 else None,
         )
+
+
+class PastMeeting(msgspec.Struct, frozen=True):
+    """A meeting of a group in a run."""
+
+    a: str
+    """The robot of role a."""
+    b: str
+    """The robot of role b."""
+    first: int
+    """The tick in which a leaves for it; 0 if it is the first one of both robots."""
+    last: int
+    """The tick before the first of the robots leaves for its next meeting, or the last one of the run."""
+    number: int = 1
+    """The number of meetings of the two so far, this one included."""
+    newcomers: frozenset[str] = frozenset()
+    """The robots whose first meeting this is."""
+
+
+def past_meetings(run: Run) -> tuple[PastMeeting, ...]:
+    """Return the meetings of the group in `run` that have begun, in that order; empty for pairs."""
+    if run.setup is None or not run.setup.visits:
+        return ()
+    begun = _begun(run)
+    spans = sorted(
+        (first, _last(begun, robot, meeting.peer, first, run.length), robot, meeting.peer)
+        for robot, meetings in begun.items()
+        for first, meeting in meetings
+        if meeting.role == "a" and meeting.peer in begun
+    )
+    found: list[PastMeeting] = []
+    times: Counter[frozenset[str]] = Counter()
+    met: set[str] = set()
+    for first, last, a, b in spans:
+        robots = frozenset((a, b))
+        times[robots] += 1
+        found.append(PastMeeting(a, b, first, last, times[robots], robots - met))
+        met |= robots
+    return tuple(found)
+
+
+Begun = dict[str, list[tuple[int, PresentMeeting]]]
+"""The meetings of each robot with the ticks in which they begin."""
+
+
+def _begun(run: Run) -> Begun:
+    begun: Begun = {}
+    meetings: Meetings = {}
+    for tick in range(run.length):
+        commands = {robot: one for robot in run.robots if (one := run.command(robot, tick)) is not None}
+        earlier, meetings = meetings, meetings_after(meetings, commands)
+        for robot in commands if meetings is not earlier else ():
+            if robot in meetings and meetings[robot] != earlier.get(robot):
+                begun.setdefault(robot, []).append((tick, meetings[robot]))
+    return begun
+
+
+def _last(begun: Begun, a: str, b: str, first: int, length: int) -> int:
+    """Return the last tick of the meeting of `a` and `b` that begins in tick `first`."""
+    leaves = [tick for tick, _ in begun[a] if tick > first]
+    leaves += [tick for tick, meeting in begun[b] if tick > first and meeting.peer != a]
+    return min([length, *leaves]) - 1

@@ -11,7 +11,7 @@ import msgspec
 from msgspec.structs import replace
 
 from protocol.attack import Attack
-from protocol.messages import RobotConfig
+from protocol.messages import Command, RobotConfig
 from protocol.mission import Anchor, Mission, PlannerName, Role
 from protocol.motion import Pose
 from protocol.orbits import RENDEZVOUS, Orbit
@@ -65,10 +65,22 @@ class PresentMeeting(NamedTuple):
     """The meeting that a robot of a group is in, or on its way to."""
 
     peer: RobotId
-    visiting: bool
-    """True if the robot knows its pose already."""
-    known: frozenset[RobotId] = frozenset()
-    """The robots of which it has heard that they are localised."""
+    role: Role
+    """The role of the robot in it."""
+
+
+Meetings = Mapping[RobotId, PresentMeeting]
+"""The latest meeting of each robot of which one is known."""
+
+
+def meetings_after(meetings: Meetings, commands: Mapping[RobotId, Command]) -> Meetings:
+    """Return the latest meetings in the tick of `commands`; `meetings` are those of the tick before."""
+    new = {
+        robot: PresentMeeting(command.peer, command.role)
+        for robot, command in commands.items()
+        if command.peer is not None and command.role is not None
+    }
+    return meetings if all(meetings.get(robot) == one for robot, one in new.items()) else {**meetings, **new}
 
 
 class RunSetup(msgspec.Struct, frozen=True, dict=True):
@@ -148,37 +160,18 @@ class RunSetup(msgspec.Struct, frozen=True, dict=True):
                 found.setdefault(robot, visit.ends_s)
         return found
 
-    @cached_property
-    def partners(self) -> dict[RobotId, tuple[RobotId, ...]]:
-        """The peers of each robot's meetings, in their order; for pairs, one each.
+    def in_meetings(self, meetings: Meetings) -> RunSetup:
+        """Return this setup with the peer and the role that each robot has in its meeting.
 
-        In a group, robots whose setup is not known are left out, and so are those that only meet such ones.
+        A robot that is not in the mission, or that meets one which is not, changes nothing.
         """
-        if not self.visits:
-            return {robot.id: (robot.peer,) for robot in self.robots}
-        found: dict[RobotId, tuple[RobotId, ...]] = {}
-        known = {*self.ids}
-        for visit in [one for one in self.visits if {one.visitor, one.visited} <= known]:
-            found[visit.visitor] = (*found.get(visit.visitor, ()), visit.visited)
-            found[visit.visited] = (visit.visitor, *found.get(visit.visited, ()))
-        return found
-
-    def in_meetings(self, meetings: Mapping[RobotId, PresentMeeting]) -> RunSetup:
-        """Return this setup with the peer and the role that each robot has in its meeting."""
-        if not meetings:
-            return self
-        return replace(
-            self,
-            robots=tuple(
-                [_in_meeting(one, meetings[one.id]) if one.id in meetings else one for one in self.robots]
-            ),
-        )
-
-
-def _in_meeting(one: RobotSetup, meeting: PresentMeeting) -> RobotSetup:
-    if meeting.peer == one.peer and not meeting.visiting:
-        return one
-    return replace(one, peer=meeting.peer, role="a" if meeting.visiting else "b")
+        robots = [
+            replace(one, peer=meeting.peer, role=meeting.role)
+            if (meeting := meetings.get(one.id)) is not None and meeting.peer in {*self.ids} - {one.id}
+            else one
+            for one in self.robots
+        ]
+        return replace(self, robots=tuple(robots)) if meetings else self
 
 
 def of_scenario(scenario: Scenario, mode: str | None = None, tick_s: float | None = None) -> RunSetup:

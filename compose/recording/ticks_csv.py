@@ -67,7 +67,7 @@ def rows(run: Run) -> Iterator[TickRow]:
                 anchor_range=observation.anchor_range,
                 mutual_range=contact.range if contact is not None else None,
                 phase=command.phase if command is not None else None,
-                state=command.state if command is not None else None,
+                state=command.task if command is not None else None,
             )
 
 

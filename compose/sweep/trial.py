@@ -341,7 +341,7 @@ def _meeting(run: Run, a: str, b: str, *, in_group: bool) -> tuple[int | None, i
             not in_group
             and orbiting is None
             and len(commands) == 2
-            and all(command.state == "orbiting" for command in commands)
+            and all(command.task == "orbiting" for command in commands)
         ):
             orbiting = tick.truth.tick
     return orbiting, None

@@ -12,7 +12,6 @@ from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from compose.recording.meetings import TRAVELLING
 from compose.recording.recording_files import WORLD_JOURNAL
 from compose.recording.run_setup import of_scenario
 from compose.terminal import tables
@@ -20,6 +19,7 @@ from compose.terminal.braille import Drawing, Point
 from compose.view.outlines import box, circle
 from compose.view.recorded import Journals, scenes
 from compose.view.scene import Player, Scene
+from compose.view.words import TRAVELLING
 from protocol.journal.journal_file import Tail
 from protocol.messages import Command, DeadlineMissed, FinalReport, MissionEnd
 from protocol.mission import Role
@@ -77,7 +77,7 @@ class RobotCounts:
         waiting = len(self._scenario.robots) - len(commands)
         verdicts = Counter(_verdict(command) for command in commands)
         phases = Counter(f"phase {command.phase}" for command in commands)
-        states = Counter(one_line(command.state) for command in commands)
+        states = Counter(one_line(command.task) for command in commands)
         latest = max((command.tick for command in commands), default=0)
         rows = tables.table(["", "robots"], [], [])
         for heading, counts in (("outcome", verdicts), ("phase", phases), ("state", states)):

@@ -132,9 +132,9 @@ def _deciding(
     if earlier is None or command.phase != earlier.phase:
         name = "" if robot_setup.own_planner else f": {PHASE_NAMES[command.phase]}"
         yield Event(tick, "phase", robot, f"{robot} begins phase {command.phase}{name}")
-    active = command.verdict is None or (grouped and command.state != "localised")
-    if active and (earlier is None or command.state != earlier.state):
-        yield Event(tick, "state", robot, doing(robot_setup, command.phase, command.state, None))
+    active = command.verdict is None or (grouped and command.task != "localised")
+    if active and (earlier is None or command.task != earlier.task):
+        yield Event(tick, "state", robot, doing(robot_setup, command.phase, command.task, None))
     if command.verdict is None and earlier is not None and earlier.verdict is not None:
         yield Event(tick, "undecided", robot, f"{robot} withdraws its claim: another meeting contradicts it")
     if command.verdict is not None and (earlier is None or earlier.verdict is None):
@@ -153,7 +153,7 @@ def _verdict(robot_setup: RobotSetup, command: Command, now: TickData) -> Event:
             return Event(now.tick, "claim", robot, text)
         case verdict:
             kind: Kind = "inconsistent" if isinstance(verdict, Inconsistent) else "undecided"
-            return Event(now.tick, kind, robot, doing(robot_setup, command.phase, command.state, verdict))
+            return Event(now.tick, kind, robot, doing(robot_setup, command.phase, command.task, verdict))
 
 
 PHASE_NAMES = {1: "localisation relative to its anchor", 2: "search for its peer", 3: "encounter"}

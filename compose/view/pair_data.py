@@ -58,10 +58,10 @@ class PairData(msgspec.Struct, frozen=True):
         A robot that has not driven since its command of the tick before repeats it, and begins nothing.
         """
         earlier, command = self.commands(robot)
-        begun = earlier is not None and earlier.state == state and not self.drove(robot)
-        return command is not None and command.state == state and not begun
+        begun = earlier is not None and earlier.task == state and not self.drove(robot)
+        return command is not None and command.task == state and not begun
 
     def state(self, robot: str) -> str | None:
         """Return the state of the robot's command of this tick."""
         command = self.now.commands.get(robot)
-        return command.state if command is not None else None
+        return command.task if command is not None else None

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping
-from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
 from compose.recording.kills_file import Killed
-from compose.recording.meetings import GroupTick, Meetings, meetings_after, senders
-from compose.recording.run_setup import RunSetup
+from compose.recording.run_setup import Meetings, RunSetup, meetings_after
 from compose.scenario.kills import WORLD
 from protocol.messages import (
     Command,
@@ -101,8 +99,8 @@ class RunData:
         """The complete ticks whose deadline each robot has missed, in ascending order."""
         self._absences: dict[str | None, Absence] = {}
         """The latest absence of each process that was killed and is not known to be back."""
-        self._meetings: dict[int, tuple[Meetings, Mapping[str, Command]]] = {}
-        """The meetings of a group, and the latest commands, by tick, in the order of the ticks."""
+        self._meetings: dict[int, Meetings] = {}
+        """The latest meeting of each robot of a group by tick, in the order of the ticks."""
         self._setup_at: tuple[RunSetup, Meetings, RunSetup] | None = None
         """The latest arguments and result of `setup_at`: setup, meetings, and the setup with these."""
         self._written: dict[str, tuple[int, int]] = {}
@@ -135,36 +133,17 @@ class RunData:
             self._meetings.popitem()
 
     def setup_at(self, setup: RunSetup, tick: int) -> RunSetup:
-        """Return `setup` with the peer that each robot of a group meets in `tick`; for pairs, `setup`."""
+        """Return `setup` with the latest meeting of each robot of a group in `tick`; for pairs, `setup`."""
         if not setup.visits:
             return setup
         latest = next(reversed(self._meetings), -1)
         for later in self.between(latest + 1, tick):
-            met, earlier = self._meetings.get(latest, ({}, {}))
-            commands = self.ticks[later].commands
-            known = commands if commands.keys() >= {*setup.ids} else {**earlier, **commands}
-            seen = self.ticks[later].observations
-            heard = {robot: senders(observation) for robot, observation in seen.items()}
-            now = GroupTick(commands, self._logs(later), heard, partial(self._place, later))
-            self._meetings[later] = meetings_after(setup, met, earlier, now), known
+            self._meetings[later] = meetings_after(self._meetings.get(latest, {}), self.ticks[later].commands)
             latest = later
-        present = self._meetings.get(tick, ({}, {}))[0]
+        present = self._meetings.get(tick, {})
         if self._setup_at is None or self._setup_at[:2] != (setup, present):
             self._setup_at = setup, present, setup.in_meetings(present)
         return self._setup_at[2]
-
-    def _logs(self, tick: int) -> list[Link]:
-        """Return the links of the reports with a log in `tick`."""
-        reports = self.ticks[tick].reports if tick in self.ticks else {}
-        return [link for link, sized in reports.items() if sized.report.has_log]
-
-    def _place(self, tick: int, robot: str) -> Pose | None:
-        """Return the true pose of a robot in `tick`, or where it believes to be."""
-        data = self.ticks.get(tick)
-        if data is None or robot in data.truth:
-            return data.truth[robot] if data is not None else None
-        estimate = data.estimates.get(robot)
-        return estimate.world[0] if estimate is not None and estimate.world else None
 
     def conclude(self, end: MissionEnd) -> None:
         """Set the end of the mission, which changes its last tick, unless it is known already."""

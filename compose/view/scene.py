@@ -221,7 +221,7 @@ def player_of(
     if down:
         sentence = f"{robot} is down: its process is gone"
     elif command is not None:
-        sentence = doing(robot_setup, command.phase, command.state, command.verdict)
+        sentence = doing(robot_setup, command.phase, command.task, command.verdict)
     elif robot in now.late:
         sentence = f"{robot} has missed the deadline and stands still"
     return Player(
@@ -235,7 +235,7 @@ def player_of(
         contacts=observation.contacts if observation is not None else (),
         sent=_sent(sent.report, sent.bytes) if sent is not None else None,
         command=(
-            Decision(command.v, command.omega, command.phase, command.state, command.verdict)
+            Decision(command.v, command.omega, command.phase, command.task, command.verdict)
             if command is not None
             else None
         ),

@@ -40,6 +40,8 @@ DOING = {
     "unconfirmed": "{robot} knows a pose by {peer}, and waits until another robot confirms it",
 }
 """Sentences by state name, of all other states."""
+TRAVELLING = "travelling"
+"""The state of a robot that drives to another one of its group."""
 WAITING = "{robot} waits beside its anchor until {peer} comes into range"
 """The sentence of the state "orbiting" of a robot whose plan has no speed."""
 

@@ -31,13 +31,8 @@ from protocol.sweep_ticks import straight_ticks, sweepers_of_part, ticks_of_part
 from world.hardware.termination import LAST_WORDS, Termination
 from world.referee import either, inaccuracy
 
-RESTING_STATES = ("localised", "undecided", "inconsistent")
-"""The states of a planner whose meeting is over."""
-RESTING_TICKS = 16
-"""The ticks in such a state after which the robot has no visit to make.
-
-A planner that waits for the verdict of its peer goes on 8 ticks after it has left it.
-"""
+LEAVING_TICKS = 16
+"""A bound on the ticks from the end of a meeting until its robots leave for the next one."""
 
 
 class GroupEnding(Termination):
@@ -67,8 +62,8 @@ class GroupEnding(Termination):
         """The tick of the latest TickStart that has been received, by robot."""
         self._is_complete = False
         """True if this robot has its result, and waits for no other one."""
-        self._resting = 0
-        """The number of consecutive ticks in which the planner had nothing to do."""
+        self._rests = False
+        """True if this robot's planner has nothing to do, as its latest Command says."""
         self._said = 0
         """The number of TickStarts in which this process has reported that."""
         self._known: int | None = None
@@ -106,7 +101,7 @@ class GroupEnding(Termination):
         """
         if command is not None:
             self.verdict = command.verdict
-            self._resting = self._resting + 1 if command.state in RESTING_STATES else 0
+            self._rests = command.rests
         lost = [robot for robot in self._others if self._is_lost(robot, tick)]
         self._is_complete = self.verdict is not None and self._results.keys() | {*lost} >= self._others
         gone = {robot for robot in self._results if self._is_silent(robot)}
@@ -124,7 +119,7 @@ class GroupEnding(Termination):
         if not self._is_silent(robot):
             return False
         late = tick - self._ends.get(robot, self._plan)
-        return late > self._plan or (late > 0 and self._visits and self._resting > RESTING_TICKS)
+        return late > self._plan or (late > 0 and self._visits and self._rests)
 
     def _end(self, tick: int) -> MissionEnd:
         """Return the MissionEnd. Its reason is that of one robot without a pose, and names the others."""
@@ -176,6 +171,6 @@ def _sweep_ticks(config: RobotConfig) -> int:
     if config.sweep is None:
         return 0
     mission, widest = config.mission, config.widest_distance
-    once = RESTING_TICKS + max(ticks_of_parts(config.sweep, mission, widest, len(config.unanchored)))
+    once = LEAVING_TICKS + max(ticks_of_parts(config.sweep, mission, widest, len(config.unanchored)))
     tour = len(config.members) * straight_ticks(widest, mission)
     return once + (sweepers_of_part(config.tolerates) - 1) * (once + tour)

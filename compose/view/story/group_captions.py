@@ -7,13 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from compose.recording.meetings import TRAVELLING
-from compose.recording.run_setup import RobotSetup, RunSetup
+from compose.recording.run_setup import RunSetup
 from compose.view.deliveries import contact_of
 from compose.view.events import Event, metres
 from compose.view.run_data import TickData
 from compose.view.story.caption import Caption, count_word, faults, stopped
-from compose.view.words import end_reason
+from compose.view.words import TRAVELLING, end_reason
 from protocol.messages import Inconsistent, Localised, MissionEnd, Undecided
 from protocol.motion import travelled
 
@@ -69,13 +68,9 @@ def _meeting(setup: RunSetup, before: TickData, now: TickData) -> Iterator[Capti
         if command is not None and command.phase == 3:
             text = f"{a.id} and {b.id} are in range of each other again."
         else:
-            text = f"{a.id} reaches {b.id}." if _visits(setup, a) else f"{a.id} and {b.id} meet."
+            visits = command is not None and command.task == TRAVELLING
+            text = f"{a.id} reaches {b.id}." if visits else f"{a.id} and {b.id} meet."
         yield Caption("contact", text + far, (a.id, b.id))
-
-
-def _visits(setup: RunSetup, robot: RobotSetup) -> bool:
-    """Return whether the robot, of role a, is in a meeting after its first one."""
-    return robot.peer != setup.partners[robot.id][0]
 
 
 def _concluding(
@@ -118,8 +113,8 @@ def _departing(setup: RunSetup, before: TickData, now: TickData) -> Iterator[Cap
     found = []
     for one in setup.robots:
         command, earlier = now.commands.get(one.id), before.commands.get(one.id)
-        leaves = command is not None and command.state == TRAVELLING
-        if leaves and earlier is not None and earlier.state != TRAVELLING:
+        leaves = command is not None and command.task == TRAVELLING
+        if leaves and earlier is not None and earlier.task != TRAVELLING:
             found.append((one.id, one.peer))
     if not found:
         return
@@ -138,7 +133,7 @@ def _begins(robot: str, state: str, before: TickData, now: TickData) -> bool:
     command, earlier = now.commands.get(robot), before.commands.get(robot)
     if command is None or earlier is None:
         return False
-    return command.state == state and earlier.state not in (state, "looping")
+    return command.task == state and earlier.task not in (state, "looping")
 
 
 def _end(setup: RunSetup, now: TickData, end: MissionEnd) -> Caption:

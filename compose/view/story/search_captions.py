@@ -104,11 +104,11 @@ def beginning_again(pair: PairData) -> Iterator[Caption]:
     """Yield which robot drives back to its anchor, since it missed its peer or is not localised by it."""
     for robot in pair.robots:
         before, now = pair.commands(robot.id)
-        if before is None or now is None or robot.orbit.v == 0.0 or now.state != "homing":
+        if before is None or now is None or robot.orbit.v == 0.0 or now.task != "homing":
             continue
         if before.phase == 3:
             failed = f"{robot.id} has not found out where it is from its distances to {robot.peer}."
-        elif before.state == "orbiting":
+        elif before.task == "orbiting":
             failed = f"{robot.id} has not met {robot.peer} on its circle."
         else:
             continue
