@@ -54,6 +54,7 @@ from protocol.units import (
     Angle,
     AngularVelocity,
     Count,
+    Finite,
     Range,
     RobotId,
     Tick,
@@ -196,6 +197,60 @@ class Inconsistent(
 
 Verdict = Localised | Undecided | Inconsistent
 """The final result of a robot. It does not change once it has been sent in a Command or Report."""
+
+
+CauseCode = Literal[
+    "wrong", "inconsistent", "undecided", "position", "heading", "max-ticks", "dead", "others", "waiting",
+    "no-result", "failed",
+]  # fmt: skip
+"""A condition that keeps a mission from ending `localised`.
+
+- `wrong`: the robot's claim is off by the position (m) and heading (rad) in `values`; with noise, the claimed
+  sigmas follow.
+- `inconsistent`: the robot found the contradiction `text` in the reports of its peer, the second robot.
+- `undecided`: the robot gave up, because of `text`.
+- `position`, `heading`: the robot claims it with the first sigma in `values` (m or rad), and the second is
+  required.
+- `max-ticks`: the robots have no result at `max_ticks`.
+- `dead`: the robot is dead from the tick in `values` on.
+- `others`: the robots are not localised either.
+- `waiting`: the robot is localised, but others are not, as far as it knows.
+- `no-result`: no result of the robots was received.
+- `failed`: a process or a driver has failed: `text`.
+"""
+
+
+VALUES_OF_CAUSES: dict[str, tuple[int, ...]] = {
+    "wrong": (2, 4),
+    "position": (2,),
+    "heading": (2,),
+    "dead": (1,),
+}
+"""The possible numbers of values of the causes that have values."""
+ROBOTS_OF_CAUSES = {"inconsistent": (1, 2), "failed": (0,)}
+"""The possible numbers of robots of the causes that are not of one robot."""
+OF_SEVERAL = ("max-ticks", "others", "no-result")
+"""The causes of any number of robots, at least one."""
+
+
+class Cause(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """A reason for the outcome of a mission. `compose/recording/reasons.py` makes the text for a user."""
+
+    code: CauseCode
+    """The condition."""
+    robots: Annotated[tuple[RobotId, ...], Meta(max_length=MAX_MEMBERS)] = ()
+    """The robots concerned."""
+    values: Annotated[tuple[Finite, ...], Meta(max_length=4)] = ()
+    """The quantities of the condition; see CauseCode."""
+    text: Text | None = None
+    """The statement of a planner, or of an error; None if the condition has none."""
+
+    def __post_init__(self) -> None:
+        _cut(self, "text")
+        robots, values = len(self.robots), len(self.values)
+        fits = robots >= 1 if self.code in OF_SEVERAL else robots in ROBOTS_OF_CAUSES.get(self.code, (1,))
+        if not (fits and values in VALUES_OF_CAUSES.get(self.code, (0,))):
+            raise ValueError(f"a cause {self.code} with {robots} robots and {values} values")
 
 
 Version = Annotated[str, Meta(max_length=64)]
@@ -441,11 +496,8 @@ class MissionEnd(Message, frozen=True):
     """The last tick."""
     outcome: Outcome
     """The outcome of the run."""
-    reason: Text | None
-    """The reason for the outcome, for a user; None if it is `localised`."""
-
-    def __post_init__(self) -> None:
-        _cut(self, "reason")
+    causes: tuple[Cause, ...] = ()
+    """The reasons for the outcome, the main one first; empty if it is `localised`."""
 
 
 # --- from a robot ---

@@ -19,6 +19,7 @@ from compose.launch import model_loader
 from compose.launch.class_loader import name_of, trust
 from compose.recording import run as recorded
 from compose.recording.group_localisation import MeetingResult, meeting_results
+from compose.recording.reasons import reason_for
 from compose.recording.recording_files import make_folder, user_errors
 from compose.recording.summary_json import SUMMARY_JSON, Mode, leave, summary
 from protocol import documents, files
@@ -93,7 +94,7 @@ class Run(msgspec.Struct, frozen=True, dict=True, eq=False):
     @property
     def reason(self) -> str | None:
         """The reason for another outcome than `localised`."""
-        return self.model.end.reason if self.model.end is not None else "the recording breaks off"
+        return reason_for(self.model.end) if self.model.end is not None else "the recording breaks off"
 
     @property
     def ticks(self) -> int:

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from compose.errors import UserError
-from protocol.messages import Command, Observation
+from compose.recording.reasons import reason_for
+from protocol.messages import Command, MissionEnd, Observation
 from protocol.motion import Controls, Pose
 from protocol.spelling import did_you_mean
 from tandem.scenarios import Scenario, plain, scenario_of
-from world.referee import MissionOutcome
 from world.tick import advance, observations, release
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ class World:
         self.scenario = chosen if seed is None else chosen.with_(seed=seed)
         """The scenario."""
         self._state = release(self.scenario.template.scenario)
-        self._end: MissionOutcome | None = None
+        self._end: MissionEnd | None = None
 
     @property
     def tick(self) -> int:
@@ -61,7 +61,7 @@ class World:
     @property
     def reason(self) -> str | None:
         """The reason for an outcome other than `localised`."""
-        return None if self._end is None else self._end.reason
+        return None if self._end is None else reason_for(self._end)
 
     def observe(self) -> dict[str, Observation]:
         """Return what each robot measures and receives in this tick; the same whenever it is called."""
@@ -79,7 +79,7 @@ class World:
         after = World.__new__(World)
         after.scenario, after._state, after._end = self.scenario, self._state, None
         onward = advance(self._state, {robot: self._command(robot, one) for robot, one in commands.items()})
-        if isinstance(onward, MissionOutcome):
+        if isinstance(onward, MissionEnd):
             after._end = onward
         else:
             after._state = onward

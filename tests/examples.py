@@ -6,6 +6,7 @@ from msgspec.structs import replace
 
 from compose.scenario.scenario_file import load
 from protocol.messages import (
+    Cause,
     Command,
     Contact,
     DeadlineMissed,
@@ -70,8 +71,8 @@ EXAMPLES: tuple[Message, ...] = (
     Estimate(5, "a", (POSE,), (), False, (1.0,), Covariance(0.5, 0.25, 0.0, 0.75, -0.5, 1.0)),
     GroundTruth(6, {"a": POSE, "b": Pose(0.5, 0.5, 0.5)}),
     DeadlineMissed(8, "b"),
-    MissionEnd(48, "wrong", "a claims a pose that is 1 m off"),
-    MissionEnd(48, "localised", None),
+    MissionEnd(48, "wrong", (Cause("wrong", ("a",), (1.0, 0.5)),)),
+    MissionEnd(48, "localised"),
     FinalReport(
         "b", 5, 3, "circle", -2.5, (4, 2), 0.5, 1.5, 2, 0.75, "8 mutual ranges", 0.25, 3, 4, 1, 2, 5, 3, 600
     ),

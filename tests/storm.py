@@ -298,7 +298,7 @@ class Storm:
         robot, some = _robot(key), self._draw.uniform(0.01, 3.0)
         match _topic(key):
             case "observation" if end and self._draw.random() < 0.3:
-                return MissionEnd(tick, "localised" if some < 1.0 else "failed", None)
+                return MissionEnd(tick, "localised" if some < 1.0 else "failed")
             case "observation":
                 return Observation(tick, robot, Controls(some / 3.0, some), some)
             case "command":

@@ -31,6 +31,7 @@ from protocol.attack import Attack
 from protocol.journal import journal_file
 from protocol.journal.journal_file import CorruptJournal, MemoryJournal
 from protocol.messages import (
+    Cause,
     Command,
     Contact,
     DeadlineMissed,
@@ -59,7 +60,6 @@ from tests.commands import (
 from tests.series import series
 from tests.test_real_time import missed
 from world import world_journal as reader_of_world
-from world.referee import MissionOutcome
 from world.scenario import Scenario
 from world.simulation import Simulation
 
@@ -224,7 +224,7 @@ def test_a_failed_run_violates_no_rule() -> None:
     robots["a"].observation(a)
     robots["a"].decide()
     robots["a"].estimate()
-    end = simulation.end(MissionOutcome("failed", "no answer from b at tick 5 for 30 s"))
+    end = simulation.end(MissionEnd(5, "failed", (Cause("failed", text="no answer from b"),)))
     simulation.journal_final_reports([robots["a"].final_report(end)])
     findings = audit_run(of_frames({name: book.frames for name, book in books.items()}))
     assert found(findings) == [(4, "b", "order")]
@@ -390,7 +390,11 @@ def test_a_report_that_is_missing_in_lockstep_is_found(folder: Path) -> None:
 
 
 def test_a_changed_mission_end_or_final_report_is_found(folder: Path) -> None:
-    plant(folder / A, (of(MissionEnd), to(reason="none")), (of(FinalReport), to(reports_heard=2)))
+    plant(
+        folder / A,
+        (of(MissionEnd), to(causes=(Cause("failed", text="none"),))),
+        (of(FinalReport), to(reports_heard=2)),
+    )
     findings = audit(folder)
     assert found(findings) == [(LAST, "a", "order")] * 2 + [(LAST, "a", "decision")]
     assert what(findings, "order")[1] == "the world's FinalReport from it: reports_heard is 3, expected 2"
@@ -767,7 +771,10 @@ def test_a_claim_by_too_few_noisy_ranges_is_found(
 
 def test_a_mission_end_that_differs_from_the_referees_is_found(folder: Path) -> None:
     for name in (A, B, WORLD_JOURNAL):
-        plant(folder / name, (of(MissionEnd), to(outcome="undecided", reason="a: tired")))
+        plant(
+            folder / name,
+            (of(MissionEnd), to(outcome="undecided", causes=(Cause("undecided", ("a",), text="tired"),))),
+        )
     assert [one.line for one in audit(folder).violations] == [
         "tick 48, the world, claim: it ends undecided (a: tired), expected localised"
     ]

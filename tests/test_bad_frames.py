@@ -21,7 +21,7 @@ from msgspec.structs import replace
 from compose.launch.processes import free_endpoint
 from compose.scenario.scenario_file import load, parse
 from protocol.journal.journal_file import read
-from protocol.messages import Command, Contact, FinalReport, Message, MissionEnd, Observation, Report
+from protocol.messages import Cause, Command, Contact, FinalReport, Message, MissionEnd, Observation, Report
 from protocol.motion import ORIGIN, REST
 from protocol.network import inbox, keys, session
 from protocol.network.endpoints import listening
@@ -290,13 +290,13 @@ def test_a_robot_refuses_frames_out_of_step_and_uses_a_repeated_report_once(tmp_
                 observation(1),
                 observation(4),
                 observation(900),
-                MissionEnd(1, "failed", None),
+                MissionEnd(1, "failed"),
             ):
                 world_says.put(encode(odd))
             world_says.put(encode(replace(observation(2), anchor_range=1.0)))
-            world_says.put(encode(MissionEnd(900, "localised", None)))
+            world_says.put(encode(MissionEnd(900, "localised")))
             play(3, told(3))
-            world_says.put(encode(MissionEnd(3, "undecided", "for a test")))
+            world_says.put(encode(MissionEnd(3, "undecided", (Cause("dead", ("a",), (1,)),))))
             final_report = answer(said, FinalReport)
             world_says.put(encode(observation(1)))
             world_says.put(encode(final_report))
@@ -323,7 +323,7 @@ def test_a_robot_of_a_group_refuses_reports_of_itself_and_of_robots_outside_the_
             for robot, publisher in senders.items():
                 publisher.put(encode(Report(0, robot, 1, "straight", None, 0, 0, (), 0, (), 0, 0)))
             agent.until_prints("/robot/z/to/a: its sender is not in this mission")
-            world_says.put(encode(MissionEnd(0, "undecided", "for a test")))
+            world_says.put(encode(MissionEnd(0, "undecided", (Cause("dead", ("a",), (1,)),))))
             final_report = answer(said, FinalReport)
             world_says.put(encode(final_report))
             ended = agent.ended()

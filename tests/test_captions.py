@@ -19,7 +19,7 @@ from compose.view.scene import Scene, scene
 from compose.view.story.caption import FAULTS, Caption
 from compose.view.story.captions import captions
 from protocol.attack import Attack
-from protocol.messages import Contact, Inconsistent, Localised, MissionEnd, Outcome, Undecided
+from protocol.messages import Cause, Contact, Inconsistent, Localised, MissionEnd, Outcome, Undecided
 from tests.commands import SECTION_IV
 from world.faults import Fault, LinkSelector
 from world.scenario import Scenario
@@ -229,31 +229,40 @@ def with_verdicts(now: TickData, **verdicts: object) -> TickData:
 
 
 @pytest.mark.parametrize(
-    ("outcome", "reason", "text"),
+    ("outcome", "cause", "text"),
     [
-        ("undecided", "b: too few ranges", "The mission ends undecided: b: too few ranges."),
-        ("wrong", "a is off by 2 m", "The mission ends with a wrong claim: a is off by 2 m."),
-        ("failed", "no answer of b within 30 s", "The mission fails: no answer of b within 30 s."),
         (
             "undecided",
-            "max_ticks: a, b not localised by then",
+            Cause("undecided", ("b",), text="too few ranges"),
+            "The mission ends undecided: b: too few ranges.",
+        ),
+        (
+            "wrong",
+            Cause("wrong", ("a",), (2.0, 0.1)),
+            "The mission ends with a wrong claim: a claims a pose that is 2 m and 0.1 rad off.",
+        ),
+        ("failed", Cause("failed", text="no answer of b"), "The mission fails: no answer of b."),
+        (
+            "undecided",
+            Cause("max-ticks", ("a", "b")),
             "The mission ends undecided: the time is up, and a and b are not localised.",
         ),
         ("localised", None, "Both are localised: each knows its position and its heading."),
     ],
 )
 def test_only_an_end_that_is_localised_says_so(
-    paper_1: Run, outcome: Outcome, reason: str | None, text: str
+    paper_1: Run, outcome: Outcome, cause: Cause | None, text: str
 ) -> None:
     setup, before, now = last(paper_1)
-    told = [one.text for one in captions(setup, before, now, (), MissionEnd(48, outcome, reason))]
+    end = MissionEnd(48, outcome, () if cause is None else (cause,))
+    told = [one.text for one in captions(setup, before, now, (), end)]
     assert told[-1] == text
     assert ("Both claim to know their poses." in told) == (outcome != "localised")
 
 
 def test_a_link_that_delivers_nothing_is_named_at_the_end_with_the_truth(paper_1: Run) -> None:
     setup, before, now = last(paper_1)
-    end = MissionEnd(48, "undecided", "max_ticks: b not localised by then")
+    end = MissionEnd(48, "undecided", (Cause("max-ticks", ("b",)),))
     lost = Fault(link=LinkSelector("a", "b", both=False), loss=1.0)
     for faults, text in (
         ((lost,), "No report from a to b ever arrives."),

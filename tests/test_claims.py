@@ -30,7 +30,6 @@ from protocol.messages import Command, Estimate, FinalReport, Localised, Mission
 from protocol.motion import Covariance, Pose
 from tests.commands import SECTION_IV, tandem
 from tests.surveys import scenario_of
-from world.referee import MissionOutcome
 from world.tick import World, advance, release
 from world.world_journal import Tick, WorldHistory
 
@@ -77,9 +76,8 @@ def claimed(text: str, covariance: Covariance | None, *, by: float = 0.03) -> Ru
     }
     onward = advance(world, first)
     assert isinstance(onward, World)
-    mission_outcome = advance(onward, {})
-    assert isinstance(mission_outcome, MissionOutcome)
-    end = MissionEnd(1, mission_outcome.outcome, mission_outcome.reason)
+    end = advance(onward, {})
+    assert isinstance(end, MissionEnd)
     return Run(
         WorldHistory(of_world(), scenario, (Tick(world, first), Tick(onward, {})), None, None, end, {})
     )
@@ -318,7 +316,7 @@ def test_a_trial_with_two_claims_counts_once_in_the_mean_nees() -> None:
     row = row_of(
         Run(
             WorldHistory(
-                of_world(), scenario, (Tick(world, commands),), None, None, MissionEnd(0, "localised", None)
+                of_world(), scenario, (Tick(world, commands),), None, None, MissionEnd(0, "localised")
             )
         )
     )

@@ -15,9 +15,11 @@ from msgspec.structs import replace
 
 from agent.process.link import WORLD_SILENCE_S
 from compose.launch.driver_loader import config_of
+from compose.recording.reasons import reason_for
 from compose.scenario.scenario_file import parse
 from protocol.journal.journal_file import MemoryJournal
 from protocol.messages import (
+    Cause,
     Command,
     FinalReport,
     Inconsistent,
@@ -195,8 +197,7 @@ def test_a_driver_that_fails_ends_the_mission_and_stops_the_robot(
 ) -> None:
     _, end, told = played(driver, lambda tick: [encode(command(tick))])
     assert end.outcome == "failed"
-    assert end.reason is not None
-    assert end.reason.startswith(said)
+    assert str(reason_for(end)).startswith(said)
     assert driver.stopped >= 1
     assert told == [end]
 
@@ -204,8 +205,7 @@ def test_a_driver_that_fails_ends_the_mission_and_stops_the_robot(
 def test_an_agent_that_never_answers_ends_the_mission_after_the_timeout(played: Play) -> None:
     _, end, _ = played(Recorded(), lambda _: [], ticks=1000, timeout=1.0)
     assert end.outcome == "failed"
-    assert end.reason is not None
-    assert end.reason.startswith("no answer from a's agent for 1.")
+    assert str(reason_for(end)).startswith("no answer from a's agent for 1.")
 
 
 def test_an_agent_that_only_reconnects_ends_the_mission_after_the_timeout(stage: Stage, played: Play) -> None:
@@ -214,8 +214,7 @@ def test_an_agent_that_only_reconnects_ends_the_mission_after_the_timeout(stage:
         stage.comes("alive", keys.robot_alive("r", "a"), after=float(second))
     _, end, _ = played(Recorded(), lambda _: [], ticks=1000, timeout=3.0)
     assert end.outcome == "failed"
-    assert end.reason is not None
-    assert end.reason.startswith("no answer from a's agent for ")
+    assert str(reason_for(end)).startswith("no answer from a's agent for ")
     assert stage.now < 20.0
 
 
@@ -263,7 +262,7 @@ def test_the_mission_ends_when_each_robot_knows_that_the_other_knows(
 ) -> None:
     end = ended(own, said)
     assert end is not None
-    assert (end.tick, end.outcome, end.reason) == (tick, outcome, reason)
+    assert (end.tick, end.outcome, reason_for(end)) == (tick, outcome, reason)
 
 
 def test_the_mission_ends_when_the_peer_sends_nothing_for_too_long() -> None:
@@ -290,7 +289,7 @@ def test_a_peer_that_is_killed_between_its_claim_and_its_last_report_is_waited_f
         return [encode(command(tick, verdict=LOCALISED if tick >= 5 else None))]
 
     _, end, _ = played(Recorded(), answer, ticks=100)
-    assert end == MissionEnd(40 + LAST_WORDS, "localised", None)
+    assert end == MissionEnd(40 + LAST_WORDS, "localised")
 
 
 def test_only_reports_of_the_mission_and_near_its_tick_are_used_and_journaled(
@@ -324,7 +323,9 @@ def test_only_reports_of_the_mission_and_near_its_tick_are_used_and_journaled(
 
     stage.answer = answer
     stage.alive("a")
-    assert field.run_mission(10.0, lambda: None) == MissionEnd(6 + LAST_WORDS, "undecided", "a: why")
+    assert field.run_mission(10.0, lambda: None) == MissionEnd(
+        6 + LAST_WORDS, "undecided", (Cause("undecided", ("a",), text="why"),)
+    )
     history = driver_history([encode(CONFIG), *journal.frames], CONFIG, Path("a"))
     assert [one.received for one in history.ticks if one.received] == [(genuine,)]
     refused = capsys.readouterr().err
@@ -336,7 +337,7 @@ def test_only_reports_of_the_mission_and_near_its_tick_are_used_and_journaled(
 def test_a_robot_that_is_restarted_after_the_end_only_records_the_end_if_that_is_missing(
     stage: Stage, is_end_recorded: bool
 ) -> None:
-    end, journal = MissionEnd(5, "undecided", "max_ticks: a not localised by then"), MemoryJournal()
+    end, journal = MissionEnd(5, "undecided", (Cause("max-ticks", ("a",)),)), MemoryJournal()
     ticks = [DrivenTick(Observation(tick, "a", None, 1.0), b"", command(tick)) for tick in range(6)]
     field = Field(Recorded(), CONFIG, "r", stage, max_ticks=5, manoeuvre_s=MANOEUVRE_S, journal=journal)
     field.resume(DriverHistory(tuple(ticks), (), end if is_end_recorded else None), 5)

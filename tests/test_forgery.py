@@ -17,6 +17,7 @@ from compose.network import KEYED
 from compose.scenario.scenario_file import load
 from compose.view.web.live import FRAMES_AHEAD, MOST_TICKS_MISSED, ReceivedMission, RefusedFrame
 from protocol.messages import (
+    Cause,
     Command,
     Estimate,
     GroundTruth,
@@ -48,8 +49,8 @@ def report(tick: int, robot: str) -> Report:
 
 
 FORGED: dict[str, Message] = {
-    "the end": MissionEnd(0, "localised", "forged"),
-    "an end to come": MissionEnd(LAST, "failed", "forged"),
+    "the end": MissionEnd(0, "localised", (Cause("failed", text="forged"),)),
+    "an end to come": MissionEnd(LAST, "failed", (Cause("failed", text="forged"),)),
     "the truth": GroundTruth(0, {"a": HERE, "b": HERE}),
     "b's verdict": command(0, "b", Localised(HERE)),
     "b's manoeuvre": command(0, "b"),
@@ -191,6 +192,6 @@ def test_with_one_robots_certificate_nobody_forges_end_truth_ticks_or_another_ro
         assert [one.status for one in ended] == [0, 0, 0], clock.err
         watch.until(lambda: shown(address)["end"] is not None, "it shows the end")
         found = shown(address)
-        assert found["end"][2] == "localised"
-        assert found["last"] == found["end"][1] == 48
+        assert found["end"]["outcome"] == "localised"
+        assert found["last"] == found["end"]["tick"] == 48
         assert "forged" not in json.dumps(found)

@@ -109,7 +109,7 @@ def test_one_attacker_keeps_no_honest_robot_from_a_right_claim(seed: int) -> Non
             if robot in honest:
                 assert claim is not None
                 at = run.ticks[claim.tick].truth.poses[place]
-                assert mistake(Localised(claim.pose), at, scenario.mission) is None
+                assert mistake(robot, Localised(claim.pose), at, scenario.mission) is None
 
 
 def test_a_pair_tries_again_with_another_robot_when_its_first_meeting_has_failed() -> None:

@@ -14,6 +14,7 @@ from compose.audit.rules import audit_run
 from compose.errors import BadScenario
 from compose.launch.in_process import run_mission
 from compose.recording.corrected_bounds import corrected_bounds
+from compose.recording.reasons import reason_for
 from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
 from compose.recording.run import Run, read
 from compose.recording.summary_json import summary
@@ -76,7 +77,7 @@ def test_a_dead_robot_stands_still_and_measures_and_receives_nothing(four: Run) 
 def test_the_outcome_names_the_dead_robot_once_the_others_are_localised(four: Run) -> None:
     assert localised(four) == {"b", "c", "d"}
     assert four.end is not None
-    assert (four.end.outcome, four.end.reason) == ("undecided", "a is dead from tick 20 on")
+    assert (four.end.outcome, reason_for(four.end)) == ("undecided", "a is dead from tick 20 on")
 
 
 def test_a_verdict_of_a_dead_robot_does_not_count(four: Run) -> None:

@@ -11,9 +11,11 @@ from msgspec.structs import replace
 
 from compose.errors import UserError
 from compose.launch.driver_loader import config_of, mission
+from compose.recording.reasons import reason_for
 from compose.scenario.scenario_file import parse
 from protocol.journal.journal_file import CorruptJournal, MemoryJournal, Sink
 from protocol.messages import (
+    Cause,
     Command,
     Contact,
     FinalReport,
@@ -234,7 +236,7 @@ def test_the_mission_ends_when_all_know_that_all_have_results(ending: GroupEndin
     assert ending.tick_start(50) == TickStart(50, "a", LOCALISED, complete=True)
     assert ending.receive(result("c"))
     assert not ending.receive(result("c"))
-    assert ends(ending, range(50, 90)) == MissionEnd(50 + LAST_WORDS, "localised", None)
+    assert ends(ending, range(50, 90)) == MissionEnd(50 + LAST_WORDS, "localised")
 
 
 def test_a_robot_that_is_killed_after_its_result_is_waited_for_until_it_knows_all_others(
@@ -245,7 +247,7 @@ def test_a_robot_that_is_killed_after_its_result_is_waited_for_until_it_knows_al
         ending.receive(result(robot, complete=robot != "c"))
     assert ends(ending, range(10, 50)) is None
     ending.receive(result("c"))
-    assert ends(ending, range(50, 90)) == MissionEnd(50 + LAST_WORDS, "localised", None)
+    assert ends(ending, range(50, 90)) == MissionEnd(50 + LAST_WORDS, "localised")
 
 
 def test_a_robot_with_a_result_that_stays_silent_is_not_waited_for(stage: Stage, ending: GroupEnding) -> None:
@@ -254,7 +256,7 @@ def test_a_robot_with_a_result_that_stays_silent_is_not_waited_for(stage: Stage,
     stage.now += 31.0
     for robot in "bd":
         ending.receive(result(robot))
-    assert ends(ending, range(10, 50)) == MissionEnd(10 + LAST_WORDS, "localised", None)
+    assert ends(ending, range(10, 50)) == MissionEnd(10 + LAST_WORDS, "localised")
 
 
 def test_a_robot_that_catches_up_tells_the_others_that_it_waits_for_none_before_it_ends(
@@ -265,7 +267,7 @@ def test_a_robot_that_catches_up_tells_the_others_that_it_waits_for_none_before_
         ending.receive(result(robot))
     localised = Command(10, "a", 0.0, 0.0, 3, "localised", LOCALISED)
     assert all(ending.after(tick, localised) is None for tick in range(10, 50))
-    assert ends(ending, range(50, 90)) == MissionEnd(50 + LAST_WORDS - 1, "localised", None)
+    assert ends(ending, range(50, 90)) == MissionEnd(50 + LAST_WORDS - 1, "localised")
 
 
 PLAN = 164
@@ -288,8 +290,10 @@ def test_a_silent_robot_is_given_up_after_its_planned_time_and_a_visit(
     ending.receive(result("d"))
     stage.now += silent_s
     ending.receive(result("c"))
-    why = "a is localised; no result of b received"
-    assert ends(ending, range(10, 1000), rests=rests) == MissionEnd(tick, "undecided", why)
+    end = ends(ending, range(10, 1000), rests=rests)
+    assert end is not None
+    assert (end.tick, end.outcome) == (tick, "undecided")
+    assert reason_for(end) == "a is localised; no result of b received"
 
 
 def test_a_robot_that_has_just_been_localised_does_not_give_up_a_silent_one(
@@ -322,7 +326,7 @@ def test_the_outcome_is_that_of_all_robots(
     ending.receive(result("c", verdict))
     end = ends(ending, range(10, 801))
     assert end is not None
-    assert (end.outcome, end.reason) == (outcome, reason)
+    assert (end.outcome, reason_for(end)) == (outcome, reason)
 
 
 @pytest.mark.parametrize(
@@ -348,7 +352,7 @@ def test_the_reason_names_all_robots_that_are_not_localised(
         ending.receive(result(robot, verdict))
     end = ends(ending, range(10, 801))
     assert end is not None
-    assert (end.outcome, end.reason) == (outcome, reason)
+    assert (end.outcome, reason_for(end)) == (outcome, reason)
 
 
 def test_a_robot_without_a_result_ends_at_max_ticks(ending: GroupEnding) -> None:
@@ -356,7 +360,7 @@ def test_a_robot_without_a_result_ends_at_max_ticks(ending: GroupEnding) -> None
         ending.receive(result(robot))
     moving = [ending.after(tick, command(tick)) for tick in range(801)]
     assert moving[:800] == [None] * 800
-    assert moving[800] == MissionEnd(800, "undecided", "max_ticks: a not localised by then")
+    assert moving[800] == MissionEnd(800, "undecided", (Cause("max-ticks", ("a",)),))
 
 
 def test_results_are_journaled_once_when_they_are_received(stage: Stage) -> None:
@@ -396,7 +400,7 @@ def test_results_that_were_received_are_known_after_a_restart(stage: Stage, tmp_
     a = Member(stage, "a", 100, LOCALISED)
     a.field.resume(history, known=0)
     stage.alive("a", "b", "c", "d")
-    assert a.play() == MissionEnd(LAST_WORDS, "localised", None)
+    assert a.play() == MissionEnd(LAST_WORDS, "localised")
     with pytest.raises(CorruptJournal, match="it belongs to another mission"):
         driver_history(frames, config_in_group("b"), tmp_path)
 

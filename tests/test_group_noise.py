@@ -18,6 +18,7 @@ from compose.audit.rules import audit_run
 from compose.errors import Unworkable
 from compose.launch.in_process import run_mission
 from compose.launch.planner_loader import planner_of
+from compose.recording.reasons import reason_for
 from compose.recording.run import read
 from compose.scenario.group_meetings import ALLOWED_SIDES
 from compose.scenario.scenario_file import validate
@@ -88,7 +89,7 @@ def test_a_claim_that_a_later_meeting_contradicts_is_withdrawn_and_no_claim_is_w
     assert audit_run(run).violations == ()
     assert run.end is not None
     assert run.end.outcome == "undecided"
-    assert "r3: r1 and r2 contradict each other" in str(run.end.reason)
+    assert "r3: r1 and r2 contradict each other" in str(reason_for(run.end))
     assert localised(run) == {"r1", "r2"}
     commands = [command for tick in run.ticks if (command := tick.commands.get("r3")) is not None]
     assert any(isinstance(one.verdict, Localised) for one in commands), "it claimed what was wrong"

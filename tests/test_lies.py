@@ -14,6 +14,7 @@ from agent.peer.motion_log import MotionLog
 from agent.planning import plausibility
 from compose.errors import BadScenario
 from compose.launch.in_process import run_mission
+from compose.recording.reasons import reason_for
 from compose.recording.run import Run
 from compose.recording.summary_json import summary
 from compose.scenario.scenario_file import parse
@@ -63,7 +64,7 @@ def test_every_false_manoeuvre_or_start_is_inconsistent(attack: Attack, attacker
         assert outcome(recording) == "inconsistent", seed
         assert recording.end is not None
         peer = "b" if attacker == "a" else "a"
-        assert (recording.end.reason or "").startswith(f"{peer}: {attacker} reports "), recording.end.reason
+        assert str(reason_for(recording.end)).startswith(f"{peer}: {attacker} reports ")
 
 
 def _is_falsified(recording: Run, attacker: str, attack: Attack) -> bool:

@@ -16,13 +16,14 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from compose.launch import in_process
+from compose.recording.reasons import reason_for
 from compose.recording.recording_files import WORLD_JOURNAL
 from compose.recording.run import Run, read
 from compose.recording.ticks_csv import ticks_csv
 from compose.scenario.scenario_file import load, parse
 from protocol.journal import journal_file
 from protocol.journal.environment import of_world
-from protocol.messages import Command, Localised, Observation, Undecided
+from protocol.messages import Cause, Command, Localised, MissionEnd, Observation, Undecided
 from protocol.motion import REST, Controls, Covariance, Pose, step
 from protocol.noise import Noise, VelocityNoise
 from protocol.wire import decode, encode
@@ -30,9 +31,8 @@ from tests.commands import SECTION_IV, journals, tandem
 from tests.series import series
 from world import random_streams
 from world.random_streams import gaussian, uniform
-from world.referee import MissionOutcome
 from world.scenario import Scenario
-from world.sensors import Mutual, anchor_ranges, executed, mutual_ranges, odometry
+from world.sensors import Mutual, anchor_ranges, executed, in_contact, mutual_ranges, odometry
 from world.simulation import Simulation
 from world.tick import World, advance, observations, release
 from world.truth import Truth
@@ -225,12 +225,18 @@ def test_other_robots_shift_no_draw() -> None:
         assert [ours] == mutual_ranges(at_tick(two, tick), two, two.pairs())
 
 
+def moved_to(world: World, tick: int) -> World:
+    """Return `world` at another tick."""
+    truth = at_tick(world.scenario, tick)
+    return replace(world, truth=truth, contacts=in_contact(truth, world.scenario, world.pairs))
+
+
 def test_a_mutual_range_is_measured_once_and_sent_to_both() -> None:
     scenario = near("mutual_sigma = 0.1\noutliers = 0.2\ndrop_outs = 0.2")
     world = release(scenario)
     told = set()
     for tick in range(200):
-        one, other = observations(replace(world, truth=at_tick(scenario, tick)))
+        one, other = observations(moved_to(world, tick))
         (by_a,), (by_b,) = one.contacts, other.contacts
         assert (by_a.peer, by_b.peer) == ("b", "a")
         assert by_a.range == by_b.range
@@ -318,7 +324,7 @@ def test_a_range_that_is_dropped_leaves_the_contact() -> None:
     scenario = near("drop_outs = 0.5")
     world, dropped = release(scenario), 0
     for tick in range(100):
-        for observation in observations(replace(world, truth=at_tick(scenario, tick))):
+        for observation in observations(moved_to(world, tick)):
             (contact,) = observation.contacts
             assert contact.heard == (tick,)
             assert contact.range in (None, APART)
@@ -475,12 +481,14 @@ def test_a_claim_is_compared_with_the_true_pose_at_its_tick() -> None:
     later = moved_on(at_first, {"a": claims(0, "a", a), "b": sent(0.0, 0.0, "b")})
     now_a, now_b = later.truth.poses
     assert math.hypot(now_a.x - a.x, now_a.y - a.y) > 1e-3
-    assert advance(later, {"b": claims(1, "b", now_b)}) == MissionOutcome("localised")
+    assert advance(later, {"b": claims(1, "b", now_b)}) == MissionEnd(1, "localised")
     stale = advance(later, {"b": claims(1, "b", b)})
-    assert isinstance(stale, MissionOutcome)
+    assert isinstance(stale, MissionEnd)
     assert stale.outcome == "wrong"
     gives_up = Command(1, "b", 0.0, 0.0, 3, "undecided", Undecided("no way"))
-    assert advance(later, {"b": gives_up}) == MissionOutcome("undecided", "b: no way")
+    assert advance(later, {"b": gives_up}) == MissionEnd(
+        1, "undecided", (Cause("undecided", ("b",), text="no way"),)
+    )
 
 
 def test_a_claim_is_wrong_beyond_five_of_its_sigmas_and_the_reason_names_them() -> None:
@@ -495,9 +503,9 @@ def test_a_claim_is_wrong_beyond_five_of_its_sigmas_and_the_reason_names_them() 
     ):
         claim = Pose(a.x + off, a.y, a.heading + turned)
         onward = advance(world, {"a": claims(0, "a", claim, sure), "b": claims(0, "b", b)})
-        assert isinstance(onward, MissionOutcome)
+        assert isinstance(onward, MissionEnd)
         assert onward.outcome == (outcome or "localised")
-        assert outcome is None or (onward.reason or "").endswith("rad off, with sigmas 0.05 m and 0.02 rad")
+        assert outcome is None or str(reason_for(onward)).endswith("rad off, with sigmas 0.05 m and 0.02 rad")
 
 
 # --- the recording ---------------------------------------------------------------------------------------
@@ -552,7 +560,7 @@ def driven(scenario: Scenario, folder: Path, ticks: int) -> tuple[list[Truth], l
                 {robot.id: sent(v, omega, robot.id, tick) for robot in scenario.robots}
             )
             assert ended is None
-        simulation.end(MissionOutcome("undecided", "enough"))
+        simulation.end(MissionEnd(ticks, "undecided"))
     return truths, told
 
 

@@ -33,6 +33,7 @@ from agent.planning.plausibility import objection
 from agent.planning.state import MODE_NAMES
 from compose.errors import BadScenario, Unworkable
 from compose.launch.in_process import run_mission
+from compose.recording.reasons import reason_for
 from compose.scenario import scenario_file
 from protocol.messages import Observation, Report
 from protocol.motion import REST, Segment
@@ -352,8 +353,8 @@ def test_a_bias_of_the_anchors_only_ends_undecided_and_names_the_profile_to_try(
     end = run_mission(parsed("{anchor_sigma = 0.05, mutual_sigma = 0.05}", 0.3, BIASED)).end
     assert end is not None
     assert end.outcome == "undecided"
-    assert 'noise = "uwb' in str(end.reason)
-    assert "contradict mission.noise" in str(end.reason)
+    assert 'noise = "uwb' in str(reason_for(end))
+    assert "contradict mission.noise" in str(reason_for(end))
 
 
 @pytest.mark.parametrize("heading", [0.0, 1.5, 3.1])

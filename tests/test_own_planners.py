@@ -385,7 +385,7 @@ def test_without_a_world_the_mission_ends_by_the_verdicts_around_the_bodies() ->
     assert ending.after(5, replace(sent, tick=5, verdict=claim)) is None
     assert ending.receive(Report(6, "b", heard=6, verdict=claim, body=b"\xc0"))
     found = [ending.after(tick, sent) for tick in range(6, 11)]
-    assert found[-1] == MissionEnd(10, "localised", None)
+    assert found[-1] == MissionEnd(10, "localised")
     assert found[:-1] == [None] * 4
 
 

@@ -15,7 +15,7 @@ import zenoh
 
 from compose.launch.processes import free_endpoint
 from compose.scenario.scenario_file import load
-from protocol.messages import Command, MissionEnd, Observation
+from protocol.messages import Cause, Command, MissionEnd, Observation
 from protocol.network import keys, session
 from protocol.network.endpoints import at, listening
 from protocol.wire import VERSION, encode
@@ -195,7 +195,7 @@ def running(mission: Played) -> None:
 def over(mission: Played) -> None:
     alive(mission)
     mission.frames = {
-        keys.observation("r", "a"): encode(MissionEnd(9, "undecided", "it was dark")),
+        keys.observation("r", "a"): encode(MissionEnd(9, "undecided", (Cause("dead", ("a",), (1,)),))),
         keys.command("r", "a"): encode(Command(9, "a", 0.0, 0.0, 3, "undecided")),
     }
 

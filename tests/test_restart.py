@@ -30,6 +30,7 @@ from protocol.journal import journal_file
 from protocol.journal.journal_file import CannotRecord, CorruptJournal, Journal
 from protocol.journal.resume import Retrace
 from protocol.messages import (
+    Cause,
     Command,
     Contact,
     DeadlineMissed,
@@ -392,7 +393,7 @@ def test_an_agent_repeats_its_final_report_until_a_world_has_recorded_it(tmp_pat
             if arrival.topic == "command":
                 assert isinstance(decode(arrival.frame, FinalReport), FinalReport)
                 return arrival.frame
-            publisher.put(encode(MissionEnd(0, "undecided", "for a test")))
+            publisher.put(encode(MissionEnd(0, "undecided", (Cause("dead", ("a",), (1,)),))))
 
     with ExitStack() as folder:
         with session.open_router(listening(endpoint)) as link:

@@ -21,6 +21,7 @@ from protocol.journal.journal_file import Journal, read
 from protocol.journal.resume import Retrace
 from protocol.messages import (
     MAX_TEXT,
+    Cause,
     Command,
     FinalReport,
     Inconsistent,
@@ -29,7 +30,6 @@ from protocol.messages import (
     Observation,
     OfRobot,
     Undecided,
-    Verdict,
 )
 from protocol.network import keys, session
 from protocol.network.endpoints import at
@@ -38,7 +38,6 @@ from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode, encode
 from tests.commands import BOUND_S, PAPER_1, tandem, world
 from tests.examples import EXAMPLES
 from tests.test_wire import changed, framed, packed, parts, plain
-from world.referee import MissionOutcome
 from world.simulation import Simulation, resumed
 from world.world_journal import world_history
 
@@ -101,7 +100,7 @@ def test_the_text_fields_are_these() -> None:
     assert set(FIELDS) == {
         (Undecided, "reason"),
         (Inconsistent, "claim"),
-        (MissionEnd, "reason"),
+        (Cause, "text"),
         (FinalReport, "blocking_reason"),
     }
 
@@ -111,15 +110,15 @@ def test_the_text_fields_are_these() -> None:
 def test_what_is_encoded_is_within_its_bound(kind: type[msgspec.Struct], field: str, words: str) -> None:
     made = replace(example_of(kind), **{field: words})
     assert len(getattr(made, field)) == MAX_TEXT
-    told: Message = (
-        made if isinstance(made, Message) else Command(0, "a", 0.0, 0.0, 1, "done", _verdict(made))
-    )
+    match made:
+        case Message():
+            told = made
+        case Cause():
+            told = MissionEnd(0, "failed", (made,))
+        case _:
+            assert isinstance(made, Undecided | Inconsistent)
+            told = Command(0, "a", 0.0, 0.0, 1, "done", made)
     assert decode(encode(told), type(told)) == told
-
-
-def _verdict(value: object) -> Verdict:
-    assert isinstance(value, Undecided | Inconsistent)
-    return value
 
 
 @pytest.mark.parametrize(("kind", "field"), FIELDS)
@@ -168,7 +167,8 @@ def test_every_word_for_a_state_is_within_its_bound() -> None:
 def test_a_world_whose_reason_is_too_long_leaves_a_journal_that_is_read_and_taken_up(tmp_path: Path) -> None:
     scenario, path = load("paper-1"), tmp_path / "world.journal"
     with Journal(path) as journal:
-        end = Simulation(scenario, journal).end(MissionOutcome("failed", "no answer from " + "robot, " * 200))
+        cause = Cause("failed", text="no answer from " + "robot, " * 200)
+        end = Simulation(scenario, journal).end(MissionEnd(0, "failed", (cause,)))
     assert world_history(read(path), path).end == end
     recording = Retrace(path)
     assert resumed(scenario, recording).mission_end == end
@@ -183,7 +183,7 @@ def test_an_agent_that_gives_up_at_length_leaves_a_journal_that_is_read(tmp_path
         robot.state = robot.state.undecided("\U0001f600" * 1000)
         command = robot.decide()
         robot.estimate()
-        robot.final_report(MissionEnd(1, "undecided", f"a: {'x' * 1000}"))
+        robot.final_report(MissionEnd(1, "undecided", (Cause("undecided", ("a",), text="x" * 1000),)))
     assert command.verdict == Undecided("\U0001f600" * MAX_TEXT)
     assert agent_history(read(path), path).final_report is not None
     for frame in read(path):
@@ -214,8 +214,11 @@ def test_a_run_that_ends_with_the_longest_verdict_is_read(tmp_path: Path) -> Non
             match message:
                 case Observation(tick):
                     commands[robot].put(encode(Command(tick, robot, 0.0, 0.0, 1, "undecided", gives_up)))
-                case MissionEnd(_, outcome, reason):
-                    assert (outcome, reason) == ("undecided", f"a: {gives_up.reason}"[:MAX_TEXT])
+                case MissionEnd(_, outcome, causes):
+                    assert (outcome, causes) == (
+                        "undecided",
+                        (Cause("undecided", ("a",), text=gives_up.reason),),
+                    )
                     said = replace(example_of(FinalReport), robot=robot)
                     assert isinstance(said, FinalReport)
                     commands[robot].put(encode(said))

@@ -19,6 +19,7 @@ from compose.audit.rules import audit_run
 from compose.errors import UserError
 from compose.launch.in_process import run_mission
 from compose.recording.corrected_bounds import corrected_bounds
+from compose.recording.reasons import reason_for
 from compose.recording.recording_files import agent_journal
 from compose.recording.run import Run, of_frames, read
 from compose.scenario.scenario_change import file_table
@@ -301,7 +302,7 @@ def given_up_after(scenario: Scenario) -> int:
     while (end := ending.after(tick, Command(tick, "a", 0.0, 0.0, 3, "sweeping", localised))) is None:
         tick += 1
         ending.tick_start(tick)
-    assert end.reason == "a is localised; no result of u received"
+    assert reason_for(end) == "a is localised; no result of u received"
     return end.tick
 
 

@@ -9,16 +9,17 @@ from msgspec.structs import replace
 
 from agent.estimation import precision
 from compose.launch.in_process import run_mission
+from compose.recording.reasons import reason_for
 from compose.scenario.scenario_file import parse
 from compose.scenario.shipped_files import shipped
-from protocol.messages import Command, Localised, Report, Undecided
+from protocol.messages import Command, Localised, MissionEnd, Report, Undecided
 from protocol.motion import ORIGIN, Covariance
 from tests.series import series
 from tests.steps import planner_of, steps
 from tests.surveys import scenario_of
 from tests.test_claims import EXACT, NOISY
 from world.hardware.termination import LAST_WORDS, Ending
-from world.referee import MissionOutcome, decide_outcome, inaccuracy
+from world.referee import decide_outcome, inaccuracy
 from world.tick import World, advance, release
 
 GAVE_UP = Undecided("no pose explains the anchor ranges")
@@ -26,8 +27,9 @@ GAVE_UP = Undecided("no pose explains the anchor ranges")
 
 def test_the_mission_ends_when_one_of_a_pair_has_given_up() -> None:
     world = next(steps("paper-1")).world
-    mission_outcome = decide_outcome(world.scenario, world.truth, {"a": GAVE_UP})
-    assert mission_outcome == MissionOutcome("undecided", f"a: {GAVE_UP.reason}")
+    end = decide_outcome(world.scenario, world.truth, {"a": GAVE_UP})
+    assert end is not None
+    assert (end.outcome, reason_for(end)) == ("undecided", f"a: {GAVE_UP.reason}")
     assert decide_outcome(world.scenario, world.truth, {}) is None
 
 
@@ -53,9 +55,9 @@ def test_a_wrong_claim_cannot_be_taken_back() -> None:
     assert isinstance(world, World)
     world = advance(world, step.commands)
     assert isinstance(world, World)
-    mission_outcome = decide_outcome(world.scenario, world.truth, world.verdicts | {"b": GAVE_UP})
-    assert mission_outcome is not None
-    assert mission_outcome.outcome == "wrong"
+    end = decide_outcome(world.scenario, world.truth, world.verdicts | {"b": GAVE_UP})
+    assert end is not None
+    assert end.outcome == "wrong"
 
 
 def test_the_paper_planner_gives_up_if_the_third_mutual_range_selects_no_placement(
@@ -67,7 +69,7 @@ def test_the_paper_planner_gives_up_if_the_third_mutual_range_selects_no_placeme
     recording = run_mission(parse(text, "random", seed=441))
     assert recording.end is not None
     assert recording.end.outcome == "undecided"
-    assert recording.end.reason == "b: the third mutual range does not select a placement"
+    assert reason_for(recording.end) == "b: the third mutual range does not select a placement"
     states = [(moment.commands["a"].task, moment.commands["b"].task) for moment in recording.ticks]
     assert states[-3:] == [("straight", "standing"), ("waiting", "last-manoeuvre"), ("waiting", "undecided")]
 
@@ -80,7 +82,7 @@ def covariance(position: float, heading: float) -> Covariance:
     return Covariance(position**2 / 2.0, 0.0, 0.0, position**2 / 2.0, 0.0, heading**2)
 
 
-def after_claims(text: str, a: Covariance | None, *, off: float = 0.0) -> MissionOutcome | World:
+def after_claims(text: str, a: Covariance | None, *, off: float = 0.0) -> MissionEnd | World:
     """Return the result of immediate claims of both; that of a is `off` by metres, with covariance `a`."""
     world = release(parse(text, "noisy", seed=1))
     there, other = world.truth.poses
@@ -107,8 +109,9 @@ def after_claims(text: str, a: Covariance | None, *, off: float = 0.0) -> Missio
 def test_a_claim_below_the_required_accuracy_is_not_localised(
     position: float, heading: float, what: str | None
 ) -> None:
-    expected = MissionOutcome("localised") if what is None else MissionOutcome("undecided", what)
-    assert after_claims(NOISY, covariance(position, heading)) == expected
+    end = after_claims(NOISY, covariance(position, heading))
+    assert isinstance(end, MissionEnd)
+    assert (end.outcome, reason_for(end)) == ("localised" if what is None else "undecided", what)
 
 
 def test_no_sigma_excuses_a_claim_that_is_farther_off_than_the_accuracy_allows() -> None:
@@ -116,8 +119,8 @@ def test_no_sigma_excuses_a_claim_that_is_farther_off_than_the_accuracy_allows()
     huge = covariance(4.5e7, 3.0)
     for text, far, near in ((NOISY, 0.501, 0.499), (EXACT, 2e-6, 1e-7)):
         wrong, vague = after_claims(text, huge, off=far), after_claims(text, huge, off=near)
-        assert isinstance(wrong, MissionOutcome)
-        assert isinstance(vague, MissionOutcome)
+        assert isinstance(wrong, MissionEnd)
+        assert isinstance(vague, MissionEnd)
         assert (wrong.outcome, vague.outcome) == ("wrong", "undecided")
 
 
@@ -149,8 +152,10 @@ def honest_claims(
                 for command in moment.commands.values():
                     if isinstance(command.verdict, Localised):
                         claims += 1
-                        assert inaccuracy(command.verdict, recording.scenario.mission) is None, (sigma, seed)
-            assert "claims a" not in (recording.end.reason or ""), (sigma, seed, recording.end)
+                        assert (
+                            inaccuracy(command.robot, command.verdict, recording.scenario.mission) is None
+                        ), (sigma, seed)
+            assert "claims a" not in (reason_for(recording.end) or ""), (sigma, seed, recording.end)
     return claims
 
 

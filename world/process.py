@@ -20,13 +20,12 @@ from typing import Any
 
 import zenoh
 
-from protocol.messages import Command, FinalReport, GroundTruth, Message, MissionEnd, Observation
+from protocol.messages import Cause, Command, FinalReport, GroundTruth, Message, MissionEnd, Observation
 from protocol.network import diagnosis, keys, session
 from protocol.network.endpoints import Endpoints
 from protocol.network.inbox import NO_ARRIVAL, Arrival, Inbox
 from protocol.spelling import did_you_mean
 from protocol.wire import encode
-from world.referee import MissionOutcome
 from world.simulation import Simulation
 
 LINK_TIMEOUT_S = 3.0
@@ -157,7 +156,8 @@ class WorldProcess:
                 if self._period is not None:
                     due = max((due or self._began) + self._period, time.monotonic())
         except NoAnswer as error:
-            end = simulation.end(MissionOutcome("failed", str(error)))
+            causes = (Cause("failed", text=str(error)),)
+            end = simulation.end(MissionEnd(simulation.tick, "failed", causes))
         self._ended = time.monotonic() if self._ended is None else self._ended
         self.running_s = self._ended - self._began if self._began is not None else 0.0
         simulation.journal_final_reports(self._collect_final_reports(end, expected))

@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-import msgspec
-
-from protocol.messages import Inconsistent, Localised, Outcome, Undecided, Verdict
+from protocol.messages import Cause, Inconsistent, Localised, MissionEnd, Outcome, Undecided, Verdict
 from protocol.mission import HEADING_ACCURACY, Mission
 from protocol.motion import Pose, wrap
 from protocol.rounding import TOLERANCE
@@ -16,18 +14,6 @@ from world.truth import Truth
 
 TOLERATED_SIGMAS = 5.0
 """The number of claimed standard deviations by which a claim may differ from the truth, with noise."""
-
-MOST_NAMED = 4
-"""The most robots that are named at the end of a reason; the summary of a run has all of them."""
-
-
-class MissionOutcome(msgspec.Struct, frozen=True):
-    """The outcome of a run."""
-
-    outcome: Outcome
-    """The outcome."""
-    reason: str | None = None
-    """The reason, for a user; None if the outcome is `localised`."""
 
 
 def errors(claim: Pose, truth: Pose) -> tuple[float, float]:
@@ -48,29 +34,54 @@ def tolerances(claim: Localised, mission: Mission) -> tuple[float, float]:
     )
 
 
-def inaccuracy(claim: Localised, mission: Mission) -> str | None:
-    """Return how `claim` misses the required accuracy, for a user; None if it does not."""
+def inaccuracy(robot: str, claim: Localised, mission: Mission) -> Cause | None:
+    """Return how the `claim` of `robot` misses the required accuracy; None if it does not."""
     covariance = claim.covariance
     if covariance is None:
         return None
     position, heading = covariance.position_sigma, covariance.heading_sigma
     if position > mission.accuracy:
-        return f"claims a position known to {position:.3g} m, required {mission.accuracy:g}"
+        return Cause("position", (robot,), (position, mission.accuracy))
     if heading > HEADING_ACCURACY:
-        return f"claims a heading known to {heading:.3g} rad, required {HEADING_ACCURACY:g}"
+        return Cause("heading", (robot,), (heading, HEADING_ACCURACY))
     return None
 
 
-def mistake(claim: Localised, truth: Pose, mission: Mission) -> str | None:
-    """Return the errors of `claim`, for a user, if it is wrong; None if it is correct."""
+def mistake(robot: str, claim: Localised, truth: Pose, mission: Mission) -> Cause | None:
+    """Return the errors of the `claim` of `robot` if it is wrong; None if it is correct."""
     position, heading = errors(claim.pose, truth)
     far, askew = tolerances(claim, mission)
     if position <= far and heading <= askew:
         return None
-    off, covariance = f"{position:.3g} m and {heading:.3g} rad off", claim.covariance
-    if covariance is None:
-        return off
-    return f"{off}, with sigmas {covariance.position_sigma:.3g} m and {covariance.heading_sigma:.3g} rad"
+    covariance = claim.covariance
+    sigmas = () if covariance is None else (covariance.position_sigma, covariance.heading_sigma)
+    return Cause("wrong", (robot,), (position, heading, *sigmas))
+
+
+def shortfall(robot: str, verdict: Verdict | None, mission: Mission, peer: str | None = None) -> Cause | None:
+    """Return why `robot` is not localised by its `verdict`, in a meeting with `peer`; None if it is."""
+    match verdict:
+        case Undecided(reason):
+            return Cause("undecided", (robot,), text=reason)
+        case Inconsistent(claim):
+            return Cause("inconsistent", (robot,) if peer is None else (robot, peer), text=claim)
+        case Localised():
+            return inaccuracy(robot, verdict, mission)
+        case None:
+            return None
+
+
+def main_cause(shortfalls: Sequence[Cause]) -> Cause | None:
+    """Return the first contradiction in `shortfalls`, or else the first of them; None if there is none."""
+    return next((one for one in shortfalls if one.code == "inconsistent"), next(iter(shortfalls), None))
+
+
+def mission_end(tick: int, causes: Sequence[Cause]) -> MissionEnd:
+    """Return the end of a mission without wrong claims in `tick`, because of `causes`."""
+    if not causes:
+        return MissionEnd(tick, "localised")
+    outcome: Outcome = "inconsistent" if causes[0].code == "inconsistent" else "undecided"
+    return MissionEnd(tick, outcome, tuple(causes))
 
 
 def decide_outcome(
@@ -78,8 +89,8 @@ def decide_outcome(
     truth: Truth,
     verdicts: Mapping[str, Verdict],
     claimed: Mapping[str, Pose] | None = None,
-) -> MissionOutcome | None:
-    """Return the outcome once all results are known or `max_ticks` is reached; None before.
+) -> MissionEnd | None:
+    """Return the end once all results are known or `max_ticks` is reached; None before.
 
     A claim is compared with the true pose at the tick of the claim, which is in `claimed`, or with the
     current one if `claimed` is None. The run does not wait for a robot whose peer is undecided or
@@ -99,82 +110,50 @@ def decide_outcome(
     for robot, pose in zip(scenario.robots, truth.poses, strict=True):
         verdict = verdicts.get(robot.id)
         if isinstance(verdict, Localised):
-            why = mistake(verdict, pose if claimed is None else claimed[robot.id], scenario.mission)
+            at_claim = pose if claimed is None else claimed[robot.id]
+            why = mistake(robot.id, verdict, at_claim, scenario.mission)
             if why is not None:
-                return MissionOutcome("wrong", f"{robot.id} claims a pose that is {why}")
-    found, named = _outcome_of_right_claims(scenario, verdicts, open_cases)
-    if not scenario.meetings or found.reason is None:
-        return found
-    clauses = _others_not_localised(scenario, verdicts, truth.tick, named)
-    return MissionOutcome(found.outcome, "; ".join((found.reason, *clauses)))
+                return MissionEnd(truth.tick, "wrong", (why,))
+    main = main_cause([*_shortfalls(scenario, verdicts).values()])
+    if main is None and open_cases:
+        main = Cause("max-ticks", tuple(open_cases))
+    if main is None:
+        main = next((_dead(one) for one in scenario.deaths if one.robot not in verdicts), None)
+    causes = [main] if main is not None else []
+    if main is not None and scenario.meetings:
+        named = open_cases if main.code == "max-ticks" else main.robots[:1]
+        causes += _others_not_localised(scenario, verdicts, truth.tick, named)
+    return mission_end(truth.tick, causes)
 
 
-def _outcome_of_right_claims(
-    scenario: Scenario, verdicts: Mapping[str, Verdict], open_cases: Sequence[str]
-) -> tuple[MissionOutcome, Sequence[str]]:
-    """Return the outcome of a run without a wrong claim, and the robots that its reason names."""
-    for robot in scenario.robots:
-        verdict = verdicts.get(robot.id)
-        if isinstance(verdict, Inconsistent):
-            what = f"{robot.id}: {robot.peer} reports {verdict.claim}"
-            return MissionOutcome("inconsistent", what), (robot.id,)
-    for robot in scenario.robots:
-        match verdicts.get(robot.id):
-            case Undecided(reason):
-                return MissionOutcome("undecided", f"{robot.id}: {reason}"), (robot.id,)
-            case Localised() as claim if (vague := inaccuracy(claim, scenario.mission)) is not None:
-                return MissionOutcome("undecided", f"{robot.id} {vague}"), (robot.id,)
-    if open_cases:
-        what = f"max_ticks: {', '.join(open_cases)} not localised by then"
-        return MissionOutcome("undecided", what), open_cases
-    for death in scenario.deaths:
-        if death.robot not in verdicts:
-            return MissionOutcome("undecided", _dead(death)), (death.robot,)
-    return MissionOutcome("localised"), ()
+def _shortfalls(scenario: Scenario, verdicts: Mapping[str, Verdict]) -> dict[str, Cause]:
+    """Return why robots are not localised by their verdicts, in the order of `scenario`."""
+    found = [shortfall(one.id, verdicts.get(one.id), scenario.mission, one.peer) for one in scenario.robots]
+    return {one.robots[0]: one for one in found if one is not None}
 
 
 def _others_not_localised(
     scenario: Scenario, verdicts: Mapping[str, Verdict], tick: int, named: Sequence[str]
-) -> list[str]:
-    """Return clauses about the robots of a group, without those `named`, that are dead or not localised.
+) -> list[Cause]:
+    """Return causes of the robots of a group, without those `named`, that are dead or not localised.
 
     A dead robot that is localised may be the one that was to find the others.
     """
     dead = [one for one in scenario.deaths if one.tick <= tick]
-    found = [_dead(one) for one in dead if one.robot not in named]
     known = {*named, *[one.robot for one in dead]}
     left = [robot for robot in not_localised(scenario, verdicts, tick) if robot not in known]
-    if left:
-        found.append(either(left))
-    return found
+    found = [_dead(one) for one in dead if one.robot not in named]
+    return [*found, Cause("others", tuple(left))] if left else found
 
 
-def either(robots: Sequence[str]) -> str:
-    """Return the clause that `robots` are not localised either, which names some of them."""
-    more = len(robots) - MOST_NAMED
-    names = ", ".join(robots[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
-    return f"{names} {'is' if len(robots) == 1 else 'are'} not localised either"
+def _dead(death: Death) -> Cause:
+    return Cause("dead", (death.robot,), (death.tick,))
 
 
-def _dead(death: Death) -> str:
-    return f"{death.robot} is dead from tick {death.tick} on"
-
-
-def not_localised(scenario: Scenario, verdicts: Mapping[str, Verdict], tick: int) -> dict[str, str]:
-    """Return the reason for each robot that is not localised at `tick`, in the order of `scenario`."""
-    found = {}
-    deaths = {one.robot: one for one in scenario.deaths if one.tick <= tick}
-    for robot in scenario.robots:
-        match verdicts.get(robot.id):
-            case Undecided(reason):
-                found[robot.id] = reason
-            case Inconsistent(contradiction):
-                found[robot.id] = f"its peer reports {contradiction}"
-            case Localised() as claim:
-                if (vague := inaccuracy(claim, scenario.mission)) is not None:
-                    found[robot.id] = f"it {vague}"
-            case None if robot.id in deaths:
-                found[robot.id] = f"it is dead from tick {deaths[robot.id].tick} on"
-            case None:
-                found[robot.id] = "it has no result by then"
-    return found
+def not_localised(scenario: Scenario, verdicts: Mapping[str, Verdict], tick: int) -> dict[str, Cause]:
+    """Return the cause for each robot that is not localised at `tick`, in the order of `scenario`."""
+    found = _shortfalls(scenario, verdicts)
+    dead = {one.robot: _dead(one) for one in scenario.deaths if one.tick <= tick}
+    missing = [one.id for one in scenario.robots if one.id not in verdicts]
+    found |= {robot: dead.get(robot, Cause("max-ticks", (robot,))) for robot in missing}
+    return {one.id: found[one.id] for one in scenario.robots if one.id in found}

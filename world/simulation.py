@@ -11,7 +11,6 @@ from protocol.journal.journal_file import CorruptJournal, Sink
 from protocol.journal.resume import ReplayMismatch, Retrace
 from protocol.messages import Command, DeadlineMissed, FinalReport, MissionEnd, Observation
 from protocol.wire import encode
-from world.referee import MissionOutcome
 from world.scenario import Scenario
 from world.tick import advance, observations, release
 from world.world_journal import world_history
@@ -83,7 +82,7 @@ class Simulation:
         if self.missed or len(commands) < len(self.world.scenario.robots):
             self._note_missed(commands)
         onward = advance(self.world, commands)
-        if isinstance(onward, MissionOutcome):
+        if isinstance(onward, MissionEnd):
             self.last_answered = tuple(commands)
             return self.end(onward)
         self.world = onward
@@ -96,12 +95,12 @@ class Simulation:
             else:
                 self.missed.setdefault(observation.robot, []).append(observation)
 
-    def end(self, mission_outcome: MissionOutcome) -> MissionEnd:
-        """End the run with this outcome, and journal and return the MissionEnd. Raises CannotRecord."""
-        self.mission_end = MissionEnd(self.tick, mission_outcome.outcome, mission_outcome.reason)
+    def end(self, end: MissionEnd) -> MissionEnd:
+        """End the run with `end`, and journal and return it. Raises CannotRecord."""
+        self.mission_end = end
         if self._journal is not None:
-            self._journal.write(self._encode(self.mission_end))
-        return self.mission_end
+            self._journal.write(self._encode(end))
+        return end
 
     def journal_final_reports(self, final_reports: Iterable[FinalReport]) -> None:
         """Journal the FinalReports that are not in the journal yet, in the order of the scenario.
@@ -143,7 +142,7 @@ def _retrace(simulation: Simulation, recording: Retrace) -> None:
         for tick in recorded.ticks:
             simulation.command(tick.commands)
         if recorded.end is not None and simulation.mission_end is None:
-            simulation.end(MissionOutcome(recorded.end.outcome, recorded.end.reason))
+            simulation.end(recorded.end)
         simulation.journal_final_reports(recorded.final_reports.values())
     except ReplayMismatch:
         raise CorruptJournal(

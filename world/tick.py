@@ -7,10 +7,10 @@ from typing import Any
 
 import msgspec
 
-from protocol.messages import Command, Contact, Localised, LostReport, Observation, Verdict
+from protocol.messages import Command, Contact, Localised, LostReport, MissionEnd, Observation, Verdict
 from protocol.motion import REST, Controls, Pose
 from world.channel import LinkState, idle_link_state, link_faults, next_link_state
-from world.referee import MissionOutcome, decide_outcome
+from world.referee import decide_outcome
 from world.scenario import Scenario
 from world.sensors import Mutual, anchor_ranges, executed, in_contact, odometry
 from world.truth import Truth, limited_controls
@@ -94,8 +94,8 @@ def observations(world: World) -> list[Observation]:
     ]
 
 
-def advance(world: World, commands: Mapping[str, Command]) -> World | MissionOutcome:
-    """Return the world one tick later, or the outcome of the run.
+def advance(world: World, commands: Mapping[str, Command]) -> World | MissionEnd:
+    """Return the world one tick later, or the end of the run.
 
     A robot without a Command rests, and so does a dead one.
     """
@@ -114,9 +114,9 @@ def advance(world: World, commands: Mapping[str, Command]) -> World | MissionOut
         if isinstance(verdict, Localised) and verdict is not world.verdicts.get(robot.id):
             claimed = claimed | {robot.id: truth.poses[place]}
     if verdicts or truth.tick >= scenario.max_ticks:
-        mission_outcome = decide_outcome(scenario, truth, verdicts, claimed)
-        if mission_outcome is not None:
-            return mission_outcome
+        end = decide_outcome(scenario, truth, verdicts, claimed)
+        if end is not None:
+            return end
     moved = truth.moved(driven, scenario.mission.period)
     contacts = in_contact(moved, scenario, world.pairs)
     links = _carried(world.links, scenario, moved, contacts)

@@ -11,7 +11,6 @@ from protocol.journal.journal_file import CorruptJournal, UnexpectedFrame, take_
 from protocol.messages import Command, DeadlineMissed, Environment, FinalReport, MissionEnd
 from protocol.mission import Role
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
-from world.referee import MissionOutcome
 from world.scenario import Scenario
 from world.tick import World, advance, release
 from world.truth import Truth
@@ -45,8 +44,8 @@ class WorldHistory(msgspec.Struct, frozen=True):
     """The complete ticks."""
     ahead: World | None
     """The state at the tick after these; None if the last of them ended the run."""
-    mission_outcome: MissionOutcome | None
-    """The recomputed outcome; None if the Commands did not end the run."""
+    recomputed_end: MissionEnd | None
+    """The recomputed end; None if the Commands did not end the run."""
     end: MissionEnd | None = None
     """The recorded end; None if the journal breaks off before."""
     final_reports: dict[str, FinalReport] = {}
@@ -91,8 +90,8 @@ class WorldJournalReading:
         """The messages that have been read, in order."""
         self.ticks: list[Tick] = []
         """The complete ticks."""
-        self.mission_outcome: MissionOutcome | None = None
-        """The recomputed outcome."""
+        self.recomputed_end: MissionEnd | None = None
+        """The recomputed end."""
         self.end: MissionEnd | None = None
         """The recorded end."""
         self.final_reports: dict[str, FinalReport] = {}
@@ -120,7 +119,7 @@ class WorldJournalReading:
         match message:
             case Command() | DeadlineMissed() if (
                 self.end is None
-                and self.mission_outcome is None
+                and self.recomputed_end is None
                 and message.tick == tick
                 and message.robot == self._ids[len(self._answers)]
             ):
@@ -169,8 +168,8 @@ class WorldJournalReading:
         self.ticks.append(Tick(world, commands))
         self._answers = {}
         onward = advance(world, commands)
-        if isinstance(onward, MissionOutcome):
-            self.mission_outcome = onward
+        if isinstance(onward, MissionEnd):
+            self.recomputed_end = onward
         else:
             self.world = onward
 
@@ -182,8 +181,8 @@ class WorldJournalReading:
             self.environment,
             self.world.scenario,
             tuple(self.ticks),
-            self.world if self.mission_outcome is None else None,
-            self.mission_outcome,
+            self.world if self.recomputed_end is None else None,
+            self.recomputed_end,
             self.end,
             dict(self.final_reports),
             self.unexpected,

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from msgspec.structs import astuple
-
 from agent.estimation.mutual_ranges import ELSEWHERE
 from agent.planning.planner import Planner
 from agent.process.agent_journal import AgentHistory
 from compose.audit.findings import Checks, Violation, between
 from compose.launch.planner_loader import planner_of
+from compose.recording.reasons import of_it, reason_for
 from compose.recording.run import Run
 from protocol.messages import MissionEnd, Report
 from protocol.motion import Pose, travelled
@@ -29,10 +28,9 @@ def claim(run: Run) -> Checks:
         if standing is None:
             continue
         tick, made = standing
-        why = mistake(made, run.ticks[tick].world.truth.poses[place], mission)
-        yield None if why is None else Violation("claim", tick, placed.id, f"it claims a pose that is {why}")
-        vague = inaccuracy(made, mission)
-        yield None if vague is None else Violation("claim", tick, placed.id, f"it {vague}")
+        truth = run.ticks[tick].world.truth.poses[place]
+        for why in (mistake(placed.id, made, truth, mission), inaccuracy(placed.id, made, mission)):
+            yield None if why is None else Violation("claim", tick, placed.id, of_it(why))
         agent = run.agents.get(placed.id)
         if agent is not None and tick < len(agent.steps) and agent.steps[tick].command is not None:
             yield _redundant(run, placed, agent, tick)
@@ -118,10 +116,9 @@ def outcome(run: Run) -> Checks:
 
     A run that failed before the referee had an outcome is accepted.
     """
-    end, mission_outcome = run.end, run.history.mission_outcome
+    end, expected = run.end, run.history.recomputed_end
     if end is None:
         return
-    expected = MissionEnd(end.tick, *astuple(mission_outcome)) if mission_outcome is not None else None
     if expected is not None and end != expected:
         what = f"it ends {_ending(end)}, expected {_ending(expected)}"
         yield Violation("claim", end.tick, None, what, between(end, expected))
@@ -132,4 +129,5 @@ def outcome(run: Run) -> Checks:
 
 
 def _ending(end: MissionEnd) -> str:
-    return f"{end.outcome} ({end.reason})" if end.reason else end.outcome
+    why = reason_for(end)
+    return f"{end.outcome} ({why})" if why else end.outcome

@@ -22,8 +22,8 @@ from compose.errors import ENDED, UserError, status_of
 from compose.launch import planner_loader
 from compose.launch.class_loader import trust
 from compose.launch.signals import stop_by_signal
+from compose.recording.reasons import ended
 from compose.recording.recording_files import agent_journal
-from compose.recording.run import ended
 from compose.scenario import kills
 from compose.terminal.outcome import reopened
 from compose.terminal.text_width import tell
@@ -60,7 +60,7 @@ def main(options: argparse.Namespace) -> int:
             raise UserError(str(error)) from None
         if options.launched:
             return ENDED
-        tell(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
+        tell(f"{options.id}: {ended(end, end.tick)}")
         return status_of(end.outcome)
 
     return participate(f"tandem agent {options.id}", take_part, (NoWorld,), launched=options.launched)

@@ -21,8 +21,8 @@ from compose.launch.processes import free_endpoint
 from compose.launch.signals import stop_by_signal
 from compose.launch.supervisor import STOP_S, ChildFailed, Supervisor
 from compose.network import reach
+from compose.recording.reasons import ended
 from compose.recording.recording_files import folder_for
-from compose.recording.run import ended
 from compose.scenario.run_settings import check_rate
 from compose.terminal.text_width import tell
 from protocol.messages import Localised, MissionEnd, RobotConfig
@@ -95,7 +95,7 @@ def main(options: argparse.Namespace) -> int:
             advice = f"; a lower --rate, such as {rate / 2:g}, leaves more time" if field.missed else ""
             missed = f"missed the deadline in {field.missed} of {end.tick + 1} ticks"
             tell(f"{options.id}: {missed}{advice}")
-        tell(f"{options.id}: {ended(end.outcome, end.tick, end.reason)}")
+        tell(f"{options.id}: {ended(end, end.tick)}")
         return status_of(end.outcome)
 
     return participate(f"tandem robot {options.id}", take_part, (NoStart, ChildFailed))

@@ -30,7 +30,7 @@ from compose.figures.sheet import (
 )
 from compose.figures.style import INK, PALE, SCREEN, Medium
 from compose.figures.trajectory import draw_plane, window
-from compose.recording.run import ended
+from compose.recording.reasons import ended
 from compose.view.colours import COLOURS
 from compose.view.outlines import OUTLINE_SIGMAS, Point, Reach, outline
 from protocol.messages import Estimate
@@ -105,7 +105,7 @@ def _top(sheet: Sheet, pair: PairRecord, role: Role) -> None:
 def _title(pair: PairRecord, role: Role) -> list[str]:
     """Return the title: the robot, the outcome of the mission, and the robot's claim."""
     one, scenario, ending = pair.robot(role), pair.run.scenario, pair.run.end
-    end = "the recording breaks off" if ending is None else ended(ending.outcome, ending.tick, ending.reason)
+    end = "the recording breaks off" if ending is None else ended(ending, ending.tick)
     first = f"Robot {one.id} of {scenario.name}, seed {scenario.seed}: {end}"
     if one.claim is None:
         return [first, "The robot claims no pose."]

@@ -28,7 +28,6 @@ from protocol.messages import (
 )
 from protocol.wire import EncodedMessages, encode
 from world.faults import LATEST
-from world.referee import MissionOutcome
 from world.scenario import Scenario
 from world.simulation import Simulation
 from world.world_journal import Tick, WorldHistory
@@ -119,9 +118,8 @@ def played(
         end = simulation.command(commands)
     final_reports: dict[str, FinalReport] = {robot: robots[robot].final_report(end) for robot in ids}
     simulation.journal_final_reports(final_reports.values())
-    mission_outcome = MissionOutcome(end.outcome, end.reason)
     history = WorldHistory(
-        environment.of_world(), scenario, tuple(ticks), None, mission_outcome, end, final_reports
+        environment.of_world(), scenario, tuple(ticks), None, end, end, final_reports
     )
     return Run(history, claim_estimates=claims)
 

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 import msgspec
 
-from compose.recording.run import Run, broken_off, ended
+from compose.recording.reasons import ended, outcome_after
+from compose.recording.run import Run
 
 
 class Comparison(msgspec.Struct, frozen=True):
@@ -37,7 +38,7 @@ def comparison(one: Run, other: Run) -> Comparison:
 
 def _outcome(run: Run) -> str:
     end = run.end
-    return broken_off(run.length - 1) if end is None else ended(end.outcome, end.tick, None)
+    return ended(None, run.length - 1) if end is None else outcome_after(end.outcome, end.tick, None)
 
 
 def _compared(one: Run, other: Run) -> Iterator[str]:

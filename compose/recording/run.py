@@ -13,6 +13,7 @@ from msgspec.structs import replace
 
 from compose.recording.claim import Claim, claim, truth_held
 from compose.recording.kills_file import Killed, kills_in
+from compose.recording.reasons import ended
 from compose.recording.recording_files import (
     WORLD_JOURNAL,
     JournalFile,
@@ -31,12 +32,10 @@ from protocol.messages import (
     Localised,
     MissionEnd,
     Observation,
-    Outcome,
     RobotConfig,
     Verdict,
 )
 from protocol.motion import Controls, Pose
-from protocol.output import one_line
 from world import world_journal
 from world.scenario import Scenario
 from world.tick import observations, verdicts_after
@@ -301,8 +300,7 @@ class Run(msgspec.Struct, frozen=True, dict=True):
         """
         if self.world is not None:
             one, last, end = self.world.scenario, len(self.world.ticks) - 1, self.world.end
-            how = ended(end.outcome, last, end.reason) if end is not None else broken_off(last)
-            return f"{one.name}, seed {one.seed}, {one.planner_name}: {how}"
+            return f"{one.name}, seed {one.seed}, {one.planner_name}: {ended(end, last)}"
         agents = {robot: self.agents[robot] for robot in pair}
         planner_name = next(iter(agents.values())).config.planner_name
         return f"{' and '.join(agents)} in hardware mode, {planner_name}: {_outcome(agents)}"
@@ -316,24 +314,12 @@ def nearest_contact(contacts: Sequence[Contact]) -> Contact | None:
 def _outcome(agents: Mapping[str, AgentHistory]) -> str:
     """Return the outcome that each robot recorded, in one line; if all agree, once."""
     ends = {
-        robot: ended(agent.end.outcome, agent.end.tick, agent.end.reason)
-        if agent.end is not None
-        else broken_off(len(agent.steps) - 1)
+        robot: ended(agent.end, agent.end.tick if agent.end is not None else len(agent.steps) - 1)
         for robot, agent in agents.items()
     }
     if len(set(ends.values())) == 1:
         return next(iter(ends.values()))
     return "; ".join([f"{robot}: {end}" for robot, end in ends.items()])
-
-
-def broken_off(ticks: int) -> str:
-    """Return the outcome of a run without an end, in one line."""
-    return f"the recording breaks off after {max(0, ticks)} ticks"
-
-
-def ended(outcome: Outcome, ticks: int, reason: str | None) -> str:
-    """Return the outcome of a run that ended, in one line."""
-    return f"{outcome} after {ticks} ticks{f' ({one_line(reason)})' if reason else ''}"
 
 
 def read(folder: Path, *, audited: bool = False) -> Run:

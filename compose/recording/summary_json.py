@@ -20,7 +20,8 @@ from compose.recording.group_localisation import (
     meeting_results,
     search_results,
 )
-from compose.recording.run import Run, ended
+from compose.recording.reasons import of_it, outcome_after, reason_for
+from compose.recording.run import Run
 from compose.recording.ticks_csv import ticks_csv
 from protocol import files
 from protocol.messages import FinalReport
@@ -42,7 +43,7 @@ def summary(run: Run, mode: Mode | None, wall_s: float | None) -> dict[str, Any]
         "seed": scenario.seed,
         "mode": mode,
         "outcome": run.end.outcome if run.end is not None else "failed",
-        "reason": run.end.reason if run.end is not None else "the recording breaks off",
+        "reason": reason_for(run.end) if run.end is not None else "the recording breaks off",
         "ticks": ticks[-1].truth.tick if ticks else 0,
         "wall_s": wall_s,
         "first_contact_tick": first_contact(run),
@@ -75,12 +76,13 @@ def _group(run: Run) -> dict[str, Any]:
     meetings, searches = list(meeting_results(run)), list(search_results(run))
     results: list[MeetingResult | SearchResult] = [*meetings, *searches]
     ticks = [one.localised_tick for one in results]
+    left = not_localised(run.scenario, run.verdicts(), run.length - 1)
     return {
         "bound_s": max(one.bound_s for one in results),
         "bound_ticks": max(one.bound_ticks for one in results),
         "localised_tick": max(tick for tick in ticks if tick is not None) if None not in ticks else None,
         "corrected_bounds": msgspec.to_builtins(list(corrected_bounds(run))),
-        "not_localised": not_localised(run.scenario, run.verdicts(), run.length - 1),
+        "not_localised": {robot: of_it(cause) for robot, cause in left.items()},
         "deaths": {one.robot: one.tick for one in run.scenario.deaths},
         "meetings": msgspec.to_builtins(meetings),
         **({"without_anchor": msgspec.to_builtins(searches)} if searches else {}),
@@ -155,4 +157,4 @@ def leave(run: Run, summary: Mapping[str, Any], folder: Path) -> None:
 
 def outcome_line(summary: Mapping[str, Any]) -> str:
     """Return the outcome in one line."""
-    return ended(summary["outcome"], summary["ticks"], summary["reason"])
+    return outcome_after(summary["outcome"], summary["ticks"], summary["reason"])

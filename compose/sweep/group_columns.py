@@ -64,7 +64,7 @@ def group_columns(run: Run) -> GroupColumns | None:
 def _is_right(run: Run, robot: str, claim: Claim) -> bool:
     """Return whether `claim` of `robot` is right, by the tolerances of the referee."""
     truth = run.truth(robot)[claim.tick]
-    return mistake(Localised(claim.pose, claim.covariance), truth, run.scenario.mission) is None
+    return mistake(robot, Localised(claim.pose, claim.covariance), truth, run.scenario.mission) is None
 
 
 def _met_and_found(run: Run, honest: list[str]) -> tuple[int, int]:

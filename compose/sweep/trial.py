@@ -12,6 +12,7 @@ from compose.audit.findings import Findings
 from compose.recording.claim import Claim
 from compose.recording.closest_approach import nearest
 from compose.recording.group_localisation import TICK_ROUNDING
+from compose.recording.reasons import reason_for
 from compose.recording.run import Run
 from compose.recording.summary_json import first_contact
 from compose.scenario.kills import Kill
@@ -240,7 +241,7 @@ def row(trial: Trial, run: Run, wall_s: float, findings: Findings | None = None)
         trial=trial.number,
         seed=scenario.seed,
         outcome=end.outcome,
-        reason=end.reason,
+        reason=reason_for(end),
         ticks=end.tick,
         first_contact_tick=first_contact(run),
         orbiting_tick=_last([orbiting for orbiting, _ in encounters]),

@@ -9,10 +9,11 @@ from typing import Literal
 
 import msgspec
 
+from compose.recording.reasons import plain_reason
 from compose.recording.run_setup import RobotSetup, RunSetup
 from compose.view.deliveries import Passage, contact_of
 from compose.view.run_data import TickData
-from compose.view.words import doing, end_reason
+from compose.view.words import doing
 from protocol.messages import Command, Inconsistent, Localised, MissionEnd
 from protocol.motion import wrap
 
@@ -23,7 +24,7 @@ Kind = Literal[
 ]  # fmt: skip
 
 
-class Event(msgspec.Struct, frozen=True):
+class Event(msgspec.Struct, frozen=True, omit_defaults=True):
     """One event of a tick."""
 
     tick: int
@@ -32,6 +33,13 @@ class Event(msgspec.Struct, frozen=True):
     """The robot concerned; None for the world or for all robots."""
     text: str
     """The event as a sentence."""
+    truth: str | None = None
+    """What the ground truth adds to it, for views that show it; None if nothing."""
+
+    @property
+    def whole(self) -> str:
+        """The sentence with what the ground truth adds to it."""
+        return self.text if self.truth is None else f"{self.text}; {self.truth}"
 
 
 def events(
@@ -53,7 +61,8 @@ def events(
         yield from _believing(robot_setup, before, now)
     yield from _radio(now.tick, passages)
     if end is not None and end.tick == now.tick:
-        why = f" ({end_reason(end.reason)})" if end.reason else ""
+        plain = plain_reason(end)
+        why = f" ({plain})" if plain else ""
         yield Event(now.tick, "end", None, f"The mission ends: {end.outcome}{why}")
 
 
@@ -147,10 +156,10 @@ def _verdict(robot_setup: RobotSetup, command: Command, now: TickData) -> Event:
         case Localised(pose):
             x, y, heading = pose.x, pose.y, wrap(pose.heading)
             text = f"{robot} claims to be at ({x:.2f}, {y:.2f}) m, heading {heading:+.2f} rad"
-            truth = now.truth.get(robot)
+            error, truth = None, now.truth.get(robot)
             if truth is not None:
-                text += f"; the error is {metres(math.hypot(x - truth.x, y - truth.y))}"
-            return Event(now.tick, "claim", robot, text)
+                error = f"the error is {metres(math.hypot(x - truth.x, y - truth.y))}"
+            return Event(now.tick, "claim", robot, text, error)
         case verdict:
             kind: Kind = "inconsistent" if isinstance(verdict, Inconsistent) else "undecided"
             return Event(now.tick, kind, robot, doing(robot_setup, command.phase, command.task, verdict))

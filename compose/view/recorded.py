@@ -170,7 +170,7 @@ class Journals:
             self.setup = of_scenario(reading.world.scenario, self._mode())
         for tick in reading.ticks[first_new:]:
             self.known.add_tick(tick)
-        if reading.mission_outcome is None:
+        if reading.recomputed_end is None:
             self.known.add_world(reading.world)
         if reading.end is not None:
             self.known.conclude(reading.end)

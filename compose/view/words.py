@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-
 from compose.recording.run_setup import RobotSetup
 from protocol.messages import Inconsistent, Undecided, Verdict
 
@@ -44,25 +42,6 @@ TRAVELLING = "travelling"
 """The state of a robot that drives to another one of its group."""
 WAITING = "{robot} waits beside its anchor until {peer} comes into range"
 """The sentence of the state "orbiting" of a robot whose plan has no speed."""
-
-
-TIME_IS_UP = re.compile(r"max_ticks: (.+?) not localised by then(.*)")
-"""The reason of a mission that ends at its largest number of ticks, as the world writes it."""
-MOST_NAMES = 4
-"""The largest number of robots that a sentence names."""
-
-
-def end_reason(reason: str) -> str:
-    """Return the reason of a mission's end as a clause without the names of fields."""
-    found = TIME_IS_UP.fullmatch(reason)
-    if found is None:
-        return reason
-    robots = found[1].split(", ")
-    if len(robots) > MOST_NAMES:
-        names = f"{len(robots)} robots"
-    else:
-        names = " and ".join([", ".join(robots[:-1]), robots[-1]] if len(robots) > 1 else robots)
-    return f"the time is up, and {names} {'are' if len(robots) > 1 else 'is'} not localised{found[2]}"
 
 
 def doing(robot_setup: RobotSetup, phase: int, state: str, verdict: Verdict | None) -> str:

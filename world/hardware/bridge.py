@@ -21,6 +21,7 @@ import zenoh
 
 from protocol.journal.journal_file import Sink
 from protocol.messages import (
+    Cause,
     Command,
     FinalReport,
     MissionEnd,
@@ -190,7 +191,7 @@ class Field:
             while end is None:
                 end = self._play_tick()
         except DriverFailed as failure:
-            end = MissionEnd(max(self._tick, 0), "failed", f"{self._id}'s driver: {failure}")
+            end = self._failed(f"{self._id}'s driver: {failure}")
         finally:
             self._stop()
         if not self._is_end_recorded:
@@ -269,8 +270,12 @@ class Field:
             self._take(self._inbox.next(max(until, self._next) - now))
         self._take_waiting()
         if self._unanswered and now - self._answered > self._timeout:
-            return MissionEnd(tick, "failed", f"no answer from {self._id}'s agent for {self._timeout:g} s")
+            return self._failed(f"no answer from {self._id}'s agent for {self._timeout:g} s")
         return self._ending.after(tick, command)
+
+    def _failed(self, what: str) -> MissionEnd:
+        """Return the end of a mission that has failed by `what`."""
+        return MissionEnd(max(self._tick, 0), "failed", (Cause("failed", text=what),))
 
     def _measured(self, tick: int) -> list[bytes]:
         """Return the frame of the Observation of `tick`, and that of its mark if it has one.

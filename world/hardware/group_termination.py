@@ -17,21 +17,19 @@ import math
 import time
 
 from protocol.messages import (
+    Cause,
     Command,
-    Inconsistent,
-    Localised,
     MissionEnd,
     Report,
     RobotConfig,
     TickStart,
-    Undecided,
     Verdict,
 )
 from protocol.sweep_ticks import straight_ticks, sweepers_of_part, ticks_of_parts
 from world.hardware.termination import LAST_WORDS, Termination
-from world.referee import either, inaccuracy
+from world.referee import main_cause, mission_end, shortfall
 
-LEAVING_TICKS = 16
+PARTING_TICKS = 16
 """A bound on the ticks from the end of a meeting until its robots leave for the next one."""
 
 
@@ -122,39 +120,20 @@ class GroupEnding(Termination):
         return late > self._plan or (late > 0 and self._visits and self._rests)
 
     def _end(self, tick: int) -> MissionEnd:
-        """Return the MissionEnd. Its reason is that of one robot without a pose, and names the others."""
+        """Return the MissionEnd. Its main cause is that of one robot without a pose; others follow."""
         results = self._results if self.verdict is None else {**self._results, self._me: self.verdict}
-        missing = [robot for robot in self._group if robot not in results and robot != self._me]
-        failed = {robot: why for robot in self._group if (why := self._failure(robot, results.get(robot)))}
-        false = [robot for robot in failed if isinstance(results[robot], Inconsistent)]
-        first = next(iter(false or failed), None)
-        if self.verdict is None:
-            first, reason = self._me, f"max_ticks: {self._me} not localised by then"
-        elif first is not None:
-            reason = failed[first]
-        elif missing:
-            reason = f"{self._me} is localised"
-        else:
-            return MissionEnd(tick, "localised", None)
-        clauses, left = [reason], [robot for robot in failed if robot != first]
-        if left:
-            clauses.append(either(left))
+        missing = tuple([robot for robot in self._group if robot not in results and robot != self._me])
+        shortfalls = [shortfall(robot, results.get(robot), self._mission) for robot in self._group]
+        found = [one for one in shortfalls if one is not None]
+        main = main_cause(found) if self.verdict is not None else Cause("max-ticks", (self._me,))
+        if main is None and missing:
+            main = Cause("waiting", (self._me,))
+        causes = [main] if main is not None else []
+        if left := tuple([robot for one in found if one is not main for robot in one.robots]):
+            causes.append(Cause("others", left))
         if missing:
-            clauses.append(f"no result of {', '.join(missing)} received")
-        return MissionEnd(tick, "inconsistent" if first in false else "undecided", "; ".join(clauses))
-
-    def _failure(self, robot: str, verdict: Verdict | None) -> str | None:
-        """Return why `robot` is not localised by this result; None if it is, or has no result yet."""
-        match verdict:
-            case Undecided(reason):
-                return f"{robot}: {reason}"
-            case Inconsistent(claim):
-                return f"{robot}: its peer reports {claim}"
-            case Localised():
-                vague = inaccuracy(verdict, self._mission)
-                return f"{robot} {vague}" if vague is not None else None
-            case None:
-                return None
+            causes.append(Cause("no-result", missing))
+        return mission_end(tick, causes)
 
 
 def _confirmed_tick(config: RobotConfig) -> int:
@@ -171,6 +150,6 @@ def _sweep_ticks(config: RobotConfig) -> int:
     if config.sweep is None:
         return 0
     mission, widest = config.mission, config.widest_distance
-    once = LEAVING_TICKS + max(ticks_of_parts(config.sweep, mission, widest, len(config.unanchored)))
+    once = PARTING_TICKS + max(ticks_of_parts(config.sweep, mission, widest, len(config.unanchored)))
     tour = len(config.members) * straight_ticks(widest, mission)
     return once + (sweepers_of_part(config.tolerates) - 1) * (once + tour)

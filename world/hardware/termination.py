@@ -12,17 +12,15 @@ import time
 from typing import Protocol
 
 from protocol.messages import (
+    Cause,
     Command,
-    Inconsistent,
-    Localised,
     MissionEnd,
     Report,
     RobotConfig,
     TickStart,
-    Undecided,
     Verdict,
 )
-from world.referee import inaccuracy
+from world.referee import mission_end, shortfall
 
 LAST_WORDS = 4
 """The number of ticks in which a robot still sends Reports after both results are known and acknowledged."""
@@ -94,7 +92,7 @@ class Ending(Termination):
             self.verdict, self._at, self._since = command.verdict, tick, time.monotonic()
         if self.verdict is None:
             if tick >= self._max_ticks:
-                return MissionEnd(tick, "undecided", f"max_ticks: {self._me} not localised by then")
+                return mission_end(tick, [Cause("max-ticks", (self._me,))])
             return None
         if self._known is None and self._peers is not None and self._is_acknowledged:
             self._known = tick
@@ -105,18 +103,11 @@ class Ending(Termination):
         return None
 
     def _end(self, tick: int) -> MissionEnd:
-        for robot, other, verdict in (
-            (self._me, self._peer, self.verdict),
-            (self._peer, self._me, self._peers),
-        ):
-            match verdict:
-                case Inconsistent(claim):
-                    return MissionEnd(tick, "inconsistent", f"{robot}: {other} reports {claim}")
-                case Undecided(reason):
-                    return MissionEnd(tick, "undecided", f"{robot}: {reason}")
-        for robot, verdict in ((self._me, self.verdict), (self._peer, self._peers)):
-            if isinstance(verdict, Localised) and (vague := inaccuracy(verdict, self._mission)) is not None:
-                return MissionEnd(tick, "undecided", f"{robot} {vague}")
-        if isinstance(self._peers, Localised):
-            return MissionEnd(tick, "localised", None)
-        return MissionEnd(tick, "undecided", f"{self._me} is localised; no result of {self._peer} received")
+        results = ((self._me, self.verdict, self._peer), (self._peer, self._peers, self._me))
+        found = [shortfall(robot, verdict, self._mission, other) for robot, verdict, other in results]
+        left = sorted(
+            [one for one in found if one is not None], key=lambda one: one.code in ("position", "heading")
+        )
+        if left or self._peers is not None:
+            return mission_end(tick, left[:1])
+        return mission_end(tick, [Cause("waiting", (self._me,)), Cause("no-result", (self._peer,))])

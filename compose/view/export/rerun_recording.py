@@ -188,7 +188,7 @@ class _Drawing:
                         self._log(f"plots/{robot.id}/{number}", rr.Scalars(known))
         self._draw_contacts(scene)
         for event in scene.events:
-            self._log("log", rr.TextLog(event.text, level=RERUN_LEVELS.get(event.kind, "INFO")))
+            self._log("log", rr.TextLog(event.whole, level=RERUN_LEVELS.get(event.kind, "INFO")))
 
     def _draw_robot(self, robot: RobotSetup, player: Player) -> None:
         pose = player.pose

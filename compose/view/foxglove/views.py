@@ -315,5 +315,5 @@ def _frame(robot_setup: RobotSetup) -> Pose:
 def _line(event: Event, at: fox.Timestamp) -> fox.Log:
     level = FOXGLOVE_LEVELS.get(event.kind, fox.LogLevel.Info)
     return fox.Log(
-        timestamp=at, level=level, message=event.text, name=event.robot or "world", file=event.kind
+        timestamp=at, level=level, message=event.whole, name=event.robot or "world", file=event.kind
     )

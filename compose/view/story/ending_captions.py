@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
+from compose.recording.reasons import plain_reason
 from compose.recording.run_setup import RunSetup
 from compose.view.events import metres
 from compose.view.pair_data import PairData
 from compose.view.run_data import TickData
 from compose.view.story.caption import Caption, attacked, stopped
-from compose.view.words import end_reason
 from protocol.messages import Inconsistent, Localised, MissionEnd, Undecided
 
 MOST_LISTED_LINKS = 2
@@ -49,7 +49,8 @@ def concluding(pair: PairData, ended: MissionEnd | None) -> Iterator[Caption]:
 
 def ending(setup: RunSetup, now: TickData, end: MissionEnd) -> Caption:
     """Return the caption of the end of the mission."""
-    why = f": {stopped(end_reason(end.reason))}" if end.reason else "."
+    plain = plain_reason(end)
+    why = f": {stopped(plain)}" if plain else "."
     errors = _claim_errors(setup, now)
     largest = _off(errors, setup.mission.noise.exact) if errors else None
     silent = _silent_links(setup)

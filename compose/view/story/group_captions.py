@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from compose.recording.reasons import plain_reason
 from compose.recording.run_setup import RunSetup
 from compose.view.deliveries import contact_of
 from compose.view.events import Event, metres
 from compose.view.run_data import TickData
 from compose.view.story.caption import Caption, count_word, faults, stopped
-from compose.view.words import TRAVELLING, end_reason
+from compose.view.words import TRAVELLING
 from protocol.messages import Inconsistent, Localised, MissionEnd, Undecided
 from protocol.motion import travelled
 
@@ -146,7 +147,8 @@ def _end(setup: RunSetup, now: TickData, end: MissionEnd) -> Caption:
     largest = f"The largest error of a localised robot is {size}." if errors else None
     if end.outcome == "localised":
         return Caption("end", f"All {len(setup.robots)} robots are localised.", truth=largest)
-    why = f": {stopped(end_reason(end.reason))}" if end.reason else "."
+    plain = plain_reason(end)
+    why = f": {stopped(plain)}" if plain else "."
     return Caption("end", f"The mission ends: {end.outcome}{why}", truth=largest)
 
 

@@ -17,7 +17,7 @@ from compose.view.web import estimate_page, sweep_page
 from compose.view.web.changed_missions import ChangedMissions
 from compose.view.web.live import Listener
 from compose.view.web.requested_work import RequestedWork
-from compose.view.web.sources import Recorded, WatchedRun
+from compose.view.web.sources import Recorded, WatchedRun, end_of
 from compose.view.web.trials import Trials
 from protocol import files
 from protocol.journal.journal_file import CorruptJournal
@@ -139,7 +139,7 @@ class Site:
                     "robots": len(show.setup.robots) if show.setup is not None else 0,
                     "last": show.head,
                     "live": show.live,
-                    "end": show.known.end,
+                    "end": end_of(show.known.end),
                 }
                 for name, show in self.shows.items()
             ],

@@ -9,16 +9,23 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from compose.recording.reasons import reason_for
 from compose.recording.recording_files import WORLD_JOURNAL, agent_journal, journals_in
 from compose.recording.run_setup import RunSetup
 from compose.view.recorded import Journals
 from compose.view.run_data import RunData
+from protocol.messages import MissionEnd
 from world.scenario import Scenario
 
 REVISIONS_KEPT = 1000
 """The number of stored revisions. A page that has missed more reloads all scenes."""
 UNANSWERED = 5
 """The maximum number of ticks by which the head goes back to a tick with all commands."""
+
+
+def end_of(end: MissionEnd | None) -> dict[str, Any] | None:
+    """Return the end of a mission for the page, as its value in JSON; None before."""
+    return None if end is None else {"tick": end.tick, "outcome": end.outcome, "reason": reason_for(end)}
 
 
 class WatchedRun(ABC):
@@ -82,7 +89,7 @@ class WatchedRun(ABC):
             "first": next(iter(self.known.ticks), 0),
             "live": self.live,
             "has_truth": self.known.has_truth,
-            "end": self.known.end,
+            "end": end_of(self.known.end),
             "farewells": self.known.final_reports,
             "notes": self.notes,
         }

@@ -15,7 +15,7 @@ export function list_missions(root, { shows, network }) {
         thumbnail(one.name), make("b", { textContent: one.name }), " ",
         ...(one.title !== one.name ? [make("span", { textContent: one.title }), " "] : []),
         make("span", { textContent: plural(one.robots, "robot") }), " ",
-        outcome_chip(one.end?.[2], state_of(one.live, one.last, one.end && { tick: one.end[1], outcome: one.end[2] })));
+        outcome_chip(one.end?.outcome, state_of(one.live, one.last, one.end)));
       return make("li", {}, link);
     })),
   );

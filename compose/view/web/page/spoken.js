@@ -1,7 +1,7 @@
 // What screen readers read: the plane in a sentence, and the events of a tick.
 
 import { leads } from "./held.js";
-import { place, rad, without_error } from "./words.js";
+import { place, rad, said } from "./words.js";
 
 const ANNOUNCE_MS = 900;
 const MOST_ROBOTS = 4;
@@ -36,7 +36,7 @@ export class Announcer {
     this.#tick = view.tick;
     this.#at = now;
     const events = scene.events.filter((event) => !view.focus || !event.robot || event.robot === view.focus).slice(0, MOST_EVENTS);
-    const texts = events.map((event) => (view.truth ? event.text : without_error(event.text)));
+    const texts = events.map((event) => said(event, view.truth));
     return texts.length || !passing ? `Tick ${view.tick}. ${texts.join(". ") || activities(store, view)}` : null;
   }
 }

@@ -34,7 +34,7 @@ export class Store {
   get live() { return this.state.live; }
   /** True if the ground truth of any tick is known. */
   get has_truth() { return this.state.has_truth; }
-  get end() { return this.state.end && { tick: this.state.end[1], outcome: this.state.end[2], reason: this.state.end[3] }; }
+  get end() { return this.state.end; }
   /** The first tick that is not loaded; all earlier ticks are. */
   get whole() { return this.#whole; }
 

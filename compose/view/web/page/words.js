@@ -27,8 +27,8 @@ export function probability(value) {
   return `${(100 * value).toFixed(value < 0.1 ? 1 : 0)} %`;
 }
 
-/** Removes the position error from an event's text, for views that hide the ground truth. */
-export const without_error = (text) => text.replace(/; the error is .*$/, "");
+/** Returns the text of an event, with what the ground truth adds if it is `shown`. */
+export const said = ({ text, truth }, shown) => (shown && truth ? `${text}; ${truth}` : text);
 
 export const plural = (count, one) => `${count} ${one}${count === 1 ? "" : "s"}`;
 
