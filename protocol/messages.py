@@ -684,8 +684,8 @@ class GroundTruth(Message, frozen=True):
 class TickStart(Message, frozen=True):
     """The start of tick k at one robot's driver, from which the peer's driver sets its clock.
 
-    A driver also sends it to its own agent, while it waits for other robots and tick k cannot begin yet. In a
-    group, it also contains what ends the mission of others.
+    It also contains what ends the mission of others. A driver also sends it to its own agent, while it waits
+    for other robots and tick k cannot begin yet.
     """
 
     tick: Tick
@@ -693,9 +693,9 @@ class TickStart(Message, frozen=True):
     robot: RobotId
     """The robot of the sending driver."""
     verdict: Verdict | None = None
-    """The final result of a robot of a group; None until it has one, and in a pair."""
+    """The final result of the robot; None until it has one."""
     complete: bool = False
-    """True if a robot of a group has its result, and waits for no other robot."""
+    """True if the robot has its result, and waits for no other robot."""
 
 
 OfRobot = (

@@ -13,7 +13,7 @@ import pytest
 
 from protocol.network import keys
 from protocol.network.inbox import NO_ARRIVAL, Arrival, Inbox, Topic
-from world.hardware import bridge, group_termination, termination
+from world.hardware import bridge, termination
 
 TRANSPORT_S = 1e-4
 """The simulated transport time of a frame, in s."""
@@ -29,7 +29,7 @@ class Stage(Inbox):
         """keys and frames that the bridge has sent"""
         self.answer: Callable[[str, bytes], None] = lambda _key, _frame: None
         self._coming: list[tuple[float, int, Arrival]] = []
-        for module in (bridge, termination, group_termination):
+        for module in (bridge, termination):
             monkeypatch.setattr(module, "time", self)
         monkeypatch.setattr(
             bridge,

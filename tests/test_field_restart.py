@@ -22,7 +22,7 @@ from compose.launch.processes import free_endpoint
 from compose.scenario.scenario_file import load
 from docs.rover import Rover
 from protocol.journal.journal_file import CorruptJournal
-from protocol.messages import Localised, Observation, Report
+from protocol.messages import Localised, Observation, TickStart
 from protocol.motion import ORIGIN, REST
 from protocol.network import keys, session
 from protocol.network.inbox import Inbox
@@ -119,19 +119,20 @@ def test_a_killed_robot_resumes_from_its_journal(pair: Pair, killed: str, tmp_pa
 
 
 @pytest.mark.long
-def test_a_report_before_tick_0_does_not_keep_a_killed_robot_from_resuming(tmp_path: Path) -> None:
+def test_a_result_before_tick_0_does_not_keep_a_killed_robot_from_resuming(tmp_path: Path) -> None:
     """The certificate of the peer suffices to send it. The malformed one after it shows that it was read."""
     endpoint = free_endpoint()
     words = ("robot", "a", "--mission", "paper-1", "--driver", "docs.rover:Rover", "--rate", "10")
     robot = (*words, "--listen", endpoint, "--out", tmp_path)
-    claim = Report(0, "b", 1, "straight", ORIGIN, 0, 0, (), 0, (), 0, 0, Localised(ORIGIN))
+    claim = TickStart(0, "b", Localised(ORIGIN), complete=True)
     with TandemProcess(*robot) as first:
         first.until_prints("a: in run paper-1, waiting for its peer")
         with stranger_at(endpoint) as link:
-            peer = session.publisher(link, keys.report("paper-1", "b", "a"))
+            key = keys.tick_start("paper-1", "b")
+            peer = session.publisher(link, key)
             for frame in (encode(claim), b"malformed"):
                 peer.put(frame)
-            first.until_prints("tandem robot a: refused a frame on tandem/paper-1/robot/b/to/a")
+            first.until_prints(f"tandem robot a: refused a frame on {key}")
         first.tell(SIGKILL)
         first.ended()
     again = tandem(*robot, "--connect-timeout", "2")

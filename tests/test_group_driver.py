@@ -37,9 +37,8 @@ from tests.test_group_field import FAR
 from world.hardware.bridge import Field, NoStart
 from world.hardware.driver import THINKING, Reading
 from world.hardware.driver_journal import driver_history
-from world.hardware.group_termination import GroupEnding
 from world.hardware.measurements import InvalidReading, observation_frame
-from world.hardware.termination import LAST_WORDS
+from world.hardware.termination import LAST_WORDS, Ending
 from world.hardware.tick_source import UNHEARD, TickSource
 
 TICK_S = (1.0 + THINKING) * MANOEUVRE_S
@@ -205,11 +204,11 @@ def result(robot: str, verdict: Verdict | None = LOCALISED, *, complete: bool = 
 
 
 @pytest.fixture
-def ending(stage: Stage) -> GroupEnding:  # noqa: ARG001  # its clock is that of the stage
-    return GroupEnding(config_in_group("a"), 800, 30.0)
+def ending(stage: Stage) -> Ending:  # noqa: ARG001  # its clock is that of the stage
+    return Ending(config_in_group("a"), 800, 30.0)
 
 
-def ends(ending: GroupEnding, ticks: range, *, rests: bool = True) -> MissionEnd | None:
+def ends(ending: Ending, ticks: range, *, rests: bool = True) -> MissionEnd | None:
     """Return the first MissionEnd in `ticks`, in which a is localised."""
     for tick in ticks:
         ending.tick_start(tick)
@@ -220,7 +219,7 @@ def ends(ending: GroupEnding, ticks: range, *, rests: bool = True) -> MissionEnd
 
 
 def test_the_own_result_of_a_robot_does_not_end_its_mission_while_others_have_none(
-    ending: GroupEnding,
+    ending: Ending,
 ) -> None:
     for robot in "bc":
         assert ending.receive(result(robot))
@@ -229,7 +228,7 @@ def test_the_own_result_of_a_robot_does_not_end_its_mission_while_others_have_no
     assert (start.verdict, start.complete) == (LOCALISED, False)
 
 
-def test_the_mission_ends_when_all_know_that_all_have_results(ending: GroupEnding) -> None:
+def test_the_mission_ends_when_all_know_that_all_have_results(ending: Ending) -> None:
     for robot in "bcd":
         ending.receive(result(robot, complete=robot != "c"))
     assert ends(ending, range(10, 50)) is None
@@ -240,7 +239,7 @@ def test_the_mission_ends_when_all_know_that_all_have_results(ending: GroupEndin
 
 
 def test_a_robot_that_is_killed_after_its_result_is_waited_for_until_it_knows_all_others(
-    ending: GroupEnding,
+    ending: Ending,
 ) -> None:
     """It has journaled which results it knows, and needs the rest when it is back."""
     for robot in "bcd":
@@ -250,7 +249,7 @@ def test_a_robot_that_is_killed_after_its_result_is_waited_for_until_it_knows_al
     assert ends(ending, range(50, 90)) == MissionEnd(50 + LAST_WORDS, "localised")
 
 
-def test_a_robot_with_a_result_that_stays_silent_is_not_waited_for(stage: Stage, ending: GroupEnding) -> None:
+def test_a_robot_with_a_result_that_stays_silent_is_not_waited_for(stage: Stage, ending: Ending) -> None:
     for robot in "bcd":
         ending.receive(result(robot, complete=robot != "c"))
     stage.now += 31.0
@@ -260,7 +259,7 @@ def test_a_robot_with_a_result_that_stays_silent_is_not_waited_for(stage: Stage,
 
 
 def test_a_robot_that_catches_up_tells_the_others_that_it_waits_for_none_before_it_ends(
-    ending: GroupEnding,
+    ending: Ending,
 ) -> None:
     """While it catches up, it sends no TickStart."""
     for robot in "bcd":
@@ -283,7 +282,7 @@ PLAN = 164
     ],
 )
 def test_a_silent_robot_is_given_up_after_its_planned_time_and_a_visit(
-    rests: bool, silent_s: float, tick: int, stage: Stage, ending: GroupEnding
+    rests: bool, silent_s: float, tick: int, stage: Stage, ending: Ending
 ) -> None:
     """The timeout is 30 s. The bound of the plan is 163.3 s, at which b is localised."""
     ending.receive(result("c"))
@@ -297,7 +296,7 @@ def test_a_silent_robot_is_given_up_after_its_planned_time_and_a_visit(
 
 
 def test_a_robot_that_has_just_been_localised_does_not_give_up_a_silent_one(
-    stage: Stage, ending: GroupEnding
+    stage: Stage, ending: Ending
 ) -> None:
     """The planner of a may still wait for the verdict of its peer, before it goes to the silent robot."""
     stage.now += 31.0
@@ -319,7 +318,7 @@ def test_a_robot_that_has_just_been_localised_does_not_give_up_a_silent_one(
     ],
 )
 def test_the_outcome_is_that_of_all_robots(
-    verdict: Verdict | None, outcome: str, reason: str | None, ending: GroupEnding
+    verdict: Verdict | None, outcome: str, reason: str | None, ending: Ending
 ) -> None:
     for robot in "bd":
         ending.receive(result(robot))
@@ -346,7 +345,7 @@ def test_the_outcome_is_that_of_all_robots(
     ],
 )
 def test_the_reason_names_all_robots_that_are_not_localised(
-    verdicts: dict[str, Verdict], outcome: str, reason: str, ending: GroupEnding
+    verdicts: dict[str, Verdict], outcome: str, reason: str, ending: Ending
 ) -> None:
     for robot, verdict in verdicts.items():
         ending.receive(result(robot, verdict))
@@ -355,7 +354,7 @@ def test_the_reason_names_all_robots_that_are_not_localised(
     assert (end.outcome, reason_for(end)) == (outcome, reason)
 
 
-def test_a_robot_without_a_result_ends_at_max_ticks(ending: GroupEnding) -> None:
+def test_a_robot_without_a_result_ends_at_max_ticks(ending: Ending) -> None:
     for robot in "bcd":
         ending.receive(result(robot))
     moving = [ending.after(tick, command(tick)) for tick in range(801)]

@@ -32,7 +32,6 @@ from protocol.messages import (
     MAX_BODY_BYTES,
     Inconsistent,
     Localised,
-    MissionEnd,
     Observation,
     Report,
     Undecided,
@@ -48,7 +47,6 @@ from tests.commands import tandem as command
 from tests.groups import group_of, table_of
 from tests.own_planners import Parcel, Wrapping
 from tests.series import series
-from world.hardware.termination import Ending
 
 OWN = "tests.own_planners:Wrapping"
 FAULTS = "loss=0.2, delay=0..2, duplicate=0.1, reorder=0.1, corrupt=0.05"
@@ -375,18 +373,6 @@ def test_the_largest_body_fits_a_frame_with_any_verdict(verdict: Any) -> None:
     assert report.body is not None
     assert len(report.body) == MAX_BODY_BYTES
     assert len(encode(report)) <= MAX_REPORT_BYTES
-
-
-def test_without_a_world_the_mission_ends_by_the_verdicts_around_the_bodies() -> None:
-    config = own("Wrapping").scenario.config("a")
-    ending = Ending(config, 100, 1e9)
-    claim = Localised(Pose(0.0, 0.0, 0.0))
-    sent = AssuredExact().command(first_state())
-    assert ending.after(5, replace(sent, tick=5, verdict=claim)) is None
-    assert ending.receive(Report(6, "b", heard=6, verdict=claim, body=b"\xc0"))
-    found = [ending.after(tick, sent) for tick in range(6, 11)]
-    assert found[-1] == MissionEnd(10, "localised")
-    assert found[:-1] == [None] * 4
 
 
 def test_a_planner_without_reports_of_its_own_sends_an_empty_body() -> None:

@@ -42,8 +42,8 @@ from tests.groups import R, localised, table_of
 from tests.test_audit import kept
 from tests.test_group_runs import audited, with_scenario
 from world.hardware.driver import Reading
-from world.hardware.group_termination import GroupEnding
 from world.hardware.measurements import observation_frame
+from world.hardware.termination import Ending
 from world.scenario import Scenario
 
 AREA = [-4.0, -4.0, 14.0, 12.0]
@@ -294,7 +294,7 @@ def test_a_driver_may_report_the_range_to_an_anchor_that_its_robot_does_not_have
 
 def given_up_after(scenario: Scenario) -> int:
     """Return the tick in which a stops waiting for u, which has sent nothing in hardware mode."""
-    ending = GroupEnding(scenario.config("a"), scenario.max_ticks, 0.0)
+    ending = Ending(scenario.config("a"), scenario.max_ticks, 0.0)
     for robot in "bv":
         ending.receive(TickStart(1, robot, Localised(ORIGIN), complete=True))
     localised = Localised(ORIGIN)

@@ -12,7 +12,7 @@ from compose.launch.in_process import run_mission
 from compose.recording.reasons import reason_for
 from compose.scenario.scenario_file import parse
 from compose.scenario.shipped_files import shipped
-from protocol.messages import Command, Localised, MissionEnd, Report, Undecided
+from protocol.messages import Command, Localised, MissionEnd, TickStart, Undecided
 from protocol.motion import ORIGIN, Covariance
 from tests.series import series
 from tests.steps import planner_of, steps
@@ -131,9 +131,12 @@ def test_a_claim_below_the_required_accuracy_is_not_localised_in_hardware_mode(w
     own, peers = (vague, good) if whose == "its own" else (good, vague)
     for mine, other, outcome in ((own, peers, "undecided"), (good, good, "localised")):
         ending = Ending(config, 100, 30.0)
-        ending.receive(Report(0, "b", 3, "localised", ORIGIN, 0, 0, (), 0, (), 0, 0, other))
+        ending.receive(TickStart(0, "b", other, complete=True))
         command = Command(0, "a", 0.0, 0.0, 3, "localised", mine)
-        ends = [ending.after(tick, command) for tick in range(LAST_WORDS + 1)]
+        ends = []
+        for tick in range(LAST_WORDS + 1):
+            ending.tick_start(tick)
+            ends.append(ending.after(tick, command))
         assert ends[-1] is not None
         assert ends[-1].outcome == outcome
 

@@ -25,7 +25,6 @@ from protocol.messages import (
     Command,
     FinalReport,
     MissionEnd,
-    Report,
     RobotConfig,
     TickStart,
     Verdict,
@@ -35,9 +34,8 @@ from protocol.network.inbox import NO_ARRIVAL, Arrival, Inbox
 from protocol.wire import MAX_REPORT_BYTES, encode
 from world.hardware.driver import THINKING, Driver
 from world.hardware.driver_journal import DriverHistory
-from world.hardware.group_termination import GroupEnding
 from world.hardware.measurements import InvalidReading, mark_frames, observation_frame
-from world.hardware.termination import Ending, Termination
+from world.hardware.termination import Ending
 from world.hardware.tick_source import UNHEARD, TickSource
 
 MISSION_END_REPEAT_S = 0.25
@@ -56,7 +54,7 @@ Other robots close their links at the same time. Seldom, on a busy machine, Zeno
 more, without a limit of time.
 """
 ASTRAY = 64
-"""The maximum number of ticks by which a TickStart or Report may differ from the tick of its receiver.
+"""The maximum number of ticks by which a TickStart may differ from the tick of its receiver.
 
 One of a much earlier tick was sent by a robot that has been restarted without its journal.
 """
@@ -108,11 +106,7 @@ class Field:
         self._ended: Callable[[], None] = lambda: None
         self._journal = journal
         self._max_ticks = max_ticks
-        self._ending: Termination = (
-            GroupEnding(config, max_ticks, self._timeout)
-            if config.members
-            else Ending(config, max_ticks, self._timeout)
-        )
+        self._ending = Ending(config, max_ticks, self._timeout)
         self._source = TickSource(config, self._tick_s)
         self._end: MissionEnd | None = None
         """The end of the mission that follows from the journal; None before."""
@@ -171,8 +165,6 @@ class Field:
         session.subscribe(link, keys.command(run, me), inbox, "command")
         for robot in self._others:
             session.subscribe(link, keys.tick_start(run, robot), inbox, "tick-start")
-        for robot in self._ending.reporters:
-            session.subscribe(link, keys.report(run, robot, me), inbox, "report")
         session.watch_liveliness(link, keys.robot_alive(run, "*"), inbox)
         session.answer(link, keys.config(run, me), lambda *_: self._config)
         self._token = session.show_alive(link, keys.world_alive(run))
@@ -333,8 +325,6 @@ class Field:
                 return self._on_command(arrival)
             case "tick-start":
                 self._on_tick_start(arrival)
-            case "report":
-                self._on_report(arrival)
             case "alive":
                 self._alive.add(arrival.source.robot)
                 if arrival.source.robot == self._id:
@@ -390,23 +380,11 @@ class Field:
         self._astray = ASTRAY
         self._next = now + left * self._tick_s
 
-    def _on_report(self, arrival: Arrival) -> None:
-        """Use a Report for the end of the mission. One before tick 0 is dropped: they are cumulative."""
-        report: Report | None = self._inbox.accepted(arrival, Report, MAX_REPORT_BYTES)
-        if report is None or self._tick < 0:
-            return
-        if not self._is_current(report.tick):
-            self._inbox.refuse(arrival, f"it is of tick {report.tick}, this is tick {self._tick}")
-        elif report.heard > self._tick:
-            self._inbox.refuse(arrival, f"it acknowledges tick {report.heard}, this is tick {self._tick}")
-        else:
-            self._use(report, arrival.frame)
-
     def _is_current(self, tick: int) -> bool:
         """Return whether `tick` is near this robot's, or that of the robots with which it catches up."""
         return abs(tick - max(self._tick, self._ahead)) <= ASTRAY
 
-    def _use(self, message: Report | TickStart, frame: bytes) -> None:
+    def _use(self, message: TickStart, frame: bytes) -> None:
         """Use a message of another robot for the end of the mission, and journal it if it changes something.
 
         The mission begins with tick 0, and its journal with the Observation of that tick.

@@ -20,7 +20,6 @@ from protocol.messages import (
     Message,
     MissionEnd,
     Observation,
-    Report,
     RobotConfig,
     TickStart,
 )
@@ -71,7 +70,7 @@ class DrivenTick(msgspec.Struct, frozen=True):
     """The frame of the Observation."""
     command: Command | None = None
     """The Command of the agent; None if it missed the deadline."""
-    received: tuple[Report | TickStart, ...] = ()
+    received: tuple[TickStart, ...] = ()
     """The messages of other robots that affect when the mission ends."""
 
 
@@ -97,7 +96,7 @@ class DriverHistory(msgspec.Struct, frozen=True):
         return self.end is None and start is not None and not start.synced and start.boot != boot()
 
 
-OfDriver = RobotConfig | ProcessStart | Mark | Observation | Command | Report | TickStart | MissionEnd
+OfDriver = RobotConfig | ProcessStart | Mark | Observation | Command | TickStart | MissionEnd
 """The kinds of messages in the journal of a driver."""
 
 
@@ -128,7 +127,7 @@ def driver_history(frames: Sequence[bytes], config: RobotConfig, path: Path) -> 
                 ticks and message.tick == ticks[-1].observation.tick and ticks[-1].command is None
             ):
                 ticks[-1] = msgspec.structs.replace(ticks[-1], command=message)
-            case Report() | TickStart() if ticks:
+            case TickStart() if ticks:
                 ticks[-1] = msgspec.structs.replace(ticks[-1], received=(*ticks[-1].received, message))
             case MissionEnd() if end is None:
                 end = message
