@@ -37,6 +37,10 @@ class UserError(Exception):
     """The exit status of the command that raises it."""
 
 
+class BadOptions(UserError):
+    """The options of a planner are not those that it takes."""
+
+
 class CannotWrite(UserError):
     """A file or a folder cannot be written. The exit status is FAILED if the disk is full."""
 

@@ -167,7 +167,7 @@ def test_missions_are_audited_without_a_violation(name: str) -> None:
     run = tandem.run(table, faults="loss=0.1, delay=0..1")
     assert run.audit().violations == ()
     checks = {one.rule: one.checks for one in run.audit().counts}
-    assert checks["faults"] > 0
+    assert checks["observation"] > 0
 
 
 def toml(folder: Path, name: str) -> Path:

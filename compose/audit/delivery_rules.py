@@ -6,13 +6,16 @@ import math
 from collections.abc import Sequence
 
 from agent.process.agent_journal import AgentHistory, FramedReport, Step
-from compose.audit.findings import Checks, Violation, between, difference, quoted
+from compose.audit.findings import Checks, LinkStatistics, Violation, between, difference, quoted
 from compose.recording.run import Run
 from protocol.wire import encode
 
 
 def observation(run: Run) -> Checks:
-    """Check that the sensor models give each Observation, to the bit, from the journaled Commands."""
+    """Check that the world gives each Observation, to the bit, from the journaled Commands.
+
+    It lists the Reports that are received, damaged and lost by the radio model and the fault plan.
+    """
     for robot, agent in run.agents.items():
         for step in agent.steps[: len(run.observations)]:
             expected = run.observations[step.observation.tick][robot]
@@ -105,3 +108,38 @@ def _as_sent(robot: str, step: Step, framed: FramedReport, peer: AgentHistory) -
         return None
     what = f"in the report of tick {framed.report.tick}, {difference(framed.report, sent.report)}"
     return Violation("report", tick, robot, what, between(framed.report, sent.report))
+
+
+def link_statistics(run: Run) -> tuple[LinkStatistics, ...]:
+    """Return the statistics of each link whose receiver has a journal; none if all reports are delivered."""
+    if not run.scenario.faults and run.scenario.radio is None:
+        return ()
+    return tuple([_statistics(agent, peer) for agent in run.agents.values() for peer in _peers(agent)])
+
+
+def _peers(agent: AgentHistory) -> list[str]:
+    """Return the robots that the robot whose journal is `agent` met, and the one that it should have met."""
+    contacts = [contact for step in agent.steps for contact in step.observation.contacts]
+    return list(dict.fromkeys([agent.config.peer, *[contact.peer for contact in contacts]]))
+
+
+def _statistics(agent: AgentHistory, peer: str) -> LinkStatistics:
+    """Return the statistics of the link from `peer` to the robot whose journal is `agent`."""
+    contacts = [
+        (step.observation.tick, contact)
+        for step in agent.steps
+        for contact in step.observation.contacts
+        if contact.peer == peer
+    ]
+    received = [(now, tick) for now, contact in contacts for tick in contact.heard or ()]
+    damaged = [tick for _, contact in contacts for tick in contact.damaged]
+    ticks = [tick for _, tick in received]
+    return LinkStatistics(
+        link=f"{peer}->{agent.config.robot}",
+        sent=len(contacts),
+        heard=len(received),
+        late=sum([tick < now for now, tick in received]),
+        twice=len(ticks) - len(set(ticks)),
+        damaged=len(damaged),
+        lost=sum([one.sender == peer for step in agent.steps for one in step.observation.lost]),
+    )

@@ -177,8 +177,8 @@ class HostilityProbe(Watched):
     def _try(self, state: Any, report: Report) -> None:
         why = malformed(report, self.planner)
         if why is not None:
-            if why.startswith("the decoder of"):
-                raise self.broken(f"a false report: {why}")
+            if self.planner.decoder_error is not None:
+                raise self.broken(f"a false report: {self.planner.decoder_error}")
             return
         try:
             decided = self.planner.decide(state, [body_of(report, self.planner)])

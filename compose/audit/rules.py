@@ -7,8 +7,7 @@ from collections.abc import Callable, Sequence
 from compose.audit import scenario_rules
 from compose.audit.agent_rules import decision, limits, log
 from compose.audit.claim_rules import claim
-from compose.audit.delivery_rules import contact, observation, report
-from compose.audit.fault_rules import faults, link_statistics
+from compose.audit.delivery_rules import contact, link_statistics, observation, report
 from compose.audit.findings import Checks, Findings, findings_of
 from compose.audit.journal_rules import config, order
 from compose.audit.scenario_rules import scenario
@@ -22,7 +21,6 @@ AUDIT_RULES: Rules = (
     scenario,
     config,
     observation,
-    faults,
     contact,
     report,
     decision,

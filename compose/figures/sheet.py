@@ -79,9 +79,7 @@ class Sheet:
         self._lines: list[tuple[str, float]] = []
         if medium.titled:
             for line in [plain(title[0]), *title[1:]]:
-                for part in wrapped(
-                    re.findall(r"(?:\\\$|\$[^$]*\$|[^\s$])+", line), self.width - 2 * EDGE, " "
-                ):
+                for part in wrapped(_TITLE_WORD.findall(line), self.width - 2 * EDGE, " "):
                     self._lines.append((part, self.top))
                     self.top += WORDS
             self.top += EDGE

@@ -118,9 +118,7 @@ def played(
         end = simulation.command(commands)
     final_reports: dict[str, FinalReport] = {robot: robots[robot].final_report(end) for robot in ids}
     simulation.journal_final_reports(final_reports.values())
-    history = WorldHistory(
-        environment.of_world(), scenario, tuple(ticks), None, end, end, final_reports
-    )
+    history = WorldHistory(environment.of_world(), scenario, tuple(ticks), None, end, end, final_reports)
     return Run(history, claim_estimates=claims)
 
 

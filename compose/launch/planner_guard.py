@@ -31,6 +31,8 @@ class GuardedPlanner(Planner[Any, Any]):
         self._robot = ""
         self._tick: int | None = None
         """The tick of the latest Observation."""
+        self.decoder_error: str | None = None
+        """The latest exception of the planner's decoder; None if it has raised none."""
         self.BODY = planner.BODY
         self.MANOEUVRES = planner.MANOEUVRES
         self.ACTIVE_SENSING = planner.ACTIVE_SENSING
@@ -90,7 +92,8 @@ class GuardedPlanner(Planner[Any, Any]):
         try:
             return self._planner.malformed(body)
         except Exception as error:  # noqa: BLE001  # an unknown process may have sent the body
-            return f"the decoder of {self._name} raises {type(error).__name__}: {error}"
+            self.decoder_error = f"the decoder of {self._name} raises {type(error).__name__}: {error}"
+            return self.decoder_error
 
     def summary(self, state: Any) -> Summary:
         """Return the planner's part of the FinalReport."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from compose.errors import UserError
+from compose.errors import BadOptions, UserError
 from compose.launch.class_loader import entry_points, named
 from protocol.messages import (
     RobotConfig,
@@ -43,7 +43,7 @@ def check(name: str, options: Mapping[str, Any]) -> None:
     """Load the planner, and create it. Raises UserError if that is not possible, or not permitted."""
     if is_shipped(name):
         if options:
-            raise UserError(f"options: the planner '{name}' has none")
+            raise BadOptions(f"options: the planner '{name}' has none")
         return
     _created(name, options)
 
@@ -149,4 +149,4 @@ def _created(name: str, options: Mapping[str, Any]) -> Planner[Any, Any]:
     try:
         return maker(**options)
     except Exception as error:  # noqa: BLE001  # as above
-        raise UserError(f"options: {name} cannot be created: {type(error).__name__}: {error}") from None
+        raise BadOptions(f"options: {name} cannot be created: {type(error).__name__}: {error}") from None

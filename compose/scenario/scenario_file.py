@@ -10,7 +10,7 @@ from typing import Any
 
 import msgspec
 
-from compose.errors import BadFault, BadKill, BadScenario, Unworkable, UserError
+from compose.errors import BadFault, BadKill, BadOptions, BadScenario, Unworkable, UserError
 from compose.launch import model_loader, planner_loader
 from compose.launch.class_loader import trust
 from compose.scenario.fault_syntax import FaultTable, added, table_of
@@ -341,7 +341,7 @@ def _check_planner(table: PlannerTable, source: str) -> None:
     try:
         planner_loader.check(table.name, table.options)
     except UserError as error:
-        field = "planner." if str(error).startswith("options: ") else "planner.name: "
+        field = "planner." if isinstance(error, BadOptions) else "planner.name: "
         raise BadScenario(f"{source}: {field}{error}") from None
 
 

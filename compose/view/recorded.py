@@ -114,9 +114,10 @@ class Journals:
                     self._fold_agent(frames, path)
             except OtherVersion as error:
                 self._note(f"{self.folder}: {error.versions}; {error.remedy}")  # the same in all journals
-            except (CorruptJournal, MalformedFrame) as error:
-                text = str(error)
-                self._note(text if text.startswith(str(path)) else f"{path}: {text}")
+            except CorruptJournal as error:
+                self._note(str(error))
+            except MalformedFrame as error:
+                self._note(f"{path}: {error}")
         configs = self.known.configs
         world = self._world.world
         if world is not None:
