@@ -220,17 +220,10 @@ CauseCode = Literal[
 """
 
 
-VALUES_OF_CAUSES: dict[str, tuple[int, ...]] = {
-    "wrong": (2, 4),
-    "position": (2,),
-    "heading": (2,),
-    "dead": (1,),
-}
+VALUES_OF_CAUSES = {"wrong": (2, 4), "position": (2,), "heading": (2,), "dead": (1,)}
 """The possible numbers of values of the causes that have values."""
-ROBOTS_OF_CAUSES = {"inconsistent": (1, 2), "failed": (0,)}
-"""The possible numbers of robots of the causes that are not of one robot."""
 OF_SEVERAL = ("max-ticks", "others", "no-result")
-"""The causes of any number of robots, at least one."""
+"""The causes of one or more robots. All others are of one, or with its peer of two, and `failed` of none."""
 
 
 class Cause(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
@@ -248,8 +241,10 @@ class Cause(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=
     def __post_init__(self) -> None:
         _cut(self, "text")
         robots, values = len(self.robots), len(self.values)
-        fits = robots >= 1 if self.code in OF_SEVERAL else robots in ROBOTS_OF_CAUSES.get(self.code, (1,))
-        if not (fits and values in VALUES_OF_CAUSES.get(self.code, (0,))):
+        most = {"failed": 0, "inconsistent": 2}.get(
+            self.code, max(1, robots) if self.code in OF_SEVERAL else 1
+        )
+        if not min(1, most) <= robots <= most or values not in VALUES_OF_CAUSES.get(self.code, (0,)):
             raise ValueError(f"a cause {self.code} with {robots} robots and {values} values")
 
 

@@ -157,6 +157,19 @@ def test_the_meetings_that_viewers_find_are_those_of_the_planners(faults: str, t
         assert same == compared
 
 
+def test_a_robot_of_a_group_rests_when_it_has_no_robot_to_drive_to_any_more(run: Run) -> None:
+    rested: set[str] = set()
+    for tick in run.ticks:
+        for robot, command in tick.commands.items():
+            assert command.rests == (command.peer is None) == (command.role is None)
+            assert command.rests or robot not in rested
+            if command.rests:
+                assert command.verdict is not None
+                assert (command.v, command.omega) == (0.0, 0.0)
+                rested.add(robot)
+    assert rested
+
+
 def test_journals_that_grow_show_the_same_meetings(folder: Path, run: Run, tmp_path: Path) -> None:
     names = [path.name for path in folder.glob("*.journal")]
     stored = {name: list(journal_file.read(folder / name)) for name in names}

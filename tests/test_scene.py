@@ -64,6 +64,16 @@ def said(shown: Performance, kind: str) -> list[tuple[int, str]]:
     return [(event.tick, event.text) for one in shown.scenes for event in one.events if event.kind == kind]
 
 
+def test_an_event_says_apart_what_only_the_ground_truth_tells(paper_1: Path) -> None:
+    claims = [event for one in read(paper_1).scenes for event in one.events if event.kind == "claim"]
+    assert len(claims) == 2
+    for event in claims:
+        assert "error" not in event.text
+        assert event.truth is not None
+        assert event.truth.startswith("the error is ")
+        assert event.whole == f"{event.text}; {event.truth}"
+
+
 def test_a_scene_shows_where_everyone_is_and_what_everyone_does(paper_1: Path) -> None:
     recording, shown = read_record(paper_1), read(paper_1)
     assert [one.tick for one in shown.scenes] == [moment.truth.tick for moment in recording.ticks]

@@ -346,3 +346,19 @@ def test_the_reports_of_a_pair_are_at_most_a_tenth_larger_than_in_version_2(name
     run = in_process.run_mission(load(name))
     sent = sum(report.bytes_sent for report in run.final_reports.values())
     assert before < sent <= 1.1 * before
+
+
+@pytest.mark.parametrize(
+    "cause",
+    [
+        ["wrong", ["a"], [], None],
+        ["wrong", ["a"], [1.0, 1.0, 1.0], None],
+        ["dead", ["a", "b"], [1], None],
+        ["max-ticks", [], [], None],
+        ["inconsistent", [], [], "x"],
+        ["failed", ["a"], [], "x"],
+    ],
+)
+def test_a_cause_without_what_its_text_needs_is_refused(cause: list[object]) -> None:
+    """The viewers make the text of causes that anyone may have sent."""
+    refuses(framed(packed(["mission-end", 48, "failed", [cause]])))

@@ -6,7 +6,6 @@ import math
 
 from compose.recording.run import Run
 from protocol.motion import Pose, step
-from world.sensors import mutual_ranges
 from world.truth import Truth
 
 INSTANTS = 32
@@ -27,7 +26,7 @@ def nearest(run: Run) -> float | None:
 def _of_pair(run: Run, pair: tuple[int, int]) -> float | None:
     least = None
     for tick in run.ticks:
-        (mutual,) = mutual_ranges(tick.truth, run.scenario, [pair])
+        mutual = tick.world.contacts.get(pair)
         if least is None and (mutual is None or mutual.range is None):
             continue
         paths = [_path(run, tick.truth, i) for i in pair]

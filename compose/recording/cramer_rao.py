@@ -17,7 +17,7 @@ from agent.estimation.gaussian.odometry_noise import Track, track
 from agent.estimation.gaussian.range_model import Ranges
 from compose.recording.run import Run
 from protocol.motion import REST, Pose
-from world.sensors import anchor_ranges, mutual_ranges
+from world.sensors import anchor_ranges
 
 
 def position_bounds(run: Run, pair: tuple[int, int], tick: int) -> tuple[float, float] | None:
@@ -45,7 +45,7 @@ def position_bounds(run: Run, pair: tuple[int, int], tick: int) -> tuple[float, 
         for k, (place, anchor) in enumerate(zip(pair, anchors, strict=True)):
             if ranges[place] is not None:
                 own[k].append((truth.tick, _apart(truth.poses[place], Pose(anchor.x, anchor.y, 0.0))))
-        (contact,) = mutual_ranges(truth, scenario, [(min(pair), max(pair))])
+        contact = at.world.contacts.get((min(pair), max(pair)))
         if contact is not None and contact.range is not None:
             mutual.append((truth.tick, _apart(truth.poses[pair[0]], truth.poses[pair[1]])))
     tracks, guess = [], []
