@@ -39,7 +39,7 @@ from __future__ import annotations
 import math
 import re
 from functools import cached_property
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
@@ -150,7 +150,7 @@ class Contact(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_field
     """The ticks of the peer's Reports that arrive damaged in this tick, and are refused."""
 
 
-class LostReport(NamedTuple):
+class LostReport(msgspec.Struct, frozen=True, array_like=True, gc=False, forbid_unknown_fields=True):
     """A Report that the channel has lost: it never arrives."""
 
     sender: RobotId

@@ -62,7 +62,7 @@ class AssuredExact(LogPlanner):
                 return state
 
     def command(self, state: RobotState) -> Command:
-        """Return the command for the next tick, with the phase, the mode and the verdict."""
+        """Return the command for the next tick, with the phase, the task and the verdict."""
         return exchange.command(state, REST if self._must_wait(state) else transitions.controls(state))
 
     def required_mutual_ranges(self, mission: Mission) -> int:

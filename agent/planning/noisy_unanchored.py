@@ -140,7 +140,7 @@ class NoisyUnanchoredPlanner(Planner[NoisyUnanchoredState, Report]):
         return _moved_on(state) if state.verdict is None else state
 
     def command(self, state: NoisyUnanchoredState) -> Command:
-        """Return the command for the next tick, with the phase, the mode and the verdict."""
+        """Return the command for the next tick, with the phase, the task and the verdict."""
         return state.command(GAUSSIAN.pose_tolerance)
 
     def estimate(self, state: NoisyUnanchoredState) -> Estimate:

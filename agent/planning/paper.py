@@ -64,7 +64,7 @@ class Paper(LogPlanner):
         return rendezvous(mission, distance, "paper")
 
     def command(self, state: RobotState) -> Command:
-        """Return the command for the next tick, with the phase, the mode and the verdict."""
+        """Return the command for the next tick, with the phase, the task and the verdict."""
         return exchange.command(state, transitions.controls(state))
 
     def required_mutual_ranges(self, mission: Mission) -> int:

@@ -115,7 +115,7 @@ class Planner(Generic[S, B]):
         raise NotImplementedError
 
     def command(self, state: S) -> Command:
-        """Return the command for the next tick, with the phase, the mode and the verdict."""
+        """Return the command for the next tick, with the phase, the task and the verdict."""
         raise NotImplementedError
 
     def estimate(self, state: S) -> Estimate:

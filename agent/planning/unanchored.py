@@ -193,7 +193,7 @@ class UnanchoredPlanner(Planner[UnanchoredState, Report]):
         return _moved_on(state) if isinstance(state.mode, Looping) and state.verdict is None else state
 
     def command(self, state: UnanchoredState) -> Command:
-        """Return the command for the next tick, with the phase, the mode and the verdict."""
+        """Return the command for the next tick, with the phase, the task and the verdict."""
         return state.command(EXACT_ESTIMATOR.pose_tolerance)
 
     def estimate(self, state: UnanchoredState) -> Estimate:

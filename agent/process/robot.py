@@ -106,7 +106,7 @@ class Robot:
         self.anchor_ranges += observation.anchor_range is not None
         self.command = self._command_frame = None
         self.reports = {}
-        self.lost.update(observation.lost)
+        self.lost.update([(one.sender, one.tick) for one in observation.lost])
         self._unlisted = {contact.peer for contact in observation.contacts if contact.heard is None}
         for contact in observation.contacts:
             peer = contact.peer
