@@ -61,6 +61,8 @@ NO_VALUE = "none"
 PARTS = (
     messages.Contact,
     messages.Ranged,
+    messages.LostReport,
+    messages.Cause,
     messages.Localised,
     messages.Undecided,
     messages.Inconsistent,
