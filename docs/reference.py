@@ -1,4 +1,4 @@
-"""Tables of the reference pages, generated from the code: `uv run docs/reference.py [--check]`.
+"""Tables of the pages, generated from code and expected results: `uv run docs/reference.py [--check]`.
 
 The script writes each of TABLES into the page that has its two marker lines, between them. With `--check` it
 writes nothing, and its exit status is 1 if a page would change.
@@ -41,6 +41,7 @@ from compose.scenario.scenario_tables import (
     ScenarioFile,
     WorldTable,
 )
+from compose.sweep import spec
 from compose.sweep.draws import DrawTable, StartsTable
 from compose.sweep.paired_differences import PairedDifference
 from compose.sweep.spec import AxisTable, RowTable, SpecFile
@@ -50,6 +51,7 @@ from protocol.attack import Attack
 from protocol.network import keys
 from protocol.noise import Noise, VelocityNoise
 from tandem import rows
+from tests.expected.tables import table as results_of
 from world.world_noise import WorldActuationNoise, WorldNoise, WorldOdometryNoise
 
 DOCS = Path(__file__).parent
@@ -329,6 +331,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "wire-messages": wire_messages,
     "wire-parts": wire_parts,
     "command-line": command_line,
+    **{f"results-{name}": partial(results_of, name) for name in spec.shipped()},
 }
 """the tables by the names that pages use"""
 

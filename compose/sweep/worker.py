@@ -99,7 +99,7 @@ def _play(chunks: SimpleQueue[Chunk], answers: BinaryIO) -> None:
         except Empty:
             return
         for number, seed in zip(chunk.trials, chunk.seeds, strict=True):
-            _answer(answers, encoder.encode(_played(chunk, number, seed)))
+            _answer(answers, encoder.encode(played(chunk, number, seed)))
 
 
 def _listen(chunks: SimpleQueue[Chunk], folder: str) -> None:
@@ -123,7 +123,7 @@ def framed(body: bytes) -> bytes:
     return len(body).to_bytes(LENGTH_BYTES, "big") + body
 
 
-def _played(chunk: Chunk, number: int, seed: int) -> trial.TrialRow:
+def played(chunk: Chunk, number: int, seed: int) -> trial.TrialRow:
     """Run one trial, and return its row. An exception gives the row of a lost trial."""
     began = time.perf_counter()
     try:
