@@ -13,24 +13,32 @@ POOLED_BY = {"partition": 0, "crash-2": 1, "crash": 1}
 """The index of the axis whose values are the rows, in sweeps with many equal cells; else each cell is."""
 
 
+FEWEST_SHOWN = 40
+"""The fewest trials of a cell of which a page shows results."""
+
+
 def table(name: str) -> str:
-    """Return the table of the sweep `name`, with the command that compares it, in Markdown."""
+    """Return the table of the sweep `name` in Markdown, with the command that compares it.
+
+    It has the results of earlier runs with more trials; else, those of the cells, if they are enough.
+    """
     file = read(name)
     assert file is not None
-    rows = _rows(file)
-    columns = [column for column in _columns() if any(column[1](cells) for cells in rows.values())]
-    each = f"{_number(file.trials)} trial{'s' if file.trials > 1 else ''} in each cell"
-    lines = [
-        f"{each}, seed {file.seed}, code of {file.commit}. {file.notes}".strip(),
-        "",
-        _line([" ", *[head for head, _ in columns]]),
-        _line(["---"] * (len(columns) + 1)),
-        *[_line([row, *[of(cells) for _, of in columns]]) for row, cells in rows.items()],
-        "",
-        f"`uv run python -m tests.expected {name}`",
-    ]
+    of_file = f"{_number(file.trials)} trial{'s' if file.trials > 1 else ''} in each cell, seed {file.seed}"
+    lines = [f"`uv run python -m tests.expected {name}`; its file has {of_file}, code of {file.commit}."]
+    if file.notes:
+        lines += [file.notes]
     if file.landed:
         lines += ["", *_landed(file)]
+    elif file.trials >= FEWEST_SHOWN:
+        rows = _rows(file)
+        columns = [column for column in _columns() if any(column[1](cells) for cells in rows.values())]
+        lines += [
+            "",
+            _line([" ", *[head for head, _ in columns]]),
+            _line(["---"] * (len(columns) + 1)),
+            *[_line([row, *[of(cells) for _, of in columns]]) for row, cells in rows.items()],
+        ]
     return "\n".join(lines)
 
 
@@ -119,8 +127,6 @@ def _landed(file: Expected) -> list[str]:
     columns = [name for name in ("ticks", "nees", "other") if any(getattr(one, name) for one in file.landed)]
     heads = {"ticks": "ticks, median / 95 %", "nees": "mean NEES", "other": "also"}
     return [
-        "Earlier runs with more trials:",
-        "",
         _line([" ", "trials", *shown, *[heads[name] for name in columns], "commit"]),
         _line(["---"] * (len(shown) + len(columns) + 3)),
         *[
@@ -128,7 +134,7 @@ def _landed(file: Expected) -> list[str]:
                 [
                     one.label,
                     _number(one.trials),
-                    *[_number(one.outcomes.get(outcome, 0)) for outcome in shown],
+                    *[_number(one.outcomes[outcome]) if outcome in one.outcomes else "" for outcome in shown],
                     *[getattr(one, name) for name in columns],
                     one.commit,
                 ]
