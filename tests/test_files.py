@@ -164,7 +164,7 @@ def test_every_file_of_a_run_and_an_export_is_whole_or_absent_however_little_roo
 FILLED = """
 import resource, signal, sys
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (9_900, resource.RLIM_INFINITY))
+resource.setrlimit(resource.RLIMIT_FSIZE, (10_100, resource.RLIM_INFINITY))
 from compose.cli.main import main
 main(sys.argv[1:])
 """

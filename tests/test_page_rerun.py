@@ -81,7 +81,7 @@ def test_a_changed_mission_is_that_of_its_scenario_file_run_in_one_process(addre
     run = in_process.run_mission(scenario)
     mission = fetched(address, f"shows/{name}")
     assert run.end is not None
-    assert mission["end"][1:3] == [run.end.tick, run.end.outcome]
+    assert (mission["end"]["tick"], mission["end"]["outcome"]) == (run.end.tick, run.end.outcome)
     assert mission["stage"]["mission"]["sensing_range"] == 3.5
     assert mission["stage"]["faults"][0][1] == 0.05
     for tick in (0, run.end.tick):
