@@ -196,6 +196,7 @@ def test_a_claim_waits_for_the_accuracy_that_is_asked_for(sample: RangeRecording
     assert re.match(r"the sigma of [AB]'s position is .* m, required 0.01", strict.summary.blocking_reason)
 
 
+@pytest.mark.long
 def test_no_nees_stands_beside_a_pose_that_the_robot_may_not_claim(sample: RangeRecording) -> None:
     strict, claimed = [sample_estimates(sample, accuracy=one).summary for one in (0.01, 0.3)]
     for name, robot in strict.robots.items():

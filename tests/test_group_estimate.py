@@ -97,6 +97,7 @@ def test_a_robot_without_ranges_has_no_pose_and_the_summary_says_why() -> None:
     assert all(summary.robots[name].first_claim is not None for name in ("r00", "r01", "r02"))
 
 
+@pytest.mark.long
 def test_the_order_of_the_robots_changes_the_order_of_the_rows_alone() -> None:
     recording = recorded(3, 5)
     one, other = estimate_of(recording), estimate_of(recording, ("r02", "r00", "r01"))

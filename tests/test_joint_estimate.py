@@ -24,7 +24,6 @@ from agent.estimation.gaussian.joint_search import JointHypotheses, certainties,
 from agent.estimation.gaussian.odometry_noise import constant_errors, track, variances
 from agent.estimation.gaussian.range_model import PairRanges, Ranges
 from tests.moving_groups import NOISE, PERIOD_S, MovingGroup, moving_group
-from tests.series import series
 
 Array = NDArray[np.float64]
 
@@ -207,7 +206,8 @@ class Scores:
         assert beyond <= binom.ppf(0.9995, count, 0.01)
 
 
-@pytest.mark.parametrize("unanchored", series([[3], []]))
+@pytest.mark.parametrize("unanchored", [[3], []])
+@pytest.mark.long
 def test_the_covariances_of_groups_are_right(unanchored: list[int]) -> None:
     scores = Scores(4, range(20), unanchored)
     assert len(scores.nees) >= 76

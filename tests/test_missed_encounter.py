@@ -113,6 +113,7 @@ def test_a_recording_in_which_a_left_b_is_audited_replayed_and_told(tmp_path: Pa
     assert f"{failed} It drives back to its anchor to measure its pose again." in told
 
 
+@pytest.mark.long
 def test_neither_robot_keeps_hypotheses_of_the_meeting_that_a_left() -> None:
     known: dict[str, list[Belief]] = {"a": [], "b": []}
 

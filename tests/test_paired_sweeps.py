@@ -186,6 +186,7 @@ def test_planners_get_the_same_trials_and_their_difference_is_that_of_the_pairs(
         tandem.sweep("random", PLANNERS, trials=8, seed=3, paired=False, out=tmp_path / "out")
 
 
+@pytest.mark.long
 def test_an_axis_of_the_api_is_paired_as_the_caller_says_and_no_other_is_compared(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

@@ -141,6 +141,7 @@ def test_a_file_of_settings_in_the_working_directory_changes_no_figure(tmp_path:
 
 
 @pytest.mark.parametrize("name", series(["planner", "model"]))
+@pytest.mark.long
 def test_the_page_imports_what_a_folder_names_only_if_a_flag_does(
     name: str, stranger: Path, mark: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
