@@ -169,6 +169,8 @@ from compose.cli.main import main
 main(sys.argv[1:])
 """
 """A scenario whose journals fit the limit, and whose ticks.csv does not."""
+NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}
+"""Python does not notice that the limit cuts off the bytecode that it caches."""
 
 
 @pytest.mark.parametrize("how", [["--in-process"], []])
@@ -177,7 +179,7 @@ def test_the_outcome_is_printed_where_a_full_disk_takes_no_summary(how: list[str
     ended = subprocess.run(
         [sys.executable, "-c", FILLED, "run", "it.toml", "-q", *how, "--out", "full", "--no-export"],
         cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), **NO_BYTECODE},
         capture_output=True,
         text=True,
         timeout=60,
@@ -256,7 +258,7 @@ def test_the_draft_of_a_process_that_was_killed_is_removed_and_that_of_a_live_on
     with subprocess.Popen(
         [sys.executable, "-c", begun, tmp_path / "it"],
         stdout=subprocess.PIPE,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), **NO_BYTECODE},
     ) as other:
         try:
             assert other.stdout is not None

@@ -147,7 +147,7 @@ def _others_not_localised(
 
 
 def _dead(death: Death) -> Cause:
-    return Cause("dead", (death.robot,), (death.tick,))
+    return Cause("dead", (death.robot,), (float(death.tick),))
 
 
 def not_localised(scenario: Scenario, verdicts: Mapping[str, Verdict], tick: int) -> dict[str, Cause]:
