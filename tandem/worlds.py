@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from copy import copy
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -76,8 +77,7 @@ class World:
         """
         if self._end is not None:
             raise UserError(f"the world has ended: {self._end.outcome}")
-        after = World.__new__(World)
-        after.scenario, after._state, after._end = self.scenario, self._state, None
+        after = copy(self)
         onward = advance(self._state, {robot: self._command(robot, one) for robot, one in commands.items()})
         if isinstance(onward, MissionEnd):
             after._end = onward

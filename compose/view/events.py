@@ -34,7 +34,7 @@ class Event(msgspec.Struct, frozen=True, omit_defaults=True):
     text: str
     """The event as a sentence."""
     truth: str | None = None
-    """What the ground truth adds to it, for views that show it; None if nothing."""
+    """The addition of the ground truth, for views that show it; None if there is none."""
 
     @property
     def whole(self) -> str:

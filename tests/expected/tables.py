@@ -73,7 +73,7 @@ def _columns() -> list[Column]:
 def _counted(outcome: str) -> Callable[[Sequence[CellResults]], str]:
     def text(cells: Sequence[CellResults]) -> str:
         count = sum([cell.outcomes.get(outcome, 0) for cell in cells])
-        return f"{count:,}".replace(",", " ") if count else ""
+        return _number(count) if count else ""
 
     return text
 
