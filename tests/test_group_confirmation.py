@@ -32,9 +32,7 @@ from compose.recording.corrected_bounds import corrected_bounds
 from compose.recording.group_localisation import past_meetings
 from compose.recording.run import Run, of_frames
 from compose.scenario.scenario_change import file_table
-from compose.scenario.scenario_file import ScenarioTemplate, validate
-from compose.sweep import spec
-from compose.sweep.cells import cells, setting_of
+from compose.scenario.scenario_file import validate
 from compose.sweep.group_columns import group_columns
 from protocol.messages import Localised, Report, Undecided
 from protocol.motion import Covariance, Pose
@@ -167,17 +165,6 @@ def test_a_robot_whose_other_peers_are_dead_ends_undecided_and_names_the_one() -
         first.visitor: Undecided(f"2 robots must agree on its pose; it knows one by: {first.visited}"),
         first.visited: Undecided(f"2 robots must agree on its pose; it knows one by: {first.visitor}"),
     }
-
-
-@pytest.mark.long
-def test_no_shipped_attack_leads_to_a_wrong_claim() -> None:
-    shipped = spec.load("group-attacks-noise-tolerated")
-    for cell in cells(shipped):
-        template = setting_of(shipped, cell)
-        assert isinstance(template, ScenarioTemplate)
-        scenario = template.seeded(5)
-        if scenario.confirmation is not None and len(scenario.robots) == 4:
-            assert honest(of_frames(kept(scenario)))[2] == 0, cell
 
 
 @pytest.mark.long
