@@ -15,6 +15,7 @@ from compose.sweep import spec
 from compose.sweep.cells import cells, label
 from compose.sweep.spec import Sweep
 from protocol import documents
+from tests.expected.__main__ import report
 from tests.expected.comparison import (
     Count,
     Run,
@@ -58,6 +59,7 @@ def drawn(
             "heading": error,
         },
         np.full((len(cell), 3), math.nan),
+        np.full(len(cell), "0badcafe"),
     )
 
 
@@ -112,6 +114,10 @@ def test_with_the_same_seeds_trials_are_compared_one_by_one() -> None:
     found = findings(compare([run_of(later, old)]))
     (one,) = found
     assert (one.quantity, one.verdict, one.where) == ("ticks", "worse", "same seeds, 209")
+    otherwise = msgspec.structs.replace(old, decisions=np.where(old.trial == 3, "0badcaff", old.decisions))
+    assert number_changed(run_of(otherwise, old)) == (11, 11 * 20)
+    assert report([run_of(otherwise, old)]) == 1
+    assert report([run_of(otherwise, old)], statistics=True) == 0
 
 
 def test_a_file_contains_the_results_from_which_it_was_written() -> None:
@@ -135,6 +141,6 @@ def test_each_shipped_sweep_has_expected_results_of_all_its_cells(name: str) -> 
 @pytest.mark.timeout(900)
 def test_shipped_sweeps_have_their_expected_results() -> None:
     """The command forks, so it is a process of its own, without the threads of other tests."""
-    command = [sys.executable, "-m", "tests.expected"]
+    command = [sys.executable, "-m", "tests.expected", "--statistics"]
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=800, check=False)
     assert ended.returncode == 0, ended.stdout + ended.stderr

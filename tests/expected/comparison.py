@@ -378,7 +378,9 @@ def paired_trials(run: Run) -> tuple[Trials, dict[str, Floats]]:
         for name in ("ticks", "nees")
     }
     outcomes = {"localised": letters == "l", "wrong": letters == "w", "outcome": letters}
-    return trials, {name: one[at] for name, one in (values | outcomes).items()}
+    decisions = [one.decisions.split() or [""] * len(one.outcomes) for one in run.old.sample]
+    known = {"decisions": np.array([one for some in decisions for one in some])}
+    return trials, {name: one[at] for name, one in (values | outcomes | known).items()}
 
 
 def changes(name: str, trials: Trials, old: dict[str, Floats]) -> Floats:
@@ -393,7 +395,10 @@ def changes(name: str, trials: Trials, old: dict[str, Floats]) -> Floats:
 
 
 def number_changed(run: Run) -> tuple[int, int]:
-    """Return how many trials with the same seeds end otherwise than those in the file, and of how many."""
+    """Return how many trials with the same seeds differ from those in the file, and of how many.
+
+    In the environment of the file, its decisions are compared, too: nothing may differ unless they changed.
+    """
     trials, old = paired_trials(run)
     letters = np.array([outcome[0] for outcome in trials.outcome.tolist()])
     changed = letters != old["outcome"]
@@ -401,4 +406,12 @@ def number_changed(run: Run) -> tuple[int, int]:
         difference = changes(name, trials, old)
         changed |= np.nan_to_num(difference) != 0.0
         changed |= np.isnan(trials.values[name]) != np.isnan(old[name])
+    if same_environment(run):
+        both = (old["decisions"] != "") & (trials.decisions != "")
+        changed |= both & (old["decisions"] != trials.decisions)
     return int(changed.sum()), len(changed)
+
+
+def same_environment(run: Run) -> bool:
+    """Return whether the trials ran with the libraries and the kind of processor that the file names."""
+    return run.new.environment == run.old.environment != ""

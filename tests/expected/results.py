@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from compose.sweep.cells import cells, label
 from compose.sweep.spec import Sweep
 from compose.sweep.statistics import column
 from protocol import documents
+from protocol.journal import environment
 
 FOLDER = Path(__file__).parent
 STRIDE = 10_000
@@ -94,6 +95,8 @@ class Sample(msgspec.Struct, frozen=True, omit_defaults=True):
     outcomes: str
     ticks: str
     nees: str = ""
+    decisions: str = ""
+    """checksums of all Commands of a mission, in the environment of the file"""
 
 
 class Landed(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -131,6 +134,8 @@ class Expected(msgspec.Struct, frozen=True, omit_defaults=True):
     landed: tuple[Landed, ...] = ()
     """results of earlier runs, which are only shown; they stay until a run has as many trials"""
     notes: str = ""
+    environment: str = ""
+    """libraries and processor with which the trials ran: with the same, decisions are the same to the bit"""
 
 
 TRANSFORMED: dict[str, Callable[[Floats], Floats]] = {
@@ -159,10 +164,12 @@ class Trials(msgspec.Struct, frozen=True):
     """the quantities that have quantiles or means, by their names"""
     honest: Floats
     """numbers of honest robots of groups: right, undecided, wrong, shape (trials, 3)"""
+    decisions: NDArray[np.str_]
+    """checksum of all Commands; empty if it is not known"""
 
     @classmethod
-    def of(cls, table: pa.Table) -> Trials:
-        """Return the arrays of a table of trials."""
+    def of(cls, table: pa.Table, decisions: Sequence[str] = ()) -> Trials:
+        """Return the arrays of a table of trials, and of the checksums of their decisions."""
         outcome = np.array(table["outcome"].to_pylist(), str)
         localised = outcome == "localised"
         values = {
@@ -191,6 +198,7 @@ class Trials(msgspec.Struct, frozen=True):
             column(table, "truth_held"),
             values,
             honest,
+            np.array(decisions or [""] * len(table), str),
         )
 
     def where(self, chosen: NDArray[np.bool_]) -> Trials:
@@ -244,6 +252,7 @@ def expected(
         cell=tuple([cell_results(label(sweep, one), of) for one, of in zip(every, of_cell, strict=True)]),
         sample=tuple([sample(of) for of in of_cell]),
         notes=notes,
+        environment=f"{environment.of_robot()}",
     )
 
 
@@ -282,6 +291,7 @@ def sample(trials: Trials) -> Sample:
         "".join([outcome[0] for outcome in first.outcome.tolist()]),
         " ".join([_text(value) for value in first.values["ticks"]]),
         " ".join([_text(value) for value in nees]) if not np.isnan(nees).all() else "",
+        " ".join(first.decisions.tolist()) if all(first.decisions) else "",
     )
 
 
