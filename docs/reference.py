@@ -20,6 +20,7 @@ from msgspec import NODEFAULT
 from msgspec import inspect as types
 
 from compose.cli.main import COMMANDS, command_parser
+from compose.cli.removed import REMOVED
 from compose.recording.estimating.estimate_rows import (
     EstimateSummary,
     PoseEstimate,
@@ -331,6 +332,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "wire-messages": wire_messages,
     "wire-parts": wire_parts,
     "command-line": command_line,
+    "removed": lambda: _table(["removed", "instead"], [[f"`{one.name}`", one.instead] for one in REMOVED]),
     **{f"results-{name}": partial(results_of, name) for name in spec.shipped()},
 }
 """the tables by the names that pages use"""

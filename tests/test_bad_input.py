@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from compose.errors import BadScenario
+from compose.cli import main
+from compose.cli.removed import REMOVED
+from compose.errors import BadScenario, UserError
 from compose.scenario.scenario_file import parse
 from protocol.mission import Mission, infeasibility
 from tests.commands import PAPER_1, Ended, several_pairs, tandem, world
@@ -383,8 +385,6 @@ def test_an_unknown_scenario_is_refused(
         (["run", "paper-1", "--fast"], "--fast"),
         (["run", "paper-1", "--out"], "--out"),
         (["run", "paper-1", "--in-process", "--rate", "2"], "--rate"),
-        (["run", "paper-1", "--in-process", "--foxglove", "8765"], "--foxglove: "),
-        *((["run", "paper-1", "--foxglove", v], "--foxglove: ") for v in ("-1", "65536", "http")),
         (["run", "paper-1", "--export"], "--export: it needs --out DIR"),
         (["run", "paper-1", "--port", "8080"], "--port: it needs --watch"),
         (["replay", ""], "'' is not a path"),
@@ -436,8 +436,17 @@ def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
         ended = tandem("world", "paper-1", "--listen", endpoint, "--out", "out", cwd=tmp_path)
+        page = tandem("run", "paper-1", "--watch", "--port", endpoint.rpartition(":")[2])
     refused(ended, f"--listen: {endpoint}: already in use")
+    refused(page, "--port: ", "cannot be used: Address already in use")
     assert list(tmp_path.glob("out/*")) == []
+
+
+def test_what_was_removed_is_one_line_that_names_what_replaces_it() -> None:
+    for removed in REMOVED:
+        with pytest.raises(UserError, match=re.escape(f"`{removed.name}` was removed in version 0.3: ")):
+            main.parse(removed.name.split())
+    refused(tandem("run", "paper-1", "--foxglove=8765"), "`run --foxglove` was removed", "run.mcap")
 
 
 # --- the folder of the recording --------------------------------------------------------------------

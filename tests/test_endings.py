@@ -18,9 +18,9 @@ from signal import SIGHUP, SIGINT, SIGKILL, SIGSTOP, SIGTERM
 
 import pytest
 
+from compose.launch.page_process import PageProcess
 from compose.launch.processes import free_endpoint
 from compose.launch.supervisor import Supervisor
-from compose.launch.viewers import Viewer, stay
 from protocol.network.diagnosis import MUTE
 from protocol.network.inbox import Arrival, Inbox, Interrupted
 from tests.commands import (
@@ -314,6 +314,6 @@ def test_a_page_that_stays_is_not_ended_by_another_process_that_ends_late() -> N
     inbox.put("ended", "agent a")
     children = Supervisor(inbox)
     child = children.start("the page", main="signal:pause", answers=True)
-    stay([Viewer("the page", child, "here")], inbox)
+    assert PageProcess(child, "here").stay(inbox) is False
     children.stop()
     assert taken == [True, True]

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import asyncio
-import base64
 import csv
 import functools
-import http.client
 import io
 import itertools
 import json
@@ -14,13 +11,11 @@ import math
 import random
 import re
 import shutil
-import socket
-import struct
 import subprocess
 import sys
 import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from signal import Signals
 from types import SimpleNamespace
@@ -29,32 +24,26 @@ from typing import Any
 import msgpack
 import msgspec
 import numpy as np
-import psutil
 import pyarrow.parquet as pq
 import pytest
-import websockets
 from mcap.reader import make_reader
-from mcap.records import Schema
 from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 
-from compose.audit.replay import replayed
 from compose.cli import export_bar, run
 from compose.cli.main import parse
 from compose.launch import in_process
-from compose.launch.processes import free_endpoint
 from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
 from compose.recording.run import Run, read
 from compose.scenario.scenario_file import load
 from compose.view.export.folder import export
-from compose.view.foxglove.gate import GUESTS, GUESTS_FILES
 from compose.view.foxglove.views import LEAST_OPACITY
 from protocol import wire
 from protocol.journal import journal_file
 from protocol.messages import Estimate, Observation
 from protocol.motion import wrap
 from protocol.wire import decode
-from tests.commands import BOUND_S, OVER, REAL_TIME, TandemProcess, processes_of, tandem, until
+from tests.commands import BOUND_S, TandemProcess, tandem
 from tests.doctor import complaints
 from tests.replays import journals_of, killed
 from tests.series import series
@@ -450,7 +439,7 @@ def test_a_missing_recording_and_an_unwritable_folder_are_refused(paper_1: Path,
     assert ended.err.startswith(f"tandem export: {tmp_path / 'file'} cannot be written: ")
 
 
-# --- exports during a run, and the Foxglove server --------------------------------------------------------
+# --- exports during a run -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mode", series([[], ["--in-process"]]))
@@ -535,207 +524,6 @@ def test_ctrl_c_ends_an_export_and_leaves_nothing_half_written(paper_1: Path, tm
         with pytest.raises(AssertionError, match="stopped"):
             export(read(paper_1), tmp_path / "out", check=functools.partial(stopped_unless, some))
         assert {path.name for path in (tmp_path / "out").iterdir()} == left
-
-
-STANDING = {"/stage", "/a/pose", "/b/trail", "/contact", "/a/belief", "/journal/world/command"}
-"""The topics that have a message at any time."""
-
-
-async def watched(port: int, until: str) -> dict[str, str]:
-    """Return the schemas by topic, after a log line starts with `until` and all of STANDING are received."""
-    async with websockets.connect(
-        f"ws://127.0.0.1:{port}",
-        subprotocols=[websockets.Subprotocol("foxglove.sdk.v1")],
-        max_size=None,
-        close_timeout=0.5,
-    ) as link:
-        assert link.subprotocol == "foxglove.sdk.v1"
-        topics: dict[int, dict[str, Any]] = {}
-        told: set[str] = set()
-        lines: list[str] = []
-        while not any(line.startswith(until) for line in lines) or not told >= STANDING:
-            frame = await link.recv()
-            if isinstance(frame, str):
-                said = json.loads(frame)
-                assert said["op"] != "status", said  # for example an unknown channel
-                if said["op"] == "advertise":
-                    assert not told, "a channel is added while somebody looks"
-                    topics |= {channel["id"]: channel for channel in said["channels"]}
-                    wanted = [{"id": one["id"], "channelId": one["id"]} for one in said["channels"]]
-                    await link.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
-            elif frame[0] == 1:
-                number, _ = struct.unpack_from("<IQ", frame, 1)
-                channel = topics[number]
-                told.add(channel["topic"])
-                if channel["topic"] == "/log":
-                    lines.append(log_message(channel, frame[13:]))
-        return {one["topic"]: one["schemaName"] for one in topics.values()}
-
-
-def log_message(channel: dict[str, Any], data: bytes) -> str:
-    schema = Schema(
-        data=base64.b64decode(channel["schema"]), encoding="protobuf", id=1, name=channel["schemaName"]
-    )
-    decoder = DecoderFactory().decoder_for("protobuf", schema)
-    assert decoder is not None
-    return str(decoder(data).message)
-
-
-@pytest.mark.long
-def test_a_viewer_sees_a_run_from_its_start_to_its_end(tmp_path: Path) -> None:
-    port = int(free_endpoint().rsplit(":", 1)[1])
-    out = tmp_path / "out"
-    (tmp_path / "assured.toml").write_text(REAL_TIME)
-    scenario = tmp_path / "assured.toml"
-    with TandemProcess(
-        "run", scenario, "-q", "--rate", "40", "--foxglove", str(port), "--out", out
-    ) as played:
-        played.until_prints(f"the Foxglove server at ws://127.0.0.1:{port}")
-        topics = asyncio.run(asyncio.wait_for(watched(port, "The mission ends: "), BOUND_S))
-        played.until_prints("until Ctrl-C")
-        assert played.tell(Signals.SIGINT)
-        ended = played.ended()
-    assert ended.status in OVER
-    assert re.search(r"\n(localised|undecided) after ", ended.out)
-    assert topics["/tf"] == "foxglove.FrameTransforms"
-    assert topics["/journal/agent-a/observation"] == "tandem.Observation"
-    again = replayed(read(out))
-    assert again.differences == ()
-
-
-def test_a_viewer_that_connects_late_sees_the_static_scene_and_the_end() -> None:
-    port = int(free_endpoint().rsplit(":", 1)[1])
-    with TandemProcess("run", "paper-1", "-q", "--foxglove", str(port)) as played:
-        played.until_prints("until Ctrl-C")
-        assert asyncio.run(asyncio.wait_for(watched(port, "The mission ends: localised"), BOUND_S))
-        played.tell(Signals.SIGINT)
-        assert played.ended().status == 0
-
-
-ORIGINS = {
-    None: 101,
-    "https://app.foxglove.dev": 101,
-    "file://": 101,
-    "http://localhost:8080": 101,  # named
-    "http://127.0.0.1:8080": 403,
-    "https://app.foxglove.dev.elsewhere.example": 403,
-    "http://elsewhere.example": 403,
-    "null": 403,
-}
-"""The origins of pages that connect to --foxglove, with the status of the answer."""
-
-
-def test_of_web_pages_only_foxglove_s_app_and_those_named_see_a_run() -> None:
-    port = int(free_endpoint().rsplit(":", 1)[1])
-    allowed = ("--foxglove-origin", "http://localhost:8080")
-    with TandemProcess("run", "paper-1", "-q", "--foxglove", str(port), *allowed) as played:
-        played.until_prints("until Ctrl-C")
-        for origin, status in ORIGINS.items():
-            for host, known in (("127.0.0.1", True), ("localhost", True), ("elsewhere.example", False)):
-                heads = {"Host": f"{host}:{port}"} | ({"Origin": origin} if origin is not None else {})
-                assert (origin, host, asked(port, heads)) == (origin, host, status if known else 403)
-        assert asked(port, {"Host": f"127.0.0.1:{port}", "Upgrade": "h2c"}) == 403
-        with pytest.raises(ConnectionError):
-            asked(port, {"X-Much": "x" * 100_000})
-        assert asked(port, {}) == 101
-        # no page can find the port of the SDK's own server
-        listening = {place for place in listened_by(processes_of(str(port))) if place[1] != port}
-        assert all(host.startswith("127.") and host != "127.0.0.1" for host, _ in listening)
-        assert len(listening) == 1
-
-
-@pytest.mark.long
-def test_a_crowd_of_viewers_is_turned_away_and_leaves_room_for_those_that_come_after_it() -> None:
-    port = int(free_endpoint().rsplit(":", 1)[1])
-    files = GUESTS_FILES + 50
-    limited = ("sh", "-c", f'ulimit -n {files}; exec "$@"', "sh")
-    heads = {"Host": f"127.0.0.1:{port}"}
-    with TandemProcess("run", "paper-1", "-q", "--foxglove", str(port), through=limited) as played:
-        played.until_prints("until Ctrl-C")
-        crowd = [asking(port, heads) for _ in range(GUESTS)]
-        assert {connection.getresponse().status for connection in crowd} == {101}
-        crowd += [asking(port, {}) for _ in range(files)]
-        assert crowd[GUESTS].getresponse().status == 503
-        assert server_at(port).num_fds() <= GUESTS_FILES
-        for connection in crowd:
-            connection.close()
-        until(lambda: asked(port, heads) == 101, "there is room again")
-
-
-def test_a_viewer_that_ends_before_ctrl_c_is_named() -> None:
-    port = int(free_endpoint().rsplit(":", 1)[1])
-    with TandemProcess("run", "paper-1", "-q", "--foxglove", str(port)) as played:
-        played.until_prints("until Ctrl-C")
-        server_at(port).kill()
-        ended = played.ended()
-    assert (ended.status, ended.err) == (3, "tandem run: the Foxglove server was killed by signal 9\n")
-
-
-def asked(port: int, heads: dict[str, str]) -> int:
-    """Return the status of the answer to a WebSocket handshake with these headers."""
-    connection = asking(port, heads)
-    status = connection.getresponse().status
-    connection.close()
-    return status
-
-
-def asking(port: int, heads: dict[str, str]) -> http.client.HTTPConnection:
-    """Return a connection on which a WebSocket handshake with these headers has been sent."""
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=BOUND_S)
-    usual = {
-        "Connection": "Upgrade",
-        "Upgrade": "websocket",
-        "Sec-WebSocket-Version": "13",
-        "Sec-WebSocket-Key": base64.b64encode(bytes(16)).decode(),
-        "Sec-WebSocket-Protocol": "foxglove.sdk.v1",
-    }
-    connection.request("GET", "/", headers=usual | heads)
-    return connection
-
-
-def server_at(port: int) -> psutil.Process:
-    """Return the process that listens on an IPv4 `port`."""
-    [pid] = {
-        link.pid
-        for link in psutil.net_connections("tcp4")
-        if link.status == psutil.CONN_LISTEN and link.laddr.port == port
-    }
-    assert pid is not None
-    return psutil.Process(pid)
-
-
-def listened_by(pids: Iterable[int]) -> set[tuple[str, int]]:
-    """Return the IPv4 addresses and ports on which these processes listen."""
-    return {
-        (str(link.laddr.ip), int(link.laddr.port))
-        for pid in pids
-        for link in psutil.Process(pid).net_connections("inet4")
-        if link.status == psutil.CONN_LISTEN
-    }
-
-
-def test_a_page_s_origin_is_named_as_a_browser_sends_it() -> None:
-    for words, complaint in (
-        (
-            ["--foxglove", "0", "--foxglove-origin", "viewer"],
-            "argument --foxglove-origin: 'viewer' is not an origin ",
-        ),
-        (["--foxglove-origin", "null"], "--foxglove-origin: it needs --foxglove"),
-    ):
-        ended = tandem("run", "paper-1", *words)
-        assert (ended.status, ended.out) == (2, "")
-        assert ended.err.startswith(f"tandem run: {complaint}")
-
-
-def test_a_port_in_use_is_reported_before_the_mission_starts(tmp_path: Path) -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
-        ended = tandem("run", "paper-1", "-q", "--foxglove", str(port), "--out", tmp_path / "out")
-    assert (ended.status, ended.out) == (2, "")
-    assert ended.err.startswith(f"tandem run: --foxglove: port {port} cannot be served: ")
-    assert list((tmp_path / "out").iterdir()) == []
 
 
 # --- reading ------------------------------------------------------------------------------------------

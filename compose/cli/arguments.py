@@ -326,13 +326,6 @@ def port(text: str) -> int:
     return value
 
 
-def origin(text: str) -> str:
-    """Return the origin of a web page, as a browser sends it. Raises ArgumentTypeError."""
-    if text != "null" and not re.fullmatch(r"[a-z][a-z0-9+.-]*://[A-Za-z0-9.\[\]:-]*", text):
-        raise ArgumentTypeError(f"'{text}' is not an origin such as https://viewer.example:8080")
-    return text
-
-
 def address(text: str) -> str:
     """Return an IP address in its canonical form. Raises ArgumentTypeError."""
     try:

@@ -16,6 +16,7 @@ from functools import cache
 from importlib import import_module
 from typing import NamedTuple, NoReturn
 
+from compose.cli.removed import refuse_removed
 from compose.errors import BROKEN_PIPE, BUG, FAILED, STOPPED_STATUS, USER_ERROR, UserError
 from compose.launch.interruption import INTERRUPTION
 from compose.terminal import text_width
@@ -183,11 +184,13 @@ def command_parser(command: CommandEntry) -> CommandParser:
 def _split(arguments: Sequence[str]) -> tuple[CommandEntry, Sequence[str]]:
     """Return the command that `arguments` name, and the words after it.
 
-    End the process after `--help` or `--version`, or if there is no such command.
+    End the process after `--help` or `--version`, or if there is no such command. Raises UserError if they
+    name something that was removed.
     """
     place = next(
         (i for i, word in enumerate(arguments) if word == "-" or not word.startswith("-")), len(arguments)
     )
+    refuse_removed(arguments[place:])
     parser = _top_parser()
     if not arguments:
         parser.error(f"COMMAND is missing; `{program('tandem')} --help` lists the commands")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -14,8 +14,8 @@ from compose.errors import FAILED, STOPPED_STATUS, UserError
 from compose.extras import need
 from compose.launch import processes, supervisor
 from compose.launch.interruption import INTERRUPTION
+from compose.launch.page_process import PageProcess, serving
 from compose.launch.signals import stop_by_signal
-from compose.launch.viewers import Viewer, foxglove_server, page, stay, viewing
 from compose.recording.kills_file import KILLS
 from compose.recording.recording_files import folder_for, not_recorded
 from compose.recording.run import Run, read
@@ -45,20 +45,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--export",
         action=argparse.BooleanOptionalAction,
         help="also write run.mcap and tables to --out DIR [default: if the extra `lab` is installed]",
-    )
-    parser.add_argument(
-        "--foxglove",
-        type=arguments.port,
-        metavar="PORT",
-        help="serve the live mission to Foxglove on this TCP port",
-    )
-    parser.add_argument(
-        "--foxglove-origin",
-        type=arguments.origin,
-        action="append",
-        default=[],
-        metavar="ORIGIN",
-        help="origin of web pages that may connect to --foxglove, besides Foxglove's own; may be repeated",
     )
     parser.add_argument(
         "--watch", action="store_true", help="serve a web page that shows the mission, live and afterwards"
@@ -96,7 +82,8 @@ def run_one(options: argparse.Namespace) -> int:
     scenario = found.seeded(options.seed)
     if options.out is not None and (any(options.out.glob("*.journal")) or (options.out / KILLS).exists()):
         raise UserError(f"--out: {options.out} already contains a recording; choose another folder")
-    _check_viewers(options)
+    if options.port is not None and not options.watch:
+        raise UserError("--port: it needs --watch, which serves the page")
     if options.export:
         need(*export_bar.MODULES)
         if options.out is None:
@@ -109,16 +96,6 @@ def run_one(options: argparse.Namespace) -> int:
     return _as_processes(options, scenario, kills)
 
 
-def _check_viewers(options: argparse.Namespace) -> None:
-    """Check the flags of viewers. Raises UserError."""
-    if options.port is not None and not options.watch:
-        raise UserError("--port: it needs --watch, which serves the page")
-    if options.foxglove is not None:
-        need("foxglove")
-    elif options.foxglove_origin:
-        raise UserError("--foxglove-origin: it needs --foxglove")
-
-
 def _in_process(options: argparse.Namespace, scenario: Scenario, kills: tuple[Kill, ...]) -> int:
     from compose.launch import in_process  # noqa: PLC0415  # processes need no planner here
 
@@ -129,14 +106,12 @@ def _in_process(options: argparse.Namespace, scenario: Scenario, kills: tuple[Ki
         raise UserError(f"{where}: --in-process has no processes to kill")
     if options.rate is not None:
         raise UserError("--rate: --in-process cannot run in real time")
-    if options.foxglove is not None:
-        raise UserError("--foxglove: with --in-process, the run is over before a viewer can connect")
     began = time.perf_counter()
     if options.out is None and not options.watch:
         with concluded(options, in_process.run_mission(scenario), None, "in-process", began) as status:
             return status
     inbox = Inbox("tandem run")
-    with folder_for(options.out) as folder, _viewers(options, scenario, folder, inbox) as viewers:
+    with folder_for(options.out) as folder, _page(options, folder, inbox) as page:
         began = time.perf_counter()
         try:
             finished = in_process.run_mission(scenario, folder)
@@ -146,7 +121,7 @@ def _in_process(options: argparse.Namespace, scenario: Scenario, kills: tuple[Ki
             break_off(options, folder, f"stopped by {INTERRUPTION.signal_name}", began)
             raise
         stop_by_signal(inbox)
-        return _finish(options, finished, folder, "in-process", began, viewers, inbox)
+        return _finish(options, finished, folder, "in-process", began, page, inbox)
 
 
 def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[Kill, ...]) -> int:
@@ -155,7 +130,7 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
     with (
         folder_for(options.out) as folder,
         _keys(options, scenario) as keys,
-        _viewers(options, scenario, folder, inbox) as viewers,
+        _page(options, folder, inbox) as page,
     ):
         began = time.perf_counter()
         try:
@@ -169,7 +144,7 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
                     timeout=options.timeout,
                     kills=kills,
                     keys=keys,
-                    agents_journal=bool(options.out is not None or kills or viewers or shows_live(options)),
+                    agents_journal=bool(options.out is not None or kills or page or shows_live(options)),
                     on_start=lambda: stop_by_signal(inbox),
                 )
         except supervisor.ChildFailed as failure:
@@ -185,7 +160,7 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
             return STOPPED_STATUS
         for kill in spared:
             inbox.say(f"--kill {kill.text}: not reached")
-        return _finish(options, read(folder), folder, "processes", began, viewers, inbox)
+        return _finish(options, read(folder), folder, "processes", began, page, inbox)
 
 
 @contextmanager
@@ -202,18 +177,14 @@ def _keys(options: argparse.Namespace, scenario: Scenario) -> Iterator[Path | No
 
 
 @contextmanager
-def _viewers(
-    options: argparse.Namespace, scenario: Scenario, folder: Path, inbox: Inbox
-) -> Iterator[list[Viewer]]:
-    """Start the viewers of the mission recorded in `folder`, print their addresses, and yield them."""
-    wanted = [page(folder, options.port or 0)] if options.watch else []
-    if options.foxglove is not None:
-        ids = [robot.id for robot in scenario.robots]
-        wanted.append(foxglove_server(folder, options.foxglove, options.foxglove_origin, ids))
-    with viewing(wanted, inbox) as started:
-        for viewer in started:
-            viewer.announce()
-        yield started
+def _page(options: argparse.Namespace, folder: Path, inbox: Inbox) -> Iterator[PageProcess | None]:
+    """Serve the page of the mission recorded in `folder`, and print its address; None without --watch."""
+    if not options.watch:
+        yield None
+        return
+    with serving(folder, options.port or 0, inbox) as page:
+        page.announce()
+        yield page
 
 
 def _finish(
@@ -222,17 +193,17 @@ def _finish(
     folder: Path,
     mode: Mode,
     began: float,
-    viewers: Sequence[Viewer],
+    page: PageProcess | None,
     inbox: Inbox,
 ) -> int:
-    """Write all files, print the outcome, serve the viewers until they are stopped, and return the status."""
+    """Write all files, print the outcome, serve the page until it is stopped, and return the status."""
     try:
         with concluded(options, run, folder, mode, began) as status:
             exported = _export(options, folder, inbox, None if options.in_process else run)
     except Interrupted as signal_name:
         inbox.say(f"stopped by {signal_name} before the export was complete")
         return STOPPED_STATUS
-    served = stay(viewers, inbox)
+    served = page is None or page.stay(inbox)
     return FAILED if not served or (options.export and not exported) else status
 
 

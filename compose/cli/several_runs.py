@@ -26,7 +26,7 @@ def run_all(
 
     Nothing runs if a scenario is invalid. The recording of each is in a folder of its own in `--out`.
     """
-    for flag in ("watch", "foxglove", "export"):
+    for flag in ("watch", "export"):
         if getattr(options, flag):
             raise UserError(f"--{flag}: it needs a single mission")
     named = [_named(options, *mission) for mission in missions]

@@ -25,7 +25,7 @@ from compose.cli.recording import note
 from compose.errors import ENDED, STOPPED_STATUS, UserError
 from compose.extras import need
 from compose.launch.class_loader import trust
-from compose.launch.viewers import OVER
+from compose.launch.page_process import OVER
 from protocol.output import say
 
 if TYPE_CHECKING:

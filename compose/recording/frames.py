@@ -2,31 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from typing import Any
 
 import msgspec
 from msgspec.structs import astuple
 
-from compose.recording.recording_files import KINDS
 from compose.recording.run import Run
-from protocol.journal.journal_file import message_in
-from protocol.messages import (
-    Command,
-    DeadlineMissed,
-    Environment,
-    Estimate,
-    FinalReport,
-    Localised,
-    Message,
-    MissionEnd,
-    Observation,
-)
+from protocol.messages import Command, DeadlineMissed, Estimate, Localised, MissionEnd, Observation
 from protocol.wire import body
-from world.scenario import Scenario
-
-OfWorld = Environment | Scenario | Command | DeadlineMissed | MissionEnd | FinalReport
-"""The kinds of messages in the world's journal."""
 
 
 class Journaled(msgspec.Struct, frozen=True):
@@ -39,7 +22,7 @@ class Journaled(msgspec.Struct, frozen=True):
     tick: int
     """Tick in which it was journaled; a Report that was received late is of an earlier tick."""
     message: Any
-    """Decoded message, one of KINDS."""
+    """Decoded message."""
     frame: bytes
     """Encoded message."""
 
@@ -81,18 +64,12 @@ def kind_of(kind: type[msgspec.Struct]) -> str:
     return str(kind.__struct_config__.tag)
 
 
-class JournalDecoder:
-    """A reader of the frames of one journal, which finds their ticks. They may be given in parts."""
-
-    def __init__(self, name: str) -> None:
-        """`name` is the file name of the journal."""
-        self._name = name
-        self._place = 0
-        self._tick = 0
-
-    def of(self, messages: Iterable[Message], frames: Iterable[bytes]) -> Iterator[Journaled]:
-        """Yield the next messages of the journal, whose frames are `frames`."""
-        for message, frame in zip(messages, frames, strict=False):
+def in_time(run: Run) -> list[Journaled]:
+    """Return the messages of all journals by tick, and within a tick in the order of the journals."""
+    found = []
+    for name, journal in run.journals.items():
+        latest = 0
+        for place, (message, frame) in enumerate(zip(journal.messages, journal.frames, strict=False)):
             match message:
                 case (
                     Observation(tick)
@@ -101,17 +78,6 @@ class JournalDecoder:
                     | DeadlineMissed(tick)
                     | MissionEnd(tick)
                 ):
-                    self._tick = max(self._tick, tick)
-            yield Journaled(self._name, self._place, self._tick, message, frame)
-            self._place += 1
-
-    def decoded(self, frames: Iterable[bytes]) -> Iterator[Journaled]:
-        """Yield the next frames of the journal. Raises CorruptJournal if one cannot be decoded."""
-        for frame in frames:
-            yield from self.of([message_in(frame, KINDS, self._name)], [frame])
-
-
-def in_time(run: Run) -> list[Journaled]:
-    """Return the messages of all journals by tick, and within a tick in the order of the journals."""
-    each = [JournalDecoder(name).of(one.messages, one.frames) for name, one in run.journals.items()]
-    return sorted([one for some in each for one in some], key=lambda one: one.tick)
+                    latest = max(latest, tick)
+            found.append(Journaled(name, place, latest, message, frame))
+    return sorted(found, key=lambda one: one.tick)

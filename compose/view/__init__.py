@@ -1,1 +1,1 @@
-"""Scenes of a run for viewers: the page (`web`), Foxglove (`foxglove`) and exported files (`export`)."""
+"""Scenes of a run for viewers: the page (`web`), MCAP files (`foxglove`) and exported files (`export`)."""

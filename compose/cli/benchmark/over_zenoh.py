@@ -12,8 +12,8 @@ from rich.table import Table
 
 from compose.cli.benchmark.bench_table import add_row, new_table
 from compose.launch import in_process, processes, zenoh_baseline
+from compose.launch.page_process import serving
 from compose.launch.supervisor import COMMAND, STOP_S, Supervisor
-from compose.launch.viewers import page, viewing
 from compose.network import KEYED
 from compose.recording.recording_files import WORLD_JOURNAL
 from compose.scenario import scenario_file
@@ -108,8 +108,8 @@ def _mission_rate(
         folder = stack.enter_context(tempfile.TemporaryDirectory())
         clients = []
         if watched:
-            (viewer,) = stack.enter_context(viewing([page(Path(folder), 0)], Inbox("tandem bench")))
-            clients.append([viewer.address])
+            page = stack.enter_context(serving(Path(folder), 0, Inbox("tandem bench")))
+            clients.append([page.address])
         common = ["--connect", str(endpoints), "--quiet", *(["--out", folder] if journals else [])]
         robots = [["agent", robot.id, *keyed(robot.id), *common] for robot in scenario.robots]
         with (

@@ -1,1 +1,1 @@
-"""Runs in Foxglove's formats: MCAP files and a live server."""
+"""Runs in Foxglove's formats: MCAP files, and a layout for them."""

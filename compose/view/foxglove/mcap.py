@@ -9,21 +9,19 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from io import RawIOBase
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import foxglove
 import msgspec
 from foxglove import Channel, Context, Schema
 from foxglove.mcap import MCAPWriteOptions
 
-from compose.recording.frames import Journaled, OfWorld, kind_of
-from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
+from compose.recording.frames import Journaled, kind_of
 from compose.recording.run_setup import RunSetup
 from compose.view.foxglove.schemas import object_schema, schema
 from compose.view.foxglove.views import Views, nanoseconds, topics
 from compose.view.numbers import Numbers
 from compose.view.scene import Scene
-from protocol.messages import OfRobot
 from protocol.wire import VERSION
 
 CHUNK_BYTES = 1 << 18
@@ -44,33 +42,14 @@ class Channels:
     def __init__(self, context: Context) -> None:
         self._context = context
         self._frames: dict[tuple[str, type], Channel] = {}
-        self._latest: dict[Channel, tuple[bytes, int]] = {}
         self._views: dict[str, Channel] = {}
-
-    def open(self, robots: Sequence[str]) -> None:
-        """Create all channels that a run of `robots` can have, so that none is added while viewers watch."""
-        for name, kinds in {
-            WORLD_JOURNAL: OfWorld,
-            **{agent_journal(one): OfRobot for one in robots},
-        }.items():
-            for kind in get_args(kinds):
-                self._of_frames(name, kind)
-        self.open_views(robots)
 
     def frame(self, one: Journaled, at: int) -> None:
         """Publish the msgpack body of a journaled frame on the channel of its journal and message type.
 
         `at` is the simulated time in ns.
         """
-        channel = self._of_frames(one.journal, type(one.message))
-        body = one.body
-        channel.log(body, log_time=at)
-        self._latest[channel] = (body, at)
-
-    def republish(self) -> None:
-        """Publish the latest journaled frame of each channel again, for new viewers."""
-        for channel, (body, at) in self._latest.items():
-            channel.log(body, log_time=at)
+        self._of_frames(one.journal, type(one.message)).log(one.body, log_time=at)
 
     def _of_frames(self, journal: str, kind: type[msgspec.Struct]) -> Channel:
         """Return the channel of a journal and a message type, created if needed."""
@@ -89,23 +68,17 @@ class Channels:
     def open_views(self, robots: Iterable[str]) -> None:
         """Create all channels for scenes, including those that stay empty."""
         for topic, kind in topics(robots).items():
-            if topic not in self._views:
-                numbers = kind is Numbers
-                self._views[topic] = Channel(
-                    topic,
-                    message_encoding="json" if numbers else "protobuf",
-                    schema=NUMBERS if numbers else kind.get_schema(),
-                    context=self._context,
-                )
+            numbers = kind is Numbers
+            self._views[topic] = Channel(
+                topic,
+                message_encoding="json" if numbers else "protobuf",
+                schema=NUMBERS if numbers else kind.get_schema(),
+                context=self._context,
+            )
 
     def view(self, topic: str, message: Any, at: int) -> None:
         """Publish a message of a scene on `topic`; `at` is the simulated time in ns."""
         self._views[topic].log(message.encode(), log_time=at)
-
-    @property
-    def watched(self) -> bool:
-        """True if any scene channel has a subscriber."""
-        return any(channel.has_sinks() for channel in self._views.values())
 
     def close(self) -> None:
         """Close all channels."""

@@ -1,7 +1,7 @@
 """Scenes of a run in Foxglove's schemas, which any compatible viewer displays without configuration.
 
 The reference frames are `world`, the true pose `ID` of robot ID, and its anchor's frame `ID/anchor`. Each
-message is complete in itself, so a viewer can seek in a recording or connect late.
+message is complete in itself, so a viewer can seek in a recording.
 """
 
 from __future__ import annotations
@@ -112,7 +112,6 @@ class Views:
         self.setup = setup
         self._unit = BODY_OF_RANGE * setup.mission.sensing_range
         self._trails = {robot: Trail() for robot in setup.ids}
-        self._latest: Scene | None = None
 
     def standing(self) -> Shown:
         """Return the static content: anchors, sensing ranges and orbits."""
@@ -123,30 +122,12 @@ class Views:
 
     def of(self, scene: Scene) -> Iterator[Shown]:
         """Yield the messages of one tick."""
-        yield from self.passing(scene)
-        yield from self._whole(scene)
-
-    def latest(self) -> Iterator[Shown]:
-        """Yield the messages of the latest tick again, for new viewers."""
-        if self._latest is not None:
-            yield from self._lines(self._latest)
-            yield from self._whole(self._latest)
-
-    def passing(self, scene: Scene) -> Iterator[Shown]:
-        """Yield only the log of a tick that is not shown; its poses are added to the trails."""
-        self._latest = scene
+        at = shapes.timestamp(nanoseconds(self.setup, scene.tick))
         for player in scene.players:
             if player.pose is not None:
                 self._trails[player.robot].add(player.pose)
-        yield from self._lines(scene)
-
-    def _lines(self, scene: Scene) -> Iterator[Shown]:
-        at = shapes.timestamp(nanoseconds(self.setup, scene.tick))
         for event in scene.events:
             yield Shown("/log", _line(event, at))
-
-    def _whole(self, scene: Scene) -> Iterator[Shown]:
-        at = shapes.timestamp(nanoseconds(self.setup, scene.tick))
         yield Shown("/tf", fox.FrameTransforms(transforms=list(self._transforms(scene, at))))
         for player in scene.players:
             robot_setup = self.setup.robot_setup(player.robot)

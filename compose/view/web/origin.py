@@ -9,19 +9,18 @@ from __future__ import annotations
 
 import ipaddress
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 
 
-def refusal(hosts: Sequence[str], origins: Sequence[str], allowed: Collection[str] = ()) -> str | None:
+def refusal(hosts: Sequence[str], origins: Sequence[str]) -> str | None:
     """Return the reason for which a request is refused, in one line; None if it is allowed.
 
-    `hosts` and `origins` are the values of these headers in the request; `allowed` are the origins of
-    foreign pages that are allowed.
+    `hosts` and `origins` are the values of these headers in the request.
     """
     if len(hosts) != 1 or not _is_here(hosts[0]):
         return "the Host header must be an IP address or localhost"
     own = (f"http://{hosts[0]}", f"https://{hosts[0]}")
-    if len(origins) > 1 or any(origin not in (*own, *allowed) for origin in origins):
+    if len(origins) > 1 or any(origin not in own for origin in origins):
         return "requests from pages of this origin are not allowed (Origin header)"
     return None
 

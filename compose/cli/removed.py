@@ -1,0 +1,33 @@
+"""The commands and flags that version 0.3 removed, and what replaces each; version 0.4 drops this table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from compose.errors import UserError
+
+
+class Removed(NamedTuple):
+    """A removed command, or a removed flag of a command."""
+
+    name: str
+    """The command, or the command and its flag, separated by one blank."""
+    instead: str
+    """What replaces it, as the end of a sentence."""
+
+
+_FOXGLOVE = "use `--watch`, or open run.mcap of `tandem export` in Foxglove"
+REMOVED = (
+    Removed("run --foxglove", _FOXGLOVE),
+    Removed("run --foxglove-origin", _FOXGLOVE),
+)
+
+
+def refuse_removed(words: Sequence[str]) -> None:
+    """Raise UserError if `words`, a command and its arguments, name something that was removed."""
+    named = {words[0]} if words else set()
+    named |= {f"{words[0]} {word.partition('=')[0]}" for word in words[1:] if word.startswith("--")}
+    for removed in REMOVED:
+        if removed.name in named:
+            raise UserError(f"`{removed.name}` was removed in version 0.3: {removed.instead}")

@@ -1,0 +1,88 @@
+"""The process that serves the page of a mission from its growing journals, and its launcher's side.
+
+It writes its address to standard output when it is ready. It ends on SIGTERM, and with its launcher.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from compose.errors import UserError
+from compose.launch.child import ChildProcess
+from compose.launch.supervisor import COMMAND, Supervisor
+from protocol.network.inbox import Inbox, Interrupted
+from protocol.output import say
+
+WHAT = "the page"
+"""The name of the process in messages."""
+OVER = b"."
+"""The message to it that the mission has ended."""
+READY_S = 30.0
+"""Time in s that it has to be ready."""
+
+
+def warm_up() -> None:
+    """Prepare a fork server for the page, which shares few modules. Importing this module does all of it."""
+
+
+class PageProcess:
+    """A running page."""
+
+    def __init__(self, child: ChildProcess, address: str) -> None:
+        self.address = address
+        self._child = child
+
+    def announce(self) -> None:
+        """Print the address."""
+        say(f"{WHAT} at {self.address}")
+
+    def stay(self, inbox: Inbox) -> bool:
+        """Wait, after the mission, for Ctrl-C or for the end of the page, which `inbox` receives.
+
+        Return whether it has not failed; a failure is printed. Processes of the mission that end later are
+        ignored.
+        """
+        self._child.send(OVER)
+        say(f"{WHAT} remains at {self.address} until Ctrl-C")
+        with suppress(Interrupted):
+            while self._child.running:
+                inbox.next(None)
+        if self._child.running or self._child.status == 0:
+            return True
+        inbox.say(f"{WHAT} {self._child.how_ended().splitlines()[-1]}")
+        return False
+
+
+@contextmanager
+def serving(folder: Path, port: int, inbox: Inbox) -> Iterator[PageProcess]:
+    """Serve the page of the recording in `folder` in this context; `inbox` receives the end of its process.
+
+    Raises UserError, with the last line of its standard error, if it is not ready within READY_S.
+    """
+    children = Supervisor(inbox, "compose.launch.page_process:warm_up")
+    arguments = ("watch", str(folder), "--launched", "--port", str(port))
+    try:
+        child = children.start(WHAT, *arguments, main=COMMAND, answers=True)
+        address = _address(child)
+        if address is None:
+            child.end()
+            errors = child.stderr_text().splitlines()
+            late = f"{WHAT}: not ready within {READY_S:g} s"
+            raise UserError(errors[-1].removeprefix("tandem watch: ") if errors else late)
+        yield PageProcess(child, address)
+    finally:
+        children.stop()
+
+
+def _address(child: ChildProcess) -> str | None:
+    """Return the address that the page writes when it is ready; None if it is not ready within READY_S."""
+    line, give_up = b"", time.monotonic() + READY_S
+    with suppress(TimeoutError):
+        while not line.endswith(b"\n") and (news := child.receive(give_up - time.monotonic())):
+            line += news
+    if not line.endswith(b"\n"):
+        return None
+    return line.decode().strip() or None
