@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import re
 from pathlib import Path
 
@@ -10,7 +9,6 @@ import pytest
 from matplotlib.text import Annotation
 from msgspec.structs import replace
 from playwright.sync_api import expect
-from rich.console import Console
 
 from agent.process.planner_replay import PlannerReplay
 from compose.figures import catalogue
@@ -26,7 +24,7 @@ from compose.recording.run import read as read_run
 from compose.scenario.scenario_file import parse
 from compose.scenario.shipped_files import shipped
 from compose.terminal import progress
-from compose.terminal.live_display import RobotMap
+from compose.terminal.live_display import ProgressLine
 from compose.view.foxglove.views import Views
 from compose.view.numbers import Numbers
 from compose.view.recorded import Journals, run_data, scenes, scenes_of
@@ -453,17 +451,13 @@ def test_the_table_has_the_tick_and_the_pose_of_each_claim_in_place_of_the_last_
     assert "tick: of the claim" in out
 
 
-def test_the_map_counts_localised_robots_and_names_destinations(
-    folder: Path, tmp_path: Path, run: Run
-) -> None:
+def test_the_line_of_a_mission_counts_robots_by_outcome(folder: Path, tmp_path: Path, run: Run) -> None:
+    line = ProgressLine(run.scenario, tmp_path)
+    assert line.display().plain.endswith(f"tick 0 of {run.scenario.max_ticks} at most: waiting for 8")
     frames = list(journal_file.read(folder / "world.journal"))
     (tmp_path / "world.journal").write_bytes(packed(frames[: round(0.68 * len(frames))]))
-    console = Console(file=io.StringIO(), width=100, height=40, markup=False)
-    console.print(RobotMap(run.scenario, tmp_path, console).display())
-    assert isinstance(console.file, io.StringIO)
-    text = console.file.getvalue()
-    assert "4 of 8 robots localised" in text
-    assert re.search(r"r[0-3]  phase 2: travelling to r[4-7]", text)
+    assert line.display().plain.endswith(" at most: 4 localised, 4 no verdict yet")
+    assert line.display().plain.endswith(" at most: 4 localised, 4 no verdict yet")
 
 
 def test_localised_robots_have_another_colour_in_foxglove_and_in_pictures(

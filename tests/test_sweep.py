@@ -486,6 +486,18 @@ def test_the_printed_command_of_a_trial_runs_it_again(folder: Path) -> None:
 
 
 @pytest.mark.long
+def test_the_bar_of_a_sweep_says_what_its_times_are_and_fits_80_columns(folder: Path) -> None:
+    (folder / "few.toml").write_text('name = "a-name-of-18-chars"\nscenario = "random"\ntrials = 40\n')
+    status, shown = on_a_terminal("sweep", "few.toml", "--workers", "1", "--out", "out", cwd=folder)
+    assert status == 0
+    lines = [line for line in re.split("\x1b\\[2K|\r|\n", shown) if "left" in line]
+    text = re.sub("\x1b\\[[?0-9;]*[a-zA-Z]", "", lines[-1])
+    assert re.search(r"/40 [0-9.e+]+ trials/s [0-9:]+ elapsed, [0-9:]+ left", text)
+    assert text.startswith("a-name-of-18-chars")
+    assert len(text) <= 80
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("columns", [80, 40])
 def test_a_narrow_terminal_shows_all_outcomes_and_breaks_no_word_and_no_command(
     columns: int, folder: Path

@@ -23,7 +23,7 @@ from compose.recording.summary_json import Mode
 from compose.scenario.kills import Kill
 from compose.scenario.run_settings import check_rate, run_name
 from compose.scenario.scenario_file import setting
-from compose.terminal.outcome import break_off, concluded, shown_live, shows_live
+from compose.terminal.outcome import break_off, concluded, shown_live
 from protocol.journal.journal_file import CannotRecord
 from protocol.network.inbox import Inbox, Interrupted
 from world.scenario import Scenario
@@ -144,7 +144,7 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
                     timeout=options.timeout,
                     kills=kills,
                     keys=keys,
-                    agents_journal=bool(options.out is not None or kills or page or shows_live(options)),
+                    agents_journal=bool(options.out is not None or kills or page),
                     on_start=lambda: stop_by_signal(inbox),
                 )
         except supervisor.ChildFailed as failure:

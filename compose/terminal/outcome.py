@@ -23,18 +23,13 @@ from world.scenario import Scenario
 @contextmanager
 def shown_live(options: argparse.Namespace, scenario: Scenario, folder: Path) -> Iterator[None]:
     """Show the progress of the run recorded in `folder`, if standard output is a terminal."""
-    if not shows_live(options):
+    if options.quiet or not sys.stdout.isatty():
         yield
         return
     from compose.terminal import live_display  # noqa: PLC0415  # loaded only if it is used
 
     with live_display.live(scenario, folder):
         yield
-
-
-def shows_live(options: argparse.Namespace) -> bool:
-    """Return whether a run is displayed while it runs."""
-    return not options.quiet and sys.stdout.isatty()
 
 
 @contextmanager
