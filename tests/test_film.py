@@ -1,15 +1,12 @@
-"""`tandem export --gif` and `--mp4`: the guided play of a recording as an animated picture and as a video."""
+"""`tandem export --gif`: the guided play of a recording as an animated picture."""
 
 from __future__ import annotations
 
 import shutil
 from contextlib import suppress
-from itertools import pairwise
 from pathlib import Path
 from signal import SIGINT, SIGTERM, Signals
 
-import av
-import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
@@ -19,10 +16,6 @@ from tests.series import series
 
 MOST_BYTES = 500_000
 """The largest size of the picture of paper-1."""
-MOST_FRAMES = 600
-"""The largest number of frames of the video of paper-1."""
-FRAME_S = 1.0
-"""The time in s in which the browser draws a frame on any machine."""
 
 
 def need_browser() -> None:
@@ -44,31 +37,12 @@ def test_the_picture_lasts_as_long_as_guided_play_and_is_small(paper_1: Path, tm
     assert len(durations) > 30
 
 
-@pytest.mark.long
-@pytest.mark.timeout(300)  # it draws hundreds of frames
-def test_the_video_lasts_as_long_as_guided_play_and_is_small(paper_1: Path, tmp_path: Path) -> None:
-    need_browser()
-    with TandemProcess("export", paper_1, "--mp4", "--out", tmp_path) as export:
-        ended = export.ended(MOST_FRAMES * FRAME_S)
-    assert (ended.status, ended.out, ended.err) == (0, f"{tmp_path / 'run.mp4'}\n", "")
-    assert (tmp_path / "run.mp4").stat().st_size < 2 * MOST_BYTES
-    with av.open(tmp_path / "run.mp4") as video:
-        (stream,) = video.streams.video
-        assert (stream.width, stream.height) == (film.WIDTH, film.HEIGHT)
-        frames = [frame.to_ndarray(format="gray") for frame in video.decode(stream)]
-    assert 40_000 < len(frames) * film.VIDEO_FRAME_MS < 60_000
-    assert len(frames) < MOST_FRAMES
-    changes = sum([bool(np.abs(now.astype(np.int16) - was).max() > 64) for was, now in pairwise(frames)])
-    assert changes > 100
-
-
-@pytest.mark.parametrize("kind", ["gif", "mp4"])
 def test_without_a_browser_there_is_one_line(
-    kind: str, paper_1: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    paper_1: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    ended = tandem("export", paper_1, f"--{kind}", "--out", tmp_path / "out")
-    message = f"tandem export: --{kind} needs chromium: apt-get install chromium\n"
+    ended = tandem("export", paper_1, "--gif", "--out", tmp_path / "out")
+    message = "tandem export: --gif needs chromium: apt-get install chromium\n"
     assert ended == (2, "", message)
 
 

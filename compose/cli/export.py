@@ -48,11 +48,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="write only run.gif: the guided play as an animated picture (extra film, and Chromium)",
     )
-    kinds.add_argument(
-        "--mp4",
-        action="store_true",
-        help="write only run.mp4: the guided play as a video (extra film, and Chromium)",
-    )
     add_closing(parser, "tandem export recording --out exported", "docs/recordings.md")
 
 
@@ -67,9 +62,7 @@ def main(options: argparse.Namespace) -> int:
     if options.html:
         return _html(options.recording, out)
     if options.gif:
-        return _film(options.recording, out, "gif")
-    if options.mp4:
-        return _film(options.recording, out, "mp4")
+        return _gif(options.recording, out)
     if options.rerun:
         return _rerun(options.recording, out)
     need(*MODULES)
@@ -105,23 +98,23 @@ def _html(recording: Path, out: Path) -> int:
     return ENDED
 
 
-def _film(recording: Path, out: Path, kind: str) -> int:
-    """Write run.gif or run.mp4 to `out`, and print its path."""
-    need(*["av"] * (kind == "mp4"), "PIL", "playwright", extra="film")
+def _gif(recording: Path, out: Path) -> int:
+    """Write run.gif to `out`, and print its path."""
+    need("PIL", "playwright", extra="film")
     from compose.view.web import film  # noqa: PLC0415  # slow to import, and optional
     from compose.view.web.standalone import standalone_page  # noqa: PLC0415  # it imports Zenoh
 
     inbox = Inbox("tandem export")
-    program = film.browser(f"--{kind}")
+    program = film.browser("--gif")
     page = standalone_page(recording)
     note("export", page.notes)
     stop_by_signal(inbox)
     try:
-        content = (film.gif if kind == "gif" else film.mp4)(page.html, program, lambda: inbox.next(0.0))
+        content = film.gif(page.html, program, lambda: inbox.next(0.0))
     except Interrupted as signal_name:
         inbox.say(f"stopped by {signal_name}")
         return STOPPED_STATUS
-    say(str(_written(out, f"run.{kind}", content)))
+    say(str(_written(out, "run.gif", content)))
     return ENDED
 
 

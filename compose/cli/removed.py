@@ -21,6 +21,7 @@ _FOXGLOVE = "use `--watch`, or open run.mcap of `tandem export` in Foxglove"
 REMOVED = (
     Removed("run --foxglove", _FOXGLOVE),
     Removed("run --foxglove-origin", _FOXGLOVE),
+    Removed("export --mp4", "use `--gif`, or `--html`, whose page plays the mission"),
 )
 
 

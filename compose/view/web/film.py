@@ -1,4 +1,4 @@
-"""The guided play of a recording as an animated picture or a video, taken from the page in headless Chromium.
+"""The guided play of a recording as an animated picture, taken from the page in headless Chromium.
 
 The clock of the page stands still between two frames, so that the frames do not depend on the
 speed of the machine.
@@ -33,17 +33,13 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 WIDTH, HEIGHT = 900, 640
 """The size of the picture in pixels."""
 FRAME_MS = 250
-"""The time between two frames of a picture in ms; the page lets no more pass between two of its drawings."""
-VIDEO_FRAME_MS = 100
-"""The time between two frames of a video in ms."""
+"""The time between two frames in ms; the page lets no more pass between two of its drawings."""
 STILL_AFTER = 6
 """The number of frames with a mark before the one that is a picture of it."""
 LAST_MS = 3000
 """The time in ms for which the last frame is shown."""
 MOST_MS = 300_000
 """The longest time in ms that is shown. Guided play takes about a minute."""
-QUALITY = "20"
-"""The constant rate factor of a video; text is sharp with it, and a smaller one makes larger files."""
 STYLE = """
 header, aside, #further, #legend summary, #transport button, #pace { display: none !important; }
 #mission { grid-template-columns: 1fr; }
@@ -76,12 +72,7 @@ def gif(page: str, program: str, check: Callable[[], object] = lambda: None) -> 
 
     `program` is the browser. `check` is called between two frames; if it raises, the browser is closed.
     """
-    return _gif(_frames(page, program, FRAME_MS, check), check)
-
-
-def mp4(page: str, program: str, check: Callable[[], object] = lambda: None) -> bytes:
-    """Return the same as a video: MP4 with H.264."""
-    return _mp4(_frames(page, program, VIDEO_FRAME_MS, check), check)
+    return _gif(_frames(page, program, check), check)
 
 
 def still(html: str, program: str, mark: str, size: tuple[int, int]) -> bytes:
@@ -95,7 +86,7 @@ def still(html: str, program: str, mark: str, size: tuple[int, int]) -> bytes:
     with _opened(html, program, size, lambda: None) as page:
         marked = page.locator("#legend li").get_by_text(mark)
         after = 0
-        for _ in _played(page, FRAME_MS, lambda: None):
+        for _ in _played(page, lambda: None):
             after += marked.count() > 0
             if after > STILL_AFTER:
                 break
@@ -105,12 +96,12 @@ def still(html: str, program: str, mark: str, size: tuple[int, int]) -> bytes:
     return file.getvalue()
 
 
-def _frames(html: str, program: str, frame_ms: int, check: Callable[[], object]) -> list[bytes]:
-    """Return the frames of guided play as PNG files, one for each `frame_ms`."""
+def _frames(html: str, program: str, check: Callable[[], object]) -> list[bytes]:
+    """Return the frames of guided play as PNG files."""
     with _opened(html, program, (WIDTH, HEIGHT), check) as page:
         page.add_style_tag(content=STYLE)
         page.keyboard.press("f")  # a camera at rest: most of the picture stays the same
-        return list(_played(page, frame_ms, check))
+        return list(_played(page, check))
 
 
 @contextmanager
@@ -166,12 +157,12 @@ def _killed(folder: Path) -> bool:
     return found
 
 
-def _played(page: Page, frame_ms: int, check: Callable[[], object]) -> Iterator[bytes]:
-    """Play the page, and yield a PNG file for each `frame_ms`."""
+def _played(page: Page, check: Callable[[], object]) -> Iterator[bytes]:
+    """Play the page, and yield a PNG file for each FRAME_MS."""
     page.locator("#play").evaluate("(button) => button.click()")
-    for _ in range(MOST_MS // frame_ms):
+    for _ in range(MOST_MS // FRAME_MS):
         check()
-        page.clock.fast_forward(frame_ms)
+        page.clock.fast_forward(FRAME_MS)
         yield page.screenshot()
         if page.locator("#play").get_attribute("aria-label") == "Play":
             return
@@ -205,23 +196,6 @@ def _gif(frames: list[bytes], check: Callable[[], object]) -> bytes:
         file, "GIF", save_all=True, append_images=rest, duration=durations, loop=0,
         transparency=SAME_PIXEL, disposal=1, optimize=False,
     )  # fmt: skip
-    return file.getvalue()
-
-
-def _mp4(frames: list[bytes], check: Callable[[], object]) -> bytes:
-    """Return PNG files as a video; the last one stays for LAST_MS."""
-    import av  # noqa: PLC0415  # optional
-    from PIL import Image  # noqa: PLC0415
-
-    file = BytesIO()
-    with av.open(file, "w", format="mp4") as video:
-        stream = video.add_stream("libx264", rate=1000 // VIDEO_FRAME_MS, options={"crf": QUALITY})
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
-        for frame in frames + frames[-1:] * (LAST_MS // VIDEO_FRAME_MS):
-            check()
-            pixels = np.asarray(Image.open(BytesIO(frame)).convert("RGB"))
-            video.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
-        video.mux(stream.encode())
     return file.getvalue()
 
 
