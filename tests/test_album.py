@@ -26,7 +26,7 @@ from msgspec.structs import replace
 from agent.planning.assured import AssuredExact
 from agent.planning.phase3_last_manoeuvre import compared
 from agent.planning.strides import stride
-from compose.cli.figures import drawing
+from compose.cli.figures import draw
 from compose.figures import PICTURES, catalogue, decisions, manoeuvre, over_time, phase_one, steps, trajectory
 from compose.figures.agent_replay import agent_replay
 from compose.figures.pair import PairRecord, pair_of
@@ -367,24 +367,19 @@ ABSENT = {"undecided": {"phase-1-a", "plan-a-b", "encounter-a-b"}}
 
 @pytest.mark.parametrize("name", series(["noisy", "undecided", "assured", "faulty", "letter"], 0))
 def test_each_kind_of_figure_is_drawn_or_the_reason_is_printed(
-    name: str, recordings: Path, tmp_path: Path
+    name: str, recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     told = pair(recorded(name, recordings))
     kinds = [kind for kind in PICTURES if kind != "robot"]
-    tasks = drawing(told, kinds, ["svg"], tmp_path, torn=False, paper=False)
-    assert len(tasks) == len(kinds)
-    lines = [line for task in tasks for line in task()]
-    out = [line.text for line in lines if not line.error]
-    err = [line.text for line in lines if line.error]
+    out = [path for kind in kinds for path in draw(told, kind, ["svg"], tmp_path, torn=False, paper=False)]
+    err = capsys.readouterr().err
     made = {path.stem for path in tmp_path.iterdir()}
     missing = ABSENT.get(name, set())
-    assert sorted(re.findall(r"^tandem figures: no (\S+): .+$", "\n".join(err), re.MULTILINE)) == sorted(
-        missing
-    )
+    assert sorted(re.findall(r"^tandem figures: no (\S+): .+$", err, re.MULTILINE)) == sorted(missing)
     always = {"trajectory-a-b", "phase-1-a", "phase-1-b", "encounter-a-b", "ranges-a-b", "errors-a-b"}
     assert made >= always - missing
     assert any(name.startswith("plan-") for name in made) == ("plan-a-b" not in missing)
-    assert sorted(out) == sorted(map(str, tmp_path.iterdir()))
+    assert sorted(out) == sorted(tmp_path.iterdir())
 
 
 def test_every_pair_has_figures_of_its_own(recordings: Path) -> None:

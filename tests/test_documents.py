@@ -29,7 +29,6 @@ NESTED = 100_000 * '{"a":'
 PARSERS = {"msgspec.json.decode", "msgspec.json.Decoder", "msgspec.toml.decode", "json.loads", "json.load"}
 """The functions that parse what `protocol.documents` checks."""
 OWN = {
-    "compose/launch/second_process.py",  # what another process of Tandem wrote
     "compose/view/foxglove/layout.py",  # what a library returned
     "compose/view/web/page_client.py",  # what a page of the benchmark answered
     "protocol/network/endpoints.py",  # what Zenoh returned of a configuration that was checked

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +14,6 @@ from compose.errors import ENDED, FAILED, CannotWrite
 from compose.extras import need
 from compose.figures import FIGURE_FORMATS, PICTURES
 from compose.launch.class_loader import trust
-from compose.launch.second_process import OutputLine, Task, share
 from compose.recording.group_localisation import PastMeeting, past_meetings
 from compose.recording.recording_files import agent_journal, user_errors
 from compose.recording.run import Run
@@ -72,7 +70,7 @@ def main(options: argparse.Namespace) -> int:
     pairs: list[tuple[Sequence[str], PastMeeting | None]] = [((one.a, one.b), one) for one in past]
     pairs = pairs or [(robots, None) for robots in run.pairs]
     replayed: dict[str, AgentReplay | None] = {}
-    drawn: list[str] = []
+    drawn: list[Path] = []
     with (
         _printed(drawn),
         counting("tandem figures", sum([len(robots) + len(kinds) for robots, _ in pairs])) as done,
@@ -92,61 +90,45 @@ def main(options: argparse.Namespace) -> int:
                 status = FAILED
                 continue
             try:
-                tasks = drawing(pair, kinds, formats, folder, torn=bool(torn), paper=options.paper)
-                share(tasks, partial(_noted, drawn, done))
+                for kind in kinds:
+                    drawn += draw(pair, kind, formats, folder, torn=bool(torn), paper=options.paper)
+                    done()
             except OSError as error:
                 raise CannotWrite(folder, error) from None
     return status
 
 
-def drawing(
-    pair: PairRecord, kinds: Sequence[str], formats: Sequence[str], folder: Path, *, torn: bool, paper: bool
-) -> list[Task]:
-    """Return the tasks of drawing the figures of `kinds`, one for each kind.
+def draw(
+    pair: PairRecord, kind: str, formats: Sequence[str], folder: Path, *, torn: bool, paper: bool
+) -> list[Path]:
+    """Draw the figures of `kind`, print why one does not apply, and return the paths of the files.
 
-    A task returns a line for each file, and for each figure that does not apply. `torn` states that the
-    recording is incomplete, so that an event that it lacks may have happened; `paper` is the flag.
-    Raises OSError, as do the tasks.
+    `torn` states that the recording is incomplete, so that an event that it lacks may have happened; `paper`
+    is the flag. Raises OSError.
     """
     from compose.figures import catalogue, style  # noqa: PLC0415
     from compose.figures.sheet import Absent  # noqa: PLC0415
 
     medium = style.PAPER if paper else style.SCREEN
     folder.mkdir(exist_ok=True)
-
-    def draw(kind: str) -> Sequence[OutputLine]:
-        lines = []
-        with style.look(medium):
-            for name, figure in catalogue.pictures(pair, kind, medium):
-                if isinstance(figure, Absent):
-                    why = f"{figure.why}{' (in the incomplete recording)' if torn else ''}"
-                    lines.append(OutputLine(f"tandem figures: no {name}: {why}", error=True))
-                else:
-                    paths = style.save(figure, folder / name, formats, medium.dpi)
-                    lines += [OutputLine(str(path)) for path in paths]
-        return lines
-
-    return [partial(draw, kind) for kind in kinds]
+    paths: list[Path] = []
+    with style.look(medium):
+        for name, figure in catalogue.pictures(pair, kind, medium):
+            if isinstance(figure, Absent):
+                _say(f"no {name}: {figure.why}{' (in the incomplete recording)' if torn else ''}")
+            else:
+                paths += style.save(figure, folder / name, formats, medium.dpi)
+    return paths
 
 
 @contextmanager
-def _printed(paths: Sequence[str]) -> Iterator[None]:
+def _printed(paths: Sequence[Path]) -> Iterator[None]:
     """Print `paths` after the block, because the reader of the output may leave at the first line."""
     try:
         yield
     finally:
         if paths:
-            say(*paths)
-
-
-def _noted(drawn: list[str], done: Callable[[], None], lines: Sequence[OutputLine]) -> None:
-    """Add the paths in `lines` to those `drawn`, and print the other lines."""
-    for line in lines:
-        if line.error:
-            say(line.text, error=True)
-        else:
-            drawn.append(line.text)
-    done()
+            say(*map(str, paths))
 
 
 def _replays(

@@ -8,6 +8,7 @@ exit status of each process. The server ends when the launcher does, and no proc
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import os
 import select
@@ -22,9 +23,10 @@ import msgspec
 from setproctitle import setproctitle
 
 from compose.launch.forked import REQUEST_BYTES, STREAMS, Ended, ForkRequest, Imported, Signal
-from compose.launch.parent_end import end_with_parent, signal_when_parent_ends
 from protocol.output import one_line
 
+PR_SET_PDEATHSIG = 1
+"""The option of prctl(2) for a signal on the end of the parent, from <sys/prctl.h>."""
 NOT_FORKED = 71
 """The exit status reported for a process that could not be forked (EX_OSERR)."""
 LINGER_S = 5.0
@@ -127,12 +129,20 @@ def _become(start: ForkRequest, streams: list[int], parent: int) -> None:
     """Give this forked process its own session, default signals, standard streams, arguments and title."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     os.setsid()
-    end_with_parent(parent, signal.SIGKILL)
+    _signal_when_parent_ends(signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(128 + signal.SIGKILL)
     for number, stream in enumerate(streams):
         os.dup2(stream, number)
         os.close(stream)
     sys.argv = [start.title, *start.arguments]
     setproctitle(one_line(" ".join(sys.argv)))
+
+
+def _signal_when_parent_ends(number: signal.Signals) -> None:
+    """Send `number` to this process when its parent ends; without effect on systems other than Linux."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, number)
 
 
 def _call(name: str) -> None:
@@ -144,7 +154,7 @@ def main() -> None:
     """Call WARM_UP, and fork processes until the launcher has ended."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
-    signal_when_parent_ends(signal.SIGCONT)  # a suspended server must notice the end, too
+    _signal_when_parent_ends(signal.SIGCONT)  # a suspended server must notice the end, too
     _call(sys.argv[1])
     setproctitle(f"tandem fork-server of {os.getppid()}")
     gc.collect()

@@ -8,7 +8,6 @@ from pathlib import Path
 import msgspec
 
 from compose.errors import CannotWrite, UserError
-from compose.launch.second_process import OutputLine, Task, share
 from compose.recording.frames import in_time
 from compose.recording.recording_files import agent_journal, make_folder
 from compose.recording.run import Run
@@ -40,9 +39,8 @@ def export(
     *,
     done: Callable[[], object] = lambda: None,
     check: Callable[[], object] = lambda: None,
-    alone: bool = True,
 ) -> Exported:
-    """Write the files for `run` to `out`; unless `alone`, with the help of a second process.
+    """Write the files for `run` to `out`.
 
     Calls `done` after each file, and `check` between steps, which may raise.
     Raises OSError or CorruptJournal if a journal cannot be read to its end, UserError if there is no
@@ -62,9 +60,12 @@ def export(
         lambda path: path.write_text(table(ticks), encoding="utf-8"),
         lambda path: write_ticks(run, ticks, setup.mission.period, path),
     )
-    tasks = [_task(write, path) for write, path in zip(writers, paths, strict=True)]
     try:
-        share(tasks, lambda _: done(), check, alone=alone)
+        for write, path in zip(writers, paths, strict=True):
+            check()
+            with files.draft(path) as place:
+                write(place)
+            done()
     except OSError as error:
         raise CannotWrite(out, error) from None
     except TooLong as error:
@@ -75,14 +76,3 @@ def export(
         torn={name: journal.torn for name, journal in run.journals.items() if journal.torn},
         missing=tuple([name for name in names if name not in run.journals]),
     )
-
-
-def _task(write: Callable[[Path], object], path: Path) -> Task:
-    """Return the task of writing the file at `path` by `write`."""
-
-    def task() -> Sequence[OutputLine]:
-        with files.draft(path) as place:
-            write(place)
-        return ()
-
-    return task
