@@ -27,7 +27,6 @@ from world.world_journal import WorldJournalReading
 def run_data(run: Run) -> RunData:
     """Return the data of a recording. The world's journal takes precedence over those of the agents."""
     known = RunData()
-    known.add_kills(run.kills)
     if run.world is not None:
         for tick in run.world.ticks:
             known.add_tick(tick)
@@ -42,6 +41,7 @@ def run_data(run: Run) -> RunData:
     if run.end is not None:
         known.conclude(run.end)
     known.add_final_reports(run.final_reports)
+    known.add_kills(run.kills)
     return known
 
 
@@ -93,8 +93,6 @@ class Journals:
         """One line per damaged journal. Its frames after the damage are ignored."""
         self._tails: dict[str, Tail] = {}
         self._world = WorldJournalReading()
-        self._kills = 0
-        """The number of killed processes that have been read."""
 
     @property
     def scenario(self) -> Scenario | None:
@@ -103,7 +101,6 @@ class Journals:
 
     def read(self) -> None:
         """Read the frames appended since the last call, as many as `Tail` reads at once. Raises OSError."""
-        self._read_kills()
         for path in journals_in(self.folder):
             tail = self._tails.setdefault(path.name, Tail(path))
             try:
@@ -128,24 +125,20 @@ class Journals:
         if world is None and len(configs) > (len(self.setup.robots) if self.setup is not None else 0):
             self.setup = of_configs(self.folder.name, configs)
 
-    def _read_kills(self) -> None:
-        kills, note = kills_in(self.folder)
-        if note is not None:
-            self._note(note)
-            return
-        self.known.add_kills(kills[self._kills :])
-        self._kills = len(kills)
-
     @property
     def more(self) -> bool:
         """True if the last call of `read` has left frames to be read by the next one."""
         return any(tail.more for tail in self._tails.values())
 
     def fill(self) -> None:
-        """Compute missing observations from the world's journal. Call once the journals are complete."""
+        """Add what follows from complete journals: missing observations, and the killed processes."""
         content = self._world.content()
         if content is not None:
             self.known.add_observations(content.worlds)
+        kills, note = kills_in(self.folder)
+        self.known.add_kills(kills)
+        if note is not None:
+            self._note(note)
 
     def _note(self, text: str) -> None:
         if text not in self.notes:

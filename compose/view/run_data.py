@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -66,14 +65,6 @@ class TickData(msgspec.Struct, frozen=True):
     A number that cannot be right is left out: the launcher's list is not part of the journals."""
 
 
-class Absence(NamedTuple):
-    """The ticks in which a killed process was gone."""
-
-    killed: Killed
-    last: int
-    """The latest of these ticks that is known."""
-
-
 class RunData:
     """The data of a run, collected while messages arrive."""
 
@@ -91,14 +82,6 @@ class RunData:
         self._seen: set[str | None] = set()
         self.gone: set[str | None] = set()
         """Robots whose process was seen and has ended; None is the world."""
-        self._complete = -1
-        """The latest tick that the world's journal has completely."""
-        self._kills: dict[int, list[Killed]] = {}
-        """The processes that were killed in ticks after `_complete`, by tick."""
-        self._missed: dict[str, list[int]] = {}
-        """The complete ticks whose deadline each robot has missed, in ascending order."""
-        self._absences: dict[str | None, Absence] = {}
-        """The latest absence of each process that was killed and is not known to be back."""
         self._meetings: dict[int, Meetings] = {}
         """The latest meeting of each robot of a group by tick, in the order of the ticks."""
         self._setup_at: tuple[RunSetup, Meetings, RunSetup] | None = None
@@ -166,67 +149,39 @@ class RunData:
         for robot, command in tick.commands.items():
             data.commands.setdefault(robot, command)
         data.late.update({robot.id for robot in tick.world.scenario.robots} - tick.commands.keys())
-        for robot in data.late:
-            self._missed.setdefault(robot, []).append(tick.truth.tick)
-        self._complete = tick.truth.tick
-        self._extend_absences()
-        for killed in self._kills.pop(self._complete, ()):
-            self._begin_absence(killed)
-
-    def add_kills(self, kills: Iterable[Killed]) -> None:
-        """Add processes that were killed; those that are no process of the mission are ignored."""
-        for killed in kills:
-            if killed.tick <= self._complete:
-                self._begin_absence(killed)
-            else:
-                self._kills.setdefault(killed.tick, []).append(killed)
 
     def add_final_reports(self, reports: Mapping[str, FinalReport]) -> None:
-        """Add the FinalReports of the world's journal, after all of its ticks."""
+        """Add the FinalReports of the world's journal."""
         self.final_reports.update(reports)
-        self._extend_absences()
 
-    def _begin_absence(self, killed: Killed) -> None:
-        """Add the absence of a process from the tick of its kill, which is complete."""
-        robot = None if killed.who == WORLD else killed.who
-        data = self.ticks[killed.tick]
-        if robot is None or robot in data.truth:
-            if robot not in data.down:
-                self.at(killed.tick).down.add(robot)
-            self._absences[robot] = Absence(killed, killed.tick)
-            self._extend_absence(robot)
+    def add_kills(self, kills: Iterable[Killed]) -> None:
+        """Add processes that were killed, once the journals are complete; others than theirs are ignored."""
+        of_process: dict[str | None, dict[int, Killed]] = {}
+        for killed in kills:
+            of_process.setdefault(None if killed.who == WORLD else killed.who, {})[killed.tick] = killed
+        for robot, by_tick in of_process.items():
+            for tick, killed in by_tick.items():
+                if tick in self.ticks and (robot is None or robot in self.ticks[tick].truth):
+                    self._add_absence(robot, killed, by_tick)
 
-    def _extend_absences(self) -> None:
-        for robot in list(self._absences):
-            self._extend_absence(robot)
+    def _add_absence(self, robot: str | None, killed: Killed, by_tick: Mapping[int, Killed]) -> None:
+        """Add the absence of a process in the tick of its kill, and in those after it that it was late for.
 
-    def _extend_absence(self, robot: str | None) -> None:
-        """Extend the absence of a process by the complete ticks after it whose deadline the process missed.
-
-        A process that is started again is back when a tick after it is complete, or its FinalReport is known:
-        it goes on only if what it replayed is identical to its journal.
+        It ends before the next kill in `by_tick`. The process is back if it answers the next tick, or at the
+        end: it goes on only if what it replayed is identical to its journal.
         """
-        killed, last = self._absences[robot]
-        while last < self._complete and robot in self.ticks[last + 1].late:
+        last = killed.tick
+        self.at(last).down.add(robot)
+        while last + 1 not in by_tick and last + 1 in self.ticks and robot in self.ticks[last + 1].late:
             last += 1
-            if robot not in self.ticks[last].down:
-                self.at(last).down.add(robot)
-        self._absences[robot] = Absence(killed, last)
-        reported = self.end is not None and (robot is None or robot in self.final_reports)
-        if last < self._complete or reported:
-            del self._absences[robot]
-            if killed.after is not None:
-                self.at(last).back.add(robot)
-                if self._can_have_replayed(killed, robot):
-                    self.ticks[last].replayed[robot] = killed.replayed_ticks
-
-    def _can_have_replayed(self, killed: Killed, robot: str | None) -> bool:
-        """Return whether a process can have replayed as many ticks as `killed` says.
-
-        It has answered all ticks before the kill but those whose deadline it missed, and none after it.
-        """
-        missed = bisect_left(self._missed.get(robot, []), killed.tick) if robot is not None else 0
-        return killed.tick - missed <= killed.replayed_ticks <= killed.tick + 1
+            self.at(last).down.add(robot)
+        following = self.ticks.get(last + 1)
+        answers = following is not None and (robot is None or robot in following.commands)
+        ends = self.end is not None and (robot is None or robot in self.final_reports)
+        if killed.after is not None and (answers or ends):
+            self.ticks[last].back.add(robot)
+            if killed.replayed_ticks <= killed.tick + 1:
+                self.ticks[last].replayed[robot] = killed.replayed_ticks
 
     def add_observations(self, worlds: Iterable[World]) -> None:
         """Add the Observations that are still missing in the ticks of `worlds`."""
