@@ -21,6 +21,7 @@ from msgspec import inspect as types
 
 from compose.cli.main import COMMANDS, command_parser
 from compose.cli.removed import REMOVED
+from compose.recording import rows
 from compose.recording.estimating.estimate_rows import (
     EstimateSummary,
     PoseEstimate,
@@ -30,7 +31,6 @@ from compose.recording.estimating.estimate_rows import (
 from compose.recording.estimating.learned_errors import LearnedErrors
 from compose.recording.group_localisation import MeetingResult
 from compose.recording.ranging import recording_rows
-from compose.recording.ticks_csv import TickRow
 from compose.scenario.fault_syntax import FaultTable
 from compose.scenario.json_schema import described
 from compose.scenario.kills import KillTable
@@ -51,7 +51,6 @@ from protocol import messages, wire
 from protocol.attack import Attack
 from protocol.network import keys
 from protocol.noise import Noise, VelocityNoise
-from tandem import rows
 from tests.expected.tables import table as results_of
 from world.world_noise import WorldActuationNoise, WorldNoise, WorldOdometryNoise
 
@@ -308,7 +307,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "trial-columns": partial(columns_of, TrialRow),
     "robot-columns": partial(columns_of, RobotRow),
     "difference-columns": partial(columns_of, PairedDifference),
-    "tick-columns": partial(columns_of, TickRow),
+    "tick-columns": partial(columns_of, rows.TickRow),
     "truth-table": partial(columns_of, rows.TruthRow),
     "observation-table": partial(columns_of, rows.ObservationRow),
     "command-table": partial(columns_of, rows.CommandRow),

@@ -17,7 +17,9 @@ from compose.extras import need
 from compose.figures import PICTURES
 from compose.launch import model_loader
 from compose.launch.class_loader import name_of, trust
+from compose.recording import rows
 from compose.recording import run as recorded
+from compose.recording.frames import in_time
 from compose.recording.group_localisation import MeetingResult, meeting_results
 from compose.recording.reasons import reason_for
 from compose.recording.recording_files import make_folder, user_errors
@@ -26,7 +28,6 @@ from protocol import documents, files
 from protocol.journal.journal_file import CorruptJournal, packed
 from protocol.messages import Outcome
 from protocol.spelling import did_you_mean
-from tandem import rows
 from tandem.columns import Table, table_of
 
 if TYPE_CHECKING:
@@ -137,7 +138,7 @@ class Run(msgspec.Struct, frozen=True, dict=True, eq=False):
     @cached_property
     def messages(self) -> Table:
         """All journaled frames, by tick, with their content as JSON: the columns of `MessageRow`."""
-        return table_of(rows.MessageRow, rows.message_rows(self.model))
+        return table_of(rows.MessageRow, rows.message_rows(in_time(self.model)))
 
     @cached_property
     def claims(self) -> Table:

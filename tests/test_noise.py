@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from compose.launch import in_process
 from compose.recording.reasons import reason_for
 from compose.recording.recording_files import WORLD_JOURNAL
+from compose.recording.rows import ticks_csv
 from compose.recording.run import Run, read
-from compose.recording.ticks_csv import ticks_csv
 from compose.scenario.scenario_file import load, parse
 from protocol.journal import journal_file
 from protocol.journal.environment import of_world

@@ -13,9 +13,9 @@ import pytest
 
 from agent.estimation.closed_forms import Placement, placements
 from compose.launch.in_process import run_mission
+from compose.recording.rows import ticks_csv
 from compose.recording.run import Run
 from compose.recording.summary_json import summary
-from compose.recording.ticks_csv import ticks_csv
 from compose.scenario.scenario_file import load
 from protocol.journal import journal_file
 from protocol.messages import (

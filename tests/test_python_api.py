@@ -21,9 +21,9 @@ from compose.audit.rules import audit_run
 from compose.cli.benchmark import api_missions
 from compose.recording import run as recorded
 from compose.recording.estimating.estimate_rows import PoseEstimateRow
+from compose.recording.rows import tick_rows
 from compose.recording.run import read
 from compose.recording.summary_json import summary
-from compose.recording.ticks_csv import rows
 from protocol.messages import Command
 from protocol.motion import REST
 from tandem import scenarios
@@ -37,7 +37,6 @@ MODULES = (
     ".columns",
     ".missions",
     ".results",
-    ".rows",
     ".scenarios",
     ".sweeps",
     ".worlds",
@@ -161,7 +160,7 @@ def test_a_run_as_processes_with_a_kill_has_the_same_data() -> None:
 
 
 def test_the_tables_hold_what_the_files_hold(run: tandem.Run) -> None:
-    ticks = list(rows(run.model))
+    ticks = list(tick_rows(run.model))
     for name in ("tick", "robot", "x", "y", "heading"):
         assert run.truth[name].tolist() == [getattr(row, name) for row in ticks]
     for name in ("anchor_range", "mutual_range"):

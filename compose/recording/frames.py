@@ -64,6 +64,11 @@ def kind_of(kind: type[msgspec.Struct]) -> str:
     return str(kind.__struct_config__.tag)
 
 
+def verdict_name(command: Command | None) -> str | None:
+    """Return `localised`, `undecided` or `inconsistent`; None without a Command, or one without a verdict."""
+    return kind_of(type(command.verdict)) if command is not None and command.verdict is not None else None
+
+
 def in_time(run: Run) -> list[Journaled]:
     """Return the messages of all journals by tick, and within a tick in the order of the journals."""
     found = []

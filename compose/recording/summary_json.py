@@ -21,8 +21,8 @@ from compose.recording.group_localisation import (
     search_results,
 )
 from compose.recording.reasons import of_it, outcome_after, reason_for
+from compose.recording.rows import ticks_csv
 from compose.recording.run import Run
-from compose.recording.ticks_csv import ticks_csv
 from protocol import files
 from protocol.messages import FinalReport
 from protocol.motion import Pose, wrap

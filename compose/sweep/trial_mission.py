@@ -12,8 +12,8 @@ import msgspec
 from compose.audit import rules
 from compose.audit.findings import Findings
 from compose.launch import in_process
+from compose.recording.rows import ticks_csv
 from compose.recording.run import Run, of_frames, read
-from compose.recording.ticks_csv import ticks_csv
 from compose.scenario.kills import Kill
 from compose.scenario.run_settings import run_name
 from protocol.journal.journal_file import MemoryJournal, packed

@@ -11,6 +11,7 @@ from pathlib import Path
 from rich.live import Live
 from rich.text import Text
 
+from compose.recording.frames import verdict_name
 from compose.recording.recording_files import KINDS, WORLD_JOURNAL
 from compose.terminal import tables
 from protocol.journal.journal_file import Tail
@@ -52,7 +53,7 @@ class ProgressLine:
                 message = decode(frame, KINDS, MAX_FRAME_BYTES)
                 if isinstance(message, Command):
                     self._commands[message.robot] = message
-        outcomes = Counter(_outcome(command) for command in self._commands.values())
+        outcomes = Counter(verdict_name(command) or UNDECIDED for command in self._commands.values())
         waiting = len(self._scenario.robots) - len(self._commands)
         parts = [f"{count} {name}" for name, count in outcomes.most_common()]
         parts += [f"waiting for {waiting}"] * (waiting > 0)
@@ -63,7 +64,3 @@ class ProgressLine:
             no_wrap=True,
             overflow="ellipsis",
         )
-
-
-def _outcome(command: Command) -> str:
-    return str(command.verdict.__struct_config__.tag) if command.verdict is not None else UNDECIDED

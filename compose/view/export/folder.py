@@ -10,9 +10,9 @@ import msgspec
 from compose.errors import CannotWrite, UserError
 from compose.recording.frames import in_time
 from compose.recording.recording_files import agent_journal, make_folder
+from compose.recording.rows import MessageRow, TickRow, csv_text, message_rows, tick_rows
 from compose.recording.run import Run
-from compose.recording.ticks_csv import rows, table
-from compose.view.export.parquet import frames_csv, write_ticks
+from compose.view.export.parquet import write_ticks
 from compose.view.foxglove.layout import layout
 from compose.view.foxglove.mcap import TooLong, write_mcap
 from compose.view.recorded import checked, scenes_of
@@ -49,15 +49,15 @@ def export(
     robots, setup = checked(run)
     check()
     frames = in_time(run)
-    ticks = list(rows(run))
+    ticks = list(tick_rows(run))
     check()
     make_folder(out)
     paths = tuple([out / name for name in FILES])
     writers: Sequence[Callable[[Path], object]] = (
         lambda path: write_mcap(setup, frames, scenes_of(run), path, check),
         lambda path: path.write_bytes(layout(setup)),
-        lambda path: path.write_text(frames_csv(frames, check), encoding="utf-8"),
-        lambda path: path.write_text(table(ticks), encoding="utf-8"),
+        lambda path: path.write_text(csv_text(MessageRow, message_rows(frames, check)), encoding="utf-8"),
+        lambda path: path.write_text(csv_text(TickRow, ticks), encoding="utf-8"),
         lambda path: write_ticks(run, ticks, setup.mission.period, path),
     )
     try:

@@ -1,25 +1,20 @@
-"""Tables of a recording: one row per tick and robot with its estimate, and one row per journaled frame."""
+"""`ticks.parquet`: one row per tick and robot, with its estimate."""
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import pyarrow as pa
 import pyarrow.parquet as pq
 from msgspec.structs import asdict
 
-from compose.recording.claim import nees
-from compose.recording.frames import Journaled
+from compose.recording.frames import verdict_name
+from compose.recording.rows import TickRow, hypotheses
 from compose.recording.run import Run
-from compose.recording.ticks_csv import TickRow
 from protocol.messages import Estimate
-from protocol.motion import Covariance, Pose
-from world.referee import errors
+from protocol.motion import Covariance, Pose, wrap
 
 _POSE = pa.struct([(name, pa.float64()) for name in Pose.__struct_fields__])
 _TICK_TYPES: dict[str, pa.DataType] = {
@@ -44,61 +39,37 @@ TICK_COLUMNS = [
 """The columns of `ticks.parquet`."""
 
 
-def write_ticks(run: Run, rows: Iterable[TickRow], period: float, path: Path) -> None:
-    """Write `ticks.parquet` to `path`: the `rows` of `run`, with estimates and their errors.
+def write_ticks(run: Run, ticks: Iterable[TickRow], period: float, path: Path) -> None:
+    """Write `ticks.parquet` to `path`: the rows of `ticks.csv`, with estimates and their errors.
 
     `period` is T_s in s.
     """
     estimates = {(robot, one.tick): one for robot, agent in run.agents.items() for one in agent.estimates}
+    truths = {robot: run.truth(robot) for robot in run.robots}
     lines = []
-    for row in rows:
-        command = run.command(row.robot, row.tick)
-        extra = {
-            "time_s": row.tick * period,
-            "verdict": _tag(command.verdict if command is not None else None),
-        }
-        lines.append(asdict(row) | extra | _estimate(estimates.get((row.robot, row.tick)), row.pose))
+    for row in ticks:
+        more: dict[str, Any] = {"time_s": row.tick * period}
+        more["verdict"] = verdict_name(run.command(row.robot, row.tick))
+        held = estimates.get((row.robot, row.tick))
+        if held is not None:
+            pose = truths[row.robot][row.tick] if truths[row.robot] else None
+            more |= _estimate(held, Pose(pose.x, pose.y, wrap(pose.heading)) if pose else None, period)
+        lines.append(asdict(row) | more)
     schema = pa.schema([pa.field(name, _TICK_TYPES.get(name, pa.float64())) for name in TICK_COLUMNS])
     pq.write_table(pa.Table.from_pylist(lines, schema=schema), path)
 
 
-def _tag(verdict: msgspec.Struct | None) -> str | None:
-    return str(verdict.__struct_config__.tag) if verdict is not None else None
-
-
-def _estimate(held: Estimate | None, truth: Pose | None) -> dict[str, Any]:
+def _estimate(held: Estimate, truth: Pose | None, period: float) -> dict[str, Any]:
     """Return the columns of an estimate, with the errors of its first world pose if the truth is known."""
-    if held is None:
-        return {}
     columns: dict[str, Any] = {
         "local": [asdict(pose) for pose in held.local],
         "world": [asdict(pose) for pose in held.world],
         "probability": list(held.probabilities),
     }
-    if not held.world:
-        return columns
-    first = held.world[0]
-    columns |= {f"estimate_{name}": value for name, value in asdict(first).items()}
-    if truth is not None:
-        columns["position_error_m"], columns["heading_error_rad"] = errors(first, truth)
-    if held.covariance is not None:
-        columns |= {f"cov_{name}": value for name, value in asdict(held.covariance).items()}
-        columns["position_sigma_m"] = held.covariance.position_sigma
-        columns["heading_sigma_rad"] = held.covariance.heading_sigma
-        if truth is not None:
-            columns["nees"] = nees(first, truth, held.covariance)
+    if held.world:
+        first = next(hypotheses(held, truth, period))
+        columns |= {f"estimate_{name}": value for name, value in asdict(held.world[0]).items()}
+        columns |= {name: getattr(first, name) for name in _MEASURES}
+        if held.covariance is not None:
+            columns |= {f"cov_{name}": value for name, value in asdict(held.covariance).items()}
     return columns
-
-
-def frames_csv(frames: Iterable[Journaled], check: Callable[[], object] = lambda: None) -> str:
-    """Return the CSV table with one row per frame: its position, tick, kind, size, and message as JSON.
-
-    Calls `check` before each frame, which may raise.
-    """
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["journal", "place", "tick", "kind", "bytes", "message"])
-    for one in frames:
-        check()
-        writer.writerow([one.journal, one.place, one.tick, one.kind, len(one.frame), one.json])
-    return out.getvalue()

@@ -1,22 +1,56 @@
-"""The rows of a run's tables. Poses are in the world frame unless stated."""
+"""The tables of a run: a type for the rows of each, whose fields are the columns, and the rows.
+
+`ticks.csv`, `ticks.parquet`, `frames.csv` and the tables of the Python API are made of them. Poses are in the
+world frame unless stated.
+"""
 
 from __future__ import annotations
 
+import csv
+import io
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import msgspec
+from msgspec.structs import astuple
 
 from compose.recording import run as recorded
 from compose.recording.claim import Claim, nees
-from compose.recording.frames import in_time
+from compose.recording.frames import Journaled, verdict_name
 from protocol.messages import Estimate
 from protocol.motion import Pose, wrap
 from world.referee import errors
 
 
-class TruthRow(msgspec.Struct, frozen=True):
-    """The true pose of one robot in one tick."""
+class TickRow(msgspec.Struct, frozen=True):
+    """One row of `ticks.csv`: one robot in one tick. None is an empty field of the file."""
+
+    tick: int
+    """The tick k."""
+    robot: str
+    """The robot's name."""
+    x: float | None
+    """True x in m; None in hardware mode."""
+    y: float | None
+    """True y in m; None in hardware mode."""
+    heading: float | None
+    """True heading in rad, in (-pi, pi]; None in hardware mode."""
+    v: float | None
+    """Speed in m/s executed until the next tick, measured in hardware mode; None in the last tick."""
+    omega: float | None
+    """Turn rate in rad/s, like `v`."""
+    anchor_range: float | None
+    """Measured range to the anchor in m."""
+    mutual_range: float | None
+    """Measured range to the peer in m; in a group, to the nearest robot."""
+    phase: int | None
+    """Phase of the Command; None if the Command was late."""
+    state: str | None
+    """Planner state of the Command; None if the Command was late."""
+
+
+class RobotTick(msgspec.Struct, frozen=True):
+    """What the rows about one robot in one tick begin with."""
 
     tick: int
     """The tick k."""
@@ -24,6 +58,11 @@ class TruthRow(msgspec.Struct, frozen=True):
     """The simulated time k T_s in s."""
     robot: str
     """The robot's name."""
+
+
+class TruthRow(RobotTick, frozen=True):
+    """The true pose of one robot in one tick."""
+
     x: float
     """True x in m."""
     y: float
@@ -32,15 +71,9 @@ class TruthRow(msgspec.Struct, frozen=True):
     """True heading in rad, in (-pi, pi]."""
 
 
-class ObservationRow(msgspec.Struct, frozen=True):
+class ObservationRow(RobotTick, frozen=True):
     """The measurements of one robot in one tick."""
 
-    tick: int
-    """The tick k."""
-    time_s: float
-    """The simulated time k T_s in s."""
-    robot: str
-    """The robot's name."""
     v: float | None
     """The odometry over the tick before: speed in m/s; missing in tick 0."""
     omega: float | None
@@ -53,15 +86,9 @@ class ObservationRow(msgspec.Struct, frozen=True):
     """The range to the peer in m; missing without one."""
 
 
-class CommandRow(msgspec.Struct, frozen=True):
+class CommandRow(RobotTick, frozen=True):
     """The Command of one robot in one tick. A Command that was late has no row."""
 
-    tick: int
-    """The tick k."""
-    time_s: float
-    """The simulated time k T_s in s."""
-    robot: str
-    """The robot's name."""
     v: float
     """The commanded speed in m/s until the next tick."""
     omega: float
@@ -74,15 +101,9 @@ class CommandRow(msgspec.Struct, frozen=True):
     """The final result: `localised`, `undecided` or `inconsistent`; missing until there is one."""
 
 
-class EstimateRow(msgspec.Struct, frozen=True):
+class EstimateRow(RobotTick, frozen=True):
     """One hypothesis about the pose of one robot in one tick; a tick has as many rows as hypotheses."""
 
-    tick: int
-    """The tick k."""
-    time_s: float
-    """The simulated time k T_s in s."""
-    robot: str
-    """The robot's name."""
     frame: str
     """The frame of the pose: `world`, or `local`, the anchor frame, while its direction is unknown."""
     hypothesis: int
@@ -163,6 +184,30 @@ class ClaimRow(msgspec.Struct, frozen=True):
     """The size of all reports sent in bytes."""
 
 
+def tick_rows(run: recorded.Run) -> Iterator[TickRow]:
+    """Yield one row per tick and robot, from tick 0. A robot whose journal ends earlier has no later rows."""
+    truths = {robot: run.truth(robot) for robot in run.robots}
+    for tick in range(run.length):
+        for robot, observation in run.observations[tick].items():
+            pose = truths[robot][tick] if truths[robot] else None
+            contact = run.contact(robot, tick)
+            driven = run.driven(robot, tick)
+            command = run.command(robot, tick)
+            yield TickRow(
+                tick,
+                robot,
+                x=pose.x if pose is not None else None,
+                y=pose.y if pose is not None else None,
+                heading=wrap(pose.heading) if pose is not None else None,
+                v=driven.v if driven is not None else None,
+                omega=driven.omega if driven is not None else None,
+                anchor_range=observation.anchor_range,
+                mutual_range=contact.range if contact is not None else None,
+                phase=command.phase if command is not None else None,
+                state=command.task if command is not None else None,
+            )
+
+
 def truth_rows(run: recorded.Run, period: float) -> Iterator[TruthRow]:
     """Yield the true poses by tick; `period` is T_s in s. There are none in hardware mode."""
     paths = {robot: run.truth(robot) for robot in run.robots}
@@ -195,8 +240,9 @@ def command_rows(run: recorded.Run, period: float) -> Iterator[CommandRow]:
         for robot in run.robots:
             one = run.command(robot, tick)
             if one is not None:
-                verdict = str(one.verdict.__struct_config__.tag) if one.verdict is not None else None
-                yield CommandRow(tick, tick * period, robot, one.v, one.omega, one.phase, one.task, verdict)
+                yield CommandRow(
+                    tick, tick * period, robot, one.v, one.omega, one.phase, one.task, verdict_name(one)
+                )
 
 
 def estimate_rows(run: recorded.Run, period: float) -> Iterator[EstimateRow]:
@@ -205,10 +251,11 @@ def estimate_rows(run: recorded.Run, period: float) -> Iterator[EstimateRow]:
     found = [one for agent in run.agents.values() for one in agent.estimates]
     for one in sorted(found, key=lambda one: one.tick):
         path = paths[one.robot]
-        yield from _hypotheses(one, path[one.tick] if one.tick < len(path) else None, period)
+        yield from hypotheses(one, path[one.tick] if one.tick < len(path) else None, period)
 
 
-def _hypotheses(one: Estimate, truth: Pose | None, period: float) -> Iterator[EstimateRow]:
+def hypotheses(one: Estimate, truth: Pose | None, period: float) -> Iterator[EstimateRow]:
+    """Yield the hypotheses of an estimate; `truth` is the true pose in its tick, if it is known."""
     for place, pose in enumerate(one.world or one.local):
         covariance = one.covariance if one.world and not place else None
         position, heading = errors(pose, truth) if one.world and truth is not None else (None, None)
@@ -231,9 +278,12 @@ def _hypotheses(one: Estimate, truth: Pose | None, period: float) -> Iterator[Es
         )
 
 
-def message_rows(run: recorded.Run) -> Iterator[MessageRow]:
-    """Yield the frames of all journals, by tick."""
-    for one in in_time(run):
+def message_rows(
+    frames: Iterable[Journaled], check: Callable[[], object] = lambda: None
+) -> Iterator[MessageRow]:
+    """Yield the rows of journaled frames. Calls `check` before each, which may raise."""
+    for one in frames:
+        check()
         yield MessageRow(one.journal, one.place, one.tick, one.kind, len(one.frame), one.json)
 
 
@@ -272,3 +322,17 @@ def _claim(run: recorded.Run, robot: str) -> Claim | None:
         return run.claim(robot)
     tick, verdict = found
     return Claim(tick, verdict.pose, verdict.covariance, math.nan, math.nan, None)
+
+
+def ticks_csv(run: recorded.Run) -> str:
+    """Return the text of `ticks.csv`."""
+    return csv_text(TickRow, tick_rows(run))
+
+
+def csv_text(kind: type[msgspec.Struct], rows: Iterable[msgspec.Struct]) -> str:
+    """Return `rows`, of type `kind`, as a CSV table; floats are in their shortest exact form."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(kind.__struct_fields__)
+    writer.writerows([["" if one is None else one for one in astuple(row)] for row in rows])
+    return out.getvalue()
