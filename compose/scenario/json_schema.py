@@ -27,7 +27,7 @@ def json_schema(file: type[msgspec.Struct]) -> dict[str, Any]:
     It accepts more than a command does: rules between fields are not part of it.
     """
     schema: dict[str, Any] = _for_toml(msgspec.json.schema(file))
-    structs = {struct.__name__: struct for struct in _structs(inspect.type_info(file))}
+    structs = {struct.__name__: struct for struct in structs_in(inspect.type_info(file))}
     for name, definition in schema["$defs"].items():
         struct = structs[name]
         definition["description"] = " ".join((struct.__doc__ or "").split("\n\n")[0].split())
@@ -61,20 +61,24 @@ def _for_toml(value: Any) -> Any:
     return found
 
 
-def _structs(kind: inspect.Type) -> Iterator[type[msgspec.Struct]]:
+def structs_in(kind: inspect.Type) -> Iterator[type[msgspec.Struct]]:
     """Yield the structs in a type, at any depth."""
     match kind:
         case inspect.StructType(cls=cls, fields=fields):
             yield cls
             for field in fields:
-                yield from _structs(field.type)
+                yield from structs_in(field.type)
         case inspect.Metadata(type=inner):
-            yield from _structs(inner)
+            yield from structs_in(inner)
         case inspect.UnionType(types=several) | inspect.TupleType(item_types=several):
             for one in several:
-                yield from _structs(one)
-        case inspect.ListType(item_type=item) | inspect.VarTupleType(item_type=item):
-            yield from _structs(item)
+                yield from structs_in(one)
+        case (
+            inspect.ListType(item_type=item)
+            | inspect.VarTupleType(item_type=item)
+            | inspect.DictType(value_type=item)
+        ):
+            yield from structs_in(item)
 
 
 def described(struct: type[msgspec.Struct], field: str) -> str:

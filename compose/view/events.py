@@ -37,6 +37,13 @@ class Event(msgspec.Struct, frozen=True, omit_defaults=True):
     """The addition of the ground truth, for views that show it; None if there is none."""
 
     @property
+    def level(self) -> Literal["info", "warning", "error"]:
+        """How serious it is."""
+        if self.kind == "inconsistent":
+            return "error"
+        return "warning" if self.kind in ("report-lost", "report-damaged", "late", "undecided") else "info"
+
+    @property
     def whole(self) -> str:
         """The sentence with what the ground truth adds to it."""
         return self.text if self.truth is None else f"{self.text}; {self.truth}"

@@ -7,8 +7,9 @@ import math
 import msgspec
 from msgspec import UNSET, UnsetType
 
+from compose.recording.run_setup import RobotSetup
 from compose.view.outlines import OUTLINE_SIGMAS
-from compose.view.scene import HeldPoses, Player
+from compose.view.scene import HeldPoses, Player, Scene
 from protocol.mission import Anchor
 from protocol.motion import Pose
 from world.referee import errors
@@ -42,7 +43,7 @@ class Numbers(msgspec.Struct, frozen=True):
         `anchor` is its own, None if it has none, and `peer` the poses that its peer holds.
         """
         held = player.held
-        hypotheses = held.world or held.local if held is not None else ()
+        hypotheses = held.poses if held is not None else ()
         world = held.world if held is not None else ()
         covariance = held.covariance if world and held is not None else None
         ranges = [
@@ -60,7 +61,7 @@ class Numbers(msgspec.Struct, frozen=True):
         distances = [errors(pose, player.pose)[0] for pose in world] if player.pose is not None else []
         return Numbers(
             hypotheses=len(hypotheses) if held is not None else UNSET,
-            probability=_probability(held) if held is not None and hypotheses else UNSET,
+            probability=held.shares[0] if held is not None and hypotheses else UNSET,
             position_error_m=(max(distances) if own is None else distances[0]) if distances else UNSET,
             position_bound_m=OUTLINE_SIGMAS * covariance.position_sigma if covariance is not None else UNSET,
             anchor_range_m=player.anchor_range if player.anchor_range is not None else UNSET,
@@ -68,6 +69,12 @@ class Numbers(msgspec.Struct, frozen=True):
             anchor_residual_m=_residual(player.anchor_range, expected),
             mutual_residual_m=_residual(ranges[0] if ranges else None, apart),
         )
+
+    @staticmethod
+    def in_scene(scene: Scene, robot: RobotSetup) -> Numbers:
+        """Return the numbers of `robot` in the tick of `scene`."""
+        player = scene.player(robot.id)
+        return Numbers.of(player, robot.given_anchor, scene.held_by(player.peer or robot.peer))
 
     def encode(self) -> bytes:
         """Return the numbers as a JSON object."""
@@ -78,12 +85,7 @@ def _leading(held: HeldPoses | None) -> Pose | None:
     """Return the pose in the world frame that is more probable than all others together, if there is one."""
     if held is None or not held.world:
         return None
-    return held.world[0] if _probability(held) > 0.5 else None
-
-
-def _probability(held: HeldPoses) -> float:
-    """Return the probability of the first pose; there must be one."""
-    return held.probability[0] if held.probability else 1.0 / len(held.world or held.local)
+    return held.world[0] if held.shares[0] > 0.5 else None
 
 
 def _residual(measured: float | None, expected: float | None) -> float | UnsetType:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import msgspec
 
@@ -73,6 +74,16 @@ class HeldPoses(msgspec.Struct, frozen=True, omit_defaults=True):
     """The outline in m of where the first pose in `world` is, if along an arc; empty if in an ellipse."""
 
     @property
+    def poses(self) -> tuple[Pose, ...]:
+        """The poses in the world frame or, while there are none, in that of the anchor."""
+        return self.world or self.local
+
+    @property
+    def shares(self) -> tuple[Probability, ...]:
+        """The probability of each of `poses`."""
+        return self.probability or (1.0 / max(1, len(self.poses)),) * len(self.poses)
+
+    @property
     def outline(self) -> Sequence[Point]:
         """The closed outline of where the first pose in `world` is; empty without a covariance."""
         if self.covariance is None or not self.world:
@@ -125,6 +136,17 @@ class Player(msgspec.Struct, frozen=True, omit_defaults=True):
         return self.command is not None and isinstance(self.command.verdict, Localised)
 
 
+class PairLink(NamedTuple):
+    """Two robots that meet during the run, and the line between them while they are in contact."""
+
+    a: str
+    b: str
+    ends: tuple[Point, ...] = ()
+    """The true positions of both in m; empty if they are not in contact, or a position is unknown."""
+    range: float | None = None
+    """The range between them in m, if it was measured."""
+
+
 class Scene(msgspec.Struct, frozen=True):
     """The visible data of one tick."""
 
@@ -147,6 +169,16 @@ class Scene(msgspec.Struct, frozen=True):
     def held_by(self, robot: str) -> HeldPoses | None:
         """Return the poses that `robot` holds; None if they, or the robot, are unknown."""
         return next((player.held for player in self.players if player.robot == robot), None)
+
+    def links(self, setup: RunSetup) -> Iterator[PairLink]:
+        """Yield the link of each pair that meets during the run."""
+        for one, other in setup.links():
+            a, b = self.player(one.id), self.player(other.id)
+            contact = next((contact for contact in a.contacts if contact.peer == other.id), None)
+            if contact is None or a.pose is None or b.pose is None:
+                yield PairLink(one.id, other.id)
+            else:
+                yield PairLink(one.id, other.id, ((a.pose.x, a.pose.y), (b.pose.x, b.pose.y)), contact.range)
 
 
 def scene(

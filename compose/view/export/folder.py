@@ -14,7 +14,7 @@ from compose.recording.rows import MessageRow, TickRow, csv_text, message_rows, 
 from compose.recording.run import Run
 from compose.view.export.parquet import write_ticks
 from compose.view.foxglove.layout import layout
-from compose.view.foxglove.mcap import TooLong, write_mcap
+from compose.view.foxglove.mcap import TooLong, mcap
 from compose.view.recorded import checked, scenes_of
 from protocol import files
 
@@ -54,7 +54,7 @@ def export(
     make_folder(out)
     paths = tuple([out / name for name in FILES])
     writers: Sequence[Callable[[Path], object]] = (
-        lambda path: write_mcap(setup, frames, scenes_of(run), path, check),
+        lambda path: path.write_bytes(mcap(setup, frames, scenes_of(run), check)),
         lambda path: path.write_bytes(layout(setup)),
         lambda path: path.write_text(csv_text(MessageRow, message_rows(frames, check)), encoding="utf-8"),
         lambda path: path.write_text(csv_text(TickRow, ticks), encoding="utf-8"),

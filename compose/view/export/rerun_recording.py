@@ -35,11 +35,7 @@ HEIGHT = 1.1
 LINE_RADII = {"thin": -0.8, "path": -1.8, "contact": -3.0}
 """The radii of lines. Negative radii are in pixels of the window."""
 GREEN, GREY = (0, 128, 90), (128, 128, 128)
-RERUN_LEVELS = {
-    **dict.fromkeys(("report-lost", "report-damaged", "late", "undecided"), "WARN"),
-    "inconsistent": "ERROR",
-}
-"""The log level of an event by its kind; INFO for all others."""
+RERUN_LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
 NONE = rr.Clear(recursive=False)
 """The component that ends the display of an entity."""
 
@@ -178,8 +174,7 @@ class _Drawing:
             self._draw_robot(robot, player)
             self._draw_hypotheses(robot, player)
         for robot in self._setup.robots[:PLOTTED]:
-            player = scene.player(robot.id)
-            numbers = Numbers.of(player, robot.given_anchor, scene.held_by(player.peer or robot.peer))
+            numbers = Numbers.in_scene(scene, robot)
             for number in numbers.__struct_fields__:
                 value = getattr(numbers, number)
                 if any(number in plotted for plotted in PLOTS.values()):
@@ -188,7 +183,7 @@ class _Drawing:
                         self._log(f"plots/{robot.id}/{number}", rr.Scalars(known))
         self._draw_contacts(scene)
         for event in scene.events:
-            self._log("log", rr.TextLog(event.whole, level=RERUN_LEVELS.get(event.kind, "INFO")))
+            self._log("log", rr.TextLog(event.whole, level=RERUN_LEVELS[event.level]))
 
     def _draw_robot(self, robot: RobotSetup, player: Player) -> None:
         pose = player.pose
@@ -222,13 +217,12 @@ class _Drawing:
         if held.local and not poses:
             frame = robot.frame or Pose(robot.anchor.x, robot.anchor.y, 0.0)
             poses = tuple([compose(frame, pose) for pose in held.local])
-        shares = held.probability or (1.0 / max(1, len(poses)),) * len(poses)
         arrows = rr.Arrows3D(
             origins=[(pose.x, pose.y, 0.0) for pose in poses],
             vectors=[self._ahead(pose) for pose in poses],
             radii=self._unit / 50,
             colors=[_colour(player.hue(robot))],
-            labels=[f"{share:.2g}" for share in shares],
+            labels=[f"{share:.2g}" for share in held.shares],
             show_labels=len(poses) > 1,
         )
         self._while(f"robots/{robot.id}/hypotheses", arrows if poses else None)
@@ -238,14 +232,10 @@ class _Drawing:
         self._while(f"robots/{robot.id}/ellipse", outline)
 
     def _draw_contacts(self, scene: Scene) -> None:
-        for one, other in self._setup.links():
-            a, b = scene.player(one.id), scene.player(other.id)
-            contact = next((contact for contact in a.contacts if contact.peer == other.id), None)
-            link = None
-            if contact is not None and a.pose is not None and b.pose is not None:
-                length = f"{contact.range:.2f} m" if contact.range is not None else "no range"
-                link = _lines([[(a.pose.x, a.pose.y), (b.pose.x, b.pose.y)]], GREEN, "contact", length)
-            self._while(f"contact/{one.id}-{other.id}", link)
+        for link in scene.links(self._setup):
+            length = f"{link.range:.2f} m" if link.range is not None else "no range"
+            line = _lines([link.ends], GREEN, "contact", length) if link.ends else None
+            self._while(f"contact/{link.a}-{link.b}", line)
 
     def _ahead(self, pose: Pose) -> tuple[float, float, float]:
         """Return the arrow of a pose, one drawn length long."""

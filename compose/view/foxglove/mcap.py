@@ -5,10 +5,8 @@ Times are simulated times, beginning at 0. Equal recordings give equal bytes.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Sequence
-from io import RawIOBase
-from pathlib import Path
+from io import BytesIO
 from typing import Any
 
 import foxglove
@@ -86,17 +84,15 @@ class Channels:
             channel.close()
 
 
-def write_mcap(
+def mcap(
     setup: RunSetup,
     frames: Sequence[Journaled],
     scenes: Sequence[Scene],
-    path: Path,
     check: Callable[[], object] = lambda: None,
-) -> None:
-    """Write the journaled `frames` and the `scenes` of a run, both in the order of their ticks, to `path`.
+) -> bytes:
+    """Return the journaled `frames` and the `scenes` of a run, both in the order of their ticks, as a file.
 
-    Calls `check` in each tick, which may raise. Raises OSError if the file cannot be written, TooLong if the
-    run is too long.
+    Calls `check` in each tick, which may raise. Raises TooLong if the run is too long.
     """
     last = max([scene.tick for scene in scenes], default=0)
     if nanoseconds(setup, last) >= LAST_TIMESTAMP_S * 1_000_000_000:
@@ -105,15 +101,14 @@ def write_mcap(
         )
     context = Context()
     channels = Channels(context)
+    file = BytesIO()
+    options = MCAPWriteOptions(chunk_size=CHUNK_BYTES, compression_threads=0)
     try:
-        with path.open("wb", buffering=0) as file:
-            output = _Output(file)
-            options = MCAPWriteOptions(chunk_size=CHUNK_BYTES, compression_threads=0)
-            with foxglove.open_mcap(output, context=context, writer_options=options):
-                _publish(setup, frames, scenes, channels, [output.check, check])
-            output.check()
+        with foxglove.open_mcap(file, context=context, writer_options=options):
+            _publish(setup, frames, scenes, channels, check)
     finally:
         channels.close()
+    return file.getvalue()
 
 
 def _publish(
@@ -121,7 +116,7 @@ def _publish(
     frames: Sequence[Journaled],
     scenes: Sequence[Scene],
     channels: Channels,
-    checks: Sequence[Callable[[], object]],
+    check: Callable[[], object],
 ) -> None:
     """Publish everything, tick by tick: the journaled frames, then the scene."""
     views = Views(setup)
@@ -138,42 +133,4 @@ def _publish(
             channels.view(*views.standing(), at)
         for shown in views.of(one):
             channels.view(*shown, at)
-        for check in checks:
-            check()
-
-
-class _Output:
-    """A file that stores its first write error and then pretends that all writes succeed.
-
-    MCAP's writer reports an error at every write, and fails if the file position is not where it left it.
-    """
-
-    def __init__(self, file: RawIOBase) -> None:
-        self._file = file
-        self._error: OSError | None = None
-        self._at = self._end = 0
-
-    def check(self) -> None:
-        """Raise the stored OSError, if a write has failed."""
-        if self._error is not None:
-            raise self._error
-
-    def write(self, data: bytes | bytearray) -> int:
-        rest = memoryview(data)
-        while rest and self._error is None:
-            try:
-                rest = rest[self._file.write(rest) or 0 :]
-            except OSError as error:
-                self._error = error
-        self._at += len(data)
-        self._end = max(self._end, self._at)
-        return len(data)
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        self._at = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: self._end}[whence]
-        if self._error is None:
-            self._file.seek(self._at)
-        return self._at
-
-    def flush(self) -> None:
-        """Do nothing: writes are unbuffered."""
+        check()

@@ -8,6 +8,8 @@ from typing import Any
 import msgspec
 from msgspec import inspect
 
+from compose.scenario.json_schema import structs_in
+
 
 @cache
 def schema(kind: type[msgspec.Struct]) -> bytes:
@@ -16,7 +18,7 @@ def schema(kind: type[msgspec.Struct]) -> bytes:
     It extends msgspec's schema, which has no field names in arrays and regular expressions in Python syntax.
     """
     described = msgspec.json.schema(kind)
-    structs = {one.__name__: one for one in _structs(inspect.type_info(kind))}
+    structs = {one.__name__: one for one in structs_in(inspect.type_info(kind))}
     for name, part in described["$defs"].items():
         struct = structs.get(name)
         if struct is not None and "prefixItems" in part:
@@ -31,21 +33,6 @@ def schema(kind: type[msgspec.Struct]) -> bytes:
 def object_schema(kind: type[msgspec.Struct]) -> bytes:
     """Return the JSON Schema of objects of type `kind`, without references, which not all viewers follow."""
     return msgspec.json.encode(msgspec.json.schema(kind)["$defs"][kind.__name__], order="sorted")
-
-
-def _structs(info: Any) -> set[type[msgspec.Struct]]:
-    """Return all struct types that occur in a type, at any depth."""
-    found: set[type[msgspec.Struct]] = set()
-    match info:
-        case inspect.Metadata(type=inner) | inspect.VarTupleType(item_type=inner):
-            found |= _structs(inner)
-        case inspect.UnionType(types=types) | inspect.TupleType(item_types=types):
-            found = found.union(*map(_structs, types))
-        case inspect.DictType(value_type=inner):
-            found |= _structs(inner)
-        case inspect.StructType(cls=struct, fields=fields):
-            found = {struct}.union(*[_structs(field.type) for field in fields])
-    return found
 
 
 def _in_ecma(part: Any) -> Any:

@@ -42,6 +42,12 @@ def point(x: float, y: float) -> fox.Point3:
     return fox.Point3(x=x, y=y, z=0.0)
 
 
+def middle(ends: Sequence[tuple[float, float]]) -> Pose:
+    """Return the middle between two points."""
+    (x, y), (to_x, to_y) = ends
+    return Pose((x + to_x) / 2, (y + to_y) / 2, 0.0)
+
+
 def strip(points: Sequence[tuple[float, float]], tint: fox.Color, width: float) -> fox.LinePrimitive:
     """Return a line through `points`, `width` pixels wide."""
     return line([point(x, y) for x, y in points], tint, width)

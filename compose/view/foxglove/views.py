@@ -32,11 +32,7 @@ LEAST_OPACITY = 0.06
 RGB_COLOURS: dict[Role, tuple[float, float, float]] = {"a": colours.rgb("a"), "b": colours.rgb("b")}
 GREY = (0.5, 0.5, 0.5)
 GREEN = (0.0, 0.5, 0.35)
-FOXGLOVE_LEVELS = {
-    **dict.fromkeys(("report-lost", "report-damaged", "late", "undecided"), fox.LogLevel.Warning),
-    "inconsistent": fox.LogLevel.Error,
-}
-"""The log level of an event by its kind; Info for all others."""
+FOXGLOVE_LEVELS = {"info": fox.LogLevel.Info, "warning": fox.LogLevel.Warning, "error": fox.LogLevel.Error}
 DELIVERED = {"heard": "received", "damaged": "damaged", "lost": "lost"}
 """The words for the deliveries of reports, by `Passage.what`."""
 
@@ -131,10 +127,7 @@ class Views:
         yield Shown("/tf", fox.FrameTransforms(transforms=list(self._transforms(scene, at))))
         for player in scene.players:
             robot_setup = self.setup.robot_setup(player.robot)
-            numbers = Numbers.of(
-                player, robot_setup.given_anchor, scene.held_by(player.peer or robot_setup.peer)
-            )
-            yield Shown(f"/{player.robot}/numbers", numbers)
+            yield Shown(f"/{player.robot}/numbers", Numbers.in_scene(scene, robot_setup))
             yield from self._robot(player, at)
         yield Shown("/contact", fox.SceneUpdate(entities=list(self._contacts(scene, at))))
 
@@ -165,10 +158,10 @@ class Views:
             yield Shown(f"/{robot}/trail", self._trails[robot].message(at))
             yield Shown(f"/{robot}/body", fox.SceneUpdate(entities=[self._body(robot_setup, player, at)]))
         if player.held is not None:
-            frame, hypotheses = _hypotheses(robot, player.held)
-            poses = [shapes.pose(one) for one in hypotheses]
+            frame = WORLD_FRAME if player.held.world else f"{robot}/anchor"
+            poses = [shapes.pose(one) for one in player.held.poses]
             yield Shown(f"/{robot}/hypotheses", fox.PosesInFrame(timestamp=at, frame_id=frame, poses=poses))
-            belief = self._belief(robot_setup, frame, hypotheses, player.held, at, player.hue(robot_setup))
+            belief = self._belief(robot, frame, player.held, at, RGB_COLOURS[player.hue(robot_setup)])
             yield Shown(f"/{robot}/belief", fox.SceneUpdate(entities=[belief]))
 
     def _body(self, robot_setup: RobotSetup, player: Player, at: fox.Timestamp) -> fox.SceneEntity:
@@ -184,7 +177,7 @@ class Views:
         if player.anchor_range is not None:
             ends = [(player.pose.x, player.pose.y), (robot_setup.anchor.x, robot_setup.anchor.y)]
             lines.append(shapes.strip(ends, shapes.colour(hue, 0.5), 1.5))
-            middle = Pose((ends[0][0] + ends[1][0]) / 2, (ends[0][1] + ends[1][1]) / 2, 0.0)
+            middle = shapes.middle(ends)
             texts.append(shapes.words(f"{player.anchor_range:.3f} m", middle, self._unit, colour))
         return fox.SceneEntity(
             timestamp=at,
@@ -229,63 +222,38 @@ class Views:
 
     def _contacts(self, scene: Scene, at: fox.Timestamp) -> Iterator[fox.SceneEntity]:
         """Yield one entity per pair. In contact it shows the link, the range and deliveries of reports."""
-        for one, other in self.setup.links():
-            a, b = scene.player(one.id), scene.player(other.id)
-            contact = next((contact for contact in a.contacts if contact.peer == other.id), None)
+        for link in scene.links(self.setup):
             lines, texts = [], []
-            if contact is not None and a.pose is not None and b.pose is not None:
-                ends = [(a.pose.x, a.pose.y), (b.pose.x, b.pose.y)]
-                lines = [shapes.strip(ends, shapes.colour(GREEN), 3.0)]
-                words = [f"{contact.range:.3f} m"] if contact.range is not None else ["no range"]
+            if link.ends:
+                lines = [shapes.strip(link.ends, shapes.colour(GREEN), 3.0)]
+                words = [f"{link.range:.3f} m"] if link.range is not None else ["no range"]
                 words += [
                     f"{passage.sender}'s report of tick {passage.tick}: {DELIVERED[passage.what]}"
                     for passage in scene.passages
-                    if {passage.sender, passage.receiver} == {one.id, other.id} and passage.what != "sent"
+                    if {passage.sender, passage.receiver} == {link.a, link.b} and passage.what != "sent"
                 ]
-                middle = Pose((a.pose.x + b.pose.x) / 2, (a.pose.y + b.pose.y) / 2, 0.0)
+                middle = shapes.middle(link.ends)
                 texts = [shapes.words("\n".join(words), middle, self._unit, shapes.colour(GREEN))]
             yield fox.SceneEntity(
-                timestamp=at, frame_id=WORLD_FRAME, id=f"{one.id}-{other.id}", lines=lines, texts=texts
+                timestamp=at, frame_id=WORLD_FRAME, id=f"{link.a}-{link.b}", lines=lines, texts=texts
             )
 
     # --- hypotheses ---
 
     def _belief(
-        self,
-        robot_setup: RobotSetup,
-        frame: str,
-        poses: Sequence[Pose],
-        held: HeldPoses,
-        at: fox.Timestamp,
-        hue: Role,
+        self, robot: str, frame: str, held: HeldPoses, at: fox.Timestamp, colour: tuple[float, float, float]
     ) -> fox.SceneEntity:
         """Return an arrow for each hypothesis, paler if less probable, and where the first one may be."""
-        colour = RGB_COLOURS[hue]
-        probability = held.probability or (1.0 / max(1, len(poses)),) * len(poses)
-        lines = []
-        if held.outline:
-            lines.append(shapes.strip(held.outline, shapes.colour(colour), 1.5))
-        shades = [shapes.colour(colour, max(LEAST_OPACITY, share)) for share in probability]
-        texts = [
-            shapes.words(f"{share:.3g}", pose, self._unit, shade)
-            for pose, share, shade in zip(poses, probability, shades, strict=False)
-            if len(poses) > 1
-        ]
+        arrows, texts = [], []
+        for pose, share in zip(held.poses, held.shares, strict=False):
+            shade = shapes.colour(colour, max(LEAST_OPACITY, share))
+            arrows.append(shapes.arrow(pose, self._unit, shade))
+            if len(held.poses) > 1:
+                texts.append(shapes.words(f"{share:.3g}", pose, self._unit, shade))
+        lines = [shapes.strip(held.outline, shapes.colour(colour), 1.5)] if held.outline else []
         return fox.SceneEntity(
-            timestamp=at,
-            frame_id=frame,
-            id=robot_setup.id,
-            arrows=[
-                shapes.arrow(pose, self._unit, shade) for pose, shade in zip(poses, shades, strict=False)
-            ],
-            lines=lines,
-            texts=texts,
+            timestamp=at, frame_id=frame, id=robot, arrows=arrows, lines=lines, texts=texts
         )
-
-
-def _hypotheses(robot: str, held: HeldPoses) -> tuple[str, tuple[Pose, ...]]:
-    """Return the frame of a robot's hypotheses, and their poses in it."""
-    return (WORLD_FRAME, held.world) if held.world else (f"{robot}/anchor", held.local)
 
 
 def _frame(robot_setup: RobotSetup) -> Pose:
@@ -294,7 +262,7 @@ def _frame(robot_setup: RobotSetup) -> Pose:
 
 
 def _line(event: Event, at: fox.Timestamp) -> fox.Log:
-    level = FOXGLOVE_LEVELS.get(event.kind, fox.LogLevel.Info)
+    level = FOXGLOVE_LEVELS[event.level]
     return fox.Log(
         timestamp=at, level=level, message=event.whole, name=event.robot or "world", file=event.kind
     )
