@@ -14,7 +14,7 @@ class Removed(NamedTuple):
     name: str
     """The command, or the command and its flag, separated by one blank."""
     instead: str
-    """What replaces it, as the end of a sentence."""
+    """The replacement, as the end of a sentence."""
 
 
 _FOXGLOVE = "use `--watch`, or open run.mcap of `tandem export` in Foxglove"

@@ -50,7 +50,7 @@ class TickRow(msgspec.Struct, frozen=True):
 
 
 class RobotTick(msgspec.Struct, frozen=True):
-    """What the rows about one robot in one tick begin with."""
+    """The first columns of a row about one robot in one tick."""
 
     tick: int
     """The tick k."""

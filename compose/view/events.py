@@ -38,7 +38,7 @@ class Event(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @property
     def level(self) -> Literal["info", "warning", "error"]:
-        """How serious it is."""
+        """The level at which logs show it."""
         if self.kind == "inconsistent":
             return "error"
         return "warning" if self.kind in ("report-lost", "report-damaged", "late", "undecided") else "info"
