@@ -42,15 +42,15 @@ from compose.figures.style import SCREEN, SWEEP_MEDIUM, look, save  # noqa: E402
 from compose.launch import in_process  # noqa: E402
 from compose.recording.run import Run, read  # noqa: E402
 from compose.scenario import scenario_file  # noqa: E402
-from compose.view.web import film  # noqa: E402
 from compose.view.web.standalone import standalone_page  # noqa: E402
+from docs import film  # noqa: E402
 from protocol.journal import environment  # noqa: E402
 
 STYLE = ("compose/figures/style.py", "compose/view/colours.py")
 MISSIONS = ("compose/figures/*.py", "compose/view/colours.py", "compose/view/outlines.py")
 PAGE = (
     *[f"compose/view/{name}.py" for name in ("configurations", "events", "outlines", "words")],
-    *["compose/view/story/*.py", "compose/view/web/film.py", "compose/view/web/standalone.py"],
+    *["compose/view/story/*.py", "docs/film.py", "compose/view/web/standalone.py"],
     "compose/view/web/page/*",
 )
 """The code that draws figures of missions, and the page, as patterns of paths."""
@@ -126,11 +126,11 @@ def decisions(run: Run) -> dict[str, Any]:
 def page(folder: Path, wanted: Mapping[str, str]) -> None:
     """Draw the guided play of paper-1, and one picture of it."""
     ran("paper-1", folder)
-    html, program = standalone_page(folder).html, film.browser("docs/picture.py")
+    html = standalone_page(folder).html
     if "page.gif" in wanted:
-        (folder / "page.gif").write_bytes(film.gif(html, program))
+        (folder / "page.gif").write_bytes(film.gif(html))
     if "page.png" in wanted:
-        (folder / "page.png").write_bytes(film.still(html, program, *STILL))
+        (folder / "page.png").write_bytes(film.still(html, *STILL))
 
 
 def estimate(folder: Path, wanted: Mapping[str, str] = {}) -> None:

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image, ImageSequence
 
-from docs import picture, rendezvous
+from docs import film, picture, rendezvous
 
 ROOT = Path(__file__).parents[1]
 IMAGE = re.compile(r"!\[[^]]*\]\((?:docs/)?([^)]+)\)")
@@ -22,6 +23,16 @@ def test_no_figure_of_the_documentation_is_stale() -> None:
 @pytest.mark.long
 def test_no_figure_of_a_sweep_or_an_estimate_is_stale() -> None:
     assert not list(picture.stale())
+
+
+def test_the_animation_of_the_readme_is_small_and_lasts_as_long_as_guided_play() -> None:
+    path = ROOT / "docs" / "page.gif"
+    assert path.stat().st_size < 500_000
+    with Image.open(path) as animation:
+        assert animation.size == (film.WIDTH, film.HEIGHT)
+        durations = [frame.info["duration"] for frame in ImageSequence.Iterator(animation)]
+    assert 40_000 < sum(durations) < 60_000
+    assert len(durations) > 30
 
 
 def test_one_command_draws_every_figure_of_the_documentation() -> None:

@@ -17,7 +17,6 @@ from protocol.journal import journal_file
 from protocol.messages import Command, DeadlineMissed
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from tests.commands import journals, tandem
-from tests.test_film import need_browser
 
 SCHEDULE = ("b@20:command", "a@30", "world@30:journal", "b@47:journal", "a@48")
 
@@ -144,15 +143,12 @@ def test_a_damaged_file_is_one_note_and_the_recording_is_read_without_it(
         ["export"],
         ["export", "--pyfg"],
         ["export", "--html"],
-        pytest.param(["export", "--gif"], marks=pytest.mark.long),
     ],
     ids=" ".join,
 )
 def test_every_command_says_once_that_the_file_is_damaged_and_goes_on(
     words: list[str], paper_1: Path, tmp_path: Path
 ) -> None:
-    if "--gif" in words:
-        need_browser()
     shutil.copytree(paper_1, tmp_path / "run")
     command, *flags = words
     expected = tandem(command, tmp_path / "run", *flags)

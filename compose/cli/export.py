@@ -10,15 +10,13 @@ from typing import TYPE_CHECKING
 
 from compose.cli.arguments import add_closing, add_recording, folder
 from compose.cli.recording import note, read_noted
-from compose.errors import ENDED, FAILED, STOPPED_STATUS, CannotWrite
+from compose.errors import ENDED, FAILED, CannotWrite
 from compose.extras import need
-from compose.launch.signals import stop_by_signal
 from compose.recording.recording_files import make_folder, user_errors
 from compose.recording.run import Run
 from compose.terminal.outcome import counting
 from compose.terminal.text_width import tell
 from protocol import files
-from protocol.network.inbox import Inbox, Interrupted
 from protocol.output import say
 
 if TYPE_CHECKING:
@@ -53,11 +51,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="write only run.rrd: a recording for Rerun, with its views in place (extra rerun)",
     )
-    kinds.add_argument(
-        "--gif",
-        action="store_true",
-        help="write only run.gif: the guided play as an animated picture (extra film, and Chromium)",
-    )
     add_closing(parser, "tandem export recording --out exported", "docs/recordings.md")
 
 
@@ -71,8 +64,6 @@ def main(options: argparse.Namespace) -> int:
         return _pyfg(options.recording, out)
     if options.html:
         return _html(options.recording, out)
-    if options.gif:
-        return _gif(options.recording, out)
     if options.rerun:
         return _rerun(options.recording, out)
     need(*MODULES)
@@ -126,26 +117,6 @@ def _html(recording: Path, out: Path) -> int:
     page = standalone_page(recording)
     say(str(_written(out, "run.html", page.html)))
     note("export", page.notes)
-    return ENDED
-
-
-def _gif(recording: Path, out: Path) -> int:
-    """Write run.gif to `out`, and print its path."""
-    need("PIL", "playwright", extra="film")
-    from compose.view.web import film  # noqa: PLC0415  # slow to import, and optional
-    from compose.view.web.standalone import standalone_page  # noqa: PLC0415  # it imports Zenoh
-
-    inbox = Inbox("tandem export")
-    program = film.browser("--gif")
-    page = standalone_page(recording)
-    note("export", page.notes)
-    stop_by_signal(inbox)
-    try:
-        content = film.gif(page.html, program, lambda: inbox.next(0.0))
-    except Interrupted as signal_name:
-        inbox.say(f"stopped by {signal_name}")
-        return STOPPED_STATUS
-    say(str(_written(out, "run.gif", content)))
     return ENDED
 
 

@@ -21,7 +21,8 @@ _FOXGLOVE = "use `--watch`, or open run.mcap of `tandem export` in Foxglove"
 REMOVED = (
     Removed("run --foxglove", _FOXGLOVE),
     Removed("run --foxglove-origin", _FOXGLOVE),
-    Removed("export --mp4", "use `--gif`, or `--html`, whose page plays the mission"),
+    Removed("export --gif", "use `--html`, whose page plays the mission"),
+    Removed("export --mp4", "use `--html`, whose page plays the mission"),
 )
 
 

@@ -6,27 +6,21 @@ speed of the machine.
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
-import signal
+import sys
 import tempfile
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from PIL import Image
+from playwright.sync_api import Page, sync_playwright
 
-from compose.errors import UserError
 from compose.view.web.standalone import PAGE
-
-if TYPE_CHECKING:
-    from PIL.Image import Image as Picture
-    from playwright.sync_api import Page
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 """The names of the program that draws the page."""
@@ -53,40 +47,27 @@ MIXED = (("robot-a", "ink", 0.8), ("robot-b", "ink", 0.8), ("accent", "paper", 0
 
 They are those of contact on the time line, and of the range of an anchor.
 """
-REMOVE_S = 2.0
-"""The time in s in which the processes of a browser that has been stopped end."""
 SAME_PIXEL = 255
 """The colour of pixels that are as in the frame before."""
 
 
-def browser(flag: str) -> str:
-    """Return the path of the program that draws the page. Raises UserError, which names `flag`."""
-    found = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if found is None:
-        raise UserError(f"{flag} needs chromium: apt-get install chromium")
-    return found
+def gif(html: str) -> bytes:
+    """Return the guided play of the standalone page as an animated GIF."""
+    with _opened(html, (WIDTH, HEIGHT)) as page:
+        page.add_style_tag(content=STYLE)
+        page.keyboard.press("f")  # a camera at rest: most of the picture stays the same
+        return _gif(list(_played(page)))
 
 
-def gif(page: str, program: str, check: Callable[[], object] = lambda: None) -> bytes:
-    """Return the guided play of the standalone `page` as an animated GIF.
-
-    `program` is the browser. `check` is called between two frames; if it raises, the browser is closed.
-    """
-    return _gif(_frames(page, program, check), check)
-
-
-def still(html: str, program: str, mark: str, size: tuple[int, int]) -> bytes:
+def still(html: str, mark: str, size: tuple[int, int]) -> bytes:
     """Return a picture of the standalone page in guided play, as a PNG file.
 
     It is the one STILL_AFTER frames after the legend lists `mark`; the last one if it never does.
-    `program` is the browser.
     """
-    from PIL import Image  # noqa: PLC0415  # optional
-
-    with _opened(html, program, size, lambda: None) as page:
+    with _opened(html, size) as page:
         marked = page.locator("#legend li").get_by_text(mark)
         after = 0
-        for _ in _played(page, lambda: None):
+        for _ in _played(page):
             after += marked.count() > 0
             if after > STILL_AFTER:
                 break
@@ -96,87 +77,41 @@ def still(html: str, program: str, mark: str, size: tuple[int, int]) -> bytes:
     return file.getvalue()
 
 
-def _frames(html: str, program: str, check: Callable[[], object]) -> list[bytes]:
-    """Return the frames of guided play as PNG files."""
-    with _opened(html, program, (WIDTH, HEIGHT), check) as page:
-        page.add_style_tag(content=STYLE)
-        page.keyboard.press("f")  # a camera at rest: most of the picture stays the same
-        return list(_played(page, check))
-
-
 @contextmanager
-def _opened(html: str, program: str, size: tuple[int, int], check: Callable[[], object]) -> Iterator[Page]:
-    """Yield the standalone page with a clock that stands still; if something fails, call `check` first."""
-    from playwright.sync_api import sync_playwright  # noqa: PLC0415  # slow, and optional
-
-    with _temporary() as folder:
-        file = folder / "run.html"
+def _opened(html: str, size: tuple[int, int]) -> Iterator[Page]:
+    """Yield the standalone page with a clock that stands still."""
+    program = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if program is None:
+        sys.exit("docs/picture.py needs chromium: apt-get install chromium")
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
+        file = Path(folder) / "run.html"
         file.write_text(html, encoding="utf-8")
-        try:
-            with sync_playwright() as playwright:
-                shown = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
-                page = shown.new_page(viewport={"width": size[0], "height": size[1]}, color_scheme="light")
-                page.clock.install(time=0)
-                page.goto(file.as_uri())
-                page.clock.pause_at(1000)
-                page.wait_for_selector("body[data-shown='0']", state="attached")
-                yield page
-                shown.close()
-        except Exception:
-            check()  # Ctrl-C in a terminal reaches Playwright's own process, too
-            raise
+        shown = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        page = shown.new_page(viewport={"width": size[0], "height": size[1]}, color_scheme="light")
+        page.clock.install(time=0)
+        page.goto(file.as_uri())
+        page.clock.pause_at(1000)
+        page.wait_for_selector("body[data-shown='0']", state="attached")
+        yield page
+        shown.close()
 
 
-@contextmanager
-def _temporary() -> Iterator[Path]:
-    """Yield a folder for all temporary files, the browser's included, and remove it with them."""
-    before = os.environ.get("TMPDIR")
-    folder = Path(tempfile.mkdtemp(prefix="tandem-"))
-    os.environ["TMPDIR"] = str(folder)
-    try:
-        yield folder
-    finally:
-        if before is None:
-            del os.environ["TMPDIR"]
-        else:
-            os.environ["TMPDIR"] = before
-        give_up, used = time.monotonic() + REMOVE_S, True
-        while (used or folder.exists()) and time.monotonic() < give_up:
-            used = _killed(folder)  # a process of the browser that is about to end may make it again
-            shutil.rmtree(folder, ignore_errors=True)
-
-
-def _killed(folder: Path) -> bool:
-    """Kill the processes that have a path in `folder` in their command line; return whether there are any."""
-    name, found = os.fsencode(folder), False
-    for line in Path("/proc").glob("[0-9]*/cmdline"):
-        with suppress(OSError):  # it has ended meanwhile
-            if name in line.read_bytes():
-                found = True
-                os.kill(int(line.parent.name), signal.SIGKILL)
-    return found
-
-
-def _played(page: Page, check: Callable[[], object]) -> Iterator[bytes]:
+def _played(page: Page) -> Iterator[bytes]:
     """Play the page, and yield a PNG file for each FRAME_MS."""
     page.locator("#play").evaluate("(button) => button.click()")
     for _ in range(MOST_MS // FRAME_MS):
-        check()
         page.clock.fast_forward(FRAME_MS)
         yield page.screenshot()
         if page.locator("#play").get_attribute("aria-label") == "Play":
             return
 
 
-def _gif(frames: list[bytes], check: Callable[[], object]) -> bytes:
+def _gif(frames: list[bytes]) -> bytes:
     """Return PNG files as an animated GIF; equal frames in a row become one."""
-    from PIL import Image  # noqa: PLC0415  # optional
-
-    images: list[Picture] = []
+    images: list[Image.Image] = []
     durations: list[int] = []
     before = b""
     for frame in frames:
-        check()
         if frame == before:
             durations[-1] += FRAME_MS
             continue
