@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
 
 from foxglove import messages as fox
 
@@ -12,8 +11,6 @@ from protocol.motion import Pose
 
 ORIGIN_POSE = fox.Pose(position=fox.Vector3(), orientation=fox.Quaternion(w=1.0))
 """The pose of the reference frame in itself."""
-CACHED = 1000
-"""The number of colours that are stored, since most are used in every tick."""
 
 
 def timestamp(ns: int) -> fox.Timestamp:
@@ -31,7 +28,6 @@ def pose(at: Pose) -> fox.Pose:
     return fox.Pose(position=fox.Vector3(x=at.x, y=at.y, z=0.0), orientation=turned(at.heading))
 
 
-@lru_cache(CACHED)
 def colour(rgb: tuple[float, float, float], alpha: float = 1.0) -> fox.Color:
     """Return a colour from red, green, blue and alpha, each from 0 to 1."""
     return fox.Color(r=rgb[0], g=rgb[1], b=rgb[2], a=alpha)

@@ -7,7 +7,7 @@ message is complete in itself, so a viewer can seek in a recording.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 from foxglove import messages as fox
@@ -69,36 +69,16 @@ def nanoseconds(setup: RunSetup, tick: int) -> int:
 
 
 class Trail:
-    """The latest TRAIL_POSES true poses of a robot. Each is converted once for all its messages."""
+    """The latest TRAIL_POSES true poses of a robot, and their positions. Each is converted once."""
 
     def __init__(self) -> None:
+        self.poses: deque[fox.Pose] = deque(maxlen=TRAIL_POSES)
         self.points: deque[fox.Point3] = deque(maxlen=TRAIL_POSES)
-        self._poses: deque[bytes] = deque(maxlen=TRAIL_POSES)
-        """The encoded poses."""
 
     def add(self, pose: Pose) -> None:
         """Append a pose."""
-        self._poses.append(_poses([shapes.pose(pose)]).encode())
+        self.poses.append(shapes.pose(pose))
         self.points.append(shapes.point(pose.x, pose.y))
-
-    def message(self, at: fox.Timestamp) -> Joined:
-        """Return the message of all poses at the time `at`."""
-        return Joined((_poses([], at).encode(), *self._poses))
-
-
-class Joined(NamedTuple):
-    """A message of Foxglove's schemas in encoded parts, which protobuf merges when they are concatenated."""
-
-    parts: tuple[bytes, ...]
-
-    def encode(self) -> bytes:
-        """Return the encoded message."""
-        return b"".join(self.parts)
-
-
-def _poses(poses: Sequence[fox.Pose], at: fox.Timestamp | None = None) -> fox.PosesInFrame:
-    """Return a part of a message of poses in the world frame; the first part has a time `at`."""
-    return fox.PosesInFrame(timestamp=at, frame_id=WORLD_FRAME if at is not None else "", poses=list(poses))
 
 
 class Views:
@@ -155,7 +135,8 @@ class Views:
         if player.pose is not None:
             pose = fox.PoseInFrame(timestamp=at, frame_id=WORLD_FRAME, pose=shapes.pose(player.pose))
             yield Shown(f"/{robot}/pose", pose)
-            yield Shown(f"/{robot}/trail", self._trails[robot].message(at))
+            trail = list(self._trails[robot].poses)
+            yield Shown(f"/{robot}/trail", fox.PosesInFrame(timestamp=at, frame_id=WORLD_FRAME, poses=trail))
             yield Shown(f"/{robot}/body", fox.SceneUpdate(entities=[self._body(robot_setup, player, at)]))
         if player.held is not None:
             frame = WORLD_FRAME if player.held.world else f"{robot}/anchor"
