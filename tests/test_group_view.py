@@ -286,8 +286,8 @@ def test_the_captions_of_a_group_tell_who_drives_to_whom_and_how_many_are_locali
         (60, "r1 reaches r2. Their distance is 2.76 m."),
         (62, "r0 reaches r3. Their distance is 2.59 m."),
     ]
-    assert told[-1] == (108, "All 8 robots are localised.")
-    assert shown[-1].captions[-1].truth == "The largest error of a localised robot is less than 1 µm."
+    assert told[-1] == (108, "All 8 robots are localised: each knows its position and its heading.")
+    assert (shown[-1].captions[-1].truth or "").startswith("The claimed positions are off by less than 1 µm")
 
 
 def test_the_log_has_what_robots_do_after_their_claims_and_each_contact_once(
@@ -509,5 +509,5 @@ def test_guided_play_tells_the_story_of_the_whole_group(opened: Open, folder: Pa
         page = started(opened, address)
         told = list(dict.fromkeys(caption for _, caption in played(page)))
     assert told[0].startswith("Eight robots measure")
-    assert told[-1].startswith("All 8 robots are localised.")
+    assert told[-1].startswith("All 8 robots are localised: ")
     assert len(told) >= 15

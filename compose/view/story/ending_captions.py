@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 
 from compose.recording.reasons import plain_reason
@@ -12,6 +11,7 @@ from compose.view.pair_data import PairData
 from compose.view.run_data import TickData
 from compose.view.story.caption import Caption, attacked, stopped
 from protocol.messages import Inconsistent, Localised, MissionEnd, Undecided
+from protocol.motion import travelled
 
 MOST_LISTED_LINKS = 2
 """The largest number of links that a sentence names."""
@@ -51,7 +51,7 @@ def ending(setup: RunSetup, now: TickData, end: MissionEnd) -> Caption:
     """Return the caption of the end of the mission."""
     plain = plain_reason(end)
     why = f": {stopped(plain)}" if plain else "."
-    errors = _claim_errors(setup, now)
+    errors = _claim_errors(now)
     largest = _off(errors, setup.mission.noise.exact) if errors else None
     silent = _silent_links(setup)
     robots = len(setup.robots)
@@ -103,15 +103,13 @@ def _silent_links(setup: RunSetup) -> str | None:
     return f"No report {' or '.join(links)} ever arrives." if links else None
 
 
-def _claim_errors(setup: RunSetup, now: TickData) -> list[float]:
-    """Return the position errors in m of the claims in this tick; empty without the ground truth."""
-    errors = []
-    for robot in setup.ids:
-        command, truth = now.commands.get(robot), now.truth.get(robot)
-        if command is not None and truth is not None and isinstance(command.verdict, Localised):
-            pose = command.verdict.pose
-            errors.append(math.hypot(pose.x - truth.x, pose.y - truth.y))
-    return errors
+def _claim_errors(now: TickData) -> list[float]:
+    """Return the position errors in m of robots that claim theirs; empty without the ground truth."""
+    return [
+        travelled(truth, estimate.world[0])
+        for robot, estimate in now.estimates.items()
+        if estimate.localised and estimate.world and (truth := now.truth.get(robot)) is not None
+    ]
 
 
 def _off(errors: list[float], exact: bool) -> str:

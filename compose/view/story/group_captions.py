@@ -7,15 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from compose.recording.reasons import plain_reason
 from compose.recording.run_setup import RunSetup
 from compose.view.deliveries import contact_of
 from compose.view.events import Event, metres
 from compose.view.run_data import TickData
 from compose.view.story.caption import Caption, count_word, faults, stopped
+from compose.view.story.ending_captions import ending
 from compose.view.words import TRAVELLING
 from protocol.messages import Inconsistent, Localised, MissionEnd, Undecided
-from protocol.motion import travelled
 
 MOST_LISTED_ROBOTS = 4
 """The largest number of robots or meetings that a sentence names."""
@@ -38,7 +37,7 @@ def group_captions(
         yield from _departing(setup, before, now)
     yield from faults(events)
     if ended is not None:
-        yield _end(setup, now, ended)
+        yield ending(setup, now, ended)
 
 
 def _beginning(setup: RunSetup) -> Caption:
@@ -135,21 +134,6 @@ def _begins(robot: str, state: str, before: TickData, now: TickData) -> bool:
     if command is None or earlier is None:
         return False
     return command.task == state and earlier.task not in (state, "looping")
-
-
-def _end(setup: RunSetup, now: TickData, end: MissionEnd) -> Caption:
-    errors = [
-        travelled(truth, estimate.world[0])
-        for robot, estimate in now.estimates.items()
-        if estimate.localised and estimate.world and (truth := now.truth.get(robot)) is not None
-    ]
-    size = metres(max(errors)) if errors and max(errors) >= 1e-6 else "less than 1 µm"
-    largest = f"The largest error of a localised robot is {size}." if errors else None
-    if end.outcome == "localised":
-        return Caption("end", f"All {len(setup.robots)} robots are localised.", truth=largest)
-    plain = plain_reason(end)
-    why = f": {stopped(plain)}" if plain else "."
-    return Caption("end", f"The mission ends: {end.outcome}{why}", truth=largest)
 
 
 def _listed(names: Sequence[str], what: str) -> str:
