@@ -508,6 +508,7 @@ def test_an_agents_journal_is_never_overwritten(tmp_path: Path) -> None:
         ("run niose", "; did you mean 'noise'?"),
         ("sweep los", "; did you mean 'loss'?"),
         ("rnu paper-1", "; did you mean 'run'?"),
+        ("bench --rounds 3", ": `uv run python -m tests.benchmark` in a clone measures the same"),
         ("run paper-1 --sede 3", "tandem run: unrecognized arguments: --sede 3; did you mean '--seed'?"),
         ("figures x --out y", "tandem figures: unrecognized arguments: --out y"),
         ("figures x --only encunter", "; did you mean 'encounter'?"),

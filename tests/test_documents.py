@@ -30,7 +30,6 @@ PARSERS = {"msgspec.json.decode", "msgspec.json.Decoder", "msgspec.toml.decode",
 """The functions that parse what `protocol.documents` checks."""
 OWN = {
     "compose/view/foxglove/layout.py",  # what a library returned
-    "compose/view/web/page_client.py",  # what a page of the benchmark answered
     "protocol/network/endpoints.py",  # what Zenoh returned of a configuration that was checked
     "protocol/documents.py",
 }

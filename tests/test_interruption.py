@@ -87,7 +87,6 @@ def test_ctrl_c_while_tandem_starts_ends_it_without_output(module: str) -> None:
             ("watch RECORDING", "uvicorn"),
             ("check-planner assured", "compose.audit.rules"),
             ("run paper-1 --secure --out OUT", "cryptography"),
-            ("bench", "cryptography"),
             ("doctor", "compose.doctor.machine_checks"),
             ("run paper-1 --in-process --out OUT", "numpy"),
             ("run paper-1 --out OUT", "compose.launch.processes"),

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
+from statistics import median
 from typing import Any, NoReturn
 
 import msgspec
@@ -18,7 +19,6 @@ import tandem
 from agent.process import agent_journal
 from compose import extras
 from compose.audit.rules import audit_run
-from compose.cli.benchmark import api_missions
 from compose.recording import run as recorded
 from compose.recording.estimating.estimate_rows import PoseEstimateRow
 from compose.recording.rows import tick_rows
@@ -28,6 +28,7 @@ from protocol.messages import Command
 from protocol.motion import REST
 from tandem import scenarios
 from tandem.columns import Table
+from tests.benchmark import in_process as benchmark
 from tests.commands import tandem as command
 from tests.series import series
 
@@ -383,11 +384,12 @@ def test_a_run_with_another_seed_does_nothing_twice(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.long
-def test_the_benchmark_compares_the_api_with_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(api_missions, "MISSIONS_PER_SCENARIO", {"random": 50})
-    cells = [[*column.cells] for column in api_missions.missions_by_api(3, lambda: None).columns]
-    assert cells[0][2] == "tandem.run / engine (at most 1.6)"
-    assert float(str(cells[1][2])) < 2.0
+def test_the_api_takes_at_most_twice_the_time_of_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(benchmark, "BY_API", {"random": 50})
+    ratios = [
+        benchmark.missions_by_api(number)["tandem.run / engine (at most 1.6), random"] for number in range(3)
+    ]
+    assert median(ratios) < 2.0
 
 
 # --- sweeps -------------------------------------------------------------------------------------------

@@ -69,7 +69,6 @@ COMMANDS = (
     CommandEntry("ps", "Check", "List the missions on a network and the robots in them."),
     CommandEntry("check-driver", "Check", "Check a driver against its contract; the robot moves."),
     CommandEntry("check-planner", "Check", "Check a planner of your own against its contract."),
-    CommandEntry("bench", "Check", "Measure speed against baselines in the same run."),
     CommandEntry("completion", "Check", "Print a script with which bash or zsh completes `tandem`."),
 )
 """All commands, in the order of `tandem --help`."""

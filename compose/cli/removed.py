@@ -23,6 +23,7 @@ REMOVED = (
     Removed("run --foxglove-origin", _FOXGLOVE),
     Removed("export --gif", "use `--html`, whose page plays the mission"),
     Removed("export --mp4", "use `--html`, whose page plays the mission"),
+    Removed("bench", "`uv run python -m tests.benchmark` in a clone measures the same"),
 )
 
 

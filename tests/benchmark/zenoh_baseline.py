@@ -1,4 +1,4 @@
-"""The Zenoh baseline of `tandem bench`: the duration of a tick's message exchange without a mission.
+"""The Zenoh baseline of the benchmark: the duration of a tick's message exchange without a mission.
 
 The processes, topology, quality of service and sizes of messages are those of a mission. The world sends a
 frame to each robot and waits for a frame from each. Nothing is encoded, checked or stored.

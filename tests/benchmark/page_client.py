@@ -1,4 +1,4 @@
-"""A client that makes the requests of an open page without a browser, as a load for `tandem bench`."""
+"""A client that makes the requests of an open page without a browser, as a load."""
 
 from __future__ import annotations
 

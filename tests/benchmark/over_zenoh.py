@@ -5,23 +5,23 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
+from functools import cache
 from pathlib import Path
 from statistics import median
 
-from rich.table import Table
-
-from compose.cli.benchmark.bench_table import add_row, new_table
-from compose.launch import in_process, processes, zenoh_baseline
+from compose.launch import in_process, processes
 from compose.launch.page_process import serving
 from compose.launch.supervisor import COMMAND, STOP_S, Supervisor
 from compose.network import KEYED
 from compose.recording.recording_files import WORLD_JOURNAL
 from compose.scenario import scenario_file
+from compose.security import certificates
 from protocol.journal.journal_file import Journal
 from protocol.network import access_control, session
 from protocol.network.endpoints import Endpoints, configured, listening
 from protocol.network.inbox import Inbox
 from protocol.wire import encode
+from tests.benchmark import zenoh_baseline
 from world.process import WorldProcess
 from world.scenario import Scenario
 from world.simulation import Simulation
@@ -32,41 +32,26 @@ BARRIER_TICKS = 5000
 """The number of ticks of the baseline, about as many as the mission has."""
 
 
-def ticks_per_second(rounds: int, done: Callable[[], None]) -> Table:
+def ticks_per_second(_: int) -> dict[str, float]:
     """Measure a mission as processes; the baseline only exchanges frames of the same size over Zenoh."""
     scenario = scenario_file.load(LONG_MISSION)
-    sizes = _frame_sizes(scenario)
-    missions: list[float] = []
-    bare: list[float] = []
-    watched: list[float] = []
-    secured: list[float] = []
-    barriers: list[float] = []
-    for _ in range(rounds):
-        missions.append(_mission_rate(scenario))
-        bare.append(_mission_rate(scenario, journals=False))
-        watched.append(_mission_rate(scenario, watched=True))
-        secured.append(_mission_rate(scenario, secured=True))
-        barriers.append(_barrier_rate(scenario, sizes))
-        done()
-    table = new_table("Ticks/s as processes, two robots")
-    add_row(table, f"a mission ({LONG_MISSION}), with journals", missions, "ticks/s")
-    add_row(table, "the same, without journals", bare, "ticks/s")
-    add_row(table, "the same, with a client of the page", watched, "ticks/s")
-    add_row(table, "the same, over TLS with access control", secured, "ticks/s")
-    add_row(table, f"baseline: frames of {sizes[0]} and {sizes[1]} bytes", barriers, "ticks/s")
-    ratios = [mission / one for mission, one in zip(missions, barriers, strict=True)]
-    add_row(table, "mission / baseline (at least 0.5)", ratios, "")
-    ratios = [mission / without for mission, without in zip(missions, bare, strict=True)]
-    add_row(table, "with journals / without (at least 0.85)", ratios, "")
-    ratios = [with_page / mission for with_page, mission in zip(watched, missions, strict=True)]
-    add_row(table, "watched / mission (at least 0.6)", ratios, "")
-    ratios = [with_keys / mission for with_keys, mission in zip(secured, missions, strict=True)]
-    add_row(table, "secured / mission (at least 0.75)", ratios, "")
-    return table
+    sizes = _frame_sizes()
+    mission = _mission_rate(scenario)
+    barrier = _barrier_rate(scenario, sizes)
+    return {
+        f"a mission ({LONG_MISSION}), with journals, ticks/s": mission,
+        f"baseline: frames of {sizes[0]} and {sizes[1]} bytes, ticks/s": barrier,
+        "mission / baseline (at least 0.5)": mission / barrier,
+        "with journals / without (at least 0.85)": mission / _mission_rate(scenario, journals=False),
+        "with a client of the page / without (at least 0.6)": _mission_rate(scenario, watched=True) / mission,
+        "TLS and access control / without (at least 0.75)": _mission_rate(scenario, secured=True) / mission,
+    }
 
 
-def _frame_sizes(scenario: Scenario) -> tuple[int, int]:
-    """Return the median sizes of an Observation and of a Command (bytes)."""
+@cache
+def _frame_sizes() -> tuple[int, int]:
+    """Return the median sizes of an Observation and of a Command of LONG_MISSION (bytes)."""
+    scenario = scenario_file.load(LONG_MISSION)
     simulation = Simulation(scenario)
     observations: list[int] = []
     commands: list[int] = []
@@ -85,7 +70,7 @@ def _processes(
 
     With `until_ended`, wait at most STOP_S for all to end first.
     """
-    children = Supervisor(Inbox("tandem bench"))
+    children = Supervisor(Inbox("benchmark"))
     try:
         for number, arguments in enumerate(commands):
             children.start(str(number), *arguments, main=main)
@@ -108,17 +93,17 @@ def _mission_rate(
         folder = stack.enter_context(tempfile.TemporaryDirectory())
         clients = []
         if watched:
-            page = stack.enter_context(serving(Path(folder), 0, Inbox("tandem bench")))
+            page = stack.enter_context(serving(Path(folder), 0, Inbox("benchmark")))
             clients.append([page.address])
         common = ["--connect", str(endpoints), "--quiet", *(["--out", folder] if journals else [])]
         robots = [["agent", robot.id, *keyed(robot.id), *common] for robot in scenario.robots]
         with (
-            _processes(clients, main="compose.view.web.page_client:main"),
+            _processes(clients, main="tests.benchmark.page_client:main"),
             _processes(robots, until_ended=True),
             session.open_router(endpoints) as link,
             Journal(Path(folder) / WORLD_JOURNAL) if journals else nullcontext() as journal,
         ):
-            process = WorldProcess(Simulation(scenario, journal), "bench", Inbox("tandem bench"))
+            process = WorldProcess(Simulation(scenario, journal), "benchmark", Inbox("benchmark"))
             process.attach(link)
             end = process.run()
             return end.tick / process.running_s
@@ -130,8 +115,6 @@ def _endpoints(
     """Return the world's endpoints, and a function from a robot's id to the flags with its keys."""
     if not secured:
         return listening(processes.free_endpoint()), lambda _: []
-    from compose.security import certificates  # noqa: PLC0415  # the library is optional
-
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tandem-keys-")))
     certificates.make(folder, [robot.id for robot in scenario.robots], (), 1)
     endpoints = configured(folder / "world" / KEYED, listen=[processes.free_endpoint("tls")])
@@ -142,9 +125,9 @@ def _barrier_rate(scenario: Scenario, sizes: tuple[int, int]) -> float:
     """Return the ticks per second of the baseline, with frames of `sizes` bytes."""
     endpoint = processes.free_endpoint()
     ids = [robot.id for robot in scenario.robots]
-    robots = [[endpoint, one, str(sizes[1]), str(BARRIER_TICKS)] for one in ids]
+    robots = [[endpoint, robot, str(sizes[1]), str(BARRIER_TICKS)] for robot in ids]
     with (
         session.open_router(listening(endpoint)) as link,
-        _processes(robots, main="compose.launch.zenoh_baseline:main", until_ended=True),
+        _processes(robots, main="tests.benchmark.zenoh_baseline:main", until_ended=True),
     ):
         return BARRIER_TICKS / zenoh_baseline.world(link, ids, sizes[0], BARRIER_TICKS)

@@ -1,1 +1,0 @@
-"""The measurements of `tandem bench`, each beside a baseline in the same run."""
