@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 import socket
@@ -33,7 +32,7 @@ from protocol.network import session
 from protocol.network.diagnosis import MUTE
 from protocol.network.endpoints import configured, listening
 from protocol.wire import VERSION
-from tests.commands import ENDLESS, LONG, Ended, TandemProcess, tandem, world
+from tests.commands import LONG, Ended, TandemProcess, tandem, world
 from tests.series import series
 from tests.test_keys import expire, give_foreign, last, world_of
 from tests.test_topologies import Router, connect, listen, record_of, routing, same
@@ -263,7 +262,7 @@ def test_a_network_without_missions_is_reported() -> None:
     with session.open_router(listening(endpoint)):
         ended = tandem("doctor", *connect(endpoint))
     assert findings(ended, "ok")[-1] == "alive: no mission is running on this network"
-    assert findings(ended, "--") == ["rules: there are none to test without --keys"]
+    assert findings(ended, "--") == []
 
 
 @contextmanager
@@ -323,42 +322,14 @@ def test_clock_offsets_are_measured_within_their_uncertainty(
     assert words in found.text
 
 
-# --- access rules ---------------------------------------------------------------------------------------
-
-
-def let_read_truth(settings: dict[str, Any]) -> None:
-    """Add a rule that permits reading the ground truth."""
-    rules = settings["access_control"]
-    rules["rules"].append(
-        {
-            "id": "curious",
-            "permission": "allow",
-            "flows": ["ingress", "egress"],
-            "messages": ["put", "declare_subscriber"],
-            "key_exprs": ["tandem/*/world/truth"],
-        }
-    )
-    subject = next(one for one in rules["subjects"] if one["id"] == "agent-a")
-    rules["policies"].append({"subjects": [subject["id"]], "rules": ["curious"]})
-
-
-def enforce_nothing(settings: dict[str, Any]) -> None:
-    settings["access_control"]["enabled"] = False
-
-
-def enforce(_settings: dict[str, Any]) -> None:
-    """Leave the rules unchanged."""
+# --- a router with keys ---------------------------------------------------------------------------------
 
 
 @contextmanager
-def router_by(keys: Path, change: Callable[[dict[str, Any]], None], folder: Path) -> Iterator[str]:
-    """Yield the endpoint of a router with a modified configuration."""
-    own = shutil.copytree(keys / "router", folder / "router")
-    settings = json.loads((own / KEYED).read_text().partition("\n")[2])
-    change(settings)
-    (own / KEYED).write_text(f"//\n{json.dumps(settings)}")
+def router_by(keys: Path, folder: Path) -> Iterator[str]:
+    """Yield the endpoint of a router with these keys."""
     endpoint = free_endpoint("tls")
-    with routing(Router(endpoint, (), own), folder):
+    with routing(Router(endpoint, (), keys / "router"), folder):
         yield endpoint
 
 
@@ -370,86 +341,12 @@ def start(
     return stack.enter_context(TandemProcess(*arguments, *where))
 
 
-FORGED = (
-    "robot/a/observation, robot/a/tick-start, robot/b/command, robot/b/estimate, robot/b/to/a, world/truth"
-)
-FORGED_BY_VIEWER = (
-    "robot/a/command, robot/a/estimate, robot/a/observation, robot/a/tick-start, robot/a/to/a, world/truth"
-)
-READ = "robot/b/command, robot/b/observation, world/truth"
-
-
-@pytest.mark.parametrize(
-    ("change", "fixes"),
-    [
-        (enforce, []),
-        pytest.param(
-            enforce_nothing, [f"can publish {FORGED};", f"can read {READ} in mine;"], marks=pytest.mark.long
-        ),
-        pytest.param(
-            let_read_truth,
-            ["can publish world/truth;", "can read world/truth in mine;"],
-            marks=pytest.mark.long,
-        ),
-    ],
-)
-def test_rules_are_tried_while_a_mission_runs(
-    change: Callable[[dict[str, Any]], None], fixes: list[str], keys: Path, tmp_path: Path
-) -> None:
-    (tmp_path / "endless.toml").write_text(ENDLESS)
-    with router_by(keys, change, tmp_path) as endpoint, ExitStack() as stack:
-        part = partial(start, keys, endpoint, tmp_path / "out", stack)
-        part("world", "world", tmp_path / "endless.toml", "--run", "mine")
-        for robot in [part(f"agent-{robot}", "agent", robot) for robot in "ab"]:
-            robot.until((tmp_path / "out" / "agent-b.journal").exists, "b plays")
-        ended = tandem("doctor", "--connect", endpoint, "--keys", keys / "agent-a", "--timeout", "20")
-    assert findings(ended, "--") == []
-    found = findings(ended, "fix")
-    assert len(found) == len(fixes)
-    for line, words in zip(found, fixes, strict=True):
-        assert line.startswith(f"rules: agent-a {words}")
-    said = findings(ended, "ok")
-    assert f"router: {endpoint} answers, over TLS" in said
-    assert "rules: agent-a can publish Reports of a" in said
-    assert (f"rules: agent-a cannot read {READ} in mine" in said) is (not fixes)
-    assert said[-1] == "alive: mine: its world, with this protocol version; a's agent"
-
-
-@pytest.mark.parametrize(("change", "passes"), [(enforce, False), (enforce_nothing, True)])
-def test_a_page_with_the_right_to_publish_is_a_problem(
-    change: Callable[[dict[str, Any]], None], passes: bool, keys: Path, tmp_path: Path
-) -> None:
-    with router_by(keys, change, tmp_path) as endpoint:
-        ended = tandem("doctor", "--connect", endpoint, "--keys", keys / "viewer")
-    if passes:
-        only_fix(ended, f"rules: viewer can publish {FORGED_BY_VIEWER};")
-    else:
-        assert findings(ended, "fix") == []
-        assert any("robot/a/command" in one and "cannot publish" in one for one in findings(ended, "ok"))
-
-
 def test_access_rules_without_the_robot_are_a_problem(keys: Path, tmp_path: Path) -> None:
     everybody = shutil.copytree(keys, tmp_path / "keys")
     assert tandem("keys", everybody, "--robots", "c").status == 0
-    with router_by(keys, enforce, tmp_path) as endpoint:
+    with router_by(keys, tmp_path) as endpoint:
         ended = tandem("doctor", "--connect", endpoint, "--keys", everybody / "agent-c")
-    only_fix(ended, "rules: agent-c cannot publish Reports of c; the router must enforce the rules")
-
-
-@pytest.mark.long
-def test_a_check_that_needs_a_running_mission_is_not_reported_as_passed(keys: Path, tmp_path: Path) -> None:
-    with router_by(keys, enforce, tmp_path) as endpoint, ExitStack() as stack:
-        flags = ("--connect", endpoint, "--keys", keys / "agent-a", "--timeout", "0.2")
-        assert not any(
-            "read" in line for line in tandem("doctor", *flags).out.splitlines() if "rules:" in line
-        )
-        part = partial(start, keys, endpoint, tmp_path / "out", stack)
-        part("world", "world", "paper-1", "--run", "mine")
-        part("agent-a", "agent", "a").until_answered("a", tmp_path / "out")
-        ended = tandem("doctor", *flags)
-    assert findings(ended, "fix") == []
-    (untried,) = findings(ended, "--")
-    assert untried.startswith(f"rules: reading {READ}: mine had no ticks within 0.2 s")
+    only_fix(ended, "router: it passes no Reports of c; restart it with the zenoh.json5 of `tandem keys`")
 
 
 # --- no mission is disturbed ----------------------------------------------------------------------------
@@ -457,12 +354,9 @@ def test_a_check_that_needs_a_running_mission_is_not_reported_as_passed(keys: Pa
 
 @pytest.mark.long
 def test_the_doctor_does_not_change_the_recording_of_a_mission(keys: Path, tmp_path: Path) -> None:
-    """No rule restricts the doctor here.
-
-    It runs before b joins, while all robots move, and several times at once.
-    """
+    """It runs before b joins, while all robots move, and several times at once."""
     expected, out = record_of(LONG, tmp_path), tmp_path / "out"
-    with router_by(keys, enforce_nothing, tmp_path) as endpoint, ExitStack() as stack:
+    with router_by(keys, tmp_path) as endpoint, ExitStack() as stack:
         part = partial(start, keys, endpoint, out, stack)
         started = {
             "world": part("world", "world", tmp_path / "scenario.toml", "--run", "mine"),
@@ -476,14 +370,12 @@ def test_the_doctor_does_not_change_the_recording_of_a_mission(keys: Path, tmp_p
             for who in ("agent-a", "agent-b", "viewer")
         ]
         for doctor in doctors[:2]:
-            doctor.until_prints("can publish Reports of")
+            doctor.until_prints("clock:")
         started["b"] = part("agent-b", "agent", "b")
         listing = tandem("ps", "--connect", endpoint, "--keys", keys / "viewer")
         assert listing.status == 0
         same(started, out, expected)
         for doctor in doctors:
             ended = doctor.ended()
-            assert ended.status == 1
+            assert ended.status == 0
             assert ended.err == ""
-        for doctor in doctors[:2]:
-            assert "world/truth in mine" in doctor.out

@@ -14,7 +14,6 @@ from typing import Any
 import msgspec
 import zenoh
 
-from compose.doctor.access_checks import ASK_S, decoded
 from protocol.messages import (
     Command,
     FinalReport,
@@ -26,8 +25,10 @@ from protocol.messages import (
 )
 from protocol.network import keys, session
 from protocol.network.keys import Key
-from protocol.wire import version_of
+from protocol.wire import MalformedFrame, decode, version_of
 
+ASK_S = 2.0
+"""Time in s to wait for one answer."""
 FIND_S = 0.5
 """Time in s to look for a mission if there is none: routers may just have connected to each other."""
 MISSIONS_POLL_S = 0.02
@@ -98,6 +99,14 @@ def _alive(link: zenoh.Session) -> dict[str, frozenset[str]]:
     return {run: frozenset(found[run]) for run in sorted(found)}
 
 
+def _decoded(frame: bytes | None, kind: Any) -> Any:
+    """Return the message in a frame; None if there is no frame, or it cannot be decoded."""
+    try:
+        return decode(frame, kind) if frame is not None else None
+    except MalformedFrame:
+        return None
+
+
 class _LatestFrames:
     """The latest frame of each key, and the number of frames. Samples under other keys are ignored."""
 
@@ -149,7 +158,7 @@ class _LatestFrames:
 
     def message(self, key: Key, messages: Any) -> Any:
         """Return the latest message under `key`, if it is one of `messages` and of the robot in the key."""
-        message = decoded(self.latest.get(key), messages)
+        message = _decoded(self.latest.get(key), messages)
         return message if getattr(message, "robot", key.robot) == key.robot else None
 
 
@@ -161,7 +170,7 @@ def _mission(link: zenoh.Session, latest: _LatestFrames, run: str, alive: frozen
     ]
     answers = _configs(link, run, latest.named(run, keys.observation) | alive - {""}) if "" in alive else {}
     frames += answers.values()
-    configs = [one for frame in answers.values() if (one := decoded(frame, RobotConfig)) is not None]
+    configs = [one for frame in answers.values() if (one := _decoded(frame, RobotConfig)) is not None]
     named = alive - {""} | latest.named(run, keys.observation) | latest.named(run, keys.command)
     named |= {robot for one in configs for robot in one.others}
     messages = [
@@ -202,11 +211,11 @@ def _configs(link: zenoh.Session, run: str, robots: set[str]) -> dict[str, bytes
                 link,
                 keys.config(run, robot),
                 ASK_S,
-                lambda frame: decoded(frame, RobotConfig) is not None,
+                lambda frame: _decoded(frame, RobotConfig) is not None,
             )
             if isinstance(answer, bytes):
                 found[robot] = answer
-                config = decoded(answer, RobotConfig)
+                config = _decoded(answer, RobotConfig)
                 paired.update(config.others if config is not None else ())
     return found
 
