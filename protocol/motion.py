@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from typing import Any
 
 import msgspec
 
@@ -148,6 +149,30 @@ def inverse(pose: Pose) -> Pose:
     """Return the inverse transformation: `compose(pose, inverse(pose))` is ORIGIN."""
     c, s = math.cos(pose.heading), math.sin(pose.heading)
     return Pose(-c * pose.x - s * pose.y, s * pose.x - c * pose.y, -pose.heading)
+
+
+def relative(frame: Pose, pose: Pose) -> Pose:
+    """Return `pose` in `frame`, both given in one frame: `compose(frame, relative(frame, p))` is `p`."""
+    c, s = math.cos(frame.heading), math.sin(frame.heading)
+    dx, dy = pose.x - frame.x, pose.y - frame.y
+    return Pose(c * dx + s * dy, c * dy - s * dx, pose.heading - frame.heading)
+
+
+def placed(frame: Pose, x: Any, y: Any) -> tuple[Any, Any]:
+    """Return the points with coordinates `x` and `y` (floats or arrays) in `frame`,
+    as `compose` does poses."""
+    c, s = math.cos(frame.heading), math.sin(frame.heading)
+    return frame.x + c * x - s * y, frame.y + s * x + c * y
+
+
+def rotated(c: Any, s: Any, x: Any, y: Any) -> tuple[Any, Any]:
+    """Return vectors turned by angles with cosine `c` and sine `s`. All are floats or arrays."""
+    return c * x - s * y, s * x + c * y
+
+
+def rotated_back(c: Any, s: Any, x: Any, y: Any) -> tuple[Any, Any]:
+    """Return the vectors that `rotated` turns into these."""
+    return c * x + s * y, c * y - s * x
 
 
 def travelled(origin: Pose, pose: Pose) -> float:

@@ -32,7 +32,7 @@ BELOW = {
 }
 """The packages of the project that each package may import."""
 
-BUDGETS = {"protocol": 4_310, "agent": 15_370, "world": 4_270, "compose": 33_250, "tandem": 1_800}
+BUDGETS = {"protocol": 4_330, "agent": 15_370, "world": 4_270, "compose": 33_250, "tandem": 1_800}
 """The largest number of lines of Python of each package. Raising one needs a reason in the commit."""
 
 SHELL = {

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from protocol.motion import Pose, compose, wrap
+from protocol.motion import Pose, compose, rotated, wrap
 
 TRIANGLE_SLACK = 1e-7
 """The fraction of a triangle's perimeter by which rounding may violate the triangle inequality.
@@ -48,9 +48,14 @@ class Placement(NamedTuple):
     x: float
     y: float
 
+    @property
+    def frame(self) -> Pose:
+        """The pose of <a(M1)> in <b(M2)>."""
+        return Pose(self.x, self.y, self.phi)
+
     def place(self, pose: Pose) -> Pose:
         """Return `pose`, given in <a(M1)>, in <b(M2)>."""
-        return compose(Pose(self.x, self.y, self.phi), pose)
+        return compose(self.frame, pose)
 
 
 def placements(
@@ -85,8 +90,8 @@ def placements(
         # <a(M1)> seen from p1b, with the x-axis towards p1a
         turn = side - course
         c, s = math.cos(turn), math.sin(turn)
-        anchor_x = rho1 - (c * p1a.x - s * p1a.y)
-        anchor_y = -(s * p1a.x + c * p1a.y)
+        ahead, aside = rotated(c, s, p1a.x, p1a.y)
+        anchor_x, anchor_y = rho1 - ahead, -aside
         radius = math.hypot(anchor_x, anchor_y)
         for tx, ty in circle_intersections(p1b.x, p1b.y, radius, distance):
             spin = math.atan2(ty - p1b.y, tx - p1b.x) - math.atan2(anchor_y, anchor_x)

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from agent.peer.motion_log import MotionLog
 from protocol.attack import OF_THE_START, Attack
 from protocol.messages import Ranged
-from protocol.motion import Pose, Segment
+from protocol.motion import Pose, Segment, rotated
 
 
 def falsified_log(
@@ -95,6 +95,6 @@ def start(true: Pose, attack: Attack) -> Pose:
             return replace(true, heading=true.heading + attack.size)
         case "reframe":
             c, s = math.cos(attack.size), math.sin(attack.size)
-            return Pose(c * true.x - s * true.y, s * true.x + c * true.y, true.heading + attack.size)
+            return Pose(*rotated(c, s, true.x, true.y), true.heading + attack.size)
         case _:
             return true

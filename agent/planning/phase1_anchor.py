@@ -11,7 +11,7 @@ import msgspec
 from agent.estimation.exact import Branch
 from agent.planning.manoeuvres import Manoeuvres
 from protocol.mission import RANGE_MARGIN, Mission, third_point_turn_rate
-from protocol.motion import Controls, Pose, chord, compose
+from protocol.motion import Controls, Pose, chord, compose, rotated_back
 
 PREFERENCE = 1e-9
 """The relative improvement, above rounding errors, that a later candidate needs to replace an earlier one."""
@@ -84,7 +84,7 @@ def _outward(place: Pose, half_turn: float, forward: float) -> tuple[float, floa
     """Return the components in m of the position, relative to the anchor, along and across the next chord."""
     course = place.heading + half_turn
     c, s = forward * math.cos(course), forward * math.sin(course)
-    return place.x * c + place.y * s, place.y * c - place.x * s
+    return rotated_back(c, s, place.x, place.y)
 
 
 def _reach(along: float, across: float, rim: float) -> float:

@@ -18,7 +18,7 @@ from agent.estimation.mutual_ranges import ELSEWHERE
 from agent.planning.manoeuvres import Manoeuvres
 from agent.planning.separation import nearest
 from protocol.mission import RANGE_MARGIN, Mission, Role
-from protocol.motion import Controls, Pose, travelled
+from protocol.motion import Controls, Pose, placed, relative, travelled
 
 Array = NDArray[np.float64]
 Point = float | Array
@@ -250,12 +250,8 @@ def _keeps_apart(question: Question, reach: ReachableEnds, mission: Mission) -> 
 
 def _standing_position(mover: Role, a: Pose, b: Pose, placement: Placement) -> tuple[float, float]:
     """Return the position of the robot that does not move, in the frame of the mover's anchor."""
-    if mover == "b":
-        there = placement.place(a)
-        return there.x, there.y
-    c, s = math.cos(placement.phi), math.sin(placement.phi)
-    dx, dy = b.x - placement.x, b.y - placement.y
-    return c * dx + s * dy, c * dy - s * dx
+    there = placement.place(a) if mover == "b" else relative(placement.frame, b)
+    return there.x, there.y
 
 
 def _best(value: Array) -> tuple[int, int]:
@@ -293,5 +289,4 @@ def _positions_in_b(
     if mover == "b":
         there = placement.place(a)
         return (there.x, there.y), (x, y)
-    c, s = math.cos(placement.phi), math.sin(placement.phi)
-    return (placement.x + c * x - s * y, placement.y + s * x + c * y), (b.x, b.y)
+    return placed(placement.frame, x, y), (b.x, b.y)

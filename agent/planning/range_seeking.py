@@ -15,7 +15,7 @@ import msgspec
 from agent.planning.manoeuvres import Manoeuvres
 from agent.planning.separation import leeway
 from protocol.mission import Mission
-from protocol.motion import REST, TAU, Controls, Pose, travelled, wrap
+from protocol.motion import REST, TAU, Controls, Pose, relative, travelled, wrap
 
 Beacon = Literal["anchor", "peer"]
 
@@ -86,7 +86,7 @@ def moved(origin: Pose, pose: Pose) -> bool:
 
 def distance_ahead(origin: Pose, pose: Pose) -> float:
     """Return the distance in m from `origin` to `pose` along the heading of `origin`; negative behind it."""
-    return (pose.x - origin.x) * math.cos(origin.heading) + (pose.y - origin.y) * math.sin(origin.heading)
+    return relative(origin, pose).x
 
 
 def onward(

@@ -11,6 +11,7 @@ import numpy as np
 from agent.estimation.gaussian.odometry_noise import Array, Places
 from agent.planning import separation
 from protocol.mission import Mission
+from protocol.motion import Pose, placed
 
 STRIDE_LENGTH = 0.25
 """The minimum length of a manoeuvre, as a fraction of R. A manoeuvre lasts as many ticks as that takes."""
@@ -49,17 +50,11 @@ class Choice(NamedTuple):
 
     def ends(self, pose: Array, some: Places | slice = slice(None)) -> tuple[Array, Array]:
         """Return the positions in m after each stride of the manoeuvres `some` from `pose`; (C, strides)."""
-        return _placed(pose, self.along[some], self.across[some])
+        return placed(Pose(*pose), self.along[some], self.across[some])
 
     def way(self, pose: Array, some: Places) -> tuple[Array, Array]:
         """Return the positions in m during the first stride of the manoeuvres `some`; (C, CHORDS)."""
-        return _placed(pose, self.way_along[some], self.way_across[some])
-
-
-def _placed(pose: Array, along: Array, across: Array) -> tuple[Array, Array]:
-    """Return the positions in m of points that are `along` the heading of `pose` and `across` it."""
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    return pose[0] + c * along - s * across, pose[1] + s * along + c * across
+        return placed(Pose(*pose), self.way_along[some], self.way_across[some])
 
 
 @cache

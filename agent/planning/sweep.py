@@ -59,14 +59,12 @@ def looping_both_ways(
     Its sides are `along` and `aside`, in m. In both together, the robot turns as much to the left as to the
     right, so an error of the scale of its gyro does not add up.
     """
-    c, s = math.cos(odometry.heading), math.sin(odometry.heading)
     corners = [
         (x, side * aside * y)
         for side in (1.0, -1.0)
         for x, y in ((0.0, 1.0), (-along, 1.0), (-along, 0.0), (0.0, 0.0))
     ]
-    places = [(odometry.x + c * x - s * y, odometry.y + s * x + c * y) for x, y in corners]
-    return Looping(tuple(places), then, since)
+    return Looping(transformed(odometry, corners), then, since)
 
 
 def controls(mode: Sweeping | Looping, odometry: Pose, mission: Mission, tolerance: float) -> Controls | None:

@@ -16,7 +16,7 @@ from agent.estimation.gaussian.least_squares import fit
 from agent.estimation.gaussian.odometry_noise import Track, track
 from agent.estimation.gaussian.range_model import Ranges
 from compose.recording.run import Run
-from protocol.motion import REST, Pose
+from protocol.motion import REST, Pose, relative
 from world.sensors import anchor_ranges
 
 
@@ -52,9 +52,8 @@ def position_bounds(run: Run, pair: tuple[int, int], tick: int) -> tuple[float, 
     for place, anchor in zip(pair, anchors, strict=True):
         tracks.append(_driven(run, place, tick))
         start = ticks[0].truth.poses[place]
-        c, s = math.cos(start.heading), math.sin(start.heading)
-        dx, dy = anchor.x - start.x, anchor.y - start.y
-        guess += [c * dx + s * dy, c * dy - s * dx, start.heading]
+        seen = relative(start, Pose(anchor.x, anchor.y, 0.0))
+        guess += [seen.x, seen.y, start.heading]
     apart = (anchors[1].x - anchors[0].x, anchors[1].y - anchors[0].y)
     exact = Ranges.of_lists(own[0], own[1], mutual, noise)
     at_truth = fit(np.array(guess), tracks, exact, noise.as_told, apart, 0)

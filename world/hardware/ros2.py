@@ -19,7 +19,7 @@ import zenoh
 from rosbags.typesys import Stores, get_typestore
 
 from protocol.messages import RobotConfig
-from protocol.motion import ORIGIN, Controls, Pose, wrap
+from protocol.motion import ORIGIN, Controls, Pose, relative, wrap
 from protocol.network import session
 from protocol.network.endpoints import at
 from world.hardware.driver import SENSING, Reading
@@ -117,7 +117,7 @@ def executed(before: Pose, after: Pose, period: float) -> Controls:
     """
     turn = after.heading - before.heading
     course = before.heading + 0.5 * turn
-    ahead = (after.x - before.x) * math.cos(course) + (after.y - before.y) * math.sin(course)
+    ahead = relative(Pose(before.x, before.y, course), after).x
     shorter = math.sin(0.5 * turn) / (0.5 * turn) if turn else 1.0
     return Controls(ahead / (shorter * period), turn / period)
 

@@ -13,6 +13,7 @@ import numpy as np
 from agent.estimation.gaussian.known_anchors import COARSE, ROTATIONS, AnchoredRobot, ranges_places, refined
 from agent.estimation.gaussian.odometry_noise import Array
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, mixture
+from protocol.motion import rotated
 
 CIRCLES = 6
 """The number of ranges whose circles are intersected, spread over all of them."""
@@ -32,7 +33,8 @@ def beacon_guesses(robot: AnchoredRobot) -> list[Array]:
     px, py = path.x[ranges.tick], path.y[ranges.tick]
     place = ranges_places(robot)
     # where the robot would have started if it were at the beacon; shape (turns, N)
-    x, y = place[:, 0] - (c * px - s * py), place[:, 1] - (s * px + c * py)
+    dx, dy = rotated(c, s, px, py)
+    x, y = place[:, 0] - dx, place[:, 1] - dy
     chosen = np.linspace(0, len(px) - 1, min(CIRCLES, len(px))).round().astype(np.intp)
     i, j = np.triu_indices(len(chosen), 1)
     i, j = chosen[i], chosen[j]

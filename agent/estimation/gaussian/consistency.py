@@ -14,6 +14,7 @@ from agent.estimation.gaussian.least_squares import own_fit
 from agent.estimation.gaussian.noise_level import INLIER
 from agent.estimation.gaussian.range_model import PairRanges
 from protocol.messages import Inconsistent
+from protocol.motion import rotated
 from protocol.noise import Noise
 
 CLAIM_P_VALUE = 1e-3
@@ -276,7 +277,8 @@ def _distance_score(fitted: Fit, pair: PairRanges) -> float:
     c, s = math.cos(fitted.guess[2]), math.sin(fitted.guess[2])
     ux, uy = fitted.directions[0][:, mutual]  # from b to a, in the frame of a's odometry
     by_distance = np.zeros(len(fitted.residuals))
-    by_distance[mutual] = -((c * ux - s * uy) * pair.apart[0] + (s * ux + c * uy) * pair.apart[1]) / length
+    along, across = rotated(c, s, ux, uy)
+    by_distance[mutual] = -(along * pair.apart[0] + across * pair.apart[1]) / length
     system = fitted.system
     weighted = system.covariance.solve(by_distance[:, None])[:, 0]
     explained = system.jacobian.T @ weighted

@@ -36,7 +36,7 @@ from agent.estimation.gaussian.own_sensors import DOUBTFUL_CLAIM, claim_profiles
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges
 from protocol.messages import Ranged
 from protocol.mission import Mission
-from protocol.motion import Covariance, Pose, wrap
+from protocol.motion import Covariance, Pose, rotated, wrap
 
 FINDER, OWN = 0, 1
 """The places of the two robots in a fit."""
@@ -154,7 +154,7 @@ def _starts(measured: JointMeasurements, mission: Mission) -> list[JointStart]:
     assert prior is not None
     c, s = math.cos(prior.mean[FINDER, 2]), math.sin(prior.mean[FINDER, 2])
     x, y = path.x[ranges.tick], path.y[ranges.tick]
-    place = np.stack((c * x - s * y, s * x + c * y), 1)
+    place = np.stack(rotated(c, s, x, y), 1)
     as_anchors = Ranges(
         ranges.rho, ranges.tick, ranges.sigma, (len(ranges.rho), 0, 0), place, np.zeros(len(x), np.intp)
     )
@@ -162,8 +162,8 @@ def _starts(measured: JointMeasurements, mission: Mission) -> list[JointStart]:
     starts = []
     for one in scored_fits(robot, [Start(guess) for guess in beacon_guesses(robot)]):
         mx, my, turn = one.fit.guess.tolist()
-        c, s = math.cos(turn), math.sin(turn)
-        poses = np.stack((prior.mean[FINDER], (-(c * mx - s * my), -(s * mx + c * my), turn)))
+        x, y = rotated(math.cos(turn), math.sin(turn), mx, my)
+        poses = np.stack((prior.mean[FINDER], (-x, -y, turn)))
         nothing = Errors(np.zeros(0), np.zeros(0), np.zeros(0))
         starts.append(JointStart(poses, (nothing, one.fit.errors[0] if one.fit.errors else nothing)))
     return starts

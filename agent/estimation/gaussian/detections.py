@@ -10,6 +10,7 @@ from agent.estimation.gaussian.fitted import Fit
 from agent.estimation.gaussian.fitted_poses import deviation
 from agent.estimation.gaussian.odometry_noise import Array, Places
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, placed
+from protocol.motion import rotated_back
 from protocol.noise import Noise
 
 
@@ -41,11 +42,8 @@ def _mutual_log_likelihood(one: Fit, pair: PairRanges) -> float:
     for robot, (x, y), sign in ((0, (wx[k], wy[k]), 1.0), (1, (vx[k], vy[k]), -1.0)):
         theta = one.guess[3 * robot + 2]
         c, s = math.cos(theta), math.sin(theta)
-        gradient[3 * robot : 3 * robot + 3] = (
-            -sign * (c * nx + s * ny),
-            -sign * (c * ny - s * nx),
-            sign * (ny * x - nx * y),
-        )
+        along, across = rotated_back(c, s, nx, ny)
+        gradient[3 * robot : 3 * robot + 3] = (-sign * along, -sign * across, sign * (ny * x - nx * y))
     sigma = math.hypot(deviation(float(gradient @ one.covariance @ gradient)), EDGE * pair.sensing_range)
     return no_detection_log_likelihood(beyond, sigma, pair.noise.drop_outs)
 

@@ -16,6 +16,7 @@ from agent.estimation.gaussian.odometry_noise import (
     constant_effects,
     spread,
 )
+from protocol.motion import rotated
 
 
 def deviation(variance: float) -> float:
@@ -72,7 +73,7 @@ def _of_survey(fitted: Fit, by_range: Array) -> Array | float:
     rotation = fitted.linear_guess[5]
     c, s = math.cos(rotation), math.sin(rotation)
     x, y = fitted.directions[1][:, mutual]  # of b, whose range changes with M2 - M1 as with its position
-    along = by_range[:, mutual] @ np.stack((c * x - s * y, s * x + c * y), 1)
+    along = by_range[:, mutual] @ np.stack(rotated(c, s, x, y), 1)
     by_error = np.concatenate((-along, along), 1)
     by_error[0:2, 0:2] -= np.eye(2)  # the claim is relative to where M1 and M2 should be
     by_error[3:5, 2:4] -= np.eye(2)
@@ -94,4 +95,4 @@ def _placed(guess: Array, path: Track) -> tuple[float, float, float]:
     """Return the last pose on `path`, relative to the anchor along the axes of <W>, in m and rad."""
     c, s = math.cos(guess[2]), math.sin(guess[2])
     x, y = float(path.x[-1]) - guess[0], float(path.y[-1]) - guess[1]
-    return c * x - s * y, s * x + c * y, guess[2] + float(path.heading[-1])
+    return *rotated(c, s, x, y), guess[2] + float(path.heading[-1])

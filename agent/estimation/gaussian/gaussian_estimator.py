@@ -16,7 +16,7 @@ from agent.estimation.gaussian.inference import PlanningHypothesis
 from agent.estimation.knowledge import Knowledge
 from protocol.messages import Localised, Observation, Undecided, Verdict
 from protocol.mission import RANGE_MARGIN
-from protocol.motion import ORIGIN, wrap
+from protocol.motion import ORIGIN, Pose, relative, wrap
 
 LIKELY_BRANCH = 0.05
 """The probability from which on a branch takes part in the planning of a manoeuvre."""
@@ -98,9 +98,8 @@ class GaussianEstimator(msgspec.Struct, frozen=True):
 def _pose_in_b_frame(planning_hypothesis: PlanningHypothesis) -> Placement:
     """Return the pose of a in the frame of b's current pose."""
     ax, ay, a_heading, bx, by, b_heading = planning_hypothesis.poses.tolist()
-    c, s = math.cos(b_heading), math.sin(b_heading)
-    dx, dy = ax - bx, ay - by
-    return Placement(wrap(a_heading - b_heading), c * dx + s * dy, c * dy - s * dx)
+    seen = relative(Pose(bx, by, b_heading), Pose(ax, ay, a_heading))
+    return Placement(wrap(seen.heading), seen.x, seen.y)
 
 
 GAUSSIAN: Estimator = GaussianEstimator()

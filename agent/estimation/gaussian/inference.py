@@ -27,7 +27,7 @@ from agent.estimation.knowledge import Belief, Knowledge
 from agent.peer.motion_log import MotionLog
 from protocol.messages import RobotConfig
 from protocol.mission import HEADING_ACCURACY, Mission
-from protocol.motion import Covariance, Pose, Segment, compose, inverse, wrap
+from protocol.motion import Covariance, Pose, Segment, compose, inverse, relative, wrap
 from protocol.noise import VelocityNoise
 
 
@@ -183,9 +183,7 @@ def branch_of(knowledge: Knowledge, scored: ScoredHypothesis) -> Branch:
     mx, my = scored.hypothesis.guess[:2]
     path = scored.fit.paths[0]
     frame = math.atan2(-my, -mx)
-    c, s = math.cos(frame), math.sin(frame)
-    x, y = float(path.x[-1]) - mx, float(path.y[-1]) - my
-    now = Pose(c * x + s * y, c * y - s * x, float(path.heading[-1]) - frame)
+    now = relative(Pose(mx, my, frame), Pose(float(path.x[-1]), float(path.y[-1]), float(path.heading[-1])))
     start = compose(now, inverse(knowledge.odometry))
     return Branch(wrap(-frame), start)
 

@@ -41,6 +41,7 @@ from agent.estimation.gaussian.odometry_noise import (
 from agent.estimation.gaussian.range_covariance import inverse_of
 from agent.estimation.gaussian.range_model import outliers
 from agent.estimation.gaussian.range_weights import BLIND, weighted_variance, weights_by_errors
+from protocol.motion import Pose, placed
 from protocol.noise import Noise
 
 
@@ -99,9 +100,7 @@ class JointFit(NamedTuple):
         """Return the position (m, relative to the origin) of a robot at `ticks`; shape (2, N)."""
         x, y, heading = self.start.poses[robot]
         path = self.problem.point(self.start.poses, self.sizes).path
-        c, s = math.cos(heading), math.sin(heading)
-        px, py = path.x[robot, ticks], path.y[robot, ticks]
-        return np.stack((x + c * px - s * py, y + s * px + c * py))
+        return np.stack(placed(Pose(x, y, heading), path.x[robot, ticks], path.y[robot, ticks]))
 
     @property
     def sizes(self) -> JointErrorSizes:
@@ -277,8 +276,7 @@ def _end(point: JointPoint, robot: int, tick: int) -> tuple[float, float, float]
     """Return the pose of a robot at `tick`."""
     x, y, heading = point.poses[robot].tolist()
     px, py = float(point.path.x[robot, tick]), float(point.path.y[robot, tick])
-    c, s = math.cos(heading), math.sin(heading)
-    return x + c * px - s * py, y + s * px + c * py, heading + float(point.path.heading[robot, tick])
+    return *placed(Pose(x, y, heading), px, py), heading + float(point.path.heading[robot, tick])
 
 
 def _end_covariance(

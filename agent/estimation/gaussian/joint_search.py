@@ -27,6 +27,7 @@ from agent.estimation.gaussian.known_anchors import AnchoredRobot, scored_fits
 from agent.estimation.gaussian.linear_model import Start
 from agent.estimation.gaussian.odometry_noise import Errors, Places
 from agent.estimation.gaussian.range_model import PairRanges, Ranges
+from protocol.motion import rotated
 
 MOST_JOINT = 12
 """The largest number of joint hypotheses whose poses are all in more probable ones, too.
@@ -292,7 +293,8 @@ def _start(one: ScoredHypothesis, anchors: Sequence[tuple[float, float]]) -> Joi
     poses = []
     for (mx, my, turn), (x, y) in zip(one.fit.guess.reshape(-1, 3).tolist(), anchors, strict=True):
         c, s = math.cos(turn), math.sin(turn)
-        poses.append((x - (c * mx - s * my), y - (s * mx + c * my), turn))
+        dx, dy = rotated(c, s, mx, my)
+        poses.append((x - dx, y - dy, turn))
     nothing = [Errors(np.zeros(0), np.zeros(0), np.zeros(0))] * len(poses)
     return JointStart(np.array(poses), one.fit.errors or tuple(nothing))
 

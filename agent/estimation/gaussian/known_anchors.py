@@ -27,6 +27,7 @@ from agent.estimation.gaussian.linear_model import Start
 from agent.estimation.gaussian.odometry_noise import Array, Places, Track
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges, mixture, predicted
 from protocol.mission import HEADING_ACCURACY
+from protocol.motion import rotated
 from protocol.noise import Noise
 
 ROTATIONS = 72
@@ -149,7 +150,7 @@ def _distinct(guesses: Array, likely: Array, last: Array, longest: float) -> lis
     """Return the likeliest of `guesses` at different poses at the place `last` (m) of the path."""
     c, s = np.cos(guesses[:, 2]), np.sin(guesses[:, 2])
     x, y = last[0] - guesses[:, 0], last[1] - guesses[:, 1]
-    ends = np.stack((c * x - s * y, s * x + c * y), 1)
+    ends = np.stack(rotated(c, s, x, y), 1)
     left: Places = np.argsort(-likely, kind="stable")
     chosen: list[Array] = []
     while len(left) and len(chosen) < CANDIDATES:

@@ -35,6 +35,7 @@ from agent.estimation.gaussian.odometry_noise import (
     symmetric,
 )
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, inlier_probability, mixture
+from protocol.motion import rotated, rotated_back
 
 SCAN = 72
 """The number of headings that are tried for the robot nearer to its anchor.
@@ -306,7 +307,7 @@ def _residuals_at(
         x = one.x + offset[:, :1] - offset[:, 2:] * qy
         y = one.y + offset[:, 1:2] + offset[:, 2:] * qx
         c, s = np.cos(z[:, i : i + 1]), np.sin(z[:, i : i + 1])
-        moved.append((c * x - s * y, s * x + c * y, c, s, qx, qy))
+        moved.append((*rotated(c, s, x, y), c, s, qx, qy))
     (nx, ny, *_), (fx, fy, *_) = moved
     dx, dy = fx - nx - apart[0], fy - ny - apart[1]
     distance = np.maximum(np.hypot(dx, dy), SIGMA_FLOOR)
@@ -321,7 +322,7 @@ def _residuals_at(
         return Residuals(rho - distance, jacobian, gap)
     for i, (_, _, c, s, qx, qy) in enumerate(moved):
         sign = 1.0 if i else -1.0
-        along, across = sign * (c * ux + s * uy), sign * (c * uy - s * ux)
+        along, across = (sign * part for part in rotated_back(c, s, ux, uy))
         by_offset = np.stack((along, across, across * qx - along * qy), -1).reshape(-1, 3) @ robots[i].root
         jacobian[..., 2 + 3 * i : 5 + 3 * i] = by_offset.reshape(*distance.shape, 3)
     return Residuals(rho - distance, jacobian, gap)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.gaussian.odometry_noise import SIGNS, Array, Places, Track
+from protocol.motion import rotated, rotated_back
 from protocol.noise import Noise, Priors, VelocityNoise
 
 SIGMA_FLOOR = 1e-6
@@ -287,14 +288,13 @@ def predicted(guess: Array, places: Array, ranges: Ranges, apart: tuple[float, f
         directions[..., 0, :, of_b], directions[..., 1, :, of_a] = 0.0, 0.0
         c, s = np.cos(anchors[..., 2:]), np.sin(anchors[..., 2:])
         x, y = away[..., 0, mutual], away[..., 1, mutual]
-        wx, wy = c * x - s * y, s * x + c * y
+        wx, wy = rotated(c, s, x, y)
         dx, dy = wx[..., 0, :] - wx[..., 1, :] - apart[0], wy[..., 0, :] - wy[..., 1, :] - apart[1]
         gap = np.maximum(np.hypot(dx, dy), SMALLEST_DISTANCE)
         distance[..., mutual] = gap
         nx, ny = (dx / gap)[..., None, :] * SIGNS, (dy / gap)[..., None, :] * SIGNS
         jacobian[..., mutual, 2::3] = (ny * wx - nx * wy).mT
-        directions[..., 0, mutual] = c * nx + s * ny
-        directions[..., 1, mutual] = c * ny - s * nx
+        directions[..., 0, mutual], directions[..., 1, mutual] = rotated_back(c, s, nx, ny)
         for robot, rows in enumerate((of_a, of_b) if ranges.place is not None else ()):
             assert ranges.place is not None
             own = _to_places(anchors[..., robot, 2:], away[..., robot, :, rows], ranges.place[rows])
@@ -314,11 +314,11 @@ def _to_places(rotation: Array, away: Array, place: Array) -> Predicted:
     """
     c, s = np.cos(rotation), np.sin(rotation)
     x, y = away[..., 0, :], away[..., 1, :]
-    wx, wy = c * x - s * y, s * x + c * y
+    wx, wy = rotated(c, s, x, y)
     dx, dy = wx - place[:, 0], wy - place[:, 1]
     distance = np.maximum(np.hypot(dx, dy), SMALLEST_DISTANCE)
     nx, ny = dx / distance, dy / distance
-    along, across = c * nx + s * ny, c * ny - s * nx
+    along, across = rotated_back(c, s, nx, ny)
     jacobian = np.stack((-along, -across, ny * wx - nx * wy), -1)
     return Predicted(distance, jacobian, np.stack((along, across), -2)[..., None, :, :])
 
@@ -332,7 +332,7 @@ def placed(guess: Array, path: Track, ticks: Places) -> tuple[Array, Array]:
     mx, my, theta = guess
     c, s = math.cos(theta), math.sin(theta)
     x, y = path.x[ticks] - mx, path.y[ticks] - my
-    return c * x - s * y, s * x + c * y
+    return rotated(c, s, x, y)
 
 
 def inlier_probability(residuals: Array, sigma: Array, noise: Noise) -> Array:
