@@ -19,6 +19,7 @@ from msgspec.structs import asdict, replace
 import tandem
 from agent.process.report_bodies import malformed, report_of
 from agent.process.report_buffer import ReportBuffer
+from agent.process.robot import REPORTS_KEPT, Robot
 from compose.audit.planner_checks import QuietInbox, check_planner
 from compose.errors import BadScenario, PlannerFailed, UserError
 from compose.launch import class_loader
@@ -30,13 +31,14 @@ from compose.recording.run import read
 from compose.scenario.scenario_file import ScenarioTemplate, load, setting, validate
 from protocol.messages import (
     MAX_BODY_BYTES,
+    Contact,
     Inconsistent,
     Localised,
     Observation,
     Report,
     Undecided,
 )
-from protocol.motion import Covariance, Pose
+from protocol.motion import REST, Covariance, Pose
 from protocol.network import keys
 from protocol.network.inbox import Arrival
 from protocol.wire import MAX_REPORT_BYTES, encode
@@ -345,6 +347,16 @@ def test_the_agent_counts_and_drops_a_report_that_the_decoder_refuses() -> None:
     assert inbox.refused["report"] == 1
     assert buffer.of("b", 0) is not None
     assert buffer.of("b", 1) is None
+
+
+def test_a_robot_keeps_its_contacts_only_while_reports_of_their_tick_are_stored() -> None:
+    config = load("paper-1").config("a")
+    robot = Robot(config, planner_of(config))
+    for tick in range(200):
+        executed = REST if tick else None
+        robot.observation(Observation(tick, "a", executed, None, (Contact("b", None, ()),)))
+        robot.decide()
+    assert list(robot.contacts) == list(range(200 - REPORTS_KEPT - 2, 200))
 
 
 def test_a_decoder_that_fails_refuses_the_report() -> None:

@@ -21,9 +21,10 @@ from agent.process.agent_journal import FramedReport
 from agent.process.discovery import ASK_AGAIN_S, NoWorld, Search, Unwelcome, confirm, join
 from agent.process.link import AgentLink, WorldLinkLost
 from agent.process.out_of_step import OutOfStep
-from agent.process.recovery import OWN_REPORTS_KEPT, REPORTS_KEPT, Memory
+from agent.process.recovery import OWN_REPORTS_KEPT, Memory
 from agent.process.report_bodies import malformed
 from agent.process.report_buffer import ReportBuffer
+from agent.process.robot import REPORTS_KEPT
 from protocol.messages import MissionEnd, Observation, RobotConfig, TickStart
 from protocol.network import session
 from protocol.network.endpoints import Endpoints

@@ -14,15 +14,13 @@ import msgspec
 from agent.planning.planner import Planner
 from agent.process.agent_journal import FramedReport, agent_history
 from agent.process.planner_replay import PlannerReplay
-from agent.process.robot import Robot
+from agent.process.robot import REPORTS_KEPT, Robot
 from protocol.journal import environment
 from protocol.journal.journal_file import CorruptJournal
 from protocol.journal.resume import ReplayMismatch, Retrace
 from protocol.messages import FinalReport, MissionEnd, Observation, RobotConfig
 from protocol.wire import encode
 
-REPORTS_KEPT = 64
-"""The number of ticks for which a received report is stored that no Observation has listed yet."""
 OWN_REPORTS_KEPT = REPORTS_KEPT - 4
 """The number of ticks for which a robot can repeat its own reports.
 

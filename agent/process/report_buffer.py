@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
 from agent.process.agent_journal import FramedReport
-from agent.process.recovery import REPORTS_KEPT
+from agent.process.robot import REPORTS_KEPT
 from protocol.messages import Report
 from protocol.network.inbox import Arrival, Inbox
 from protocol.wire import MAX_REPORT_BYTES
@@ -69,9 +69,9 @@ class ReportBuffer:
         """Mark the reports with these senders and ticks as listed by an Observation."""
         self._listed.update(reports)
 
-    def forget(self, before: int, contacts: Collection[tuple[str, int]]) -> None:
-        """Delete the reports of ticks below `before`, and count those neither listed nor of `contacts`."""
+    def forget(self, before: int, contacts: Mapping[int, Collection[str]]) -> None:
+        """Delete the reports of ticks below `before`, and count those neither listed nor in `contacts`."""
         for one in [one for one in self._reports if one[1] < before]:
             del self._reports[one]
-            self.unheard += one not in self._listed and one not in contacts
+            self.unheard += one not in self._listed and one[0] not in contacts.get(one[1], ())
             self._listed.discard(one)

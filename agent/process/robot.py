@@ -26,6 +26,9 @@ from protocol.messages import (
 )
 from protocol.wire import encode
 
+REPORTS_KEPT = 64
+"""The number of ticks for which a received report is stored that no Observation has listed yet."""
+
 
 class Robot:
     """The state of one robot, and the journal of its inputs and outputs."""
@@ -62,8 +65,8 @@ class Robot:
         self.reports_sent = 0
         self.damaged = 0
         """The number of reports that were received damaged."""
-        self.contacts: set[tuple[str, int]] = set()
-        """The other robot and the tick of each contact."""
+        self.contacts: dict[int, list[str]] = {}
+        """The robots in contact, by tick, as long as reports of that tick are stored."""
         self.lost: set[tuple[str, int]] = set()
         """The sender and the tick of each report that was lost, as the Observations say.
 
@@ -108,9 +111,10 @@ class Robot:
         self.reports = {}
         self.lost.update([(one.sender, one.tick) for one in observation.lost])
         self._unlisted = {contact.peer for contact in observation.contacts if contact.heard is None}
+        self.contacts[self.tick] = [contact.peer for contact in observation.contacts]
+        self.contacts.pop(self.tick - REPORTS_KEPT - 2, None)
         for contact in observation.contacts:
             peer = contact.peer
-            self.contacts.add((peer, observation.tick))
             self.damaged += len(contact.damaged)
             self.mutual_ranges += contact.range is not None
             body = self.planner.report_to(self.state, peer)
