@@ -72,15 +72,15 @@ def read_inside(folder: Path, *names: str, most: int) -> bytes:
     Somebody else may have written the folder, and a link in it may lead to any file of the user. Raises like
     `read_bytes`, and NotRegular for a link.
     """
-    path, place = folder.joinpath(*names), os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    path, descriptor = folder.joinpath(*names), os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         for name in names[:-1]:
-            place, outer = _within(place, name, os.O_DIRECTORY, path), place
+            descriptor, outer = _within(descriptor, name, os.O_DIRECTORY, path), descriptor
             os.close(outer)
-        with os.fdopen(_within(place, names[-1], os.O_NONBLOCK, path), "rb") as file:
+        with os.fdopen(_within(descriptor, names[-1], os.O_NONBLOCK, path), "rb") as file:
             return _content(file, path, most)
     finally:
-        os.close(place)
+        os.close(descriptor)
 
 
 def regular_in(folder: Path, pattern: str) -> list[str]:
@@ -89,27 +89,27 @@ def regular_in(folder: Path, pattern: str) -> list[str]:
     return [path.name for path in found]
 
 
-def _within(place: int, name: str, flags: int, path: Path) -> int:
-    """Return a descriptor of the directory (O_DIRECTORY) or file `name` in `place`; errors name `path`."""
+def _within(folder: int, name: str, flags: int, path: Path) -> int:
+    """Return a descriptor of the directory (O_DIRECTORY) or file `name` in `folder`; errors name `path`."""
     wanted = stat.S_ISDIR if flags & os.O_DIRECTORY else stat.S_ISREG
     try:
-        if not wanted(mode := os.stat(name, dir_fd=place, follow_symlinks=False).st_mode):
+        if not wanted(mode := os.stat(name, dir_fd=folder, follow_symlinks=False).st_mode):
             raise NotRegular(path, mode)
-        found = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | flags, dir_fd=place)
+        descriptor = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | flags, dir_fd=folder)
     except OSError as error:
         error.filename = str(path)
         raise
-    if not wanted(mode := os.fstat(found).st_mode):  # it has been replaced since `stat`
-        os.close(found)
+    if not wanted(mode := os.fstat(descriptor).st_mode):  # it has been replaced since `stat`
+        os.close(descriptor)
         raise NotRegular(path, mode)
-    return found
+    return descriptor
 
 
 def _content(file: BinaryIO, path: Path, most: int) -> bytes:
-    found = file.read(most + 1 if most >= 0 else -1)
-    if 0 <= most < len(found):
+    content = file.read(most + 1 if most >= 0 else -1)
+    if 0 <= most < len(content):
         raise TooLarge(path, most)
-    return found
+    return content
 
 
 def read_text(path: Path, most: int = -1) -> str:

@@ -109,12 +109,12 @@ class SweptArea(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fie
         aside, along = self.across, 1 - self.across
         width = high[aside] - low[aside]
         count = max(1, math.ceil(width / (2.0 * half_width * sensing_range)))
-        found: list[Place] = []
+        places: list[Place] = []
         for i in range(count * part // self.parts, count * (part + 1) // self.parts):
             middle = low[aside] + (i + 0.5) * width / count
             ends = (low[along], high[along]) if i % 2 == 0 else (high[along], low[along])
-            found += [(end, middle) if along == 0 else (middle, end) for end in ends]
-        return tuple(found)
+            places += [(end, middle) if along == 0 else (middle, end) for end in ends]
+        return tuple(places)
 
 
 def surveyed_path(

@@ -414,7 +414,7 @@ def test_a_robot_that_was_down_catches_up_with_its_peer_standing(robot: str, pee
     driver.clock = stage.monotonic
     config = config_of(parse(ASSURED, "assured"), robot, MANOEUVRE_S)
     field = Field(driver, config, "r", stage, max_ticks=305, manoeuvre_s=MANOEUVRE_S)
-    field.resume(history_of(20, robot=robot), known=17)
+    field.resume(history_of(20, robot=robot), latest=17)
     sent: list[int] = []
 
     def answer(key: str, frame: bytes) -> None:
@@ -460,7 +460,7 @@ def test_a_restarted_robot_whose_peer_comes_later_is_no_more_behind_than_the_pee
     driver = Waits()
     driver.clock = stage.monotonic
     field = Field(driver, CONFIG, "r", stage, max_ticks=90, manoeuvre_s=MANOEUVRE_S)
-    field.resume(history_of(20, robot="a"), known=19)
+    field.resume(history_of(20, robot="a"), latest=19)
 
     def answer(key: str, frame: bytes) -> None:
         if key == keys.tick_start("r", "a"):
@@ -494,7 +494,7 @@ def test_a_b_that_was_killed_before_tick_0_begins_though_a_waits_for_it(stage: S
     driver.clock = stage.monotonic
     config = config_of(parse(ASSURED, "assured"), "b", MANOEUVRE_S)
     field = Field(driver, config, "r", stage, max_ticks=9, manoeuvre_s=MANOEUVRE_S)
-    field.resume(DriverHistory(), known=-1)
+    field.resume(DriverHistory(), latest=-1)
     stage.alive("a", "b")
     tick_s = (1.0 + THINKING) * MANOEUVRE_S
     stage.comes("tick-start", keys.tick_start("r", "a"), encode(TickStart(0, "a")), 9.5 * tick_s)
@@ -547,7 +547,7 @@ def test_a_robot_that_was_killed_waits_for_its_agent_however_long_its_peer_is_th
     driver.clock = stage.monotonic
     config = config_of(parse(ASSURED, "assured"), robot, MANOEUVRE_S)
     field = Field(driver, config, "r", stage, max_ticks=25, manoeuvre_s=MANOEUVRE_S)
-    field.resume(history_of(20, robot=robot), known=19)
+    field.resume(history_of(20, robot=robot), latest=19)
     stage.alive("b" if robot == "a" else "a")
     stage.comes("alive", keys.robot_alive("r", robot), after=3.0)
     field.attach(LINK)

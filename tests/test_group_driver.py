@@ -397,7 +397,7 @@ def test_results_that_were_received_are_known_after_a_restart(stage: Stage, tmp_
     history = driver_history(frames, config, tmp_path)
     assert [one.robot for one in history.ticks[0].received] == ["b", "c", "d"]
     a = Member(stage, "a", 100, LOCALISED)
-    a.field.resume(history, known=0)
+    a.field.resume(history, latest=0)
     stage.alive("a", "b", "c", "d")
     assert a.play() == MissionEnd(LAST_WORDS, "localised")
     with pytest.raises(CorruptJournal, match="it belongs to another mission"):

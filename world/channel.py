@@ -168,26 +168,28 @@ def _sent(
 
 
 def _faulty(
-    one: InFlight, place: int, fault: Fault, burst: bool, links: LinkFaults, seed: int
+    report: InFlight, index: int, fault: Fault, burst: bool, links: LinkFaults, seed: int
 ) -> list[InFlight]:
-    """Return the copies that the fault at index `place` makes of `one`: none if it is lost."""
+    """Return the copies that the fault with this `index` makes of `report`: none if it is lost."""
 
-    def happens(what: str, chance: float, copy: int = one.copy) -> bool:
-        return chance > 0.0 and _draw(seed, place, f"{what}/{copy}", links, one.tick) < chance
+    def happens(what: str, chance: float, copy: int = report.copy) -> bool:
+        return chance > 0.0 and _draw(seed, index, f"{what}/{copy}", links, report.tick) < chance
 
     if fault.partition or happens("loss", fault.loss) or (burst and happens("burst-loss", fault.burst_loss)):
         return []
     twice = happens("duplicate", fault.duplicate)
     least, most = fault.delay
     copies = []
-    for k in (one.copy, one.copy | 1 << place) if twice else (one.copy,):
-        due = one.due + least
+    for k in (report.copy, report.copy | 1 << index) if twice else (report.copy,):
+        due = report.due + least
         if most > least:
-            due += int(_draw(seed, place, f"delay/{k}", links, one.tick) * (most - least + 1))
+            due += int(_draw(seed, index, f"delay/{k}", links, report.tick) * (most - least + 1))
         overtaken = happens("reorder", fault.reorder, k)
         damaged = happens("corrupt", fault.corrupt, k)
         copies.append(
-            InFlight(due + overtaken, one.tick, one.overtaken or overtaken, one.damaged or damaged, copy=k)
+            InFlight(
+                due + overtaken, report.tick, report.overtaken or overtaken, report.damaged or damaged, copy=k
+            )
         )
     return copies
 
@@ -208,8 +210,8 @@ def _limited(
         for before, rate in zip(air.room or (1.0,) * len(rates), rates, strict=True)
     ]
     coming = []
-    for one in due:
+    for report in due:
         if all(rate is None or left >= 1.0 for rate, left in zip(rates, room, strict=True)):
             room = [left if rate is None else left - 1.0 for rate, left in zip(rates, room, strict=True)]
-            coming.append(one)
+            coming.append(report)
     return coming, tuple(room)

@@ -16,12 +16,12 @@ def near_pairs(places: Sequence[tuple[float, float]], reach: float) -> list[tupl
     """
     width = reach * (1.0 + CELL_ROUNDING)
     cells: dict[tuple[int, int], list[int]] = {}
-    found: list[tuple[int, int]] = []
+    pairs: list[tuple[int, int]] = []
     for j, (x, y) in enumerate(places):
         column, row = math.floor(x / width), math.floor(y / width)
         for here in (column - 1, column, column + 1):
             for there in (row - 1, row, row + 1):
-                found += [(i, j) for i in cells.get((here, there), ())]
+                pairs += [(i, j) for i in cells.get((here, there), ())]
         cells.setdefault((column, row), []).append(j)
-    found.sort()
-    return found
+    pairs.sort()
+    return pairs

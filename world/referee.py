@@ -128,8 +128,8 @@ def decide_outcome(
 
 def _shortfalls(scenario: Scenario, verdicts: Mapping[str, Verdict]) -> dict[str, Cause]:
     """Return why robots are not localised by their verdicts, in the order of `scenario`."""
-    found = [shortfall(one.id, verdicts.get(one.id), scenario.mission, one.peer) for one in scenario.robots]
-    return {one.robots[0]: one for one in found if one is not None}
+    causes = [shortfall(one.id, verdicts.get(one.id), scenario.mission, one.peer) for one in scenario.robots]
+    return {one.robots[0]: one for one in causes if one is not None}
 
 
 def _others_not_localised(
@@ -140,10 +140,10 @@ def _others_not_localised(
     A dead robot that is localised may be the one that was to find the others.
     """
     dead = [one for one in scenario.deaths if one.tick <= tick]
-    known = {*named, *[one.robot for one in dead]}
-    left = [robot for robot in not_localised(scenario, verdicts, tick) if robot not in known]
-    found = [_dead(one) for one in dead if one.robot not in named]
-    return [*found, Cause("others", tuple(left))] if left else found
+    stated = {*named, *[one.robot for one in dead]}
+    left = [robot for robot in not_localised(scenario, verdicts, tick) if robot not in stated]
+    causes = [_dead(one) for one in dead if one.robot not in named]
+    return [*causes, Cause("others", tuple(left))] if left else causes
 
 
 def _dead(death: Death) -> Cause:
@@ -152,8 +152,8 @@ def _dead(death: Death) -> Cause:
 
 def not_localised(scenario: Scenario, verdicts: Mapping[str, Verdict], tick: int) -> dict[str, Cause]:
     """Return the cause for each robot that is not localised at `tick`, in the order of `scenario`."""
-    found = _shortfalls(scenario, verdicts)
+    causes = _shortfalls(scenario, verdicts)
     dead = {one.robot: _dead(one) for one in scenario.deaths if one.tick <= tick}
     missing = [one.id for one in scenario.robots if one.id not in verdicts]
-    found |= {robot: dead.get(robot, Cause("max-ticks", (robot,))) for robot in missing}
-    return {one.id: found[one.id] for one in scenario.robots if one.id in found}
+    causes |= {robot: dead.get(robot, Cause("max-ticks", (robot,))) for robot in missing}
+    return {one.id: causes[one.id] for one in scenario.robots if one.id in causes}

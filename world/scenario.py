@@ -28,10 +28,10 @@ from world.world_noise import WorldNoise
 
 def model_class(name: str, shipped: Mapping[str, Any]) -> Any:
     """Return the class of a model that is shipped, or that the user has named. Raises LookupError."""
-    found = shipped.get(name) or OWN_MODELS.get(name)
-    if found is None:
+    model = shipped.get(name) or OWN_MODELS.get(name)
+    if model is None:
         raise LookupError(f"the world uses the model {name}; to run its code, add --model {name}")
-    return found
+    return model
 
 
 class RobotSpec(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
@@ -191,10 +191,10 @@ class Scenario(
 
         In a group, they are the meetings, and a robot may be in several of them.
         """
-        place = {robot.id: i for i, robot in enumerate(self.robots)}
+        index = {robot.id: i for i, robot in enumerate(self.robots)}
         if self.meetings:
-            return tuple((place[one.visitor], place[one.visited]) for one in self.meetings)
-        return tuple((place[one.id], place[one.peer]) for one in self.robots if one.role == "a")
+            return tuple((index[one.visitor], index[one.visited]) for one in self.meetings)
+        return tuple((index[one.id], index[one.peer]) for one in self.robots if one.role == "a")
 
     def radio_pairs(self) -> tuple[tuple[int, int], ...]:
         """Return the pairs that measure their range if it is at most R: the peers, or any two of a group."""
@@ -209,8 +209,8 @@ class Scenario(
 
     def is_of(self, config: RobotConfig) -> bool:
         """Return whether `config` is the configuration of one of the robots, with any `tick_s`."""
-        known = any(spec.id == config.robot for spec in self.robots)
-        return known and self.config(config.robot, config.tick_s) == config
+        has_robot = any(spec.id == config.robot for spec in self.robots)
+        return has_robot and self.config(config.robot, config.tick_s) == config
 
     def config(self, robot: str, tick_s: float | None = None) -> RobotConfig:
         """Return the configuration of `robot`, without its pose. `tick_s` (s) is for real time only.

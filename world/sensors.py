@@ -127,8 +127,8 @@ def _modelled(rho: float | None, model: RangeModel | None, radios: Radios | None
     """Return the range that is measured under `model`, within the bounds of a range."""
     if rho is None or model is None or radios is None:
         return rho
-    found = model.measured(radios, rho)
-    return None if found is None else min(max(0.0, float(found)), LONGEST_RANGE)
+    measured = model.measured(radios, rho)
+    return None if measured is None else min(max(0.0, float(measured)), LONGEST_RANGE)
 
 
 def executed(limited_controls: Controls, scenario: Scenario, robot: str, tick: int) -> Controls:

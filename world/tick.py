@@ -103,7 +103,7 @@ def advance(world: World, commands: Mapping[str, Command]) -> World | MissionEnd
     verdicts = verdicts_after(world, commands)
     driven = []
     exact = scenario.sensors.exact
-    for place, robot in enumerate(scenario.robots):
+    for index, robot in enumerate(scenario.robots):
         if scenario.is_dead(robot.id, truth.tick):
             driven.append(REST)
             continue
@@ -112,7 +112,7 @@ def advance(world: World, commands: Mapping[str, Command]) -> World | MissionEnd
         driven.append(controls if exact else executed(controls, scenario, robot.id, truth.tick))
         verdict = verdicts.get(robot.id)
         if isinstance(verdict, Localised) and verdict is not world.verdicts.get(robot.id):
-            claimed = claimed | {robot.id: truth.poses[place]}
+            claimed = claimed | {robot.id: truth.poses[index]}
     if verdicts or truth.tick >= scenario.max_ticks:
         end = decide_outcome(scenario, truth, verdicts, claimed)
         if end is not None:
@@ -131,16 +131,16 @@ def verdicts_after(world: World, commands: Mapping[str, Command]) -> dict[str, V
     The first verdict of a robot of a pair is final. In a group, another meeting may contradict a claim, which
     is then withdrawn.
     """
-    scenario, found = world.scenario, world.verdicts
+    scenario, verdicts = world.scenario, world.verdicts
     for robot in scenario.robots:
-        command, given = commands.get(robot.id), found.get(robot.id)
+        command, given = commands.get(robot.id), verdicts.get(robot.id)
         if command is None or command.verdict == given or scenario.is_dead(robot.id, world.truth.tick):
             continue
         if given is None or scenario.meetings:
-            found = {name: one for name, one in found.items() if name != robot.id}
+            verdicts = {name: one for name, one in verdicts.items() if name != robot.id}
             if command.verdict is not None:
-                found[robot.id] = command.verdict
-    return found
+                verdicts[robot.id] = command.verdict
+    return verdicts
 
 
 def _carried(
@@ -189,10 +189,10 @@ def _delivered(
     ids, reach = [robot.id for robot in scenario.robots], scenario.sensors.reach
     senders = dict.fromkeys([sender for sender, _ in links])
     sending = tuple([(ids[sender], places[sender]) for sender in senders])
-    found: dict[tuple[int, int], tuple[Any, int | None]] = {}
+    delivered: dict[tuple[int, int], tuple[Any, int | None]] = {}
     for sender, receiver in links:
         name = f"report/{ids[sender]}->{ids[receiver]}"
         radios = Radios(name, places[sender], places[receiver], truth.tick, scenario.seed)
         transmission = Transmission(radios, reach, scenario.mission.period, sending, ids[sender])
-        found[sender, receiver] = scenario.radio.sent(before[sender, receiver].radio, transmission)
-    return found
+        delivered[sender, receiver] = scenario.radio.sent(before[sender, receiver].radio, transmission)
+    return delivered

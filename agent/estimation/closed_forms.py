@@ -85,7 +85,7 @@ def placements(
     if alpha is None:
         return []
     course = math.atan2(dy, dx)
-    found: list[Placement] = []
+    solutions: list[Placement] = []
     for side in (alpha, -alpha):
         # <a(M1)> seen from p1b, with the x-axis towards p1a
         turn = side - course
@@ -96,9 +96,9 @@ def placements(
         for tx, ty in circle_intersections(p1b.x, p1b.y, radius, distance):
             spin = math.atan2(ty - p1b.y, tx - p1b.x) - math.atan2(anchor_y, anchor_x)
             candidate = Placement(wrap(turn + spin), tx, ty)
-            if not any(same_placement(candidate, other, SAME_PLACEMENT) for other in found):
-                found.append(candidate)
-    return found
+            if not any(same_placement(candidate, other, SAME_PLACEMENT) for other in solutions):
+                solutions.append(candidate)
+    return solutions
 
 
 def same_placement(one: Placement, other: Placement, tolerance: float) -> bool:

@@ -49,8 +49,8 @@ class ExactEstimator(msgspec.Struct, frozen=True):
         """Return the branch of a robot on its anchor: its heading is radial by definition."""
         if rho0 > SAME_ANCHORS * precision.range_rounding(knowledge, knowledge.log, knowledge.tick):
             return None
-        known = precision.anchor(knowledge, ORIGIN, knowledge.log)
-        return FittedBranch(Branch(0.0, ORIGIN), known.error, known.enough)
+        accuracy = precision.anchor(knowledge, ORIGIN, knowledge.log)
+        return FittedBranch(Branch(0.0, ORIGIN), accuracy.error, accuracy.enough)
 
     def anchor(self, knowledge: Knowledge, candidates: tuple[Branch, ...]) -> AnchorEstimate:
         """Return the branches +alpha and -alpha of eq. (2) that agree with every tick of phase 1."""
@@ -68,8 +68,8 @@ class ExactEstimator(msgspec.Struct, frozen=True):
 
     def fitted(self, knowledge: Knowledge, branch: Branch) -> FittedBranch:
         """Return `branch` fitted to the ranges with the smallest anchor error."""
-        branch, known = precision.fitted(knowledge, branch)
-        return FittedBranch(branch, known.error, known.enough)
+        branch, accuracy = precision.fitted(knowledge, branch)
+        return FittedBranch(branch, accuracy.error, accuracy.enough)
 
     def pair(
         self, knowledge: Knowledge, first_tick: int, required_ranges: int, *, second_range: bool

@@ -145,10 +145,10 @@ class Facts(msgspec.Struct, frozen=True, dict=True):
         return [one for one in self.ordered if one.key.kind == kind]
 
 
-def _contradiction(known: Iterable[Fact]) -> ContradictoryFacts:
+def _contradiction(facts: Iterable[Fact]) -> ContradictoryFacts:
     """Return the error of the first key that has several values."""
     values: dict[FactKey, list[Value]] = {}
-    for key, value in known:
+    for key, value in facts:
         values.setdefault(key, []).append(value)
     first = min(key for key, some in values.items() if len(some) > 1)
     return ContradictoryFacts(first, values[first])

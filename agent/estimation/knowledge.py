@@ -106,12 +106,12 @@ class Knowledge(msgspec.Struct, frozen=True):
 
     def world_pose(self, placement: Placement) -> Pose:
         """Return the current pose in <W> if `placement` is the placement of <a(M1)> in <b(M2)>."""
-        own, peer = self.config.anchor, self.config.peer_anchor
-        m1, m2 = (own, peer) if self.config.role == "a" else (peer, own)
+        own_anchor, peer = self.config.anchor, self.config.peer_anchor
+        m1, m2 = (own_anchor, peer) if self.config.role == "a" else (peer, own_anchor)
         turn = math.atan2(m1.y - m2.y, m1.x - m2.x) - math.atan2(placement.y, placement.x)
         if self.config.role == "a":
             turn += placement.phi
-        return compose(Pose(own.x, own.y, turn), self.local_pose)
+        return compose(Pose(own_anchor.x, own_anchor.y, turn), self.local_pose)
 
     @property
     def poses(self) -> tuple[Pose, ...]:
@@ -139,19 +139,19 @@ class Knowledge(msgspec.Struct, frozen=True):
         last = min(self.tick, self.peer_state.peer.through)
         if self.peer_state.start is None or last < first:
             return ()
-        known = self.belief.observations
-        if known and known[0].tick != first:
-            known = ()
-        a_known, b_known = [at.a for at in known], [at.b for at in known]
+        observations = self.belief.observations
+        if observations and observations[0].tick != first:
+            observations = ()
+        a_known, b_known = [at.a for at in observations], [at.b for at in observations]
         a_start, a_log, b_start, b_log = self.start, self.log, self.peer_state.start, self.peer_state.peer
         if self.config.role == "b":
             a_start, a_log, b_start, b_log = b_start, b_log, a_start, a_log
-        period, new = self.config.mission.period, len(known)
+        period, new = self.config.mission.period, len(observations)
         a = a_log.track(a_start, first, last, period, a_known)
         b = b_log.track(b_start, first, last, period, b_known)
         ranges = {ranged.tick: ranged.range for ranged in self.mutual}
         ticks = range(first + new, last + 1)
-        return (*known, *map(PairObservation, ticks, a[new:], b[new:], map(ranges.get, ticks)))
+        return (*observations, *map(PairObservation, ticks, a[new:], b[new:], map(ranges.get, ticks)))
 
     @property
     def off_anchor(self) -> bool:

@@ -77,30 +77,30 @@ def anchor(knowledge: Knowledge, start: Pose, log: MotionLog) -> Known:
     """
     mission, extent = knowledge.config.mission, size(knowledge)
     enough = required_anchor_error(extent, knowledge.config.widest_distance, mission.sensing_range)
-    known = least = error = math.inf
+    bound = least = error = math.inf
     ranges = used = 0
     least_floor = 0.0
     ranged: list[tuple[Pose, float, float]] = []
-    for count, one in enumerate(log.ranges, 1):
-        if one.tick > log.through:
+    for count, measurement in enumerate(log.ranges, 1):
+        if measurement.tick > log.through:
             break
-        runs = log.until(one.tick)
+        runs = log.until(measurement.tick)
         pose, floor = follow(ORIGIN, runs, mission.period), _path_rounding(extent, runs, mission.period)
-        if ranged and (pose, one.range) == ranged[-1][:2]:
+        if ranged and (pose, measurement.range) == ranged[-1][:2]:
             continue  # The robot has not moved, as after a missed deadline.
-        ranged.append((pose, one.range, floor))
+        ranged.append((pose, measurement.range, floor))
         if len(ranged) == 1 and start.x > enough:
             continue  # The range at the start does not depend on the heading.
         before, error = error, anchor_error(start, ranged)
         if error < least or len(ranged) <= FITTED:
             least, ranges, used, least_floor = error, count, len(ranged), floor
         # Branches that `weigh_branches` merged later differ by its larger floor.
-        known = least + SAME_ANCHORS * (floor - least_floor)
+        bound = least + SAME_ANCHORS * (floor - least_floor)
         stalled = len(ranged) >= FITTED and error > BETTER * before
         spent = len(ranged) - used == OUT_AND_BACK
-        if known <= WELL * enough or (stalled and known <= enough) or spent:
-            return Known(known, ranges, enough=True)
-    return Known(known, ranges)
+        if bound <= WELL * enough or (stalled and bound <= enough) or spent:
+            return Known(bound, ranges, enough=True)
+    return Known(bound, ranges)
 
 
 NEXT_TO = 0.25
@@ -121,12 +121,12 @@ def merged(knowledge: Knowledge, branches: tuple[Branch, ...]) -> tuple[Branch, 
 
 def fitted(knowledge: Knowledge, branch: Branch) -> tuple[Branch, Known]:
     """Return `branch` fitted to the ranges with the smallest anchor error, and that error."""
-    known = anchor(knowledge, branch.start, knowledge.log)
-    if known.ranges == len(knowledge.log.ranges):
-        return branch, known
+    accuracy = anchor(knowledge, branch.start, knowledge.log)
+    if accuracy.ranges == len(knowledge.log.ranges):
+        return branch, accuracy
     ranged = [(pose, rho) for pose, rho in knowledge.seen() if rho is not None]
-    branch = polished(branch, ranged[: known.ranges])
-    return branch, replace(known, error=anchor(knowledge, branch.start, knowledge.log).error)
+    branch = polished(branch, ranged[: accuracy.ranges])
+    return branch, replace(accuracy, error=anchor(knowledge, branch.start, knowledge.log).error)
 
 
 def peer_anchor(knowledge: Knowledge) -> float:

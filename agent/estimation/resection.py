@@ -66,22 +66,22 @@ def positions(standing: Sequence[RangedPlace], floor: float) -> tuple[Point, ...
     along = (base * base + first.range**2 - second.range**2) / (2.0 * base)
     aside = math.sqrt(max(0.0, first.range**2 - along * along))
     ux, uy = (far_x - x) / base, (far_y - y) / base
-    found: list[Point] = []
+    solutions: list[Point] = []
     for side in (aside, -aside):
-        place = _fitted_position((x + along * ux - side * uy, y + along * uy + side * ux), standing)
-        explained = all(abs(math.dist(place, one.there) - one.range) <= floor for one in standing)
-        if explained and all(math.dist(place, other) > 2.0 * floor for other in found):
-            found.append(place)
-    return tuple(found)
+        position = _fitted_position((x + along * ux - side * uy, y + along * uy + side * ux), standing)
+        explained = all(abs(math.dist(position, one.there) - one.range) <= floor for one in standing)
+        if explained and all(math.dist(position, other) > 2.0 * floor for other in solutions):
+            solutions.append(position)
+    return tuple(solutions)
 
 
-def _fitted_position(place: Point, standing: Sequence[RangedPlace]) -> Point:
-    """Return the position near `place` that fits all ranges best (Gauss-Newton)."""
-    best, fitted = math.inf, place
+def _fitted_position(position: Point, standing: Sequence[RangedPlace]) -> Point:
+    """Return the position near `position` that fits all ranges best (Gauss-Newton)."""
+    best, fitted = math.inf, position
     for _ in range(RESECTION_STEPS):
         cost = xx = xy = yy = gx = gy = 0.0
         for (x, y), _, rho in standing:
-            dx, dy = place[0] - x, place[1] - y
+            dx, dy = position[0] - x, position[1] - y
             apart = math.hypot(dx, dy)
             if apart == 0.0:
                 continue
@@ -92,12 +92,12 @@ def _fitted_position(place: Point, standing: Sequence[RangedPlace]) -> Point:
         determinant = xx * yy - xy * xy
         if cost >= best:
             break
-        best, fitted = cost, place
+        best, fitted = cost, position
         if determinant <= PARALLEL * xx * yy:
             break
-        place = (
-            place[0] - (yy * gx - xy * gy) / determinant,
-            place[1] - (xx * gy - xy * gx) / determinant,
+        position = (
+            position[0] - (yy * gx - xy * gy) / determinant,
+            position[1] - (xx * gy - xy * gx) / determinant,
         )
     return fitted
 
@@ -108,88 +108,88 @@ def poses(standing: Sequence[RangedPlace], moved: Sequence[RangedPlace], floor: 
     `moved` are the ranges from other places of this robot. More than one pose is left if they do not
     determine the heading; there is none if the ranges contradict the reported places.
     """
-    found: list[Pose] = []
-    for place in positions(standing, floor):
-        for heading in _headings(place, moved):
-            pose = Pose(*place, _fitted_heading(place, heading, moved))
+    fits: list[Pose] = []
+    for position in positions(standing, floor):
+        for heading in _headings(position, moved):
+            pose = Pose(*position, _fitted_heading(position, heading, moved))
             explained = all(abs(_predicted(pose, one) - one.range) <= floor for one in moved)
-            turned = [abs(wrap(pose.heading - one.heading)) for one in found if (one.x, one.y) == place]
+            turned = [abs(wrap(pose.heading - one.heading)) for one in fits if (one.x, one.y) == position]
             if explained and all(angle * _reach(moved) > 2.0 * floor for angle in turned):
-                found.append(pose)
-    return tuple(found)
+                fits.append(pose)
+    return tuple(fits)
 
 
-def is_certain(standing: Sequence[RangedPlace], moved: Sequence[RangedPlace], found: Sequence[Pose]) -> bool:
+def is_certain(standing: Sequence[RangedPlace], moved: Sequence[RangedPlace], fits: Sequence[Pose]) -> bool:
     """Return whether one pose is left that redundant ranges have confirmed, and that they determine well.
 
     A rounding error of the ranges is amplified by at most 1 / LEAST_POSITION_INFORMATION, in position and
     heading.
     """
-    if len(found) != 1 or len(moved) < 1 + REDUNDANT or not is_fixed(standing, (found[0].x, found[0].y)):
+    if len(fits) != 1 or len(moved) < 1 + REDUNDANT or not is_fixed(standing, (fits[0].x, fits[0].y)):
         return False
     least = math.sqrt(LEAST_HEADING_INFORMATION) * _reach(moved)
-    return sum([_slope(found[0], one) ** 2 for one in moved]) >= least * least
+    return sum([_slope(fits[0], one) ** 2 for one in moved]) >= least * least
 
 
-def is_fixed(standing: Sequence[RangedPlace], place: Point) -> bool:
-    """Return whether redundant ranges determine the position `place` well."""
+def is_fixed(standing: Sequence[RangedPlace], position: Point) -> bool:
+    """Return whether redundant ranges determine `position` well."""
     if len(standing) < 2 + REDUNDANT:
         return False
-    xx, xy, yy = _information(place, standing)
+    xx, xy, yy = _information(position, standing)
     least = 0.5 * (xx + yy) - math.hypot(0.5 * (xx - yy), xy)
     return least >= LEAST_POSITION_INFORMATION * LEAST_POSITION_INFORMATION
 
 
-def _information(place: Point, standing: Sequence[RangedPlace]) -> tuple[float, float, float]:
-    """Return the sum of u u^T over the directions u from the other robot to `place`: xx, xy and yy."""
+def _information(position: Point, standing: Sequence[RangedPlace]) -> tuple[float, float, float]:
+    """Return the sum of u u^T over the directions u from the other robot to `position`: xx, xy and yy."""
     xx = xy = yy = 0.0
     for (x, y), _, _ in standing:
-        dx, dy = place[0] - x, place[1] - y
+        dx, dy = position[0] - x, position[1] - y
         squared = dx * dx + dy * dy
         if squared > 0.0:
             xx, xy, yy = xx + dx * dx / squared, xy + dx * dy / squared, yy + dy * dy / squared
     return xx, xy, yy
 
 
-def _slope(pose: Pose, one: RangedPlace) -> float:
-    """Return the derivative in m / rad of the range of `one` by the heading of `pose`."""
-    here = compose(pose, one.odometry)
-    x, y = here.x - one.there[0], here.y - one.there[1]
+def _slope(pose: Pose, ranged: RangedPlace) -> float:
+    """Return the derivative in m / rad of the range of `ranged` by the heading of `pose`."""
+    here = compose(pose, ranged.odometry)
+    x, y = here.x - ranged.there[0], here.y - ranged.there[1]
     apart = math.hypot(x, y)
     return (y * (here.x - pose.x) - x * (here.y - pose.y)) / apart if apart > 0.0 else 0.0
 
 
-def _headings(place: Point, moved: Sequence[RangedPlace]) -> tuple[float, ...]:
-    """Return the headings of the odometry's frame that agree with one range, with this robot at `place`.
+def _headings(position: Point, moved: Sequence[RangedPlace]) -> tuple[float, ...]:
+    """Return the headings of the odometry's frame that agree with one range, with this robot at `position`.
 
     It is the range that was measured farthest from the origin of the odometry.
     """
     if not moved:
         return ()
-    one = max(moved, key=lambda each: math.hypot(each.odometry.x, each.odometry.y))
-    x, y = one.there[0] - place[0], one.there[1] - place[1]
-    apart, driven = math.hypot(x, y), math.hypot(one.odometry.x, one.odometry.y)
+    farthest = max(moved, key=lambda each: math.hypot(each.odometry.x, each.odometry.y))
+    x, y = farthest.there[0] - position[0], farthest.there[1] - position[1]
+    apart, driven = math.hypot(x, y), math.hypot(farthest.odometry.x, farthest.odometry.y)
     if apart == 0.0 or driven == 0.0:
         return ()
-    cosine = (apart * apart + driven * driven - one.range * one.range) / (2.0 * apart * driven)
+    cosine = (apart * apart + driven * driven - farthest.range * farthest.range) / (2.0 * apart * driven)
     angle = math.acos(min(1.0, max(-1.0, cosine)))
-    direct = math.atan2(y, x) - math.atan2(one.odometry.y, one.odometry.x)
+    direct = math.atan2(y, x) - math.atan2(farthest.odometry.y, farthest.odometry.x)
     return direct + angle, direct - angle
 
 
-def _fitted_heading(place: Point, heading: float, moved: Sequence[RangedPlace]) -> float:
+def _fitted_heading(position: Point, heading: float, moved: Sequence[RangedPlace]) -> float:
     """Return the heading near `heading` that fits all ranges best (Gauss-Newton)."""
     best, fitted = math.inf, heading
     for _ in range(RESECTION_STEPS):
         cost = gradient = curvature = 0.0
-        for one in moved:
-            here = compose(Pose(*place, heading), one.odometry)
-            x, y = here.x - one.there[0], here.y - one.there[1]
+        for ranged in moved:
+            here = compose(Pose(*position, heading), ranged.odometry)
+            x, y = here.x - ranged.there[0], here.y - ranged.there[1]
             apart = math.hypot(x, y)
             if apart == 0.0:
                 continue
-            slope = (y * (here.x - place[0]) - x * (here.y - place[1])) / apart
-            error = apart - one.range
+            slope = (y * (here.x - position[0]) - x * (here.y - position[1])) / apart
+            error = apart - ranged.range
             cost += error * error
             gradient, curvature = gradient + slope * error, curvature + slope * slope
         if cost >= best:

@@ -65,8 +65,8 @@ class MotionLog(msgspec.Struct, frozen=True):
         if since <= self.through:
             for run in _between(addition.runs, self.through - since, addition.through - since):
                 log = log.drove(run.v, run.omega, run.ticks)
-        known = len(self.ranges)
-        new_ranges = addition.ranges[known - ranges_since :] if ranges_since <= known else ()
+        present = len(self.ranges)
+        new_ranges = addition.ranges[present - ranges_since :] if ranges_since <= present else ()
         return MotionLog(log.through, log.runs, self.ranges + new_ranges)
 
     def between(self, first: int, last: int) -> tuple[Segment, ...]:
@@ -81,13 +81,13 @@ class MotionLog(msgspec.Struct, frozen=True):
         return follow(start, self.until(tick), period)
 
     def track(
-        self, start: Pose, first: int, last: int, period: float, known: Sequence[Pose] = ()
+        self, start: Pose, first: int, last: int, period: float, poses: Sequence[Pose] = ()
     ) -> list[Pose]:
         """Return the poses at each tick in [first, last] for the pose `start` at tick 0.
 
-        `known` are the first of them, from an earlier call. They are not computed again.
+        `poses` are the first of them, from an earlier call. They are not computed again.
         """
-        track = list(known) or [self.pose(start, first, period) if first else start]
+        track = list(poses) or [self.pose(start, first, period) if first else start]
         begin = 0
         for run in _between(self.runs, first, last) if first else self.until(last):
             done = len(track) - 1 - begin
@@ -107,7 +107,7 @@ def _with_first_ticks(runs: Iterable[Segment]) -> Iterator[tuple[int, Segment]]:
 
 def _between(runs: tuple[Segment, ...], first: int, last: int) -> tuple[Segment, ...]:
     """Return the segments over [first, last]; the outer ones are cut."""
-    found: list[Segment] = []
+    segments: list[Segment] = []
     end = 0
     for run in runs:
         begin, end = end, end + run.ticks
@@ -115,5 +115,5 @@ def _between(runs: tuple[Segment, ...], first: int, last: int) -> tuple[Segment,
             break
         if end > first:
             whole = begin >= first and end <= last
-            found.append(run if whole else Segment(min(end, last) - max(begin, first), run.v, run.omega))
-    return tuple(found)
+            segments.append(run if whole else Segment(min(end, last) - max(begin, first), run.v, run.omega))
+    return tuple(segments)

@@ -60,7 +60,7 @@ def with_report(peer_state: PeerState, report: Report) -> PeerState:
     report, and may decrease: a peer that begins another meeting has none of this robot's log.
     """
     newer, latest = report.tick > peer_state.latest, report.tick >= peer_state.latest
-    known = len(peer_state.peer.ranges) >= report.ranges_since
+    continues = len(peer_state.peer.ranges) >= report.ranges_since
     whole = len(report.ranges) < MAX_REPORT_RANGES
     ranges_through = report.tick if whole else report.ranges[-1].tick
     return PeerState(
@@ -75,5 +75,7 @@ def with_report(peer_state: PeerState, report: Report) -> PeerState:
         acknowledged=report.heard if latest else peer_state.acknowledged,
         ranges_acknowledged=report.ranges_heard if latest else peer_state.ranges_acknowledged,
         heard=peer_state.heard + 1,
-        ranges_through=max(ranges_through, peer_state.ranges_through) if known else peer_state.ranges_through,
+        ranges_through=max(ranges_through, peer_state.ranges_through)
+        if continues
+        else peer_state.ranges_through,
     )

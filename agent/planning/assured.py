@@ -89,13 +89,15 @@ class AssuredExact(LogPlanner):
         a claim needs.
         """
         kind = transitions.branch_kind(state)
-        found = transitions.anchor_estimate(state)
-        state = replace(state, belief=found.belief)
-        if kind is not None and len(found.branches) == 1:
-            known = state.estimator.fitted(state, found.branches[0])
-            if known.enough:
-                return transitions.end_phase1(state, known, kind)
-        return transitions.to_third_point(state, found, self.MANOEUVRES, pinning=len(found.branches) == 1)
+        estimate = transitions.anchor_estimate(state)
+        state = replace(state, belief=estimate.belief)
+        if kind is not None and len(estimate.branches) == 1:
+            fitted = state.estimator.fitted(state, estimate.branches[0])
+            if fitted.enough:
+                return transitions.end_phase1(state, fitted, kind)
+        return transitions.to_third_point(
+            state, estimate, self.MANOEUVRES, pinning=len(estimate.branches) == 1
+        )
 
     def _decide_phase3(self, state: RobotState) -> RobotState:
         """Return `state` after the evaluation of both logs: with a verdict, a last manoeuvre, or as it was.
@@ -106,17 +108,17 @@ class AssuredExact(LogPlanner):
         evaluated = transitions.with_new_ticks(state)
         if evaluated is None:
             return state
-        state, found = transitions.pair_estimate(
+        state, estimate = transitions.pair_estimate(
             evaluated, 0, self.required_mutual_ranges(state.config.mission), second_range=True
         )
-        if found is None:  # There are too few ranges, or b was still driving while a drove straight on.
+        if estimate is None:  # There are too few ranges, or b was still driving while a drove straight on.
             b_is_standing = isinstance(state.mode, Waiting) and state.peer_state.state == MODE_NAMES[Standing]
             return transitions.begin_phase3(state) if b_is_standing else state
         if state.verdict is not None:
             return state
         # A peer that has localised itself does not move again.
         if not isinstance(state.peer_state.verdict, Localised):
-            turn = phase3_last_manoeuvre.turn(found.observations) if found.checked else "b"
+            turn = phase3_last_manoeuvre.turn(estimate.observations) if estimate.checked else "b"
             if state.config.role != turn or state.peer_state.state not in PEER_RESTS:
                 return state
-        return transitions.last_manoeuvre(state, found, self.last_manoeuvre) or state
+        return transitions.last_manoeuvre(state, estimate, self.last_manoeuvre) or state

@@ -84,15 +84,15 @@ def _now(state: GroupState) -> float:
 
 def _in_due_visit(state: GroupState) -> GroupState:
     """Return `state` on the visit whose time has come, or on the way back from one whose time is over."""
-    config, confirming, now = state.config, state.confirming, _now(state)
+    config, confirming, elapsed = state.config, state.confirming, _now(state)
     if state.visiting and confirming.until is not None:
-        if now < confirming.until or state.pair.verdict is not None:
+        if elapsed < confirming.until or state.pair.verdict is not None:
             return state
         return group_transitions.at_anchor(state)
     while confirming.visits < len(config.confirmations):
         visit = config.confirmations[confirming.visits]
-        in_time = now < visit.begins + BEGINS_WITHIN * visit.lasts
-        if now < visit.begins or (in_time and not _is_free(state)):
+        in_time = elapsed < visit.begins + BEGINS_WITHIN * visit.lasts
+        if elapsed < visit.begins or (in_time and not _is_free(state)):
             break
         confirming = replace(confirming, visits=confirming.visits + 1)
         if in_time and _may_confirm(state, visit.visited):
@@ -110,9 +110,9 @@ def _is_free(state: GroupState) -> bool:
 
 def _may_confirm(state: GroupState, peer: str) -> bool:
     """Return whether a meeting with `peer` may confirm the pose of one of the two robots."""
-    known = state.other(peer)
+    other = state.other(peer)
     met = any(one.config.peer == peer for one in state.confirming.meetings)
-    return not (met or known.failed or (known.localised and state.verdict is not None))
+    return not (met or other.failed or (other.localised and state.verdict is not None))
 
 
 def _with_frame(state: GroupState) -> GroupState:
@@ -165,8 +165,8 @@ def _confirmed(state: GroupState) -> GroupState:
         return state
     state = replace(state, confirming=replace(confirming, ranges=len(pair.log.ranges)))
     poses = {one.config.peer: later_pose(one, pair) for one in confirming.meetings}
-    known = [(peer, pose) for peer, pose in poses.items() if pose is not None]
-    for chosen in combinations(known, needed):
+    present_poses = [(peer, pose) for peer, pose in poses.items() if pose is not None]
+    for chosen in combinations(present_poses, needed):
         claims = [pose for _, pose in chosen]
         if not all(agreement(*two) >= 1.0 - config.mission.confidence for two in combinations(claims, 2)):
             continue

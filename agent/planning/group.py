@@ -67,9 +67,9 @@ class GroupPlanner(Planner[GroupState, Report]):
             pair = replace(pair, in_contact=False)
         for contact in observation.contacts:
             if contact.peer != pair.config.peer and contact.range is not None:
-                known = state.other(contact.peer)
-                ranges = (*known.mutual, Ranged(observation.tick, contact.range))
-                state = state.with_other(contact.peer, replace(known, mutual=ranges))
+                other = state.other(contact.peer)
+                ranges = (*other.mutual, Ranged(observation.tick, contact.range))
+                state = state.with_other(contact.peer, replace(other, mutual=ranges))
         if state.visiting and _is_out_of_range_again(state.pair, pair):
             pair = replace(pair, mode=Travelling(visit.stop(state.frame, pair)))
         state = group_transitions.passing_others(replace(state, pair=pair), observation.contacts)

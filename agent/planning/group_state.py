@@ -156,6 +156,6 @@ class GroupState(msgspec.Struct, frozen=True):
         """Return what the robot knows of `robot`."""
         return self.others.get(robot, Other())
 
-    def with_other(self, robot: str, known: Other) -> GroupState:
+    def with_other(self, robot: str, other: Other) -> GroupState:
         """Return this state with what the robot now knows of `robot`."""
-        return replace(self, others={**self.others, robot: known})
+        return replace(self, others={**self.others, robot: other})

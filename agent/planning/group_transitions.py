@@ -168,8 +168,8 @@ def onward(state: GroupState, *, peer_has_left: bool = False) -> GroupState:
         if state.other(peer).localised and state.verdict is not None:  # by another robot
             return next_visit(state)
         if visit.has_searched(state):
-            known = replace(state.other(peer), missed=pair.tick)
-            return next_visit(state.with_other(peer, known))
+            other = replace(state.other(peer), missed=pair.tick)
+            return next_visit(state.with_other(peer, other))
         if _is_silent(state):
             return next_visit(_after_meeting(state))
         return state
@@ -337,14 +337,14 @@ def _is_late(state: GroupState, member: Member) -> bool:
     A robot that was not there is visited again after the time of the longest way: it may have been on its way
     back from its orbit.
     """
-    known, config = state.other(member.robot), state.config
+    other, config = state.other(member.robot), state.config
     apart = math.hypot(member.anchor.x - config.anchor.x, member.anchor.y - config.anchor.y)
-    if known.localised or known.failed or apart < config.mission.orienting_distance:
+    if other.localised or other.failed or apart < config.mission.orienting_distance:
         return False
-    if known.missed is None:
+    if other.missed is None:
         return True
     mission = config.mission
-    return (state.pair.tick - known.missed) * mission.period * mission.max_speed > config.widest_distance
+    return (state.pair.tick - other.missed) * mission.period * mission.max_speed > config.widest_distance
 
 
 def at_anchor(state: GroupState) -> GroupState:
@@ -396,16 +396,16 @@ def passing_others(state: GroupState, contacts: Sequence[Contact]) -> GroupState
     free = passing.leeway(contacts, pair.config.peer if pair.in_contact else None, mission)
     mode = pair.mode
     if isinstance(mode, Travelling) and passing.yielding(state.passing, _leading(state, contacts), mission):
-        now = replace(state.passing, leeway=0.0, blocked=0, yielded=state.passing.yielded + 1)
-        return replace(state, passing=now)
-    now = passing.passed(state.passing, mode, pair.odometry, free, mission)
-    if isinstance(mode, Travelling) and (now.places or state.passing.places):
-        places, tolerance = now.places, pair.estimator.pose_tolerance
+        passed = replace(state.passing, leeway=0.0, blocked=0, yielded=state.passing.yielded + 1)
+        return replace(state, passing=passed)
+    passed = passing.passed(state.passing, mode, pair.odometry, free, mission)
+    if isinstance(mode, Travelling) and (passed.places or state.passing.places):
+        places, tolerance = passed.places, pair.estimator.pose_tolerance
         if places and phase2_orbit.arrived(Travelling(places[0]), pair.odometry, mission, tolerance):
             places = places[1:]
-        now = replace(now, places=places)
+        passed = replace(passed, places=places)
         mode = Travelling(places[0] if places else visit.stop(state.frame, pair))
-    return replace(state, pair=replace(pair, mode=mode), passing=now)
+    return replace(state, pair=replace(pair, mode=mode), passing=passed)
 
 
 def _leading(state: GroupState, contacts: Sequence[Contact]) -> list[Contact]:

@@ -83,10 +83,10 @@ class LogPlanner(Planner[RobotState, Report]):
                 driven = observations[k].executed
                 if driven != Controls(run.v, run.omega):
                     return f"it reported ({run.v:g}, {run.omega:g}) until tick {k}, expected {_json(driven)}"
-        for one in body.ranges:
-            ranged = observations[one.tick].anchor_range
-            if ranged != one.range:
-                return f"it reported {one.range!r} m at tick {one.tick}, expected {_json(ranged)}"
+        for reported in body.ranges:
+            ranged = observations[reported.tick].anchor_range
+            if ranged != reported.range:
+                return f"it reported {reported.range!r} m at tick {reported.tick}, expected {_json(ranged)}"
         return None
 
 

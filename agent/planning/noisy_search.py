@@ -55,11 +55,11 @@ class NoisyGroupPlanner(GroupPlanner):
         if not (state.sweeps or _is_beacon(state)):
             state = super().decide(state, reports)
             return _begun(state) if state.sweeps else state
-        for one in reports:
-            known = with_sender(state, one).other(one.robot)
-            known = replace(known, acknowledged=one.heard)  # if it is overtaken, more is sent again
-            state = state.with_other(one.robot, known)
-        of_peer = [one for one in reports if one.has_log and one.robot == state.pair.config.peer]
+        for report in reports:
+            sender = with_sender(state, report).other(report.robot)
+            sender = replace(sender, acknowledged=report.heard)  # if it is overtaken, more is sent again
+            state = state.with_other(report.robot, sender)
+        of_peer = [report for report in reports if report.has_log and report.robot == state.pair.config.peer]
         heard = exchange.with_reports(state.pair, of_peer)
         if heard.verdict == state.pair.verdict:
             state = replace(state, pair=heard)
@@ -112,12 +112,12 @@ def _onward(state: GroupState) -> GroupState:
         return state
     mission, odometry, phase = state.config.mission, state.pair.odometry, state.pair.phase
     along, aside = ALONG * mission.sensing_range, ASIDE * mission.sensing_range
-    found = [one for one in _helped(state) if _ticks_since(state, one) <= LINGER]
+    helped = [one for one in _helped(state) if _ticks_since(state, one) <= LINGER]
     state = sweep_transitions.moved_on(
         state,
-        found,
+        helped,
         lambda since, then: sweep.looping_both_ways(odometry, along, aside, since, then),
-        stops=any(_stops_for(state, one) for one in found),
+        stops=any(_stops_for(state, one) for one in helped),
         longest=contact_ticks(mission),
     )
     if not sweep_transitions.is_over(state):
@@ -186,10 +186,10 @@ def _stops_for(state: GroupState, robot: str) -> bool:
     return _has_passed(state.other(robot), state.pair.tick, STRIP_REACH * mission.sensing_range)
 
 
-def _has_passed(known: Other, tick: int, near: float) -> bool:
+def _has_passed(other: Other, tick: int, near: float) -> bool:
     """Return whether the range to a robot has been at most `near` m, and increases or is out of reach."""
-    latest = known.mutual[-1]
+    latest = other.mutual[-1]
     if latest.tick < tick:
         return latest.range <= near
-    before = [one.range for one in known.mutual[-2:-1] if one.tick == tick - 1]
+    before = [one.range for one in other.mutual[-2:-1] if one.tick == tick - 1]
     return bool(before) and min(before) <= near and before[0] <= latest.range

@@ -106,11 +106,11 @@ class NoisyUnanchoredPlanner(Planner[NoisyUnanchoredState, Report]):
         if state.verdict is not None:
             return state
         ranges = dict(state.ranges)
-        for one in observation.contacts:
-            if one.range is not None:
+        for contact in observation.contacts:
+            if contact.range is not None:
                 first = observation.tick - _kept(state)
-                recent = [each for each in ranges.get(one.peer, ()) if each.tick > first]
-                ranges[one.peer] = (*recent, Ranged(observation.tick, one.range))
+                recent = [each for each in ranges.get(contact.peer, ()) if each.tick > first]
+                ranges[contact.peer] = (*recent, Ranged(observation.tick, contact.range))
         return replace(state, ranges=ranges)
 
     def report(self, state: NoisyUnanchoredState) -> Report:
@@ -128,13 +128,13 @@ class NoisyUnanchoredPlanner(Planner[NoisyUnanchoredState, Report]):
             return state
         if state.tick * state.config.mission.period >= state.config.gives_up:
             return replace(state, verdict=Undecided(state.failure))
-        for one in reports:
-            if (prior := one.prior) is not None and prior.covariance is not None:
+        for report in reports:
+            if (prior := report.prior) is not None and prior.covariance is not None:
                 log = MotionLog(through=prior.tick)
-                finder = Finder(one.robot, prior.tick, prior.pose, prior.covariance, log, one.tick)
-                state = _with_finder(state, finder, one)
-            elif state.finder is None and one.state == SWEEPING:
-                why = f"{one.robot} has passed it, and does not know its own pose well enough"
+                finder = Finder(report.robot, prior.tick, prior.pose, prior.covariance, log, report.tick)
+                state = _with_finder(state, finder, report)
+            elif state.finder is None and report.state == SWEEPING:
+                why = f"{report.robot} has passed it, and does not know its own pose well enough"
                 state = replace(state, failure=why)
         state = _estimated(state)
         return _moved_on(state) if state.verdict is None else state
@@ -146,15 +146,15 @@ class NoisyUnanchoredPlanner(Planner[NoisyUnanchoredState, Report]):
     def estimate(self, state: NoisyUnanchoredState) -> Estimate:
         """Return the poses in <W> that are possible in the tick of an estimate, the most probable first."""
         is_new = state.estimated_tick == state.tick or state.verdict is not None
-        found = state.estimate if is_new else None
+        estimate = state.estimate if is_new else None
         return Estimate(
             tick=state.tick,
             robot=state.config.robot,
             local=(),
-            world=found.poses if found is not None else (),
+            world=estimate.poses if estimate is not None else (),
             localised=isinstance(state.verdict, Localised),
-            probabilities=found.probabilities if found is not None else (),
-            covariance=found.covariance if found is not None else None,
+            probabilities=estimate.probabilities if estimate is not None else (),
+            covariance=estimate.covariance if estimate is not None else None,
         )
 
     def malformed(self, body: Report) -> str | None:
@@ -172,14 +172,14 @@ class NoisyUnanchoredPlanner(Planner[NoisyUnanchoredState, Report]):
 
     def summary(self, state: NoisyUnanchoredState) -> Summary:
         """Return the number of possible poses, the probability of the first, and what prevents a claim."""
-        found = state.estimate
-        if found is None:
+        estimate = state.estimate
+        if estimate is None:
             return Summary(blocking_reason=None if state.verdict is not None else state.failure)
         return Summary(
-            hypotheses=len(found.poses),
-            probability=found.probabilities[0],
+            hypotheses=len(estimate.poses),
+            probability=estimate.probabilities[0],
             blocking_reason=None if isinstance(state.verdict, Localised) else state.failure,
-            p_value=found.p_value,
+            p_value=estimate.p_value,
         )
 
 
@@ -194,18 +194,18 @@ def _with_finder(state: NoisyUnanchoredState, finder: Finder, report: Report) ->
     Another reference of the same finder counts if it is later, and another finder once the present one is
     silent or too inaccurate.
     """
-    known = state.finder
-    if known is not None and (known.robot, known.reference) != (finder.robot, finder.reference):
-        accurate = known.covariance.position_sigma <= state.config.mission.accuracy
-        if known.robot != finder.robot and accurate and known.latest > state.tick - _kept(state):
+    present = state.finder
+    if present is not None and (present.robot, present.reference) != (finder.robot, finder.reference):
+        accurate = present.covariance.position_sigma <= state.config.mission.accuracy
+        if present.robot != finder.robot and accurate and present.latest > state.tick - _kept(state):
             return state
-        if known.robot == finder.robot and known.reference > finder.reference:
+        if present.robot == finder.robot and present.reference > finder.reference:
             return state
-        known = None
-    if known is None:
-        known, state = finder, replace(state, ranges_at_estimate=0, estimate=None)
-    log = known.log.extended(report.since, 0, MotionLog(report.through, report.runs))
-    return replace(state, finder=replace(known, log=log, latest=max(known.latest, report.tick)))
+        present = None
+    if present is None:
+        present, state = finder, replace(state, ranges_at_estimate=0, estimate=None)
+    log = present.log.extended(report.since, 0, MotionLog(report.through, report.runs))
+    return replace(state, finder=replace(present, log=log, latest=max(present.latest, report.tick)))
 
 
 def _estimated(state: NoisyUnanchoredState) -> NoisyUnanchoredState:
@@ -237,13 +237,13 @@ def _estimated(state: NoisyUnanchoredState) -> NoisyUnanchoredState:
         _path(state.log.between(finder.reference, state.tick), mission),
         ranges,
     )
-    found = estimated(contact, mission)
-    state = replace(state, estimate=found, estimated_tick=state.tick, ranges_at_estimate=len(ranges))
-    if found is None:
+    estimate = estimated(contact, mission)
+    state = replace(state, estimate=estimate, estimated_tick=state.tick, ranges_at_estimate=len(ranges))
+    if estimate is None:
         return replace(state, failure=f"no pose explains the ranges to {finder.robot}")
-    if found.blocking_reason:
-        return replace(state, failure=f"{finder.robot} has found it: {found.blocking_reason}")
-    return replace(state, verdict=Localised(found.poses[0], found.covariance))
+    if estimate.blocking_reason:
+        return replace(state, failure=f"{finder.robot} has found it: {estimate.blocking_reason}")
+    return replace(state, verdict=Localised(estimate.poses[0], estimate.covariance))
 
 
 def _path(runs: Sequence[Segment], mission: Mission) -> Track:

@@ -141,22 +141,22 @@ def _fitted(state: GroupState, *, searched: bool) -> _Fitted:
     The whole plane is searched if the known hypotheses do not explain the measurements, or if `searched`.
     """
     pair, measured = state.pair, _measured(state)
-    found = _followed(pair.belief.pair, measured, _index(pair))
-    if not searched and found.p_value >= CLAIM_P_VALUE and found.scored[0].fit.last_step <= FINISHED:
-        return found
-    again = search(measured, _hypotheses(found))
+    fitted = _followed(pair.belief.pair, measured, _index(pair))
+    if not searched and fitted.p_value >= CLAIM_P_VALUE and fitted.scored[0].fit.last_step <= FINISHED:
+        return fitted
+    again = search(measured, _hypotheses(fitted))
     return _followed(tuple([one.hypothesis for one in again]), measured, _index(pair))
 
 
-def _followed(known: tuple[Hypothesis, ...], measured: PairRanges, own: int) -> _Fitted:
-    """Return the fits that begin at the hypotheses `known`, until that of the most probable one converges."""
+def _followed(hypotheses: tuple[Hypothesis, ...], measured: PairRanges, robot: int) -> _Fitted:
+    """Return the fits that begin at `hypotheses`, until that of the most probable one converges."""
     scored: tuple[ScoredHypothesis, ...] = ()
     for _ in range(MOST_FITS):
-        scored = follow(known, measured)
-        known = tuple([one.hypothesis for one in scored])
+        scored = follow(hypotheses, measured)
+        hypotheses = tuple([one.hypothesis for one in scored])
         if not scored or scored[0].fit.last_step <= FINISHED:
             break
-    p_value = consistency_test(scored[0].fit, measured, own).p_value if scored else 0.0
+    p_value = consistency_test(scored[0].fit, measured, robot).p_value if scored else 0.0
     return _Fitted(scored, measured, p_value)
 
 

@@ -114,8 +114,8 @@ def with_claim(
     mission = state.config.mission
     belief, rival = inference.with_doubt_check(state.belief, scored, pair), None
     if belief.blocking_reason is None:
-        own = 0 if state.config.role == "a" else 1
-        robots = (own,) if isinstance(state.peer_state.verdict, Localised) else (0, 1)
+        robot = 0 if state.config.role == "a" else 1
+        robots = (robot,) if isinstance(state.peer_state.verdict, Localised) else (0, 1)
         rival = blocking_rival(scored, hypotheses[0], pair, mission, robots)
         if rival is not None:
             belief = replace(belief, blocking_reason=rival_reason(rival, mission))

@@ -77,14 +77,14 @@ class Paper(LogPlanner):
         The third range is the last one. It selects the most probable branch, if there is one.
         """
         kind, third = transitions.branch_kind(state), isinstance(state.mode, ThirdPoint)
-        found = transitions.anchor_estimate(state)
-        state = replace(state, belief=found.belief)
-        branch = found.best if third or len(found.branches) == 1 else None
+        estimate = transitions.anchor_estimate(state)
+        state = replace(state, belief=estimate.belief)
+        branch = estimate.best if third or len(estimate.branches) == 1 else None
         if kind is not None and branch is not None:
             return transitions.end_phase1(state, state.estimator.fitted(state, branch), kind)
-        if found.branches and third:
+        if estimate.branches and third:
             return state.undecided("the third range does not distinguish +alpha from -alpha")
-        return transitions.to_third_point(state, found, self.MANOEUVRES)
+        return transitions.to_third_point(state, estimate, self.MANOEUVRES)
 
     def _decide_phase3(self, state: RobotState) -> RobotState:
         """Evaluate phase 3 after a's second mutual range, and again after b's last manoeuvre.
@@ -98,15 +98,15 @@ class Paper(LogPlanner):
         first_tick, planned = state.belief.encounter_tick, state.plan is not None
         assert first_tick is not None
         a_waits = not isinstance(state.mode, Standing) or state.peer_state.state == MODE_NAMES[Waiting]
-        state, found = transitions.pair_estimate(
+        state, estimate = transitions.pair_estimate(
             evaluated,
             first_tick,
             self.required_mutual_ranges(state.config.mission),
             second_range=a_waits or planned,
         )
-        if found is None or state.verdict is not None or state.config.role == "a":
+        if estimate is None or state.verdict is not None or state.config.role == "a":
             return state
         if planned:
-            return state.undecided(found.failure)
-        moving = transitions.last_manoeuvre(state, found, self.last_manoeuvre)
+            return state.undecided(estimate.failure)
+        moving = transitions.last_manoeuvre(state, estimate, self.last_manoeuvre)
         return moving if moving is not None else state.undecided("no manoeuvre keeps the safety distance")

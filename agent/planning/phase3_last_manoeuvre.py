@@ -119,10 +119,10 @@ class Compared(NamedTuple):
 
 def turn(pair_observations: Sequence[PairObservation]) -> Role:
     """Return the robot that moves next: the one that did not move last. Robot b moves first."""
-    for before, now in pairwise(reversed(pair_observations)):
-        if travelled(before.b, now.b) > 0.0:
+    for before, latest in pairwise(reversed(pair_observations)):
+        if travelled(before.b, latest.b) > 0.0:
             return "a"
-        if travelled(before.a, now.a) > 0.0:
+        if travelled(before.a, latest.a) > 0.0:
             return "b"
     return "b"
 

@@ -47,8 +47,8 @@ def _changed_log(before: PeerState, report: Report) -> Inconsistent | None:
         reported = MotionLog(report.through - report.since, report.runs)
         if reported.between(0, last - report.since) != before.peer.between(report.since, last):
             return Inconsistent(f"manoeuvres over [{report.since}, {last}] that contradict an earlier report")
-    known = before.peer.ranges[report.ranges_since :][: len(report.ranges)]
-    if known != report.ranges[: len(known)]:
+    earlier = before.peer.ranges[report.ranges_since :][: len(report.ranges)]
+    if earlier != report.ranges[: len(earlier)]:
         return Inconsistent("ranges to its anchor that contradict an earlier report")
     return None
 

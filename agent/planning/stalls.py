@@ -37,10 +37,10 @@ def is_stalled(paths: Sequence[Track], since: int, stride: int, mission: Mission
     `paths` are those of the robots that plan together, `since` is the tick of the first of consecutive plans,
     and each lasts `stride` ticks.
     """
-    now = min([len(path.v) for path in paths])
-    if now - since < PLANS * stride:
+    tick = min([len(path.v) for path in paths])
+    if tick - since < PLANS * stride:
         return False
-    ticks = now - stride * np.arange(PLANS + 1)
+    ticks = tick - stride * np.arange(PLANS + 1)
     where = np.stack([one for path in paths for one in (path.x[ticks], path.y[ticks])])
     apart = np.abs(where[:, :, None] - where[:, None, :]).max(0) > MOVED * mission.sensing_range
     is_new = [all(apart[i, :i].tolist()) for i in range(len(ticks))]

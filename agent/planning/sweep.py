@@ -74,10 +74,10 @@ def controls(mode: Sweeping | Looping, odometry: Pose, mission: Mission, toleran
     """
     if not mode.places:
         return None
-    found = phase2_orbit.travel_controls(Travelling(mode.places[0]), odometry, mission, tolerance)
-    if found is None:
+    travelling = phase2_orbit.travel_controls(Travelling(mode.places[0]), odometry, mission, tolerance)
+    if travelling is None:
         return None
-    return Controls(min(found.v, sweep_speed(mission)), found.omega)
+    return Controls(min(travelling.v, sweep_speed(mission)), travelling.omega)
 
 
 def onward(

@@ -23,8 +23,8 @@ def wanted(state: GroupState) -> bool:
 
 def is_helped(state: GroupState, robot: str) -> bool:
     """Return whether `robot` has no anchor, and still needs the poses of this robot, as far as it knows."""
-    known = state.other(robot)
-    return robot in state.config.unanchored and not (known.localised or known.served)
+    other = state.other(robot)
+    return robot in state.config.unanchored and not (other.localised or other.served)
 
 
 def next_part(state: GroupState) -> GroupState:
@@ -56,12 +56,12 @@ def onward(state: GroupState) -> GroupState | None:
     Near robots without an anchor, it drives squares until they are localised or LOOPS_FOR ticks are over.
     """
     mission, odometry = state.config.mission, state.pair.odometry
-    found = [one for one in state.config.unanchored if is_helped(state, one) and _is_near(state, one)]
+    helped = [one for one in state.config.unanchored if is_helped(state, one) and _is_near(state, one)]
     moved = moved_on(
         state,
-        found,
+        helped,
         lambda since, then: sweep.looping(odometry, mission, since, then),
-        stops=bool(found),
+        stops=bool(helped),
         longest=LOOPS_FOR,
     )
     return None if is_over(moved) else moved
@@ -69,13 +69,13 @@ def onward(state: GroupState) -> GroupState | None:
 
 def moved_on(
     state: GroupState,
-    found: Sequence[str],
+    helped: Sequence[str],
     loop: Callable[[int, tuple[Place, ...]], Looping],
     *,
     stops: bool,
     longest: int,
 ) -> GroupState:
-    """Return `state` after a tick of a sweep, in which the robots `found` without an anchor are in contact.
+    """Return `state` after a tick of a sweep, in which the robots `helped` without an anchor are in contact.
 
     If it `stops` for them, it leaves its strip and drives a `loop`, of which it gives the first tick and the
     places that are left of the sweep. It repeats the loop until nobody is in contact any more, or for
@@ -85,15 +85,15 @@ def moved_on(
     assert isinstance(pair.mode, Sweeping | Looping)
     mode = sweep.onward(pair.mode, pair.odometry, mission, tolerance)
     if isinstance(mode, Looping) and pair.tick - mode.since > longest:
-        for robot in found:
+        for robot in helped:
             state = state.with_other(robot, replace(state.other(robot), failed=True))
-        found = []
+        helped = []
     match mode:
         case Sweeping(places) if stops:
             mode = loop(pair.tick, ((pair.odometry.x, pair.odometry.y), *places))
-        case Looping((), then, since) if found:
+        case Looping((), then, since) if helped:
             mode = loop(since, then)
-        case Looping(_, then) if not found:
+        case Looping(_, then) if not helped:
             mode = sweep.onward(Sweeping(then), pair.odometry, mission, tolerance)
     return replace(state, pair=replace(pair, mode=mode))
 
@@ -105,10 +105,10 @@ def is_over(state: GroupState) -> bool:
 
 def _is_near(state: GroupState, robot: str) -> bool:
     """Return whether this robot is near enough to `robot` to drive a square, or drives one already."""
-    known, pair = state.other(robot), state.pair
-    if known.failed or not known.mutual or known.mutual[-1].tick != pair.tick:
+    other, pair = state.other(robot), state.pair
+    if other.failed or not other.mutual or other.mutual[-1].tick != pair.tick:
         return False
     return (
         isinstance(pair.mode, Looping)
-        or known.mutual[-1].range <= STRIP_REACH * state.config.mission.sensing_range
+        or other.mutual[-1].range <= STRIP_REACH * state.config.mission.sensing_range
     )

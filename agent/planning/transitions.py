@@ -82,9 +82,9 @@ def start_phase1(state: RobotState, rho0: float | None) -> RobotState:
         return state  # a range may be missing by chance: the robot waits for its first one
     if rho0 is None:
         return state.undecided("the anchor is out of range at the start")
-    known = state.estimator.on_anchor(state, rho0)
-    if known is not None:
-        return end_phase1(state, known, "on-anchor")
+    on_anchor = state.estimator.on_anchor(state, rho0)
+    if on_anchor is not None:
+        return end_phase1(state, on_anchor, "on-anchor")
     return replace(state, mode=Straight("anchor", state.odometry, rho0))
 
 
@@ -121,28 +121,28 @@ def branch_kind(state: RobotState) -> BranchKind | None:
 
 
 def to_third_point(
-    state: RobotState, found: AnchorEstimate, manoeuvres: Manoeuvres, *, pinning: bool = False
+    state: RobotState, estimate: AnchorEstimate, manoeuvres: Manoeuvres, *, pinning: bool = False
 ) -> RobotState:
     """Plan the manoeuvre to the next measurement point of phase 1 (see `phase1_anchor.third_point`)."""
-    if not found.branches:
+    if not estimate.branches:
         return state.undecided("no pose explains the anchor ranges")
-    places = phase1_anchor.local(found.branches, state.odometry)
+    places = phase1_anchor.local(estimate.branches, state.odometry)
     command = phase1_anchor.third_point(
-        places, state.config.mission, manoeuvres, margin=found.margin, pinning=pinning
+        places, state.config.mission, manoeuvres, margin=estimate.margin, pinning=pinning
     )
     if command is None:
         return state.undecided("eq. (5) allows no manoeuvre to a third range")
-    return replace(state, mode=ThirdPoint(found.branches, state.odometry, command))
+    return replace(state, mode=ThirdPoint(estimate.branches, state.odometry, command))
 
 
-def end_phase1(state: RobotState, known: FittedBranch, kind: BranchKind) -> RobotState:
-    """End phase 1: store the branch and the anchor error of `known`, and start phase 2."""
+def end_phase1(state: RobotState, fitted: FittedBranch, kind: BranchKind) -> RobotState:
+    """End phase 1: store the branch and the anchor error of `fitted`, and start phase 2."""
     belief = replace(
         state.belief,
-        branch=known.branch,
+        branch=fitted.branch,
         branch_kind=kind,
         phase1_done_tick=state.tick,
-        own_anchor=known.anchor_error,
+        own_anchor=fitted.anchor_error,
     )
     state = replace(state, belief=belief)
     mu = phase2_orbit.orientation(state.local_pose)
@@ -210,25 +210,25 @@ def pair_estimate(
 
     The arguments are those of `Estimator.pair`. The estimate is None if the measurements do not suffice yet.
     """
-    found = state.estimator.pair(state, first_tick, required_ranges, second_range=second_range)
-    if found is None:
+    estimate = state.estimator.pair(state, first_tick, required_ranges, second_range=second_range)
+    if estimate is None:
         return state, None
-    mode = state.mode if found.verdict is None else Done(3, found.verdict)
-    return replace(state, belief=found.belief, mode=mode), found
+    mode = state.mode if estimate.verdict is None else Done(3, estimate.verdict)
+    return replace(state, belief=estimate.belief, mode=mode), estimate
 
 
 def last_manoeuvre(
-    state: RobotState, found: PairEstimate, planned: Callable[[Question, Mission], Plan | None]
+    state: RobotState, estimate: PairEstimate, planned: Callable[[Question, Mission], Plan | None]
 ) -> RobotState | None:
     """Return `state` on its last manoeuvre; None if every manoeuvre violates the safety distance.
 
     `planned` returns the manoeuvre that tells several placements apart, or tests one for the first time.
     """
     mover, mission = state.config.role, state.config.mission
-    a, b, placements = found.a, found.b, found.placements
-    if found.checked and len(placements) == 1:
+    a, b, placements = estimate.a, estimate.b, estimate.placements
+    if estimate.checked and len(placements) == 1:
         plan = phase3_last_manoeuvre.most_informative_manoeuvre(
-            mover, a, b, placements[0], found.observations, mission
+            mover, a, b, placements[0], estimate.observations, mission
         )
     else:
         plan = planned(Question(mover, a, b, tuple(placements)), mission)

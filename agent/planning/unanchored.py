@@ -155,13 +155,13 @@ class UnanchoredPlanner(Planner[UnanchoredState, Report]):
         if state.odometry != state.base:
             moved = compose(inverse(state.base), state.odometry)
         new = {
-            (one.peer, observation.tick): (one.range, moved)
-            for one in observation.contacts
-            if one.range is not None
+            (contact.peer, observation.tick): (contact.range, moved)
+            for contact in observation.contacts
+            if contact.range is not None
         }
         if not new:
             return state
-        recent = {key: one for key, one in state.ranges.items() if key[1] > observation.tick - KEPT}
+        recent = {key: contact for key, contact in state.ranges.items() if key[1] > observation.tick - KEPT}
         return replace(state, ranges={**recent, **new})
 
     def report(self, state: UnanchoredState) -> Report:
@@ -181,13 +181,15 @@ class UnanchoredPlanner(Planner[UnanchoredState, Report]):
             return replace(state, verdict=Undecided(_why_undecided(state)))
         ranges, places = dict(state.ranges), dict(state.places)
         if isinstance(state.mode, Standing):  # a robot that comes back may have corrected its pose
-            places = {key: one for key, one in places.items() if key[1] > state.tick - LOOPS_FOR}
-        for one in reports:
-            if (prior := one.prior) is None or one.robot in state.candidates:
+            places = {key: report for key, report in places.items() if key[1] > state.tick - LOOPS_FOR}
+        for report in reports:
+            if (prior := report.prior) is None or report.robot in state.candidates:
                 continue
-            if (known := ranges.pop((one.robot, prior.tick), None)) is not None:
-                distance, odometry = known
-                places[one.robot, prior.tick] = RangedPlace((prior.pose.x, prior.pose.y), odometry, distance)
+            if (ranged := ranges.pop((report.robot, prior.tick), None)) is not None:
+                distance, odometry = ranged
+                places[report.robot, prior.tick] = RangedPlace(
+                    (prior.pose.x, prior.pose.y), odometry, distance
+                )
         if places.keys() != state.places.keys():
             state = _resected(replace(state, ranges=ranges, places=places))
         return _moved_on(state) if isinstance(state.mode, Looping) and state.verdict is None else state
@@ -227,12 +229,12 @@ def _now(state: UnanchoredState, base: Pose) -> Pose:
 def _resected(state: UnanchoredState) -> UnanchoredState:
     """Return `state` with what follows from its ranges to each robot: a square to drive, or a verdict."""
     for robot in sorted({robot for robot, _ in state.places} - state.candidates.keys()):
-        known = [state.places[key] for key in sorted(state.places) if key[0] == robot]
-        standing = [one for one in known if one.odometry == ORIGIN]
-        moved = [one for one in known if one.odometry != ORIGIN]
+        ranged = [state.places[key] for key in sorted(state.places) if key[0] == robot]
+        standing = [one for one in ranged if one.odometry == ORIGIN]
+        moved = [one for one in ranged if one.odometry != ORIGIN]
         if isinstance(state.mode, Standing):
-            found = resection.positions(standing, LARGEST_MISFIT)
-            if len(found) == 1 and resection.is_fixed(standing, found[0]):
+            positions = resection.positions(standing, LARGEST_MISFIT)
+            if len(positions) == 1 and resection.is_fixed(standing, positions[0]):
                 return replace(state, mode=sweep.looping(state.odometry, state.config.mission, state.tick))
         elif moved and (possible := resection.poses(standing, moved, LARGEST_MISFIT)):
             state = replace(state, possible=possible)
@@ -265,8 +267,8 @@ def _why_undecided(state: UnanchoredState) -> str:
     """Return why the robot has not claimed a pose, for a user."""
     if not state.candidates:
         return "no localised robot has found it"
-    found = ", ".join(sorted(state.candidates))
-    return f"{state.config.tolerates + 1} robots must agree on its pose; it is found by: {found}"
+    finders = ", ".join(sorted(state.candidates))
+    return f"{state.config.tolerates + 1} robots must agree on its pose; it is found by: {finders}"
 
 
 def _moved_on(state: UnanchoredState) -> UnanchoredState:

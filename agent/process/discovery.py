@@ -115,8 +115,8 @@ def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tu
         offers = _offers(link, worlds[:MOST_WORLDS], robot, search.process)
         if len(offers.configs) > 1:
             raise Unwelcome(f"several runs are alive: {', '.join(offers.configs)}; choose one with --run")
-        for found, config in offers.configs.items():
-            return found, config
+        for robot_run, config in offers.configs.items():
+            return robot_run, config
         occupied = offers.occupied
         if occupied is not None:
             second = offers.refused or second
@@ -147,11 +147,11 @@ def _offers(link: zenoh.Session, worlds: Sequence[str], robot: str, process: byt
         if isinstance(answer, str):
             refused = answer
         elif answer is not None and not is_occupied:
-            found = _decoded_config(answer, robot)
-            if isinstance(found, str):
-                unusable = found
+            config = _decoded_config(answer, robot)
+            if isinstance(config, str):
+                unusable = config
             else:
-                configs[world] = found
+                configs[world] = config
     return _Offers(configs, occupied, refused, unusable)
 
 

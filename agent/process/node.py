@@ -195,8 +195,8 @@ class AgentProcess:
         if not isinstance(message, MissionEnd) and message.robot != self._id:
             self._inbox.refuse(arrival, f"it is addressed to '{message.robot}'")
             return None
-        found: Observation | MissionEnd | TickStart = message
-        return found
+        decoded: Observation | MissionEnd | TickStart = message
+        return decoded
 
     def _is_accepted(self, end: MissionEnd) -> bool:
         return end.tick == self._latest_tick or self._out_of_step.persists(end, ENDED_S)

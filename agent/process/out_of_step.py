@@ -37,26 +37,26 @@ class OutOfStep:
         """Note that the world has appeared or gone. While it is gone, no message out of step is accepted."""
         self._world_there, self._latest = there, None
 
-    def observation(self, observation: Observation, known: int) -> None:
+    def observation(self, observation: Observation, latest: int) -> None:
         """Handle an Observation out of step. Raises NoWorld if the world keeps sending such Observations.
 
-        In that case the agent or the world has lost its recording, or the agent is too late. `known` is the
+        In that case the agent or the world has lost its recording, or the agent is too late. `latest` is the
         latest tick in step. In real time the world can still send the ticks in between.
         """
         tick = observation.tick
-        if self._real_time and tick < known:
+        if self._real_time and tick < latest:
             return  # a repetition of a tick that was already processed
-        if self._real_time and tick > known and self._latest is None:
+        if self._real_time and tick > latest and self._latest is None:
             self._appear()  # the world sends the missed ticks to a robot that appears
         if not self.persists(observation, BEHIND_S):
             return
-        if tick == known:
+        if tick == latest:
             raise NoWorld(
                 f"the recording belongs to another run: "
                 f"its Observation of {self._robot} at tick {tick} differs"
             )
-        late = "too late" if tick > known else "the world was restarted without its recording"
-        raise NoWorld(f"{late}: the world is at tick {tick}, {self._robot} at tick {known}")
+        late = "too late" if tick > latest else "the world was restarted without its recording"
+        raise NoWorld(f"{late}: the world is at tick {tick}, {self._robot} at tick {latest}")
 
     def persists(self, message: Observation | MissionEnd, bound_s: float) -> bool:
         """Return whether only messages like `message` have arrived for `bound_s` seconds.

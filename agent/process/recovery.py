@@ -75,7 +75,7 @@ def remember(recording: Retrace, planner_of: Callable[[RobotConfig], Planner[Any
     if journal.final_report is not None:  # it also counts received frames, which a replay cannot reproduce
         recording.write(*recording.frames[-2:])
     observation = journal.steps[-1].observation if journal.steps else None
-    now = observation.tick if observation is not None else 0
+    tick = observation.tick if observation is not None else 0
     latest = journal.steps[-REPORTS_KEPT:]
     return Memory(
         config=journal.config,
@@ -83,7 +83,7 @@ def remember(recording: Retrace, planner_of: Callable[[RobotConfig], Planner[Any
         observation=observation,
         own_reports=tuple(own_reports),
         received=tuple(
-            [one for step in latest for one in step.received if now - one.report.tick <= REPORTS_KEPT]
+            [one for step in latest for one in step.received if tick - one.report.tick <= REPORTS_KEPT]
         ),
         end=journal.end if journal.final_report is not None else None,
         final_report=journal.final_report,

@@ -35,18 +35,18 @@ class ReportBuffer:
         self.unheard = 0
         """The number of reports that were received, but never listed."""
 
-    def take(self, arrival: Arrival, known: int) -> None:
-        """Store the report in `arrival`, or refuse it. `known` is the tick of the latest Observation."""
+    def take(self, arrival: Arrival, latest: int) -> None:
+        """Store the report in `arrival`, or refuse it. `latest` is the tick of the latest Observation."""
         report: Report | None = self._inbox.accepted(arrival, Report, MAX_REPORT_BYTES)
         if report is None:
             return
         if (wrong := self._malformed(report)) is not None:
             self._inbox.refuse(arrival, wrong)
             return
-        if not self._real_time and report.tick > known + 1:
+        if not self._real_time and report.tick > latest + 1:
             self._inbox.refuse(arrival, "its tick is in the future")
             return
-        if abs(report.tick - max(known, 0)) > REPORTS_KEPT:
+        if abs(report.tick - max(latest, 0)) > REPORTS_KEPT:
             self.unheard += 1
             return
         framed = FramedReport(report, arrival.frame)
@@ -57,12 +57,12 @@ class ReportBuffer:
         """Return the report that `sender` sent in `tick`, or None if it has not arrived."""
         return self._reports.get((sender, tick))
 
-    def waiting(self, sender: str, known: int) -> list[FramedReport]:
-        """Return the reports of `sender` from ticks up to `known` that were never listed, oldest first."""
+    def waiting(self, sender: str, latest: int) -> list[FramedReport]:
+        """Return the reports of `sender` from ticks up to `latest` that were never listed, oldest first."""
         return [
             self._reports[one]
             for one in sorted(self._reports)
-            if one[0] == sender and one[1] <= known and one not in self._listed
+            if one[0] == sender and one[1] <= latest and one not in self._listed
         ]
 
     def list(self, reports: Iterable[tuple[str, int]]) -> None:

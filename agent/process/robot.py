@@ -176,22 +176,22 @@ class Robot:
 
         The arguments count the frames that the transport refused and the reports that no Observation listed.
         """
-        found = self.planner.summary(self.state)
+        summary = self.planner.summary(self.state)
         final_report = FinalReport(
             robot=self.config.robot,
-            anchor_ranges=_first(found.anchor_ranges, self.anchor_ranges),
-            mutual_ranges=_first(found.mutual_ranges, self.mutual_ranges),
-            branch=found.branch,
-            alpha=found.alpha,
-            candidates=found.candidates,
-            last_turn_rate=found.last_turn_rate,
-            separation_m2=found.separation_m2,
-            hypotheses=found.hypotheses,
-            probability=found.probability,
-            blocking_reason=found.blocking_reason,
-            p_value=found.p_value,
+            anchor_ranges=_first(summary.anchor_ranges, self.anchor_ranges),
+            mutual_ranges=_first(summary.mutual_ranges, self.mutual_ranges),
+            branch=summary.branch,
+            alpha=summary.alpha,
+            candidates=summary.candidates,
+            last_turn_rate=summary.last_turn_rate,
+            separation_m2=summary.separation_m2,
+            hypotheses=summary.hypotheses,
+            probability=summary.probability,
+            blocking_reason=summary.blocking_reason,
+            p_value=summary.p_value,
             reports_sent=self.reports_sent,
-            reports_heard=_first(found.reports_heard, self.reports_received),
+            reports_heard=_first(summary.reports_heard, self.reports_received),
             reports_refused=reports_refused + self.damaged,
             reports_unheard=reports_unheard,
             reports_lost=len(self.lost),

@@ -157,9 +157,9 @@ class Journal:
             raise self._cannot(error) from None
 
     def _cannot(self, error: OSError) -> CannotRecord:
-        found = CannotRecord(f"{self.path} cannot be written: {error.strerror or error}")
-        found.errno = error.errno
-        return found
+        refusal = CannotRecord(f"{self.path} cannot be written: {error.strerror or error}")
+        refusal.errno = error.errno
+        return refusal
 
     def close(self) -> None:
         """Close and unlock the file. Nothing is lost without it."""
@@ -227,11 +227,11 @@ def torn(path: Path) -> tuple[list[bytes], int]:
 def _holds_a_frame(rest: bytes) -> bool:
     """Return whether `rest`, which looks like a torn frame, contains a complete one: then it is damaged."""
     checked = 0
-    for place in range(1, len(rest)):
-        width = _HEADS.get(rest[place])
+    for offset in range(1, len(rest)):
+        width = _HEADS.get(rest[offset])
         if width is not None:
-            begin = place + 1 + width
-            size = int.from_bytes(rest[place + 1 : begin])
+            begin = offset + 1 + width
+            size = int.from_bytes(rest[offset + 1 : begin])
             if begin + size <= len(rest):
                 checked += size
                 if is_sound(rest[begin : begin + size]) or checked > MOST_CHECKED:

@@ -81,10 +81,10 @@ def agent(robot: str) -> str:
 def permits(participant: str) -> set[Permit]:
     """Return all permissions of a participant: a robot ("agent-ID") or a viewer."""
     return {
-        Permit(one.flow, one.message, _key(key, {}) if one.every else own)
+        Permit(one.flow, one.message, _key(key, {}) if one.every else keys_of)
         for key, rule in keys.KEY_RULES.items()
         for roles, passing in (((rule.by,), BY), (rule.to, TO))
-        for own in _own(key, roles, participant)
+        for keys_of in _own(key, roles, participant)
         for one in passing[rule.way]
     }
 

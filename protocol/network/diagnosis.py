@@ -33,10 +33,10 @@ ALERTS = {
 
 def why(endpoints: Endpoints) -> str:
     """Return the cause for each router of `endpoints`, and what to check, for a user. This takes seconds."""
-    found = {endpoint: _why(endpoints, endpoint) for endpoint in endpoints.connect}
-    if len(found) == 1:
-        return next(iter(found.values()))
-    return "; ".join(f"{endpoint}: {what}" for endpoint, what in found.items())
+    reasons = {endpoint: _why(endpoints, endpoint) for endpoint in endpoints.connect}
+    if len(reasons) == 1:
+        return next(iter(reasons.values()))
+    return "; ".join(f"{endpoint}: {what}" for endpoint, what in reasons.items())
 
 
 def _why(endpoints: Endpoints, endpoint: str) -> str:

@@ -221,7 +221,7 @@ def _read(file: Path) -> str:
 
 def _what(complaint: str) -> str:
     """Return Zenoh's error message about a configuration, without the position in Zenoh's source."""
-    found = re.search(r"--> (?P<line>\d+):.*= (?P<what>[^\n]*)", complaint, re.DOTALL)
-    if found is None:
+    match = re.search(r"--> (?P<line>\d+):.*= (?P<what>[^\n]*)", complaint, re.DOTALL)
+    if match is None:
         return complaint.partition(" at /")[0]
-    return f"line {found['line']}: {found['what'].partition(' at /')[0]}"
+    return f"line {match['line']}: {match['what'].partition(' at /')[0]}"

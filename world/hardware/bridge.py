@@ -132,8 +132,8 @@ class Field:
         self.missed = 0
         """The number of ticks in which the robot rested because a Command was missing."""
 
-    def resume(self, history: DriverHistory, known: int) -> None:
-        """Continue at the end of the driver's journal. `known` is the latest tick in the agent's journal.
+    def resume(self, history: DriverHistory, latest: int) -> None:
+        """Continue at the end of the driver's journal. `latest` is the latest tick in the agent's journal.
 
         The robot rested while this process was down, so the others may be any number of ticks ahead.
         """
@@ -145,7 +145,7 @@ class Field:
             self.missed += one.command is None
         self._end, self._is_end_recorded = history.end or self._end, history.end is not None
         self._tick, self._resumed, self._astray = history.tick, history.tick >= 0, self._max_ticks + 1
-        self._unanswered.extend((one.observation.tick, one.frame) for one in history.ticks[known + 1 :])
+        self._unanswered.extend((one.observation.tick, one.frame) for one in history.ticks[latest + 1 :])
 
     @property
     def tick(self) -> int:

@@ -110,17 +110,17 @@ def driver_history(frames: Sequence[bytes], config: RobotConfig, path: Path) -> 
     marked: Mark | None = None
     end: MissionEnd | None = None
     start: ProcessStart | None = None
-    for place, frame in enumerate(frames):
+    for index, frame in enumerate(frames):
         message = message_in(frame, OfDriver, path)
         match message:
-            case RobotConfig() if place == 0:
+            case RobotConfig() if index == 0:
                 if message != config:
                     raise CorruptJournal(f"{path}: it belongs to another mission: its RobotConfig differs")
-            case ProcessStart() if place > 0 and end is None:
+            case ProcessStart() if index > 0 and end is None:
                 start = message
             case Mark(tick) if tick == len(ticks):
                 marked = message
-            case Observation(tick) if tick == len(ticks) and place > 0:
+            case Observation(tick) if tick == len(ticks) and index > 0:
                 ticks.append(DrivenTick(message, frame))
                 mark = marked.mark if marked is not None and marked.tick == tick else ()
             case Command() if (
@@ -132,5 +132,5 @@ def driver_history(frames: Sequence[bytes], config: RobotConfig, path: Path) -> 
             case MissionEnd() if end is None:
                 end = message
             case _:
-                raise CorruptJournal(f"{path}: frame {place + 1}, {type(message).__name__}, is out of order")
+                raise CorruptJournal(f"{path}: frame {index + 1}, {type(message).__name__}, is out of order")
     return DriverHistory(tuple(ticks), mark, end, start)

@@ -48,11 +48,11 @@ def _contacts(reading: Reading, config: RobotConfig) -> tuple[Contact, ...]:
         if peer in ranges:
             raise InvalidReading(f"both mutual_ranges and the other fields have a contact with {peer}")
         ranges[peer] = reading.mutual_range
-    found = tuple([Contact(one, ranges.pop(one), None) for one in config.others if one in ranges])
+    contacts = tuple([Contact(one, ranges.pop(one), None) for one in config.others if one in ranges])
     if ranges:
         stranger = next(iter(ranges))
         raise InvalidReading(f"mutual_ranges: {stranger!r} is none of {', '.join(config.others)}")
-    return found
+    return contacts
 
 
 def _checked(message: Message) -> bytes:
