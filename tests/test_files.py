@@ -194,7 +194,6 @@ def test_the_outcome_is_printed_where_a_full_disk_takes_no_summary(how: list[str
 WRITING = (
     "run paper-1 --in-process --out OUT --no-export",
     "run paper-1 --out OUT --export",
-    "run paper-1 paper-2 --in-process --out OUT",
     "sweep ../few.toml --out OUT --workers 1",
     "figures RECORDING --format svg",
     "export RECORDING --out OUT",

@@ -15,8 +15,6 @@ from protocol.units import NAME
 ENDPOINT_EXAMPLE = "tcp/127.0.0.1:7447"
 SCENARIO_HELP = "name of a scenario that ships with Tandem, or path of a TOML file"
 SEED_HELP = "seed of all random draws, 0 to 2^63 - 1"
-MOST_SEEDS = 1000
-"""The largest number of seeds of one command; `tandem sweep` runs more."""
 
 # --- shared arguments -------------------------------------------------------------------------------
 
@@ -30,21 +28,6 @@ def add_scenario(parser: ArgumentParser) -> None:
     """Add one scenario and its seed, and the flags that change it."""
     parser.add_argument("scenario", type=source, metavar="SCENARIO", help=SCENARIO_HELP)
     parser.add_argument("--seed", type=natural, metavar="N", help=f"{SEED_HELP} [default: the scenario's]")
-    add_scenario_flags(parser)
-
-
-def add_scenarios(parser: ArgumentParser) -> None:
-    """Add one or several scenarios and seeds, and the flags that change them."""
-    parser.add_argument(
-        "scenario", type=source, metavar="SCENARIO", nargs="+", help=f"{SCENARIO_HELP}; or several"
-    )
-    parser.add_argument(
-        "--seed",
-        type=seeds,
-        default=(None,),
-        metavar="N",
-        help=f"{SEED_HELP}; or several, such as 1,5 or 1..20 [default: the scenario's]",
-    )
     add_scenario_flags(parser)
 
 
@@ -284,21 +267,6 @@ def natural(text: str) -> int:
     if not re.fullmatch(r"[0-9]{1,19}", text) or int(text) >= 2**63:
         raise ArgumentTypeError(f"'{text}' is not a whole number from 0 to 2^63 - 1")
     return int(text)
-
-
-def seeds(text: str) -> tuple[int, ...]:
-    """Return the seeds of a text such as 7, 1,5 or 1..20. Raises ArgumentTypeError."""
-    found: list[int] = []
-    for part in text.split(","):
-        first, dots, last = part.partition("..")
-        low = natural(first)
-        high = natural(last) if dots else low
-        if not 0 <= high - low < MOST_SEEDS:
-            raise ArgumentTypeError(f"'{part}' is not a range of 1 to {MOST_SEEDS} seeds")
-        found += range(low, high + 1)
-    if len({*found}) < len(found) or len(found) > MOST_SEEDS:
-        raise ArgumentTypeError(f"'{text}' has a seed twice, or more than {MOST_SEEDS} seeds")
-    return tuple(found)
 
 
 def cell_and_trial(text: str) -> tuple[int, int]:

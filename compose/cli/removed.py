@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -24,13 +25,23 @@ REMOVED = (
     Removed("export --gif", "use `--html`, whose page plays the mission"),
     Removed("export --mp4", "use `--html`, whose page plays the mission"),
     Removed("bench", "`uv run python -m tests.benchmark` in a clone measures the same"),
+    Removed("run SCENARIO SCENARIO", "a loop of the shell runs several files"),
+    Removed("run --seed N..N", "`tandem sweep` runs many seeds, with one table"),
 )
+
+
+def removed(name: str) -> UserError:
+    """Return the error for the row `name` of REMOVED."""
+    instead = next(one.instead for one in REMOVED if one.name == name)
+    return UserError(f"`{name}` was removed in version 0.3: {instead}")
 
 
 def refuse_removed(words: Sequence[str]) -> None:
     """Raise UserError if `words`, a command and its arguments, name something that was removed."""
     named = {words[0]} if words else set()
     named |= {f"{words[0]} {word.partition('=')[0]}" for word in words[1:] if word.startswith("--")}
-    for removed in REMOVED:
-        if removed.name in named:
-            raise UserError(f"`{removed.name}` was removed in version 0.3: {removed.instead}")
+    if "run" in named and any(re.fullmatch(r"(--seed=)?\d+(,|\.\.)[\d.,]+", word) for word in words):
+        named.add("run --seed N..N")
+    for row in REMOVED:
+        if row.name in named:
+            raise removed(row.name)

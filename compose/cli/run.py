@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from compose.cli import arguments, export
+from compose.cli.removed import removed
 from compose.errors import FAILED, STOPPED_STATUS, UserError
 from compose.extras import need
 from compose.launch import processes, supervisor
@@ -31,7 +32,8 @@ from world.scenario import Scenario
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `tandem run`."""
-    arguments.add_scenarios(parser)
+    arguments.add_scenario(parser)
+    parser.add_argument("others", nargs="*", help=argparse.SUPPRESS)  # for `compose.cli.removed`
     arguments.add_running(parser)
     parser.add_argument(
         "--in-process",
@@ -64,20 +66,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(options: argparse.Namespace) -> int:
-    """Run the mission or missions, as processes or in this one, and return the exit status of the outcome."""
+    """Run the mission, as processes or in this one, and return the exit status of its outcome."""
+    if options.others:
+        raise removed("run SCENARIO SCENARIO")
     if not options.in_process:
         supervisor.fork_server()  # it imports modules while this process does
-    missions = [(source, seed) for source in options.scenario for seed in options.seed]
-    if len(missions) > 1:
-        from compose.cli import several_runs  # noqa: PLC0415  # rarely needed
-
-        return several_runs.run_all(options, missions, run_one)
-    options.scenario, options.seed = missions[0]
-    return run_one(options)
-
-
-def run_one(options: argparse.Namespace) -> int:
-    """Run one mission, whose `scenario` and `seed` are single values, and return its exit status."""
     found = setting(options.scenario, options.fault, options.planner, options.planner_option)
     scenario = found.seeded(options.seed)
     if options.out is not None and (any(options.out.glob("*.journal")) or (options.out / KILLS).exists()):

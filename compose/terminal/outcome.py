@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
 from compose.errors import CannotWrite, status_of
 from compose.recording import run
@@ -61,8 +60,7 @@ def concluded(
     """Write `summary.json` and `ticks.csv` if `--out` is given, and yield the exit status of the outcome.
 
     The outcome is printed after the block, even if something cannot be written: the block writes further
-    files, and the reader of the output may leave at the first line. If the options have a list of
-    `results`, the content of `summary.json` is appended to it instead.
+    files, and the reader of the output may leave at the first line.
 
     `began` is the value of time.perf_counter at the start, in s. Raises UserError if the files cannot be
     written.
@@ -76,19 +74,12 @@ def concluded(
                 raise CannotWrite(folder, error) from None
         yield status_of(result["outcome"])
     finally:
-        _show(options, result)
+        if options.quiet:
+            say(outcome_line(result))
+        else:
+            from compose.terminal import progress  # noqa: PLC0415  # as above
 
-
-def _show(options: argparse.Namespace, result: dict[str, Any]) -> None:
-    """Print the outcome, or append `result`, the content of `summary.json`, to the options' `results`."""
-    if (results := getattr(options, "results", None)) is not None:
-        results.append(result)
-    elif options.quiet:
-        say(outcome_line(result))
-    else:
-        from compose.terminal import progress  # noqa: PLC0415  # as above
-
-        progress.result(result, getattr(options, "rate", None))
+            progress.result(result, getattr(options, "rate", None))
 
 
 def break_off(options: argparse.Namespace, folder: Path, reason: str, began: float) -> None:
