@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import BinaryIO
 
 import msgspec
+from mcap.records import Channel, Message
 
 from compose.errors import BadRecording
-from compose.recording.ranging.mcap_records import Channel, EndOfStream, RawMessage, entries
+from compose.recording.ranging.mcap_records import EndOfStream, entries
 from compose.recording.ranging.range_csv import TABLES
 from compose.recording.ranging.range_recording import RangeRecording
 from compose.recording.ranging.recording_rows import (
@@ -64,7 +65,7 @@ def _rows(
     counts = dict.fromkeys(TOPICS, 0)
     for entry in entries(file, path, size):
         match entry:
-            case RawMessage(channel, data):
+            case Message(channel_id=channel, data=data):
                 topic = topics.get(channel)
                 if topic is None:
                     raise BadRecording(
@@ -76,7 +77,7 @@ def _rows(
                 counts[topic] += 1
                 place = SourcePlace(f"{path}, {topic}", counts[topic], "message")
                 yield _row(data, topic, place), place
-            case Channel(number, topic, encoding):
+            case Channel(id=number, topic=topic, message_encoding=encoding):
                 topics[number] = topic
                 if topic in TOPICS and encoding != "json":
                     raise BadRecording(f"{path}: {topic} is encoded as {encoding[:40]!a}, not as 'json'")
