@@ -12,9 +12,9 @@ from compose.audit.planner_probe import BreaksContract, HostilityProbe, PurityPr
 from compose.audit.rules import audit_run
 from compose.errors import PlannerFailed, UserError
 from compose.launch import in_process, planner_loader, processes
-from compose.launch.planner_guard import GuardedPlanner
 from compose.launch.supervisor import ChildFailed
 from compose.recording import run as recorded
+from compose.recording.comparison import comparison
 from compose.recording.recording_files import WORLD_JOURNAL
 from compose.recording.run import Run
 from compose.scenario.kills import Kill, parse
@@ -94,7 +94,7 @@ def _probed(scenario: Scenario, probe: type[Watched]) -> str | None:
         def fresh() -> Planner[Any, Any]:
             return planner_loader.unguarded_planner_of(config)
 
-        return probe(GuardedPlanner(config.planner_name, fresh()), fresh)
+        return probe(config.planner_name, fresh)
 
     try:
         _journals(scenario, watched)
@@ -105,16 +105,11 @@ def _probed(scenario: Scenario, probe: type[Watched]) -> str | None:
 
 def _other(one: Mapping[str, list[bytes]], other: Mapping[str, list[bytes]]) -> str | None:
     """Return where two recordings differ first; None if they are the same."""
-    runs = recorded.of_frames(one), recorded.of_frames(other)
-    for tick in range(max(run.length for run in runs)):
-        for robot in runs[0].robots:
-            found = [run.command(robot, tick) for run in runs]
-            if found[0] != found[1]:
-                return f"the Commands of {robot} at tick {tick} differ"
-    for name in one:
-        if one[name] != other[name]:
-            return f"the Commands are the same, but not {name}"
-    return None
+    name = next((name for name in one if one[name] != other[name]), None)
+    if name is None:
+        return None
+    found = comparison(recorded.of_frames(one), recorded.of_frames(other))
+    return f"{name} has other bytes" if found.identical else found.line
 
 
 def _taken_back(run: Run) -> str | None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from agent.planning.planner import Planner, Summary
+from agent.planning.planner import Planner
 from agent.process.report_bodies import body_of, malformed, report_of
 from compose.errors import PlannerFailed
 from compose.launch.planner_guard import GuardedPlanner
@@ -41,48 +41,19 @@ class BreaksContract(Exception):
     """The planner breaks a rule of its contract; the text says which, where and when."""
 
 
-class Watched(Planner[Any, Any]):
-    """A planner that passes everything on to another. Subclasses check it."""
+class Watched(GuardedPlanner):
+    """A planner of the user that is watched. Subclasses check it."""
 
-    def __init__(self, planner: GuardedPlanner, fresh: Callable[[], Planner[Any, Any]]) -> None:
-        """`fresh` returns a new planner of the same kind, without a guard."""
-        self.planner, self.fresh = planner, fresh
-        self.BODY, self.MANOEUVRES = planner.BODY, planner.MANOEUVRES
-        self.robot, self.tick = "", 0
+    report_to = Planner.report_to
 
-    def start(self, config: RobotConfig) -> Any:
-        """Return the first state."""
-        self.robot = config.robot
-        return self.planner.start(config)
-
-    def observe(self, state: Any, observation: Observation) -> Any:
-        """Return the state with the sensor data."""
-        self.tick = observation.tick
-        return self.planner.observe(state, observation)
-
-    def report(self, state: Any) -> Any:
-        """Return the body of the report."""
-        return self.planner.report(state)
-
-    def decide(self, state: Any, reports: Sequence[Any] = ()) -> Any:
-        """Return the state with the reports."""
-        return self.planner.decide(state, reports)
-
-    def command(self, state: Any) -> Command:
-        """Return the command."""
-        return self.planner.command(state)
-
-    def estimate(self, state: Any) -> Estimate:
-        """Return the estimate."""
-        return self.planner.estimate(state)
-
-    def summary(self, state: Any) -> Summary:
-        """Return the planner's part of the FinalReport."""
-        return self.planner.summary(state)
+    def __init__(self, name: str, fresh: Callable[[], Planner[Any, Any]]) -> None:
+        """`fresh` returns a new planner of the kind `name`, without a guard."""
+        super().__init__(name, fresh())
+        self.fresh = fresh
 
     def broken(self, what: str) -> BreaksContract:
         """Return the error that says what the planner does, with robot and tick."""
-        return BreaksContract(f"{what} ({self.robot}, tick {self.tick})")
+        return BreaksContract(f"{what} ({self._robot}, tick {self._tick or 0})")
 
 
 class PurityProbe(Watched):
@@ -100,7 +71,7 @@ class PurityProbe(Watched):
 
     def observe(self, state: Any, observation: Observation) -> Any:
         """Return the state with the sensor data."""
-        self.tick = observation.tick
+        self._tick = observation.tick
         self._copy = self._of_copy("observe", self._copied(self._copy), observation)
         return self._unchanged("observe", super().observe, state, observation)
 
@@ -153,7 +124,7 @@ class PurityProbe(Watched):
             ) from None
 
     def _compare(self, method: str, answer: Any, state: Any) -> None:
-        if _frame(getattr(self.planner, method)(self._copied(state))) != _frame(answer):
+        if _frame(getattr(GuardedPlanner, method)(self, self._copied(state))) != _frame(answer):
             raise self.broken(f"{method}() gives another answer when it is called again with an equal state")
         if _frame(self._of_copy(method, self._copied(self._copy))) != _frame(answer):
             raise self.broken(
@@ -170,21 +141,23 @@ class HostilityProbe(Watched):
     def decide(self, state: Any, reports: Sequence[Any] = ()) -> Any:
         """Return the state with the true reports, after false ones have been tried."""
         for body in reports:
-            for false in _mutants(report_of(body, self.tick, self.robot), f"{self.robot}/{self.tick}"):
+            for false in _mutants(
+                report_of(body, self._tick or 0, self._robot), f"{self._robot}/{self._tick}"
+            ):
                 self._try(state, false)
         return super().decide(state, reports)
 
     def _try(self, state: Any, report: Report) -> None:
-        why = malformed(report, self.planner)
+        why = malformed(report, self)
         if why is not None:
-            if self.planner.decoder_error is not None:
-                raise self.broken(f"a false report: {self.planner.decoder_error}")
+            if self.decoder_error is not None:
+                raise self.broken(f"a false report: {self.decoder_error}")
             return
         try:
-            decided = self.planner.decide(state, [body_of(report, self.planner)])
-            self.planner.command(decided)
-            self.planner.report(decided)
-            self.planner.estimate(decided)
+            decided = super().decide(state, [body_of(report, self)])
+            self.command(decided)
+            self.report(decided)
+            self.estimate(decided)
         except PlannerFailed as error:
             raise self.broken(f"a false report that its decoder takes: {error}") from None
 
