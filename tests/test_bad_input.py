@@ -510,6 +510,7 @@ def test_an_agents_journal_is_never_overwritten(tmp_path: Path) -> None:
         ("rnu paper-1", "; did you mean 'run'?"),
         ("run paper-1 paper-2", ": a loop of the shell runs several files"),
         ("run random --seed 1..3", ": `tandem sweep` runs many seeds, with one table"),
+        ("estimate x --all-anchors", ": all anchors are used without it"),
         ("bench --rounds 3", ": `uv run python -m tests.benchmark` in a clone measures the same"),
         ("run paper-1 --sede 3", "tandem run: unrecognized arguments: --sede 3; did you mean '--seed'?"),
         ("figures x --out y", "tandem figures: unrecognized arguments: --out y"),

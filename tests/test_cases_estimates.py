@@ -224,12 +224,6 @@ def test_of_two_robots_one_needs_no_anchor() -> None:
     assert found.robots["s"].final.position_error_m < 0.5
 
 
-def test_the_flag_of_earlier_versions_is_accepted_and_says_that_it_is_the_default() -> None:
-    ended = tandem("estimate", STANDING, "--all-anchors", "--window", "0..5")
-    assert ended.status == NOT_LOCALISED
-    assert ended.err == "tandem estimate: --all-anchors is the default, and goes with the next version\n"
-
-
 # --- odometry ---------------------------------------------------------------------------------------------
 
 

@@ -250,7 +250,7 @@ def test_a_planner_that_raises_an_error_is_one_line(mode: tuple[str, ...]) -> No
 
 
 BROKEN = {
-    "Drawing": ("two runs", "the Commands of b at tick 1 differ"),
+    "Drawing": ("two runs", "the first difference is in tick 1: b's command"),
     "Clock": ("two runs", "the first difference is in tick 0: a's command"),
     "Remembers": ("equal arguments", "another answer when it is called again"),
     "Idle": ("equal arguments", "command() of a new object of the class raises AttributeError"),

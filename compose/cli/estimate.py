@@ -54,11 +54,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_part_of_recording(parser)
     parser.add_argument(
-        "--all-anchors",
-        action="store_true",
-        help=argparse.SUPPRESS,  # of earlier versions
-    )
-    parser.add_argument(
         "--accuracy",
         type=positive,
         default=0.3,
@@ -95,8 +90,6 @@ def main(options: argparse.Namespace) -> int:
     from compose.recording.estimating.estimate_run import estimated, measurements  # noqa: PLC0415  # numpy
     from compose.recording.ranging.range_files import read_ranges  # noqa: PLC0415
 
-    if options.all_anchors:
-        say("tandem estimate: --all-anchors is the default, and goes with the next version", error=True)
     stopped = None
     rule = estimate_epoch.ClaimRule(options.accuracy, options.confidence)
     if options.follow:

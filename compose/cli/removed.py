@@ -25,6 +25,7 @@ REMOVED = (
     Removed("export --gif", "use `--html`, whose page plays the mission"),
     Removed("export --mp4", "use `--html`, whose page plays the mission"),
     Removed("bench", "`uv run python -m tests.benchmark` in a clone measures the same"),
+    Removed("estimate --all-anchors", "all anchors are used without it"),
     Removed("run SCENARIO SCENARIO", "a loop of the shell runs several files"),
     Removed("run --seed N..N", "`tandem sweep` runs many seeds, with one table"),
 )
