@@ -9,13 +9,9 @@ from functools import cache
 from statistics import median
 from typing import Any
 
-import numpy as np
 from msgspec.structs import replace
 
 import tandem
-from agent.estimation.gaussian.hypotheses import search
-from agent.estimation.gaussian.odometry_noise import track
-from agent.estimation.gaussian.range_model import PairRanges, Ranges, predict
 from agent.process.robot import Robot
 from compose.launch import in_process
 from compose.launch.planner_loader import planner_of
@@ -31,8 +27,6 @@ FIRST_SEED = 1000
 """The seed of the first of all random missions."""
 SIGMA = 0.1
 """The standard deviation of all ranges in the noisy missions (m)."""
-RANGES = 322
-"""The number of ranges of each kind in the measured search."""
 GROUP_SIZES = (8, 32)
 """The numbers of robots of the groups."""
 BY_API = {"random": 50, "noisy": 5}
@@ -95,8 +89,8 @@ def missions_by_api(number: int) -> dict[str, float]:
     return values
 
 
-def noisy_missions(number: int) -> dict[str, float]:
-    """Measure random missions with ranges of SIGMA by their parts, and a search."""
+def noisy_missions(_: int) -> dict[str, float]:
+    """Measure random missions with ranges of SIGMA by their parts."""
     exact, noisy = _parts(random_missions(20)), _parts(random_missions(20, SIGMA))
     return {
         "one mission, both robots (at most 150), ms": 50.0 * sum(noisy),
@@ -104,7 +98,6 @@ def noisy_missions(number: int) -> dict[str, float]:
         "of that, decisions in contact (phase 3), ms": 50.0 * noisy[1],
         "of that, the world, ms": 50.0 * noisy[2],
         "noisy / exact": sum(noisy) / sum(exact),
-        f"a search over {3 * RANGES} ranges (at most 200), ms": 1e3 * _search_s(number),
     }
 
 
@@ -138,24 +131,6 @@ def _parts(scenarios: Sequence[Scenario]) -> tuple[float, float, float]:
             sensing += observed - sensed
             deciding += decided - observed
     return sensing, deciding, world
-
-
-def _search_s(number: int) -> float:
-    """Return the time (s) of a search with RANGES ranges of each kind, between robots that circle.
-
-    Ranges that were searched before are not searched again, so each round has others.
-    """
-    noise = Noise(anchor_sigma=SIGMA, mutual_sigma=SIGMA)
-    every, ticks = [(tick, 0.0) for tick in range(RANGES)], np.arange(RANGES - 1)
-    paths = [track(np.full(RANGES - 1, 0.5), turn + 0.2 * np.sin(ticks), 1.0) for turn in (0.5, -0.35)]
-    ranges = Ranges.of_lists(every, every, every, noise)
-    apart, none = (1.5, 0.0), np.empty(0, np.intp)
-    true = predict(np.array((0.4, 0.9, 0.3, -0.2, 1.0, -0.8)), paths, ranges, apart).distance
-    errors = SIGMA * np.random.default_rng(number).normal(size=3 * RANGES)
-    pair = PairRanges(
-        (paths[0], paths[1]), ranges._replace(rho=true + errors), (none, none, none), apart, 10.0, noise
-    )
-    return seconds(search, [pair])
 
 
 def _with_noise(exact: Scenario, noise: Noise) -> Scenario:

@@ -10,7 +10,6 @@ from pathlib import Path
 from statistics import median
 
 from compose.launch import in_process, processes
-from compose.launch.page_process import serving
 from compose.launch.supervisor import COMMAND, STOP_S, Supervisor
 from compose.network import KEYED
 from compose.recording.recording_files import WORLD_JOURNAL
@@ -43,7 +42,6 @@ def ticks_per_second(_: int) -> dict[str, float]:
         f"baseline: frames of {sizes[0]} and {sizes[1]} bytes, ticks/s": barrier,
         "mission / baseline (at least 0.5)": mission / barrier,
         "with journals / without (at least 0.85)": mission / _mission_rate(scenario, journals=False),
-        "with a client of the page / without (at least 0.6)": _mission_rate(scenario, watched=True) / mission,
         "TLS and access control / without (at least 0.75)": _mission_rate(scenario, secured=True) / mission,
     }
 
@@ -63,43 +61,27 @@ def _frame_sizes() -> tuple[int, int]:
 
 
 @contextmanager
-def _processes(
-    commands: Sequence[Sequence[str]], *, main: str = COMMAND, until_ended: bool = False
-) -> Iterator[None]:
-    """Run a process that calls `main`, a module:function, with each of `commands`, and stop them at the end.
-
-    With `until_ended`, wait at most STOP_S for all to end first.
-    """
+def _processes(commands: Sequence[Sequence[str]], main: str = COMMAND) -> Iterator[None]:
+    """Run a process that calls `main`, a module:function, with each of `commands`; stop them at the end."""
     children = Supervisor(Inbox("benchmark"))
     try:
         for number, arguments in enumerate(commands):
             children.start(str(number), *arguments, main=main)
         yield
-        if until_ended:
-            children.wait(STOP_S)
+        children.wait(STOP_S)
     finally:
         children.stop()
 
 
-def _mission_rate(
-    scenario: Scenario, *, journals: bool = True, watched: bool = False, secured: bool = False
-) -> float:
-    """Return the ticks per second of a mission as processes.
-
-    With `watched`, a page is served and a client reads it; with `secured`, all links are encrypted.
-    """
+def _mission_rate(scenario: Scenario, *, journals: bool = True, secured: bool = False) -> float:
+    """Return the ticks per second of a mission as processes; with `secured`, all links are encrypted."""
     with ExitStack() as stack:
         endpoints, keyed = _endpoints(scenario, secured, stack)
         folder = stack.enter_context(tempfile.TemporaryDirectory())
-        clients = []
-        if watched:
-            page = stack.enter_context(serving(Path(folder), 0, Inbox("benchmark")))
-            clients.append([page.address])
         common = ["--connect", str(endpoints), "--quiet", *(["--out", folder] if journals else [])]
         robots = [["agent", robot.id, *keyed(robot.id), *common] for robot in scenario.robots]
         with (
-            _processes(clients, main="tests.benchmark.page_client:main"),
-            _processes(robots, until_ended=True),
+            _processes(robots),
             session.open_router(endpoints) as link,
             Journal(Path(folder) / WORLD_JOURNAL) if journals else nullcontext() as journal,
         ):
@@ -128,6 +110,6 @@ def _barrier_rate(scenario: Scenario, sizes: tuple[int, int]) -> float:
     robots = [[endpoint, robot, str(sizes[1]), str(BARRIER_TICKS)] for robot in ids]
     with (
         session.open_router(listening(endpoint)) as link,
-        _processes(robots, main="tests.benchmark.zenoh_baseline:main", until_ended=True),
+        _processes(robots, "tests.benchmark.zenoh_baseline:main"),
     ):
         return BARRIER_TICKS / zenoh_baseline.world(link, ids, sizes[0], BARRIER_TICKS)
