@@ -117,7 +117,7 @@ def test_the_steps_compose_to_the_same_pose_as_the_recorded_increments(
 
 @given(odometries(), odometries(), stamps, st.floats(0.1, 1.0))
 @pytest.mark.long
-def test_a_range_lies_at_its_time_and_at_the_pose_of_that_time(
+def test_a_range_lies_at_its_time(
     a: RobotOdometry, b: RobotOdometry, ranges: list[tuple[float, int, int]], period_s: float
 ) -> None:
     recording = recording_of([a, b], ranges)
@@ -131,12 +131,6 @@ def test_a_range_lies_at_its_time_and_at_the_pose_of_that_time(
     np.testing.assert_allclose(begin + found.fraction * (end - begin), found.ranges.t, rtol=0, atol=1e-9)
     assert len(found.ranges.t) + found.outside == len(ranges)
     assert found.thinned == 0
-    for robot, odometry in enumerate((a, b)):
-        bases = dead_reckoned(odometry, begin)
-        poses = dead_reckoned(odometry, found.ranges.t)
-        for base, offset, pose in zip(bases, found.offsets[robot], poses, strict=True):
-            at = composed(Pose(*map(float, base)), Pose(*map(float, offset)))
-            assert_same_pose(at, Pose(*map(float, pose)))
 
 
 @given(odometries(st.just(0.0)), st.floats(0.1, 1.0), stamps)
@@ -158,21 +152,16 @@ def test_thinned_ranges_of_a_pair_are_apart_and_none_is_left_out_without_one_bef
 
 
 @given(odometries(), st.floats(0.1, 1.0))
-def test_steps_and_gaps_together_last_as_long_as_the_odometry(
-    odometry: RobotOdometry, period_s: float
-) -> None:
+def test_the_steps_last_as_long_as_the_odometry(odometry: RobotOdometry, period_s: float) -> None:
     found = steps_of(recording_of([odometry], []), ["0"], StepOptions(period_s))
     assert np.all(np.diff(found.t) > 0.0)
     assert found.t[0] == odometry.t0[0]
     assert odometry.t1[-1] - found.t[-1] < period_s + SAME_TIME_S
-    gaps = [min(end, found.t[-1]) - min(begin, found.t[-1]) for begin, end in odometry.gaps]
-    assert math.isclose(np.sum(found.missing_s), sum(gaps), abs_tol=len(found.t) * 2 * SAME_TIME_S)
 
 
-def test_a_step_in_a_gap_has_no_motion_and_says_how_much_is_missing() -> None:
+def test_a_step_in_a_gap_has_no_motion() -> None:
     odometry = odometry_of([0.0, 4.0], [1.5, 5.0], [(0.3, 0.0, 0.0), (0.4, 0.0, 0.0)])
     found = steps_of(recording_of([odometry], []), ["0"])
-    np.testing.assert_allclose(found.missing_s, [[0.0, 0.5, 1.0, 1.0, 0.0]], atol=1e-12)
     np.testing.assert_allclose(found.increments[0, :, 0], [0.2, 0.1, 0.0, 0.0, 0.4], atol=1e-12)
     np.testing.assert_allclose(found.covariance[0, :, 0, 0], [1e-4 / 1.5, 0.5e-4 / 1.5, 0.0, 0.0, 1e-4])
 
@@ -209,19 +198,16 @@ def test_the_covariance_of_a_step_is_that_of_its_increments_by_finite_difference
 
 
 @given(st.integers(0, 199), st.sampled_from([0, 2]), st.sampled_from([-1.0, 1.0]))
-def test_a_gross_increment_is_flagged_in_its_step_and_no_other(row: int, axis: int, sign: float) -> None:
+def test_a_gross_increment_is_flagged_and_no_other(row: int, axis: int, sign: float) -> None:
     begin = 0.05 * np.arange(200)
     increments = np.tile([0.02, 0.0, 0.03], (200, 1)) * np.linspace(0.0, 1.0, 200)[:, None]
     increments[row, axis] = sign * 0.5
     odometry = odometry_of(list(begin), [*begin[1:], 10.0], list(map(tuple, increments.tolist())))
-    assert list(np.flatnonzero(gross(odometry))) == [row]
-    found = steps_of(recording_of([odometry], []), ["0"], StepOptions(0.5))
-    assert list(np.flatnonzero(found.gross[0])) == [row // 10]
+    assert list(np.flatnonzero(gross(odometry, speed_bound(odometry)))) == [row]
 
 
-def test_stated_bounds_replace_those_of_the_recording() -> None:
+def test_an_increment_above_either_bound_is_gross() -> None:
     odometry = odometry_of([0.0, 1.0], [1.0, 2.0], [(0.5, 0.0, 0.1), (0.1, 0.0, 0.4)])
-    assert list(gross(odometry)) == [False, False]
     assert list(gross(odometry, SpeedBound(0.4, 0.3))) == [True, True]
     assert list(gross(odometry, SpeedBound(0.6, 0.3))) == [False, True]
     standing = odometry_of([0.0], [1.0], [(0.0, 0.0, 0.0)])
@@ -235,8 +221,6 @@ def pair_steps() -> RangeSteps:
 def test_the_sample_has_29_steps_and_a_range_of_each_pair_in_nearly_every_one() -> None:
     found = pair_steps()
     assert found.increments.shape == (2, 29, 3)
-    assert not found.gross.any()
-    assert not found.missing_s.any()
     pairs = {
         pair: len(rows) for pair, rows in read_ranges(SAMPLE)._replace(ranges=found.ranges).pairs().items()
     }

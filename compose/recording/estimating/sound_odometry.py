@@ -16,7 +16,6 @@ from compose.recording.ranging.range_recording import SAME_TIME_S, Numbers, Plac
 from compose.recording.ranging.range_steps import (
     GROSS_FACTOR,
     Flags,
-    SpeedBound,
     gross,
     speed_bound,
 )
@@ -43,15 +42,13 @@ class SoundOdometry(NamedTuple):
     """The indices of the recorded increments whose turn was off by a whole turn, which was removed."""
 
 
-def sound(
-    odometry: RobotOdometry, told: VelocityNoise | None = None, bounds: SpeedBound | None = None
-) -> SoundOdometry:
+def sound(odometry: RobotOdometry, told: VelocityNoise | None = None) -> SoundOdometry:
     """Return `odometry` with gross increments replaced and gaps filled.
 
-    `told` is its noise over one second; None for the stated covariances. `bounds` are those of `gross`.
+    `told` is its noise over one second; None for the stated covariances.
     """
     odometry, whole_turns = _without_whole_turns(odometry)
-    bound = bounds or speed_bound(odometry)
+    bound = speed_bound(odometry)
     flagged = gross(odometry, bound)
     lasts = odometry.t1 - odometry.t0
     increments, covariance = odometry.increments.copy(), _covariance(odometry, told)

@@ -46,8 +46,6 @@ class StepOptions(NamedTuple):
     The errors of a radio's ranges within a second are correlated (0.2 to 0.7 was measured on UWB), so that
     more ranges would count for more than they tell.
     """
-    bounds: SpeedBound | None = None
-    """The bounds for gross increments; None for those of `speed_bound`."""
 
 
 class RangeSteps(NamedTuple):
@@ -63,21 +61,12 @@ class RangeSteps(NamedTuple):
     """dx (m), dy (m) and dheading (rad) of each step, in the frame of its start; shape (R, K, 3)."""
     covariance: Numbers
     """The stated covariance of each step's increment; NaN where none is stated; shape (R, K, 3, 3)."""
-    missing_s: Numbers
-    """The time in s of each step without odometry; its motion is not in `increments`; shape (R, K)."""
-    gross: Flags
-    """True for a step with an increment faster than the bounds; shape (R, K)."""
     ranges: RangeSeries
     """The ranges that are kept; `first` and `second` are indices into the radios of the recording."""
     step: Places
     """The step in which each range lies; shape (M,)."""
     fraction: Numbers
     """The time of each range within its step, as a fraction of the step, from 0 to 1; shape (M,)."""
-    offsets: Numbers
-    """dx (m), dy (m) and dheading (rad) from the start of the step to each range; shape (R, M, 3).
-
-    They are those of the recorded increments, of which a step can have many.
-    """
     outside: int
     """The number of ranges that are left out since they are before the first step or after the last."""
     thinned: int
@@ -113,18 +102,14 @@ def steps_of(
     kept = known.rows(spaced(known, options.range_spacing_s))
     step = _step_at(kept.t, t)
     poses = [dead_reckoned(path, t) for path in paths]
-    offsets = [relative(at[step], dead_reckoned(path, kept.t)) for path, at in zip(paths, poses, strict=True)]
     return RangeSteps(
         tuple(robots),
         locked(t),
         locked(np.stack([relative(at[:-1], at[1:]) for at in poses])),
         locked(np.stack([step_covariance(path, t) for path in paths])),
-        locked(np.stack([_missing(path, t) for path in paths])),
-        locked(np.stack([_steps_with(gross(path, options.bounds), path, t) for path in paths])),
         kept,
         locked(step),
         locked((kept.t - t[step]) / (t[step + 1] - t[step])),
-        locked(np.stack(offsets)),
         int(np.count_nonzero(~inside)),
         len(known.t) - len(kept.t),
         int(np.count_nonzero(in_gap)),
@@ -310,22 +295,6 @@ def step_covariance(odometry: RobotOdometry, t: Numbers) -> Numbers:
     return covariance
 
 
-def _missing(odometry: RobotOdometry, t: Numbers) -> Numbers:
-    """Return the time in s of each step in which there is no odometry; shape (K,)."""
-    _, step, begin, end = _parts(odometry, t)
-    missing = np.diff(t)
-    np.subtract.at(missing, step, end - begin)
-    return np.where(missing > SAME_TIME_S, missing, 0.0)
-
-
-def _steps_with(flagged: Flags, odometry: RobotOdometry, t: Numbers) -> Flags:
-    """Return whether each step has a part of a flagged increment; shape (K,)."""
-    row, step, _, _ = _parts(odometry, t)
-    found = np.zeros(len(t) - 1, bool)
-    found[step[flagged[row]]] = True
-    return found
-
-
 GROSS_FACTOR = 3.0
 """The factor by which an increment must be faster than nearly all others to be gross.
 
@@ -358,9 +327,8 @@ def speed_bound(odometry: RobotOdometry) -> SpeedBound:
     return SpeedBound(*bounds)
 
 
-def gross(odometry: RobotOdometry, bound: SpeedBound | None = None) -> Flags:
-    """Return whether each increment is faster than `bound`, or than `speed_bound` if it is None; (N,)."""
-    v, omega = bound or speed_bound(odometry)
+def gross(odometry: RobotOdometry, bound: SpeedBound) -> Flags:
+    """Return whether each increment is faster than `bound`; shape (N,)."""
     speed, rate = speeds(odometry)
-    flags: Flags = (speed > v) | (rate > omega)
+    flags: Flags = (speed > bound.v) | (rate > bound.omega)
     return flags
