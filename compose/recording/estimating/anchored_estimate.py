@@ -28,7 +28,6 @@ from compose.recording.estimating.prepared_steps import (
     Measurements,
     OneRobot,
     horizon,
-    levelled,
     prepared_steps,
 )
 from compose.recording.estimating.recorded_noise import RecordedNoise
@@ -86,36 +85,24 @@ def anchored_measurements(
     ranges to two anchors at different places.
     """
     prepared = prepared_steps(recording, [robot], assumed, ticks)
-    part, steps = prepared.part, prepared.steps
-    ranges = steps.ranges
-    counts = [int(np.count_nonzero(ranges.second == 1 + k)) for k in range(len(part.anchors))]
-    order = sorted([k for k, count in enumerate(counts) if count], key=lambda k: -counts[k])
-    anchors = tuple([part.anchors[k] for k in order])
+    ranges, anchors = prepared.steps.ranges, prepared.anchors_of(0)
     if len({(one.x, one.y) for one in anchors}) < 2:
         names = listed([one.id for one in anchors]) or "no anchor"
         raise NoAnchors(
             f"{recording.source}: one robot needs ranges to two anchors at different places: "
             f"{robot} has ranges to {names}"
         )
-    radio = np.argsort(order)[np.searchsorted(np.sort(order), ranges.second - 1)]
+    place, radios = {one.id: k for k, one in enumerate(anchors)}, prepared.part.radios
+    radio = np.array([place[radios[second]] for second in ranges.second], np.intp)
     places = np.array([(one.x - anchors[0].x, one.y - anchors[0].y) for one in anchors])
-    heights = np.array([one.height for one in anchors])
-    rho, ratio = levelled(ranges.range, part.robots[0].antenna[2] - heights[radio])
-    sigma = prepared.sigmas(np.full(len(rho), assumed.noise.anchor_sigma), ranges.sigma) * ratio
-    unused = {"within a second after another": steps.thinned, "without odometry": steps.outside}
-    unused["in a gap of the odometry"] = steps.in_gaps
+    rho, sigma = prepared.in_plane(np.arange(len(ranges.t)))
     return AnchoredMeasurements(
         robot=prepared.robot(0, anchors),
-        t0=float(steps.t[0]),
-        ticks_per_epoch=prepared.ticks_per_epoch,
         ranges=Ranges(
             locked(rho), locked(prepared.ticks), locked(sigma), (len(rho), 0, 0), places[radio], radio
         ),
         t=ranges.t,
-        noise=assumed.noise,
-        unused={why: count for why, count in unused.items() if count},
-        skipped_s=steps.skipped_s,
-        arrivals=prepared.arrivals,
+        **prepared.shared(""),
     )
 
 

@@ -15,7 +15,6 @@ from compose.recording.estimating.prepared_steps import (
     OneRobot,
     PreparedSteps,
     horizon,
-    levelled,
     prepared_steps,
 )
 from compose.recording.estimating.recorded_noise import RecordedNoise
@@ -66,41 +65,26 @@ def group_measurements(
     """
     prepared = prepared_steps(recording, robots, assumed, ticks)
     steps = prepared.steps
-    members = tuple([prepared.robot(i, _anchors_of(i, prepared)) for i in range(len(robots))])
+    members = tuple(
+        [prepared.robot(i, prepared.anchors_of(i)[:MOST_USED_ANCHORS]) for i in range(len(robots))]
+    )
     anchors = tuple({one.id: one for robot in members for one in robot.anchors}.values())
     ranges = list(_ranges(prepared, members))
     known = [*_anchors(anchors), *ranges]
     for one in members:
         known += _manoeuvres(one.id, one.path)
     joint = joint_measurements(Facts(frozenset(known)), assumed.noise, EPOCH_S / prepared.ticks_per_epoch)
-    unused = {
-        f"to others than the {MOST_USED_ANCHORS} anchors with the most": len(steps.ranges.t) - len(ranges),
-        "within a second after another": steps.thinned,
-        "without odometry of all robots": steps.outside,
-        "in a gap of the odometry": steps.in_gaps,
-    }
-    t0 = float(steps.t[0])
+    others = f"to others than the {MOST_USED_ANCHORS} anchors with the most"
     return GroupMeasurements(
         members=members,
         joint=joint,
-        t0=t0,
-        ticks_per_epoch=prepared.ticks_per_epoch,
         ranges=joint.ranges.single,
-        t=np.asarray(t0 + joint.period * joint.ranges.tick + steps.skipped_s[joint.ranges.tick], np.float64),
-        noise=assumed.noise,
-        unused={why: count for why, count in unused.items() if count},
-        skipped_s=steps.skipped_s,
-        arrivals=prepared.arrivals,
+        t=np.asarray(
+            float(steps.t[0]) + joint.period * joint.ranges.tick + steps.skipped_s[joint.ranges.tick],
+            np.float64,
+        ),
+        **prepared.shared(" of all robots", **{others: len(steps.ranges.t) - len(ranges)}),
     )
-
-
-def _anchors_of(robot: int, prepared: PreparedSteps) -> tuple[FixedAnchor, ...]:
-    """Return the anchors to which a robot has ranges, at most MOST_USED_ANCHORS, that with the most first."""
-    part, ranges = prepared.part, prepared.steps.ranges
-    seconds = ranges.second[ranges.first == robot] - len(part.robots)
-    counts = np.bincount(seconds[seconds >= 0], minlength=len(part.anchors)).tolist()
-    order = sorted([k for k, count in enumerate(counts) if count], key=lambda k: -counts[k])
-    return tuple([part.anchors[k] for k in order[:MOST_USED_ANCHORS]])
 
 
 MOST_USED_ANCHORS = 32
@@ -127,11 +111,8 @@ def _ranges(prepared: PreparedSteps, members: Sequence[OneRobot]) -> Iterator[Fa
     """Yield the ranges between `members` and to their anchors in the plane, each at the nearest tick."""
     names_of_members = {one.id for one in members}
     used = [names_of_members | {anchor.id for anchor in one.anchors} for one in members]
-    part, ranges, noise = prepared.part, prepared.steps.ranges, prepared.assumed.noise
-    heights = np.array([*[one.antenna[2] for one in part.robots], *[one.height for one in part.anchors]])
-    rho, ratio = levelled(ranges.range, heights[ranges.first] - heights[ranges.second])
-    mutual, radios = ranges.second < len(part.robots), part.radios
-    sigma = prepared.sigmas(np.where(mutual, noise.mutual_sigma, noise.anchor_sigma), ranges.sigma) * ratio
+    part, ranges, radios = prepared.part, prepared.steps.ranges, prepared.part.radios
+    rho, sigma = prepared.in_plane(np.arange(len(ranges.t)))
     rows = zip(prepared.ticks, ranges.first, ranges.second, rho, sigma, strict=True)
     for tick, first, second, length, own in rows:
         names = radios[first], radios[second]

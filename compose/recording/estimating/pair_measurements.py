@@ -12,7 +12,6 @@ from compose.recording.estimating.prepared_steps import (
     Measurements,
     OneRobot,
     horizon,
-    levelled,
     prepared_steps,
 )
 from compose.recording.estimating.recorded_noise import RecordedNoise
@@ -90,35 +89,20 @@ def pair_measurements(
     Each robot has ranges to one anchor, that in `of_anchor`; they are at different places. `ticks` is the
     number of ticks in an epoch; None: by the speed of the robots.
     """
-    noise = assumed.noise
     prepared = prepared_steps(recording, robots, assumed, ticks)
-    part, steps = prepared.part, prepared.steps
-    ranges = steps.ranges
+    ranges = prepared.steps.ranges
     mutual = ranges.second < len(robots)
     lists = [*[np.flatnonzero(~mutual & (ranges.first == robot)) for robot in (0, 1)], np.flatnonzero(mutual)]
     used = np.concatenate(lists)
-    heights = np.array([*[one.antenna[2] for one in part.robots], *[one.height for one in part.anchors]])
-    rho, ratio = levelled(ranges.range[used], heights[ranges.first[used]] - heights[ranges.second[used]])
+    rho, sigma = prepared.in_plane(used)
     counts = (len(lists[0]), len(lists[1]), len(lists[2]))
-    told = np.repeat([noise.anchor_sigma, noise.anchor_sigma, noise.mutual_sigma], counts)
-    sigma = prepared.sigmas(told, ranges.sigma[used]) * ratio
     a, b = [prepared.robot(i, (own,)) for i, own in enumerate(of_anchor)]
-    unused = {
-        "within a second after another": steps.thinned,
-        "without odometry of both robots": steps.outside,
-        "in a gap of the odometry": steps.in_gaps,
-    }
     return PairMeasurements(
         a=a,
         b=b,
-        t0=float(steps.t[0]),
-        ticks_per_epoch=prepared.ticks_per_epoch,
         ranges=Ranges(locked(rho), locked(prepared.ticks[used]), locked(sigma), counts),
         t=locked(ranges.t[used].copy()),
-        noise=noise,
-        unused={why: count for why, count in unused.items() if count},
-        skipped_s=steps.skipped_s,
-        arrivals=prepared.arrivals,
+        **prepared.shared(" of both robots"),
     )
 
 
@@ -127,13 +111,7 @@ def ranged_anchors(recording: RangeRecording, robots: Sequence[str]) -> list[tup
 
     Raises NoAnchors unless they are at two different places.
     """
-    ranges, base = recording.ranges, len(recording.robots)
-    found = []
-    for robot in range(len(robots)):
-        seconds = ranges.second[(ranges.first == robot) & (ranges.second >= base)] - base
-        counts = np.bincount(seconds, minlength=len(recording.anchors)).tolist()
-        order = sorted([k for k, count in enumerate(counts) if count], key=lambda k: -counts[k])
-        found.append(tuple([recording.anchors[k] for k in order]))
+    found = [recording.anchors_of(robot) for robot in range(len(robots))]
     if len({(one.x, one.y) for own in found for one in own}) < 2:
         heard = [
             f"{name} has ranges to {listed([one.id for one in own]) or 'no anchor'}"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -170,11 +170,40 @@ class PreparedSteps(NamedTuple):
         path = path_of_steps(steps.increments[place], steps.covariance[place], period)
         return OneRobot(robot.id, anchors, path, self.sound[place], robot.antenna)
 
-    def sigmas(self, told: Numbers, stated: Numbers) -> Numbers:
-        """Return the sigmas (m) of ranges: those `told`, or `stated` by the recording if these are used."""
+    def anchors_of(self, robot: int) -> tuple[FixedAnchor, ...]:
+        """Return the anchors to which the robot at this place has ranges, that with the most first."""
+        return self.part._replace(ranges=self.steps.ranges).anchors_of(robot)
+
+    def in_plane(self, rows: Places) -> tuple[Numbers, Numbers]:
+        """Return these ranges in the plane (m), and their sigmas (m)."""
+        part, ranges, noise = self.part, self.steps.ranges.rows(rows), self.assumed.noise
+        heights = np.array([*[one.antenna[2] for one in part.robots], *[one.height for one in part.anchors]])
+        rho, ratio = levelled(ranges.range, heights[ranges.first] - heights[ranges.second])
+        sigma = np.where(ranges.second < len(part.robots), noise.mutual_sigma, noise.anchor_sigma)
         if self.assumed.stated:
-            told = np.where(np.isfinite(stated), stated, told)
-        return np.maximum(told, SIGMA_FLOOR)
+            sigma = np.where(np.isfinite(ranges.sigma), ranges.sigma, sigma)
+        return rho, np.maximum(sigma, SIGMA_FLOOR) * ratio
+
+    def shared(self, robots: str, **left_out: int) -> dict[str, Any]:
+        """Return the fields that all Measurements have in common; `robots` are those with odometry.
+
+        `left_out` are further numbers of ranges that are not used, by the reason.
+        """
+        steps = self.steps
+        unused = {
+            **left_out,
+            "within a second after another": steps.thinned,
+            f"without odometry{robots}": steps.outside,
+            "in a gap of the odometry": steps.in_gaps,
+        }
+        return {
+            "t0": float(steps.t[0]),
+            "ticks_per_epoch": self.ticks_per_epoch,
+            "noise": self.assumed.noise,
+            "unused": {why: count for why, count in unused.items() if count},
+            "skipped_s": steps.skipped_s,
+            "arrivals": self.arrivals,
+        }
 
 
 def prepared_steps(

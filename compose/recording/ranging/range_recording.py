@@ -152,6 +152,13 @@ class RangeRecording(NamedTuple):
             for one in np.unique(key)
         }
 
+    def anchors_of(self, robot: int) -> tuple[FixedAnchor, ...]:
+        """Return the anchors to which the robot at this place has ranges, that with the most first."""
+        seconds = self.ranges.second[self.ranges.first == robot] - len(self.robots)
+        counts = np.bincount(seconds[seconds >= 0], minlength=len(self.anchors)).tolist()
+        order = sorted([k for k, count in enumerate(counts) if count], key=lambda k: -counts[k])
+        return tuple([self.anchors[k] for k in order])
+
     def part(self, robots: Iterable[str], first_s: float, last_s: float) -> RangeRecording:
         """Return the part with `robots`, in their order, over [first_s, last_s].
 
