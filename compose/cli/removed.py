@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn
 
 from compose.errors import UserError
 
@@ -37,11 +37,16 @@ def removed(name: str) -> UserError:
     return UserError(f"`{name}` was removed in version 0.3: {instead}")
 
 
+def another_scenario(_: str) -> NoReturn:
+    """Raise UserError, as the type of a second scenario of `tandem run`."""
+    raise removed("run SCENARIO SCENARIO")
+
+
 def refuse_removed(words: Sequence[str]) -> None:
     """Raise UserError if `words`, a command and its arguments, name something that was removed."""
     named = {words[0]} if words else set()
     named |= {f"{words[0]} {word.partition('=')[0]}" for word in words[1:] if word.startswith("--")}
-    if "run" in named and any(re.fullmatch(r"(--seed=)?\d+(,|\.\.)[\d.,]+", word) for word in words):
+    if "run" in named and re.search(r"--seed[ =]\S+(,|\.\.)", " ".join(words)):
         named.add("run --seed N..N")
     for row in REMOVED:
         if row.name in named:

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from compose.cli import arguments, export
-from compose.cli.removed import removed
+from compose.cli.removed import another_scenario
 from compose.errors import FAILED, STOPPED_STATUS, UserError
 from compose.extras import need
 from compose.launch import processes, supervisor
@@ -33,7 +33,7 @@ from world.scenario import Scenario
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `tandem run`."""
     arguments.add_scenario(parser)
-    parser.add_argument("others", nargs="*", help=argparse.SUPPRESS)  # for `compose.cli.removed`
+    parser.add_argument("others", nargs="*", type=another_scenario, help=argparse.SUPPRESS)
     arguments.add_running(parser)
     parser.add_argument(
         "--in-process",
@@ -67,8 +67,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(options: argparse.Namespace) -> int:
     """Run the mission, as processes or in this one, and return the exit status of its outcome."""
-    if options.others:
-        raise removed("run SCENARIO SCENARIO")
     if not options.in_process:
         supervisor.fork_server()  # it imports modules while this process does
     found = setting(options.scenario, options.fault, options.planner, options.planner_option)
