@@ -3,27 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import gc
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from compose.cli.arguments import add_closing, add_recording, folder
+from compose.cli.export_files import EXPORT_MODULES, exported
 from compose.cli.recording import note, read_noted
 from compose.errors import ENDED, FAILED, CannotWrite
 from compose.extras import need
 from compose.recording.recording_files import make_folder, user_errors
-from compose.recording.run import Run
-from compose.terminal.outcome import counting
 from compose.terminal.text_width import tell
 from protocol import files
 from protocol.output import say
-
-if TYPE_CHECKING:
-    from compose.view.export.folder import Exported
-
-MODULES = ("foxglove", "pyarrow")
-"""The optional libraries that an export of all files needs; the caller checks that they are installed."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -66,7 +56,7 @@ def main(options: argparse.Namespace) -> int:
         return _html(options.recording, out)
     if options.rerun:
         return _rerun(options.recording, out)
-    need(*MODULES)
+    need(*EXPORT_MODULES)
     done = exported(options.recording, out)
     for path in done.files:
         say(str(path))
@@ -75,27 +65,6 @@ def main(options: argparse.Namespace) -> int:
     for name in done.missing:
         note("export", [f"{name} is missing"])
     return FAILED if done.missing else ENDED
-
-
-def exported(
-    folder: Path,
-    out: Path,
-    check: Callable[[], object] = lambda: None,
-    *,
-    run: Run | None = None,
-    quiet: bool = False,
-) -> Exported:
-    """Export the recording in `folder` to `out`, with a progress bar unless `quiet`.
-
-    `check` is called repeatedly, and may raise an exception to end the export. `run` is the recording if it
-    has been read already. Raises UserError if a file cannot be read or written.
-    """
-    from compose.view.export.folder import FILES, export  # noqa: PLC0415  # slow to import, and optional
-
-    with user_errors(folder), counting("export", 0 if quiet else len(FILES)) as done:
-        run = run or read_noted(folder, "export")
-        gc.freeze()  # else each garbage collection goes through all messages again
-        return export(run, out, done=done, check=check)
 
 
 def _pyfg(recording: Path, out: Path) -> int:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from compose.cli import arguments, export
+from compose.cli import arguments, export_files
 from compose.cli.removed import another_scenario
 from compose.errors import FAILED, STOPPED_STATUS, UserError
 from compose.extras import need
@@ -76,7 +76,7 @@ def main(options: argparse.Namespace) -> int:
     if options.port is not None and not options.watch:
         raise UserError("--port: it needs --watch, which serves the page")
     if options.export:
-        need(*export.MODULES)
+        need(*export_files.EXPORT_MODULES)
         if options.out is None:
             raise UserError("--export: it needs --out DIR")
     kills = found.kills(scenario.seed, options.kill)
@@ -206,13 +206,13 @@ def _export(options: argparse.Namespace, folder: Path, inbox: Inbox, run: Run | 
     if options.out is None or options.export is False:
         return False
     try:
-        need(*export.MODULES)
+        need(*export_files.EXPORT_MODULES)
     except UserError as error:
         if not options.quiet:  # the export was not requested
             inbox.say(f"not exported: {error}")
         return False
     try:
-        export.exported(folder, folder, lambda: inbox.next(0.0), run=run, quiet=options.quiet)
+        export_files.exported(folder, folder, lambda: inbox.next(0.0), run=run, quiet=options.quiet)
     except UserError as error:
         inbox.say(f"not exported: {error}")
         return False
