@@ -1,9 +1,12 @@
 """The figures of the documentation: draw them, or say which are stale.
 
-`uv run docs/picture.py` draws all of them (hours: three are of 3 000, 14 000 and 42 000 missions),
+`uv run docs/picture.py` draws all of them (an hour: one is of 3 000 missions),
 `uv run docs/picture.py page.gif noisy-a.svg` those two. Then `figures.json` says from what each was made:
 hashes of its file, of the code that draws it with its input, and of what its missions decided. With `--check`
 it draws none, and prints a line for each stale figure; the exit status is 1 if there are any.
+
+The figures of sweeps, of 14 000 and 42 000 missions, are drawn from tables of their points, `loss.csv` and
+`settings.csv`. `uv run docs/picture.py --sweep loss.svg` runs the sweep, and writes its table again.
 
 A figure is stale if its file, the code that draws it, or its input has changed since it was drawn, or if its
 missions end or decide otherwise in any tick. Positions are not compared: their last bits depend on the
@@ -42,9 +45,11 @@ from compose.figures.style import SCREEN, SWEEP_MEDIUM, look, save  # noqa: E402
 from compose.launch import in_process  # noqa: E402
 from compose.recording.run import Run, read  # noqa: E402
 from compose.scenario import scenario_file  # noqa: E402
+from compose.sweep import axis_figures, spec  # noqa: E402
 from compose.view.web.standalone import standalone_page  # noqa: E402
 from docs import film  # noqa: E402
 from protocol.journal import environment  # noqa: E402
+from tandem.sweeps import sweep as run_sweep  # noqa: E402
 
 STYLE = ("compose/figures/style.py", "compose/view/colours.py")
 MISSIONS = ("compose/figures/*.py", "compose/view/colours.py", "compose/view/outlines.py")
@@ -80,6 +85,8 @@ class Source(NamedTuple):
     """True if decisions are the same on all processors."""
     quick: bool = False
     """True if what was decided is known within a second."""
+    sweep: Callable[[], None] | None = None
+    """Runs the missions and writes the table from which `draw` draws; None if `draw` runs them."""
 
 
 def mission(name: str, figures: Mapping[str, str], *, exact: bool = True) -> Source:
@@ -148,24 +155,36 @@ def estimated(folder: Path) -> dict[str, Any]:
     return {"first claims": claims, "ranges": result["ranges"]}
 
 
-def sweep(name: str, **figures: str) -> Source:
-    """Return the source of figures of a shipped sweep."""
+def sweep(name: str, place: int, title: str) -> Source:
+    """Return the source of the figure of a shipped sweep over one of its axes, of a name in STATISTICS."""
+    table, statistic = DOCS / f"{name}.csv", axis_figures.STATISTICS[title]
 
-    def run(folder: Path, *options: str) -> None:
-        tandem("sweep", name, *options, "--out", str(folder / name))
+    def run() -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            points = axis_figures.points(run_sweep(name, out=folder).results, place, statistic)
+        with table.open("w", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows([axis_figures.Point._fields, *points])
 
-    def draw(folder: Path, wanted: Mapping[str, str]) -> None:
-        run(folder)
-        for file, title in wanted.items():
-            shutil.copyfile(folder / name / "figures" / f"{title}.svg", folder / file)
+    def draw(folder: Path, _: Mapping[str, str]) -> None:
+        with table.open(newline="") as file:
+            points = [
+                axis_figures.Point(
+                    row["line"], int(row["value"]), row["quantity"],
+                    *[float(row[key] or "nan") for key in ("estimate", "low", "high")],
+                )
+                for row in csv.DictReader(file)
+            ]  # fmt: skip
+        with look(SWEEP_MEDIUM):
+            figure = axis_figures.over_axis(spec.load(name), place, statistic, points)
+            save(figure, folder / name, ["svg"])
 
     def decided(folder: Path) -> dict[str, Any]:
-        run(folder, "--trials", "1")
+        tandem("sweep", name, "--trials", "1", "--out", str(folder / name))
         with (folder / name / "summary.csv").open(newline="") as file:
             return {"cells": [(row["localised"], row["ticks_p50"]) for row in csv.DictReader(file)]}
 
-    code = (f"compose/sweep/shipped/{name}.toml", "compose/sweep/axis_figures.py", *STYLE)
-    return Source({f"{file}.svg": title for file, title in figures.items()}, code, draw, decided, exact=True)
+    code = (f"compose/sweep/shipped/{name}.toml", f"docs/{name}.csv", "compose/sweep/axis_figures.py", *STYLE)
+    return Source({f"{name}.svg": title}, code, draw, decided, exact=True, sweep=run)
 
 
 def radios(folder: Path, wanted: Mapping[str, str] = {}, trials: int = 200) -> str:
@@ -212,8 +231,8 @@ SOURCES = (
          *STYLE),
         estimate, estimated,
     ),
-    sweep("settings", settings="ticks-setting"),
-    sweep("loss", loss="ticks-share-lost"),
+    sweep("settings", 0, "ticks"),
+    sweep("loss", 0, "ticks"),
     Source(
         {"radios.svg": "planners over radio models"}, ("docs/examples/planners_and_radios.py",),
         lambda folder, wanted: print(radios(folder, wanted), end=""),
@@ -285,25 +304,29 @@ def tried(source: Source) -> str:
         return hashed(json.dumps(source.decided(Path(folder)), sort_keys=True).encode())
 
 
-def draw(names: Sequence[str]) -> None:
-    """Draw the figures with these names, and record from what they are made."""
+def draw(names: Sequence[str], *, sweep: bool = False) -> None:
+    """Draw the figures with these names, and record from what they are made.
+
+    With `sweep`, run the sweeps of those that are drawn from a table. Without, what their missions decided
+    stays as it was when the table was made.
+    """
     for source in SOURCES:
         wanted = {name: title for name, title in source.figures.items() if name in names}
         if not wanted:
             continue
+        if source.sweep is not None and sweep:
+            source.sweep()
         with tempfile.TemporaryDirectory() as folder:
             source.draw(Path(folder), wanted)
             for name in wanted:
                 shutil.copyfile(Path(folder) / name, DOCS / name)
-        decided = tried(source)
         made = recorded()
+        if source.sweep is None or sweep:
+            played = {"environment": here(), "decided": tried(source)}
         for name, title in wanted.items():
-            made[name] = {
-                "file": file_of(name),
-                "code": code_of(source, title),
-                "environment": here(),
-                "decided": decided,
-            }
+            if source.sweep is not None and not sweep:
+                played = {key: made[name][key] for key in ("environment", "decided")}
+            made[name] = {"file": file_of(name), "code": code_of(source, title), **played}
             print(name)
         text = json.dumps(dict(sorted(made.items())), indent=1)
         (DOCS / RECORD).write_text(text + "\n")
@@ -315,6 +338,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("names", nargs="*", metavar="FIGURE", help="a file in docs/ (default: all)")
     parser.add_argument("--check", action="store_true", help="print which figures are stale")
+    parser.add_argument("--sweep", action="store_true", help="run sweeps again instead of using their tables")
     arguments = parser.parse_args()
     if unknown := set(arguments.names) - set(names):
         parser.error(f"no figure of docs/: {', '.join(sorted(unknown))} (there are {', '.join(names)})")
@@ -322,7 +346,7 @@ def main() -> int:
         found = list(stale())
         print(*found, sep="\n", end="\n" if found else "")
         return 1 if found else 0
-    draw(arguments.names or names)
+    draw(arguments.names or names, sweep=arguments.sweep)
     return 0
 
 

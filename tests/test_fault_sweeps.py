@@ -109,19 +109,24 @@ values = [[0.0], [0.5]]
 
 
 @pytest.mark.parametrize(("labels", "curve"), [('["0", "0.5"]', True), ('["none", "half"]', False)])
-def test_labels_that_are_numbers_make_a_curve_with_a_band(labels: str, curve: bool, tmp_path: Path) -> None:
+def test_labels_that_are_numbers_make_a_curve(labels: str, curve: bool, tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(SMALL.replace("LABELS", labels))
     sweep = spec.load(str(tmp_path / "small.toml"))
     silent = execution.Progress(say=print, begin=lambda *_: None, done=lambda _: None)
     results = execution.sweep(
         sweep, tmp_path / "out", execution.ExecutionOptions(workers=1), Inbox("test"), silent
     )
-    (axes,) = axis_figures.ticks_against(results, 0).axes
+    ticks = axis_figures.STATISTICS["ticks"]
+    points = axis_figures.points(results, 0, ticks)
+    (axes,) = axis_figures.over_axis(sweep, 0, ticks, points).axes
     median = axes.lines[0]
     assert median.get_linestyle() == ("-" if curve else "None")
     assert np.asarray(median.get_xdata()).tolist() == ([0.0, 0.5] if curve else [0.0, 1.0])
-    assert ("10 to 90 %" in axes.get_legend_handles_labels()[1]) == curve
+    assert axes.get_legend_handles_labels()[1] == ["median", "95 %"]
     found = [results.figures[cell.index] for cell in results.cells]
+    assert [one.estimate for one in points] == [
+        *(ticks for one in found for ticks in (one.ticks_p50, one.ticks_p95)),
+    ]
     assert [one.localised for one in found] == [3, 3]
     assert found[0].reports_lost == 0 < found[1].reports_lost
     for one in found:

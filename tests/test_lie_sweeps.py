@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from compose.sweep import attack_figures, axis_figures, execution, spec
+from compose.sweep import axis_figures, execution, spec
 from compose.sweep.cells import RefusedCell, cells, setting_of
 from protocol.attack import Attack
 from protocol.network.inbox import Inbox
@@ -78,32 +77,14 @@ def test_honest_missions_localise_and_attacks_are_inconsistent(results: executio
 
 
 @pytest.mark.long
-def test_the_figures_show_the_outcomes_of_each_attack(results: execution.Results, tmp_path: Path) -> None:
+def test_a_figure_shows_how_often_each_attack_is_found(results: execution.Results, tmp_path: Path) -> None:
     axis_figures.draw(results, tmp_path)
-    assert {f"{name}.{kind}" for name in ("attacks", "roc") for kind in ("svg", "pdf", "png")} <= {
-        path.name for path in tmp_path.iterdir()
+    assert {path.stem for path in tmp_path.iterdir()} == {
+        f"{name}-{axis}" for name in ("success", "inconsistent", "ticks") for axis in ("attack", "sigma")
     }
-    place = attack_figures.attack_axis(results)
-    assert place == 0
-    exact, noisy = attack_figures.outcomes(results, place).axes
-    for panel in (exact, noisy):
-        widths = [[bar.get_width() for bar in bars] for bars in panel.containers]
-        assert np.allclose(widths, [[0.0, 1.0, 1.0], [0.0] * 3, [1.0, 0.0, 0.0], [0.0] * 3])
-    roc = attack_figures.roc(results, place)
-    assert roc is not None
-    (panel,) = roc.axes
-    assert [line.get_label() for line in panel.lines] == ["scale orbit", "rotate encounter"]
-    assert all(np.all(line.get_ydata() == 1.0) for line in panel.lines), "every lie before any honest one"
-
-
-@pytest.mark.long
-def test_a_sweep_without_attacks_has_no_figures_of_attacks(tmp_path: Path) -> None:
-    (tmp_path / "few.toml").write_text('name = "few"\nscenario = "random"\ntrials = 2\nseed = 1\n')
-    progress = execution.Progress(say=lambda _: None, begin=lambda *_: None, done=lambda _: None)
-    sweep = spec.load(str(tmp_path / "few.toml"))
-    results = execution.sweep(
-        sweep, tmp_path / "out", execution.ExecutionOptions(workers=1), Inbox("test"), progress
-    )
-    assert attack_figures.attack_axis(results) is None
-    axis_figures.draw(results, tmp_path / "figures")
-    assert not (tmp_path / "figures" / "roc.svg").exists()
+    found = axis_figures.points(results, 0, axis_figures.STATISTICS["inconsistent"])
+    rates = [
+        (line, attack, 1.0 if attack else 0.0) for line in ("0 m", "0.01 m") for attack in range(3)
+    ]  # fmt: skip
+    assert [(one.line, one.value, one.estimate) for one in found] == rates
+    assert all(one.low < one.high for one in found), "four trials leave an interval"

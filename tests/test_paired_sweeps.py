@@ -202,7 +202,9 @@ def test_an_axis_of_the_api_is_paired_as_the_caller_says_and_no_other_is_compare
         apart = [name for name, one in zip(axes, expected, strict=True) if not one]
         assert ("other draws at each value of " + ", ".join(apart) in shown) == bool(apart)
         for place, one in enumerate(expected):
-            label = axis_figures.ticks_against(results.results, place).axes[0].get_xlabel()
+            ticks = axis_figures.STATISTICS["ticks"]
+            points = axis_figures.points(results.results, place, ticks)
+            label = axis_figures.over_axis(results.sweep, place, ticks, points).axes[0].get_xlabel()
             assert label.endswith("(other draws at each value)") == (not one)
     with pytest.raises(tandem.UserError, match=r"paired: 'mission\.period' is none of the axes fault"):
         tandem.sweep("random", axes, paired=["fault[0].loss", "mission.period"])

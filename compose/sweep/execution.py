@@ -79,20 +79,6 @@ class Results(msgspec.Struct, frozen=True):
         """Return the rows of the trials of these cells."""
         return self.table.filter(pa.array(np.isin(self.table["cell"].to_numpy(), cells)))
 
-    def settings(self, place: int) -> list[tuple[list[tuple[str, str]], list[int]]]:
-        """Return all combinations of values of the axes other than the one at index `place`.
-
-        Each is a list of (name of axis, label of value), and its cells in the order of the axis at `place`.
-        """
-        others = [(i, axis) for i, axis in enumerate(self.sweep.axes) if i != place]
-        found: dict[tuple[int, ...], list[int]] = {}
-        for cell in self.cells:
-            found.setdefault(tuple([cell.place[i] for i, _ in others]), []).append(cell.index)
-        return [
-            ([(axis.name, axis.label(value)) for (_, axis), value in zip(others, choice, strict=True)], cells)
-            for choice, cells in found.items()
-        ]
-
 
 def sweep(
     sweep: Sweep,

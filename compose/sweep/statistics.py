@@ -9,13 +9,13 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from statistics import NormalDist
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 import msgspec
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from scipy.special import gammainccinv, gammaincinv  # type: ignore[import-untyped]
+from scipy.special import bdtr, gammainccinv, gammaincinv  # type: ignore[import-untyped]
 
 from compose.recording.claim import DEGREES_OF_FREEDOM
 from compose.sweep.cells import Cell
@@ -37,6 +37,14 @@ FIGURES_OF_GROUP = (
     *("honest_localised", "honest_undecided", "honest_wrong", "attacker_met", "attacker_found"),
 )
 """The fields of a CellSummary that only groups have."""
+
+
+class Interval(NamedTuple):
+    """An estimate, and the bounds of its interval."""
+
+    estimate: float
+    low: float
+    high: float
 
 
 class CellSummary(msgspec.Struct, frozen=True):
@@ -142,11 +150,11 @@ def counted(table: pa.Table, refused: str | None = None) -> CellSummary:
     `refused` is the reason why the scenario of the cell is infeasible, or None.
     """
     everything = len(table)
-    table = _not_refused(table)
+    table = ran(table)
     outcomes = table["outcome"].to_pylist()
     counts = {outcome: outcomes.count(outcome) for outcome in get_args(Outcome)}
     k, n = counts["localised"], len(outcomes)
-    low, high = wilson(k, n)
+    rate, low, high = wilson(k, n) if n else (None, None, None)
     ticks = column(table, "ticks")[np.array([outcome == "localised" for outcome in outcomes], bool)]
     meeting, error = _known(column(table, "meeting_tick")), _known(column(table, "position_error_m"))
     right = table.filter(pa.array([outcome != "wrong" for outcome in outcomes], pa.bool_()))
@@ -159,7 +167,7 @@ def counted(table: pa.Table, refused: str | None = None) -> CellSummary:
     return CellSummary(
         trials=n,
         **counts,
-        rate=k / n if n else None,
+        rate=rate,
         rate_low=low,
         rate_high=high,
         ticks_p10=_percentile(ticks, 10),
@@ -231,14 +239,26 @@ def _rmse_over_bound(table: pa.Table) -> float | None:
     return float(np.sqrt(np.mean(errors[known] ** 2) / np.mean(bounds[known] ** 2)))
 
 
-def wilson(k: int, n: int) -> tuple[float | None, float | None]:
-    """Return the Wilson interval of the rate of `k` successes in `n` trials; (None, None) if n is 0."""
-    if not n:
-        return None, None
+def wilson(k: int, n: int) -> Interval:
+    """Return the rate of `k` successes in `n` trials, at least one, with its Wilson interval."""
     z = NormalDist().inv_cdf(0.5 + 0.5 * CONFIDENCE)
     centre = (k + 0.5 * z * z) / (n + z * z)
     half = z / (n + z * z) * math.sqrt(k * (n - k) / n + 0.25 * z * z)
-    return 0.0 if k == 0 else centre - half, 1.0 if k == n else centre + half
+    return Interval(k / n, 0.0 if k == 0 else centre - half, 1.0 if k == n else centre + half)
+
+
+def quantile(values: Floats, p: float) -> Interval:
+    """Return the quantile `p` of `values`, of which there is at least one, with linear interpolation.
+
+    The bounds are order statistics, those of the binomial distribution of the number of values below the
+    quantile: they hold for any distribution of the values. Where there are too few, they are the extremes.
+    """
+    ordered, n = np.sort(values), len(values)
+    below = bdtr(np.arange(n + 1), n, p)
+    low, high = np.searchsorted(below, [0.5 * (1.0 - CONFIDENCE), 0.5 * (1.0 + CONFIDENCE)])
+    return Interval(
+        float(np.quantile(ordered, p)), float(ordered[max(low - 1, 0)]), float(ordered[min(high, n - 1)])
+    )
 
 
 def nees_band(trials: int) -> tuple[float | None, float | None]:
@@ -311,8 +331,8 @@ def columns_of(sweep: Sweep) -> list[str]:
     return [name for name in CellSummary.__struct_fields__ if sweep.of_group or name not in FIGURES_OF_GROUP]
 
 
-def _not_refused(table: pa.Table) -> pa.Table:
-    """Return the trials that were not refused."""
+def ran(table: pa.Table) -> pa.Table:
+    """Return the trials of `table` that were not refused."""
     return table.filter(
         pa.array([outcome != "refused" for outcome in table["outcome"].to_pylist()], pa.bool_())
     )
@@ -336,7 +356,7 @@ def refusals(table: pa.Table) -> list[tuple[str, int]]:
 
 def noted(table: pa.Table) -> NotableTrial | None:
     """Return the trial to look at first; None if none has run."""
-    table = _not_refused(table)
+    table = ran(table)
     if not len(table):
         return None
     outcomes = table["outcome"].to_pylist()
