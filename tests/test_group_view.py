@@ -405,7 +405,7 @@ def test_the_sheet_of_the_group_has_the_tree_and_the_tick_of_each_claim(
     ((name, figure),) = drawn
     assert name == "meetings"
     assert not isinstance(figure, Absent)
-    plane, lanes = figure.axes
+    plane, _, lanes = figure.axes
     found = {str(one.get_gid()): one for one in [*plane.get_children(), *lanes.get_children()]}
     for robot in run.robots:
         claim, label = run.claim(robot), found[f"localised-{robot}"]

@@ -95,8 +95,10 @@ def checked(pair: PairRecord, medium: Medium) -> None:
         figure.set_dpi(medium.dpi)
         figure.draw_without_rendering()
         sheet = figure.bbox.padded(0.5)
-        keys = [key.get_window_extent() for key in figure.legends]
-        panels = [panel for axes in figure.axes if (panel := axes.get_tightbbox()) is not None]
+        keys = [key.get_window_extent() for axes in figure.axes if (key := axes.get_legend()) is not None]
+        panels = [
+            panel for axes in figure.axes if axes.axison and (panel := axes.get_tightbbox()) is not None
+        ]
         for box in [*keys, *panels, *[text.get_window_extent() for text in figure.texts]]:
             assert sheet.x0 <= box.x0 <= box.x1 <= sheet.x1, (name, box, sheet)
             assert sheet.y0 <= box.y0 <= box.y1 <= sheet.y1, (name, box, sheet)

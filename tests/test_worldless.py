@@ -112,7 +112,8 @@ def test_figures_without_the_truth_are_drawn_as_in_simulation(folders: tuple[Pat
         assert lines[0] == lines[1] != []
     figure = drawn(over_time.ranges(told))
     assert line(figure, "mutual-range") == line(drawn(over_time.ranges(known)), "mutual-range")
-    labels = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+    (key,) = [key for axes in figure.axes if (key := axes.get_legend()) is not None]
+    labels = [text.get_text() for text in key.get_texts()]
     assert "separation, from claims" in labels
     assert "true separation" not in labels
 

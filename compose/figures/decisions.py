@@ -12,7 +12,7 @@ from agent.planning.active_sensing import Surveying
 from agent.planning.state import RobotState
 from agent.planning.strides import stride
 from compose.figures.pair import PairRecord
-from compose.figures.sheet import NO_ENCOUNTER, Absent, Sheet, Window, circle, some, square
+from compose.figures.sheet import NO_ENCOUNTER, Absent, Window, circle, series, some, square
 from compose.figures.style import INK, PALE, PALER, ROLE_MARKERS, SCREEN, Medium
 from compose.view.colours import COLOURS
 from protocol.mission import ROLES, Role
@@ -64,12 +64,12 @@ def draw(pair: PairRecord, medium: Medium = SCREEN) -> Figure | Absent:
         else f"all {len(found)} decisions"
     )
     title = f"Hypotheses of the pair and chosen manoeuvres: {many}"
-    sheet = Sheet(medium, len(shown) == 1, [pair.title, title])
-    panels = [sheet.panel() for _ in shown]
+    captions = [_caption(one, i + 1) for i, one in enumerate(shown)]
+    sheet, panels = series(medium, [pair.title, title], captions, _window(pair, shown))
     for axes, one in zip(panels, shown, strict=True):
         _panel(axes, pair, one)
     _key(panels[-1], pair)
-    sheet.series(panels, [_caption(one, i + 1) for i, one in enumerate(shown)], _window(pair, shown))
+    sheet.key(panels[-1])
     return sheet.finished()
 
 
@@ -91,14 +91,15 @@ def _window(pair: PairRecord, shown: list[PairDecision]) -> Window:
     return square(points, 0.16, 0.5 * pair.mission.sensing_range)
 
 
-def _caption(one: PairDecision, number: int) -> list[str]:
+def _caption(one: PairDecision, number: int) -> str:
     state = next(iter(one.states.values()))
     count, probability = len(state.belief.pair), state.belief.pair[0].probability
     hypotheses = f"{count} hypotheses" if count > 1 else "1 hypothesis"
     first = f"{math.floor(1e4 * probability) / 100:g} %"
-    claim = ["claim"] if any(state.verdict is not None for state in one.states.values()) else []
-    ranges = f"{len(state.mutual)} mutual ranges"
-    return [f"({number}) $k$ = {one.tick}", ranges, hypotheses, f"first {first}", *claim]
+    claim = ", claim" if any(state.verdict is not None for state in one.states.values()) else ""
+    return (
+        f"({number}) $k$ = {one.tick}, {len(state.mutual)} mutual ranges\n{hypotheses}, first {first}{claim}"
+    )
 
 
 def _panel(axes: Axes, pair: PairRecord, one: PairDecision) -> None:

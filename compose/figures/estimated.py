@@ -14,7 +14,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
-from compose.figures.sheet import EDGE, FOOT, GAP, Sheet, around
+from compose.figures.sheet import Sheet, around
 from compose.figures.style import INK, PALE, ROLE_MARKERS, SCREEN, Medium
 from compose.recording.estimating.estimate_rows import PoseEstimateRow
 from compose.recording.estimating.estimate_run import EstimationProblem, RecordingEstimate
@@ -25,8 +25,8 @@ from compose.view.outlines import OUTLINE_SIGMAS, outline
 from protocol.mission import ROLES
 from protocol.motion import Covariance, Pose
 
-AXIS, TALL, TALLEST = 0.6, 1.0, 5.0
-"""The space left of a panel over time, its height, and the largest height of the plane, in inches."""
+TALL, TALLEST = 1.0, 5.0
+"""The height of a panel over time, and the largest height of the plane, in inches."""
 OUTLINES_PER_PATH = 12
 """The largest number of outlines along a path of where the robot is."""
 NEES_BOUND = 11.34
@@ -126,7 +126,7 @@ def _title(drawn: Drawn) -> str:
 
 def _path(drawn: Drawn, medium: Medium) -> Figure:
     sheet = Sheet(medium, narrow=False, title=[_title(drawn)])
-    axes = sheet.panel()
+    axes = sheet.panels["plane"]
     points: list[tuple[float, float]] = []
     for i, (colour, marks) in enumerate(drawn.looks):
         name = drawn.problem.robots[i].id
@@ -153,7 +153,8 @@ def _path(drawn: Drawn, medium: Medium) -> Figure:
         axes.plot(anchor.x, anchor.y, ls="", marker=marker, ms=5, color=INK, label=f"anchor {anchor.id}")
         points.append((anchor.x, anchor.y))
     axes.plot([], [], color=PALE, lw=6.0, alpha=0.3, label="3 sigma")
-    sheet.plane(axes, around(points, PATH_MARGIN), TALLEST)
+    sheet.plane("plane", around(points, PATH_MARGIN), TALLEST)
+    sheet.key(axes)
     return sheet.finished()
 
 
@@ -163,28 +164,23 @@ def _covariance(row: PoseEstimateRow) -> Covariance:
 
 def _over_time(drawn: Drawn, medium: Medium) -> Figure:
     """Return the figure of errors, NEES, hypotheses and residuals over time; the first two need the truth."""
-    sheet = Sheet(medium, narrow=False, title=[_title(drawn)])
     known = any(row.nees is not None for row in drawn.estimates.rows)
     panels = [_errors, _nees, _hypotheses] if known else [_sigmas, _hypotheses]
-    end = float(drawn.since_begin(drawn.estimates.epochs[-1].t))
+    pairs = ["-".join(pair) for pair in drawn.ranged]
+    rows = [[name] for draw in panels for name in (draw.__name__, f"{draw.__name__} key")]
+    sheet = Sheet(medium, False, [_title(drawn)], [*rows, *[[pair] for pair in pairs]])
     for draw in panels:
-        axes = _panel(sheet, end)
-        draw(axes, drawn)
-        sheet.key_below(axes)
-    for which, pair in enumerate(drawn.ranged):
-        axes = _panel(sheet, end)
-        _residuals(axes, drawn, which, "-".join(pair))
+        draw(sheet.tall(draw.__name__, TALL), drawn)
+        sheet.key(sheet.panels[draw.__name__], f"{draw.__name__} key")
+    for which, pair in enumerate(pairs):
+        _residuals(sheet.tall(pair, TALL), drawn, which, pair)
+    end = float(drawn.since_begin(drawn.estimates.epochs[-1].t))
+    over_time = [sheet.panels[name] for name in (*[draw.__name__ for draw in panels], *pairs)]
+    for axes in over_time:
+        axes.set_xlim(0.0, end)
+        axes.grid(color="0.9", lw=0.5)
+    over_time[-1].set_xlabel("time [s]")
     return sheet.finished()
-
-
-def _panel(sheet: Sheet, end: float) -> Axes:
-    axes = sheet.panel()
-    sheet.place(axes, AXIS, sheet.top + GAP, sheet.width - AXIS - 3 * EDGE, TALL)
-    sheet.top += GAP + TALL + FOOT
-    axes.set_xlim(0.0, end)
-    axes.set_xlabel("time [s]")
-    axes.grid(color="0.9", lw=0.5)
-    return axes
 
 
 def _times(drawn: Drawn, i: int) -> Numbers:
@@ -243,7 +239,6 @@ def _hypotheses(axes: Axes, drawn: Drawn) -> None:
     right = axes.twinx()
     right.plot(times, counts, color=PALE, lw=1.0, drawstyle="steps-post")
     right.set_ylim(0.0, max(counts) + 0.5)
-    right.set_position(axes.get_position())
 
 
 def _residuals(axes: Axes, drawn: Drawn, which: int, name: str) -> None:

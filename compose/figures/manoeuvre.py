@@ -14,28 +14,13 @@ from matplotlib.figure import Figure
 from agent.estimation.closed_forms import Placement
 from agent.planning.phase3_last_manoeuvre import Array, Compared, LastManoeuvre, Plan, compared
 from compose.figures.pair import PairRecord
-from compose.figures.sheet import (
-    ANCHORS,
-    EDGE,
-    FOOT,
-    GAP,
-    HEAD,
-    LABEL,
-    LEFT,
-    NO_ENCOUNTER,
-    Absent,
-    Sheet,
-    circle,
-    named,
-)
+from compose.figures.sheet import ANCHORS, LABEL, NO_ENCOUNTER, Absent, Sheet, circle
 from compose.figures.style import INK, PALE, PALER, ROLE_MARKERS, SCREEN, Medium
 from compose.figures.trajectory import heading
 from compose.view.colours import COLOURS
 from protocol.mission import ROLES, Mission, Role
 from protocol.motion import ORIGIN, Pose, compose, step
 
-PLANE = 3.4
-"""The width and height of the plane's panel, in inches; the panel with the value of eq. (8) is beside it."""
 WINDOW_MARGIN = 1.14
 """The half-width of the window, as a multiple of the largest distance from the robot that must be visible."""
 ARC_SEGMENTS = 24
@@ -112,8 +97,8 @@ def _figure(pair: PairRecord, one: Planned, medium: Medium) -> Figure:
     assert pair.planner is not None
     assert pair.planner.MANOEUVRES is not None
     ways = compared(plan.question, mission, pair.planner.MANOEUVRES)
-    sheet = Sheet(medium, False, [pair.title, _title(pair, one)])
-    axes, value = sheet.panel(), sheet.panel()
+    sheet = Sheet(medium, False, [pair.title, _title(pair, one)], [["plane", "value"], ["key", "key"]])
+    axes, value = sheet.panels["plane"], sheet.panels["value"]
     half = WINDOW_MARGIN * max(
         mission.max_speed * mission.period,
         *[math.hypot(p.x - seen.mover.x, p.y - seen.mover.y) for p in seen.others],
@@ -121,15 +106,11 @@ def _figure(pair: PairRecord, one: Planned, medium: Medium) -> Figure:
     _candidates(axes, pair, one, seen, half)
     _reach(axes, pair, plan, seen, ways)
     x, y = seen.mover.x, seen.mover.y
-    named(axes, (x - half, x + half, y - half, y + half))
+    sheet.plane("plane", (x - half, x + half, y - half, y + half))
     draw_cost(value, plan, ways, mission)
-    top, left = sheet.top + HEAD, LEFT + PLANE + LEFT + GAP
     if value.get_legend_handles_labels()[0]:
-        top += sheet.key(value, left, top, sheet.width - left)
-    sheet.place(axes, LEFT, top, PLANE, PLANE)
-    sheet.place(value, left, top, sheet.width - left - 2 * EDGE, PLANE)
-    sheet.top = top + PLANE + FOOT
-    sheet.key_below(axes)
+        value.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), frameon=False)
+    sheet.key(axes)
     return sheet.finished()
 
 

@@ -9,25 +9,11 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap, to_hex, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, Polygon, Wedge
-from matplotlib.ticker import MaxNLocator
 from matplotlib.typing import ColorType
 
-from compose.figures.over_time import AXIS, TALL, draw_errors, draw_hypotheses, timed
+from compose.figures.over_time import TALL, draw_errors, draw_hypotheses, timed
 from compose.figures.pair import PairRecord, Side, error, others
-from compose.figures.sheet import (
-    FOOT,
-    GAP,
-    HEAD,
-    LEFT,
-    NO_TRUTH,
-    ROW,
-    WORDS,
-    Absent,
-    Sheet,
-    fitted,
-    named,
-    plain,
-)
+from compose.figures.sheet import NO_TRUTH, Absent, Sheet, Window, plain
 from compose.figures.style import INK, PALE, SCREEN, Medium
 from compose.figures.trajectory import draw_plane, window
 from compose.recording.reasons import ended
@@ -38,8 +24,14 @@ from protocol.mission import Role
 from protocol.motion import ORIGIN, Pose
 from protocol.rounding import TOLERANCE
 
-NEAR, BESIDE, TALLEST = 1.9, 2.1, 4.4
-"""The widths of the enlarged panel and of the keys, and the maximum height of the plane, in inches."""
+MOSAIC = (
+    ("plane", "near"),
+    ("key", "ages"),
+    ("errors", "errors-key"),
+    ("hypotheses", "hypotheses-key"),
+)
+WIDTHS, TALLEST = (1.7, 1.0), 4.4
+"""The ratio of the widths of its columns, and the maximum height of the plane in inches."""
 AGES: dict[Role, LinearSegmentedColormap] = {
     "a": LinearSegmentedColormap.from_list("ages-a", ["#9cc9ea", COLOURS["a"], "#04263f"]),
     "b": LinearSegmentedColormap.from_list("ages-b", ["#f2b79f", COLOURS["b"], "#4a1608"]),
@@ -58,48 +50,31 @@ PANEL_ARROW = 0.55
 
 
 def draw(pair: PairRecord, role: Role, medium: Medium = SCREEN) -> Figure | Absent:
-    """Return the figure: the plane, the enlarged panel with the keys beside it, and two panels over time."""
+    """Return the figure: the plane, the enlarged panel beside it, two panels over time, and their keys."""
     if not pair.true:
         return Absent(NO_TRUTH)
-    sheet = Sheet(medium, False, _title(pair, role))
-    _top(sheet, pair, role)
-    sheet.top += GAP + WORDS
-    width = sheet.width - AXIS - BESIDE - GAP
-    for row in ("errors", "hypotheses"):
-        axes = sheet.panel()
-        timed(axes, pair, width, role, phases=row == "errors", label=row == "hypotheses")
-        if row == "errors":
+    sheet = Sheet(medium, False, _title(pair, role), MOSAIC, WIDTHS)
+    axes, near = sheet.panels["plane"], sheet.panels["near"]
+    draw_plane(axes, pair, role)
+    draw_estimates(axes, pair, role)
+    sheet.plane("plane", window(pair), TALLEST)
+    sheet.key(axes)
+    draw_near(near, pair, role)
+    if pair.robot(role).likeliest:
+        sheet.plane("near", _near_window(pair, role))
+        near.set(xlabel="x error [m]", ylabel="y error [m]")
+        sheet.key(near, "ages", title="estimates, by tick")
+    else:
+        sheet.panels["ages"].set_axis_off()
+    for name in ("errors", "hypotheses"):
+        axes = sheet.tall(name, TALL - 0.3)
+        timed(axes, pair, role, phases=name == "errors", label=name == "hypotheses")
+        if name == "errors":
             draw_errors(axes, pair, "position", role)
         else:
             draw_hypotheses(axes, pair, role)
-        sheet.place(axes, AXIS, sheet.top, width, TALL - 0.3)
-        sheet.key(axes, AXIS + width + GAP, sheet.top, BESIDE)
-        sheet.top += TALL - 0.3 + GAP + WORDS
-    sheet.top += FOOT - WORDS - GAP + (WORDS if pair.mission.period != 1.0 else 0.0)
+        sheet.key(axes, f"{name}-key")
     return sheet.finished()
-
-
-def _top(sheet: Sheet, pair: PairRecord, role: Role) -> None:
-    """Draw the plane, the enlarged panel to its right, and their keys below the two, or below the latter."""
-    axes, near, visible = sheet.panel(), sheet.panel(), window(pair)
-    draw_plane(axes, pair, role)
-    draw_estimates(axes, pair, role)
-    named(axes, visible)
-    draw_near(near, pair, role)
-    width, height = fitted(visible, sheet.room - NEAR - LEFT - 2 * GAP, TALLEST)
-    top, left = sheet.top + HEAD + WORDS, LEFT + width + LEFT + 2 * GAP
-    sheet.place(axes, LEFT, top, width, height)
-    sheet.place(near, left, top, NEAR, NEAR)
-    right = top + NEAR + FOOT + GAP / 2
-    if pair.robot(role).likeliest:
-        right += sheet.key(near, left, right, sheet.width - left, title="estimates, by tick") + GAP / 2
-    _, labels = axes.get_legend_handles_labels()
-    if right + len(labels) * ROW <= top + height + FOOT:
-        right += sheet.key(axes, left, right, 0.0)
-        sheet.top = max(right, top + height + FOOT)
-    else:
-        sheet.top = max(right, top + height + FOOT)
-        sheet.key_below(axes)
 
 
 def _title(pair: PairRecord, role: Role) -> list[str]:
@@ -223,8 +198,6 @@ def draw_near(axes: Axes, pair: PairRecord, role: Role) -> None:
         )  # fmt: skip
         return
     axes.set_title("relative to the true pose", color=PALE, pad=5, loc="left")
-    axes.set_xlabel("x error [m]")
-    axes.set_ylabel("y error [m]")
     colours, (last, truth), half = _ages(one, role), one.likeliest[-1], _half(pair, role)
     _heading(axes, (0.0, 0.0), truth.heading, half, INK)
     axes.plot(0.0, 0.0, "o", ms=5, color=INK, gid="near-truth", label="true")
@@ -251,11 +224,12 @@ def draw_near(axes: Axes, pair: PairRecord, role: Role) -> None:
                 lw=0,
             )
         )
-    axes.set_xlim(-half, half)
-    axes.set_ylim(-half, half)
-    axes.xaxis.set_major_locator(MaxNLocator(4))
-    axes.yaxis.set_major_locator(MaxNLocator(4))
     axes.grid(lw=0.4, color="0.9")
+
+
+def _near_window(pair: PairRecord, role: Role) -> Window:
+    half = _half(pair, role)
+    return -half, half, -half, half
 
 
 def _half(pair: PairRecord, role: Role) -> float:

@@ -1,4 +1,4 @@
-"""Ranges, separation, errors and hypotheses over time, on an axis that gives each phase its own scale."""
+"""Ranges, separation, errors and hypotheses over time."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Any, Literal
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import MaxNLocator, NullLocator
 
-from compose.figures.pair import PairRecord, Span, error, others
-from compose.figures.sheet import ANCHORS, EDGE, FOOT, GAP, NO_TRUTH, WORDS, Absent, Sheet, measured
+from compose.figures.pair import PairRecord, error, others
+from compose.figures.sheet import ANCHORS, NO_TRUTH, Absent, Sheet
 from compose.figures.style import INK, PALE, ROLE_MARKERS, SCREEN, SHADE, Medium
 from compose.recording.claim import Claim
 from compose.view.colours import COLOURS
@@ -20,20 +20,15 @@ from protocol.mission import ROLES, Role
 from protocol.motion import Covariance, Pose, wrap
 from protocol.rounding import TOLERANCE
 
-AXIS, TALL = 0.72, 1.9
-"""The space left of a panel over time for its axis, and the height of the panel, in inches."""
-PHASE_TITLES = {1: "own anchor", 2: "search for the peer", 3: "encounter"}
+TALL = 1.9
+"""The height of a panel over time, in inches."""
 SHADES = {1: "0.93", 2: "1.0", 3: "0.97"}
-NARROW = 0.18
-"""The fraction of the width below which a phase is too narrow, so that each phase gets its own scale."""
-PHASE_SHARES = (0.3, 0.45)
-"""The bounds of a phase's fraction of the width in that case, before normalisation."""
-DIGIT, LABELS = 0.078, 3.2
-"""The width of a digit of a tick label, in inches, and the approximate number of tick labels per inch."""
-DENSE = 30
-"""The number of ticks in a phase from which on single ticks get no marker."""
-SMALLEST_ERROR = 1e-16
-"""The smallest error drawn, in m or rad. Smaller errors are drawn at this value."""
+NAMED = 0.15
+"""The fraction of the width below which only the number of a phase is written above the panel."""
+MANY = 60
+"""The maximum number of markers on a line."""
+FLOOR = 0.1 * TOLERANCE
+"""The smallest error drawn, in m or rad: smaller ones are rounding errors, and are drawn at this value."""
 ROLE_LINES: dict[Role, Any] = {"a": "-", "b": (0, (4, 1.5))}
 LONE_LINES: dict[Role, Any] = {"a": "-.", "b": (0, (1, 1))}
 CLAIMED: dict[Role, Any] = {"a": (0, (6, 1.5, 1, 1.5, 1, 1.5)), "b": (0, (1, 3))}
@@ -42,10 +37,6 @@ CLAIMED: dict[Role, Any] = {"a": (0, (6, 1.5, 1, 1.5, 1, 1.5)), "b": (0, (1, 3))
 No two are the same, so the lines differ without colour. The phase is that of the axis.
 """
 BAND_SIGMAS = 3.0
-ROOM = 4.0
-"""The factor by which the error scale extends beyond the drawn values."""
-SHORT_DECADES = 20.0
-"""The ratio of a logarithmic scale's ends below which powers of ten give too few tick labels."""
 RANKS = 6
 """The number of hypotheses drawn as lines."""
 BEYOND = 0.05
@@ -57,119 +48,50 @@ Points = Sequence[tuple[int, float]]
 Quantity = Literal["position", "heading"]
 
 
-# --- the axis -----------------------------------------------------------------------------------------
-
-
-def timed(
-    axes: Axes, pair: PairRecord, width: float, *roles: Role, phases: bool = True, label: bool = True
-) -> None:
-    """Set up the time axis of `axes`, `width` inches wide: phases of the robots with `roles`, and contact.
+def timed(axes: Axes, pair: PairRecord, *roles: Role, phases: bool = True, label: bool = True) -> None:
+    """Set up the time axis of `axes`, in ticks: phases of the robots with `roles`, and contact.
 
     `phases` writes their names above the panel, and `label` that of the axis below it.
     """
     spans = pair.spans(*roles)
-    ticks, shares = _edges(spans)
-    even = np.allclose(np.diff(ticks) / (ticks[-1] - ticks[0]), np.diff(shares))
-    if not even:
-        scales = (lambda x: _along(x, ticks, shares), lambda x: _along(x, shares, ticks))
-        axes.set_xscale("function", functions=scales)
-    axes.set_xlim(ticks[0], ticks[-1])
-    for span, left, right in zip(spans, ticks, ticks[1:], strict=False):
+    first, end = spans[0].first - 0.5, spans[-1].last + 0.5
+    axes.set_xlim(first, end)
+    for span in spans:
+        left, right = span.first - 0.5, span.last + 0.5
         axes.axvspan(left, right, color=SHADES[span.phase], lw=0, zorder=-3, gid=f"phase-{span.phase}")
-        if left > ticks[0]:
+        if left > first:
             axes.axvline(left, color="0.6", lw=0.6, zorder=-1)
-    for i, (first, last) in enumerate(pair.contacts):
+        if phases:
+            name = f"phase {span.phase}" if right - left > NAMED * (end - first) else str(span.phase)
+            axes.text(
+                (left + right) / 2, 1.03, name, transform=axes.get_xaxis_transform(), ha="center", color="0.3"
+            )
+    for i, (begin, last) in enumerate(pair.contacts):
         axes.axvspan(
-            first - 0.5, last + 0.5, color=SHADE, lw=0, zorder=-2, gid=f"contact-{first}-{last}",
+            begin - 0.5, last + 0.5, color=SHADE, lw=0, zorder=-2, gid=f"contact-{begin}-{last}",
             label="in contact" if i == 0 else None,
         )  # fmt: skip
-    if phases:
-        for span, left, right in zip(spans, shares, shares[1:], strict=False):
-            named = f"phase {span.phase}" if pair.own_planner else f"{span.phase}: {PHASE_TITLES[span.phase]}"
-            names = (named, f"phase {span.phase}", str(span.phase))
-            fit = next((name for name in names[:2] if measured(name) < (right - left) * width), names[2])
-            axes.text((left + right) / 2, 1.03, fit, transform=axes.transAxes, ha="center", color="0.3")
-    scaled = [Span(0, spans[0].first, spans[-1].last)] if even else spans
-    axes.xaxis.set_major_locator(FixedLocator(_marks(scaled, ticks, [0.0, 1.0] if even else shares, width)))
-    axes.xaxis.set_minor_locator(NullLocator())
-    if not label:
-        axes.tick_params(labelbottom=False)
-        return
-    period = pair.mission.period
-    if period == 1.0:
-        axes.xaxis.set_major_formatter("{x:g}")
-        name = "tick (1 s)"
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    if label:
+        axes.set_xlabel(f"tick ({pair.mission.period:g} s)")
     else:
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}\n{x * period:g} s"))
-        name = "tick and time since the start"
-    axes.set_xlabel(name if even else f"{name}; one scale per phase")
+        axes.tick_params(labelbottom=False)
 
 
-def _edges(spans: Sequence[Span]) -> tuple[list[float], list[float]]:
-    """Return the boundaries of the phases, in ticks and as fractions of the width."""
-    ticks = [spans[0].first - 0.5, *[span.last + 0.5 for span in spans]]
-    shares = np.diff(ticks) / (ticks[-1] - ticks[0])
-    if min(shares) < NARROW:
-        shares = np.clip(shares, *PHASE_SHARES)
-        shares = shares / shares.sum()
-    return ticks, [0.0, *np.cumsum(shares).tolist()]
-
-
-def _along(values: Any, here: list[float], there: list[float]) -> Any:
-    """Map `values` by the piecewise linear function from the knots `here` to `there`, with extrapolation."""
-    x, begins, goals = np.asarray(values, float), np.asarray(here), np.asarray(there)
-    piece = np.clip(np.searchsorted(begins, x) - 1, 0, len(begins) - 2)
-    slopes = np.diff(goals) / np.diff(begins)
-    return goals[piece] + slopes[piece] * (x - begins[piece])
-
-
-def _marks(spans: Sequence[Span], ticks: list[float], shares: list[float], width: float) -> list[float]:
-    """Return the ticks with labels: round numbers in each phase that do not overlap."""
-    marked: list[float] = []
-    end = -1.0
-    for span, share in zip(spans, np.diff(shares), strict=True):
-        count = max(1, int(LABELS * width * share))
-        for tick in MaxNLocator(nbins=count, integer=True, steps=[1, 2, 5, 10]).tick_values(
-            span.first, span.last
-        ):
-            half = 0.5 * DIGIT / width * (len(f"{tick:g}") + 1)
-            at = float(_along(tick, [ticks[0], ticks[-1]] if len(spans) == 1 else ticks, shares))
-            if span.first <= tick <= span.last and at - half >= end:
-                marked.append(float(tick))
-                end = at + half
-    return marked
-
-
-def _marked(pair: PairRecord, role: Role, ticks: Sequence[int]) -> list[int]:
-    """Return the indices of the ticks whose phase is short enough for a marker at each tick."""
-    sparse: set[int] = set()
-    for span in pair.spans(role):
-        if span.last - span.first < DENSE:
-            sparse.update(range(span.first, span.last + 1))
-    return [i for i, tick in enumerate(ticks) if tick in sparse]
-
-
-# --- ranges -------------------------------------------------------------------------------------------
+def every(count: int) -> int:
+    """Return the number of points from one marker to the next, on a line of `count` points."""
+    return max(1, math.ceil(count / MANY))
 
 
 def ranges(pair: PairRecord, medium: Medium = SCREEN) -> Figure:
     """Return the figure of the measured ranges and of the robots' separation."""
-    sheet = Sheet(medium, True, [pair.title])
-    axes = sheet.panel()
-    width = sheet.width - AXIS - EDGE
-    timed(axes, pair, width, *ROLES)
+    sheet = Sheet(medium, True, [pair.title], [["ranges"], ["key"]])
+    axes = sheet.tall("ranges", TALL + 0.3)
+    timed(axes, pair, *ROLES)
     _ranges(axes, pair)
     axes.set_ylabel("distance [m]")
-    sheet.top += WORDS
-    sheet.place(axes, AXIS, sheet.top, width, TALL + 0.3)
-    sheet.top += TALL + 0.3 + FOOT + _second_row(pair)
-    sheet.key_below(axes)
+    sheet.key(axes)
     return sheet.finished()
-
-
-def _second_row(pair: PairRecord) -> float:
-    """Return the height of the times below the ticks, in inches."""
-    return WORDS if pair.mission.period != 1.0 else 0.0
 
 
 def _ranges(axes: Axes, pair: PairRecord) -> None:
@@ -221,27 +143,19 @@ def _measured(
         )
 
 
-# --- errors -------------------------------------------------------------------------------------------
-
-
 def errors(pair: PairRecord, medium: Medium = SCREEN) -> Figure | Absent:
     """Return the figure of the position and heading errors of both robots."""
     if not pair.true:
         return Absent(NO_TRUTH)
     if not any(pair.robot(role).estimates for role in ROLES):
         return Absent("neither robot has an estimate of its pose")
-    sheet = Sheet(medium, True, [pair.title])
     quantities: tuple[Quantity, ...] = ("position", "heading")
-    sheet.top += WORDS
-    width = sheet.width - AXIS - EDGE
+    sheet = Sheet(medium, True, [pair.title], [[*quantities[:1]], [*quantities[1:]], ["key"]])
     for quantity in quantities:
-        axes, last = sheet.panel(), quantity == "heading"
-        timed(axes, pair, width, *ROLES, phases=not last, label=last)
+        axes, last = sheet.tall(quantity, TALL), quantity == "heading"
+        timed(axes, pair, *ROLES, phases=not last, label=last)
         draw_errors(axes, pair, quantity, *ROLES)
-        sheet.place(axes, AXIS, sheet.top, width, TALL)
-        sheet.top += TALL + GAP
-    sheet.top += FOOT - GAP + _second_row(pair)
-    sheet.key_below(sheet.figure.axes[0])
+    sheet.key(sheet.panels["position"])
     return sheet.finished()
 
 
@@ -257,14 +171,14 @@ def draw_errors(axes: Axes, pair: PairRecord, quantity: Quantity, *roles: Role) 
         sigmas = _errors(axes, pair, role, quantity, off)
     if pair.exact:
         axes.axhline(TOLERANCE, ls="-.", lw=0.9, color=PALE, gid="tolerance", zorder=1,
-                     label="tolerance: 1e-6 m" + (" or rad" if len(roles) > 1 else ""))  # fmt: skip
+                     label=f"tolerance: {TOLERANCE:g}; smaller\nthan {FLOOR:g} is drawn there")  # fmt: skip
     elif quantity == "position":
         required = pair.mission.accuracy
         axes.axhline(required, ls="-.", lw=0.9, color=PALE, gid="accuracy", zorder=1,
                      label=f"required sigma: {required:g} m")  # fmt: skip
     if len(roles) == 1 and sigmas:
         _line(axes, sigmas, lw=0.7, ls="-", color=COLOURS[roles[0]], gid="sigma", label="claimed sigma")
-    _scale(axes)
+    axes.set_yscale("log")
     if len(roles) == 1 and sigmas:
         low, _ = axes.get_ylim()
         ticks, values = np.array(sigmas).T
@@ -299,14 +213,14 @@ def _errors(
     likeliest = [(one.tick, off(one.world[0], truth)) for one, truth in robot.likeliest]
     _line(axes, likeliest, lw=1.2, ls=ROLE_LINES[role], ms=3.6, color=colour, gid=f"{quantity}-{robot.id}",
           label=f"{robot.id}, {'pose' if pair.exact else 'most probable pose'}",
-          markevery=_marked(pair, role, [tick for tick, _ in likeliest]), **ROLE_MARKERS[role])  # fmt: skip
+          markevery=every(len(likeliest)), **ROLE_MARKERS[role])  # fmt: skip
     sigmas = [(one.tick, _sigma(one.covariance, quantity)) for one, _ in robot.likeliest if one.covariance]
     _line(axes, [(tick, BAND_SIGMAS * sigma) for tick, sigma in sigmas], lw=0.9, ls=CLAIMED[role],
           color=colour, gid=f"{quantity}-sigma-{robot.id}",
           label=rf"{robot.id}, claimed 3 $\sigma$")  # fmt: skip
     if robot.claim is not None:
         axes.plot(
-            robot.claim.tick, max(_of_claim(robot.claim, quantity), SMALLEST_ERROR),
+            robot.claim.tick, max(_of_claim(robot.claim, quantity), FLOOR),
             ROLE_MARKERS[role]["marker"], ms=9, mfc="none", mec=INK, mew=1.1, ls="", clip_on=False, zorder=5,
             gid=f"claim-{robot.id}", label=f"claim of {robot.id}, tick {robot.claim.tick}",
         )  # fmt: skip
@@ -339,23 +253,7 @@ def _line(axes: Axes, points: Points, **looks: Any) -> None:
     if len(points) == 1:
         looks = {"marker": ".", **looks}
     if points:
-        axes.plot([tick for tick, _ in points], [max(value, SMALLEST_ERROR) for _, value in points], **looks)
-
-
-def _scale(axes: Axes) -> None:
-    """Make the scale of errors logarithmic, ROOM times wider than what is drawn."""
-    axes.set_yscale("log")
-    values = [float(y) for one in axes.lines for y in np.ravel(one.get_ydata()) if one.get_gid() and y > 0.0]
-    low, high = (min(values) / ROOM, max(values) * ROOM) if values else (0.1 * TOLERANCE, 10.0)
-    axes.set_ylim(low, high)
-    axes.yaxis.set_major_locator(
-        LogLocator(subs=(1.0, 2.0, 5.0) if high < SHORT_DECADES * low else (1.0,), numticks=7)
-    )
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}".replace("e-0", "e-")))
-    axes.yaxis.set_minor_locator(NullLocator())
-
-
-# --- hypotheses ---------------------------------------------------------------------------------------
+        axes.plot([tick for tick, _ in points], [max(value, FLOOR) for _, value in points], **looks)
 
 
 def draw_hypotheses(axes: Axes, pair: PairRecord, role: Role) -> None:
@@ -371,7 +269,7 @@ def draw_hypotheses(axes: Axes, pair: PairRecord, role: Role) -> None:
     if robot.placed:
         first = robot.placed[0][0].tick
         axes.axvline(first, color="0.3", lw=0.8, ls=":", gid="placed")
-        axes.text(1.0, 1.04, f"from tick {first}: configurations of the pair", ha="right", **words)
+        axes.text(1.0, 1.04, f"from tick {first}: of the pair", ha="right", **words)
 
 
 def _probabilities(axes: Axes, pair: PairRecord, role: Role) -> None:
@@ -418,7 +316,7 @@ def _rank(axes: Axes, pair: PairRecord, role: Role, rank: int, placed: bool, edg
     else:
         axes.plot(
             ticks, probability, "-", ms=3.6, lw=1.2, color=COLOURS[role], gid=gid, clip_on=False, zorder=4,
-            markevery=_marked(pair, role, ticks), **ROLE_MARKERS[role],
+            markevery=every(len(ticks)), **ROLE_MARKERS[role],
         )  # fmt: skip
 
 
@@ -434,7 +332,7 @@ def _count(axes: Axes, pair: PairRecord, role: Role) -> None:
         ticks, held = zip(*counts, strict=True)
         axes.plot(
             ticks, held, "-", ms=3.6, lw=1.2, drawstyle="steps-post", color=COLOURS[role], gid="count",
-            markevery=_marked(pair, role, ticks), label="possible poses", **ROLE_MARKERS[role],
+            markevery=every(len(ticks)), label="possible poses", **ROLE_MARKERS[role],
         )  # fmt: skip
     axes.axhline(1.0, color=PALE, lw=0.9, ls="-.", label="one pose")
     known = [count for _, count in counts if not math.isnan(count)]

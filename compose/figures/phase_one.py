@@ -63,7 +63,7 @@ def draw(pair: PairRecord, role: Role, medium: Medium = SCREEN) -> Figure | Abse
         virtual = branches[0].branch.distance(state.odometry)
         points += [(x, y) for x in (-virtual, virtual) for y in (-virtual, virtual)]
     sheet = Sheet(medium, True, [pair.title, _title(pair, role, state)])
-    axes = sheet.panel()
+    axes = sheet.panels["plane"]
     circle(axes, (0, 0), reach, lw=1.2, ls="-", color="k", gid="range", label=f"$R$ = {reach:g} m")
     axes.plot(0, 0, "x", color="k", ms=6, mew=1.4, ls="", gid="anchor", label=f"anchor ${ANCHORS[role]}$")
     _circles(axes, track, branches[0].branch, state.belief.branch_kind)
@@ -72,7 +72,8 @@ def draw(pair: PairRecord, role: Role, medium: Medium = SCREEN) -> Figure | Abse
         if one.status == "rejected" and pair.exact:
             _contradictions(axes, one.branch, track, reach)
     _name_points(axes, track, branches[0].branch)
-    sheet.plane(axes, around(points, 0.05), TALLEST_PHASE_ONE)
+    sheet.plane("plane", around(points, 0.05), TALLEST_PHASE_ONE)
+    sheet.key(axes)
     return sheet.finished()
 
 

@@ -1,61 +1,41 @@
-"""The layout of a figure: a title, panels and keys placed in inches from the top, and a height that follows.
-
-Sizes of texts are measured in the fonts that Matplotlib ships and rounded up, so that equal figures are equal
-byte for byte.
-"""
+"""The layout of a figure: a title, panels in a mosaic, and keys, by Matplotlib's constrained layout."""
 
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Iterable, Sequence
-from functools import cache
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
-import numpy as np
-from matplotlib import rcParams
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import RendererAgg
 from matplotlib.figure import Figure
-from matplotlib.font_manager import FontProperties
-from matplotlib.legend import Legend
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
-from matplotlib.transforms import Bbox
+from matplotlib.transforms import Bbox, blended_transform_factory
 
-from compose.figures.style import DECIMALS, INK, PAGE, SCREEN, TEXT, Medium
+from compose.figures.style import INK, PAGE, Medium
 from protocol.mission import Role
 
-EDGE, GAP = 0.06, 0.12
-"""The margin at the edges of a figure, and the gap between a panel and its key, in inches."""
-LEFT, FOOT, HEAD, WORDS = 0.48, 0.36, 0.06, 0.155
-"""The space left of a panel for its axis, below it, above it, and per line of a text, in inches."""
-HANDLE, SPACE, BETWEEN = 2.2, 0.5, 1.0
-"""The lengths of a key's handles and of the gaps after handles and between columns, in font sizes."""
-KEY_BESIDE = 0.6
-"""The least fraction of the width that a plane has if its key is beside it."""
-ROW = 0.165
-"""The height of a row of a key, in inches."""
+PAD = 0.04
+"""The distance in inches between panels, and of all from the edges of a figure."""
 PANELS, ACROSS = 6, 3
 """The maximum number of panels of a series, in total and in a row."""
-HINTED = 1.03
-"""The largest ratio of the widths of a text at two resolutions, which differ by its hinting."""
-TEXT_DPI = SCREEN.dpi
-"""The resolution at which texts are measured, in dots per inch."""
+LONE = 3.0
+"""The maximum height of the panel of a series with one panel, in inches."""
+KEY_WIDTH = 0.85
+"""The fraction of a cell's width, with its axis labels, that a key in it may take."""
+NUMBERS = 6
+"""The maximum number of intervals between the labelled ticks of an axis of the plane."""
 NO_ENCOUNTER = "the robots had no encounter (phase 3)"
 NO_TRUTH = "a recording in hardware mode has no ground truth"
 NO_PLACES = "in hardware mode, positions follow from claims, and not both robots made one"
 ANCHORS: dict[Role, str] = {"a": "M_1", "b": "M_2"}
 """The anchors' names in the paper, for use between two `$`."""
-AXIS_STEPS = (1, 2, 5, 10)
-"""The steps between two ticks of an axis, times a power of 10 m. Numbers such as -7.5 do not fit in LEFT."""
 LABEL = {"facecolor": "white", "alpha": 0.75, "pad": 0.6, "lw": 0}
 """The background of a text within a panel."""
 Window = tuple[float, float, float, float]
 """A window of the plane: left, right, low and high, in m."""
 Moment = TypeVar("Moment")
-_TITLE_WORD = re.compile(r"(?:\\\$|\$[^$]*\$|[^\s$])+")
-"""A word of a title; spaces between two `$` do not end it."""
 
 
 class Absent(NamedTuple):
@@ -65,160 +45,119 @@ class Absent(NamedTuple):
 
 
 class Sheet:
-    """A figure that is filled from the top, `top` inches of it so far.
+    """A figure whose panels are the cells of a mosaic, and whose height follows from theirs.
 
-    The first line of the title is printed literally; in the others `$` encloses symbols.
+    Each row of the mosaic has a cell that spans no other row. The first line of the title is printed
+    literally; in the others `$` encloses symbols.
     """
 
-    def __init__(self, medium: Medium, narrow: bool, title: Sequence[str]) -> None:
+    def __init__(
+        self,
+        medium: Medium,
+        narrow: bool,
+        title: Sequence[str],
+        mosaic: Sequence[Sequence[str]] = (("plane",), ("key",)),
+        widths: Sequence[float] | None = None,
+    ) -> None:
         self.width = medium.narrow if narrow else PAGE
-        self.figure = Figure(figsize=(self.width, 1.0))
-        self.top = EDGE
-        self._panels: list[tuple[Axes, tuple[float, float, float, float]]] = []
-        self._keys: list[tuple[Legend, float, float]] = []
-        self._lines: list[tuple[str, float]] = []
+        self._engine = ConstrainedLayoutEngine(w_pad=PAD, h_pad=PAD, wspace=0.0, hspace=0.0)
+        self.figure = Figure(figsize=(self.width, 6.0), layout=self._engine)
         if medium.titled:
-            for line in [plain(title[0]), *title[1:]]:
-                for part in wrapped(_TITLE_WORD.findall(line), self.width - 2 * EDGE, " "):
-                    self._lines.append((part, self.top))
-                    self.top += WORDS
-            self.top += EDGE
-
-    @property
-    def room(self) -> float:
-        """The width of a panel that takes the whole width, in inches."""
-        return self.width - LEFT - 3 * EDGE
-
-    def panel(self) -> Axes:
-        """Add and return axes, which are yet to be placed."""
-        return self.figure.add_axes((0.0, 0.0, 1.0, 1.0))
-
-    def place(self, axes: Axes, left: float, top: float, width: float, height: float) -> None:
-        """Place axes; all arguments are in inches, from the upper left corner."""
-        self._panels.append((axes, (left, top, width, height)))
-
-    def key(self, panel: Axes, left: float, top: float, width: float, **look: Any) -> float:
-        """Draw the legend of `panel` with as many columns as fit in `width` inches; return its height."""
-        handles, labels = panel.get_legend_handles_labels()
-        if not handles:
-            return 0.0
-        rows = next((n for n in range(1, len(labels)) if _width(labels, n) <= width), len(labels))
-        columns = math.ceil(len(labels) / rows)
-        key = self.figure.legend(
-            handles,
-            labels,
-            loc="upper left",
-            ncols=columns,
-            frameon=False,
-            handlelength=HANDLE,
-            handletextpad=SPACE,
-            columnspacing=BETWEEN,
-            labelspacing=0.4,
-            borderaxespad=0.0,
-            borderpad=0.0,
-            alignment="left",
-            **look,
+            words = "\n".join([plain(title[0]), *title[1:]])
+            self.figure.suptitle(words, x=PAD / self.width, ha="left", wrap=True, color=INK)
+        self.panels: dict[str, Axes] = self.figure.subplot_mosaic(
+            [list(row) for row in mosaic], width_ratios=widths, empty_sentinel=""
         )
-        self._keys.append((key, left, top))
-        return (rows + ("title" in look)) * ROW
+        self._mosaic = mosaic
+        self._widths = list(widths or [1.0] * len(mosaic[0]))
+        self._heights: dict[str, Callable[[], float]] = {}
 
-    def plane(self, axes: Axes, window: Window, tallest: float) -> None:
-        """Place a plane that shows `window`, with its key beside it if there is room, and below it else."""
-        _, labels = axes.get_legend_handles_labels()
-        beside = _width(labels, len(labels)) + GAP
-        if (left := self.room - beside) < KEY_BESIDE * self.room:
-            left = self.room
-        width, height = fitted(window, left, tallest)
-        top = self.top + HEAD
-        self.place(axes, LEFT, top, width, height)
-        named(axes, window)
-        self.top = top + height + FOOT
-        if left == self.room:
-            self.key_below(axes)
-        else:
-            self.top = max(self.top, top + self.key(axes, LEFT + width + GAP, top, 0.0))
+    def tall(self, name: str, height: float) -> Axes:
+        """Return the panel `name`, which is `height` inches high."""
+        self._heights[name] = lambda: height
+        return self.panels[name]
 
-    def key_below(self, axes: Axes) -> None:
-        """Draw the legend of `axes` below what is placed already, from edge to edge if narrow."""
-        left = LEFT if self.width == PAGE else EDGE
-        self.top += GAP / 2
-        self.top += self.key(axes, left, self.top, self.width - left - EDGE)
+    def plane(self, name: str, window: Window, tallest: float = math.inf, *, low: bool = True) -> None:
+        """Let the panel `name` show `window`, at most `tallest` inches high; name its y axis if `low`."""
+        axes = self.panels[name]
+        left, right, bottom, top = window
+        axes.set_xlim(left, right)
+        axes.set_ylim(bottom, top)
+        axes.set_aspect("equal", adjustable="box", anchor="NW")
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_locator(MaxNLocator(NUMBERS, steps=(1, 2, 5, 10)))
+        axes.set_xlabel("x [m]")
+        if low:
+            axes.set_ylabel("y [m]")
+        ratio = (top - bottom) / (right - left)
+        self._heights[name] = lambda: min(tallest, ratio * self.width * _place(axes).width)
 
-    def series(self, panels: Sequence[Axes], captions: Sequence[Sequence[str]], window: Window) -> None:
-        """Place panels that show `window` to one scale, each below its caption, in rows of up to ACROSS.
+    def key(self, panel: Axes, name: str = "key", **look: Any) -> None:
+        """Draw the legend of `panel` in the cell `name`, with as many columns as fit.
 
-        A caption is a sequence of parts, which are wrapped.
+        It begins below or beside the panel, but at the edge of a figure of one column.
         """
-        columns = min(ACROSS, len(panels))
-        width = (self.room - (columns - 1) * LEFT) / columns
-        width, height = fitted(window, min(width, 0.42 * PAGE), math.inf)
-        texts = [wrapped([f"{part}," for part in parts[:-1]] + [parts[-1]], width + 0.7 * LEFT, " ")
-                 for parts in captions]  # fmt: skip
-        for first in range(0, len(panels), columns):
-            row = range(first, min(first + columns, len(panels)))
-            self.top += HEAD + WORDS * max(len(texts[i]) for i in row)
-            for column, i in enumerate(row):
-                self.place(panels[i], LEFT + column * (width + LEFT), self.top, width, height)
-                panels[i].set_title("\n".join(texts[i]), loc="left", pad=3, linespacing=1.15, x=-0.1)
-                named(panels[i], window, low=column == 0)
-            self.top += height + FOOT
-        self.key_below(panels[-1])
+        cell, edge = self.panels[name], self.width < PAGE
+        cell.set_axis_off()
+        handles, labels = panel.get_legend_handles_labels()
+        share = [width for width, one in zip(self._widths, self._row(name), strict=True) if one == name]
+        room = self.width - 2 * PAD if edge else KEY_WIDTH * self.width * sum(share) / sum(self._widths)
+        places = self.figure.transFigure if edge else cell.transAxes
+        self._heights[name] = lambda: 0.0
+        for columns in range(len(labels), 0, -1):
+            key = cell.legend(
+                handles, labels, ncols=columns, loc="upper left", frameon=False, borderaxespad=0.0,
+                borderpad=0.0, handlelength=2.2, handletextpad=0.5, columnspacing=1.0, labelspacing=0.4,
+                alignment="left", bbox_to_anchor=(PAD / self.width if edge else 0.0, 1.0),
+                bbox_transform=blended_transform_factory(places, cell.transAxes), **look,
+            )  # fmt: skip
+            key.set_in_layout(not edge)
+            width, height = key.get_window_extent().size / self.figure.dpi
+            self._heights[name] = lambda tall=float(height): tall  # type: ignore[misc]
+            if width <= room:
+                break
+
+    def _row(self, name: str) -> Sequence[str]:
+        """Return the row of the mosaic with the cell `name`."""
+        return next(row for row in self._mosaic if name in row)
 
     def finished(self) -> Figure:
-        """Return the figure, with everything in its place."""
-        wide, tall = self.width, math.ceil(100.0 * (self.top + EDGE)) / 100.0
-        self.figure.set_size_inches(wide, tall)
-        for axes, (left, top, width, height) in self._panels:
-            corners = (left / wide, 1.0 - (top + height) / tall), ((left + width) / wide, 1.0 - top / tall)
-            axes.set_position(Bbox(np.round(corners, DECIMALS)))
-        for key, left, top in self._keys:
-            key.set_bbox_to_anchor((left / wide, 1.0 - top / tall), transform=self.figure.transFigure)
-        for text, top in self._lines:
-            self.figure.text(EDGE / wide, 1.0 - (top + WORDS / 2) / tall, text, va="center", color=INK)
+        """Return the figure, as high as its rows of panels need."""
+        for _ in range(2):  # the width of a plane, and with it its height, depends on the labels of its axis
+            self._engine.execute(self.figure)
+            tall = self.figure.get_figheight()
+            rows = [[name for name in dict.fromkeys(row) if name in self._heights] for row in self._mosaic]
+            wanted = [max([self._heights[name]() for name in row]) for row in rows]
+            grid = self.panels[rows[0][0]].get_gridspec()
+            assert grid is not None
+            grid.set_height_ratios([max(height, 1e-3) for height in wanted])
+            self.figure.set_figheight(
+                tall + sum(wanted) - sum([tall * _place(self.panels[row[0]]).height for row in rows])
+            )
+        self._engine.execute(self.figure)
+        self.figure.set_layout_engine("none")
         return self.figure
 
 
-def measured(text: str) -> float:
-    """Return the width of a line of text in the font of `look`, in inches, rounded up to 0.01."""
-    return _measured(text, rcParams["font.family"][0])
+def series(
+    medium: Medium, title: Sequence[str], captions: Sequence[str], window: Window
+) -> tuple[Sheet, list[Axes]]:
+    """Return a sheet with a panel below each caption, in rows of up to ACROSS, that all show `window`."""
+    count, columns = len(captions), min(ACROSS, len(captions))
+    rows = [
+        [str(i) if i < count else "" for i in range(first, first + columns)]
+        for first in range(0, count, columns)
+    ]
+    sheet = Sheet(medium, count == 1, title, [*rows, ["key"] * columns])
+    for i, caption in enumerate(captions):
+        sheet.plane(str(i), window, LONE if count == 1 else math.inf, low=i % columns == 0)
+        sheet.panels[str(i)].set_title(caption, loc="left", pad=3)
+    return sheet, [sheet.panels[str(i)] for i in range(count)]
 
 
-@cache
-def _measured(text: str, family: str) -> float:
-    font, symbols = FontProperties(family=family, size=TEXT), text.replace(r"\$", "").count("$") > 0
-    size = _renderer().get_text_width_height_descent(text, font, symbols)  # type: ignore[no-untyped-call]
-    return math.ceil(100.0 * float(size[0]) / TEXT_DPI) / 100.0
-
-
-@cache
-def _renderer() -> RendererAgg:
-    return RendererAgg(1, 1, TEXT_DPI)  # type: ignore[no-untyped-call]
-
-
-def wrapped(words: Iterable[str], width: float, between: str) -> list[str]:
-    """Return lines of `words` that are at most `width` inches wide, unless a single word is wider."""
-    lines: list[str] = []
-    for word in words:
-        if lines and measured(longer := f"{lines[-1]}{between}{word}") <= width:
-            lines[-1] = longer
-        else:
-            lines.append(word)
-    return lines
-
-
-def _width(labels: Sequence[str], rows: int) -> float:
-    """Return the width of a key with at most `rows` rows, in inches.
-
-    Matplotlib fills its columns one after the other, the first ones with a row more than the last ones.
-    """
-    columns = math.ceil(len(labels) / rows)
-    rows, longer = divmod(len(labels), columns)
-    wide, start = 0.0, 0
-    for column in range(columns):
-        end = start + rows + (column < longer)
-        wide += max(map(measured, labels[start:end]), default=0.0)
-        start = end
-    return HINTED * wide + (columns * (HANDLE + SPACE) + (columns - 1) * BETWEEN) * TEXT / 72.0
+def _place(axes: Axes) -> Bbox:
+    """Return the cell of `axes`, in fractions of the figure's size."""
+    return axes.get_position(original=True)
 
 
 def circle(axes: Axes, place: tuple[float, float], radius: float, **look: Any) -> None:
@@ -232,25 +171,6 @@ def circle(axes: Axes, place: tuple[float, float], radius: float, **look: Any) -
 def plain(text: str) -> str:
     """Return `text` with each `$` escaped, for literal printing."""
     return text.replace("$", r"\$")
-
-
-def named(axes: Axes, window: Window, *, low: bool = True) -> None:
-    """Set the window of `axes` with one scale for x and y, and name the axes; y only if `low`."""
-    axes.set_xlim(*window[:2])
-    axes.set_ylim(*window[2:])
-    axes.set_aspect("equal", adjustable="box")
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(MaxNLocator("auto", steps=AXIS_STEPS))
-    axes.set_xlabel("x [m]")
-    if low:
-        axes.set_ylabel("y [m]")
-
-
-def fitted(window: Window, width: float, tallest: float) -> tuple[float, float]:
-    """Return the width and height of a panel for `window`, within `width` by `tallest` inches."""
-    left, right, low, high = window
-    scale = min(width / (right - left), tallest / (high - low))
-    return scale * (right - left), scale * (high - low)
 
 
 def around(points: Sequence[tuple[float, float]], margin: float) -> Window:

@@ -11,19 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch
 from matplotlib.ticker import MaxNLocator
 
-from compose.figures.sheet import (
-    EDGE,
-    FOOT,
-    GAP,
-    LABEL,
-    NO_TRUTH,
-    WORDS,
-    Absent,
-    Sheet,
-    Window,
-    around,
-    circle,
-)
+from compose.figures.sheet import LABEL, NO_TRUTH, Absent, Sheet, Window, around, circle
 from compose.figures.style import INK, PALE, SCREEN, Medium
 from compose.recording.run import Run
 from compose.recording.run_setup import RunSetup
@@ -36,8 +24,6 @@ TALLEST_SPREAD = 4.6
 """The maximum height of the plane, in inches."""
 LANE, MOST_LANES = 0.17, 8.0
 """The height of a robot's lane, and the maximum height of all of them, in inches."""
-AXIS, BOUND = 0.72, 0.45
-"""The space left of the lanes for the robots' names, and right of them for their bounds, in inches."""
 MOST_AXIS_TICKS = 16
 """The largest number of robots with whose anchors the ticks of their claims are written."""
 LANE_COLOURS: dict[bool, Role] = {False: "b", True: "a"}
@@ -70,23 +56,18 @@ def draw(run: Run, medium: Medium = SCREEN) -> Figure | Absent:
         return Absent(NO_TRUTH)
     robots = group_robots(run, setup)
     claimed = sum([one.localised is not None for one in robots])
-    sheet = Sheet(
-        medium, False, [run.title(run.robots), f"Meetings: {claimed} of {len(robots)} robots localised"]
-    )
-    axes = sheet.panel()
+    title = [run.title(run.robots), f"Meetings: {claimed} of {len(robots)} robots localised"]
+    sheet = Sheet(medium, False, title, [["plane"], ["key"], ["lanes"]])
+    axes = sheet.panels["plane"]
     reach = setup.mission.sensing_range
     for one in robots:
         _home(axes, one, reach, ticks=len(robots) <= MOST_AXIS_TICKS)
         _path(axes, one)
     _tree(axes, setup, robots)
     _key(axes, reach, unanchored=any(one.anchor is None for one in robots))
-    sheet.plane(axes, _window(robots, reach), TALLEST_SPREAD)
-    lanes = sheet.panel()
-    _lanes(lanes, setup, robots)
-    sheet.top += GAP + WORDS
-    tall = min(LANE * len(robots) + LANE, MOST_LANES)
-    sheet.place(lanes, AXIS, sheet.top, sheet.width - AXIS - BOUND - EDGE, tall)
-    sheet.top += tall + FOOT
+    sheet.plane("plane", _window(robots, reach), TALLEST_SPREAD)
+    sheet.key(axes)
+    _lanes(sheet.tall("lanes", min(LANE * len(robots) + LANE, MOST_LANES)), setup, robots)
     return sheet.finished()
 
 

@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from compose.figures.pair import PairRecord
-from compose.figures.sheet import NO_ENCOUNTER, NO_PLACES, Absent, Sheet, Window, circle, some, square
+from compose.figures.sheet import NO_ENCOUNTER, NO_PLACES, Absent, Window, circle, series, some, square
 from compose.figures.style import INK, PALE, ROLE_MARKERS, SCREEN, Medium
 from compose.figures.trajectory import draw_trail, heading
 from compose.view.colours import COLOURS, line_style
@@ -27,12 +27,12 @@ def draw(pair: PairRecord, medium: Medium = SCREEN) -> Figure | Absent:
         return Absent(NO_ENCOUNTER if pair.encounter_tick is None else "the encounter has no mutual range")
     shown = some(ticks)
     window = _window(pair, ticks[0], shown[-1])
-    sheet = Sheet(medium, len(shown) == 1, [pair.title, _title(ticks, shown)])
-    panels = [sheet.panel() for _ in shown]
+    captions = [_caption(pair, tick, i + 1) for i, tick in enumerate(shown)]
+    sheet, panels = series(medium, [pair.title, _title(ticks, shown)], captions, window)
     for i, tick in enumerate(shown):
         _panel(panels[i], pair, ticks[0], shown[i - 1] if i else tick, tick)
     _key(panels[-1], pair)
-    sheet.series(panels, [_caption(pair, tick, i + 1) for i, tick in enumerate(shown)], window)
+    sheet.key(panels[-1])
     return sheet.finished()
 
 
@@ -62,14 +62,14 @@ def _title(ticks: list[int], shown: list[int]) -> str:
     return f"Encounter: {many}, $k$ = {ticks[0]} to {ticks[-1]}"
 
 
-def _caption(pair: PairRecord, tick: int, number: int) -> list[str]:
+def _caption(pair: PairRecord, tick: int, number: int) -> str:
     """Return the caption of a panel: the range, and the state of each robot's command."""
     rho = pair.mutual[tick][1]
     states = []
     for role in ROLES:
         command = pair.command(role, tick)
         states.append(f"{pair.robot(role).id}: {command.task if command is not None else 'no command'}")
-    return [f"({number}) $k$ = {tick}", rf"$\rho$ = {rho:.4f} m", *states]
+    return "\n".join([rf"({number}) $k$ = {tick}, $\rho$ = {rho:.4f} m", *states])
 
 
 def _panel(axes: Axes, pair: PairRecord, first: int, before: int, tick: int) -> None:

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import matplotlib as mpl
 from matplotlib import _mathtext
 from matplotlib.figure import Figure
-from matplotlib.transforms import Bbox
 
 from compose.figures import FIGURE_FORMATS
 from compose.view.colours import COLOURS
@@ -34,8 +33,6 @@ SMALLEST_FONT = 6.0
 """The font size of subscripts and superscripts, in points."""
 COLUMN, PAGE = 3.5, 7.16
 """The widths of one column and of two columns of a paper (IEEE), in inches."""
-DECIMALS = 6
-"""The number of decimal places of panel positions, which are fractions of the figure's size."""
 
 LAYOUT_TABLES = ["GSUB", "GPOS", "GDEF", "BASE", "JSTF", "MATH", "kern"]
 """The tables of a font with which text is laid out. A PDF file states the place of each glyph."""
@@ -84,8 +81,8 @@ def look(medium: Medium) -> Iterator[None]:
     """Use the matplotlib settings for drawing and saving figures for `medium`, and no others.
 
     Matplotlib reads a file `matplotlibrc` in the working directory. That may be a stranger's folder, and the
-    file can start LaTeX. The fixed hash salt makes equal figures equal byte for byte. Fonts are embedded as
-    TrueType (42), because publishers reject Type 3, matplotlib's default.
+    file can start LaTeX. With the fixed hash salt, and without a date, a figure that is drawn again differs
+    little. Fonts are embedded as TrueType (42), because publishers reject Type 3, matplotlib's default.
     """
     with mpl.rc_context():
         mpl.rcdefaults()
@@ -108,7 +105,6 @@ def save(
 
     Raises OSError.
     """
-    _settle(figure)
     if "pdf" in formats:
         _leave_out_layout_tables()
     written = [path.with_name(f"{path.name}.{ending}") for ending in formats]
@@ -124,17 +120,3 @@ def _leave_out_layout_tables() -> None:
     from fontTools.subset import Options  # type: ignore[import-untyped]  # noqa: PLC0415  # only for PDF
 
     Options._drop_tables_default = [*Options._drop_tables_default, *LAYOUT_TABLES]
-
-
-def _settle(figure: Figure) -> None:
-    """Fix the panels' positions from a constrained layout, rounded to DECIMALS.
-
-    The last bits of a constrained layout vary between processes, so unrounded files would differ.
-    """
-    if figure.get_layout_engine() is None:
-        return
-    figure.draw_without_rendering()
-    figure.set_layout_engine("none")
-    for axes in figure.axes:
-        corners = axes.get_position(original=True).get_points()
-        axes.set_position(Bbox(corners.round(DECIMALS)), "original")

@@ -25,13 +25,13 @@ RANGE_ARROW = 0.35
 
 
 def draw(pair: PairRecord, medium: Medium = SCREEN) -> Figure | Absent:
-    """Return the figure: the plane with the key beside or below it."""
+    """Return the figure: the plane with the key below it."""
     if not pair.placed:
         return Absent(NO_PLACES)
     sheet = Sheet(medium, True, [pair.title])
-    axes = sheet.panel()
-    draw_plane(axes, pair)
-    sheet.plane(axes, window(pair), TALLEST_TRAJECTORY)
+    draw_plane(sheet.panels["plane"], pair)
+    sheet.plane("plane", window(pair), TALLEST_TRAJECTORY)
+    sheet.key(sheet.panels["plane"])
     return sheet.finished()
 
 
