@@ -95,16 +95,18 @@ def checked(pair: PairRecord, medium: Medium) -> None:
         figure.set_dpi(medium.dpi)
         figure.draw_without_rendering()
         sheet = figure.bbox.padded(0.5)
-        keys = [key.get_window_extent() for axes in figure.axes if (key := axes.get_legend()) is not None]
+        keys = [
+            key.get_window_extent() for axes in figure.axes if not axes.axison and (key := axes.get_legend())
+        ]
         panels = [
             panel for axes in figure.axes if axes.axison and (panel := axes.get_tightbbox()) is not None
         ]
         for box in [*keys, *panels, *[text.get_window_extent() for text in figure.texts]]:
             assert sheet.x0 <= box.x0 <= box.x1 <= sheet.x1, (name, box, sheet)
             assert sheet.y0 <= box.y0 <= box.y1 <= sheet.y1, (name, box, sheet)
-        for i, key in enumerate(keys):
+        for i, one in enumerate(keys):
             for other in [*keys[:i], *panels]:
-                assert Bbox.intersection(key.padded(-0.5), other) is None, (name, key, other)
+                assert Bbox.intersection(one.padded(-0.5), other) is None, (name, one, other)
 
 
 def pixels_across(png: Path) -> int:

@@ -103,7 +103,6 @@ class Sheet:
         share = [width for width, one in zip(self._widths, self._row(name), strict=True) if one == name]
         room = self.width - 2 * PAD if edge else KEY_WIDTH * self.width * sum(share) / sum(self._widths)
         places = self.figure.transFigure if edge else cell.transAxes
-        self._heights[name] = lambda: 0.0
         for columns in range(len(labels), 0, -1):
             key = cell.legend(
                 handles, labels, ncols=columns, loc="upper left", frameon=False, borderaxespad=0.0,
@@ -112,10 +111,11 @@ class Sheet:
                 bbox_transform=blended_transform_factory(places, cell.transAxes), **look,
             )  # fmt: skip
             key.set_in_layout(not edge)
-            width, height = key.get_window_extent().size / self.figure.dpi
-            self._heights[name] = lambda tall=float(height): tall  # type: ignore[misc]
-            if width <= room:
+            extent = key.get_window_extent()
+            if extent.width <= room * self.figure.dpi:
                 break
+        height = extent.height / self.figure.dpi if labels else 0.0
+        self._heights[name] = lambda: height
 
     def _row(self, name: str) -> Sequence[str]:
         """Return the row of the mosaic with the cell `name`."""
