@@ -46,6 +46,7 @@ from compose.sweep import spec
 from compose.sweep.draws import DrawTable, StartsTable
 from compose.sweep.paired_differences import PairedDifference
 from compose.sweep.spec import AxisTable, RowTable, SpecFile
+from compose.sweep.statistics import CellSummary
 from compose.sweep.trial import RobotRow, TrialRow
 from protocol import messages, wire
 from protocol.attack import Attack
@@ -306,6 +307,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "starts": partial(fields_of, StartsTable),
     "trial-columns": partial(columns_of, TrialRow),
     "robot-columns": partial(columns_of, RobotRow),
+    "summary-columns": partial(columns_of, CellSummary),
     "difference-columns": partial(columns_of, PairedDifference),
     "tick-columns": partial(columns_of, rows.TickRow),
     "truth-table": partial(columns_of, rows.TruthRow),

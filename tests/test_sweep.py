@@ -971,4 +971,7 @@ def test_a_sweep_of_draws_counts_what_it_refused_and_resumes(folder: Path) -> No
     assert counts in ended.out
     assert counts in straight.out
     (summary,) = summary_rows(folder / "out")
+    first = f"trial {refused[0]['trial']} of cell 0: {refused[0]['reason']}"
+    said = " ".join(straight.out.split())
+    assert f"{len(refused)} trials refused; the first is {first[:60]}" in said
     assert (summary["trials"], summary["refused_trials"]) == (str(80 - len(refused)), str(len(refused)))

@@ -18,7 +18,7 @@ from matplotlib.ticker import LogFormatter
 from compose.figures.style import SWEEP_MEDIUM, look, save
 from compose.sweep.execution import Results
 from compose.sweep.spec import Axis, Sweep
-from compose.sweep.statistics import Floats, Interval, column, quantile, ran, wilson
+from compose.sweep.statistics import Floats, Interval, Trials, column, quantile, wilson
 
 STYLES = (
     ("#0b3c6f", "-", "o"),
@@ -74,9 +74,8 @@ def _rate(outcome: str) -> Callable[[pa.Table], dict[str, Interval]]:
     """Return the function that estimates the rate of `outcome`."""
 
     def estimates(table: pa.Table) -> dict[str, Interval]:
-        outcomes = ran(table)["outcome"].to_pylist()
-        k, n = outcomes.count(outcome), len(outcomes)
-        return {"": wilson(k, n)} if n else {}
+        outcomes = Trials(table).outcomes
+        return {"": wilson(outcomes.count(outcome), len(outcomes))} if outcomes else {}
 
     return estimates
 
@@ -91,13 +90,6 @@ def _quantiles(values: Callable[[pa.Table], Floats]) -> Callable[[pa.Table], dic
     return estimates
 
 
-def _ticks(table: pa.Table) -> Floats:
-    """Return the ticks of the trials that localised."""
-    localised = np.array([outcome == "localised" for outcome in table["outcome"].to_pylist()], bool)
-    ticks: Floats = column(table, "ticks")[localised]
-    return ticks
-
-
 STATISTICS = {
     "success": Statistic("localised, of all trials", _rate("localised")),
     "inconsistent": Statistic(
@@ -108,7 +100,9 @@ STATISTICS = {
     "wrong": Statistic(
         "wrong, of all trials", _rate("wrong"), lambda table: "wrong" in table["outcome"].to_pylist()
     ),
-    "ticks": Statistic("ticks until localised", _quantiles(_ticks), logarithmic=True),
+    "ticks": Statistic(
+        "ticks until localised", _quantiles(lambda table: Trials(table).ticks), logarithmic=True
+    ),
     "wall": Statistic(
         "wall time [s]",
         _quantiles(lambda table: column(table, "wall_s")),

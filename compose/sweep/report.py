@@ -18,7 +18,7 @@ from compose.sweep.cells import Cell
 from compose.sweep.execution import Progress, Results
 from compose.sweep.paired_differences import PairedDifference
 from compose.sweep.results_folder import CELLS
-from compose.sweep.statistics import CellSummary, noted, refusals
+from compose.sweep.statistics import COLUMNS, CellSummary, noted
 from compose.terminal import tables, text_width
 from compose.terminal.invocation import program
 from compose.terminal.text_width import tell
@@ -212,12 +212,15 @@ def _block(lines: Sequence[str]) -> None:
 
 
 def _refused(results: Results) -> Iterator[str]:
-    """Yield a line for each cell that cannot run, and for each reason for refused trials."""
+    """Yield a line for each cell that cannot run, and one for the refused trials."""
     for index, figures in results.figures.items():
         if figures.refused is not None:
             yield f"cell {index} cannot run: {figures.refused}"
-    for reason, count in refusals(results.table):
-        yield f"refused: {count}: {reason}"
+    outcomes = results.table["outcome"].to_pylist()
+    if "refused" in outcomes:
+        first = results.table.slice(outcomes.index("refused"), 1).to_pylist()[0]
+        where = f"trial {first['trial']} of cell {first['cell']}"
+        yield f"{outcomes.count('refused')} trials refused; the first is {where}: {first['reason']}"
 
 
 def _new_folder(name: str) -> Path:
@@ -313,36 +316,19 @@ def _axes(results: Results, cell: Cell) -> list[str]:
 
 
 def _figures(figures: CellSummary) -> dict[str, str]:
+    """Return the texts of the columns of a cell, by their titles."""
+    texts = {
+        shown.title: "-" if (value := getattr(figures, name)) is None else format(value, shown.form)
+        for name, shown in COLUMNS.items()
+        if shown.title
+    }
+    honest = (figures.honest_localised, figures.honest_undecided, figures.honest_wrong)
     return {
-        "trials": str(figures.trials),
-        **{name: str(getattr(figures, name)) for name in OUTCOME_COLUMNS},
-        "clean": str(figures.clean) if figures.audited else "-",
-        "rate": _number(figures.rate, ".4f"),
-        "rate_low": _number(figures.rate_low, ".4f"),
-        "rate_high": _number(figures.rate_high, ".4f"),
-        "p50": _number(figures.ticks_p50, ".0f"),
-        "p95": _number(figures.ticks_p95, ".0f"),
-        "max": _number(figures.ticks_max, ".0f"),
-        "error p50": _number(figures.error_p50_m, ".1e"),
-        "error max": _number(figures.error_max_m, ".1e"),
-        "within": _number(figures.within_3_accuracy, ".4f"),
-        "nees": _number(figures.nees_mean, ".3g"),
-        "nees low": _number(figures.nees_low, ".3g"),
-        "nees high": _number(figures.nees_high, ".3g"),
-        "share p50": _number(figures.bound_share_p50, ".2f"),
-        "share max": _number(figures.bound_share_max, ".2f"),
-        "corrected": _number(figures.corrected_share_max, ".2f"),
-        "travel p50": _number(figures.makespan_p50, ".2f"),
-        "travel p95": _number(figures.makespan_p95, ".2f"),
-        "honest": "-"
-        if figures.honest_localised is None
-        else f"{figures.honest_localised}/{figures.honest_undecided}/{figures.honest_wrong}",
+        **texts,
+        "clean": texts["clean"] if figures.audited else "-",
+        "honest": "-" if None in honest else "/".join(map(str, honest)),
         "found": f"{figures.attacker_found}/{figures.attacker_met}" if figures.attacker_met else "-",
     }
-
-
-def _number(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)
 
 
 def _cells(count: int) -> str:

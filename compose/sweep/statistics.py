@@ -1,15 +1,14 @@
-"""The statistics of each cell: outcomes, durations and accuracy of its trials, and `summary.csv`."""
+"""The statistics of each cell: outcomes, durations and accuracy of its trials, and `summary.csv`.
 
-from __future__ import annotations
+The annotations of CellSummary hold the functions that compute it, so they are evaluated here.
+"""
 
 import csv
 import io
 import math
-import re
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from statistics import NormalDist
-from typing import Any, NamedTuple, get_args
+from typing import Annotated, Any, NamedTuple, get_type_hints
 
 import msgspec
 import numpy as np
@@ -22,9 +21,7 @@ from compose.sweep.cells import Cell
 from compose.sweep.field_paths import canonical
 from compose.sweep.spec import Sweep
 from compose.sweep.trial import TrialOutcome
-from protocol.messages import Outcome
 
-_NUMBER = re.compile(r"[-+]?\d[\d.]*(e[-+]?\d+)?")
 Floats = NDArray[np.float64]
 CONFIDENCE = 0.95
 """The confidence level of the interval of a success rate."""
@@ -32,11 +29,6 @@ NEES_CONFIDENCE = 0.99
 """The probability with which a mean NEES lies in its band if the covariances are consistent."""
 WORSE = ("wrong", "inconsistent", "failed", "undecided")
 """The outcomes that need a look, the worst first."""
-FIGURES_OF_GROUP = (
-    *("bound_share_p50", "bound_share_max", "corrected_share_max", "makespan_p50", "makespan_p95"),
-    *("honest_localised", "honest_undecided", "honest_wrong", "attacker_met", "attacker_found"),
-)
-"""The fields of a CellSummary that only groups have."""
 
 
 class Interval(NamedTuple):
@@ -47,90 +39,201 @@ class Interval(NamedTuple):
     high: float
 
 
+class Trials:
+    """The trials of a cell that were not refused, as the columns of `summary.csv` take them."""
+
+    def __init__(self, table: pa.Table) -> None:
+        self.table = ran(table)
+        self.outcomes: list[str] = self.table["outcome"].to_pylist()
+        self.refused = len(table) - len(self.outcomes)
+
+    def known(self, name: str) -> Floats:
+        """Return the known values of a column; none if the sweep has no such column."""
+        return _known(column(self.table, name)) if name in self.table.schema.names else np.zeros(0)
+
+    @property
+    def ticks(self) -> Floats:
+        """The ticks of the trials that localised."""
+        return _known(
+            column(self.table, "ticks")[np.array([one == "localised" for one in self.outcomes], bool)]
+        )
+
+    def shares(self, bound: str) -> Floats:
+        """Return the ticks of the last honest claim over those in `bound`, of trials that are not `wrong`."""
+        if bound not in self.table.schema.names:
+            return np.zeros(0)
+        right = np.array([one != "wrong" for one in self.outcomes], bool)
+        return _known((column(self.table, "honest_tick") / column(self.table, bound))[right])
+
+
+class Shown(NamedTuple):
+    """How a column of `summary.csv` is computed, and how the terminal shows it."""
+
+    value: Callable[[Trials], float | None]
+    title: str = ""
+    """The title of its column on the terminal; empty if it is not shown there."""
+    form: str = "d"
+    """The format of its value there."""
+    of_group: bool = False
+    """True if only sweeps of groups have the column."""
+
+
+def _outcome(name: str) -> Shown:
+    return Shown(lambda trials: trials.outcomes.count(name), name)
+
+
+def _rate(bound: int, title: str) -> Shown:
+    """Return the column with the rate of trials that localised (0), or a bound of its interval (1, 2)."""
+    return Shown(
+        lambda trials: (
+            wilson(trials.outcomes.count("localised"), n)[bound] if (n := len(trials.outcomes)) else None
+        ),
+        title,
+        ".4f",
+    )
+
+
+def _ticks(percent: float, title: str = "") -> Shown:
+    return Shown(lambda trials: _percentile(trials.ticks, percent), title, ".0f")
+
+
+def _quantile(name: str, percent: float, title: str = "") -> Shown:
+    return Shown(lambda trials: _percentile(trials.known(name), percent), title, ".1e")
+
+
+def _share(bound: str, percent: float, title: str) -> Shown:
+    return Shown(lambda trials: _percentile(trials.shares(bound), percent), title, ".2f", of_group=True)
+
+
+def _total(name: str) -> Shown:
+    return Shown(lambda trials: int(trials.known(name).sum()))
+
+
+def _group_total(name: str) -> Shown:
+    """Return the column with the sum of another one; None where no trial has a value."""
+    return Shown(lambda trials: int(known.sum()) if len(known := trials.known(name)) else None, of_group=True)
+
+
+def _within(trials: Trials) -> float | None:
+    claims = trials.known("claims").sum()
+    return float(trials.known("claims_within").sum() / claims) if claims else None
+
+
+def _nees(trials: Trials) -> float | None:
+    known = trials.known("nees")
+    return float(known.mean()) if len(known) else None
+
+
+Number = float | None
+
+
 class CellSummary(msgspec.Struct, frozen=True):
     """A row of `summary.csv`, without the columns of the axes. A value that does not apply is None."""
 
-    trials: int
+    trials: Annotated[int, Shown(lambda trials: len(trials.outcomes), "trials")]
     """number of trials that were not refused; the counts of the outcomes sum to it"""
-    localised: int
-    undecided: int
-    inconsistent: int
-    wrong: int
-    failed: int
+    localised: Annotated[int, _outcome("localised")]
+    """number of trials that ended so"""
+    undecided: Annotated[int, _outcome("undecided")]
+    """likewise"""
+    inconsistent: Annotated[int, _outcome("inconsistent")]
+    """likewise"""
+    wrong: Annotated[int, _outcome("wrong")]
+    """likewise"""
+    failed: Annotated[int, _outcome("failed")]
     """number of trials that failed or were lost"""
-    rate: float | None
+    rate: Annotated[Number, _rate(0, "rate")]
     """fraction of the trials that localised"""
-    rate_low: float | None
-    rate_high: float | None
-    """bounds of the 95 % Wilson interval of the rate"""
-    ticks_p10: float | None
-    """percentiles of the number of ticks of trials that localised"""
-    ticks_p50: float | None
-    ticks_p90: float | None
-    ticks_p95: float | None
-    ticks_max: float | None
-    meeting_tick_p50: float | None
+    rate_low: Annotated[Number, _rate(1, "rate_low")]
+    """lower bound of its 95 % Wilson interval"""
+    rate_high: Annotated[Number, _rate(2, "rate_high")]
+    """upper bound of that interval"""
+    ticks_p10: Annotated[Number, _ticks(10)]
+    """10th percentile of the number of ticks of trials that localised"""
+    ticks_p50: Annotated[Number, _ticks(50, "p50")]
+    """their median"""
+    ticks_p90: Annotated[Number, _ticks(90)]
+    """their 90th percentile"""
+    ticks_p95: Annotated[Number, _ticks(95, "p95")]
+    """their 95th percentile"""
+    ticks_max: Annotated[Number, _ticks(100, "max")]
+    """the largest of them"""
+    meeting_tick_p50: Annotated[Number, _quantile("meeting_tick", 50)]
     """median tick at which phase 3 began, of trials in which it began"""
-    meeting_tick_max: float | None
-    t_max_s: float | None
+    meeting_tick_max: Annotated[Number, _quantile("meeting_tick", 100)]
+    """the largest of these ticks"""
+    t_max_s: Annotated[Number, _quantile("t_max_s", 100)]
     """largest T_max of a trial, in s"""
-    t_max_ratio_max: float | None
-    """largest ratio of the time from both in orbit to phase 3 to T_max"""
-    error_p50_m: float | None
+    t_max_ratio_max: Annotated[
+        Number, Shown(lambda trials: _percentile(_known(orbited_over_t_max(trials.table)), 100))
+    ]
+    """largest ratio of the time from both in orbit to phase 3 to T_max; the paper's T_max can be exceeded,
+    since it holds in continuous time"""
+    error_p50_m: Annotated[Number, _quantile("position_error_m", 50, "error p50")]
     """median over trials with a claim of the largest position error of a robot"""
-    error_max_m: float | None
-    error_max_rad: float | None
-    claims: int
+    error_max_m: Annotated[Number, _quantile("position_error_m", 100, "error max")]
+    """the largest of these errors"""
+    error_max_rad: Annotated[Number, _quantile("heading_error_rad", 100)]
+    """largest heading error of a claim"""
+    claims: Annotated[int, _total("claims")]
     """number of claims by all robots"""
-    within_3_accuracy: float | None
+    within_3_accuracy: Annotated[Number, Shown(_within, "within", ".4f")]
     """fraction of the claims with a position error of at most 3 times mission.accuracy"""
-    truth_held: float | None
+    truth_held: Annotated[Number, Shown(lambda trials: _fraction(trials.table["truth_held"].to_pylist()))]
     """fraction of the trials with claims under noise in which every such robot held the true hypothesis"""
-    nees_mean: float | None
+    nees_mean: Annotated[Number, Shown(_nees, "nees", ".3g")]
     """mean over trials of the mean NEES of their robots' claims, wrong ones included; 3 is expected if the
-    claimed covariances are consistent"""
-    nees_low: float | None
+    claimed covariances are consistent. The errors of a pair are correlated, so a trial counts once"""
+    nees_low: Annotated[Number, Shown(lambda one: nees_band(len(one.known("nees")))[0], "nees low", ".3g")]
     """lower bound of the band that contains nees_mean in 99 % of sweeps if covariances are consistent"""
-    nees_high: float | None
+    nees_high: Annotated[Number, Shown(lambda one: nees_band(len(one.known("nees")))[1], "nees high", ".3g")]
     """upper bound of that band"""
-    rmse_over_bound: float | None
+    rmse_over_bound: Annotated[Number, Shown(lambda trials: _rmse_over_bound(trials.table))]
     """root mean square of the position errors of all robots, divided by that of their Cramér-Rao bounds"""
-    reports_p50: float | None
+    reports_p50: Annotated[Number, _quantile("reports_sent", 50)]
     """median number of reports that all robots of a trial sent"""
-    audited: int
+    audited: Annotated[int, Shown(lambda trials: len(trials.known("violations")))]
     """number of audited trials"""
-    clean: int
+    clean: Annotated[int, Shown(lambda trials: int((trials.known("violations") == 0.0).sum()), "clean")]
     """number of audited trials without a violation"""
-    violations: int
+    violations: Annotated[int, _total("violations")]
     """number of violations in all trials"""
-    reports_lost: int
+    reports_lost: Annotated[int, _total("reports_lost")]
     """number of reports lost in all trials"""
-    reports_refused: int
+    reports_refused: Annotated[int, _total("reports_refused")]
     """number of reports rejected in all trials"""
-    refused_trials: int
+    refused_trials: Annotated[int, Shown(lambda trials: trials.refused)]
     """number of trials whose scenario is infeasible with the drawn values; no other figure counts them"""
     refused: str | None
     """reason why the scenario of this cell is infeasible"""
-    bound_share_p50: float | None
+    bound_share_p50: Annotated[Number, _share("bound_ticks", 50, "share p50")]
     """only for groups: median over trials in which all honest robots claimed of honest_tick / bound_ticks"""
-    bound_share_max: float | None
+    bound_share_max: Annotated[Number, _share("bound_ticks", 100, "share max")]
     """only for groups: the largest of these"""
-    corrected_share_max: float | None
+    corrected_share_max: Annotated[Number, _share("corrected_ticks", 100, "corrected")]
     """only for groups: the largest honest_tick / corrected_ticks, of trials with a corrected bound"""
-    makespan_p50: float | None
+    makespan_p50: Annotated[Number, _share("travel_ticks", 50, "travel p50")]
     """only for groups: median over the same trials of honest_tick / travel_ticks"""
-    makespan_p95: float | None
+    makespan_p95: Annotated[Number, _share("travel_ticks", 95, "travel p95")]
     """only for groups: the 95th percentile of these"""
-    honest_localised: int | None
+    honest_localised: Annotated[int | None, _group_total("honest_localised")]
     """only for groups: number of honest robots, of all trials, whose claims are right"""
-    honest_undecided: int | None
+    honest_undecided: Annotated[int | None, _group_total("honest_undecided")]
     """only for groups: number of those that have no claim at the end"""
-    honest_wrong: int | None
+    honest_wrong: Annotated[int | None, _group_total("honest_wrong")]
     """only for groups: number of those whose claims are wrong"""
-    attacker_met: int | None
+    attacker_met: Annotated[int | None, _group_total("attacker_met")]
     """only for groups: number of their meetings with a robot that has an attack, of audited trials"""
-    attacker_found: int | None
+    attacker_found: Annotated[int | None, _group_total("attacker_found")]
     """only for groups: number of these in which they found its data inconsistent"""
+
+
+COLUMNS: dict[str, Shown] = {
+    name: hint.__metadata__[0]
+    for name, hint in get_type_hints(CellSummary, include_extras=True).items()
+    if name != "refused"
+}
+"""How each field of a CellSummary is computed and shown, but for `refused`."""
 
 
 class NotableTrial(msgspec.Struct, frozen=True):
@@ -149,78 +252,9 @@ def counted(table: pa.Table, refused: str | None = None) -> CellSummary:
 
     `refused` is the reason why the scenario of the cell is infeasible, or None.
     """
-    everything = len(table)
-    table = ran(table)
-    outcomes = table["outcome"].to_pylist()
-    counts = {outcome: outcomes.count(outcome) for outcome in get_args(Outcome)}
-    k, n = counts["localised"], len(outcomes)
-    rate, low, high = wilson(k, n) if n else (None, None, None)
-    ticks = column(table, "ticks")[np.array([outcome == "localised" for outcome in outcomes], bool)]
-    meeting, error = _known(column(table, "meeting_tick")), _known(column(table, "position_error_m"))
-    right = table.filter(pa.array([outcome != "wrong" for outcome in outcomes], pa.bool_()))
-    claims, nees = int(_known(column(table, "claims")).sum()), _known(column(table, "nees"))
-    nees_low, nees_high = nees_band(len(nees))
-    violations = _known(column(table, "violations"))
-    shares, makespans, corrected = [
-        _shares(right, name) for name in ("bound_ticks", "travel_ticks", "corrected_ticks")
-    ]
-    return CellSummary(
-        trials=n,
-        **counts,
-        rate=rate,
-        rate_low=low,
-        rate_high=high,
-        ticks_p10=_percentile(ticks, 10),
-        ticks_p50=_percentile(ticks, 50),
-        ticks_p90=_percentile(ticks, 90),
-        ticks_p95=_percentile(ticks, 95),
-        ticks_max=_percentile(ticks, 100),
-        meeting_tick_p50=_percentile(meeting, 50),
-        meeting_tick_max=_percentile(meeting, 100),
-        t_max_s=_percentile(_known(column(table, "t_max_s")), 100),
-        t_max_ratio_max=_percentile(_known(orbited_over_t_max(table)), 100),
-        error_p50_m=_percentile(error, 50),
-        error_max_m=_percentile(error, 100),
-        error_max_rad=_percentile(_known(column(table, "heading_error_rad")), 100),
-        claims=claims,
-        within_3_accuracy=float(_known(column(table, "claims_within")).sum()) / claims if claims else None,
-        truth_held=_fraction(table["truth_held"].to_pylist()),
-        nees_mean=float(nees.mean()) if len(nees) else None,
-        nees_low=nees_low,
-        nees_high=nees_high,
-        rmse_over_bound=_rmse_over_bound(table),
-        reports_p50=_percentile(_known(column(table, "reports_sent")), 50),
-        audited=len(violations),
-        clean=int((violations == 0.0).sum()),
-        violations=int(violations.sum()),
-        reports_lost=int(_known(column(table, "reports_lost")).sum()),
-        reports_refused=int(_known(column(table, "reports_refused")).sum()),
-        refused_trials=everything - n,
-        refused=refused,
-        bound_share_p50=_percentile(shares, 50),
-        bound_share_max=_percentile(shares, 100),
-        corrected_share_max=_percentile(corrected, 100),
-        makespan_p50=_percentile(makespans, 50),
-        makespan_p95=_percentile(makespans, 95),
-        honest_localised=_sum_of_known(table, "honest_localised"),
-        honest_undecided=_sum_of_known(table, "honest_undecided"),
-        honest_wrong=_sum_of_known(table, "honest_wrong"),
-        attacker_met=_sum_of_known(table, "attacker_met"),
-        attacker_found=_sum_of_known(table, "attacker_found"),
-    )
-
-
-def _shares(right: pa.Table, bound: str) -> Floats:
-    """Return the tick of the last claim of an honest robot over the column `bound`; none for pairs."""
-    if bound not in right.schema.names:
-        return np.zeros(0)
-    return _known(column(right, "honest_tick") / column(right, bound))
-
-
-def _sum_of_known(table: pa.Table, name: str) -> int | None:
-    """Return the sum of a column of groups; None for pairs, and if no trial has a value."""
-    known = _known(column(table, name)) if name in table.schema.names else np.zeros(0)
-    return int(known.sum()) if len(known) else None
+    trials = Trials(table)
+    values: dict[str, Any] = {name: shown.value(trials) for name, shown in COLUMNS.items()}
+    return CellSummary(refused=refused, **values)
 
 
 def _rmse_over_bound(table: pa.Table) -> float | None:
@@ -328,7 +362,11 @@ def header(sweep: Sweep) -> list[str]:
 
 def columns_of(sweep: Sweep) -> list[str]:
     """Return the fields of a CellSummary that `sweep` has."""
-    return [name for name in CellSummary.__struct_fields__ if sweep.of_group or name not in FIGURES_OF_GROUP]
+    return [
+        name
+        for name in CellSummary.__struct_fields__
+        if sweep.of_group or name not in COLUMNS or not COLUMNS[name].of_group
+    ]
 
 
 def ran(table: pa.Table) -> pa.Table:
@@ -336,22 +374,6 @@ def ran(table: pa.Table) -> pa.Table:
     return table.filter(
         pa.array([outcome != "refused" for outcome in table["outcome"].to_pylist()], pa.bool_())
     )
-
-
-def refusals(table: pa.Table) -> list[tuple[str, int]]:
-    """Return the reasons for refused trials with their counts, the most frequent first.
-
-    Reasons that differ only in numbers are counted together under the first of them.
-    """
-    first: dict[str, str] = {}
-    counts: Counter[str] = Counter()
-    for outcome, reason in zip(table["outcome"].to_pylist(), table["reason"].to_pylist(), strict=True):
-        if outcome != "refused":
-            continue
-        kind = _NUMBER.sub("", reason)
-        counts[kind] += 1
-        first.setdefault(kind, reason)
-    return [(first[kind], count) for kind, count in counts.most_common()]
 
 
 def noted(table: pa.Table) -> NotableTrial | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pyarrow as pa
@@ -17,28 +17,14 @@ from compose.sweep.group_columns import GROUP_COLUMNS
 from compose.sweep.spec import Sweep
 from compose.sweep.trial import RobotRow, TrialRow
 from protocol.files import open_file
-from protocol.motion import Covariance
 
+_ARROW = {int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
 _TRIAL_TYPES: dict[str, pa.DataType] = {
-    "cell": pa.int32(),
-    "trial": pa.int32(),
-    "seed": pa.int64(),
-    **dict.fromkeys(("outcome", "reason", "error", "branch", "first_violation"), pa.string()),
-    **dict.fromkeys(("ticks", "first_contact_tick", "orbiting_tick", "meeting_tick"), pa.int64()),
-    **dict.fromkeys(("t_max_ticks", "candidates", "candidates_left"), pa.int64()),
-    **dict.fromkeys(GROUP_COLUMNS, pa.int64()),
-    "travel_ticks": pa.float64(),
-    **dict.fromkeys(("hypotheses", "claims", "claims_within", "violations"), pa.int64()),
-    **dict.fromkeys(("reports_sent", "reports_heard", "reports_refused"), pa.int64()),
-    **dict.fromkeys(("reports_lost", "bytes_sent", "kills"), pa.int64()),
-    **dict.fromkeys(("same_record", "truth_held"), pa.bool_()),
-    **dict.fromkeys(("period_s", "t_max_s", "wall_s", "position_error_m", "nearest_m"), pa.float64()),
-    **dict.fromkeys(
-        ("heading_error_rad", "alpha", "probability", "p_value", "position_sigma_m", "nees", "bound_m"),
-        pa.float64(),
-    ),
-    **dict.fromkeys([f"cov_{name}" for name in Covariance.__struct_fields__], pa.float64()),
-}
+    name: next((_ARROW[one] for one in (bool, int, float) if one in (hint, *get_args(hint))), pa.string())
+    for row in (TrialRow, RobotRow)
+    for name, hint in get_type_hints(row).items()
+} | {"cell": pa.int32(), "trial": pa.int32()}
+"""The types of the columns of rows, by name."""
 _OF_ALL = [field for field in TrialRow.__struct_fields__ if field not in ("cell", "trial", "robots", "drawn")]
 
 
