@@ -120,7 +120,7 @@ def _title(pair: PairRecord, one: Planned) -> str:
     frame = (
         f"{robot}'s own frame"
         if _framed_by_itself(one.plan)
-        else rf"$\langle {mover}({ANCHORS[mover]})\rangle$"
+        else rf"$\langle\,{mover}({ANCHORS[mover]})\rangle$"
     )
     v, omega = one.plan.command.v, one.plan.command.omega
     chosen = rf"$v_2$ = {v:g} m/s, $\omega_2$ = {omega:+.4f} rad/s"

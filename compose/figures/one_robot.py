@@ -8,14 +8,13 @@ from collections.abc import Sequence
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap, to_hex, to_rgba
 from matplotlib.figure import Figure
-from matplotlib.patches import FancyArrowPatch, Polygon, Wedge
-from matplotlib.typing import ColorType
+from matplotlib.patches import Polygon, Wedge
 
 from compose.figures.over_time import TALL, draw_errors, draw_hypotheses, timed
 from compose.figures.pair import PairRecord, Side, error, others
 from compose.figures.sheet import NO_TRUTH, Absent, Sheet, Window, plain
 from compose.figures.style import INK, PALE, SCREEN, Medium
-from compose.figures.trajectory import draw_plane, window
+from compose.figures.trajectory import draw_plane, heading, window
 from compose.recording.reasons import ended
 from compose.view.colours import COLOURS
 from compose.view.outlines import OUTLINE_SIGMAS, Point, Reach, outline
@@ -199,7 +198,7 @@ def draw_near(axes: Axes, pair: PairRecord, role: Role) -> None:
         return
     axes.set_title("relative to the true pose", color=PALE, pad=5, loc="left")
     colours, (last, truth), half = _ages(one, role), one.likeliest[-1], _half(pair, role)
-    _heading(axes, (0.0, 0.0), truth.heading, half, INK)
+    heading(axes, Pose(0.0, 0.0, truth.heading), PANEL_ARROW * half, INK)
     axes.plot(0.0, 0.0, "o", ms=5, color=INK, gid="near-truth", label="true")
     for estimate, then in legible(pair, role) or [(last, truth)]:
         pose, marker = estimate.world[0], "*" if estimate is last else "D"
@@ -209,7 +208,7 @@ def draw_near(axes: Axes, pair: PairRecord, role: Role) -> None:
             color=colours[estimate.tick], mec="white", mew=0.5, zorder=6, label=str(estimate.tick),
         )  # fmt: skip
     off = last.world[0].x - truth.x, last.world[0].y - truth.y
-    _heading(axes, off, last.world[0].heading, half, AGES[role](1.0))
+    heading(axes, Pose(*off, last.world[0].heading), PANEL_ARROW * half, to_hex(AGES[role](1.0)))
     if last.covariance is not None:
         spread = math.degrees(min(math.pi, OUTLINE_SIGMAS * last.covariance.heading_sigma))
         middle = math.degrees(last.world[0].heading)
@@ -242,12 +241,3 @@ def _half(pair: PairRecord, role: Role) -> float:
     most = max([size(*one) for one in legible(pair, role)], default=last)
     least = EXACTLY * pair.mission.sensing_range if pair.exact else TOLERANCE
     return max(min(1.1 * most, LARGEST_PANEL * last), least)
-
-
-def _heading(axes: Axes, at: tuple[float, float], heading: float, half: float, colour: ColorType) -> None:
-    tip = at[0] + PANEL_ARROW * half * math.cos(heading), at[1] + PANEL_ARROW * half * math.sin(heading)
-    axes.add_patch(
-        FancyArrowPatch(
-            at, tip, arrowstyle="-|>", mutation_scale=8, color=colour, lw=1.1, shrinkA=0, shrinkB=0
-        )
-    )

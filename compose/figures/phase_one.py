@@ -120,7 +120,7 @@ def _name(branch: Branch, branches: Sequence[Branch], end: RobotState) -> str:
 
 def _title(pair: PairRecord, role: Role, state: RobotState) -> str:
     robot = pair.robot(role).id
-    frame = rf"$\langle {role}({ANCHORS[role]})\rangle$"
+    frame = rf"$\langle\,{role}({ANCHORS[role]})\rangle$"
     if state.belief.phase1_done_tick is None:
         result = f"not finished at $k$ = {state.tick}"
     else:

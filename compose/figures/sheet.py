@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from textwrap import wrap
 from typing import Any, NamedTuple, TypeVar
 
 from matplotlib.axes import Axes
@@ -13,11 +14,13 @@ from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Bbox, blended_transform_factory
 
-from compose.figures.style import INK, PAGE, Medium
+from compose.figures.style import INK, PAGE, TEXT, Medium
 from protocol.mission import Role
 
 PAD = 0.04
 """The distance in inches between panels, and of all from the edges of a figure."""
+TITLE = 110
+"""The maximum number of characters of a line of a title, which fit in the width PAGE."""
 PANELS, ACROSS = 6, 3
 """The maximum number of panels of a series, in total and in a row."""
 LONE = 3.0
@@ -63,14 +66,15 @@ class Sheet:
         self._engine = ConstrainedLayoutEngine(w_pad=PAD, h_pad=PAD, wspace=0.0, hspace=0.0)
         self.figure = Figure(figsize=(self.width, 6.0), layout=self._engine)
         if medium.titled:
-            words = "\n".join([plain(title[0]), *title[1:]])
-            self.figure.suptitle(words, x=PAD / self.width, ha="left", wrap=True, color=INK)
+            lines = [part for line in (plain(title[0]), *title[1:]) for part in wrap(line, TITLE)]
+            self.figure.suptitle("\n".join(lines), x=PAD / self.width, ha="left", size=TEXT, color=INK)
         self.panels: dict[str, Axes] = self.figure.subplot_mosaic(
             [list(row) for row in mosaic], width_ratios=widths, empty_sentinel=""
         )
         self._mosaic = mosaic
         self._widths = list(widths or [1.0] * len(mosaic[0]))
         self._heights: dict[str, Callable[[], float]] = {}
+        self._planes: list[Axes] = []
 
     def tall(self, name: str, height: float) -> Axes:
         """Return the panel `name`, which is `height` inches high."""
@@ -83,13 +87,13 @@ class Sheet:
         left, right, bottom, top = window
         axes.set_xlim(left, right)
         axes.set_ylim(bottom, top)
-        axes.set_aspect("equal", adjustable="box", anchor="NW")
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_locator(MaxNLocator(NUMBERS, steps=(1, 2, 5, 10)))
         axes.set_xlabel("x [m]")
         if low:
             axes.set_ylabel("y [m]")
         ratio = (top - bottom) / (right - left)
+        self._planes.append(axes)
         self._heights[name] = lambda: min(tallest, ratio * self.width * _place(axes).width)
 
     def key(self, panel: Axes, name: str = "key", **look: Any) -> None:
@@ -103,7 +107,8 @@ class Sheet:
         share = [width for width, one in zip(self._widths, self._row(name), strict=True) if one == name]
         room = self.width - 2 * PAD if edge else KEY_WIDTH * self.width * sum(share) / sum(self._widths)
         places = self.figure.transFigure if edge else cell.transAxes
-        for columns in range(len(labels), 0, -1):
+        columns = 1
+        for _ in range(2):  # first in one column, whose width says how many fit
             key = cell.legend(
                 handles, labels, ncols=columns, loc="upper left", frameon=False, borderaxespad=0.0,
                 borderpad=0.0, handlelength=2.2, handletextpad=0.5, columnspacing=1.0, labelspacing=0.4,
@@ -112,8 +117,7 @@ class Sheet:
             )  # fmt: skip
             key.set_in_layout(not edge)
             extent = key.get_window_extent()
-            if extent.width <= room * self.figure.dpi:
-                break
+            columns = max(1, min(len(labels), int(room * self.figure.dpi / max(extent.width, 1.0))))
         height = extent.height / self.figure.dpi if labels else 0.0
         self._heights[name] = lambda: height
 
@@ -123,17 +127,17 @@ class Sheet:
 
     def finished(self) -> Figure:
         """Return the figure, as high as its rows of panels need."""
-        for _ in range(2):  # the width of a plane, and with it its height, depends on the labels of its axis
-            self._engine.execute(self.figure)
-            tall = self.figure.get_figheight()
-            rows = [[name for name in dict.fromkeys(row) if name in self._heights] for row in self._mosaic]
-            wanted = [max([self._heights[name]() for name in row]) for row in rows]
-            grid = self.panels[rows[0][0]].get_gridspec()
-            assert grid is not None
-            grid.set_height_ratios([max(height, 1e-3) for height in wanted])
-            self.figure.set_figheight(
-                tall + sum(wanted) - sum([tall * _place(self.panels[row[0]]).height for row in rows])
-            )
+        self._engine.execute(self.figure)  # the width of a plane, and with it its height, needs its labels
+        tall = self.figure.get_figheight()
+        rows = [[name for name in dict.fromkeys(row) if name in self._heights] for row in self._mosaic]
+        wanted = [max([self._heights[name]() for name in row]) for row in rows]
+        grid = self.panels[rows[0][0]].get_gridspec()
+        assert grid is not None
+        grid.set_height_ratios([max(height, 1e-3) for height in wanted])
+        spare = sum([tall * _place(self.panels[row[0]]).height for row in rows]) - sum(wanted)
+        self.figure.set_figheight(tall - spare)
+        for axes in self._planes:  # only now, since labels of a plane within its cell would take no space
+            axes.set_aspect("equal", adjustable="box", anchor="NW")
         self._engine.execute(self.figure)
         self.figure.set_layout_engine("none")
         return self.figure

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,8 +33,6 @@ SMALLEST_FONT = 6.0
 COLUMN, PAGE = 3.5, 7.16
 """The widths of one column and of two columns of a paper (IEEE), in inches."""
 
-LAYOUT_TABLES = ["GSUB", "GPOS", "GDEF", "BASE", "JSTF", "MATH", "kern"]
-"""The tables of a font with which text is laid out. A PDF file states the place of each glyph."""
 _DATES: dict[str, dict[str, None]] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {}}
 
 # Matplotlib has no setting for the size of subscripts, which its 0.7 would make 5.6 points.
@@ -105,18 +102,8 @@ def save(
 
     Raises OSError.
     """
-    if "pdf" in formats:
-        _leave_out_layout_tables()
     written = [path.with_name(f"{path.name}.{ending}") for ending in formats]
     for ending, place in zip(formats, written, strict=True):
         with files.draft(place) as drawn:
             figure.savefig(drawn, format=ending, dpi=dpi, metadata=_DATES[ending])
     return tuple(written)
-
-
-@cache
-def _leave_out_layout_tables() -> None:
-    """Embed fonts in PDF files without LAYOUT_TABLES, which take most of the time of an embedding."""
-    from fontTools.subset import Options  # type: ignore[import-untyped]  # noqa: PLC0415  # only for PDF
-
-    Options._drop_tables_default = [*Options._drop_tables_default, *LAYOUT_TABLES]
