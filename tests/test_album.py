@@ -461,7 +461,7 @@ def test_with_its_output_in_a_file_the_progress_bar_stays_on_the_terminal(
     with (tmp_path / "out").open("wb") as out:
         command = [sys.executable, "-P", "-m", "compose.cli", *arguments]
         subprocess.run(command, stdout=out, stderr=theirs, check=True)
-    shown = os.read(ours, 65536).decode()
+    shown = os.read(ours, 65536).decode(errors="replace")
     os.close(ours)
     os.close(theirs)
     assert (tmp_path / "out").read_text() == f"{folder}/figures/ranges-a-b.svg\n"

@@ -41,26 +41,9 @@ COLUMN_NOTES = (
     ("nees low", "nees: mean, and the 99 % band for consistent covariances"),
 )
 """The footnotes of the table, each with the column whose presence requires it."""
-WIDEST = (
-    *OUTCOME_COLUMNS,
-    "clean",
-    "rate",
-    "rate_low",
-    "rate_high",
-    "p50",
-    "p95",
-    "max",
-    "error p50",
-    "error max",
-)
-"""The columns of the widest table, except for `trials`."""
-COLUMN_CHOICES = (
-    ("trials", *WIDEST),
-    ("trials", *WIDEST[:-2]),
-    ("trials", *OUTCOME_COLUMNS, "clean", "rate", "p50", "max"),
-    ("trials", *OUTCOME_COLUMNS, "rate"),
-    ("trials", *OUTCOME_COLUMNS),
-    OUTCOME_COLUMNS,
+COLUMN_CHOICES = tuple(
+    tuple([shown.title for shown in COLUMNS.values() if shown.title and 0 <= shown.rank <= most])
+    for most in range(max([shown.rank for shown in COLUMNS.values()]), -1, -1)
 )
 """The possible choices of columns. The first that fits the terminal is used. Outcomes are never dropped."""
 SHOWN_GROUP_COLUMNS = ("share p50", "share max", "corrected", "travel p50", "travel p95", "honest")

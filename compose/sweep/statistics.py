@@ -76,13 +76,15 @@ class Shown(NamedTuple):
     """The format of its value there."""
     of_group: bool = False
     """True if only sweeps of groups have the column."""
+    rank: int = -1
+    """The larger it is, the earlier a table that is too wide lacks the column; -1 if another rule decides."""
 
 
 def _outcome(name: str) -> Shown:
-    return Shown(lambda trials: trials.outcomes.count(name), name)
+    return Shown(lambda trials: trials.outcomes.count(name), name, rank=0)
 
 
-def _rate(bound: int, title: str) -> Shown:
+def _rate(bound: int, title: str, rank: int) -> Shown:
     """Return the column with the rate of trials that localised (0), or a bound of its interval (1, 2)."""
     return Shown(
         lambda trials: (
@@ -90,15 +92,16 @@ def _rate(bound: int, title: str) -> Shown:
         ),
         title,
         ".4f",
+        rank=rank,
     )
 
 
-def _ticks(percent: float, title: str = "") -> Shown:
-    return Shown(lambda trials: _percentile(trials.ticks, percent), title, ".0f")
+def _ticks(percent: float, title: str = "", rank: int = -1) -> Shown:
+    return Shown(lambda trials: _percentile(trials.ticks, percent), title, ".0f", rank=rank)
 
 
 def _quantile(name: str, percent: float, title: str = "") -> Shown:
-    return Shown(lambda trials: _percentile(trials.known(name), percent), title, ".1e")
+    return Shown(lambda trials: _percentile(trials.known(name), percent), title, ".1e", rank=5)
 
 
 def _share(bound: str, percent: float, title: str) -> Shown:
@@ -119,6 +122,10 @@ def _within(trials: Trials) -> float | None:
     return float(trials.known("claims_within").sum() / claims) if claims else None
 
 
+def _clean(trials: Trials) -> int:
+    return int((trials.known("violations") == 0.0).sum())
+
+
 def _nees(trials: Trials) -> float | None:
     known = trials.known("nees")
     return float(known.mean()) if len(known) else None
@@ -130,7 +137,7 @@ Number = float | None
 class CellSummary(msgspec.Struct, frozen=True):
     """A row of `summary.csv`, without the columns of the axes. A value that does not apply is None."""
 
-    trials: Annotated[int, Shown(lambda trials: len(trials.outcomes), "trials")]
+    trials: Annotated[int, Shown(lambda trials: len(trials.outcomes), "trials", rank=1)]
     """number of trials that were not refused; the counts of the outcomes sum to it"""
     localised: Annotated[int, _outcome("localised")]
     """number of trials that ended so"""
@@ -142,21 +149,21 @@ class CellSummary(msgspec.Struct, frozen=True):
     """likewise"""
     failed: Annotated[int, _outcome("failed")]
     """number of trials that failed or were lost"""
-    rate: Annotated[Number, _rate(0, "rate")]
+    rate: Annotated[Number, _rate(0, "rate", 2)]
     """fraction of the trials that localised"""
-    rate_low: Annotated[Number, _rate(1, "rate_low")]
+    rate_low: Annotated[Number, _rate(1, "rate_low", 4)]
     """lower bound of its 95 % Wilson interval"""
-    rate_high: Annotated[Number, _rate(2, "rate_high")]
+    rate_high: Annotated[Number, _rate(2, "rate_high", 4)]
     """upper bound of that interval"""
     ticks_p10: Annotated[Number, _ticks(10)]
     """10th percentile of the number of ticks of trials that localised"""
-    ticks_p50: Annotated[Number, _ticks(50, "p50")]
+    ticks_p50: Annotated[Number, _ticks(50, "p50", 3)]
     """their median"""
     ticks_p90: Annotated[Number, _ticks(90)]
     """their 90th percentile"""
-    ticks_p95: Annotated[Number, _ticks(95, "p95")]
+    ticks_p95: Annotated[Number, _ticks(95, "p95", 4)]
     """their 95th percentile"""
-    ticks_max: Annotated[Number, _ticks(100, "max")]
+    ticks_max: Annotated[Number, _ticks(100, "max", 3)]
     """the largest of them"""
     meeting_tick_p50: Annotated[Number, _quantile("meeting_tick", 50)]
     """median tick at which phase 3 began, of trials in which it began"""
@@ -194,7 +201,7 @@ class CellSummary(msgspec.Struct, frozen=True):
     """median number of reports that all robots of a trial sent"""
     audited: Annotated[int, Shown(lambda trials: len(trials.known("violations")))]
     """number of audited trials"""
-    clean: Annotated[int, Shown(lambda trials: int((trials.known("violations") == 0.0).sum()), "clean")]
+    clean: Annotated[int, Shown(_clean, "clean", rank=3)]
     """number of audited trials without a violation"""
     violations: Annotated[int, _total("violations")]
     """number of violations in all trials"""
