@@ -163,12 +163,12 @@ def sweep(name: str, place: int, title: str) -> Source:
         with tempfile.TemporaryDirectory() as folder:
             points = axis_figures.points(run_sweep(name, out=folder).results, place, statistic)
         with table.open("w", newline="") as file:
-            csv.writer(file, lineterminator="\n").writerows([axis_figures.Point._fields, *points])
+            csv.writer(file, lineterminator="\n").writerows([axis_figures.FigurePoint._fields, *points])
 
     def draw(folder: Path, _: Mapping[str, str]) -> None:
         with table.open(newline="") as file:
             points = [
-                axis_figures.Point(
+                axis_figures.FigurePoint(
                     row["line"], int(row["value"]), row["quantity"],
                     *[float(row[key] or "nan") for key in ("estimate", "low", "high")],
                 )

@@ -23,9 +23,9 @@ from protocol.rounding import TOLERANCE
 TALL = 1.9
 """The height of a panel over time, in inches."""
 SHADES = {1: "0.93", 2: "1.0", 3: "0.97"}
-NAMED = 0.15
+NAME_SHARE = 0.15
 """The fraction of the width below which only the number of a phase is written above the panel."""
-MANY = 60
+MOST_MARKERS = 60
 """The maximum number of markers on a line."""
 FLOOR = 0.1 * TOLERANCE
 """The smallest error drawn, in m or rad: smaller ones are rounding errors, and are drawn at this value."""
@@ -62,7 +62,7 @@ def timed(axes: Axes, pair: PairRecord, *roles: Role, phases: bool = True, label
         if left > first:
             axes.axvline(left, color="0.6", lw=0.6, zorder=-1)
         if phases:
-            name = f"phase {span.phase}" if right - left > NAMED * (end - first) else str(span.phase)
+            name = f"phase {span.phase}" if right - left > NAME_SHARE * (end - first) else str(span.phase)
             axes.text(
                 (left + right) / 2, 1.03, name, transform=axes.get_xaxis_transform(), ha="center", color="0.3"
             )
@@ -80,7 +80,7 @@ def timed(axes: Axes, pair: PairRecord, *roles: Role, phases: bool = True, label
 
 def every(count: int) -> int:
     """Return the number of points from one marker to the next, on a line of `count` points."""
-    return max(1, math.ceil(count / MANY))
+    return max(1, math.ceil(count / MOST_MARKERS))
 
 
 def ranges(pair: PairRecord, medium: Medium = SCREEN) -> Figure:

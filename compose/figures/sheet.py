@@ -27,7 +27,7 @@ LONE = 3.0
 """The maximum height of the panel of a series with one panel, in inches."""
 KEY_WIDTH = 0.85
 """The fraction of a cell's width, with its axis labels, that a key in it may take."""
-NUMBERS = 6
+PLANE_INTERVALS = 6
 """The maximum number of intervals between the labelled ticks of an axis of the plane."""
 NO_ENCOUNTER = "the robots had no encounter (phase 3)"
 NO_TRUTH = "a recording in hardware mode has no ground truth"
@@ -88,7 +88,7 @@ class Sheet:
         axes.set_xlim(left, right)
         axes.set_ylim(bottom, top)
         for axis in (axes.xaxis, axes.yaxis):
-            axis.set_major_locator(MaxNLocator(NUMBERS, steps=(1, 2, 5, 10)))
+            axis.set_major_locator(MaxNLocator(PLANE_INTERVALS, steps=(1, 2, 5, 10)))
         axes.set_xlabel("x [m]")
         if low:
             axes.set_ylabel("y [m]")

@@ -18,7 +18,7 @@ from matplotlib.ticker import LogFormatter
 from compose.figures.style import SWEEP_MEDIUM, look, save
 from compose.sweep.execution import Results
 from compose.sweep.spec import Axis, Sweep
-from compose.sweep.statistics import Floats, Interval, Trials, column, quantile, wilson
+from compose.sweep.statistics import CellTrials, Floats, Interval, column, quantile, wilson
 
 STYLES = (
     ("#0b3c6f", "-", "o"),
@@ -42,7 +42,7 @@ POINTS_SPREAD = 0.45
 """The fraction of the space of a label over which the points of several lines are spread."""
 
 
-class Point(NamedTuple):
+class FigurePoint(NamedTuple):
     """A point of a figure: an estimate from the trials of some cells, with the bounds of its interval."""
 
     line: str
@@ -74,7 +74,7 @@ def _rate(outcome: str) -> Callable[[pa.Table], dict[str, Interval]]:
     """Return the function that estimates the rate of `outcome`."""
 
     def estimates(table: pa.Table) -> dict[str, Interval]:
-        outcomes = Trials(table).outcomes
+        outcomes = CellTrials(table).outcomes
         return {"": wilson(outcomes.count(outcome), len(outcomes))} if outcomes else {}
 
     return estimates
@@ -101,7 +101,7 @@ STATISTICS = {
         "wrong, of all trials", _rate("wrong"), lambda table: "wrong" in table["outcome"].to_pylist()
     ),
     "ticks": Statistic(
-        "ticks until localised", _quantiles(lambda table: Trials(table).ticks), logarithmic=True
+        "ticks until localised", _quantiles(lambda table: CellTrials(table).ticks), logarithmic=True
     ),
     "wall": Statistic(
         "wall time [s]",
@@ -126,11 +126,11 @@ def draw(results: Results, folder: Path) -> None:
                     save(figure, folder / f"{title}-{name}")
 
 
-def points(results: Results, place: int, statistic: Statistic) -> list[Point]:
+def points(results: Results, place: int, statistic: Statistic) -> list[FigurePoint]:
     """Return the points of `statistic` over the axis at index `place`."""
     axis = results.sweep.axes[place]
     return [
-        Point(line, x, name, *estimate)
+        FigurePoint(line, x, name, *estimate)
         for line, chosen in _lines(results, place)
         for x in range(len(axis.values))
         for name, estimate in statistic.estimates(
@@ -139,7 +139,7 @@ def points(results: Results, place: int, statistic: Statistic) -> list[Point]:
     ]
 
 
-def over_axis(sweep: Sweep, place: int, statistic: Statistic, points: Sequence[Point]) -> Figure:
+def over_axis(sweep: Sweep, place: int, statistic: Statistic, points: Sequence[FigurePoint]) -> Figure:
     """Return the figure of `points` over the axis at index `place`. Points over numbers are joined."""
     axis = sweep.axes[place]
     figure, axes, at = _against(axis)

@@ -39,7 +39,7 @@ class Interval(NamedTuple):
     high: float
 
 
-class Trials:
+class CellTrials:
     """The trials of a cell that were not refused, as the columns of `summary.csv` take them."""
 
     def __init__(self, table: pa.Table) -> None:
@@ -66,10 +66,10 @@ class Trials:
         return _known((column(self.table, "honest_tick") / column(self.table, bound))[right])
 
 
-class Shown(NamedTuple):
-    """How a column of `summary.csv` is computed, and how the terminal shows it."""
+class SummaryColumn(NamedTuple):
+    """A column of `summary.csv`: its value, and its place in the table on the terminal."""
 
-    value: Callable[[Trials], float | None]
+    value: Callable[[CellTrials], float | None]
     title: str = ""
     """The title of its column on the terminal; empty if it is not shown there."""
     form: str = "d"
@@ -80,13 +80,13 @@ class Shown(NamedTuple):
     """The larger it is, the earlier a table that is too wide lacks the column; -1 if another rule decides."""
 
 
-def _outcome(name: str) -> Shown:
-    return Shown(lambda trials: trials.outcomes.count(name), name, rank=0)
+def _outcome(name: str) -> SummaryColumn:
+    return SummaryColumn(lambda trials: trials.outcomes.count(name), name, rank=0)
 
 
-def _rate(bound: int, title: str, rank: int) -> Shown:
+def _rate(bound: int, title: str, rank: int) -> SummaryColumn:
     """Return the column with the rate of trials that localised (0), or a bound of its interval (1, 2)."""
-    return Shown(
+    return SummaryColumn(
         lambda trials: (
             wilson(trials.outcomes.count("localised"), n)[bound] if (n := len(trials.outcomes)) else None
         ),
@@ -96,37 +96,41 @@ def _rate(bound: int, title: str, rank: int) -> Shown:
     )
 
 
-def _ticks(percent: float, title: str = "", rank: int = -1) -> Shown:
-    return Shown(lambda trials: _percentile(trials.ticks, percent), title, ".0f", rank=rank)
+def _ticks(percent: float, title: str = "", rank: int = -1) -> SummaryColumn:
+    return SummaryColumn(lambda trials: _percentile(trials.ticks, percent), title, ".0f", rank=rank)
 
 
-def _quantile(name: str, percent: float, title: str = "") -> Shown:
-    return Shown(lambda trials: _percentile(trials.known(name), percent), title, ".1e", rank=5)
+def _quantile(name: str, percent: float, title: str = "") -> SummaryColumn:
+    return SummaryColumn(lambda trials: _percentile(trials.known(name), percent), title, ".1e", rank=5)
 
 
-def _share(bound: str, percent: float, title: str) -> Shown:
-    return Shown(lambda trials: _percentile(trials.shares(bound), percent), title, ".2f", of_group=True)
+def _share(bound: str, percent: float, title: str) -> SummaryColumn:
+    return SummaryColumn(
+        lambda trials: _percentile(trials.shares(bound), percent), title, ".2f", of_group=True
+    )
 
 
-def _total(name: str) -> Shown:
-    return Shown(lambda trials: int(trials.known(name).sum()))
+def _total(name: str) -> SummaryColumn:
+    return SummaryColumn(lambda trials: int(trials.known(name).sum()))
 
 
-def _group_total(name: str) -> Shown:
+def _group_total(name: str) -> SummaryColumn:
     """Return the column with the sum of another one; None where no trial has a value."""
-    return Shown(lambda trials: int(known.sum()) if len(known := trials.known(name)) else None, of_group=True)
+    return SummaryColumn(
+        lambda trials: int(known.sum()) if len(known := trials.known(name)) else None, of_group=True
+    )
 
 
-def _within(trials: Trials) -> float | None:
+def _within(trials: CellTrials) -> float | None:
     claims = trials.known("claims").sum()
     return float(trials.known("claims_within").sum() / claims) if claims else None
 
 
-def _clean(trials: Trials) -> int:
+def _clean(trials: CellTrials) -> int:
     return int((trials.known("violations") == 0.0).sum())
 
 
-def _nees(trials: Trials) -> float | None:
+def _nees(trials: CellTrials) -> float | None:
     known = trials.known("nees")
     return float(known.mean()) if len(known) else None
 
@@ -137,7 +141,7 @@ Number = float | None
 class CellSummary(msgspec.Struct, frozen=True):
     """A row of `summary.csv`, without the columns of the axes. A value that does not apply is None."""
 
-    trials: Annotated[int, Shown(lambda trials: len(trials.outcomes), "trials", rank=1)]
+    trials: Annotated[int, SummaryColumn(lambda trials: len(trials.outcomes), "trials", rank=1)]
     """number of trials that were not refused; the counts of the outcomes sum to it"""
     localised: Annotated[int, _outcome("localised")]
     """number of trials that ended so"""
@@ -172,7 +176,7 @@ class CellSummary(msgspec.Struct, frozen=True):
     t_max_s: Annotated[Number, _quantile("t_max_s", 100)]
     """largest T_max of a trial, in s"""
     t_max_ratio_max: Annotated[
-        Number, Shown(lambda trials: _percentile(_known(orbited_over_t_max(trials.table)), 100))
+        Number, SummaryColumn(lambda trials: _percentile(_known(orbited_over_t_max(trials.table)), 100))
     ]
     """largest ratio of the time from both in orbit to phase 3 to T_max; the paper's T_max can be exceeded,
     since it holds in continuous time"""
@@ -184,24 +188,30 @@ class CellSummary(msgspec.Struct, frozen=True):
     """largest heading error of a claim"""
     claims: Annotated[int, _total("claims")]
     """number of claims by all robots"""
-    within_3_accuracy: Annotated[Number, Shown(_within, "within", ".4f")]
+    within_3_accuracy: Annotated[Number, SummaryColumn(_within, "within", ".4f")]
     """fraction of the claims with a position error of at most 3 times mission.accuracy"""
-    truth_held: Annotated[Number, Shown(lambda trials: _fraction(trials.table["truth_held"].to_pylist()))]
+    truth_held: Annotated[
+        Number, SummaryColumn(lambda trials: _fraction(trials.table["truth_held"].to_pylist()))
+    ]
     """fraction of the trials with claims under noise in which every such robot held the true hypothesis"""
-    nees_mean: Annotated[Number, Shown(_nees, "nees", ".3g")]
+    nees_mean: Annotated[Number, SummaryColumn(_nees, "nees", ".3g")]
     """mean over trials of the mean NEES of their robots' claims, wrong ones included; 3 is expected if the
     claimed covariances are consistent. The errors of a pair are correlated, so a trial counts once"""
-    nees_low: Annotated[Number, Shown(lambda one: nees_band(len(one.known("nees")))[0], "nees low", ".3g")]
+    nees_low: Annotated[
+        Number, SummaryColumn(lambda one: nees_band(len(one.known("nees")))[0], "nees low", ".3g")
+    ]
     """lower bound of the band that contains nees_mean in 99 % of sweeps if covariances are consistent"""
-    nees_high: Annotated[Number, Shown(lambda one: nees_band(len(one.known("nees")))[1], "nees high", ".3g")]
+    nees_high: Annotated[
+        Number, SummaryColumn(lambda one: nees_band(len(one.known("nees")))[1], "nees high", ".3g")
+    ]
     """upper bound of that band"""
-    rmse_over_bound: Annotated[Number, Shown(lambda trials: _rmse_over_bound(trials.table))]
+    rmse_over_bound: Annotated[Number, SummaryColumn(lambda trials: _rmse_over_bound(trials.table))]
     """root mean square of the position errors of all robots, divided by that of their Cramér-Rao bounds"""
     reports_p50: Annotated[Number, _quantile("reports_sent", 50)]
     """median number of reports that all robots of a trial sent"""
-    audited: Annotated[int, Shown(lambda trials: len(trials.known("violations")))]
+    audited: Annotated[int, SummaryColumn(lambda trials: len(trials.known("violations")))]
     """number of audited trials"""
-    clean: Annotated[int, Shown(_clean, "clean", rank=3)]
+    clean: Annotated[int, SummaryColumn(_clean, "clean", rank=3)]
     """number of audited trials without a violation"""
     violations: Annotated[int, _total("violations")]
     """number of violations in all trials"""
@@ -209,7 +219,7 @@ class CellSummary(msgspec.Struct, frozen=True):
     """number of reports lost in all trials"""
     reports_refused: Annotated[int, _total("reports_refused")]
     """number of reports rejected in all trials"""
-    refused_trials: Annotated[int, Shown(lambda trials: trials.refused)]
+    refused_trials: Annotated[int, SummaryColumn(lambda trials: trials.refused)]
     """number of trials whose scenario is infeasible with the drawn values; no other figure counts them"""
     refused: str | None
     """reason why the scenario of this cell is infeasible"""
@@ -235,12 +245,12 @@ class CellSummary(msgspec.Struct, frozen=True):
     """only for groups: number of these in which they found its data inconsistent"""
 
 
-COLUMNS: dict[str, Shown] = {
+COLUMNS: dict[str, SummaryColumn] = {
     name: hint.__metadata__[0]
     for name, hint in get_type_hints(CellSummary, include_extras=True).items()
     if name != "refused"
 }
-"""How each field of a CellSummary is computed and shown, but for `refused`."""
+"""The columns of a CellSummary by name, but for `refused`, which is given."""
 
 
 class NotableTrial(msgspec.Struct, frozen=True):
@@ -259,7 +269,7 @@ def counted(table: pa.Table, refused: str | None = None) -> CellSummary:
 
     `refused` is the reason why the scenario of the cell is infeasible, or None.
     """
-    trials = Trials(table)
+    trials = CellTrials(table)
     values: dict[str, Any] = {name: shown.value(trials) for name, shown in COLUMNS.items()}
     return CellSummary(refused=refused, **values)
 
