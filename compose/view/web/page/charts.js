@@ -390,16 +390,14 @@ function valued({ text }, { low, high }, bin) {
 
 const who = (robot, name) => (MUTUAL.has(name) ? `${robot.id} to ${robot.peer}` : name === "position_bound_m" ? `${robot.id} 3 sigma` : robot.id);
 
-/** Returns the texts above a strip, with the error and 3 sigma of a robot in one, in the same unit if they have the same. */
+/** Returns the texts above a strip, with the error and 3 sigma of a robot in one. */
 function joined(values) {
   const found = [];
   for (const one of values) {
     const before = found.at(-1);
     if (one.name !== "position_bound_m") found.push({ ...one, text: `${who(one.robot, one.name)} ${one.text}` });
-    else if (before?.robot === one.robot) {
-      const unit = one.text.slice(one.text.lastIndexOf(" "));
-      before.text = `${before.text.endsWith(unit) ? before.text.slice(0, -unit.length) : before.text} / ${one.text}`;
-    } else found.push({ ...one, text: `${one.robot.id} ${one.text}` });
+    else if (before?.robot === one.robot) before.text = `${before.text} / ${one.text}`;
+    else found.push({ ...one, text: `${one.robot.id} ${one.text}` });
   }
   return found;
 }
