@@ -20,7 +20,7 @@ from agent.estimation.facts import (
     manoeuvre,
     mutual_range,
 )
-from agent.estimation.gaussian.joint_fit import JointFit, JointStart, joint_fit
+from agent.estimation.fit import JointFit, JointStart, joint_fit
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, joint_measurements
 from agent.estimation.gaussian.joint_search import search
 from tests.moving_groups import NOISE, PERIOD_S, MovingGroup, moving_group

@@ -6,19 +6,16 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from msgspec.structs import replace
 from numpy.typing import NDArray
 from scipy.optimize import least_squares  # type: ignore[import-untyped]
 from scipy.stats import binom, chi2  # type: ignore[import-untyped]
 
 from agent.estimation.facts import Facts, Manoeuvre, anchor, anchor_range, manoeuvre, mutual_range
+from agent.estimation.fit import JointFit, JointStart, joint_fit
 from agent.estimation.gaussian.fitted_poses import poses
 from agent.estimation.gaussian.hypotheses import search as search_of_pair
 from agent.estimation.gaussian.joint_claims import blocking_reason, undetermined
-from agent.estimation.gaussian.joint_fit import JointFit, JointStart, joint_fit
-from agent.estimation.gaussian.joint_problem import JointProblem
 from agent.estimation.gaussian.joint_ranges import MOST_MUTUAL_RANGES, JointMeasurements, joint_measurements
 from agent.estimation.gaussian.joint_search import JointHypotheses, certainties, search
 from agent.estimation.gaussian.odometry_noise import constant_errors, track, variances
@@ -128,19 +125,6 @@ def test_the_joint_fit_is_the_optimum_that_scipy_finds(unanchored: list[int]) ->
     sigmas = np.sqrt(np.diagonal(covariance))
     assert np.max(np.abs((fit.poses - ends).ravel()) / sigmas) < 0.01
     assert np.max(np.abs(fit.covariance - covariance) / np.outer(sigmas, sigmas)) < 0.02
-
-
-@settings(max_examples=20, deadline=None)
-@given(st.integers(2, 5), st.integers(0, 1000))
-def test_the_derivatives_of_all_ranges_are_right(robots: int, seed: int) -> None:
-    group = moving_group(robots, seed, ticks=6)
-    measured = measured_of(group)
-    problem, start = JointProblem.of(measured), at_truth(group, measured)
-    point, small = problem.begin(start.poses, ()), 1e-6
-    for i in range(start.poses.size):
-        step = (small * np.eye(start.poses.size)[i]).reshape(start.poses.shape)
-        more, less = (problem.begin(start.poses + sign * step, ()).residuals for sign in (1.0, -1.0))
-        np.testing.assert_allclose((less - more) / (2.0 * small), point.jacobian[:, i], atol=1e-5)
 
 
 def test_two_robots_have_the_same_poses_as_by_the_fit_of_a_pair() -> None:

@@ -191,7 +191,7 @@ def test_reports_under_odometry_noise_fit_in_a_frame_and_no_claim_is_wrong() -> 
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("robots", "unanchored", "groups"), [(4, 2, 8), (8, 4, 4), (8, 6, 2)])
+@pytest.mark.parametrize(("robots", "unanchored", "groups"), [(4, 2, 8), (8, 4, 4), (8, 6, 3)])
 def test_random_groups_make_no_wrong_claim_under_noise_and_reported_poses_have_right_covariances(
     robots: int, unanchored: int, groups: int
 ) -> None:

@@ -14,11 +14,12 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from agent.estimation.fit import LAST_STEP
 from agent.estimation.gaussian import odometry_noise
 from agent.estimation.gaussian.consistency import FINISHED
 from agent.estimation.gaussian.fitted import Fit
 from agent.estimation.gaussian.fitted_poses import deviation, poses
-from agent.estimation.gaussian.least_squares import LAST_STEP, fit, fits
+from agent.estimation.gaussian.least_squares import fit, fits
 from agent.estimation.gaussian.linear_model import Start
 from agent.estimation.gaussian.odometry_noise import (
     OdometryNoiseModel,

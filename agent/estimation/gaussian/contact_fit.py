@@ -16,12 +16,12 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
+from agent.estimation.fit import JointFit, JointStart, joint_fits
 from agent.estimation.gaussian.beacon_guesses import beacon_guesses
 from agent.estimation.gaussian.claim_rivals import WRONG_SIGMAS
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, EARLY_CLAIM_P_VALUE, chi2_p_value
 from agent.estimation.gaussian.fitted_poses import deviation
 from agent.estimation.gaussian.joint_claims import blocking_reason
-from agent.estimation.gaussian.joint_fit import JointFit, JointStart, joint_fit
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges, PosePrior
 from agent.estimation.gaussian.joint_search import (
     JointHypotheses,
@@ -93,14 +93,13 @@ def estimated(contact: ContactRanges, mission: Mission) -> ContactEstimate | Non
     measured = _measured(contact, mission)
     if len(measured.ranges.rho) < FEWEST_FOR_POSE:
         return None
-    fits = [joint_fit(measured, start) for start in _starts(measured, mission)]
-    found = with_probability(fits)
+    found = with_probability(joint_fits(measured, _starts(measured, mission)))
     if not found:
         return None
     level = found[0].fit.level
     if abs(level - 1.0) > SAME_LEVEL:  # the level is that of these measurements, not of the finder's pose
         measured = _with_level(measured, level)
-        found = with_probability([joint_fit(measured, one.fit.start) for one in found])
+        found = with_probability(joint_fits(measured, [one.fit.start for one in found]))
     estimate = _estimate(found, measured, mission) if found else None
     return estimate if estimate is not None and _is_sendable(estimate) else None
 
@@ -230,14 +229,15 @@ def _rival(best: JointFit, measured: JointMeasurements, mission: Mission) -> str
     along, far = axes[:, 1], WRONG_SIGMAS * deviation(float(np.sum(variances)))
     information = prior.information.copy()
     information[i : i + 2, i : i + 2] += np.outer(along, along) / (HOLDING * far) ** 2
-    weights = []
+    weights: list[float] = []
     for offset in (0.0, far, -far):
         mean = prior.mean.copy()
         mean[OWN, :2] = best.start.poses[OWN, :2] + offset * along
         held = replace(measured, prior=PosePrior(mean, information, prior.rank + 1))
         poses = best.start.poses.copy()
         poses[OWN, :2] = mean[OWN, :2]
-        weights.append(joint_fit(held, JointStart(poses, best.start.errors)).weight)
+        fits = joint_fits(held, [JointStart(poses, best.start.errors)])
+        weights += [one.weight for one in fits] or [math.inf]
     ratio, most = max(weights[1:]) - weights[0], math.log1p(-mission.confidence)
     if ratio <= most:
         return ""
@@ -250,7 +250,7 @@ def _rival(best: JointFit, measured: JointMeasurements, mission: Mission) -> str
 def _doubt(best: JointFit, measured: JointMeasurements) -> str:
     """Return which profile explains the measurements much better than the given noise, or an empty text."""
     for name, other in claim_profiles(measured.noise):
-        again = joint_fit(replace(measured, noise=other), JointStart(best.start.poses))
-        if again.weight - best.weight > DOUBTFUL_CLAIM:
+        fits = joint_fits(replace(measured, noise=other), [JointStart(best.start.poses)])
+        if any(again.weight - best.weight > DOUBTFUL_CLAIM for again in fits):
             return f"the profile '{name}' explains the ranges and the odometry of both robots better"
     return ""

@@ -7,21 +7,10 @@ from typing import TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.estimation.fit import DESCENT, LARGEST_STEP, SHORTER_STEPS
 from agent.estimation.gaussian.fitted import NormalEquations
 from agent.estimation.gaussian.linear_model import ErrorSizes, LinearModel, Point, Problem, product
 from agent.estimation.gaussian.odometry_noise import Array, Places
-
-LARGEST_STEP = 1.0
-"""The largest change of an unknown, in m and rad, in one step."""
-
-SHORTER_STEPS = (0.5, 0.25, 0.0625)
-"""The fractions of a step that are tried in turn if it does not descend.
-
-Gauss-Newton with full steps may alternate between two guesses for ever.
-"""
-
-DESCENT = 1e-6
-"""The increase of the cost, in units of chi-square, that is due to rounding."""
 
 
 def stepped(

@@ -14,12 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from agent.estimation.fit import FIT_STEPS
 from agent.estimation.gaussian.anchor_guesses import MOST_FOLLOWED, SEED_RANGES, UNLIKELY, anchors
 from agent.estimation.gaussian.detections import anchor_log_likelihood, detection_log_likelihood
 from agent.estimation.gaussian.fitted import Fit
 from agent.estimation.gaussian.least_squares import (
     COARSE_STILL,
-    FIT_STEPS,
     WARM_DECREASE,
     fits,
     without_outliers,

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from agent.estimation.fit import JointFit, JointStart, joint_fits
 from agent.estimation.gaussian import hypotheses
 from agent.estimation.gaussian.beacon_guesses import beacon_guesses
 from agent.estimation.gaussian.hypotheses import (
@@ -21,7 +22,6 @@ from agent.estimation.gaussian.hypotheses import (
     WARM_STEPS,
     ScoredHypothesis,
 )
-from agent.estimation.gaussian.joint_fit import JointFit, JointStart, joint_fit
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.known_anchors import AnchoredRobot, scored_fits
 from agent.estimation.gaussian.linear_model import Start
@@ -86,7 +86,7 @@ def search(measured: JointMeasurements, reach: float) -> JointHypotheses:
 def follow(known: JointHypotheses, measured: JointMeasurements, steps: int = WARM_STEPS) -> JointHypotheses:
     """Return the hypotheses that follow from those `known` before the latest facts."""
     part = measured.some(known.located)
-    found = [joint_fit(part, one.fit.start, steps) for one in known.scored]
+    found = joint_fits(part, [one.fit.start for one in known.scored], steps)
     return JointHypotheses(known.located, with_probability(found))
 
 
@@ -205,14 +205,14 @@ def _with(
     # all poses of the new robots under the first hypothesis, and the first pose under all others
     found.sort(key=lambda each: (each[0] > 0, -each[1]))
     part, order = measured.some(located), np.argsort([*known.located, *candidate.robots])
-    fits = []
+    starts = []
     for rank, (others, weight, one, new) in enumerate(found[:MOST_POSES]):
         if weight >= least and (others == 0 or rank < MOST_JOINT):
             begun = one.fit.start if one is not None else JointStart(np.zeros((0, 3)))
             poses = np.concatenate((begun.poses, new.start.poses))[order]
             errors = [*begun.errors, *new.start.errors]
-            fits.append(joint_fit(part, JointStart(poses, tuple([errors[k] for k in order]))))
-    return JointHypotheses(located, with_probability(fits))
+            starts.append(JointStart(poses, tuple([errors[k] for k in order])))
+    return JointHypotheses(located, with_probability(joint_fits(part, starts)))
 
 
 def _new(

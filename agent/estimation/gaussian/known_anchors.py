@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from agent.estimation.fit import FIT_STEPS
 from agent.estimation.gaussian.anchor_guesses import anchors
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, HIGHEST_LEVEL, chi2_p_value
 from agent.estimation.gaussian.fitted_poses import deviation
@@ -22,7 +23,7 @@ from agent.estimation.gaussian.hypotheses import (
     with_probability,
 )
 from agent.estimation.gaussian.inference import MUTUAL_RANGES, MUTUAL_RANGES_WITH_OUTLIERS
-from agent.estimation.gaussian.least_squares import FIT_STEPS, fits
+from agent.estimation.gaussian.least_squares import fits
 from agent.estimation.gaussian.linear_model import Start
 from agent.estimation.gaussian.odometry_noise import Array, Places, Track
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges, mixture, predicted

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from agent.estimation.fit import FIT_STEPS, LAST_STEP, RIDGE, SETTLED_WEIGHT, SOFT
 from agent.estimation.gaussian.descent import full_step, rows_of, stepped
 from agent.estimation.gaussian.fitted import Fit, NormalEquations
 from agent.estimation.gaussian.linear_model import LinearModel, Point, Problem, Start, product
@@ -32,16 +33,6 @@ from agent.estimation.gaussian.range_model import Ranges, outliers
 from agent.estimation.gaussian.range_weights import inlier_probabilities, weighted_variance, weights_by_errors
 from protocol.noise import Noise
 
-FIT_STEPS = 8
-"""The maximum number of Gauss-Newton steps."""
-
-LAST_STEP = 3e-3
-"""The expected length in sigmas of the next step from which on a step is the last.
-
-Steps of Gauss-Newton decrease by a constant factor, about 0.1 with ranges of a tenth of their length. The
-linear model is not computed again after the last step.
-"""
-
 COARSE_STILL = 0.05
 """The value of LAST_STEP for fits on which only the robot's way depends.
 
@@ -50,15 +41,6 @@ No claim does: each search fits all ranges again. With LAST_STEP, such a fit tak
 
 WARM_DECREASE = 0.1
 """The expected decrease of the first step of a fit that begins at the last one, which has one range less."""
-
-SETTLED_WEIGHT = 1e-2
-"""The change of a weight below which the weights have converged."""
-
-RIDGE = 1e-12
-"""The fraction of the information that is added to its diagonal, and an absolute part of the same size.
-
-With it, the variance of an unknown that the ranges leave undetermined is large but finite.
-"""
 
 
 def fit(
@@ -113,7 +95,7 @@ def fits(
         variance = weighted_variance(ranges.sigma, weights)
         covariance = range_covariance(variance, linear.columns, linear.dense)
         system = _solved(point.predicted.jacobian[..., problem.free], linear.innovation, covariance)
-        updated = inlier_probabilities(system, weights, ranges.sigma, noise) if problem.robust else weights
+        updated = _inliers(system, variance, ranges.sigma, noise) if problem.robust else weights
         quality = _quality(system, weights, noise)
         if step == 0:
             before = quality.last_step / decrease
@@ -140,6 +122,14 @@ def fits(
         if len(left) < len(onward):
             point, weights, before = rows_of((point, weights, before), onward)
     return [ended[i] for i in range(len(starts))]
+
+
+def _inliers(system: NormalEquations, variance: Array, sigma: Array, noise: Noise) -> Array:
+    """Return the probability that each range is an inlier."""
+    weighted = system.weighted[..., :-1]
+    explained = np.add.reduce((weighted @ system.of_guess) * weighted, -1)
+    alone = system.covariance.precisions
+    return inlier_probabilities(system.multipliers, alone, explained, variance, sigma, noise)
 
 
 def _first_weights(problem: Problem, starts: Sequence[Start], point: Point, linear: LinearModel) -> Array:
@@ -283,10 +273,6 @@ def _log_likelihood(
     return log_likelihood
 
 
-SOFT = 0.1
-"""The least smoothing of the ends of the outlier density, as a fraction of the least bias."""
-
-
 class HeldFit(NamedTuple):
     """The result of a fit in which one coordinate is held."""
 
@@ -319,7 +305,7 @@ def held_fits(problem: Problem, begun: Fit, row: int, offsets: Array, steps: int
             loosened = np.square(sigma) + np.add.reduce(np.square(problem.common), 1)
             weights = weights_by_errors(point.residuals, np.sqrt(loosened), noise)
         elif problem.robust:
-            weights = inlier_probabilities(system, weights, sigma, noise)
+            weights = _inliers(system, weighted_variance(sigma, weights), sigma, noise)
         weights[:, row] = 1.0
     chi2, level = _quality(system, weights, noise).chi2.tolist(), begun.level
     return [

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from agent.estimation.fit import LEAST_VARIANCE
 from agent.estimation.gaussian.odometry_noise import (
     Array,
     Errors,
@@ -287,10 +288,6 @@ class Problem(NamedTuple):
         by_path = constant[self.common.shape[1] :].reshape(self.patterns.shape[:2])
         parts = zip(white, by_path, self.lengths, strict=True)
         return tuple([Errors(v[:ticks], omega[:ticks], some) for (v, omega), some, ticks in parts])
-
-
-LEAST_VARIANCE = 1e-300
-"""The variance of odometry noise that counts as 0; the odometry error is then 0, too."""
 
 
 def product(matrix: Array, vector: Array) -> Array:

@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.estimation.smoother import SLIGHT
 from protocol.noise import Noise, VelocityNoise
 
 Array = NDArray[np.float64]
@@ -215,10 +216,6 @@ def _shortening(half: Array, period: float) -> Array:
     by_half = np.where(slight, half / -3.0, 1.0 / np.tan(safe) - 1.0 / safe)
     shortening: Array = (0.5 * period) * by_half
     return shortening
-
-
-SLIGHT = 1e-4
-"""The half turn in rad below which the series of the derivative is used."""
 
 
 class Ticks(msgspec.Struct, frozen=True, eq=False, dict=True):

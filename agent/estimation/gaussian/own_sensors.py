@@ -12,11 +12,12 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
+from agent.estimation.fit import FIT_STEPS
 from agent.estimation.gaussian.anchor_guesses import anchors
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, consistency_test
 from agent.estimation.gaussian.fitted import Fit
 from agent.estimation.gaussian.hypotheses import search
-from agent.estimation.gaussian.least_squares import FIT_STEPS, fit, fits
+from agent.estimation.gaussian.least_squares import fit, fits
 from agent.estimation.gaussian.linear_model import Start
 from agent.estimation.gaussian.odometry_noise import Track, rescaled
 from agent.estimation.gaussian.range_model import PairRanges, Ranges

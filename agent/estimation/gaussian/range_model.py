@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.gaussian.odometry_noise import SIGNS, Array, Places, Track
+from agent.estimation.smoother import SMALLEST_DISTANCE
 from protocol.motion import rotated, rotated_back
 from protocol.noise import Noise, Priors, VelocityNoise
 
@@ -321,10 +322,6 @@ def _to_places(rotation: Array, away: Array, place: Array) -> Predicted:
     along, across = rotated_back(c, s, nx, ny)
     jacobian = np.stack((-along, -across, ny * wx - nx * wy), -1)
     return Predicted(distance, jacobian, np.stack((along, across), -2)[..., None, :, :])
-
-
-SMALLEST_DISTANCE = 1e-12
-"""The distance (m) below which a direction is not defined."""
 
 
 def placed(guess: Array, path: Track, ticks: Places) -> tuple[Array, Array]:

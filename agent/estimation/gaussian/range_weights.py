@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from agent.estimation.gaussian.fitted import NormalEquations
 from agent.estimation.gaussian.odometry_noise import Array
 from agent.estimation.gaussian.range_model import inlier_probability
 from protocol.noise import Noise
@@ -22,15 +21,17 @@ def weighted_variance(sigma: Array, weights: Array) -> Array:
     return variance
 
 
-def inlier_probabilities(system: NormalEquations, weights: Array, sigma: Array, noise: Noise) -> Array:
-    """Return the probability that each range is an inlier, given the prediction from all other ranges."""
-    alone = system.covariance.precisions
-    weighted = system.weighted[..., :-1]
-    explained = np.add.reduce((weighted @ system.of_guess) * weighted, -1)
+def inlier_probabilities(
+    multipliers: Array, alone: Array, explained: Array, variance: Array, sigma: Array, noise: Noise
+) -> Array:
+    """Return the probability that each range is an inlier, given the prediction from all other ranges.
+
+    `multipliers` are the innovations times their inverse covariance, `alone` is the diagonal of that, and
+    `explained` the part of it that the unknowns explain. `variance` is the own one of each range (m^2).
+    """
     precision = np.maximum(alone - explained, BLIND * alone)
-    error = system.multipliers / precision
-    variance = np.maximum(1.0 / precision - weighted_variance(sigma, weights), 0.0) + np.square(sigma)
-    return weights_by_errors(error, np.sqrt(variance), noise)
+    spread = np.maximum(1.0 / precision - variance, 0.0) + np.square(sigma)
+    return weights_by_errors(multipliers / precision, np.sqrt(spread), noise)
 
 
 def weights_by_errors(errors: Array, sigma: Array, noise: Noise) -> Array:

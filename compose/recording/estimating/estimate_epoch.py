@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from agent.estimation.fit import JointFit
 from agent.estimation.gaussian.fitted import Fit
-from agent.estimation.gaussian.joint_fit import JointFit
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.joint_search import Certainty
 from agent.estimation.gaussian.known_anchors import AnchoredRobot

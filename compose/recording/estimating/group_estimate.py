@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from agent.estimation.fit import FIT_STEPS
 from agent.estimation.gaussian.consistency import FINISHED
 from agent.estimation.gaussian.joint_claims import blocking_reason, open_position, undetermined
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
@@ -19,7 +20,6 @@ from agent.estimation.gaussian.joint_search import (
     merged,
     search,
 )
-from agent.estimation.gaussian.least_squares import FIT_STEPS
 from compose.recording.estimating.estimate_epoch import (
     GIVEN_UP,
     MOST_SEARCHES,

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
+from agent.estimation.fit import JointFit
 from agent.estimation.gaussian.fitted import Fit
-from agent.estimation.gaussian.joint_fit import JointFit
 from agent.estimation.gaussian.odometry_noise import Array, Projection, Ticks, constant_effects
 from compose.recording.ranging.range_recording import Numbers
 

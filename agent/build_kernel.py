@@ -1,0 +1,57 @@
+"""The build hook that compiles the kernel of the estimator, `smoother.c`, when Tandem is installed.
+
+It uses the C compiler of the machine, which `CC` or `cc` names; where there is none, that of the PyPI package
+`ziglang`. In a clone, the library is written beside its source, where an editable installation finds it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+from pathlib import Path
+from typing import Any
+
+from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+
+SOURCE = "agent/estimation/smoother.c"
+LIBRARY = "agent/estimation/libsmoother.so"
+FLAGS = ("-O3", "-ffp-contract=off", "-fPIC", "-shared")
+"""The options: without contraction and fast math, results follow from the source and the C library alone."""
+COMPILER_PACKAGE = "ziglang>=0.13,<1"
+
+
+def machine_compiler() -> list[str]:
+    """Return the command of the machine's C compiler; empty if there is none."""
+    command = os.environ.get("CC", "cc").split()
+    return command if command and shutil.which(command[0]) else []
+
+
+class KernelHook(BuildHookInterface):  # type: ignore[misc]  # hatchling has no types
+    """Compiles the kernel for a wheel, which is tagged for its platform."""
+
+    def dependencies(self) -> list[str]:
+        """Return the package that brings a compiler, where the machine has none."""
+        return [] if self.target_name != "wheel" or machine_compiler() else [COMPILER_PACKAGE]
+
+    def initialize(self, _version: str, build_data: dict[str, Any]) -> None:
+        """Compile the kernel; a source distribution contains its source alone."""
+        if self.target_name != "wheel":
+            return
+        root = Path(self.root)
+        source, library = root / SOURCE, root / LIBRARY
+        compiler = machine_compiler() or [sys.executable, "-m", "ziglang", "cc"]
+        digest = hashlib.sha256(source.read_bytes()).hexdigest()
+        part = library.with_name(f"{library.name}.{os.getpid()}")  # a process may have loaded the old one
+        command = [*compiler, *FLAGS, f'-DSOURCE="{digest}"', "-o", str(part), str(source), "-lm"]
+        ended = subprocess.run(command, capture_output=True, text=True, check=False)
+        if ended.returncode:
+            raise SystemExit(f"{SOURCE} does not compile: {' '.join(command)}\n{ended.stderr}")
+        part.replace(library)
+        platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
+        build_data["artifacts"].append(f"/{LIBRARY}")
+        build_data["pure_python"] = False
+        build_data["tag"] = f"py3-none-{platform}"

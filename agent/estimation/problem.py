@@ -1,0 +1,118 @@
+"""The measurements of n robots as the arrays of a fit: paths, ranges, and the errors that they may have."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+
+from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges
+from agent.estimation.gaussian.odometry_noise import Array, Places, Track, constant_errors, variances
+from agent.estimation.smoother import Measured
+from protocol.noise import Noise
+
+
+class JointProblem(msgspec.Struct, frozen=True, eq=False):
+    """The part of a fit that does not change during it. Ranges are in the order of their ticks."""
+
+    measured: Measured
+    noise: Noise
+    order: Places
+    """The ranges of the measurements in the order of the fit; shape (N,)."""
+    back: Places
+    """The ranges of the fit in the order of the measurements; shape (N,)."""
+    sigma: Array
+    """The standard deviation of each range in m; shape (N,)."""
+    lengths: tuple[int, ...]
+    """The number of ticks of each path."""
+    free: int
+    """The number of unknowns of the start poses that only the ranges determine."""
+    ends: tuple[int, ...]
+    """The row after the last one of each pair of radios, in the order of the measurements."""
+    ticks: Places
+    """The tick of each range, in the order of the measurements; shape (N,)."""
+
+    @staticmethod
+    def of(measured: JointMeasurements) -> JointProblem:
+        """Return the problem of all robots in `measured`."""
+        noise, priors, ranges = measured.noise, measured.noise.priors, measured.ranges
+        n, lengths = len(measured.paths), tuple([len(path.v) for path in measured.paths])
+        ticks = max(lengths, default=0)
+        tick = np.minimum(ranges.tick, ticks)
+        order = np.argsort(tick, kind="stable")
+        back = np.empty_like(order)
+        back[order] = np.arange(len(order))
+        v, omega, slip = _velocities(measured.paths, ticks)
+        anchor, anchors = _unsure_anchors(ranges) if priors.survey_error else (np.full(len(order), -1), 0)
+        prior = measured.prior
+        return JointProblem(
+            Measured(
+                period=measured.period,
+                v=v,
+                omega=omega,
+                slip=slip,
+                white=_variances(measured.paths, v, omega, noise),
+                patterns=constant_errors(v, omega, noise),
+                begin=np.searchsorted(tick[order], np.arange(ticks + 2)),
+                first=ranges.first[order],
+                second=ranges.second[order],
+                place=ranges.place[order],
+                rho=ranges.rho[order],
+                common=ranges.single.common_errors(priors)[order],
+                anchor=anchor[order],
+                anchors=anchors,
+                survey=priors.survey_error,
+                radio=ranges.radio[order],
+                radios=int(ranges.radio.max(initial=-1)) + 1 if priors.slow_sigma else 0,
+                slow=priors.slow_sigma**2,
+                decay=math.exp(-measured.period / priors.slow_time),
+                mean=np.zeros(3 * n) if prior is None else prior.mean.ravel(),
+                information=np.zeros((3 * n, 3 * n)) if prior is None else prior.information,
+            ),
+            noise,
+            order,
+            back,
+            ranges.sigma[order],
+            lengths,
+            3 * n - (0 if prior is None else prior.rank),
+            ranges.ends,
+            ranges.tick,
+        )
+
+    @property
+    def robust(self) -> bool:
+        """True if a range may be an outlier."""
+        return bool(self.noise.outliers or self.noise.strays)
+
+
+def _velocities(paths: tuple[Track, ...], ticks: int) -> tuple[Array, Array, Array]:
+    """Return v, omega and slip of all paths, shape (n, K); a shorter one goes on at rest."""
+    v, omega, slip = np.zeros((3, len(paths), ticks))
+    for i, path in enumerate(paths):
+        known = len(path.v)
+        v[i, :known], omega[i, :known] = path.v, path.omega
+        if path.slip is not None:
+            slip[i, :known] = path.slip
+    return v, omega, slip
+
+
+def _variances(paths: tuple[Track, ...], v: Array, omega: Array, noise: Noise) -> Array:
+    """Return the variances of v and omega of all paths, (n, 2, K): those of the noise, and the extra ones."""
+    white = variances(v, omega, noise.odometry)
+    for i, path in enumerate(paths):
+        known = len(path.v)
+        white[i, :, known:] = 0.0
+        if path.extra is not None:
+            white[i, :, :known] += path.extra
+    return white
+
+
+def _unsure_anchors(ranges: JointRanges) -> tuple[Places, int]:
+    """Return the anchor of each range, -1 of one between robots, and the number of anchors."""
+    number: dict[tuple[float, ...], int] = {}
+    anchor = np.full(len(ranges.rho), -1)
+    for row, (second, place) in enumerate(zip(ranges.second.tolist(), ranges.place.tolist(), strict=True)):
+        if second < 0:
+            anchor[row] = number.setdefault(tuple(place), len(number))
+    return anchor, len(number)

@@ -1,0 +1,132 @@
+"""The kernel of a fit does what its text says, to the bit, and its steps are those of least squares."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from agent.estimation import smoother
+from agent.estimation.gaussian.joint_ranges import PosePrior, joint_measurements
+from agent.estimation.kernel import Kernel
+from agent.estimation.problem import JointProblem
+from agent.estimation.smoother import Measured, Singular
+from tests.moving_groups import NOISE, PERIOD_S, moving_group
+
+Array = smoother.Array
+
+
+def problem_of(
+    seed: int, robots: int, ticks: int, *, slow: float, survey: float, prior: bool
+) -> JointProblem:
+    """Return the problem of a random group: with slow errors, surveying errors and a prior of the poses."""
+    noise = replace(NOISE, slow_sigma=slow, survey_error=survey)
+    measured = joint_measurements(moving_group(robots, seed, ticks=ticks, noise=noise).facts, noise, PERIOD_S)
+    if prior:
+        root = np.random.default_rng(seed).normal(size=(3 * robots, 3 * robots))
+        about = PosePrior(np.zeros((robots, 3)), root @ root.T, 3 * robots)
+        measured = replace(measured, prior=about)
+    return JointProblem.of(measured)
+
+
+def point_of(of: Measured, seed: int) -> tuple[Array, Array, Array]:
+    """Return start poses, constant errors and white errors at random."""
+    rng = np.random.default_rng(seed)
+    white = np.sqrt(of.white) * rng.normal(size=of.white.shape)
+    return rng.uniform(-5.0, 5.0, 3 * of.robots), rng.normal(size=of.patterns.shape[:2]), white
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    st.integers(0, 10**6),
+    st.integers(1, 3),
+    st.integers(1, 7),
+    st.sampled_from([0.0, 0.08]),
+    st.sampled_from([0.0, 0.1]),
+    st.booleans(),
+    st.sampled_from([1e-3, 1.0, 1e9]),
+)
+def test_the_kernel_equals_its_text_to_the_bit(
+    seed: int, robots: int, ticks: int, slow: float, survey: float, prior: bool, largest: float
+) -> None:
+    problem = problem_of(seed, robots, ticks, slow=slow, survey=survey, prior=prior)
+    of, variance = problem.measured, np.square(problem.sigma)
+    poses, constant, white = point_of(of, seed)
+    kernel = Kernel(of)
+    walk, text = kernel.walked(poses, constant, white), smoother.walked(of, poses, constant, white)
+    for one, other in zip(walk, text, strict=True):
+        assert one.tobytes() == other.tobytes()
+    loose = kernel.loosened(walk, poses, variance)
+    assert loose.tobytes() == smoother.loosened(of, walk, poses, variance).tobytes()
+    given = (walk, poses, variance, 1e-12, largest)
+    for name, one in kernel.step(*given)._asdict().items():
+        expected = getattr(smoother.step(of, *given), name)
+        assert np.asarray(one).tobytes() == np.asarray(expected).tobytes(), name
+
+
+def dense(problem: JointProblem, poses: Array, constant: Array, white: Array) -> tuple[Array, Array, Array]:
+    """Return the whole least-squares problem at a point: J, right side, all errors as unknowns."""
+    of, small = problem.measured, 1e-6
+    kernel, n3, m = Kernel(of), 3 * of.robots, of.patterns.shape[1]
+    sizes = np.sqrt(of.white)
+
+    def predicted(x: Array) -> Array:
+        start, common, own, errors = np.split(x, np.cumsum([n3, of.common.shape[1], of.robots * m]))
+        walk = kernel.walked(start, own.reshape(-1, m), errors.reshape(of.white.shape) * sizes)
+        return of.rho - walk.residual + of.common @ common
+
+    x = np.concatenate((poses, np.zeros(of.common.shape[1]), constant.ravel(), (white / sizes).ravel()))
+    columns = [(predicted(x + step) - predicted(x - step)) / (2.0 * small) for step in small * np.eye(len(x))]
+    rows, priors = np.stack(columns, 1) / problem.sigma[:, None], np.eye(len(x))[n3:]
+    right = np.concatenate(((of.rho - predicted(x)) / problem.sigma, -x[n3:]))
+    return np.concatenate((rows, priors)), right, x
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_step_is_that_of_least_squares_with_all_errors_as_unknowns(seed: int) -> None:
+    problem = problem_of(seed, 2, 5, slow=0.0, survey=0.0, prior=False)
+    of = problem.measured
+    poses, constant, white = point_of(of, seed)
+    constant, white = 0.3 * constant, 0.3 * white
+    step = Kernel(of).step(
+        Kernel(of).walked(poses, constant, white), poses, np.square(problem.sigma), 0.0, np.inf
+    )
+    jacobian, right, x = dense(problem, poses, constant, white)
+    change, *_ = np.linalg.lstsq(jacobian, right)
+    after, size = x + change, of.size
+    n3 = 3 * of.robots
+    np.testing.assert_allclose(step.change[:n3], change[:n3], atol=1e-4 * np.max(np.abs(change[:n3])))
+    np.testing.assert_allclose(step.change[n3:], after[n3:size], atol=1e-4)
+    np.testing.assert_allclose(
+        step.white / np.sqrt(of.white), after[size:].reshape(of.white.shape), atol=1e-4
+    )
+    inverse = np.linalg.inv(jacobian.T @ jacobian)[:size, :size]
+    np.testing.assert_allclose(step.inverse, inverse, rtol=1e-3, atol=1e-6 * np.max(inverse))
+    left = right - jacobian @ change
+    assert step.chi2 == pytest.approx(float(left @ left), rel=1e-4)
+
+
+def test_each_range_is_weighed_by_the_prediction_from_all_others() -> None:
+    problem = problem_of(3, 2, 5, slow=0.05, survey=0.0, prior=False)
+    of = problem.measured
+    poses, constant, white = point_of(of, 3)
+    kernel, variance = Kernel(of), np.square(problem.sigma)
+    walk = kernel.walked(poses, constant, white)
+    step = kernel.step(walk, poses, variance, 0.0, np.inf)
+    for j in (0, 4, len(variance) - 1):
+        without = variance.copy()
+        without[j] = 1e12
+        alone = kernel.step(walk, poses, without, 0.0, np.inf)
+        error = step.multipliers[j] / (step.alone[j] - step.explained[j])
+        assert error == pytest.approx(1e12 * alone.multipliers[j], rel=1e-4)
+
+
+def test_ranges_that_determine_no_pose_are_singular() -> None:
+    measured = joint_measurements(moving_group(1, 1, ticks=3).facts, NOISE, PERIOD_S).until(0)
+    problem = JointProblem.of(measured)
+    kernel = Kernel(problem.measured)
+    poses, constant, white = point_of(problem.measured, 1)
+    with pytest.raises(Singular, match="do not determine"):
+        kernel.step(kernel.walked(poses, constant, white), poses, np.square(problem.sigma), 0.0, 1.0)
