@@ -21,6 +21,7 @@ from cryptography.hazmat.primitives.serialization import (
     load_pem_private_key,
 )
 
+from agent.estimation import kernel
 from compose import extras
 from compose.doctor.certificate_checks import certificate_findings
 from compose.doctor.network_checks import APART_S, compared
@@ -63,7 +64,7 @@ def test_versions_are_printed(tmp_path: Path) -> None:
     for name in ("python 3.", "eclipse-zenoh 1.", "numpy ", "scipy ", "msgpack ", "msgspec "):
         assert name in said
     assert f"tandem-ranging {extras.version()}" in said
-    assert said.endswith(f"protocol version {VERSION}")
+    assert said.endswith(f", estimator compiled by {kernel.compiler()}, protocol version {VERSION}")
     assert findings(ended, "--") == ["network: there is no --connect"]
     assert tandem("--version", cwd=tmp_path) == (
         0,

@@ -43,13 +43,18 @@ def library() -> ctypes.CDLL:
         found = ctypes.CDLL(str(KERNEL))
     except OSError as error:
         raise NoKernel(f"the estimator is not compiled: {error}; {REINSTALL}") from error
-    found.source.restype = ctypes.c_char_p
+    found.source.restype = found.compiler.restype = ctypes.c_char_p
     text = KERNEL_SOURCE.read_bytes() if KERNEL_SOURCE.exists() else None
     if text is not None and found.source() != hashlib.sha256(text).hexdigest().encode():
         raise NoKernel(f"{KERNEL} is not compiled from {KERNEL_SOURCE.name} as it is now; {REINSTALL}")
     found.walked.restype = found.loosened.restype = None
     found.step.restype = ctypes.c_int
     return found
+
+
+def compiler() -> str:
+    """Return the name and version of the compiler of the kernel. Raises NoKernel."""
+    return str(library().compiler().decode()).strip()
 
 
 class Kernel:

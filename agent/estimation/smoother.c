@@ -13,6 +13,17 @@
 /* The SHA-256 of this text, which the build gives. */
 const char *source(void) { return SOURCE; }
 
+const char *compiler(void)
+{
+#if defined(__clang__)
+    return "clang " __clang_version__;
+#elif defined(__GNUC__)
+    return "gcc " __VERSION__;
+#else
+    return "an unknown compiler";
+#endif
+}
+
 #define SLIGHT 1e-4
 #define SMALLEST_DISTANCE 1e-12
 

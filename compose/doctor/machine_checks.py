@@ -7,6 +7,7 @@ import platform
 import socket
 from collections.abc import Iterator
 
+from agent.estimation import kernel
 from compose import extras
 from compose.doctor.finding import Finding, fix, ok
 from compose.network import beyond
@@ -34,8 +35,12 @@ def versions() -> Iterator[Finding]:
         f"python {platform.python_version()}",
         f"{PACKAGE} {own}",
         *fitting,
-        f"protocol version {VERSION}",
     ]
+    try:
+        installed.append(f"estimator compiled by {kernel.compiler()}")
+    except kernel.NoKernel as error:
+        yield fix(f"versions: {error}")
+    installed.append(f"protocol version {VERSION}")
     yield ok(f"versions: {', '.join(installed)}")
     for one in found:
         if not one.fits:
