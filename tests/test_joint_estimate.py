@@ -17,9 +17,10 @@ from agent.estimation.gaussian.fitted_poses import poses
 from agent.estimation.gaussian.hypotheses import search as search_of_pair
 from agent.estimation.gaussian.joint_claims import blocking_reason, undetermined
 from agent.estimation.gaussian.joint_ranges import MOST_MUTUAL_RANGES, JointMeasurements, joint_measurements
-from agent.estimation.gaussian.joint_search import JointHypotheses, certainties, search
+from agent.estimation.gaussian.joint_search import search
 from agent.estimation.gaussian.odometry_noise import constant_errors, track, variances
 from agent.estimation.gaussian.range_model import PairRanges, Ranges
+from agent.estimation.posterior import JointHypotheses, certainties
 from tests.moving_groups import NOISE, PERIOD_S, MovingGroup, moving_group
 
 Array = NDArray[np.float64]

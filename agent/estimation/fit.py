@@ -210,14 +210,17 @@ def _fitted(problem: JointProblem, kernel: Kernel, start: JointStart, steps: int
             told = (step.multipliers, step.alone, step.explained)
             updated = inlier_probabilities(*told, variance, sigma, noise)
         freedom = int(np.count_nonzero(weights > INLIER)) - problem.free
-        length = step.length / math.sqrt(noise_level(step.chi2, freedom, noise))
+        level = noise_level(step.chi2, freedom, noise)
+        length = step.length / math.sqrt(level)
         before = length if number == 0 else before
         expected = length**2 / max(length, before, LAST_STEP)
         still = float(np.max(np.abs(updated - weights), initial=0.0)) < SETTLED_WEIGHT
         if number == steps:
-            return _fit(problem, point, step, weights, length)
+            off = _off_model(point, step, variance, level)
+            return _fit(problem, point, step, weights, off if off > 1.0 else length)
         point = _stepped(problem, kernel, point, step, variance)
-        if still and expected < LAST_STEP and number > 0:
+        still = still and expected < LAST_STEP and number > 0  # the path is corrected at least once
+        if still and _off_model(point, step, variance, level) <= 1.0:
             return _fit(problem, point, step, weights, expected)
         weights, before = updated, length
     raise AssertionError("the last step returns")
@@ -235,6 +238,16 @@ def _begin(problem: JointProblem, kernel: Kernel, start: JointStart) -> _Point:
     nothing = np.zeros(len(of.rho))
     errors = _Errors(np.zeros(of.common.shape[1]), constant, white, nothing, nothing)
     return _Point.of(problem, kernel, np.array(start.poses, np.float64).ravel(), errors)
+
+
+def _off_model(point: _Point, step: FitStep, variance: Array, level: float) -> float:
+    """Return the sigmas by which the errors at `point` exceed those of the linear model.
+
+    The length of a step tells how far the start poses are from their optimum, but not how far the path is:
+    where ranges are exact, the second order of a step of the path can leave residuals of thousands of their
+    sigmas. More than one sigma is a step that the path still has to take.
+    """
+    return math.sqrt(max(point.cost(variance) - step.chi2, 0.0) / level)
 
 
 def _stepped(problem: JointProblem, kernel: Kernel, point: _Point, step: FitStep, variance: Array) -> _Point:
@@ -261,8 +274,9 @@ def _fit(problem: JointProblem, point: _Point, step: FitStep, weights: Array, la
     freedom = int(np.count_nonzero(weights > INLIER)) - problem.free
     level = noise_level(step.chi2, freedom, problem.noise)
     if problem.noise.sigma_degrees:
-        own, sigma = point.own[back], problem.sigma[back]
-        correlation = residual_correlation(own, weights[back], sigma, problem.ends, level)
+        rows = problem.by_radio
+        own, sigma = point.own[rows], problem.sigma[rows]
+        correlation = residual_correlation(own, weights[rows], sigma, problem.ends, level)
         level = noise_level(step.chi2, freedom, problem.noise, correlation)
     errors = [
         Errors(v[:ticks], omega[:ticks], constant)

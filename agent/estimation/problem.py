@@ -28,8 +28,10 @@ class JointProblem(msgspec.Struct, frozen=True, eq=False):
     """The number of ticks of each path."""
     free: int
     """The number of unknowns of the start poses that only the ranges determine."""
+    by_radio: Places
+    """The ranges of the fit, those of each pair of radios together; shape (N,)."""
     ends: tuple[int, ...]
-    """The row after the last one of each pair of radios, in the order of the measurements."""
+    """The place in `by_radio` after the last one of each pair of radios."""
     ticks: Places
     """The tick of each range, in the order of the measurements; shape (N,)."""
 
@@ -43,6 +45,7 @@ class JointProblem(msgspec.Struct, frozen=True, eq=False):
         order = np.argsort(tick, kind="stable")
         back = np.empty_like(order)
         back[order] = np.arange(len(order))
+        by_radio = np.argsort(ranges.radio[order], kind="stable")
         v, omega, slip = _velocities(measured.paths, ticks)
         anchor, anchors = _unsure_anchors(ranges) if priors.survey_error else (np.full(len(order), -1), 0)
         prior = measured.prior
@@ -76,7 +79,8 @@ class JointProblem(msgspec.Struct, frozen=True, eq=False):
             ranges.sigma[order],
             lengths,
             3 * n - (0 if prior is None else prior.rank),
-            ranges.ends,
+            by_radio,
+            tuple((np.flatnonzero(np.diff(ranges.radio[order][by_radio])) + 1).tolist()),
             ranges.tick,
         )
 

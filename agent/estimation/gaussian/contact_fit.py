@@ -23,17 +23,11 @@ from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, EARLY_CLAIM_P_V
 from agent.estimation.gaussian.fitted_poses import deviation
 from agent.estimation.gaussian.joint_claims import blocking_reason
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges, PosePrior
-from agent.estimation.gaussian.joint_search import (
-    JointHypotheses,
-    JointHypothesis,
-    certainties,
-    with_probability,
-)
-from agent.estimation.gaussian.known_anchors import FEWEST_FOR_POSE, AnchoredRobot, scored_fits
-from agent.estimation.gaussian.linear_model import Start
+from agent.estimation.gaussian.known_anchors import FEWEST_FOR_POSE, AnchoredRobot, scored_fits, start_of
 from agent.estimation.gaussian.odometry_noise import Errors, Track
 from agent.estimation.gaussian.own_sensors import DOUBTFUL_CLAIM, claim_profiles
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges
+from agent.estimation.posterior import JointHypotheses, JointHypothesis, certainties, with_probability
 from protocol.messages import Ranged
 from protocol.mission import Mission
 from protocol.motion import Covariance, Pose, rotated, wrap
@@ -159,12 +153,10 @@ def _starts(measured: JointMeasurements, mission: Mission) -> list[JointStart]:
     )
     robot = AnchoredRobot(measured.paths[OWN], as_anchors, mission.sensing_range, measured.noise)
     starts = []
-    for one in scored_fits(robot, [Start(guess) for guess in beacon_guesses(robot)]):
-        mx, my, turn = one.fit.guess.tolist()
-        x, y = rotated(math.cos(turn), math.sin(turn), mx, my)
-        poses = np.stack((prior.mean[FINDER], (-x, -y, turn)))
+    for one in scored_fits(robot, list(map(start_of, beacon_guesses(robot)))):
+        poses = np.stack((prior.mean[FINDER], one.fit.start.poses[0]))
         nothing = Errors(np.zeros(0), np.zeros(0), np.zeros(0))
-        starts.append(JointStart(poses, (nothing, one.fit.errors[0] if one.fit.errors else nothing)))
+        starts.append(JointStart(poses, (nothing, *one.fit.start.errors)))
     return starts
 
 

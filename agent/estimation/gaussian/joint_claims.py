@@ -10,16 +10,12 @@ from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, HIGHE
 from agent.estimation.gaussian.fitted_poses import deviation
 from agent.estimation.gaussian.inference import MUTUAL_RANGES, MUTUAL_RANGES_WITH_OUTLIERS
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
-from agent.estimation.gaussian.joint_search import (
-    FEWEST_DECISIVE,
-    Certainty,
-    JointHypotheses,
-    beacons,
-)
+from agent.estimation.gaussian.joint_search import FEWEST_DECISIVE, beacons
 from agent.estimation.gaussian.known_anchors import LARGEST_STRAY_SHARE, inaccuracy
 from agent.estimation.gaussian.noise_level import INLIER
 from agent.estimation.gaussian.odometry_noise import Places
 from agent.estimation.gaussian.range_model import MOVED
+from agent.estimation.posterior import Certainty, JointHypotheses
 
 OPEN = 0.5
 """The sigma of a position from which on a robot has no pose, as a fraction of the longest range."""

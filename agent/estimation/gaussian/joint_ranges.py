@@ -21,8 +21,8 @@ from protocol.noise import Noise
 MOST_MUTUAL_RANGES = 1024
 """The most ranges between robots in one fit, of all pairs together; see MOST_CORRELATED_RANGES.
 
-The cost of a fit is cubic in their number: with so many, a step takes about 0.2 s. A group of 16 robots that
-meet as planned has about 500. With less, 16 robots that all range each other would use fewer than 8 ranges of
+With so many ranges of 8 robots, a step takes about 2 ms. A group of 16 robots that meet as planned has about
+500. With less, 16 robots that all range each other would use fewer than 8 ranges of
 each pair.
 """
 
@@ -48,11 +48,6 @@ class JointRanges(msgspec.Struct, frozen=True, dict=True, eq=False):
     def pairs(self) -> list[NDArray[np.bool]]:
         """The ranges of each pair of radios that has some; shapes (N,)."""
         return [self.radio == one for one in sorted(set(self.radio.tolist()))]
-
-    @cached_property
-    def ends(self) -> tuple[int, ...]:
-        """The row after the last one of each pair of radios."""
-        return tuple((np.flatnonzero(np.diff(self.radio)) + 1).tolist())
 
     @cached_property
     def of_anchors(self) -> int:

@@ -12,21 +12,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.fit import FIT_STEPS
+from agent.estimation.fit import FIT_STEPS, JointStart, joint_fits
 from agent.estimation.gaussian.anchor_guesses import anchors
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, HIGHEST_LEVEL, chi2_p_value
 from agent.estimation.gaussian.fitted_poses import deviation
-from agent.estimation.gaussian.hypotheses import (
-    WARM_STEPS,
-    Hypothesis,
-    ScoredHypothesis,
-    with_probability,
-)
+from agent.estimation.gaussian.hypotheses import WARM_STEPS
 from agent.estimation.gaussian.inference import MUTUAL_RANGES, MUTUAL_RANGES_WITH_OUTLIERS
-from agent.estimation.gaussian.least_squares import fits
-from agent.estimation.gaussian.linear_model import Start
+from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges
 from agent.estimation.gaussian.odometry_noise import Array, Places, Track
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges, mixture, predicted
+from agent.estimation.posterior import JointHypothesis, with_probability
 from protocol.mission import HEADING_ACCURACY
 from protocol.motion import rotated
 from protocol.noise import Noise
@@ -69,26 +64,51 @@ class AnchoredRobot(NamedTuple):
     """The longest range (m) that is expected."""
     noise: Noise
 
+    @property
+    def measured(self) -> JointMeasurements:
+        """The measurements for a fit; positions are relative to the same point as those of the anchors."""
+        ranges = self.ranges
+        count = len(ranges.rho)
+        assert ranges.place is not None
+        assert ranges.radio is not None
+        own = JointRanges(
+            ranges.rho,
+            ranges.tick,
+            ranges.sigma,
+            np.zeros(count, np.intp),
+            np.full(count, -1),
+            ranges.place,
+            ranges.radio,
+        )
+        return JointMeasurements(("",), (), (), (self.path,), own, self.path.period, (0.0, 0.0), self.noise)
 
-def search(robot: AnchoredRobot, known: Sequence[Hypothesis] = ()) -> tuple[ScoredHypothesis, ...]:
+
+def search(robot: AnchoredRobot, known: Sequence[JointHypothesis] = ()) -> tuple[JointHypothesis, ...]:
     """Return the hypotheses of a search of the whole plane, and those `known`, the likeliest first."""
     if len(robot.ranges.rho) < FEWEST_FOR_POSE:
         return ()
-    starts = [one.start for one in known] + [Start(guess) for guess in _candidates(robot)]
-    return scored_fits(robot, starts)
+    starts = [one.fit.start for one in known]
+    return scored_fits(robot, [*starts, *map(start_of, _candidates(robot))])
 
 
-def follow(robot: AnchoredRobot, known: Sequence[Hypothesis]) -> tuple[ScoredHypothesis, ...]:
+def follow(robot: AnchoredRobot, known: Sequence[JointHypothesis]) -> tuple[JointHypothesis, ...]:
     """Return the hypotheses that follow from those `known` before the latest ranges."""
-    return scored_fits(robot, [one.start for one in known], WARM_STEPS)
+    return scored_fits(robot, [one.fit.start for one in known], WARM_STEPS)
 
 
 def scored_fits(
-    robot: AnchoredRobot, starts: Sequence[Start], steps: int = FIT_STEPS
-) -> tuple[ScoredHypothesis, ...]:
+    robot: AnchoredRobot, starts: Sequence[JointStart], steps: int = FIT_STEPS
+) -> tuple[JointHypothesis, ...]:
     """Return the hypotheses of the fits that begin at `starts`, the likeliest first."""
-    found = fits(starts, [robot.path], robot.ranges, robot.noise, steps=steps)
-    return with_probability([(one, 0.0) for one in found])
+    return with_probability(joint_fits(robot.measured, starts, steps))
+
+
+def start_of(guess: Array) -> JointStart:
+    """Return the pose at tick 0 of a robot, from the place of the origin in the frame of its odometry and the
+    rotation of this frame; shape (3,)."""
+    mx, my, turn = guess.tolist()
+    x, y = rotated(math.cos(turn), math.sin(turn), mx, my)
+    return JointStart(np.array([[-x, -y, turn]]))
 
 
 def _candidates(robot: AnchoredRobot) -> list[Array]:
@@ -164,29 +184,28 @@ def _distinct(guesses: Array, likely: Array, last: Array, longest: float) -> lis
 
 
 def blocking_reason(
-    scored: Sequence[ScoredHypothesis], covariance: Array, robot: AnchoredRobot, accuracy: float, sure: float
+    scored: Sequence[JointHypothesis], robot: AnchoredRobot, accuracy: float, sure: float
 ) -> str:
     """Return the first condition for a claim that is not met, or an empty text.
 
     The conditions are those of two robots: the probability `sure`, enough ranges, their consistency, and the
-    `accuracy` (m) of the position by the `covariance` of the pose.
+    `accuracy` (m) of the position.
     """
     best, ranges = scored[0], robot.ranges
     required = MUTUAL_RANGES_WITH_OUTLIERS if robot.noise.outliers else MUTUAL_RANGES
     if len(ranges.rho) < required:
         return f"{len(ranges.rho)} of {required} required ranges"
-    if best.hypothesis.probability < sure:
-        probability = best.hypothesis.probability
-        return f"the most probable of {len(scored)} hypotheses has probability {probability:.6f}"
+    if best.probability < sure:
+        return f"the most probable of {len(scored)} hypotheses has probability {best.probability:.6f}"
     if best.fit.last_step > FINISHED:
         return "the fit of the most probable hypothesis has not converged"
-    free = max(best.fit.inliers - 3, 1)
+    free = best.fit.freedom
     if chi2_p_value(best.fit.chi2 / HIGHEST_LEVEL, free) < CLAIM_P_VALUE:
         return f"the residuals are too large: chi-square {best.fit.chi2:.3g} for {free} degrees of freedom"
     strays = len(ranges.rho) - best.fit.inliers
     if strays > (LARGEST_STRAY_SHARE + robot.noise.outliers) * len(ranges.rho):
         return f"{strays} of {len(ranges.rho)} ranges fit no other"
-    return inaccuracy(covariance, accuracy)
+    return inaccuracy(best.fit.covariance, accuracy)
 
 
 def inaccuracy(covariance: Array, accuracy: float) -> str:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from agent.estimation.gaussian.consistency import FINISHED
-from agent.estimation.gaussian.fitted_poses import poses
-from agent.estimation.gaussian.hypotheses import Hypothesis, ScoredHypothesis
 from agent.estimation.gaussian.known_anchors import (
     FEWEST_FOR_POSE,
     AnchoredRobot,
@@ -15,6 +13,7 @@ from agent.estimation.gaussian.known_anchors import (
     search,
 )
 from agent.estimation.gaussian.range_model import Ranges
+from agent.estimation.posterior import JointHypothesis
 from compose.recording.estimating.estimate_epoch import (
     GIVEN_UP,
     MOST_SEARCHES,
@@ -115,7 +114,7 @@ class AnchoredEstimator:
 
     def __init__(self, rule: ClaimRule) -> None:
         self._rule = rule
-        self._known: tuple[Hypothesis, ...] = ()
+        self._known: tuple[JointHypothesis, ...] = ()
         self._searched = self._searches = 0
         self._claimed = False
 
@@ -134,18 +133,23 @@ class AnchoredEstimator:
         if wanted and not due and self._searches >= MOST_SEARCHES:
             reason = reason or GIVEN_UP
         elif wanted:
-            scored = search(robot, tuple([one.hypothesis for one in scored]) or self._known)
+            scored = search(robot, scored or self._known)
             self._searched, self._searches = count, self._searches + 1
             reason = self._reason(robot, scored) if scored else ""
         if not scored:
             what = "no hypothesis explains the ranges" if count >= FEWEST_FOR_POSE else "too few ranges"
             return EstimateEpoch(t, counts, (), (False,), what, None)
-        self._known = tuple([one.hypothesis for one in scored])
+        self._known = scored
         self._claimed = self._claimed or not reason
-        found = [(one.hypothesis.probability, *poses(one.fit, (0.0, 0.0))) for one in scored]
-        hypotheses = tuple([of_centres(*one, measured.sides, measured.origin) for one in found])
+        hypotheses = tuple(
+            [
+                of_centres(
+                    one.probability, one.fit.poses, one.fit.covariance, measured.sides, measured.origin
+                )
+                for one in scored
+            ]
+        )
         return EstimateEpoch(t, counts, hypotheses, (not reason,), reason, EpochFit(scored[0].fit, robot))
 
-    def _reason(self, robot: AnchoredRobot, scored: tuple[ScoredHypothesis, ...]) -> str:
-        covariance = poses(scored[0].fit, (0.0, 0.0))[1]
-        return blocking_reason(scored, covariance, robot, self._rule.accuracy, self._rule.confidence)
+    def _reason(self, robot: AnchoredRobot, scored: tuple[JointHypothesis, ...]) -> str:
+        return blocking_reason(scored, robot, self._rule.accuracy, self._rule.confidence)

@@ -10,9 +10,9 @@ import numpy as np
 from agent.estimation.fit import JointFit
 from agent.estimation.gaussian.fitted import Fit
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
-from agent.estimation.gaussian.joint_search import Certainty
 from agent.estimation.gaussian.known_anchors import AnchoredRobot
 from agent.estimation.gaussian.range_model import PairRanges
+from agent.estimation.posterior import Certainty
 from compose.recording.estimating.prepared_steps import OneRobot
 from compose.recording.ranging.range_recording import Numbers
 from protocol.motion import wrap
@@ -100,7 +100,7 @@ def of_centres(
     poses = mean.reshape(-1, 3).copy()
     poses[:, 0] += origin[0]
     poses[:, 1] += origin[1]
-    centred = np.eye(len(mean))
+    centred = np.eye(poses.size)
     for i, robot in enumerate(robots):
         forward, left, _ = robot.antenna
         offset = (forward + 1j * left) * np.exp(1j * poses[i, 2])

@@ -8,18 +8,8 @@ from agent.estimation.fit import FIT_STEPS
 from agent.estimation.gaussian.consistency import FINISHED
 from agent.estimation.gaussian.joint_claims import blocking_reason, open_position, undetermined
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
-from agent.estimation.gaussian.joint_search import (
-    NO_HYPOTHESES,
-    Certainty,
-    JointHypotheses,
-    JointHypothesis,
-    candidates,
-    certainties,
-    extended,
-    follow,
-    merged,
-    search,
-)
+from agent.estimation.gaussian.joint_search import candidates, extended, follow, merged, search
+from agent.estimation.posterior import NO_HYPOTHESES, Certainty, JointHypotheses, JointHypothesis, certainties
 from compose.recording.estimating.estimate_epoch import (
     GIVEN_UP,
     MOST_SEARCHES,
