@@ -165,7 +165,11 @@ class _Point(NamedTuple):
         of_white = np.square(errors.white) / np.maximum(of.white, LEAST_VARIANCE)
         squares = np.sum(np.square(errors.common)) + np.sum(np.square(errors.constant)) + np.sum(of_white)
         cost = float(squares + off @ of.information @ off + errors.slow @ errors.of_slow)
-        return _Point(poses, errors, walk, walk.residual - of.common @ errors.common - errors.slow, cost)
+        own = walk.residual - of.common @ errors.common - errors.slow
+        if of.scaled >= 0:  # the scale error multiplies the predicted ranges
+            by_scale = of.common[:, of.scaled] - of.scale * (of.rho - walk.residual)
+            own += by_scale * errors.common[of.scaled]
+        return _Point(poses, errors, walk, own, cost)
 
     def cost(self, variance: Array) -> float:
         """Return twice the negative log-density of all errors; `variance` is that of each range (m^2)."""

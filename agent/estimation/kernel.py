@@ -25,8 +25,8 @@ class _Measured(ctypes.Structure):
 
     _fields_ = [
         *[(name, ctypes.c_longlong) for name in ("robots", "ticks", "ranges", "common", "constant")],
-        *[(name, ctypes.c_longlong) for name in ("anchors", "radios")],
-        *[(name, ctypes.c_double) for name in ("period", "survey", "slow", "decay")],
+        *[(name, ctypes.c_longlong) for name in ("anchors", "radios", "scaled")],
+        *[(name, ctypes.c_double) for name in ("period", "survey", "slow", "decay", "scale")],
         *[(name, Pointer) for name in ("v", "omega", "slip", "white", "patterns", "place", "rho", "effects")],
         *[(name, Pointer) for name in ("mean", "information", "begin", "first", "second", "anchor", "radio")],
     ]
@@ -69,8 +69,8 @@ class Kernel:
         size, s, n3 = of.size, 3 * n + of.radios, 3 * n
         q = size + 2 * of.anchors
         self._measured = _Measured(
-            *(n, k, count, of.common.shape[1], of.patterns.shape[1], of.anchors, of.radios),
-            *(of.period, of.survey, of.slow, of.decay),
+            *(n, k, count, of.common.shape[1], of.patterns.shape[1], of.anchors, of.radios, of.scaled),
+            *(of.period, of.survey, of.slow, of.decay, of.scale),
             *[
                 one.ctypes.data
                 for one in (

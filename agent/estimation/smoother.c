@@ -31,8 +31,8 @@ typedef long long Index;
 
 /* smoother.Measured: first the numbers, then the arrays. */
 typedef struct {
-    Index robots, ticks, ranges, common, constant, anchors, radios;
-    double period, survey, slow, decay;
+    Index robots, ticks, ranges, common, constant, anchors, radios, scaled;
+    double period, survey, slow, decay, scale;
     const double *v, *omega, *slip, *white, *patterns, *place, *rho, *effects, *mean, *information;
     const Index *begin, *first, *second, *anchor, *radio;
 } Measured;
@@ -253,7 +253,10 @@ static void measured(const Measured *of, const Walk *walk, Index j, double varia
         add(effect, row.by[t], w->u + row.at[t] * q, q);
         add(gain, row.by[t], w->p + row.at[t] * s, s);
     }
-    for (Index e = 0; e < of->common; e++) effect[3 * of->robots + e] += of->effects[j * of->common + e];
+    for (Index e = 0; e < of->common; e++) {
+        const double by_scale = of->scale * (of->rho[j] - walk->residual[j]);
+        effect[3 * of->robots + e] += e == of->scaled ? by_scale : of->effects[j * of->common + e];
+    }
     if (of->anchor[j] >= 0)
         for (Index e = 0; e < 2; e++)
             effect[size + 2 * of->anchor[j] + e] -= of->survey * walk->direction[2 * j + e];

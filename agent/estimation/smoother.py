@@ -63,6 +63,10 @@ class Measured(NamedTuple):
     """ranges in m; (N,)"""
     common: Array
     """effects in m of one sigma of each constant error on each range; (N, c)"""
+    scaled: int
+    """the one of them that is proportional to the predicted range; -1 if there is none"""
+    scale: float
+    """its effect on a range of 1 m"""
     anchor: Places
     """the anchor of each range, among those that are not surveyed exactly; -1 for any other; (N,)"""
     anchors: int
@@ -301,7 +305,8 @@ def _measured(of: Measured, walk: Walk, j: int, variance: float, found: Passed) 
         add(effect, h, found.u[a])
         add(gain, h, found.p[a])
     for e in range(len(of.common[j])):
-        effect[3 * of.robots + e] += of.common[j, e]
+        by_scale = of.scale * (of.rho[j] - walk.residual[j])
+        effect[3 * of.robots + e] += by_scale if e == of.scaled else of.common[j, e]
     if of.anchor[j] >= 0:
         for e in range(2):
             effect[of.size + 2 * of.anchor[j] + e] -= of.survey * walk.direction[j, e]

@@ -29,19 +29,8 @@ from agent.estimation.gaussian.odometry_noise import (
     wander,
 )
 from agent.estimation.gaussian.range_model import Predicted, Ranges, predicted
+from agent.estimation.problem import MOST_MEASURED_LENGTHS, SCALE_AFTER_BIAS
 from protocol.noise import Noise, VelocityNoise
-
-MOST_MEASURED_LENGTHS = 200
-"""The most ranges of a fit whose scale error multiplies the measured ranges; of more, the predicted ones.
-
-A measured range that is too long by chance is multiplied by more, so a fit gains by shrinking all ranges, and
-gains more with each of them. Ranges as told, of 0.05 m and 300 from each robot to its anchor, had a log
-evidence of 16 for the profile `uwb`, whose scale shrank them by a quarter; with 500, it was 102. By predicted
-ranges, it is -11 to -12 with any number. Up to 200 ranges it differs by 2, which decides nothing.
-"""
-
-SCALE_AFTER_BIAS = 1
-"""The column of the scale error in `Ranges.common_errors` if there is a bias of all ranges."""
 
 
 class Start(NamedTuple):
