@@ -7,7 +7,6 @@ import platform
 import socket
 from collections.abc import Iterator
 
-from agent.estimation import kernel
 from compose import extras
 from compose.doctor.finding import Finding, fix, ok
 from compose.network import beyond
@@ -36,10 +35,13 @@ def versions() -> Iterator[Finding]:
         f"{PACKAGE} {own}",
         *fitting,
     ]
-    try:
-        installed.append(f"estimator compiled by {kernel.compiler()}")
-    except kernel.NoKernel as error:
-        yield fix(f"versions: {error}")
+    if all(one.fits for one in found):
+        from agent.estimation import kernel  # noqa: PLC0415  # it imports numpy, which has to be there
+
+        try:
+            installed.append(f"estimator compiled by {kernel.compiler()}")
+        except kernel.NoKernel as error:
+            yield fix(f"versions: {error}")
     installed.append(f"protocol version {VERSION}")
     yield ok(f"versions: {', '.join(installed)}")
     for one in found:
