@@ -79,7 +79,7 @@ def test_recordings_that_users_have_end_in_one_line_within_bounds_or_with_an_est
         assert ends[path].errors.startswith(f"tandem estimate: {CASES / path}{says}")
         assert ends[path].errors.count("\n") == 1
     statuses = {name: ends[name].status for name in OTHERS}
-    assert statuses == {"before": NOT_LOCALISED, "after": LOCALISED, "calibrated": 0, "followed": USER_ERROR}
+    assert statuses == {"before": LOCALISED, "after": LOCALISED, "calibrated": 0, "followed": USER_ERROR}
     assert (
         ", /odometry, message 61: t1: it lasts 100000 s, and an estimate bridges" in ends["followed"].errors
     )

@@ -19,6 +19,7 @@ from agent.planning.pair_claim import PairInference, inferred
 from compose.errors import ENDED, NOT_LOCALISED, USER_ERROR, UserError
 from compose.recording.estimating import pair_estimate
 from compose.recording.estimating.calibration import calibrated
+from compose.recording.estimating.doubtful_units import doubtful_units
 from compose.recording.estimating.estimate_epoch import ClaimRule
 from compose.recording.estimating.estimate_rows import true_pose
 from compose.recording.estimating.estimate_run import estimated, measurements
@@ -125,6 +126,17 @@ def test_of_two_robots_the_one_in_another_unit_is_named(
     increments = s.odometry.increments * np.array((dx, dx, turn))
     s = s._replace(odometry=s.odometry._replace(increments=increments))
     assert says in measurements(recording._replace(robots=(r, s)), None, None, None).doubt
+
+
+@pytest.mark.parametrize(("factor", "suspected"), [(11.0, False), (39.37, True)])
+def test_the_ranges_to_one_anchor_in_one_part_tell_of_units_only(factor: float, suspected: bool) -> None:
+    """Odometry that slips looked like a factor of 11, and a good recording was refused."""
+    recording = simulated()
+    recording = recording.part([recording.robots[0].id], 0.0, 30.0)
+    recording = with_ranges(recording, factor * recording.ranges.range)
+    ranges = recording.ranges
+    one = recording._replace(ranges=ranges.rows(ranges.second == ranges.second[0]))
+    assert bool(doubtful_units(one)) == suspected
 
 
 def test_two_robots_with_an_anchor_each_are_suspected_too() -> None:

@@ -103,7 +103,13 @@ class _Factors(NamedTuple):
 
     @property
     def odometry(self) -> float:
-        """The median of the logarithms of the factors of ranges to odometry."""
+        """The median of the logarithms of the factors of ranges to odometry.
+
+        Odometry that slips, or has a gap, looks like any factor of the ranges to one anchor: alone, these
+        tell only that of a unit.
+        """
+        if len(self.by_odometry) == 1 and not _near_unit(_factor(self.by_odometry[0])):
+            return 0.0
         return float(np.median(self.by_odometry)) if self.by_odometry else 0.0
 
     def doubt(self, bound: float) -> str:
@@ -190,18 +196,23 @@ def _suspicion(by_odometry: float, by_anchors: float, located: bool) -> str:
 
 def _sentence(subject: str, factor: float, others: str, near_unit: float = NEAR_UNIT) -> str:
     """Return the sentence that `subject` is `factor` times what `others` allow."""
-    ratio = max(factor, 1.0 / factor)
-    unit = min(UNITS, key=lambda one: abs(math.log(ratio / one)))
-    near = max(ratio / unit, unit / ratio) < near_unit
-    number = unit if near else float(f"{ratio:.2g}")
+    unit = _near_unit(factor, near_unit)
+    number = unit or float(f"{max(factor, 1.0 / factor):.2g}")
     many = f"{round(number, 1 if number < 10.0 else 0):,.15g}".replace(",", " ")
-    name = UNITS[unit] if near else "another unit"
+    name = UNITS[unit] if unit else "another unit"
     verb, allow = "is" if subject == "odometry" else "are", "allows" if others == "odometry" else "allow"
     if factor > 1.0:
         pronoun = "it" if subject == "odometry" else "they"
         return f"{subject} {verb} about {many} times what {others} {allow}: {verb} {pronoun} in {name}?"
     doubted = "is" if others == "odometry" else "are"
     return f"{subject} {verb} about 1/{many} of what {others} {allow}: {doubted} {others} in {name}?"
+
+
+def _near_unit(factor: float, near_unit: float = NEAR_UNIT) -> float:
+    """Return the number of units in a metre that is near a factor or its inverse; 0 if there is none."""
+    ratio = max(factor, 1.0 / factor)
+    unit = min(UNITS, key=lambda one: abs(math.log(ratio / one)))
+    return unit if max(ratio / unit, unit / ratio) < near_unit else 0.0
 
 
 # --- the ranges of one robot to one anchor ------------------------------------------------------------------
