@@ -9,11 +9,13 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from datetime import timedelta
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from signal import Signals
 from typing import Any
 
 import pytest
+import tomli_w
 from cryptography.hazmat.primitives.serialization import (
     BestAvailableEncryption,
     Encoding,
@@ -36,7 +38,9 @@ from protocol.wire import VERSION
 from tests.commands import LONG, Ended, TandemProcess, tandem, world
 from tests.series import series
 from tests.test_keys import expire, give_foreign, last, world_of
+from tests.test_noisy_unanchored import NOISE
 from tests.test_topologies import Router, connect, listen, record_of, routing, same
+from tests.test_unanchored import four
 
 
 def findings(ended: Ended, mark: str) -> list[str]:
@@ -81,6 +85,47 @@ def test_a_library_that_is_too_old_is_to_be_installed_anew(
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     with TandemProcess("doctor") as doctor:
         only_fix(doctor.ended(), "versions: numpy 1.26.4; tandem-ranging", "needs <3,>=2.2: install it again")
+
+
+@pytest.fixture
+def other_kernel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the file of the compiled estimator in a copy of `agent`, which new processes import."""
+    shutil.copytree(kernel.KERNEL.parents[1], tmp_path / "agent")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    return tmp_path / "agent" / "estimation" / kernel.KERNEL.name
+
+
+def test_an_estimator_that_is_compiled_from_another_source_is_to_be_installed_anew(
+    other_kernel: Path,
+) -> None:
+    with other_kernel.with_name(kernel.KERNEL_SOURCE.name).open("a") as file:
+        file.write("/* changed */")
+    with TandemProcess("doctor") as doctor:
+        only_fix(
+            doctor.ended(), f"versions: {other_kernel}: the estimator ", "another smoother.c; install Tandem"
+        )
+
+
+def test_a_library_that_is_not_the_estimator_is_to_be_installed_anew(other_kernel: Path) -> None:
+    shutil.copy(str(import_module("msgspec._core").__file__), other_kernel)
+    with TandemProcess("doctor") as doctor:
+        only_fix(
+            doctor.ended(), f"versions: {other_kernel}: the estimator ", "symbol: source; install Tandem"
+        )
+
+
+def test_without_the_compiled_estimator_a_mission_that_needs_it_does_not_begin(other_kernel: Path) -> None:
+    other_kernel.unlink()
+    table = four()
+    table["mission"] |= {"noise": NOISE, "accuracy": 0.3}
+    scenario = other_kernel.with_name("four.toml")
+    scenario.write_text(tomli_w.dumps(table), encoding="utf-8")
+    with TandemProcess("run", scenario, "--in-process") as run, TandemProcess("run", "paper-1") as exact:
+        status, out, err = run.ended()
+        assert exact.ended().status == 0
+    assert (status, out) == (3, "")
+    begin = f"tandem run: cannot continue: {other_kernel}: the estimator is not compiled: "
+    assert re.fullmatch(f"{re.escape(begin)}.*; install Tandem again .*\n", err)
 
 
 @pytest.mark.parametrize(

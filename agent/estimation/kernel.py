@@ -6,6 +6,7 @@ Its functions are those of `smoother`, and equal to the bit.
 from __future__ import annotations
 
 import ctypes
+import errno
 import hashlib
 from functools import cache
 from pathlib import Path
@@ -32,8 +33,8 @@ class _Measured(ctypes.Structure):
     ]
 
 
-class NoKernel(RuntimeError):
-    """The kernel is not compiled, or not from the present source."""
+class NoKernel(OSError):
+    """The file of the kernel cannot be loaded, or is not compiled from the present source."""
 
 
 @cache
@@ -41,15 +42,19 @@ def library() -> ctypes.CDLL:
     """Return the compiled kernel. Raises NoKernel."""
     try:
         found = ctypes.CDLL(str(KERNEL))
-    except OSError as error:
-        raise NoKernel(f"the estimator is not compiled: {error}; {REINSTALL}") from error
-    found.source.restype = found.compiler.restype = ctypes.c_char_p
+        found.source.restype = found.compiler.restype = ctypes.c_char_p
+    except (OSError, AttributeError) as error:  # AttributeError: another library
+        raise _no_kernel(str(error).removeprefix(f"{KERNEL}: ")) from error
     text = KERNEL_SOURCE.read_bytes() if KERNEL_SOURCE.exists() else None
     if text is not None and found.source() != hashlib.sha256(text).hexdigest().encode():
-        raise NoKernel(f"{KERNEL} is not compiled from {KERNEL_SOURCE.name} as it is now; {REINSTALL}")
+        raise _no_kernel(f"it is of another {KERNEL_SOURCE.name}")
     found.walked.restype = found.loosened.restype = None
     found.step.restype = ctypes.c_int
     return found
+
+
+def _no_kernel(why: str) -> NoKernel:
+    return NoKernel(errno.ENOEXEC, f"the estimator is not compiled: {why}; {REINSTALL}", str(KERNEL))
 
 
 def compiler() -> str:

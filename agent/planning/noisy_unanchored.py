@@ -19,6 +19,7 @@ from agent.estimation.gaussian.gaussian_estimator import GAUSSIAN
 from agent.estimation.gaussian.inference import MUTUAL_RANGES, MUTUAL_RANGES_WITH_OUTLIERS
 from agent.estimation.gaussian.known_anchors import FEWEST_FOR_POSE
 from agent.estimation.gaussian.odometry_noise import Track, track
+from agent.estimation.kernel import library
 from agent.peer import peer_state
 from agent.peer.motion_log import MotionLog
 from agent.planning import sweep
@@ -97,7 +98,8 @@ class NoisyUnanchoredPlanner(Planner[NoisyUnanchoredState, Report]):
     BODY = Report
 
     def start(self, config: RobotConfig) -> NoisyUnanchoredState:
-        """Return the state of a robot that has measured nothing yet."""
+        """Return the state of a robot that has measured nothing yet. Raises NoKernel."""
+        library()  # it is needed when the robot is found, and would end the mission then
         return NoisyUnanchoredState(config)
 
     def observe(self, state: NoisyUnanchoredState, observation: Observation) -> NoisyUnanchoredState:

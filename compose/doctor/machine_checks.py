@@ -11,6 +11,7 @@ from compose import extras
 from compose.doctor.finding import Finding, fix, ok
 from compose.network import beyond
 from protocol import PACKAGE
+from protocol.files import error_text
 from protocol.network.endpoints import Endpoints, place
 from protocol.wire import VERSION
 
@@ -41,7 +42,7 @@ def versions() -> Iterator[Finding]:
         try:
             installed.append(f"estimator compiled by {kernel.compiler()}")
         except kernel.NoKernel as error:
-            yield fix(f"versions: {error}")
+            yield fix(f"versions: {error_text(error)}")
     installed.append(f"protocol version {VERSION}")
     yield ok(f"versions: {', '.join(installed)}")
     for one in found:
