@@ -22,6 +22,7 @@ LIBRARY = "agent/estimation/libsmoother.so"
 FLAGS = ("-O3", "-ffp-contract=off", "-fPIC", "-shared")
 """The options: without contraction and fast math, results follow from the source and the C library alone."""
 COMPILER_PACKAGE = "ziglang>=0.13,<1"
+OTHER_COMPILER = "set CC to a compiler that works, or to nothing (CC=) for that of ziglang"
 
 
 def machine_compiler() -> list[str]:
@@ -49,7 +50,8 @@ class KernelHook(BuildHookInterface):  # type: ignore[misc]  # hatchling has no 
         command = [*compiler, *FLAGS, f'-DSOURCE="{digest}"', "-o", str(part), str(source), "-lm"]
         ended = subprocess.run(command, capture_output=True, text=True, check=False)
         if ended.returncode:
-            raise SystemExit(f"{SOURCE} does not compile: {' '.join(command)}\n{ended.stderr}")
+            what = f"{SOURCE} does not compile; {OTHER_COMPILER}"
+            raise SystemExit(f"{what}: {' '.join(command)}\n{ended.stderr}")
         part.replace(library)
         platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
         build_data["artifacts"].append(f"/{LIBRARY}")
