@@ -446,7 +446,21 @@ def test_what_was_removed_is_one_line_that_names_what_replaces_it() -> None:
     for removed in REMOVED:
         with pytest.raises(UserError, match=re.escape(f"`{removed.name}` was removed in version 0.3: ")):
             main.parse(removed.name.split())
+        command, _, flag = removed.name.partition(" ")
+        for end in range(4, len(flag) if re.fullmatch("--[a-z0-9-]+", flag) else 0):
+            with pytest.raises(UserError, match=re.escape(f"`{command} --")):
+                main.parse([command, "x", f"{flag[:end]}=y"])
+    for seeds in ("--seed=1..3", "--see=1,2", "--seed 1..3"):
+        with pytest.raises(UserError, match=re.escape("`run --seed N..N` was removed")):
+            main.parse(["run", "paper-1", *seeds.split()])
     refused(tandem("run", "paper-1", "--foxglove=8765"), "`run --foxglove` was removed", "run.mcap")
+
+
+def test_no_flag_begins_with_the_abbreviation_of_one_that_was_removed() -> None:
+    for command, _, flag in (removed.name.partition(" ") for removed in REMOVED):
+        if re.fullmatch("--[a-z0-9-]+", flag):
+            entry = next(one for one in main.COMMANDS if one.name == command)
+            assert not re.findall(rf"{flag[:4]}[\w-]*", main.command_parser(entry).format_help())
 
 
 # --- the folder of the recording --------------------------------------------------------------------

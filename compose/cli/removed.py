@@ -43,11 +43,14 @@ def another_scenario(_: str) -> NoReturn:
 
 
 def refuse_removed(words: Sequence[str]) -> None:
-    """Raise UserError if `words`, a command and its arguments, name something that was removed."""
-    named = {words[0]} if words else set()
-    named |= {f"{words[0]} {word.partition('=')[0]}" for word in words[1:] if word.startswith("--")}
-    if "run" in named and re.search(r"--seed[ =]\S+(,|\.\.)", " ".join(words)):
-        named.add("run --seed N..N")
+    """Raise UserError if `words`, a command and its arguments, name something that was removed.
+
+    A flag may be abbreviated to two letters: with them, no other flag of its command begins.
+    """
+    if words[:1] == ["run"] and re.search(r" --see?d?[ =]\S+(,|\.\.)", " ".join(words)):
+        raise removed("run --seed N..N")
+    flags = [word.partition("=")[0] for word in words[1:] if re.match("--..", word)]
     for row in REMOVED:
-        if row.name in named:
+        command, _, flag = row.name.partition(" ")
+        if words[:1] == [command] and (not flag or (" " not in flag and any(map(flag.startswith, flags)))):
             raise removed(row.name)
