@@ -22,6 +22,8 @@ LIBRARY = "agent/estimation/libsmoother.so"
 FLAGS = ("-O3", "-ffp-contract=off", "-fPIC", "-shared")
 """The options: without contraction and fast math, results follow from the source and the C library alone."""
 COMPILER_PACKAGE = "ziglang>=0.13,<1"
+PACKAGED_COMPILER = [sys.executable, "-m", "ziglang", "cc", "-mcpu=baseline"]
+"""Its command. By default, it compiles for this machine's processor alone, and a wheel is for others, too."""
 OTHER_COMPILER = "set CC to a compiler that works, or to nothing (CC=) for that of ziglang"
 
 
@@ -44,7 +46,7 @@ class KernelHook(BuildHookInterface):  # type: ignore[misc]  # hatchling has no 
             return
         root = Path(self.root)
         source, library = root / SOURCE, root / LIBRARY
-        compiler = machine_compiler() or [sys.executable, "-m", "ziglang", "cc"]
+        compiler = machine_compiler() or PACKAGED_COMPILER
         digest = hashlib.sha256(source.read_bytes()).hexdigest()
         part = library.with_name(f"{library.name}.{os.getpid()}")  # a process may have loaded the old one
         command = [*compiler, *FLAGS, f'-DSOURCE="{digest}"', "-o", str(part), str(source), "-lm"]
