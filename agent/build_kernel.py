@@ -1,7 +1,7 @@
 """The build hook that compiles the kernel of the estimator, `smoother.c`, when Tandem is installed.
 
 It uses the C compiler of the machine, which `CC` or `cc` names; where there is none, that of the PyPI package
-`ziglang`. In a clone, the library is written beside its source, where an editable installation finds it.
+`ziglang`. An editable installation, as in a clone, finds the library beside its source.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import subprocess
 import sys
 import sysconfig
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
@@ -22,9 +23,6 @@ LIBRARY = "agent/estimation/libsmoother.so"
 FLAGS = ("-O3", "-ffp-contract=off", "-fPIC", "-shared")
 """The options: without contraction and fast math, results follow from the source and the C library alone."""
 COMPILER_PACKAGE = "ziglang>=0.13,<1"
-PACKAGED_COMPILER = [sys.executable, "-m", "ziglang", "cc", "-mcpu=baseline"]
-"""Its command. By default, it compiles for this machine's processor alone, and a wheel is for others, too."""
-OTHER_COMPILER = "set CC to a compiler that works, or to nothing (CC=) for that of ziglang"
 
 
 def machine_compiler() -> list[str]:
@@ -40,22 +38,25 @@ class KernelHook(BuildHookInterface):  # type: ignore[misc]  # hatchling has no 
         """Return the package that brings a compiler, where the machine has none."""
         return [] if self.target_name != "wheel" or machine_compiler() else [COMPILER_PACKAGE]
 
-    def initialize(self, _version: str, build_data: dict[str, Any]) -> None:
+    def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         """Compile the kernel; a source distribution contains its source alone."""
         if self.target_name != "wheel":
             return
-        root = Path(self.root)
-        source, library = root / SOURCE, root / LIBRARY
-        compiler = machine_compiler() or PACKAGED_COMPILER
+        source, library = Path(self.root) / SOURCE, Path(self.root) / LIBRARY
+        if version != "editable":
+            self._folder = TemporaryDirectory()  # the sources may be read-only, or a clone that is in use
+            library = Path(self._folder.name) / library.name
+            build_data["force_include"][str(library)] = LIBRARY
+        # By default, ziglang compiles for the processor of this machine; a wheel is for others, too.
+        compiler = machine_compiler() or [sys.executable, "-m", "ziglang", "cc", "-mcpu=baseline"]
         digest = hashlib.sha256(source.read_bytes()).hexdigest()
         part = library.with_name(f"{library.name}.{os.getpid()}")  # a process may have loaded the old one
         command = [*compiler, *FLAGS, f'-DSOURCE="{digest}"', "-o", str(part), str(source), "-lm"]
         ended = subprocess.run(command, capture_output=True, text=True, check=False)
         if ended.returncode:
-            what = f"{SOURCE} does not compile; {OTHER_COMPILER}"
+            what = f"{SOURCE} does not compile; set CC to a compiler that works, or to nothing for ziglang's"
             raise SystemExit(f"{what}: {' '.join(command)}\n{ended.stderr}")
         part.replace(library)
         platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
-        build_data["artifacts"].append(f"/{LIBRARY}")
         build_data["pure_python"] = False
         build_data["tag"] = f"py3-none-{platform}"

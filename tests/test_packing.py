@@ -90,6 +90,7 @@ def test_a_wheel_has_the_packages_with_their_data_and_types_and_nothing_else(
 ) -> None:
     with zipfile.ZipFile(built(tree, "wheel", tmp_path)) as packed:
         names = {name for name in packed.namelist() if ".dist-info/" not in name}
-    assert names == tracked(tree, "tandem", "agent", "world", "protocol", "compose")
-    assert "agent/estimation/libsmoother.so" in names
+    compiled = {"agent/estimation/libsmoother.so"}  # not in the tree, which may be read-only
+    assert names == tracked(tree, "tandem", "agent", "world", "protocol", "compose") | compiled
+    assert not compiled & tracked(tree, "agent")
     assert {f"{package}/py.typed" for package in ("tandem", "agent", "world", "protocol", "compose")} <= names
