@@ -343,7 +343,7 @@ def test_the_project_has_one_version_and_lists_tested_versions_of_its_dependenci
     version = project["project"]["version"]
     assert f"version: {version}\n" in (ROOT / "CITATION.cff").read_text()
     assert f"## {version}\n" in (ROOT / "CHANGELOG.md").read_text()
-    assert f"tandem_ranging-{version}-" in (ROOT / "docs" / "howto-raspberry-pi.md").read_text()
+    assert f"tandem_ranging-{version}.tar.gz" in (ROOT / "docs" / "howto-raspberry-pi.md").read_text()
     listed = constraints.pinned(text)
     extras = project["project"]["optional-dependencies"].values()
     required = [*project["project"]["dependencies"], *(one for extra in extras for one in extra)]
