@@ -526,6 +526,17 @@ def test_a_damaged_mcap_file_is_refused(tmp_path: Path) -> None:
     assert refused(path) == f"{path}: /odometry is encoded as 'cbor', not as 'json'"
 
 
+def test_mcap_files_after_each_other_may_expand_by_no_more_than_one_file(tmp_path: Path) -> None:
+    path = tmp_path / "many.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=1 << 23)
+        writer.start()
+        writer.add_message(writer.register_channel("/other", "json", 0), 0, bytes(4_000_000), 0)
+        writer.finish()  # type: ignore[no-untyped-call]  # of mcap
+    path.write_bytes(3 * path.read_bytes())
+    assert "a chunk of 4000066 bytes, and at most " in refused(path)
+
+
 def test_names_of_robots_and_anchors_do_not_overlap(tmp_path: Path) -> None:
     tables = {**TABLES, "anchors": [{"anchor": "a", "x": 0, "y": 0}], "ranges": TABLES["ranges"][:1]}
     assert refused(written_csv(tmp_path, tables)) == f"{tmp_path}: a is a robot and an anchor"

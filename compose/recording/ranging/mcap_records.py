@@ -43,6 +43,8 @@ class _Whole:
         self._file, self._size, self._first = file, size, b""
         self.at = 0
         """The number of bytes that were read."""
+        self.expanded = 0
+        """The number of bytes of all chunks in it, decompressed: of files after each other, those of all."""
 
     def is_at_end(self) -> bool:
         """Return whether nothing is left."""
@@ -86,15 +88,14 @@ def entries(file: BinaryIO, path: object, size: int | None) -> Iterator[Channel 
 
 def _of_file(source: _Whole) -> Iterator[Channel | Message]:
     """Yield the channels and messages of one file. Raises McapError and ValueError."""
-    expanded = 0
     for record in _records(source):
         if isinstance(record, Channel | Message):
             yield record
         elif isinstance(record, Chunk):
-            most = min(LARGEST_BYTES, SMALL_BYTES + EXPANSION * source.at - expanded)
+            most = min(LARGEST_BYTES, SMALL_BYTES + EXPANSION * source.at - source.expanded)
             if record.uncompressed_size > most:
                 raise ValueError(f"a chunk of {record.uncompressed_size} bytes, and at most {most} are read")
-            expanded += record.uncompressed_size
+            source.expanded += record.uncompressed_size
             data = _decompressed(record)
             inside = _records(_Whole(BytesIO(data), len(data)), skip_magic=True)
             try:
