@@ -147,3 +147,12 @@ def test_many_ranges_are_scaled_by_the_predicted_ones_which_noise_does_not_chang
         starts[:, :2] -= measured.origin
         scales.append(0.05 * joint_fit(measured, JointStart(starts)).constants[0])
     assert abs(np.mean(scales)) < 0.05  # two standard deviations of the mean
+
+
+def test_a_pair_of_radios_without_a_range_is_no_part_of_a_fit() -> None:
+    noise = replace(NOISE, slow_sigma=0.05)
+    measured = joint_measurements(moving_group(2, 1, ticks=5, noise=noise).facts, noise, PERIOD_S)
+    sparse = replace(measured, ranges=replace(measured.ranges, radio=10**6 * measured.ranges.radio))
+    one, other = JointProblem.of(measured).measured, JointProblem.of(sparse).measured
+    assert one.radios == other.radios == len(measured.ranges.pairs)
+    np.testing.assert_array_equal(one.radio, other.radio)

@@ -57,7 +57,8 @@ class JointProblem(msgspec.Struct, frozen=True, eq=False):
         order = np.argsort(tick, kind="stable")
         back = np.empty_like(order)
         back[order] = np.arange(len(order))
-        by_radio = np.argsort(ranges.radio[order], kind="stable")
+        radio = np.searchsorted(sorted(set(ranges.radio.tolist())), ranges.radio[order])  # without gaps
+        by_radio = np.argsort(radio, kind="stable")
         v, omega, slip = _velocities(measured.paths, ticks)
         anchor, anchors = _unsure_anchors(ranges) if priors.survey_error else (np.full(len(order), -1), 0)
         prior, few = measured.prior, len(order) <= MOST_MEASURED_LENGTHS
@@ -80,8 +81,8 @@ class JointProblem(msgspec.Struct, frozen=True, eq=False):
                 anchor=anchor[order],
                 anchors=anchors,
                 survey=priors.survey_error,
-                radio=ranges.radio[order],
-                radios=int(ranges.radio.max(initial=-1)) + 1 if priors.slow_sigma else 0,
+                radio=radio,
+                radios=int(radio.max(initial=-1)) + 1 if priors.slow_sigma else 0,
                 slow=priors.slow_sigma**2,
                 decay=math.exp(-measured.period / priors.slow_time),
                 mean=np.zeros(3 * n) if prior is None else prior.mean.ravel(),
@@ -94,7 +95,7 @@ class JointProblem(msgspec.Struct, frozen=True, eq=False):
             lengths,
             3 * n - (0 if prior is None else prior.rank),
             by_radio,
-            tuple((np.flatnonzero(np.diff(ranges.radio[order][by_radio])) + 1).tolist()),
+            tuple((np.flatnonzero(np.diff(radio[by_radio])) + 1).tolist()),
             ranges.tick,
         )
 
