@@ -18,7 +18,7 @@ from matplotlib.path import Path as PlanePath
 
 from compose.figures import one_robot, over_time
 from compose.figures.one_robot import outline_of
-from compose.figures.sheet import Absent
+from compose.figures.sheet import Absent, Sheet
 from compose.figures.style import SCREEN, look, save
 from compose.launch.in_process import run_mission
 from compose.recording.run import read
@@ -417,3 +417,13 @@ def test_a_journal_of_another_run_is_not_used(noisy: Path, tmp_path: Path) -> No
     ended = tandem("export", folder)
     assert ended.status == 2
     assert "another run" in ended.err
+
+
+def test_a_figure_of_thirty_rows_has_room_for_each() -> None:
+    names = [f"row {i}" for i in range(30)]
+    sheet = Sheet(SCREEN, False, ["many"], [[name] for name in names])
+    for name in names:
+        sheet.tall(name, 1.0).set_ylabel(name)
+    figure = sheet.finished()  # a warning, as of a layout that has no room, is an error
+    heights = [sheet.panels[name].get_position().height * figure.get_figheight() for name in names]
+    assert heights == pytest.approx([1.0] * 30, abs=0.05)

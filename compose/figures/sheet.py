@@ -64,7 +64,8 @@ class Sheet:
     ) -> None:
         self.width = medium.narrow if narrow else PAGE
         self._engine = ConstrainedLayoutEngine(w_pad=PAD, h_pad=PAD, wspace=0.0, hspace=0.0)
-        self.figure = Figure(figsize=(self.width, 6.0), layout=self._engine)
+        height = max(6.0, 0.5 * len(mosaic))  # labels alone must fit: without room, there is no layout
+        self.figure = Figure(figsize=(self.width, height), layout=self._engine)
         if medium.titled:
             lines = [part for line in (plain(title[0]), *title[1:]) for part in wrap(line, TITLE)]
             self.figure.suptitle("\n".join(lines), x=PAD / self.width, ha="left", size=TEXT, color=INK)
