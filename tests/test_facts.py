@@ -20,7 +20,7 @@ from agent.estimation.facts import (
     manoeuvre,
     mutual_range,
 )
-from agent.estimation.fit import JointFit, JointStart, joint_fit
+from agent.estimation.fit import JointFit, JointStart, joint_fits
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, joint_measurements
 from agent.estimation.gaussian.joint_search import search
 from tests.moving_groups import NOISE, PERIOD_S, MovingGroup, moving_group
@@ -53,7 +53,8 @@ def fitted(facts: Facts, group: MovingGroup) -> JointFit:
     measured = joint_measurements(facts, group.noise, PERIOD_S)
     starts = group.starts.copy()
     starts[:, :2] -= measured.origin
-    return joint_fit(measured, JointStart(starts))
+    (fit,) = joint_fits(measured, [JointStart(starts)])
+    return fit
 
 
 @given(SETS, SETS, SETS)

@@ -193,12 +193,6 @@ def joint_fits(
     return found
 
 
-def joint_fit(measured: JointMeasurements, start: JointStart, steps: int = FIT_STEPS) -> JointFit:
-    """Return the fit that begins at `start`; see `joint_fits`. Raises Singular."""
-    problem = JointProblem.of(measured)
-    return _fitted(problem, Kernel(problem.measured), start, steps)
-
-
 def _fitted(problem: JointProblem, kernel: Kernel, start: JointStart, steps: int) -> JointFit:
     noise, sigma = problem.noise, problem.sigma
     point = _begin(problem, kernel, start)

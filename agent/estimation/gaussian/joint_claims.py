@@ -6,13 +6,11 @@ import math
 
 import numpy as np
 
-from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, HIGHEST_LEVEL, chi2_p_value
 from agent.estimation.gaussian.fitted_poses import deviation
 from agent.estimation.gaussian.inference import MUTUAL_RANGES, MUTUAL_RANGES_WITH_OUTLIERS
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.joint_search import FEWEST_DECISIVE, beacons
-from agent.estimation.gaussian.known_anchors import LARGEST_STRAY_SHARE, inaccuracy
-from agent.estimation.gaussian.noise_level import INLIER
+from agent.estimation.gaussian.known_anchors import unsound_fit
 from agent.estimation.gaussian.odometry_noise import Places
 from agent.estimation.gaussian.range_model import MOVED
 from agent.estimation.posterior import Certainty, JointHypotheses
@@ -44,16 +42,8 @@ def blocking_reason(
     if certainty.probability < sure:
         many = f"the most probable of {certainty.poses} poses"
         return f"{many} has probability {certainty.probability:.6f}, required {sure:g}"
-    if fit.last_step > FINISHED:
-        return "the fit of the most probable hypothesis has not converged"
-    free = fit.freedom
-    if chi2_p_value(fit.chi2 / HIGHEST_LEVEL, free) < CLAIM_P_VALUE:
-        return f"the residuals are too large: chi-square {fit.chi2:.3g} for {free} degrees of freedom"
-    own = ranges.of(robot)
-    total, strays = int(np.count_nonzero(own)), int(np.count_nonzero(fit.weights[own] <= INLIER))
-    if strays > (LARGEST_STRAY_SHARE + used.noise.outliers) * total:
-        return f"{strays} of {total} ranges fit no other"
-    return inaccuracy(fit.covariance[3 * robot : 3 * robot + 3, 3 * robot : 3 * robot + 3], accuracy)
+    own = slice(3 * robot, 3 * robot + 3)
+    return unsound_fit(fit, np.flatnonzero(ranges.of(robot)), fit.covariance[own, own], accuracy)
 
 
 def decisive_ranges(robot: int, used: JointMeasurements, reach: float) -> int:

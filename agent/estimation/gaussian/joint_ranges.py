@@ -50,11 +50,6 @@ class JointRanges(msgspec.Struct, frozen=True, dict=True, eq=False):
         return [self.radio == one for one in sorted(set(self.radio.tolist()))]
 
     @cached_property
-    def of_anchors(self) -> int:
-        """The number of ranges to anchors."""
-        return int(np.count_nonzero(self.second < 0))
-
-    @cached_property
     def single(self) -> Ranges:
         """All ranges as if they were those of one robot, for models that do not ask who measured them."""
         return Ranges(self.rho, self.tick, self.sigma, (len(self.rho), 0, 0), self.place, self.radio)

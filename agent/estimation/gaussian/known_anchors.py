@@ -12,13 +12,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.fit import FIT_STEPS, JointStart, joint_fits
+from agent.estimation.fit import FIT_STEPS, JointFit, JointStart, joint_fits
 from agent.estimation.gaussian.anchor_guesses import anchors
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, HIGHEST_LEVEL, chi2_p_value
 from agent.estimation.gaussian.fitted_poses import deviation
 from agent.estimation.gaussian.hypotheses import WARM_STEPS
 from agent.estimation.gaussian.inference import MUTUAL_RANGES, MUTUAL_RANGES_WITH_OUTLIERS
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges
+from agent.estimation.gaussian.noise_level import INLIER
 from agent.estimation.gaussian.odometry_noise import Array, Places, Track
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges, mixture, predicted
 from agent.estimation.posterior import JointHypothesis, with_probability
@@ -191,28 +192,29 @@ def blocking_reason(
     The conditions are those of two robots: the probability `sure`, enough ranges, their consistency, and the
     `accuracy` (m) of the position.
     """
-    best, ranges = scored[0], robot.ranges
+    best, count = scored[0], len(robot.ranges.rho)
     required = MUTUAL_RANGES_WITH_OUTLIERS if robot.noise.outliers else MUTUAL_RANGES
-    if len(ranges.rho) < required:
-        return f"{len(ranges.rho)} of {required} required ranges"
+    if count < required:
+        return f"{count} of {required} required ranges"
     if best.probability < sure:
         return f"the most probable of {len(scored)} hypotheses has probability {best.probability:.6f}"
-    if best.fit.last_step > FINISHED:
-        return "the fit of the most probable hypothesis has not converged"
-    free = best.fit.freedom
-    if chi2_p_value(best.fit.chi2 / HIGHEST_LEVEL, free) < CLAIM_P_VALUE:
-        return f"the residuals are too large: chi-square {best.fit.chi2:.3g} for {free} degrees of freedom"
-    strays = len(ranges.rho) - best.fit.inliers
-    if strays > (LARGEST_STRAY_SHARE + robot.noise.outliers) * len(ranges.rho):
-        return f"{strays} of {len(ranges.rho)} ranges fit no other"
-    return inaccuracy(best.fit.covariance, accuracy)
+    return unsound_fit(best.fit, np.arange(count), best.fit.covariance, accuracy)
 
 
-def inaccuracy(covariance: Array, accuracy: float) -> str:
-    """Return which sigma in a `covariance` (3, 3) is too large for a claim, or an empty text.
+def unsound_fit(fit: JointFit, own: Places, covariance: Array, accuracy: float) -> str:
+    """Return why a robot may not claim its pose by `fit`, whatever its probability, or an empty text.
 
-    That of the position may be `accuracy` (m), that of the heading HEADING_ACCURACY.
+    The fit has to converge and to be consistent, and the position needs the `accuracy` (m). `own` are the
+    ranges of the robot, and `covariance` is that of its pose, (3, 3).
     """
+    if fit.last_step > FINISHED:
+        return "the fit of the most probable hypothesis has not converged"
+    free = fit.freedom
+    if chi2_p_value(fit.chi2 / HIGHEST_LEVEL, free) < CLAIM_P_VALUE:
+        return f"the residuals are too large: chi-square {fit.chi2:.3g} for {free} degrees of freedom"
+    total, strays = len(own), int(np.count_nonzero(fit.weights[own] <= INLIER))
+    if strays > (LARGEST_STRAY_SHARE + fit.problem.noise.outliers) * total:
+        return f"{strays} of {total} ranges fit no other"
     position = deviation(float(covariance[0, 0] + covariance[1, 1]))
     if not position <= accuracy:
         return f"the sigma of the position is {position:.3g} m, required {accuracy:g}"
