@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from functools import cached_property
 from itertools import permutations
 from math import inf, sqrt
 
@@ -27,7 +26,7 @@ class PlannedVisit(msgspec.Struct, frozen=True, array_like=True):
     """The visitor is not localised before: a seed pair."""
 
 
-class GroupPlan(msgspec.Struct, frozen=True, dict=True):
+class GroupPlan(msgspec.Struct, frozen=True):
     """The meetings that localise a group, each robot's in order."""
 
     meetings: tuple[PlannedVisit, ...]
@@ -36,11 +35,6 @@ class GroupPlan(msgspec.Struct, frozen=True, dict=True):
     """The bound in s of the time at which all are localised."""
     travel: MeetingTimes
     """The bounds of seed pairs, and of travel alone."""
-
-    @cached_property
-    def travel_lower_bound(self) -> float:
-        """A lower bound in s of the bound of any plan: of seed pairs and of travel alone."""
-        return least_makespan(self.travel)
 
 
 def least_makespan(times: MeetingTimes) -> float:

@@ -28,20 +28,8 @@ FAULTS: dict[CaptionKind, str] = {
 MOST_TOLD = 2
 """The largest number of events of one kind that a caption tells one by one."""
 COUNTS = (
-    "no",
-    "one",
-    "two",
-    "three",
-    "four",
-    "five",
-    "six",
-    "seven",
-    "eight",
-    "nine",
-    "ten",
-    "eleven",
-    "twelve",
-)
+    "no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve",
+)  # fmt: skip
 """Small numbers as words."""
 
 

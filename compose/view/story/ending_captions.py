@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from compose.recording.reasons import plain_reason
-from compose.recording.run_setup import RunSetup
+from compose.recording.run_setup import RobotSetup, RunSetup
 from compose.view.events import metres
 from compose.view.pair_data import PairData
 from compose.view.run_data import TickData
@@ -29,15 +29,9 @@ def concluding(pair: PairData, ended: MissionEnd | None) -> Iterator[Caption]:
         match command.verdict:
             case Localised():
                 (claiming if new else claimed).append(robot.id)
-            case Undecided(reason) if new:
-                yield Caption("undecided", f"{robot.id} stops without a claim: {stopped(reason)}", pair.ids)
-            case Inconsistent(what) if new:
-                text = f"{robot.id} finds that the reports of {robot.peer} contradict what it measured: "
-                text += stopped(what)
+            case verdict if new:
                 truth = attacked(pair, "does report") or "No robot reports false data."
-                yield Caption("inconsistent", text, pair.ids, truth)
-            case _:
-                pass
+                yield without_claim(robot, verdict, pair.ids, truth)
     if not claiming or (ended is not None and ended.outcome == "localised"):
         return
     everyone = len(claiming) == len(pair.ids) > 1
@@ -47,30 +41,34 @@ def concluding(pair: PairData, ended: MissionEnd | None) -> Iterator[Caption]:
     yield Caption("claim", text, pair.ids)
 
 
+def without_claim(
+    robot: RobotSetup, verdict: Undecided | Inconsistent, robots: tuple[str, ...], truth: str | None = None
+) -> Caption:
+    """Return the caption of a robot that ends without a claim; `truth` is added to a contradiction."""
+    match verdict:
+        case Undecided(reason):
+            return Caption("undecided", f"{robot.id} stops without a claim: {stopped(reason)}", robots)
+        case Inconsistent(what):
+            text = f"{robot.id} finds that the reports of {robot.peer} contradict what it measured: "
+            return Caption("inconsistent", text + stopped(what), robots, truth)
+
+
 def ending(setup: RunSetup, now: TickData, end: MissionEnd) -> Caption:
     """Return the caption of the end of the mission."""
     plain = plain_reason(end)
     why = f": {stopped(plain)}" if plain else "."
     errors = _claim_errors(now)
     largest = _off(errors, setup.mission.noise.exact) if errors else None
-    silent = _silent_links(setup)
     robots = len(setup.robots)
     match end.outcome:
         case "localised":
             who = {1: setup.ids[0], 2: "Both"}.get(robots, f"All {robots} robots")
-            each = (
-                "it knows its position and its heading"
-                if robots == 1
-                else "each knows its position and its heading"
-            )
-            are = "is" if robots == 1 else "are"
-            return Caption("end", f"{who} {are} localised: {each}.", truth=largest)
+            are, each = ("is", "it") if robots == 1 else ("are", "each")
+            text = f"{who} {are} localised: {each} knows its position and its heading."
+            return Caption("end", text, truth=largest)
         case "undecided":
-            return Caption(
-                "end",
-                f"The mission ends undecided{why}",
-                truth=" ".join(filter(None, [silent, largest])) or None,
-            )
+            truth = " ".join(filter(None, [_silent_links(setup), largest])) or None
+            return Caption("end", f"The mission ends undecided{why}", truth=truth)
         case "inconsistent":
             text = "The mission ends, because measurements and reports contradict each other"
             return Caption("end", stopped(text) if _just_told(setup, now) else f"{text}{why}", truth=largest)

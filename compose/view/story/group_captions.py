@@ -11,10 +11,10 @@ from compose.recording.run_setup import RunSetup
 from compose.view.deliveries import contact_of
 from compose.view.events import Event, metres
 from compose.view.run_data import TickData
-from compose.view.story.caption import Caption, count_word, faults, stopped
-from compose.view.story.ending_captions import ending
+from compose.view.story.caption import Caption, count_word, faults
+from compose.view.story.ending_captions import ending, without_claim
 from compose.view.words import TRAVELLING
-from protocol.messages import Inconsistent, Localised, MissionEnd, Undecided
+from protocol.messages import Localised, MissionEnd
 
 MOST_LISTED_ROBOTS = 4
 """The largest number of robots or meetings that a sentence names."""
@@ -46,15 +46,13 @@ def _beginning(setup: RunSetup) -> Caption:
     meet = f"First, {_listed(first, 'pairs meet')}"
     meet += "; then those that are localised drive to the others." if len(first) < len(setup.visits) else "."
     number = count_word(len(setup.robots)).capitalize()
-    text = f"{number} robots measure no more than the distance to their own anchor."
+    text = f"{number} robots measure no more than the distance to their own anchor"
     if found := len(setup.robots) - len(setup.anchored):
-        text = (
-            f"{number} robots measure no more than the distance to their own anchor, and {found} have none."
-        )
+        text += f", and {found} have none"
         meet += " At last, they sweep the area for those without an anchor."
     attackers = [robot.id for robot in setup.robots if robot.attack is not None]
     truth = f"{_listed(attackers, 'robots')} will report false data." if attackers else None
-    return Caption("ranging", f"{text} {meet}", truth=truth)
+    return Caption("ranging", f"{text}. {meet}", truth=truth)
 
 
 def _meeting(setup: RunSetup, before: TickData, now: TickData) -> Iterator[Caption]:
@@ -89,11 +87,8 @@ def _concluding(
         match command.verdict:
             case Localised():
                 claiming.append(robot.id)
-            case Undecided(reason):
-                yield Caption("undecided", f"{robot.id} stops without a claim: {stopped(reason)}", pair)
-            case Inconsistent(claim):
-                text = f"{robot.id} finds that the reports of {robot.peer} contradict what it measured: "
-                yield Caption("inconsistent", text + stopped(claim), pair)
+            case verdict:
+                yield without_claim(robot, verdict, pair)
     if not claiming or (ended is not None and ended.outcome == "localised"):
         return
     known = sum([isinstance(one.verdict, Localised) for one in now.commands.values()])

@@ -46,17 +46,17 @@ def _first(pair: PairData) -> bool:
 
 def mirrored(pair: PairData) -> Iterator[Caption]:
     """Yield which robots now have two possible poses relative to their anchors, if sensors are exact."""
-    robots = [robot for robot in pair.ids if _mirrored(*pair.held(robot))] if pair.exact else []
+    robots = []
+    for robot in pair.ids if pair.exact else ():
+        earlier, held = pair.held(robot)
+        if earlier is not None and held is not None and not earlier.local and len(held.local) == 2:
+            robots.append(robot)
     if robots:
         who = f"{listed(robots)} each have" if len(robots) > 1 else f"{robots[0]} has"
         relative = f"relative to {'their anchors' if len(robots) > 1 else 'its anchor'}"
         after = "After a straight drive and a second distance"
         text = f"{after}, {who} two possible poses {relative}, mirror images of each other."
         yield Caption("mirrored", text, pair.ids)
-
-
-def _mirrored(earlier: Estimate | None, held: Estimate | None) -> bool:
-    return earlier is not None and held is not None and not earlier.local and len(held.local) == 2
 
 
 def choosing_branch(pair: PairData) -> Iterator[Caption]:
