@@ -380,7 +380,7 @@ def _decide_phase3(state: RobotState, planned: JointManoeuvres) -> RobotState:
     if searched:
         belief = replace(belief, ranges_at_last_search=mutual)
     tested = replace(state, belief=inference.with_convergence_check(belief, scored))
-    if searched and len(pair.places) >= inference.sufficient_mutual_ranges(mission):
+    if searched and len(pair.places) >= inference.sufficient_mutual_ranges(mission.noise):
         tested = with_consistency_test(tested)
     if tested.verdict is None and may_claim(tested.belief, pair):
         tested, rival = with_claim(tested, scored, hypotheses, pair)

@@ -16,7 +16,7 @@ from agent.planning.manoeuvres import Manoeuvres
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent, Travelling
 from agent.planning.phase3_last_manoeuvre import LAST_SPEEDS, Standing, Waiting
 from agent.planning.state import MODE_NAMES, Done, RobotState
-from protocol.messages import Command, Localised, Observation, Report
+from protocol.messages import Command, Localised, Report
 from protocol.mission import Mission
 from protocol.motion import REST
 
@@ -34,13 +34,6 @@ class AssuredExact(LogPlanner):
         directions=(1.0, -1.0), sides=(1.0, -1.0), last_speeds=LAST_SPEEDS, fewest_out_of_range=True
     )
     """Both ways, to both sides in phase 1, and at several speeds."""
-
-    def observe(self, state: RobotState, observation: Observation) -> RobotState:
-        """Return `state` with the sensor data of one tick, and with the mode that follows from them."""
-        state = exchange.observed(state, observation)
-        return transitions.after_observation(
-            state, observation.anchor_range, self.MANOEUVRES, self._after_range
-        )
 
     def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
         """Return `state` with the peer's `reports` and with the mode that follows from them.

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import msgspec
 
 from agent.peer import peer_state
-from agent.planning import exchange, phase3_last_manoeuvre
+from agent.planning import exchange, phase3_last_manoeuvre, transitions
 from agent.planning.manoeuvres import Manoeuvres
 from agent.planning.phase3_last_manoeuvre import Plan, Question
 from agent.planning.planner import Planner, Summary
@@ -21,7 +21,7 @@ KEPT_PLACES = 3
 
 
 class LogPlanner(Planner[RobotState, Report]):
-    """A planner with the state of the shipped planners. Subclasses define `observe`, `decide`, `command`."""
+    """A planner with the state of the shipped planners. Subclasses define `decide` and `command`."""
 
     BODY = Report
     MANOEUVRES: Manoeuvres
@@ -30,6 +30,17 @@ class LogPlanner(Planner[RobotState, Report]):
     def start(self, config: RobotConfig) -> RobotState:
         """Return the state of a robot that has measured nothing yet."""
         return exchange.start(config)
+
+    def observe(self, state: RobotState, observation: Observation) -> RobotState:
+        """Return `state` with the sensor data of one tick, and with the mode that follows from them."""
+        state = exchange.observed(state, observation)
+        return transitions.after_observation(
+            state, observation.anchor_range, self.MANOEUVRES, self._after_range
+        )
+
+    def _after_range(self, state: RobotState) -> RobotState:
+        """Return `state` with the next mode of phase 1, after a range to the anchor."""
+        raise NotImplementedError
 
     def report(self, state: RobotState) -> Report:
         """Return the part of the log that the peer has not acknowledged."""

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from agent.estimation.gaussian.contact_fit import ContactEstimate, ContactRanges, estimated, is_definite
 from agent.estimation.gaussian.gaussian_estimator import GAUSSIAN
-from agent.estimation.gaussian.inference import MUTUAL_RANGES, MUTUAL_RANGES_WITH_OUTLIERS
+from agent.estimation.gaussian.inference import sufficient_mutual_ranges
 from agent.estimation.gaussian.known_anchors import FEWEST_FOR_POSE
 from agent.estimation.gaussian.odometry_noise import Track, track
 from agent.estimation.kernel import library
@@ -170,7 +170,7 @@ class NoisyUnanchoredPlanner(Planner[NoisyUnanchoredState, Report]):
 
     def required_mutual_ranges(self, mission: Mission) -> int:
         """Return the minimum number of noisy mutual ranges before a claim."""
-        return MUTUAL_RANGES_WITH_OUTLIERS if mission.noise.outliers else MUTUAL_RANGES
+        return sufficient_mutual_ranges(mission.noise)
 
     def summary(self, state: NoisyUnanchoredState) -> Summary:
         """Return the number of possible poses, the probability of the first, and what prevents a claim."""

@@ -18,7 +18,7 @@ from agent.planning.phase1_anchor import ThirdPoint
 from agent.planning.phase2_orbit import Orbiting
 from agent.planning.phase3_last_manoeuvre import Standing, Waiting
 from agent.planning.state import MODE_NAMES, RobotState
-from protocol.messages import Command, Observation, Report
+from protocol.messages import Command, Report
 from protocol.mission import Mission
 from protocol.orbits import Rendezvous, rendezvous
 
@@ -34,13 +34,6 @@ class Paper(LogPlanner):
 
     MANOEUVRES = Manoeuvres(directions=(1.0,), sides=(1.0,), last_speeds=None, fewest_out_of_range=False)
     """Forward, to the left in phase 1, and at v_max."""
-
-    def observe(self, state: RobotState, observation: Observation) -> RobotState:
-        """Return `state` with the sensor data of one tick, and with the mode that follows from them."""
-        state = exchange.observed(state, observation)
-        return transitions.after_observation(
-            state, observation.anchor_range, self.MANOEUVRES, self._after_range
-        )
 
     def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
         """Return `state` with the peer's `reports` and with the mode that follows from them.

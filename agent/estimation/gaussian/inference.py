@@ -28,7 +28,7 @@ from agent.peer.motion_log import MotionLog
 from protocol.messages import RobotConfig
 from protocol.mission import HEADING_ACCURACY, Mission
 from protocol.motion import Covariance, Pose, Segment, compose, inverse, relative, wrap
-from protocol.noise import VelocityNoise
+from protocol.noise import Noise, VelocityNoise
 
 
 class PlanningHypothesis(NamedTuple):
@@ -365,12 +365,13 @@ More ranges may not make the heading more accurate: then the robot searches long
 """
 
 
-def sufficient_mutual_ranges(mission: Mission) -> int:
+def sufficient_mutual_ranges(noise: Noise) -> int:
     """Return the number of mutual ranges from different places from which on evidence is not required.
 
-    With fewer, no suspicion of the peer counts either: the tests of a few ranges repeat each other.
+    Without evidence, a claim needs as many. With fewer, no suspicion of the peer counts either: the tests of
+    a few ranges repeat each other.
     """
-    return MUTUAL_RANGES_WITH_OUTLIERS if mission.noise.outliers else MUTUAL_RANGES
+    return MUTUAL_RANGES_WITH_OUTLIERS if noise.outliers else MUTUAL_RANGES
 
 
 def with_evidence_check(
@@ -382,7 +383,7 @@ def with_evidence_check(
     1 - confidence, if both are equally probable before. MUTUAL_RANGES suffice in any case. With outliers, a
     claim needs that number: agreement of a few ranges among which one is an outlier is not chance.
     """
-    if belief.blocking_reason is not None or len(pair.places) >= sufficient_mutual_ranges(mission):
+    if belief.blocking_reason is not None or len(pair.places) >= sufficient_mutual_ranges(mission.noise):
         return belief
     evidence, required = mutual_evidence(scored[0].fit, pair), -math.log1p(-mission.confidence)
     if evidence >= required:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from agent.estimation.gaussian.fitted_poses import deviation
-from agent.estimation.gaussian.inference import MUTUAL_RANGES, MUTUAL_RANGES_WITH_OUTLIERS
+from agent.estimation.gaussian.inference import sufficient_mutual_ranges
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.joint_search import FEWEST_DECISIVE, beacons
 from agent.estimation.gaussian.known_anchors import unsound_fit
@@ -35,7 +35,7 @@ def blocking_reason(
     fit that has converged, its consistency, and the `accuracy` (m) of the position.
     """
     fit, ranges = found.scored[0].fit, used.ranges
-    required = MUTUAL_RANGES_WITH_OUTLIERS if used.noise.outliers else MUTUAL_RANGES
+    required = sufficient_mutual_ranges(used.noise)
     count = decisive_ranges(robot, used, reach)
     if count < required:
         return f"{count} of {required} required ranges from different places"

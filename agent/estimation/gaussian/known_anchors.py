@@ -17,7 +17,7 @@ from agent.estimation.gaussian.anchor_guesses import anchors
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, HIGHEST_LEVEL, chi2_p_value
 from agent.estimation.gaussian.fitted_poses import deviation
 from agent.estimation.gaussian.hypotheses import WARM_STEPS
-from agent.estimation.gaussian.inference import MUTUAL_RANGES, MUTUAL_RANGES_WITH_OUTLIERS
+from agent.estimation.gaussian.inference import sufficient_mutual_ranges
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges
 from agent.estimation.gaussian.noise_level import INLIER
 from agent.estimation.gaussian.odometry_noise import Array, Places, Track
@@ -193,7 +193,7 @@ def blocking_reason(
     `accuracy` (m) of the position.
     """
     best, count = scored[0], len(robot.ranges.rho)
-    required = MUTUAL_RANGES_WITH_OUTLIERS if robot.noise.outliers else MUTUAL_RANGES
+    required = sufficient_mutual_ranges(robot.noise)
     if count < required:
         return f"{count} of {required} required ranges"
     if best.probability < sure:

@@ -172,9 +172,7 @@ class Problem(NamedTuple):
     @property
     def free(self) -> slice:
         """The unknowns of the guess that the ranges determine; one anchor does not tell the rotation."""
-        if len(self.lengths) == 1:
-            return slice(0, 2) if self.ranges.place is None else slice(0, 3)
-        return slice(0, 6)
+        return slice(0, 2) if len(self.lengths) == 1 else slice(0, 6)
 
     @property
     def noisy(self) -> bool:
