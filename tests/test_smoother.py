@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from agent.estimation import smoother
-from agent.estimation.fit import JointStart, joint_fit
+from agent.estimation.fit import JointStart, joint_fits
 from agent.estimation.gaussian.joint_ranges import PosePrior, joint_measurements
 from agent.estimation.kernel import Kernel
 from agent.estimation.problem import JointProblem
@@ -145,7 +145,8 @@ def test_many_ranges_are_scaled_by_the_predicted_ones_which_noise_does_not_chang
         measured = joint_measurements(group.facts, noise, PERIOD_S)
         starts = group.starts.copy()
         starts[:, :2] -= measured.origin
-        scales.append(0.05 * joint_fit(measured, JointStart(starts)).constants[0])
+        (fit,) = joint_fits(measured, [JointStart(starts)])
+        scales.append(0.05 * fit.constants[0])
     assert abs(np.mean(scales)) < 0.05  # two standard deviations of the mean
 
 
