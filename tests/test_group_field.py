@@ -210,8 +210,9 @@ def test_a_killed_robot_of_a_group_resumes(tmp_path: Path, killed: str) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("amount", range(500, 9000, 4000))
-@pytest.mark.parametrize("killed", ["a", "bd", "abcd"])
+@pytest.mark.parametrize(
+    ("killed", "amount"), [("a", 500), ("a", 8500), ("bd", 4500), ("abcd", 500), ("abcd", 8500)]
+)
 def test_robots_of_a_group_that_are_killed_at_any_moment_resume(
     tmp_path: Path, killed: str, amount: int
 ) -> None:

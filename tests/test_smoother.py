@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -132,6 +134,21 @@ def test_ranges_that_determine_no_pose_are_singular() -> None:
     poses, constant, white = point_of(problem.measured, 1)
     with pytest.raises(Singular, match="do not determine"):
         kernel.step(kernel.walked(poses, constant, white), poses, np.square(problem.sigma), 0.0, 1.0)
+
+
+def test_a_fit_in_which_rounding_leaves_no_variance_is_singular_and_is_left_out() -> None:
+    measured = joint_measurements(moving_group(2, 1, ticks=5).facts, NOISE, PERIOD_S)
+    of = JointProblem.of(measured).measured
+    for white in (1e308, np.nan):
+        wide = of._replace(white=np.full(of.white.shape, white))
+        kernel, poses = Kernel(wide), np.zeros(6)
+        walk = kernel.walked(poses, np.zeros(wide.patterns.shape[:2]), np.zeros(of.white.shape))
+        given = (walk, poses, np.full(len(of.rho), 0.01), 1e-12, 1.0)
+        for step in (kernel.step, partial(smoother.step, wide)):
+            with pytest.raises(Singular), np.errstate(all="ignore"):
+                step(*given)
+    paths = tuple([path._replace(extra=np.full((2, 5), np.nan)) for path in measured.paths])
+    assert joint_fits(replace(measured, paths=paths), [JointStart(np.zeros((2, 3)))]) == []
 
 
 def test_many_ranges_are_scaled_by_the_predicted_ones_which_noise_does_not_change() -> None:

@@ -203,6 +203,8 @@ def _fitted(problem: JointProblem, kernel: Kernel, start: JointStart, steps: int
             weights = weights_by_errors(point.walk.residual, np.sqrt(loose), noise)
         variance = weighted_variance(sigma, weights)
         step = kernel.step(point.walk, point.poses, variance, RIDGE, LARGEST_STEP)
+        if not math.isfinite(step.chi2):
+            raise Singular("an error is too large for a float")
         updated = weights
         if problem.robust:
             told = (step.multipliers, step.alone, step.explained)

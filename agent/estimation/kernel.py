@@ -48,8 +48,8 @@ def library() -> ctypes.CDLL:
     text = KERNEL_SOURCE.read_bytes() if KERNEL_SOURCE.exists() else None
     if text is not None and found.source() != hashlib.sha256(text).hexdigest().encode():
         raise _no_kernel(f"it is of another {KERNEL_SOURCE.name}")
-    found.walked.restype = found.loosened.restype = None
-    found.step.restype = ctypes.c_int
+    found.walked.restype = None
+    found.loosened.restype = found.step.restype = ctypes.c_int
     return found
 
 
@@ -98,10 +98,11 @@ class Kernel:
         return walk
 
     def loosened(self, walk: Walk, poses: Array, variance: Array) -> Array:
-        """Return the variances of the ranges before any fit; see `smoother.loosened`."""
+        """Return the variances of the ranges before any fit; see `smoother.loosened`. Raises Singular."""
         found = np.empty(len(self.of.rho))
         given = (ctypes.byref(self._measured), _addresses(*walk), _at(poses), _at(variance))
-        library().loosened(*given, self._work, _at(found))
+        if not library().loosened(*given, self._work, _at(found)):
+            raise Singular("the errors of the odometry are too large for a float")
         return found
 
     def step(self, walk: Walk, poses: Array, variance: Array, ridge: float, largest: float) -> FitStep:

@@ -241,7 +241,8 @@ static Row row_of(const Measured *of, const Walk *walk, Index j)
     return row;
 }
 
-static void measured(const Measured *of, const Walk *walk, Index j, double variance, Work *w)
+/* Returns 0 if rounding has left no variance. */
+static int measured(const Measured *of, const Walk *walk, Index j, double variance, Work *w)
 {
     const Index s = states(of), q = unknowns(of), size = estimated(of);
     const Row row = row_of(of, walk, j);
@@ -263,6 +264,7 @@ static void measured(const Measured *of, const Walk *walk, Index j, double varia
     for (int t = 0; t < row.count; t++) variance += row.by[t] * gain[row.at[t]];
     w->innovation[j] = innovation;
     w->variance[j] = variance;
+    return variance > 0.0;
 }
 
 static void updated(const Measured *of, Index j, Work *w)
@@ -282,7 +284,7 @@ static void updated(const Measured *of, Index j, Work *w)
     }
 }
 
-static void forward(
+static int forward(
     const Measured *of, const Walk *walk, const double *poses, const double *variance, int update, Work *w)
 {
     const Index n3 = 3 * of->robots, s = states(of), q = unknowns(of);
@@ -306,22 +308,24 @@ static void forward(
             decayed(of, w);
         }
         for (Index j = of->begin[k]; j < of->begin[k + 1]; j++) {
-            measured(of, walk, j, variance[j], w);
+            if (!measured(of, walk, j, variance[j], w)) return 0;
             if (update) updated(of, j, w);
         }
     }
+    return 1;
 }
 
-void loosened(
+int loosened(
     const Measured *of, const Walk *walk, const double *poses, const double *variance, Work *w, double *found)
 {
     const Index q = unknowns(of), size = estimated(of);
-    forward(of, walk, poses, variance, 0, w);
+    if (!forward(of, walk, poses, variance, 0, w)) return 0;
     for (Index j = 0; j < of->ranges; j++) {
         found[j] = w->variance[j];
         const double *effect = w->effects + j * q;
         for (Index e = 3 * of->robots; e < size; e++) found[j] += effect[e] * effect[e];
     }
+    return 1;
 }
 
 /* --- the step --------------------------------------------------------------------------------------- */
@@ -475,7 +479,7 @@ int step(const Measured *of, const Walk *walk, const double *poses, const double
          double largest, Work *w, Step *to)
 {
     const Index n3 = 3 * of->robots, q = unknowns(of), size = estimated(of);
-    forward(of, walk, poses, variance, 1, w);
+    if (!forward(of, walk, poses, variance, 1, w)) return 0;
     for (Index a = 0; a < n3; a++) {
         double *own = w->information + a * q + a;
         *own += ridge + ridge * *own;

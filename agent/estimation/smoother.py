@@ -219,7 +219,10 @@ class Passed(NamedTuple):
 
 
 def forward(of: Measured, walk: Walk, poses: Array, variance: Array, *, update: bool = True) -> Passed:
-    """Return the forward pass; without `update`, ranges are predicted only, and change nothing."""
+    """Return the forward pass; without `update`, ranges are predicted only, and change nothing.
+
+    Raises Singular if rounding has left an innovation without a variance.
+    """
     n3 = 3 * of.robots
     s, q = n3 + of.radios, of.size + 2 * of.anchors
     u, p, information = zeros(s, q), zeros(s, s), zeros(q, q)
@@ -312,6 +315,8 @@ def _measured(of: Measured, walk: Walk, j: int, variance: float, found: Passed) 
             effect[of.size + 2 * of.anchor[j] + e] -= of.survey * walk.direction[j, e]
     for a, h in row:
         variance += h * gain[a]
+    if not variance > 0.0:
+        raise Singular("the errors of the odometry are too large for a float")
     found.innovation.append(innovation)
     found.variance.append(variance)
     found.effects.append(effect)

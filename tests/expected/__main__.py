@@ -4,7 +4,7 @@ Without a name, all sweeps are run. The exit status is 1 if anything differs, fo
 of false alarms of 1 % over all statistics together. `--write` replaces the files of the sweeps that have run.
 
 Three forms decide the number of trials of each cell, from the processor time that the files state: that of
-the long suite (the default, some 4 minutes on two cores), `--hour`, and `--whole` (those of the sweep files).
+the long suite (the default, a minute on two cores), `--hour`, and `--whole` (those of the sweep files).
 With the seed of the file, which is the default, trials are also compared with those in the file one by one:
 where the libraries and the processor are those of the file, every decision has to be the same, to the bit. A
 change that means to decide otherwise is compared by its statistics alone (`--statistics`), and writes the
@@ -43,7 +43,7 @@ from tests.expected.comparison import (
 from tests.expected.playing import play
 from tests.expected.results import SAMPLE, Expected, Trials, expected, path_of, read, toml_text
 
-FORMS = {"long": 300.0, "hour": 6000.0}
+FORMS = {"long": 100.0, "hour": 6000.0}
 """The processor time of a form in s, for all files."""
 PACKAGES = ("agent", "world", "protocol")
 """The packages on whose code results depend."""

@@ -65,8 +65,9 @@ class GroupEstimator:
         if not self._known.scored:
             return NO_HYPOTHESES
         found = follow(self._known, used)
-        moving = found.scored[0].fit.last_step > FINISHED
-        return follow(found, used, FIT_STEPS) if moving else found
+        if found.scored and found.scored[0].fit.last_step > FINISHED:
+            found = follow(found, used, FIT_STEPS)
+        return found if found.scored else NO_HYPOTHESES
 
     def _extended(self, found: JointHypotheses, used: JointMeasurements, reach: float) -> JointHypotheses:
         """Return `found` with further robots; those that failed are tried again with more ranges."""
