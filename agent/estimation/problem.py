@@ -30,8 +30,6 @@ class JointProblem(msgspec.Struct, frozen=True, eq=False):
 
     measured: Measured
     noise: Noise
-    order: Places
-    """The ranges of the measurements in the order of the fit; shape (N,)."""
     back: Places
     """The ranges of the fit in the order of the measurements; shape (N,)."""
     sigma: Array
@@ -89,7 +87,6 @@ class JointProblem(msgspec.Struct, frozen=True, eq=False):
                 information=np.zeros((3 * n, 3 * n)) if prior is None else prior.information,
             ),
             noise,
-            order,
             back,
             ranges.sigma[order],
             lengths,

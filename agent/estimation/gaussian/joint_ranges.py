@@ -21,9 +21,8 @@ from protocol.noise import Noise
 MOST_MUTUAL_RANGES = 1024
 """The most ranges between robots in one fit, of all pairs together; see MOST_CORRELATED_RANGES.
 
-With so many ranges of 8 robots, a step takes about 2 ms. A group of 16 robots that meet as planned has about
-500. With less, 16 robots that all range each other would use fewer than 8 ranges of
-each pair.
+The time of a step is linear in their number. A group of 16 robots that meet as planned has about 500. With
+less, 16 robots that all range each other would use fewer than 8 ranges of each pair.
 """
 
 

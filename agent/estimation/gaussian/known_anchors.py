@@ -105,8 +105,7 @@ def scored_fits(
 
 
 def start_of(guess: Array) -> JointStart:
-    """Return the pose at tick 0 of a robot, from the place of the origin in the frame of its odometry and the
-    rotation of this frame; shape (3,)."""
+    """Return the pose of a robot at tick 0 from a guess, (3,), in the layout of `range_model.predicted`."""
     mx, my, turn = guess.tolist()
     x, y = rotated(math.cos(turn), math.sin(turn), mx, my)
     return JointStart(np.array([[-x, -y, turn]]))
