@@ -20,7 +20,8 @@ from msgspec.structs import replace
 
 from agent.estimation.gaussian.linear_model import Problem
 from agent.estimation.gaussian.odometry_noise import track
-from agent.estimation.gaussian.range_model import PairRanges, Ranges
+from agent.estimation.gaussian.pair_ranges import PairRanges
+from agent.estimation.gaussian.range_model import Ranges
 from compose.errors import NOT_LOCALISED, USER_ERROR, UserError
 from compose.recording.estimating.estimate_epoch import ClaimRule
 from compose.recording.estimating.estimate_files import ESTIMATE_COLUMNS, estimate_csv

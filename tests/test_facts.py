@@ -20,7 +20,7 @@ from agent.estimation.facts import (
     manoeuvre,
     mutual_range,
 )
-from agent.estimation.fit import JointFit, JointStart, joint_fits
+from agent.estimation.fit import Fit, Start, fits
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, joint_measurements
 from agent.estimation.gaussian.joint_search import search
 from tests.moving_groups import NOISE, PERIOD_S, MovingGroup, moving_group
@@ -44,16 +44,16 @@ def bits(measured: JointMeasurements) -> tuple[object, ...]:
     return *[part.tobytes() for part in parts], paths, measured.robots, measured.radios, measured.origin
 
 
-def bits_of_fit(fit: JointFit) -> tuple[bytes, bytes, float]:
+def bits_of_fit(fit: Fit) -> tuple[bytes, bytes, float]:
     return fit.poses.tobytes(), fit.covariance.tobytes(), fit.weight
 
 
-def fitted(facts: Facts, group: MovingGroup) -> JointFit:
+def fitted(facts: Facts, group: MovingGroup) -> Fit:
     """Return the fit to `facts` that begins at the truth."""
     measured = joint_measurements(facts, group.noise, PERIOD_S)
     starts = group.starts.copy()
     starts[:, :2] -= measured.origin
-    (fit,) = joint_fits(measured, [JointStart(starts)])
+    (fit,) = fits(measured, [Start(starts)])
     return fit
 
 

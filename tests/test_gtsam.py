@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.fitted_poses import poses
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis, search
-from agent.estimation.gaussian.range_model import PairRanges
+from agent.estimation.gaussian.pair_ranges import PairRanges
 from agent.planning.accuracy_seeking import AccuracySeeking
 from agent.planning.state import Done, RobotState
 from compose.launch.in_process import run_mission
@@ -251,7 +251,7 @@ def mission(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
 
 
 def test_the_claim_came_of_this_fit(mission: Compared) -> None:
-    (held,) = inference.pair_planning_hypotheses([mission.ours], mission.pair)
+    (held,) = inference.pair_planning_hypotheses([mission.ours])
     pose, covariance = inference.claim(held, 0, mission.pair)
     anchor = mission.config.anchor
     assert mission.claimed.covariance is not None

@@ -15,7 +15,7 @@ import pytest
 
 from agent.estimation.gaussian.fitted import Fit
 from agent.estimation.gaussian.fitted_poses import poses
-from agent.estimation.gaussian.range_model import PairRanges
+from agent.estimation.gaussian.pair_ranges import PairRanges
 from compose.recording.estimating.estimate_epoch import ClaimRule
 from compose.recording.estimating.estimate_run import estimated, measurements
 from compose.recording.estimating.pair_measurements import PairMeasurements

@@ -308,7 +308,7 @@ def test_a_search_is_repeated_only_if_a_measurement_differs_in_a_bit() -> None:
 def test_what_follows_from_a_hypothesis_is_computed_once_for_both_robots() -> None:
     pair, _ = after_a_long_way(0)
     again, _ = after_a_long_way(0)
-    ours, theirs = (inference.pair_planning_hypotheses(search(one), one) for one in (pair, again))
+    ours, theirs = (inference.pair_planning_hypotheses(search(one)) for one in (pair, again))
     assert all(one is other for one, other in zip(ours, theirs, strict=True))
     fitted = search(pair)[0].fit
     assert hash(fitted) != hash(fitted._replace(level=fitted.level)), (

@@ -12,14 +12,15 @@ from scipy.optimize import least_squares  # type: ignore[import-untyped]
 from scipy.stats import binom, chi2  # type: ignore[import-untyped]
 
 from agent.estimation.facts import Facts, Manoeuvre, anchor, anchor_range, manoeuvre, mutual_range
-from agent.estimation.fit import JointFit, JointStart, joint_fits
+from agent.estimation.fit import Fit, Start, fits
 from agent.estimation.gaussian.fitted_poses import poses
 from agent.estimation.gaussian.hypotheses import search as search_of_pair
 from agent.estimation.gaussian.joint_claims import blocking_reason, undetermined
 from agent.estimation.gaussian.joint_ranges import MOST_MUTUAL_RANGES, JointMeasurements, joint_measurements
 from agent.estimation.gaussian.joint_search import search
 from agent.estimation.gaussian.odometry_noise import constant_errors, track, variances
-from agent.estimation.gaussian.range_model import PairRanges, Ranges
+from agent.estimation.gaussian.pair_ranges import PairRanges
+from agent.estimation.gaussian.range_model import Ranges
 from agent.estimation.posterior import JointHypotheses, certainties
 from tests.moving_groups import NOISE, PERIOD_S, MovingGroup, moving_group
 
@@ -33,13 +34,13 @@ def measured_of(group: MovingGroup) -> JointMeasurements:
     return joint_measurements(group.facts, group.noise, PERIOD_S)
 
 
-def at_truth(group: MovingGroup, measured: JointMeasurements) -> JointStart:
+def at_truth(group: MovingGroup, measured: JointMeasurements) -> Start:
     starts = group.starts.copy()
     starts[:, :2] -= measured.origin
-    return JointStart(starts)
+    return Start(starts)
 
 
-def errors_of(fit: JointFit, group: MovingGroup, measured: JointMeasurements) -> Array:
+def errors_of(fit: Fit, group: MovingGroup, measured: JointMeasurements) -> Array:
     """Return the errors of the poses at the end; shape (n, 3)."""
     errors = fit.poses - group.ends
     errors[:, :2] += measured.origin
@@ -47,7 +48,7 @@ def errors_of(fit: JointFit, group: MovingGroup, measured: JointMeasurements) ->
     return errors
 
 
-def nees_of(fit: JointFit, errors: Array) -> list[float]:
+def nees_of(fit: Fit, errors: Array) -> list[float]:
     blocks = [fit.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(len(errors))]
     return [float(error @ np.linalg.solve(own, error)) for error, own in zip(errors, blocks, strict=True)]
 
@@ -121,7 +122,7 @@ def test_the_joint_fit_is_the_optimum_that_scipy_finds(unanchored: list[int]) ->
     noise = replace(NOISE, strays=0.0, sigma_degrees=0.0)
     group = moving_group(3, 5, ticks=14, noise=noise, unanchored=unanchored)
     measured = measured_of(group)
-    (fit,) = joint_fits(measured, [at_truth(group, measured)], 20)
+    (fit,) = fits(measured, [at_truth(group, measured)], 20)
     ends, covariance = Reference(measured).optimum(at_truth(group, measured).poses)
     sigmas = np.sqrt(np.diagonal(covariance))
     assert np.max(np.abs((fit.poses - ends).ravel()) / sigmas) < 0.01

@@ -11,19 +11,17 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from agent.estimation import smoother
-from agent.estimation.fit import JointStart, joint_fits
+from agent.estimation.fit import Start, fits
 from agent.estimation.gaussian.joint_ranges import PosePrior, joint_measurements
 from agent.estimation.kernel import Kernel
-from agent.estimation.problem import JointProblem
+from agent.estimation.problem import Problem
 from agent.estimation.smoother import Measured, Singular
 from tests.moving_groups import NOISE, PERIOD_S, moving_group
 
 Array = smoother.Array
 
 
-def problem_of(
-    seed: int, robots: int, ticks: int, *, slow: float, survey: float, prior: bool
-) -> JointProblem:
+def problem_of(seed: int, robots: int, ticks: int, *, slow: float, survey: float, prior: bool) -> Problem:
     """Return the problem of a random group: with slow errors, surveying errors and a prior of the poses."""
     noise = replace(NOISE, slow_sigma=slow, survey_error=survey)
     measured = joint_measurements(moving_group(robots, seed, ticks=ticks, noise=noise).facts, noise, PERIOD_S)
@@ -31,7 +29,7 @@ def problem_of(
         root = np.random.default_rng(seed).normal(size=(3 * robots, 3 * robots))
         about = PosePrior(np.zeros((robots, 3)), root @ root.T, 3 * robots)
         measured = replace(measured, prior=about)
-    return JointProblem.of(measured)
+    return Problem.of(measured)
 
 
 def point_of(of: Measured, seed: int) -> tuple[Array, Array, Array]:
@@ -57,6 +55,8 @@ def test_the_kernel_equals_its_text_to_the_bit(
 ) -> None:
     problem = problem_of(seed, robots, ticks, slow=slow, survey=survey, prior=prior)
     of, variance = problem.measured._replace(scaled=scaled), np.square(problem.sigma)
+    of.radio[::3] = -1
+    of.common[::4] = 0.0
     poses, constant, white = point_of(of, seed)
     kernel = Kernel(of)
     walk, text = kernel.walked(poses, constant, white), smoother.walked(of, poses, constant, white)
@@ -70,18 +70,22 @@ def test_the_kernel_equals_its_text_to_the_bit(
         assert np.asarray(one).tobytes() == np.asarray(expected).tobytes(), name
 
 
-def dense(problem: JointProblem, poses: Array, constant: Array, white: Array) -> tuple[Array, Array, Array]:
-    """Return the whole least-squares problem at a point: J, right side, all errors as unknowns."""
+def dense(problem: Problem, poses: Array, constant: Array, white: Array) -> tuple[Array, Array, Array]:
+    """Return the least-squares problem at a point: J, right side, changes of poses and all errors."""
     of, small = problem.measured, 1e-6
     kernel, n3, m = Kernel(of), 3 * of.robots, of.patterns.shape[1]
     sizes = np.sqrt(of.white)
 
     def predicted(x: Array) -> Array:
         start, common, own, errors = np.split(x, np.cumsum([n3, of.common.shape[1], of.robots * m]))
-        walk = kernel.walked(start, own.reshape(-1, m), errors.reshape(of.white.shape) * sizes)
+        walk = kernel.walked(
+            problem.moved(poses, start), own.reshape(-1, m), errors.reshape(of.white.shape) * sizes
+        )
         return of.rho - walk.residual + of.common @ common
 
-    x = np.concatenate((poses, np.zeros(of.common.shape[1]), constant.ravel(), (white / sizes).ravel()))
+    x = np.concatenate(
+        (np.zeros(n3), np.zeros(of.common.shape[1]), constant.ravel(), (white / sizes).ravel())
+    )
     columns = [(predicted(x + step) - predicted(x - step)) / (2.0 * small) for step in small * np.eye(len(x))]
     rows, priors = np.stack(columns, 1) / problem.sigma[:, None], np.eye(len(x))[n3:]
     right = np.concatenate(((of.rho - predicted(x)) / problem.sigma, -x[n3:]))
@@ -129,7 +133,7 @@ def test_each_range_is_weighed_by_the_prediction_from_all_others() -> None:
 
 def test_ranges_that_determine_no_pose_are_singular() -> None:
     measured = joint_measurements(moving_group(1, 1, ticks=3).facts, NOISE, PERIOD_S).until(0)
-    problem = JointProblem.of(measured)
+    problem = Problem.of(measured)
     kernel = Kernel(problem.measured)
     poses, constant, white = point_of(problem.measured, 1)
     with pytest.raises(Singular, match="do not determine"):
@@ -138,7 +142,7 @@ def test_ranges_that_determine_no_pose_are_singular() -> None:
 
 def test_a_fit_in_which_rounding_leaves_no_variance_is_singular_and_is_left_out() -> None:
     measured = joint_measurements(moving_group(2, 1, ticks=5).facts, NOISE, PERIOD_S)
-    of = JointProblem.of(measured).measured
+    of = Problem.of(measured).measured
     for white in (1e308, np.nan):
         wide = of._replace(white=np.full(of.white.shape, white))
         kernel, poses = Kernel(wide), np.zeros(6)
@@ -148,7 +152,7 @@ def test_a_fit_in_which_rounding_leaves_no_variance_is_singular_and_is_left_out(
             with pytest.raises(Singular), np.errstate(all="ignore"):
                 step(*given)
     paths = tuple([path._replace(extra=np.full((2, 5), np.nan)) for path in measured.paths])
-    assert joint_fits(replace(measured, paths=paths), [JointStart(np.zeros((2, 3)))]) == []
+    assert fits(replace(measured, paths=paths), [Start(np.zeros((2, 3)))]) == []
 
 
 def test_many_ranges_are_scaled_by_the_predicted_ones_which_noise_does_not_change() -> None:
@@ -162,7 +166,7 @@ def test_many_ranges_are_scaled_by_the_predicted_ones_which_noise_does_not_chang
         measured = joint_measurements(group.facts, noise, PERIOD_S)
         starts = group.starts.copy()
         starts[:, :2] -= measured.origin
-        (fit,) = joint_fits(measured, [JointStart(starts)])
+        (fit,) = fits(measured, [Start(starts)])
         scales.append(0.05 * fit.constants[0])
     assert abs(np.mean(scales)) < 0.05  # two standard deviations of the mean
 
@@ -171,6 +175,6 @@ def test_a_pair_of_radios_without_a_range_is_no_part_of_a_fit() -> None:
     noise = replace(NOISE, slow_sigma=0.05)
     measured = joint_measurements(moving_group(2, 1, ticks=5, noise=noise).facts, noise, PERIOD_S)
     sparse = replace(measured, ranges=replace(measured.ranges, radio=10**6 * measured.ranges.radio))
-    one, other = JointProblem.of(measured).measured, JointProblem.of(sparse).measured
+    one, other = Problem.of(measured).measured, Problem.of(sparse).measured
     assert one.radios == other.radios == len(measured.ranges.pairs)
     np.testing.assert_array_equal(one.radio, other.radio)

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 import tandem
 from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.hypotheses import Hypothesis, ScoredHypothesis, search
-from agent.estimation.gaussian.range_model import PairRanges
+from agent.estimation.gaussian.pair_ranges import PairRanges
 from agent.estimation.knowledge import Belief
 from agent.peer.motion_log import MotionLog
 from agent.planning import pair_claim

@@ -8,7 +8,7 @@ the noise level, a factor of all variances, is integrated out.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -28,7 +28,7 @@ from agent.estimation.gaussian.range_weights import (
     weights_by_errors,
 )
 from agent.estimation.kernel import Kernel
-from agent.estimation.problem import JointProblem
+from agent.estimation.problem import Problem
 from agent.estimation.smoother import FitStep, Singular, Walk
 
 FIT_STEPS = 8
@@ -44,8 +44,8 @@ linear model is not computed again after the last step.
 LARGEST_STEP = 1.0
 """The largest change of an unknown, in m and rad, in one step."""
 
-SHORTER_STEPS = (0.5, 0.25, 0.0625)
-"""The fractions of a step that are tried in turn if it does not descend.
+SHORTER_STEPS = (1.0, 0.5, 0.25, 0.0625)
+"""The fractions of a step that are tried in turn until one descends.
 
 Gauss-Newton with full steps may alternate between two guesses for ever.
 """
@@ -69,22 +69,29 @@ LEAST_VARIANCE = 1e-300
 """The variance of a white error that is 0."""
 
 
-class JointStart(NamedTuple):
+def deviation(variance: float) -> float:
+    """Return the standard deviation; infinite if rounding made the variance negative."""
+    return math.sqrt(variance) if variance >= 0.0 else math.inf
+
+
+class Start(NamedTuple):
     """The poses and the errors from which a fit begins."""
 
     poses: Array
     """The pose of each robot at tick 0, relative to the origin; shape (n, 3)."""
     errors: tuple[Errors, ...] = ()
     """The odometry errors of each robot; by default none."""
+    weights: Array | None = None
+    """The probability that each range is an inlier, shape (N,); by default it follows from the residuals."""
 
 
-class JointFit(NamedTuple):
+class Fit(NamedTuple):
     """The most probable start poses in the neighbourhood of the initial ones, with their uncertainty.
 
     Ranges are in the order of the measurements.
     """
 
-    start: JointStart
+    start: Start
     """The poses at tick 0 and the odometry errors."""
     poses: Array
     """The pose of each robot at the end of its path, relative to the origin, in m and rad; shape (n, 3)."""
@@ -108,7 +115,28 @@ class JointFit(NamedTuple):
     """Their standard deviations in the same unit."""
     paths: Array
     """The x, y (m, relative to the origin) and heading (rad) of each robot at each tick; (n, K + 1, 3)."""
-    problem: JointProblem
+    problem: Problem
+    linear: Linear
+    """The last linear model. Covariances are those of the point where it was computed."""
+
+    def __hash__(self) -> int:
+        """Return the hash of this object."""
+        return id(self)
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether `other` is this fit itself: what follows from one fit is computed once."""
+        return self is other
+
+    @property
+    def guess(self) -> Array:
+        """The pivots in the robots' frames (m) and the headings (rad) at tick 0 (see `smoother`); (3 n,)."""
+        return self.problem.guess(self.start.poses.ravel())
+
+    @property
+    def of_start(self) -> Array:
+        """The covariance of `guess`; shape (3 n, 3 n)."""
+        n3 = self.start.poses.size
+        return np.asarray(self.level * self.linear.step.inverse[:n3, :n3], np.float64)
 
     @property
     def ticks(self) -> Places:
@@ -125,9 +153,40 @@ class JointFit(NamedTuple):
         """The degrees of freedom of `chi2`, at least 1."""
         return max(self.inliers - self.problem.free, 1)
 
+    def continued(self, measured: JointMeasurements) -> Fit:
+        """Return this fit with longer paths in `measured`, and no further range."""
+        problem = Problem.of(measured)
+        point = _begin(problem, Kernel(problem.measured), self.start)
+        start, paths = _start_of(problem, point), point.walk.place
+        return self._replace(start=start, poses=paths[:, -1], paths=paths, problem=problem)
+
     def places(self, robot: int, ticks: Places) -> Array:
         """Return the position (m, relative to the origin) of a robot at `ticks`; shape (2, N)."""
         return np.asarray(self.paths[robot, ticks, :2].T, np.float64)
+
+
+class Linear(NamedTuple):
+    """The linear model of a step."""
+
+    kernel: Kernel
+    walk: Walk
+    """The paths at the point of the model."""
+    poses: Array
+    """The start poses there; shape (3 n,)."""
+    variance: Array
+    """The own variance of each range in m^2; shape (N,)."""
+    step: FitStep
+
+    def score(self, effect: Array) -> tuple[float, float]:
+        """Return how the log-likelihood changes with an unknown that changes the ranges by `effect`, (N,).
+
+        They are its first derivative and the information on it, with all other unknowns estimated beside it.
+        """
+        moves = self.walk.moves.copy()
+        moves[..., 6:] = 0.0  # the errors of the odometry at the point
+        still = self.walk._replace(moves=moves, residual=effect)
+        back = self.kernel.step(still, self.poses, self.variance, RIDGE, math.inf)
+        return float(effect @ self.step.multipliers), float(effect @ back.multipliers)
 
 
 class _Errors(NamedTuple):
@@ -158,7 +217,7 @@ class _Point(NamedTuple):
     """Twice the negative log-density of all errors that have a prior, up to a constant."""
 
     @staticmethod
-    def of(problem: JointProblem, kernel: Kernel, poses: Array, errors: _Errors) -> _Point:
+    def of(problem: Problem, kernel: Kernel, poses: Array, errors: _Errors) -> _Point:
         """Return the point with these start poses and errors."""
         of, walk = problem.measured, kernel.walked(poses, errors.constant, errors.white)
         off = of.mean - poses
@@ -176,57 +235,147 @@ class _Point(NamedTuple):
         return float(np.sum(np.square(self.own) / variance)) + self.prior_cost
 
 
-def joint_fits(
-    measured: JointMeasurements, starts: Iterable[JointStart], steps: int = FIT_STEPS
-) -> list[JointFit]:
-    """Return the fits to all ranges in `measured` that begin at `starts`, after at most `steps` steps.
+class Ending(NamedTuple):
+    """When fits end."""
+
+    steps: int = FIT_STEPS
+    """The maximum number of steps."""
+    shortest: float = LAST_STEP
+    """A step is the last if the next one is expected to be shorter, in sigmas."""
+    decrease: float = 1.0
+    """The factor by which the second step is expected to be shorter than the first: below 1 if starts are
+    fits to almost the same ranges."""
+
+
+TO_THE_END = Ending()
+"""The end of fits from which a claim may follow."""
+
+
+def fits(measured: JointMeasurements, starts: Iterable[Start], ending: Ending = TO_THE_END) -> list[Fit]:
+    """Return the fits to all ranges in `measured` that begin at `starts`.
 
     A start from which there is none, because a number is too large for a float, is left out.
     """
-    problem = JointProblem.of(measured)
+    problem = Problem.of(measured)
     kernel, found = Kernel(problem.measured), []
     for start in starts:
         try:
-            found.append(_fitted(problem, kernel, start, steps))
+            found.append(_fitted(problem, kernel, start, ending))
         except Singular:
             continue
     return found
 
 
-def _fitted(problem: JointProblem, kernel: Kernel, start: JointStart, steps: int) -> JointFit:
+class HeldFit(NamedTuple):
+    """The result of a fit in which a coordinate is held."""
+
+    log_likelihood: float
+    """The log-likelihood of the ranges, without the volume of the start poses."""
+    poses: Array
+    """The pose of each robot at the end of its path, relative to the origin, in m and rad; shape (n, 3)."""
+
+
+def held_fit(measured: JointMeasurements, begun: Fit, steps: int) -> HeldFit:
+    """Return the fit to `measured` after `steps` steps from the fit `begun`.
+
+    The last of the ranges is not one of those of that fit. It holds a coordinate. Raises Singular.
+    """
+    problem = Problem.of(measured)
+    kernel, noise, sigma = Kernel(problem.measured), problem.noise, problem.sigma
+    start = begun.start._replace(weights=np.append(begun.weights, 1.0))
+    point = _begin(problem, kernel, start)
+    weights = _first_weights(problem, kernel, start, point)
+    for number in range(steps + 1):
+        variance = weighted_variance(sigma, weights)
+        step = kernel.step(point.walk, point.poses, variance, RIDGE, LARGEST_STEP)
+        if number == steps:
+            break
+        point = _after(problem, kernel, point, step, 1.0)
+        if problem.robust and number == 0:
+            loose = np.square(sigma) + np.sum(np.square(problem.measured.common), 1)
+            weights = weights_by_errors(point.walk.residual, np.sqrt(loose), noise)
+            weights[problem.exact] = 1.0
+        elif problem.robust:
+            weights = _inliers(problem, step, variance)
+    n3 = len(point.poses)
+    volume = float(np.linalg.slogdet(step.inverse[:n3, :n3])[1])
+    return HeldFit(_evidence(problem, point, step, weights) - 0.5 * volume, point.walk.place[:, -1])
+
+
+def without_outliers(measured: JointMeasurements, starts: Sequence[Start]) -> list[Start]:
+    """Return the `starts` under which some range is an outlier, with weights that leave these ranges out.
+
+    The weights follow from the residuals and the sigmas of the ranges alone, as if the start were exact.
+    Without them, a fit first allows for the uncertainty of the odometry too, which can explain an outlier
+    and draw the fit away from the start.
+    """
+    problem = Problem.of(measured)
+    if not problem.robust:
+        return []
+    kernel, ranges, found = Kernel(problem.measured), measured.ranges, []
+    sigma = np.sqrt(np.square(ranges.sigma) + ranges.single.loosened(measured.noise.priors))
+    for start in starts:
+        residuals = _begin(problem, kernel, start).walk.residual[problem.back]
+        weights = weights_by_errors(residuals, sigma, measured.noise)
+        if weights.min() < INLIER:
+            found.append(start._replace(weights=weights))
+    return found
+
+
+def _fitted(problem: Problem, kernel: Kernel, start: Start, ending: Ending) -> Fit:
     noise, sigma = problem.noise, problem.sigma
     point = _begin(problem, kernel, start)
     weights, before = np.ones(len(sigma)), 0.0
-    for number in range(steps + 1):
+    for number in range(ending.steps + 1):
         if problem.robust and number == 0:
-            loose = kernel.loosened(point.walk, point.poses, np.square(sigma))
-            weights = weights_by_errors(point.walk.residual, np.sqrt(loose), noise)
+            weights = _first_weights(problem, kernel, start, point)
         variance = weighted_variance(sigma, weights)
         step = kernel.step(point.walk, point.poses, variance, RIDGE, LARGEST_STEP)
         if not math.isfinite(step.chi2):
             raise Singular("an error is too large for a float")
         updated = weights
         if problem.robust:
-            told = (step.multipliers, step.alone, step.explained)
-            updated = inlier_probabilities(*told, variance, sigma, noise)
+            updated = _inliers(problem, step, variance)
         freedom = int(np.count_nonzero(weights > INLIER)) - problem.free
         level = noise_level(step.chi2, freedom, noise)
         length = step.length / math.sqrt(level)
-        before = length if number == 0 else before
+        before = length / ending.decrease if number == 0 else before
         expected = length**2 / max(length, before, LAST_STEP)
         still = float(np.max(np.abs(updated - weights), initial=0.0)) < SETTLED_WEIGHT
-        if number == steps:
+        linear = Linear(kernel, point.walk, point.poses, variance, step)
+        if number == ending.steps:
             off = _off_model(point, step, variance, level)
-            return _fit(problem, point, step, weights, off if off > 1.0 else length)
+            return _fit(problem, point, linear, weights, off if off > 1.0 else length)
         point = _stepped(problem, kernel, point, step, variance)
-        still = still and expected < LAST_STEP and number > 0  # the path is corrected at least once
-        if still and _off_model(point, step, variance, level) <= 1.0:
-            return _fit(problem, point, step, weights, expected)
+        # the path is corrected at least once
+        still = still and (number > 0 or ending.decrease < 1.0 or not problem.noisy)
+        if still and expected < ending.shortest and _off_model(point, step, variance, level) <= 1.0:
+            return _fit(problem, point, linear, weights, expected)
         weights, before = updated, length
     raise AssertionError("the last step returns")
 
 
-def _begin(problem: JointProblem, kernel: Kernel, start: JointStart) -> _Point:
+def _first_weights(problem: Problem, kernel: Kernel, start: Start, point: _Point) -> Array:
+    """Return the weights with which a fit begins: those of its start, or by the residuals."""
+    if start.weights is not None:
+        weights = np.empty(len(start.weights))
+        weights[problem.back] = start.weights
+        return weights
+    loose = kernel.loosened(point.walk, point.poses, np.square(problem.sigma))
+    weights = weights_by_errors(point.walk.residual, np.sqrt(loose), problem.noise)
+    weights[problem.exact] = 1.0
+    return weights
+
+
+def _inliers(problem: Problem, step: FitStep, variance: Array) -> Array:
+    """Return the probability that each range is an inlier, given the prediction from all others."""
+    told = (step.multipliers, step.alone, step.explained)
+    weights = inlier_probabilities(*told, variance, problem.sigma, problem.noise)
+    weights[problem.exact] = 1.0
+    return weights
+
+
+def _begin(problem: Problem, kernel: Kernel, start: Start) -> _Point:
     """Return the point at `start`."""
     of = problem.measured
     constant, white = np.zeros(of.patterns.shape[:2]), np.zeros(of.white.shape)
@@ -250,27 +399,30 @@ def _off_model(point: _Point, step: FitStep, variance: Array, level: float) -> f
     return math.sqrt(max(point.cost(variance) - step.chi2, 0.0) / level)
 
 
-def _stepped(problem: JointProblem, kernel: Kernel, point: _Point, step: FitStep, variance: Array) -> _Point:
+def _stepped(problem: Problem, kernel: Kernel, point: _Point, step: FitStep, variance: Array) -> _Point:
     """Return the point after a step, or after that fraction of it that descends; else `point`."""
-    of, n3 = problem.measured, len(point.poses)
-    constants = step.limited[n3:]
-    c = of.common.shape[1]
-    constant = constants[c:].reshape(point.errors.constant.shape)
-    errors = _Errors(constants[:c], constant, step.white, step.slow, step.own)
     most = point.cost(variance) + DESCENT
-    following = _Point.of(problem, kernel, point.poses + step.limited[:n3], errors)
     for fraction in SHORTER_STEPS:
+        following = _after(problem, kernel, point, step, fraction)
         if following.cost(variance) <= most:
             return following
+    return point
+
+
+def _after(problem: Problem, kernel: Kernel, point: _Point, step: FitStep, fraction: float) -> _Point:
+    """Return the point after a `fraction` of a step."""
+    n3, c = len(point.poses), problem.measured.common.shape[1]
+    common, constant = np.split(step.limited[n3:], [c])
+    errors = _Errors(common, constant.reshape(point.errors.constant.shape), step.white, step.slow, step.own)
+    if fraction < 1.0:
         between = [one + fraction * (other - one) for one, other in zip(point.errors, errors, strict=True)]
-        poses = point.poses + fraction * step.limited[:n3]
-        following = _Point.of(problem, kernel, poses, _Errors(*between))
-    return following if following.cost(variance) <= most else point
+        errors = _Errors(*between)
+    return _Point.of(problem, kernel, problem.moved(point.poses, fraction * step.limited[:n3]), errors)
 
 
-def _fit(problem: JointProblem, point: _Point, step: FitStep, weights: Array, last_step: float) -> JointFit:
+def _fit(problem: Problem, point: _Point, linear: Linear, weights: Array, last_step: float) -> Fit:
     """Return the fit that has ended at `point`, with the linear model of the last step."""
-    n3, back = len(point.poses), problem.back
+    n3, back, step = len(point.poses), problem.back, linear.step
     freedom = int(np.count_nonzero(weights > INLIER)) - problem.free
     level = noise_level(step.chi2, freedom, problem.noise)
     if problem.noise.sigma_degrees:
@@ -278,14 +430,8 @@ def _fit(problem: JointProblem, point: _Point, step: FitStep, weights: Array, la
         own, sigma = point.own[rows], problem.sigma[rows]
         correlation = residual_correlation(own, weights[rows], sigma, problem.ends, level)
         level = noise_level(step.chi2, freedom, problem.noise, correlation)
-    errors = [
-        Errors(v[:ticks], omega[:ticks], constant)
-        for (v, omega), constant, ticks in zip(
-            point.errors.white, point.errors.constant, problem.lengths, strict=True
-        )
-    ]
-    return JointFit(
-        JointStart(point.poses.reshape(-1, 3), tuple(errors)),
+    return Fit(
+        _start_of(problem, point),
         point.walk.place[:, -1],
         level * step.ends,
         _evidence(problem, point, step, weights),
@@ -298,10 +444,18 @@ def _fit(problem: JointProblem, point: _Point, step: FitStep, weights: Array, la
         np.sqrt(np.maximum(np.diagonal(step.inverse)[n3:], 0.0)),
         point.walk.place,
         problem,
+        linear,
     )
 
 
-def _evidence(problem: JointProblem, point: _Point, step: FitStep, weights: Array) -> float:
+def _start_of(problem: Problem, point: _Point) -> Start:
+    """Return the poses at tick 0 and the errors at `point`."""
+    parts = zip(point.errors.white, point.errors.constant, problem.lengths, strict=True)
+    errors = [Errors(v[:ticks], omega[:ticks], constant) for (v, omega), constant, ticks in parts]
+    return Start(point.poses.reshape(-1, 3), tuple(errors))
+
+
+def _evidence(problem: Problem, point: _Point, step: FitStep, weights: Array) -> float:
     """Return the log-likelihood of the ranges, with all unknowns integrated out, up to a constant.
 
     Outliers count by their bias.
@@ -309,7 +463,7 @@ def _evidence(problem: JointProblem, point: _Point, step: FitStep, weights: Arra
     noise, sigma, good = problem.noise, problem.sigma, weights > INLIER
     count = int(np.count_nonzero(good))
     volume = step.volume - float(np.sum(np.log(weighted_variance(sigma, weights)[~good])))
-    weight = -0.5 * (volume + math.log(2.0 * math.pi) * count)
+    weight = -0.5 * (volume - problem.log_information + math.log(2.0 * math.pi) * count)
     weight += misfit_log_likelihood(step.chi2, count - problem.free, noise)
     if noise.outliers or noise.strays:
         weight += count * math.log1p(-noise.outliers - noise.strays)

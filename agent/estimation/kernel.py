@@ -29,7 +29,8 @@ class _Measured(ctypes.Structure):
         *[(name, ctypes.c_longlong) for name in ("anchors", "radios", "scaled")],
         *[(name, ctypes.c_double) for name in ("period", "survey", "slow", "decay", "scale")],
         *[(name, Pointer) for name in ("v", "omega", "slip", "white", "patterns", "place", "rho", "effects")],
-        *[(name, Pointer) for name in ("mean", "information", "begin", "first", "second", "anchor", "radio")],
+        *[(name, Pointer) for name in ("mean", "information", "pivot")],
+        *[(name, Pointer) for name in ("begin", "first", "second", "anchor", "radio")],
     ]
 
 
@@ -80,7 +81,7 @@ class Kernel:
                 one.ctypes.data
                 for one in (
                     *(of.v, of.omega, of.slip, of.white, of.patterns, of.place, of.rho, of.common, of.mean),
-                    *(of.information, of.begin, of.first, of.second, of.anchor, of.radio),
+                    *(of.information, of.pivot, of.begin, of.first, of.second, of.anchor, of.radio),
                 )
             ],
         )

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.fit import JointFit
+from agent.estimation.fit import Fit
 from agent.estimation.gaussian.hypotheses import NEGLIGIBLE_PROBABILITY, SAME_SIGMAS
 
 MOST_JOINT = 12
@@ -26,7 +26,7 @@ class JointHypothesis(NamedTuple):
     """One possible explanation of all ranges of the located robots."""
 
     probability: float
-    fit: JointFit
+    fit: Fit
 
 
 class JointHypotheses(NamedTuple):
@@ -41,7 +41,7 @@ class JointHypotheses(NamedTuple):
 NO_HYPOTHESES = JointHypotheses(())
 
 
-def with_probability(fits: Sequence[JointFit]) -> tuple[JointHypothesis, ...]:
+def with_probability(fits: Sequence[Fit]) -> tuple[JointHypothesis, ...]:
     """Return the hypotheses for `fits`, likeliest first, without duplicates and without improbable ones."""
     best = max([one.weight for one in fits], default=0.0)
     probable = [one for one in fits if one.weight >= best + math.log(NEGLIGIBLE_PROBABILITY)]
@@ -50,13 +50,13 @@ def with_probability(fits: Sequence[JointFit]) -> tuple[JointHypothesis, ...]:
     return tuple([JointHypothesis(math.exp(one.weight - best) / total, one) for one in left])
 
 
-def _representative(fits: Sequence[JointFit]) -> list[JointFit]:
+def _representative(fits: Sequence[Fit]) -> list[Fit]:
     """Return the different ones of `fits`, the likeliest first: all in which a robot has a pose of its own.
 
     Of the others, which combine poses of likelier fits, they are the first ones. So no ambiguity of a robot
     is lost to the number of combinations of those of others.
     """
-    left: list[JointFit] = []
+    left: list[Fit] = []
     for one in fits:
         agreed = [same(one, other) for other in left]
         if any(all(each) for each in agreed):
@@ -67,7 +67,7 @@ def _representative(fits: Sequence[JointFit]) -> list[JointFit]:
     return left
 
 
-def same(one: JointFit, other: JointFit) -> list[bool]:
+def same(one: Fit, other: Fit) -> list[bool]:
     """Return for each robot whether two fits to the same facts have the same pose, within SAME_SIGMAS."""
     change = one.poses - other.poses
     change[:, 2] = np.remainder(change[:, 2] + math.pi, math.tau) - math.pi

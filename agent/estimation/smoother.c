@@ -33,7 +33,7 @@ typedef long long Index;
 typedef struct {
     Index robots, ticks, ranges, common, constant, anchors, radios, scaled;
     double period, survey, slow, decay, scale;
-    const double *v, *omega, *slip, *white, *patterns, *place, *rho, *effects, *mean, *information;
+    const double *v, *omega, *slip, *white, *patterns, *place, *rho, *effects, *mean, *information, *pivot;
     const Index *begin, *first, *second, *anchor, *radio;
 } Measured;
 
@@ -177,6 +177,16 @@ void walked(const Measured *of, const double *poses, const double *constants, co
         }
 }
 
+/* The derivatives of the start pose of robot `i` with respect to its unknowns. */
+static void basis_of(const Measured *of, const double *poses, Index i, double by[3][3])
+{
+    double x = poses[3 * i] - of->pivot[2 * i], y = poses[3 * i + 1] - of->pivot[2 * i + 1];
+    if (isnan(x)) x = y = 0.0;
+    const double c = cos(poses[3 * i + 2]), s = sin(poses[3 * i + 2]);
+    const double rows[3][3] = {{-c, s, -y}, {-s, -c, x}, {0.0, 0.0, 1.0}};
+    memcpy(by, rows, sizeof rows);
+}
+
 /* --- the forward pass ------------------------------------------------------------------------------- */
 
 static void moved(const Measured *of, const Walk *walk, Index i, Index k, Work *w)
@@ -233,7 +243,7 @@ static Row row_of(const Measured *of, const Walk *walk, Index j)
         row.at[3] = 3 * of->second[j] + 1; row.by[3] = -y;
         row.count = 4;
     }
-    if (of->radios) {
+    if (of->radios && of->radio[j] >= 0) {
         row.at[row.count] = 3 * of->robots + of->radio[j];
         row.by[row.count] = 1.0;
         row.count++;
@@ -255,8 +265,8 @@ static int measured(const Measured *of, const Walk *walk, Index j, double varian
         add(gain, row.by[t], w->p + row.at[t] * s, s);
     }
     for (Index e = 0; e < of->common; e++) {
-        const double by_scale = of->scale * (of->rho[j] - walk->residual[j]);
-        effect[3 * of->robots + e] += e == of->scaled ? by_scale : of->effects[j * of->common + e];
+        const double by_scale = of->scale * (of->rho[j] - walk->residual[j]), told = of->effects[j * of->common + e];
+        effect[3 * of->robots + e] += e == of->scaled && told != 0.0 ? by_scale : told;
     }
     if (of->anchor[j] >= 0)
         for (Index e = 0; e < 2; e++)
@@ -284,6 +294,32 @@ static void updated(const Measured *of, Index j, Work *w)
     }
 }
 
+/* Set the effects of the unknowns of the start poses on them, and what their priors tell. */
+static void begun(const Measured *of, const double *poses, Work *w)
+{
+    const Index n3 = 3 * of->robots, q = unknowns(of);
+    double by[3][3], *told = w->vector, *row = w->other;
+    for (Index i = 0; i < n3; i += 3) {
+        basis_of(of, poses, i / 3, by);
+        for (Index a = 0; a < 3; a++) memcpy(w->u + (i + a) * q + i, by[a], sizeof by[a]);
+    }
+    for (Index a = 0; a < n3; a++) {
+        told[a] = 0.0;
+        for (Index e = 0; e < n3; e++) told[a] += of->information[a * n3 + e] * (of->mean[e] - poses[e]);
+    }
+    for (Index a = 0; a < n3; a++) {
+        const Index i = a - a % 3;
+        memset(row, 0, sizeof(double) * n3);
+        for (Index d = i; d < i + 3; d++) {
+            w->gradient[a] += w->u[d * q + a] * told[d];
+            add(row, w->u[d * q + a], of->information + d * n3, n3);
+        }
+        for (Index e = 0; e < n3; e++)
+            for (Index d = e - e % 3; d < e - e % 3 + 3; d++)
+                w->information[a * q + e] += row[d] * w->u[d * q + e];
+    }
+}
+
 static int forward(
     const Measured *of, const Walk *walk, const double *poses, const double *variance, int update, Work *w)
 {
@@ -293,13 +329,7 @@ static int forward(
     memset(w->p, 0, sizeof(double) * s * s);
     memset(w->information, 0, sizeof(double) * q * q);
     memset(w->gradient, 0, sizeof(double) * q);
-    for (Index a = 0; a < n3; a++) {
-        w->u[a * q + a] = 1.0;
-        for (Index e = 0; e < n3; e++) {
-            w->information[a * q + e] = of->information[a * n3 + e];
-            w->gradient[a] += of->information[a * n3 + e] * (of->mean[e] - poses[e]);
-        }
-    }
+    begun(of, poses, w);
     for (Index a = n3; a < s; a++) w->p[a * s + a] = of->slow;
     for (Index a = n3; a < q; a++) w->information[a * q + a] = 1.0;
     for (Index k = 0; k <= of->ticks; k++) {
@@ -349,13 +379,16 @@ static int limited(const Measured *of, double largest, const double *change, Wor
 static double chi2_of(const Measured *of, const double *poses, const double *change, Work *w)
 {
     const Index n3 = 3 * of->robots, q = unknowns(of), size = estimated(of);
-    double chi2 = 0.0, *off = w->vector;
+    double chi2 = 0.0, by[3][3], *off = w->vector;
     for (Index j = 0; j < of->ranges; j++) {
         const double misfit = w->innovation[j] - dot(w->effects + j * q, change, size);
         chi2 += misfit * misfit / w->variance[j];
     }
     chi2 += dot(change + n3, change + n3, size - n3);
-    for (Index a = 0; a < n3; a++) off[a] = of->mean[a] - poses[a] - change[a];
+    for (Index i = 0; i < n3; i += 3) {
+        basis_of(of, poses, i / 3, by);
+        for (Index a = 0; a < 3; a++) off[i + a] = of->mean[i + a] - poses[i + a] - dot(by[a], change + i, 3);
+    }
     for (Index a = 0; a < n3; a++) chi2 += off[a] * dot(of->information + a * n3, off, n3);
     return chi2;
 }
@@ -443,6 +476,7 @@ static void slow_errors(const Measured *of, Work *w, Step *to)
     memset(after, 0, sizeof(double) * of->radios);
     for (Index k = 0; k <= of->ticks; k++) {
         for (Index j = of->begin[k]; j < of->begin[k + 1]; j++) {
+            if (of->radio[j] < 0) continue;
             before[of->radio[j]] += to->own[j];
             to->slow[j] += of->slow * before[of->radio[j]];
         }
@@ -450,6 +484,7 @@ static void slow_errors(const Measured *of, Work *w, Step *to)
     }
     for (Index k = of->ticks; k >= 0; k--) {
         for (Index j = of->begin[k + 1] - 1; j >= of->begin[k]; j--) {
+            if (of->radio[j] < 0) continue;
             to->slow[j] += of->slow * after[of->radio[j]];
             after[of->radio[j]] += to->own[j];
         }

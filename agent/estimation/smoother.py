@@ -7,8 +7,10 @@ the covariance P of the state is 0 at the start. So the cost is linear in ticks 
 each range the precision with which all others predict it.
 
 The state is x, y and heading of each robot, and then the slow error of each pair of radios. An unknown is a
-coordinate of a start pose, or a constant error in units of its prior's standard deviation. The constant
-errors are relative to 0, and the poses to the point at which the step begins.
+coordinate of a start pose, or a constant error in units of its prior's standard deviation. A start pose is
+expressed by its heading and by the position of a pivot, such as the robot's anchor, in the frame of the
+robot: then one of the three unknowns is a rotation about the pivot, of which ranges to it tell nothing. The
+constant errors are relative to 0, and the poses to the point at which the step begins.
 
 This is the text of `smoother.c`, which is what a fit calls (see `kernel`): both do the same operations in the
 same order, and their results are equal to the bit.
@@ -64,7 +66,7 @@ class Measured(NamedTuple):
     common: Array
     """effects in m of one sigma of each constant error on each range; (N, c)"""
     scaled: int
-    """the one of them that is proportional to the predicted range; -1 if there is none"""
+    """the one of them that is proportional to the predicted range, where it is not 0; -1: none"""
     scale: float
     """its effect on a range of 1 m"""
     anchor: Places
@@ -74,7 +76,7 @@ class Measured(NamedTuple):
     survey: float
     """standard deviation of each coordinate of them in m: considered, not estimated (Schmidt, 1966)"""
     radio: Places
-    """pair of radios of each range, whose slow errors are correlated; (N,)"""
+    """pair of radios of each range, whose slow errors are correlated; -1 of a range without; (N,)"""
     radios: int
     """number of pairs of radios with slow errors; 0 without them"""
     slow: float
@@ -85,6 +87,8 @@ class Measured(NamedTuple):
     """expected start poses in m and rad; (3 n,)"""
     information: Array
     """inverse of their covariance, 0 for what is not known; (3 n, 3 n)"""
+    pivot: Array
+    """the place of each robot's pivot in m; NaN for its start; (n, 2)"""
 
     @property
     def robots(self) -> int:
@@ -120,7 +124,7 @@ class FitStep(NamedTuple):
     """The result of a step; p unknowns are estimated."""
 
     change: Array
-    """change of the start poses, and the constant errors; (p,)"""
+    """change of the pivots in the robots' frames and of the headings, and the constant errors; (p,)"""
     limited: Array
     """the same with a change of no coordinate by more than a bound; (p,)"""
     inverse: Array
@@ -227,11 +231,7 @@ def forward(of: Measured, walk: Walk, poses: Array, variance: Array, *, update: 
     s, q = n3 + of.radios, of.size + 2 * of.anchors
     u, p, information = zeros(s, q), zeros(s, s), zeros(q, q)
     gradient = [0.0] * q
-    for a in range(n3):
-        u[a][a] = 1.0
-        for e in range(n3):
-            information[a][e] = of.information[a, e]
-            gradient[a] += of.information[a, e] * (of.mean[e] - poses[e])
+    _begun(of, poses, u, information, gradient)
     for a in range(n3, s):
         p[a][a] = of.slow
     for a in range(n3, q):
@@ -247,6 +247,34 @@ def forward(of: Measured, walk: Walk, poses: Array, variance: Array, *, update: 
             if update:
                 _updated(found, j)
     return found
+
+
+def basis_of(of: Measured, poses: Array, i: int) -> Matrix:
+    """Return the derivatives of the start pose of robot `i` with respect to its unknowns."""
+    x, y, heading = poses[3 * i : 3 * i + 3].tolist()
+    x, y = x - of.pivot[i, 0], y - of.pivot[i, 1]
+    if math.isnan(x):
+        x, y = 0.0, 0.0
+    c, s = math.cos(heading), math.sin(heading)
+    return [[-c, s, -y], [-s, -c, x], [0.0, 0.0, 1.0]]
+
+
+def _begun(of: Measured, poses: Array, u: Matrix, information: Matrix, gradient: Vector) -> None:
+    """Set the effects of the unknowns of the start poses on them, and what their priors tell."""
+    n3 = 3 * of.robots
+    off = [of.mean[e] - poses[e] for e in range(n3)]
+    told = [dot(of.information[a].tolist(), off) for a in range(n3)]
+    for i in range(0, n3, 3):
+        for a, row in enumerate(basis_of(of, poses, i // 3)):
+            u[i + a][i : i + 3] = row
+    for a in range(n3):
+        row, i = [0.0] * n3, a - a % 3
+        for d in range(i, i + 3):
+            gradient[a] += u[d][a] * told[d]
+            add(row, u[d][a], of.information[d].tolist())
+        for e in range(n3):
+            for d in range(e - e % 3, e - e % 3 + 3):
+                information[a][e] += row[d] * u[d][e]
 
 
 def _moved(of: Measured, walk: Walk, i: int, k: int, found: Passed) -> None:
@@ -294,7 +322,7 @@ def _row(of: Measured, walk: Walk, j: int) -> list[tuple[int, float]]:
     row = [(3 * of.first[j], x), (3 * of.first[j] + 1, y)]
     if of.second[j] >= 0:
         row += [(3 * of.second[j], -x), (3 * of.second[j] + 1, -y)]
-    if of.radios:
+    if of.radios and of.radio[j] >= 0:
         row.append((3 * of.robots + of.radio[j], 1.0))
     return row
 
@@ -308,8 +336,8 @@ def _measured(of: Measured, walk: Walk, j: int, variance: float, found: Passed) 
         add(effect, h, found.u[a])
         add(gain, h, found.p[a])
     for e in range(len(of.common[j])):
-        by_scale = of.scale * (of.rho[j] - walk.residual[j])
-        effect[3 * of.robots + e] += by_scale if e == of.scaled else of.common[j, e]
+        by_scale, told = of.scale * (of.rho[j] - walk.residual[j]), of.common[j, e]
+        effect[3 * of.robots + e] += by_scale if e == of.scaled and told != 0.0 else told
     if of.anchor[j] >= 0:
         for e in range(2):
             effect[of.size + 2 * of.anchor[j] + e] -= of.survey * walk.direction[j, e]
@@ -408,7 +436,10 @@ def _chi2(of: Measured, passed: Passed, poses: Array, change: Vector) -> float:
         misfit = passed.innovation[j] - dot(effect[: of.size], change)
         chi2 += misfit * misfit / passed.variance[j]
     chi2 += dot(change[n3:], change[n3:])
-    off = [of.mean[a] - poses[a] - change[a] for a in range(n3)]
+    off = []
+    for i in range(of.robots):
+        for a, row in enumerate(basis_of(of, poses, i), 3 * i):
+            off.append(of.mean[a] - poses[a] - dot(row, change[3 * i : 3 * i + 3]))
     for a in range(n3):
         chi2 += off[a] * dot(of.information[a].tolist(), off)
     return chi2
@@ -500,13 +531,15 @@ def _slow_errors(of: Measured, own: Vector) -> Vector:
         return found
     for k in range(of.ticks + 1):
         for j in range(of.begin[k], of.begin[k + 1]):
-            before[of.radio[j]] += own[j]
-            found[j] += of.slow * before[of.radio[j]]
+            if of.radio[j] >= 0:
+                before[of.radio[j]] += own[j]
+                found[j] += of.slow * before[of.radio[j]]
         scale(before, of.decay)
     for k in range(of.ticks, -1, -1):
         for j in range(of.begin[k + 1] - 1, of.begin[k] - 1, -1):
-            found[j] += of.slow * after[of.radio[j]]
-            after[of.radio[j]] += own[j]
+            if of.radio[j] >= 0:
+                found[j] += of.slow * after[of.radio[j]]
+                after[of.radio[j]] += own[j]
         scale(after, of.decay)
     return found
 

@@ -17,7 +17,7 @@ from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis
 from agent.estimation.gaussian.inference import MANY_MUTUAL_RANGES, PlanningHypothesis
 from agent.estimation.gaussian.odometry_noise import Track
-from agent.estimation.gaussian.range_model import PairRanges
+from agent.estimation.gaussian.pair_ranges import PairRanges
 from agent.planning import active_sensing, exchange, phase2_orbit, range_seeking, transitions
 from agent.planning.active_sensing import CONTINUED, STALLED, Listening, Objective, Retreating, Surveying
 from agent.planning.assured import AssuredExact

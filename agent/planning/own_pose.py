@@ -17,7 +17,7 @@ from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, consi
 from agent.estimation.gaussian.contact_fit import is_definite
 from agent.estimation.gaussian.hypotheses import Hypothesis, ScoredHypothesis, follow, search
 from agent.estimation.gaussian.inference import PlanningHypothesis
-from agent.estimation.gaussian.range_model import PairRanges
+from agent.estimation.gaussian.pair_ranges import PairRanges
 from agent.planning import sweep
 from agent.planning.group_state import GroupState
 from agent.planning.state import RobotState
@@ -99,7 +99,7 @@ def beacon_place(state: GroupState) -> Place:
     scored = follow(pair.belief.pair, measured)
     if not scored:
         return pair.config.peer_anchor.x, pair.config.peer_anchor.y
-    poses = inference.pair_planning_hypotheses(scored[:1], measured)[0].poses
+    poses = inference.pair_planning_hypotheses(scored[:1])[0].poses
     first = 3 * (1 - _index(pair))
     x, y = poses[first : first + 2].tolist()
     return pair.config.m1.x + x, pair.config.m1.y + y
@@ -129,7 +129,7 @@ def _estimate(state: GroupState, *, searched: bool) -> _Estimate | None:
     pair, fitted = state.pair, _fitted(state, searched=searched)
     if not fitted.scored:
         return None
-    hypothesis = inference.pair_planning_hypotheses(fitted.scored[:1], fitted.measured)[0]
+    hypothesis = inference.pair_planning_hypotheses(fitted.scored[:1])[0]
     local, covariance = inference.claim(hypothesis, _index(pair), fitted.measured)
     pose = Pose(pair.config.m1.x + local.x, pair.config.m1.y + local.y, local.heading)
     return _Estimate(fitted, hypothesis, pose, covariance)

@@ -21,7 +21,7 @@ from agent.estimation.gaussian.consistency import (
 )
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis, follow, search
 from agent.estimation.gaussian.inference import PlanningHypothesis
-from agent.estimation.gaussian.range_model import PairRanges
+from agent.estimation.gaussian.pair_ranges import PairRanges
 from agent.estimation.knowledge import Belief, Knowledge
 from agent.planning.state import Done, RobotState
 from protocol.messages import Localised
@@ -87,7 +87,7 @@ def weighed(
 ) -> PairInference:
     """Return the hypotheses `scored` with the belief that follows from them."""
     mission = state.config.mission
-    hypotheses = inference.pair_planning_hypotheses(scored, pair)
+    hypotheses = inference.pair_planning_hypotheses(scored)
     belief = inference.with_pair(state, scored, hypotheses, pair, required_mutual_ranges(mission))
     return PairInference(
         scored, hypotheses, inference.with_evidence_check(belief, scored, pair, mission), searched

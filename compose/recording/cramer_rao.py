@@ -11,12 +11,12 @@ import math
 
 import numpy as np
 
-from agent.estimation.gaussian.fitted_poses import deviation, poses
-from agent.estimation.gaussian.least_squares import fit
 from agent.estimation.gaussian.odometry_noise import Track, track
+from agent.estimation.gaussian.pair_ranges import PairRanges
 from agent.estimation.gaussian.range_model import Ranges
+from agent.estimation.gaussian.reachable_accuracy import position_sigmas
 from compose.recording.run import Run
-from protocol.motion import REST, Pose, relative
+from protocol.motion import REST, Pose
 from world.sensors import anchor_ranges
 
 
@@ -48,17 +48,19 @@ def position_bounds(run: Run, pair: tuple[int, int], tick: int) -> tuple[float, 
         contact = at.world.contacts.get((min(pair), max(pair)))
         if contact is not None and contact.range is not None:
             mutual.append((truth.tick, _apart(truth.poses[pair[0]], truth.poses[pair[1]])))
-    tracks, guess = [], []
-    for place, anchor in zip(pair, anchors, strict=True):
-        tracks.append(_driven(run, place, tick))
-        start = ticks[0].truth.poses[place]
-        seen = relative(start, Pose(anchor.x, anchor.y, 0.0))
-        guess += [seen.x, seen.y, start.heading]
     apart = (anchors[1].x - anchors[0].x, anchors[1].y - anchors[0].y)
-    exact = Ranges.of_lists(own[0], own[1], mutual, noise)
-    at_truth = fit(np.array(guess), tracks, exact, noise.as_told, apart, 0)
-    covariance = poses(at_truth, apart)[1]
-    a, b = (deviation(covariance[i, i] + covariance[i + 1, i + 1]) for i in (0, 3))
+    nothing, tracks = np.empty(0, np.intp), [_driven(run, place, tick) for place in pair]
+    measured = PairRanges(
+        (tracks[0], tracks[1]),
+        Ranges.of_lists(own[0], own[1], mutual, noise),
+        (nothing, nothing, nothing),
+        apart,
+        scenario.mission.sensing_range,
+        noise.as_told,
+    )
+    starts = [ticks[0].truth.poses[place] for place in pair]
+    relative = [(pose.x - anchors[0].x, pose.y - anchors[0].y, pose.heading) for pose in starts]
+    a, b = position_sigmas(measured, np.array(relative))
     return a, b
 
 

@@ -23,7 +23,7 @@ OF_HEADING = 3
 
 
 def beacon_guesses(robot: AnchoredRobot) -> list[Array]:
-    """Return likely guesses in the layout of `range_model.predicted`, each with shape (3,).
+    """Return likely guesses in the layout of `known_anchors.predicted`, each with shape (3,).
 
     They contain the place of the origin in the frame of the odometry, and the rotation of this frame in <W>.
     """

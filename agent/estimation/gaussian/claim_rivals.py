@@ -14,15 +14,15 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from msgspec.structs import replace
 
-from agent.estimation.gaussian.fitted import Fit
-from agent.estimation.gaussian.fitted_poses import last_poses
+from agent.estimation.fit import Fit, HeldFit, held_fit
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis
 from agent.estimation.gaussian.inference import PlanningHypothesis, to_second_order
-from agent.estimation.gaussian.least_squares import HeldFit, held_fits
-from agent.estimation.gaussian.linear_model import Problem
+from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges
 from agent.estimation.gaussian.odometry_noise import Array
-from agent.estimation.gaussian.range_model import PairRanges, Ranges
+from agent.estimation.gaussian.pair_ranges import PairRanges
+from agent.estimation.smoother import Singular
 from protocol.mission import Mission
 
 WRONG_SIGMAS = 5.0
@@ -70,53 +70,47 @@ def likeliest_rival(
         i = 3 * robot
         variances, axes = np.linalg.eigh(covariance[i : i + 2, i : i + 2])
         along, far = axes[:, 1], WRONG_SIGMAS * math.sqrt(float(np.sum(variances)))
-        place = claimed.poses[i : i + 2] - robot * np.array(pair.apart)
-        anchor = place - FAR_ANCHOR * pair.sensing_range * along
-        held, row = _holding(pair, robot, anchor, math.hypot(*(place - anchor)), HOLDING_SIGMA * far)
-        (here,) = held_fits(held, fitted, row, np.zeros(1), 0)
-        there = held_fits(held, fitted, row, np.array((far, -far)), HELD_STEPS)
+        place = claimed.poses[i : i + 2]
+        here, *there = [
+            _held(_holding(pair, robot, place, along, offset, HOLDING_SIGMA * far), fitted, steps)
+            for offset, steps in ((0.0, 0), (far, HELD_STEPS), (-far, HELD_STEPS))
+        ]
         best = max(there, key=lambda one: one.log_likelihood)
-        rivals.append(_rival(robot, best, best.log_likelihood - here.log_likelihood, claimed, pair))
+        ratio = best.log_likelihood - here.log_likelihood
+        probability = math.exp(min(ratio, 0.0))
+        poses = PlanningHypothesis(probability, best.poses.ravel(), claimed.covariance)
+        rivals.append(Rival(robot, ratio, poses))
     return max(rivals, key=lambda one: one.log_likelihood_ratio)
 
 
-def _rival(
-    robot: int, held: HeldFit, log_likelihood_ratio: float, claimed: PlanningHypothesis, pair: PairRanges
-) -> Rival:
-    """Return the rival of the claim of `robot` whose poses are those of the fit `held`."""
-    mean = last_poses(held.guess, held.paths, pair.apart)
-    probability = math.exp(min(log_likelihood_ratio, 0.0))
-    return Rival(robot, log_likelihood_ratio, PlanningHypothesis(probability, mean, claimed.covariance))
+def _held(measured: JointMeasurements, fitted: Fit, steps: int) -> HeldFit:
+    """Return a fit with a held coordinate; as likely as can be if a number is too large for a float."""
+    try:
+        return held_fit(measured, fitted, steps)
+    except Singular:
+        return HeldFit(math.inf, fitted.poses)
 
 
-def _holding(pair: PairRanges, robot: int, anchor: Array, rho: float, sigma: float) -> tuple[Problem, int]:
-    """Return the problem of `pair` with one more range, which holds a coordinate of a robot, and its row.
+def _holding(
+    pair: PairRanges, robot: int, place: Array, along: Array, offset: float, sigma: float
+) -> JointMeasurements:
+    """Return the measurements of `pair` with one more range, which holds a coordinate of a robot.
 
-    It is one of the last tick to an `anchor` far away, whose position (m) is relative to the robot's own. No
-    error that ranges have in common affects it.
+    It is one of the last tick to an anchor far away: the robot is `offset` (m) beside `place` in the
+    direction `along`, within `sigma` (m). No error that ranges have in common affects it.
     """
-    ranges, noise = pair.ranges, pair.noise
-    row = sum(ranges.counts[: robot + 1])
-    first, second, mutual = [count + (kind == robot) for kind, count in enumerate(ranges.counts)]
-    anchors = np.zeros((len(ranges.rho) + 1, 2))
-    anchors[row] = anchor
-    held = Ranges(
-        np.insert(ranges.rho, row, rho),
-        np.insert(ranges.tick, row, len(pair.paths[robot].v)),
-        np.insert(ranges.sigma, row, sigma),
-        (first, second, mutual),
-        anchors,
-        np.insert(np.repeat(np.arange(3), ranges.counts), row, 3),
+    away, measured = FAR_ANCHOR * pair.sensing_range, pair.measured
+    anchor = place - away * along
+    more = JointRanges(
+        np.array([away + offset]),
+        np.array([len(pair.paths[robot].v)]),
+        np.array([sigma]),
+        np.array([robot]),
+        np.array([-1]),
+        anchor[None],
+        np.array([-1]),
     )
-    problem = Problem.of(pair.paths, held, noise, pair.apart)
-    common, slow = np.insert(ranges.common_errors(noise.priors), row, 0.0, 0), problem.slow
-    scale = problem.scale
-    if scale is not None:
-        scale[row] = 0.0
-    if slow is not None:
-        slow = slow.copy()
-        slow[row] = slow[:, row] = 0.0
-    return problem._replace(common=common, scale=scale, slow=slow), row
+    return replace(measured, ranges=measured.ranges.then(more))
 
 
 def blocking_rival(
@@ -131,7 +125,7 @@ def blocking_rival(
     A rival may be as likely as other hypotheses may be probable: 1 - confidence.
     """
     rival = likeliest_rival(scored[0].fit, pair, claimed, robots)
-    return rival if rival.log_likelihood_ratio > _allowed_ratio(mission) else None
+    return None if rival.log_likelihood_ratio <= _allowed_ratio(mission) else rival
 
 
 def _allowed_ratio(mission: Mission) -> float:

@@ -9,12 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian.fitted import Fit
-from agent.estimation.gaussian.least_squares import own_fit
+from agent.estimation.fit import Fit
+from agent.estimation.gaussian.evidence import own_fit
 from agent.estimation.gaussian.noise_level import INLIER
-from agent.estimation.gaussian.range_model import PairRanges
+from agent.estimation.gaussian.pair_ranges import PairRanges
 from protocol.messages import Inconsistent
-from protocol.motion import rotated
 from protocol.noise import Noise
 
 CLAIM_P_VALUE = 1e-3
@@ -101,7 +100,7 @@ def consistency_test(fitted: Fit, pair: PairRanges, robot: int) -> Inconsistency
     learned = pair.noise.sigma_degrees > 0.0 and p_value < LEARNED_P_VALUE
     own = None
     if learned or fitted.inliers < count:  # the own ranges, without the peer's reports
-        own = own_fit(fitted, robot, pair.paths, pair.ranges, pair.noise)
+        own = own_fit(fitted, robot, pair)
     if learned and own is not None:
         p_value, misfit = _against_own(fitted, own, pair.noise)
     what = (
@@ -272,18 +271,10 @@ def _normal(chi2: float, free: int) -> float:
 
 def _distance_score(fitted: Fit, pair: PairRanges) -> float:
     """Return by how many sigmas the ranges favour another distance of the anchors (score test, Rao 1948)."""
-    mutual = pair.ranges.rows(2)
-    length = math.hypot(*pair.apart)
-    c, s = math.cos(fitted.guess[2]), math.sin(fitted.guess[2])
-    ux, uy = fitted.directions[0][:, mutual]  # from b to a, in the frame of a's odometry
-    by_distance = np.zeros(len(fitted.residuals))
-    along, across = rotated(c, s, ux, uy)
-    by_distance[mutual] = -(along * pair.apart[0] + across * pair.apart[1]) / length
-    system = fitted.system
-    weighted = system.covariance.solve(by_distance[:, None])[:, 0]
-    explained = system.jacobian.T @ weighted
-    information = float(by_distance @ weighted - explained @ system.of_guess @ explained)
-    score = float(by_distance @ system.multipliers)
+    of, walk = fitted.problem.measured, fitted.linear.walk
+    x, y = walk.direction.T  # of a from b, which moves with M2
+    along = (x * pair.apart[0] + y * pair.apart[1]) / math.hypot(*pair.apart)
+    score, information = fitted.linear.score(np.where(of.second >= 0, -along, 0.0))
     level = max(min(fitted.level, HIGHEST_LEVEL), 1.0)
     surveyed = 2.0 * pair.noise.priors.survey_error**2  # the variance of the known distance
     if information <= LEAST_INFORMATION:

@@ -16,11 +16,10 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from agent.estimation.fit import JointFit, JointStart, joint_fits
+from agent.estimation.fit import Fit, Start, deviation, fits
 from agent.estimation.gaussian.beacon_guesses import beacon_guesses
 from agent.estimation.gaussian.claim_rivals import WRONG_SIGMAS
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, EARLY_CLAIM_P_VALUE, chi2_p_value
-from agent.estimation.gaussian.fitted_poses import deviation
 from agent.estimation.gaussian.joint_claims import blocking_reason
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges, PosePrior
 from agent.estimation.gaussian.known_anchors import FEWEST_FOR_POSE, AnchoredRobot, scored_fits, start_of
@@ -87,13 +86,13 @@ def estimated(contact: ContactRanges, mission: Mission) -> ContactEstimate | Non
     measured = _measured(contact, mission)
     if len(measured.ranges.rho) < FEWEST_FOR_POSE:
         return None
-    found = with_probability(joint_fits(measured, _starts(measured, mission)))
+    found = with_probability(fits(measured, _starts(measured, mission)))
     if not found:
         return None
     level = found[0].fit.level
     if abs(level - 1.0) > SAME_LEVEL:  # the level is that of these measurements, not of the finder's pose
         measured = _with_level(measured, level)
-        found = with_probability(joint_fits(measured, [one.fit.start for one in found]))
+        found = with_probability(fits(measured, [one.fit.start for one in found]))
     estimate = _estimate(found, measured, mission) if found else None
     return estimate if estimate is not None and _is_sendable(estimate) else None
 
@@ -141,7 +140,7 @@ def _measured(contact: ContactRanges, mission: Mission) -> JointMeasurements:
     return measured.thinned(mission.sensing_range)
 
 
-def _starts(measured: JointMeasurements, mission: Mission) -> list[JointStart]:
+def _starts(measured: JointMeasurements, mission: Mission) -> list[Start]:
     """Return the poses from which fits begin: intersections of the circles about the finder's places."""
     ranges, path, prior = measured.ranges, measured.paths[FINDER], measured.prior
     assert prior is not None
@@ -156,7 +155,7 @@ def _starts(measured: JointMeasurements, mission: Mission) -> list[JointStart]:
     for one in scored_fits(robot, list(map(start_of, beacon_guesses(robot)))):
         poses = np.stack((prior.mean[FINDER], one.fit.start.poses[0]))
         nothing = Errors(np.zeros(0), np.zeros(0), np.zeros(0))
-        starts.append(JointStart(poses, (nothing, *one.fit.start.errors)))
+        starts.append(Start(poses, (nothing, *one.fit.start.errors)))
     return starts
 
 
@@ -210,7 +209,7 @@ EARLY_FREEDOM = 13
 """The degrees of freedom below which EARLY_CLAIM_P_VALUE applies: those of 16 ranges, as in pairs."""
 
 
-def _rival(best: JointFit, measured: JointMeasurements, mission: Mission) -> str:
+def _rival(best: Fit, measured: JointMeasurements, mission: Mission) -> str:
     """Return why poses that would make a claim wrong are likely, or an empty text; see `claim_rivals`.
 
     They are fits in which the start of this robot is held, to either side along the longest axis.
@@ -228,8 +227,8 @@ def _rival(best: JointFit, measured: JointMeasurements, mission: Mission) -> str
         held = replace(measured, prior=PosePrior(mean, information, prior.rank + 1))
         poses = best.start.poses.copy()
         poses[OWN, :2] = mean[OWN, :2]
-        fits = joint_fits(held, [JointStart(poses, best.start.errors)])
-        weights += [one.weight for one in fits] or [math.inf]
+        found = fits(held, [Start(poses, best.start.errors)])
+        weights += [one.weight for one in found] or [math.inf]
     ratio, most = max(weights[1:]) - weights[0], math.log1p(-mission.confidence)
     if ratio <= most:
         return ""
@@ -239,10 +238,10 @@ def _rival(best: JointFit, measured: JointMeasurements, mission: Mission) -> str
     )
 
 
-def _doubt(best: JointFit, measured: JointMeasurements) -> str:
+def _doubt(best: Fit, measured: JointMeasurements) -> str:
     """Return which profile explains the measurements much better than the given noise, or an empty text."""
     for name, other in claim_profiles(measured.noise):
-        fits = joint_fits(replace(measured, noise=other), [JointStart(best.start.poses)])
-        if any(again.weight - best.weight > DOUBTFUL_CLAIM for again in fits):
+        found = fits(replace(measured, noise=other), [Start(best.start.poses)])
+        if any(again.weight - best.weight > DOUBTFUL_CLAIM for again in found):
             return f"the profile '{name}' explains the ranges and the odometry of both robots better"
     return ""

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from agent.estimation.gaussian.fitted import Fit
-from agent.estimation.gaussian.fitted_poses import deviation
+from agent.estimation.fit import Fit, deviation
 from agent.estimation.gaussian.odometry_noise import Array, Places
-from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, placed
+from agent.estimation.gaussian.pair_ranges import PairRanges
+from agent.estimation.gaussian.range_model import SIGMA_FLOOR
 from protocol.motion import rotated_back
 from protocol.noise import Noise
 
@@ -30,8 +30,8 @@ def _mutual_log_likelihood(one: Fit, pair: PairRanges) -> float:
     silent = pair.silent[2]
     if not len(silent):
         return 0.0
-    (wx, wy), (vx, vy) = (placed(one.guess[3 * r : 3 * r + 3], one.paths[r], silent) for r in (0, 1))
-    dx, dy = wx - vx - pair.apart[0], wy - vy - pair.apart[1]
+    (wx, wy), (vx, vy) = (one.places(robot, silent) for robot in (0, 1))
+    dx, dy = wx - vx, wy - vy
     distance = np.hypot(dx, dy)
     k = int(np.argmin(distance))
     beyond = distance - pair.sensing_range
@@ -39,12 +39,13 @@ def _mutual_log_likelihood(one: Fit, pair: PairRanges) -> float:
         return 0.0
     nx, ny = dx[k] / max(distance[k], SIGMA_FLOOR), dy[k] / max(distance[k], SIGMA_FLOOR)
     gradient = np.empty(6)
-    for robot, (x, y), sign in ((0, (wx[k], wy[k]), 1.0), (1, (vx[k], vy[k]), -1.0)):
-        theta = one.guess[3 * robot + 2]
+    beside = (vx[k] - pair.apart[0], vy[k] - pair.apart[1])
+    for robot, (x, y), sign in ((0, (wx[k], wy[k]), 1.0), (1, beside, -1.0)):
+        theta = one.start.poses[robot, 2]
         c, s = math.cos(theta), math.sin(theta)
         along, across = rotated_back(c, s, nx, ny)
         gradient[3 * robot : 3 * robot + 3] = (-sign * along, -sign * across, sign * (ny * x - nx * y))
-    sigma = math.hypot(deviation(float(gradient @ one.covariance @ gradient)), EDGE * pair.sensing_range)
+    sigma = math.hypot(deviation(float(gradient @ one.of_start @ gradient)), EDGE * pair.sensing_range)
     return no_detection_log_likelihood(beyond, sigma, pair.noise.drop_outs)
 
 
@@ -53,18 +54,19 @@ def anchor_log_likelihood(
 ) -> float:
     """Return the log-likelihood of detections by the anchor at `ranged`, and of none at `silent` (ticks)."""
     columns = slice(3 * robot, 3 * robot + 2)
-    place = one.covariance[columns, columns]
-    mx, my = one.guess[columns]
-    path, weight = one.paths[robot], 0.0
+    place, weight = one.of_start[columns, columns], 0.0
+    anchor, turn = one.problem.measured.pivot[robot], one.start.poses[robot, 2]
+    c, s = math.cos(turn), math.sin(turn)
     for ticks, sign in ((silent, 1.0), (ranged, -1.0)):
         if not len(ticks):
             continue
-        x, y = path.x[ticks] - mx, path.y[ticks] - my
+        x, y = one.places(robot, ticks) - anchor[:, None]
         beyond = sign * (np.hypot(x, y) - sensing_range)
         worst = int(np.argmin(beyond))
         if beyond[worst] > CLEAR * sensing_range:
             continue
-        u = np.array((x[worst], y[worst])) / max(math.hypot(x[worst], y[worst]), SIGMA_FLOOR)
+        along = np.array(rotated_back(c, s, x[worst], y[worst]))
+        u = along / max(math.hypot(x[worst], y[worst]), SIGMA_FLOOR)
         sigma = math.hypot(deviation(float(u @ place @ u)), EDGE * sensing_range)
         if sign > 0.0:
             weight += no_detection_log_likelihood(beyond, sigma, noise.drop_outs)

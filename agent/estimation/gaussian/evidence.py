@@ -8,10 +8,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from agent.estimation.gaussian.fitted import Fit
-from agent.estimation.gaussian.least_squares import own_fit
+from agent.estimation.fit import Fit, Start, fits
 from agent.estimation.gaussian.odometry_noise import Track
-from agent.estimation.gaussian.range_model import PairRanges, Ranges
+from agent.estimation.gaussian.pair_ranges import PairRanges
+from agent.estimation.gaussian.range_model import Ranges
+from agent.estimation.smoother import Singular
 
 
 def anchor_evidence(one: Fit, path: Track, ranges: Ranges, sensing_range: float) -> float:
@@ -22,8 +23,21 @@ def anchor_evidence(one: Fit, path: Track, ranges: Ranges, sensing_range: float)
     (see `_log_widths`).
     """
     prior = math.log(math.pi * sensing_range**2)
-    volume = math.log(2.0 * math.pi) + 0.5 * one.log_volume
-    return one.log_likelihood + volume - prior + _log_widths((path,), ranges, sensing_range)
+    return one.weight + math.log(2.0 * math.pi) - prior + _log_widths((path,), ranges, sensing_range)
+
+
+@lru_cache(maxsize=4)
+def own_fit(joint: Fit, robot: int, pair: PairRanges) -> Fit:
+    """Return the fit of one robot (0 or 1) to its own anchor alone, which begins at that of both robots.
+
+    Raises Singular if a number is too large for a float.
+    """
+    guess, measured = joint.guess[3 * robot : 3 * robot + 2], pair.of(robot)
+    start = Start(np.array([[-guess[0], -guess[1], 0.0]]), joint.start.errors[robot : robot + 1])
+    found = fits(measured, [start])
+    if not found:
+        raise Singular("the ranges to one anchor have no fit")
+    return found[0]
 
 
 @lru_cache(maxsize=2)
@@ -32,12 +46,8 @@ def mutual_evidence(one: Fit, pair: PairRanges) -> float:
 
     It is that of `anchor_evidence`, given the ranges to the anchors. All headings are equally probable.
     """
-    weight = one.log_likelihood + 0.5 * one.log_volume - math.log(2.0 * math.pi)
-    for robot in (0, 1):
-        own = own_fit(one, robot, pair.paths, pair.ranges, pair.noise)
-        weight -= own.log_likelihood + 0.5 * own.log_volume
-        for others in pair.ranges.to_others(robot):
-            weight += _log_widths((pair.paths[robot],), others, pair.sensing_range)
+    weight = one.weight - math.log(2.0 * math.pi)
+    weight -= sum([own_fit(one, robot, pair).weight for robot in (0, 1)])
     return weight + _log_widths(pair.paths, pair.ranges.only(2), pair.sensing_range)
 
 

@@ -79,7 +79,7 @@ class GaussianEstimator(msgspec.Struct, frozen=True):
         if known_through < knowledge.tick or pair.ranges.counts[2] < FEWEST_MUTUAL_RANGES:
             return None
         scored = search(pair)
-        hypotheses = inference.pair_planning_hypotheses(scored, pair)
+        hypotheses = inference.pair_planning_hypotheses(scored)
         belief = inference.with_pair(knowledge, scored, hypotheses, pair, required_ranges)
         belief = inference.with_convergence_check(belief, scored)
         belief = inference.with_doubt_check(belief, scored, pair)

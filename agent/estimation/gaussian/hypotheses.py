@@ -14,20 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.fit import FIT_STEPS
+from agent.estimation.fit import Ending, Fit, Start, fits, without_outliers
 from agent.estimation.gaussian.anchor_guesses import MOST_FOLLOWED, SEED_RANGES, UNLIKELY, anchors
 from agent.estimation.gaussian.detections import anchor_log_likelihood, detection_log_likelihood
-from agent.estimation.gaussian.fitted import Fit
-from agent.estimation.gaussian.least_squares import (
-    COARSE_STILL,
-    WARM_DECREASE,
-    fits,
-    without_outliers,
-)
-from agent.estimation.gaussian.linear_model import Start
-from agent.estimation.gaussian.odometry_noise import Errors, Places, Track
+from agent.estimation.gaussian.odometry_noise import Array, Errors, Places, Track
+from agent.estimation.gaussian.pair_ranges import PairRanges, alone
 from agent.estimation.gaussian.placement_guesses import STARTS, placements
-from agent.estimation.gaussian.range_model import PairRanges, Ranges
+from agent.estimation.gaussian.range_model import Ranges
 from protocol.noise import Noise
 
 NEGLIGIBLE_PROBABILITY = 1e-7
@@ -49,37 +42,44 @@ Where the best fit has not converged by then, it may be on its way to another mo
 With one step, that is every third tick; with more, each tick takes longer."""
 
 
+COARSE_STILL = 0.05
+"""The `Ending.shortest` of fits on which only the robot's way depends.
+
+No claim does: each search fits all ranges again. With LAST_STEP, such a fit takes twice as long.
+"""
+
+WARM_DECREASE = 0.1
+"""The expected decrease of the first step of a fit that begins at the last one, which has one range less."""
+
+
 class Hypothesis(NamedTuple):
     """One possible explanation of all measurements."""
 
-    guess: tuple[float, ...]
-    """The fitted guess, in the layout of `range_model.predict`.
-
-    It contains for each robot the position of its anchor in the frame of its odometry, and the rotation of
-    this frame in <W>.
-    """
+    poses: tuple[tuple[float, ...], ...]
+    """The fitted pose of each robot at tick 0 in m and rad, relative to M1."""
     probability: float
     """The probability that this hypothesis is true; the probabilities of all remaining ones sum to 1."""
     errors: tuple[tuple[tuple[float, ...], ...], ...] = ()
     """The odometry errors of each robot by its fit, in the order of `Errors`, where the next one begins.
 
-    A fit that began on the measured path again could end in another mode. Empty if odometry is exact.
+    A fit that began on the measured path again could end in another mode.
     """
     covariance: tuple[tuple[float, ...], ...] = ()
-    """The covariance of the guess by its fit."""
+    """The covariance of `Fit.guess`."""
 
     @property
     def start(self) -> Start:
         """Return where the next fit begins."""
         errors = [Errors(*map(np.array, error)) for error in self.errors]
-        return Start(np.array(self.guess), tuple(errors))
+        return Start(np.array(self.poses), tuple(errors))
 
     @staticmethod
     def of_fit(one: Fit, probability: float) -> Hypothesis:
         """Return the hypothesis of a fit."""
-        errors = [tuple([tuple(part.tolist()) for part in error]) for error in one.errors]
-        covariance = tuple([tuple(row) for row in one.covariance.tolist()])
-        return Hypothesis(tuple(one.guess.tolist()), probability, tuple(errors), covariance)
+        errors = [tuple([tuple(part.tolist()) for part in error]) for error in one.start.errors]
+        covariance = tuple([tuple(row) for row in one.of_start.tolist()])
+        poses = tuple([tuple(pose) for pose in one.start.poses.tolist()])
+        return Hypothesis(poses, probability, tuple(errors), covariance)
 
 
 class ScoredHypothesis(NamedTuple):
@@ -96,10 +96,7 @@ def with_probability(found: Sequence[tuple[Fit, float]]) -> tuple[ScoredHypothes
 
     Each fit is paired with the log-likelihood of its detections and of its ticks without one.
     """
-    scored = [
-        (one.log_likelihood + 0.5 * one.log_volume + max(silent, LEAST_EVIDENCE), one, silent)
-        for one, silent in found
-    ]
+    scored = [(one.weight + max(silent, LEAST_EVIDENCE), one, silent) for one, silent in found]
     scored.sort(key=lambda one: -one[0])
     left: list[tuple[float, Fit, float]] = []
     for weight, one, silent in scored:
@@ -123,9 +120,8 @@ R may not be as it was told, and detection may fade with range. So they never su
 
 def _same(one: Fit, other: Fit) -> bool:
     change = one.guess - other.guess
-    change[2::3] = np.remainder(change[2::3] + math.pi, 2.0 * math.pi) - math.pi
-    change = change[: len(one.information)]
-    return float(change @ one.information @ change) < SAME_SIGMAS**2
+    change[2::3] = np.remainder(change[2::3] + math.pi, math.tau) - math.pi
+    return float(change @ np.linalg.solve(one.of_start, change)) < SAME_SIGMAS**2
 
 
 # --- one robot and its anchor -------------------------------------------------------------------------
@@ -150,14 +146,18 @@ def of_anchor(
     if warm:
         starts = [one.start for one in known]
     else:
-        places = [one.guess[:2] for one in known]
-        points = anchors(path, ranges, sensing_range, noise, places)
-        starts = [Start(np.array([*point, 0.0])) for point in points]
-    steps, decrease = (WARM_STEPS, WARM_DECREASE) if warm else (FIT_STEPS, 1.0)
-    found = fits(starts, [path], ranges, noise, steps=steps, shortest=COARSE_STILL, decrease=decrease)
+        places = [(-x, -y) for (x, y, _), *_ in [one.poses for one in known]]
+        starts = starts_about(anchors(path, ranges, sensing_range, noise, places))
+    ending = Ending(WARM_STEPS, COARSE_STILL, WARM_DECREASE) if warm else Ending(shortest=COARSE_STILL)
+    found = fits(alone(path, ranges, noise), starts, ending)
     return with_probability(
         [(one, anchor_log_likelihood(one, 0, silent, ranges.tick, sensing_range, noise)) for one in found]
     )
+
+
+def starts_about(points: Iterable[Array]) -> list[Start]:
+    """Return starts of one robot, whose anchor is the origin and at `points` (m) in its own frame."""
+    return [Start(np.array([[-x, -y, 0.0]])) for x, y in points]
 
 
 def missing(ticks: Places, end: int, first: int = 0) -> Places:
@@ -187,12 +187,9 @@ def search(pair: PairRanges, known: tuple[Hypothesis, ...] = ()) -> tuple[Scored
     ]
     found.sort(key=lambda one: -one[0])
     starts = [start for weight, start in found[:STARTS] if weight > found[0][0] - UNLIKELY]
-    starts += without_outliers(
-        starts[:STARTS_WITHOUT_OUTLIERS], pair.paths, pair.ranges, pair.noise, pair.apart
-    )
+    starts += without_outliers(pair.measured, starts[:STARTS_WITHOUT_OUTLIERS])
     starts = [*[one.start for one in known], *starts]
-    measured = (pair.paths, pair.ranges, pair.noise, pair.apart)
-    return _scored(fits(starts, *measured), pair)
+    return _scored(fits(pair.measured, starts), pair)
 
 
 STARTS_WITHOUT_OUTLIERS = 4
@@ -204,7 +201,7 @@ def _alone(pair: PairRanges, robot: int) -> tuple[ScoredHypothesis, ...]:
     path, ranges = pair.paths[robot], pair.ranges.only(robot)
     last = int(ranges.tick[-1]) if len(ranges.tick) else 0
     found = _up_to_last_range(_OwnRanges(path.until(last), ranges, pair.sensing_range, pair.noise))
-    return tuple([one._replace(fit=one.fit.continued(path)) for one in found])
+    return tuple([one._replace(fit=one.fit.continued(pair.of(robot))) for one in found])
 
 
 class _OwnRanges(NamedTuple):
@@ -236,8 +233,7 @@ def _up_to_last_range(own: _OwnRanges) -> tuple[ScoredHypothesis, ...]:
     A robot that has left its anchor has the same in each tick.
     """
     points = anchors(own.path, own.ranges, own.sensing_range, own.noise)
-    starts = [Start(np.array([*point, 0.0])) for point in points]
-    found = fits(starts, [own.path], own.ranges, own.noise)
+    found = fits(alone(own.path, own.ranges, own.noise), starts_about(points))
     return with_probability([(one, 0.0) for one in found])
 
 
@@ -245,8 +241,7 @@ def _up_to_last_range(own: _OwnRanges) -> tuple[ScoredHypothesis, ...]:
 def follow(before: tuple[Hypothesis, ...], pair: PairRanges) -> tuple[ScoredHypothesis, ...]:
     """Return the hypotheses that follow from those of the previous tick, `before`."""
     starts = [one.start for one in before]
-    measured = (pair.paths, pair.ranges, pair.noise, pair.apart)
-    return _scored(fits(starts, *measured, WARM_STEPS), pair)
+    return _scored(fits(pair.measured, starts, Ending(WARM_STEPS)), pair)
 
 
 def _scored(found: Sequence[Fit], pair: PairRanges) -> tuple[ScoredHypothesis, ...]:

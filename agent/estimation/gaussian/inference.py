@@ -14,15 +14,15 @@ import numpy as np
 from msgspec.structs import replace
 
 from agent.estimation.exact import Branch
+from agent.estimation.fit import Fit, deviation
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, Inconsistency, consistency_test
 from agent.estimation.gaussian.evidence import anchor_evidence, mutual_evidence
-from agent.estimation.gaussian.fitted import Fit
-from agent.estimation.gaussian.fitted_poses import deviation, poses
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis, missing, of_anchor
 from agent.estimation.gaussian.odometry_noise import Array, Track, track, variances
 from agent.estimation.gaussian.own_sensors import DOUBTFUL_CLAIMS, Doubt, claim_doubt, doubt
+from agent.estimation.gaussian.pair_ranges import PairRanges
 from agent.estimation.gaussian.placement_guesses import STARTS
-from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, Ranges
+from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges
 from agent.estimation.knowledge import Belief, Knowledge
 from agent.peer.motion_log import MotionLog
 from protocol.messages import RobotConfig
@@ -180,10 +180,9 @@ whose odometry is noisy strays from its place; with less, the fits take most of 
 
 def branch_of(knowledge: Knowledge, scored: ScoredHypothesis) -> Branch:
     """Return the trajectory of `scored` as a branch, whose start and odometry lead to the present pose."""
-    mx, my = scored.hypothesis.guess[:2]
-    path = scored.fit.paths[0]
-    frame = math.atan2(-my, -mx)
-    now = relative(Pose(mx, my, frame), Pose(float(path.x[-1]), float(path.y[-1]), float(path.heading[-1])))
+    ((x, y, _),) = scored.hypothesis.poses
+    frame = math.atan2(y, x)
+    now = relative(Pose(0.0, 0.0, frame), Pose(*scored.fit.poses[0].tolist()))
     start = compose(now, inverse(knowledge.odometry))
     return Branch(wrap(-frame), start)
 
@@ -198,7 +197,7 @@ def anchor_planning_hypotheses(knowledge: Knowledge) -> list[PlanningHypothesis]
         pose = compose(branch.start, knowledge.odometry)
         c, s = math.cos(branch.alpha), math.sin(branch.alpha)
         turn = np.array(((c, -s), (s, c)))
-        covariance = turn @ np.array(one.covariance) @ turn.T
+        covariance = turn @ np.array(one.covariance)[:2, :2] @ turn.T
         now = np.array((pose.x, pose.y, pose.heading))
         hypotheses.append(PlanningHypothesis(one.probability, now, covariance))
     return hypotheses
@@ -225,8 +224,7 @@ def _anchor_sigma(fit: Fit) -> float:
 
     With noisy odometry, ranges tell less and less of where a robot started.
     """
-    of_start = np.trace(fit.covariance)
-    return deviation(float(min(of_start, np.trace(poses(fit, (0.0, 0.0))[1][:2, :2]))))
+    return deviation(float(min(np.trace(one[:2, :2]) for one in (fit.of_start, fit.covariance))))
 
 
 SURE_OF_BRANCH = 0.999
@@ -311,18 +309,14 @@ def pair_of(knowledge: Knowledge) -> PairRanges:
     )
 
 
-def pair_planning_hypotheses(
-    scored: Sequence[ScoredHypothesis], pair: PairRanges
-) -> tuple[PlanningHypothesis, ...]:
+def pair_planning_hypotheses(scored: Sequence[ScoredHypothesis]) -> tuple[PlanningHypothesis, ...]:
     """Return the hypotheses about both poses relative to M1, in the form that planning needs."""
-    return tuple(
-        [_pair_planning_hypothesis(one.hypothesis.probability, one.fit, pair.apart) for one in scored]
-    )
+    return tuple([_pair_planning_hypothesis(one.hypothesis.probability, one.fit) for one in scored])
 
 
 @lru_cache(maxsize=STARTS)
-def _pair_planning_hypothesis(probability: float, one: Fit, apart: tuple[float, float]) -> PlanningHypothesis:
-    return PlanningHypothesis(probability, *poses(one, apart))
+def _pair_planning_hypothesis(probability: float, one: Fit) -> PlanningHypothesis:
+    return PlanningHypothesis(probability, one.poses.ravel(), one.covariance)
 
 
 def blocking_reason_for(

@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 
-from agent.estimation.gaussian.fitted_poses import deviation
+from agent.estimation.fit import deviation
 from agent.estimation.gaussian.inference import sufficient_mutual_ranges
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.joint_search import FEWEST_DECISIVE, beacons
 from agent.estimation.gaussian.known_anchors import unsound_fit
 from agent.estimation.gaussian.odometry_noise import Places
-from agent.estimation.gaussian.range_model import MOVED
+from agent.estimation.gaussian.pair_ranges import MOVED
 from agent.estimation.posterior import Certainty, JointHypotheses
 
 OPEN = 0.5

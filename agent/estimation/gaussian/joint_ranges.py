@@ -41,12 +41,15 @@ class JointRanges(msgspec.Struct, frozen=True, dict=True, eq=False):
     place: Array
     """The position (m) of each range's anchor; 0 for ranges between robots; shape (N, 2)."""
     radio: Places
-    """The index of each range's pair of radios, in the order of the ranges; shape (N,)."""
+    """The index of each range's pair of radios, in the order of the ranges; shape (N,).
+
+    -1 for a range that has no error but a white one, and is no outlier.
+    """
 
     @cached_property
     def pairs(self) -> list[NDArray[np.bool]]:
         """The ranges of each pair of radios that has some; shapes (N,)."""
-        return [self.radio == one for one in sorted(set(self.radio.tolist()))]
+        return self.single.pairs
 
     @cached_property
     def single(self) -> Ranges:
@@ -56,6 +59,11 @@ class JointRanges(msgspec.Struct, frozen=True, dict=True, eq=False):
     def rows(self, some: NDArray[np.bool] | Places) -> JointRanges:
         """Return the ranges selected by `some`."""
         return JointRanges(*[part[some] for part in msgspec.structs.astuple(self)])
+
+    def then(self, more: JointRanges) -> JointRanges:
+        """Return these ranges followed by `more`."""
+        both = zip(msgspec.structs.astuple(self), msgspec.structs.astuple(more), strict=True)
+        return JointRanges(*[np.concatenate(parts) for parts in both])
 
     def of(self, robot: int) -> NDArray[np.bool]:
         """Return which ranges are those of a robot; shape (N,)."""
@@ -72,6 +80,8 @@ class PosePrior(NamedTuple):
     """The inverse covariance; 0 for what is not known; shape (3 n, 3 n)."""
     rank: int
     """The rank of `information`: the number of unknowns that it determines."""
+    log_information: float = 0.0
+    """The logarithm of its determinant for these unknowns, if evidences with other priors are compared."""
 
 
 class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):

@@ -13,18 +13,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.fit import JointStart, joint_fits
+from agent.estimation.fit import Ending, Start, fits
 from agent.estimation.gaussian import hypotheses
 from agent.estimation.gaussian.beacon_guesses import beacon_guesses
 from agent.estimation.gaussian.hypotheses import (
     NEGLIGIBLE_PROBABILITY,
     WARM_STEPS,
-    ScoredHypothesis,
 )
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.known_anchors import AnchoredRobot, scored_fits, start_of
-from agent.estimation.gaussian.odometry_noise import Errors, Places
-from agent.estimation.gaussian.range_model import PairRanges, Ranges
+from agent.estimation.gaussian.odometry_noise import Places
+from agent.estimation.gaussian.pair_ranges import PairRanges
+from agent.estimation.gaussian.range_model import Ranges
 from agent.estimation.posterior import (
     MOST_JOINT,
     MOST_POSES,
@@ -33,7 +33,6 @@ from agent.estimation.posterior import (
     JointHypothesis,
     with_probability,
 )
-from protocol.motion import rotated
 
 FEWEST_TO_ANCHORS = 3
 """The least number of ranges of each robot of a pair to its anchor."""
@@ -63,7 +62,7 @@ def search(measured: JointMeasurements, reach: float) -> JointHypotheses:
 def follow(known: JointHypotheses, measured: JointMeasurements, steps: int = WARM_STEPS) -> JointHypotheses:
     """Return the hypotheses that follow from those `known` before the latest facts."""
     part = measured.some(known.located)
-    found = joint_fits(part, [one.fit.start for one in known.scored], steps)
+    found = fits(part, [one.fit.start for one in known.scored], Ending(steps))
     return JointHypotheses(known.located, with_probability(found))
 
 
@@ -164,7 +163,7 @@ class _Located(NamedTuple):
     """The start poses of new robots under one hypothesis about the others."""
 
     log_weight: float
-    start: JointStart
+    start: Start
 
 
 def _with(
@@ -185,11 +184,11 @@ def _with(
     starts = []
     for rank, (others, weight, one, new) in enumerate(found[:MOST_POSES]):
         if weight >= least and (others == 0 or rank < MOST_JOINT):
-            begun = one.fit.start if one is not None else JointStart(np.zeros((0, 3)))
+            begun = one.fit.start if one is not None else Start(np.zeros((0, 3)))
             poses = np.concatenate((begun.poses, new.start.poses))[order]
             errors = [*begun.errors, *new.start.errors]
-            starts.append(JointStart(poses, tuple([errors[k] for k in order])))
-    return JointHypotheses(located, with_probability(joint_fits(part, starts)))
+            starts.append(Start(poses, tuple([errors[k] for k in order])))
+    return JointHypotheses(located, with_probability(fits(part, starts)))
 
 
 def _new(
@@ -259,17 +258,9 @@ def _of_pair(a: int, b: int, measured: JointMeasurements, reach: float) -> list[
         measured.noise,
     )
     return [
-        _Located(math.log(one.hypothesis.probability), _start(one, [m1, m2]))
+        _Located(
+            math.log(one.hypothesis.probability),
+            one.fit.start._replace(poses=one.fit.start.poses + (*m1, 0.0)),
+        )
         for one in hypotheses.search(pair)
     ]
-
-
-def _start(one: ScoredHypothesis, anchors: Sequence[tuple[float, float]]) -> JointStart:
-    """Return the poses at tick 0 from a fit, whose guess has the places of `anchors` in each odometry."""
-    poses = []
-    for (mx, my, turn), (x, y) in zip(one.fit.guess.reshape(-1, 3).tolist(), anchors, strict=True):
-        c, s = math.cos(turn), math.sin(turn)
-        dx, dy = rotated(c, s, mx, my)
-        poses.append((x - dx, y - dy, turn))
-    nothing = [Errors(np.zeros(0), np.zeros(0), np.zeros(0))] * len(poses)
-    return JointStart(np.array(poses), one.fit.errors or tuple(nothing))

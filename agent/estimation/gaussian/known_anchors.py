@@ -12,19 +12,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.fit import FIT_STEPS, JointFit, JointStart, joint_fits
+from agent.estimation.fit import TO_THE_END, Ending, Fit, Start, deviation, fits
 from agent.estimation.gaussian.anchor_guesses import anchors
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, HIGHEST_LEVEL, chi2_p_value
-from agent.estimation.gaussian.fitted_poses import deviation
 from agent.estimation.gaussian.hypotheses import WARM_STEPS
 from agent.estimation.gaussian.inference import sufficient_mutual_ranges
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges
 from agent.estimation.gaussian.noise_level import INLIER
 from agent.estimation.gaussian.odometry_noise import Array, Places, Track
-from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges, mixture, predicted
+from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges, mixture
 from agent.estimation.posterior import JointHypothesis, with_probability
+from agent.estimation.smoother import SMALLEST_DISTANCE
 from protocol.mission import HEADING_ACCURACY
-from protocol.motion import rotated
+from protocol.motion import rotated, rotated_back
 from protocol.noise import Noise
 
 ROTATIONS = 72
@@ -94,21 +94,21 @@ def search(robot: AnchoredRobot, known: Sequence[JointHypothesis] = ()) -> tuple
 
 def follow(robot: AnchoredRobot, known: Sequence[JointHypothesis]) -> tuple[JointHypothesis, ...]:
     """Return the hypotheses that follow from those `known` before the latest ranges."""
-    return scored_fits(robot, [one.fit.start for one in known], WARM_STEPS)
+    return scored_fits(robot, [one.fit.start for one in known], Ending(WARM_STEPS))
 
 
 def scored_fits(
-    robot: AnchoredRobot, starts: Sequence[JointStart], steps: int = FIT_STEPS
+    robot: AnchoredRobot, starts: Sequence[Start], ending: Ending = TO_THE_END
 ) -> tuple[JointHypothesis, ...]:
     """Return the hypotheses of the fits that begin at `starts`, the likeliest first."""
-    return with_probability(joint_fits(robot.measured, starts, steps))
+    return with_probability(fits(robot.measured, starts, ending))
 
 
-def start_of(guess: Array) -> JointStart:
-    """Return the pose of a robot at tick 0 from a guess, (3,), in the layout of `range_model.predicted`."""
+def start_of(guess: Array) -> Start:
+    """Return the pose of a robot at tick 0 from a guess, (3,), in the layout of `predicted`."""
     mx, my, turn = guess.tolist()
     x, y = rotated(math.cos(turn), math.sin(turn), mx, my)
-    return JointStart(np.array([[-x, -y, turn]]))
+    return Start(np.array([[-x, -y, turn]]))
 
 
 def _candidates(robot: AnchoredRobot) -> list[Array]:
@@ -137,24 +137,41 @@ def ranges_places(robot: AnchoredRobot) -> Array:
 def refined(guesses: Array, robot: AnchoredRobot) -> list[Array]:
     """Return the likeliest of `guesses` after Gauss-Newton steps on all ranges, with measured odometry."""
     ranges, path = robot.ranges, robot.path
-    at = np.stack((path.x[ranges.tick], path.y[ranges.tick]))[None]
+    at = np.stack((path.x[ranges.tick], path.y[ranges.tick]))
     sigma = np.sqrt(np.square(ranges.sigma) + ranges.loosened(robot.noise.priors))
     longest = max(float(np.max(ranges.rho)), SIGMA_FLOOR)
     for step in range(REFINEMENTS):
         s = np.hypot(sigma, COARSE * longest * ERROR_FINER**step)
-        model = predicted(guesses, np.broadcast_to(at, (len(guesses), *at.shape)), ranges, (0.0, 0.0))
-        residuals = ranges.rho - model.distance
+        distance, jacobian = predicted(guesses, at, ranges_places(robot))
+        residuals = ranges.rho - distance
         weight = mixture(residuals, s, robot.noise)[1] / np.square(s)
-        weighted = np.swapaxes(model.jacobian * weight[..., None], 1, 2)
-        information = weighted @ model.jacobian
+        weighted = np.swapaxes(jacobian * weight[..., None], 1, 2)
+        information = weighted @ jacobian
         information.reshape(len(guesses), -1)[:, ::4] *= 1.0 + DAMPING
         information.reshape(len(guesses), -1)[:, ::4] += DAMPING
         change = np.linalg.solve(information, (weighted @ residuals[..., None]))[..., 0]
         most = np.array((LONGEST_STEP * longest, LONGEST_STEP * longest, LARGEST_TURN))
         guesses = guesses + change / np.maximum(np.max(np.abs(change) / most, 1, keepdims=True), 1.0)
-    model = predicted(guesses, np.broadcast_to(at, (len(guesses), *at.shape)), ranges, (0.0, 0.0))
-    likely = mixture(ranges.rho - model.distance, np.hypot(sigma, FINAL * longest), robot.noise)[0]
-    return _distinct(guesses, likely, at[0, :, -1], longest)
+    distance, _ = predicted(guesses, at, ranges_places(robot))
+    likely = mixture(ranges.rho - distance, np.hypot(sigma, FINAL * longest), robot.noise)[0]
+    return _distinct(guesses, likely, at[:, -1], longest)
+
+
+def predicted(guesses: Array, at: Array, place: Array) -> tuple[Array, Array]:
+    """Return the N ranges (m) that `guesses` predict, (n, N), and their derivatives, (n, N, 3).
+
+    A guess has the x and y (m) of the origin in the frame of the odometry, and the rotation (rad) of this
+    frame in <W>; shape (n, 3). `at` are the places (m) of the robot in its frame, (2, N), and `place` those
+    of the anchors, (N, 2).
+    """
+    c, s = np.cos(guesses[:, 2:]), np.sin(guesses[:, 2:])
+    x, y = at[0] - guesses[:, :1], at[1] - guesses[:, 1:2]
+    wx, wy = rotated(c, s, x, y)
+    dx, dy = wx - place[:, 0], wy - place[:, 1]
+    distance = np.maximum(np.hypot(dx, dy), SMALLEST_DISTANCE)
+    nx, ny = dx / distance, dy / distance
+    along, across = rotated_back(c, s, nx, ny)
+    return distance, np.stack((-along, -across, ny * wx - nx * wy), -1)
 
 
 DAMPING = 1e-6
@@ -200,7 +217,7 @@ def blocking_reason(
     return unsound_fit(best.fit, np.arange(count), best.fit.covariance, accuracy)
 
 
-def unsound_fit(fit: JointFit, own: Places, covariance: Array, accuracy: float) -> str:
+def unsound_fit(fit: Fit, own: Places, covariance: Array, accuracy: float) -> str:
     """Return why a robot may not claim its pose by `fit`, whatever its probability, or an empty text.
 
     The fit has to converge and to be consistent, and the position needs the `accuracy` (m). `own` are the

@@ -41,7 +41,7 @@ def later_pose(met: Knowledge, now: Knowledge) -> Localised | None:
         return None
     if consistency_test(best.fit, measured, own).p_value < CLAIM_P_VALUE:
         return None
-    hypothesis = inference.pair_planning_hypotheses(scored[:1], measured)[0]
+    hypothesis = inference.pair_planning_hypotheses(scored[:1])[0]
     pose, covariance = inference.claim(hypothesis, own, measured)
     m1 = config.anchor if config.role == "a" else config.peer_anchor
     if not is_definite(covariance):

@@ -5,22 +5,20 @@ A robot does not blame its peer for what a profile explains, and claims no pose 
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import NamedTuple
 
 import msgspec
-import numpy as np
 from msgspec.structs import replace
 
-from agent.estimation.fit import FIT_STEPS
+from agent.estimation.fit import FIT_STEPS, Ending, Fit, Start, fits
 from agent.estimation.gaussian.anchor_guesses import anchors
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, consistency_test
-from agent.estimation.gaussian.fitted import Fit
-from agent.estimation.gaussian.hypotheses import search
-from agent.estimation.gaussian.least_squares import fit, fits
-from agent.estimation.gaussian.linear_model import Start
+from agent.estimation.gaussian.hypotheses import search, starts_about
 from agent.estimation.gaussian.odometry_noise import Track, rescaled
-from agent.estimation.gaussian.range_model import PairRanges, Ranges
+from agent.estimation.gaussian.pair_ranges import PairRanges, alone
+from agent.estimation.gaussian.range_model import Ranges
 from protocol.noise import PROFILES, UNTOLD_SIGMA, Noise, ProfileName
 
 DOUBTED_EVIDENCE = 3.0
@@ -125,13 +123,13 @@ def claim_doubt(fitted: Fit, pair: PairRanges) -> Doubt | None:
     move a pose by more than the noise level that robots learn.
     """
     noise = pair.noise
-    told = _evidence(fitted)
     others = {}
     for name, other in claim_profiles(noise):
-        begun = [rescaled(errors, noise, other) for errors in fitted.errors]
+        errors = tuple([rescaled(one, noise, other) for one in fitted.start.errors])
+        start, measured = Start(fitted.start.poses, errors), replace(pair.measured, noise=other)
         for steps in (0, FIT_STEPS):
-            again = fit(fitted.guess, pair.paths, pair.ranges, other, pair.apart, steps, begun)
-            others[name] = _evidence(again) - told
+            found = [again.weight for again in fits(measured, [start], Ending(steps))]
+            others[name] = max(found, default=-math.inf) - fitted.weight
             if others[name] < DOUBTFUL_CLAIM - ONE_MODEL_ERROR:
                 break
     return _best(BOTH, others, DOUBTFUL_CLAIM)
@@ -206,10 +204,5 @@ def _profile(name: ProfileName, noise: Noise, share: float = 1.0) -> Noise:
 def _log_evidence(path: Track, ranges: Ranges, sensing_range: float, noise: Noise) -> float:
     """Return the log evidence of the ranges under `noise`, with the anchor's position integrated out."""
     points = anchors(path, ranges, sensing_range, noise)
-    found = fits([Start(np.array([*point, 0.0])) for point in points], [path], ranges, noise)
-    return max(map(_evidence, found))
-
-
-def _evidence(one: Fit) -> float:
-    """Return the log evidence of a fit, with its guess integrated out, up to a constant (Laplace)."""
-    return one.log_likelihood - 0.5 * float(np.linalg.slogdet(one.information)[1])
+    found = fits(alone(path, ranges, noise), starts_about(points))
+    return max([one.weight for one in found], default=-math.inf)

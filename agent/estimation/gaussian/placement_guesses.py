@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from agent.estimation.fit import Fit, Start
 from agent.estimation.gaussian.anchor_guesses import (
     POLISHINGS,
     SAME_POSITION,
@@ -21,8 +22,6 @@ from agent.estimation.gaussian.anchor_guesses import (
     UNLIKELY,
     spread_out,
 )
-from agent.estimation.gaussian.fitted import Fit
-from agent.estimation.gaussian.linear_model import Start
 from agent.estimation.gaussian.odometry_noise import (
     Array,
     Errors,
@@ -31,10 +30,13 @@ from agent.estimation.gaussian.odometry_noise import (
     Projection,
     attributed,
     constant_effects,
+    corrected,
     spread,
     symmetric,
+    wander,
 )
-from agent.estimation.gaussian.range_model import SIGMA_FLOOR, PairRanges, inlier_probability, mixture
+from agent.estimation.gaussian.pair_ranges import PairRanges
+from agent.estimation.gaussian.range_model import SIGMA_FLOOR, inlier_probability, mixture
 from protocol.motion import rotated, rotated_back
 
 SCAN = 72
@@ -128,27 +130,29 @@ class Encounter(NamedTuple):
         weights = self.inverse @ z
         anchor = own.guess[:2] - (self.of_anchor @ weights)[:2]
         if self.odometry is None:
-            return anchor, ()
+            return anchor, own.start.errors
         model, rows = self.odometry
-        patterns = own.problem.patterns[0].copy()
+        patterns = own.problem.measured.patterns[0].copy()
         patterns[:, :, : self.since] = 0.0
         constant = constant_effects(model, rows)[:-1] @ weights
         more = attributed(model, rows, weights) + np.tensordot(constant, patterns, 1)
-        begun = own.errors[0]
+        (begun,) = own.start.errors
         return anchor, (Errors(begun.v + more[0], begun.omega + more[1], begun.constant),)
 
 
 def _encounter(own: Fit, base: int, ticks: Places) -> Encounter:
     """Return the robot of the fit `own` at `ticks`, with its offset at the tick `base`."""
-    (path,) = own.paths
-    x, y = path.x[ticks] - own.guess[0], path.y[ticks] - own.guess[1]
+    x, y = own.places(0, ticks)
     of_anchor = np.zeros((3, 3))
-    of_anchor[:2, :2] = own.covariance
+    of_anchor[:2, :2] = own.of_start[:2, :2]
     covariance, odometry, since = of_anchor, None, 0
-    if own.errors:
+    if own.problem.noisy:
         earlier = own.ticks[own.ticks <= base]
         since = int(earlier[-1]) if len(earlier) else 0
-        model = own.drift(0).since(since)
+        of, (errors,) = own.problem.measured, own.start.errors
+        correction = np.stack((errors.v, errors.omega)) + np.tensordot(errors.constant, of.patterns[0], 1)
+        path = corrected(np.stack((of.v[0], of.omega[0])), correction, of.period, of.slip[0])
+        model = wander(path, correction, of.patterns[0], of.white[0]).since(since)
         rows = Projection.pose(path, base)
         odometry = (model, rows)
         constant = constant_effects(model, rows)[:-1]
@@ -189,13 +193,15 @@ def placements(own: tuple[Fit, Fit], pair: PairRanges) -> list[Placed]:
     z, likely = _turned(z, (robots[near], robots[far]), middle, rho, sigma, apart, lever, pair)
     found = []
     for one, log_likelihood in zip(z, likely.tolist(), strict=True):
-        guess, errors = np.empty(6), []
+        poses, errors = np.empty((2, 3)), []
         for i, robot in enumerate((near, far)):
-            anchor, more = robots[robot].begun(own[robot], one[2 + 3 * i : 5 + 3 * i])
-            guess[3 * robot : 3 * robot + 3] = *anchor, one[i]
+            (mx, my), more = robots[robot].begun(own[robot], one[2 + 3 * i : 5 + 3 * i])
+            turn, (at_x, at_y) = float(one[i]), pair.anchors[robot]
+            dx, dy = rotated(math.cos(turn), math.sin(turn), mx, my)
+            poses[robot] = at_x - dx, at_y - dy, turn
             errors.append(more)
         in_order = errors if near == 0 else errors[::-1]
-        found.append(Placed(Start(guess, tuple([one for more in in_order for one in more])), log_likelihood))
+        found.append(Placed(Start(poses, tuple([one for more in in_order for one in more])), log_likelihood))
     return found
 
 

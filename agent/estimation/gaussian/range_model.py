@@ -1,31 +1,22 @@
-"""The measurement model: predicted ranges for a guess, and their likelihood.
+"""The ranges of one robot or of two, and the likelihood of their residuals.
 
-A guess contains, for each robot, the position of its anchor in the frame of its odometry and the rotation of
-that frame in <W>. Outliers follow a mixture: a range is an inlier, or too long by a uniformly distributed
-bias.
+Outliers follow a mixture: a range is an inlier, or too long by a uniformly distributed bias.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cached_property
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian.odometry_noise import SIGNS, Array, Places, Track
-from agent.estimation.smoother import SMALLEST_DISTANCE
-from protocol.motion import rotated, rotated_back
+from agent.estimation.gaussian.odometry_noise import Array, Places
 from protocol.noise import Noise, Priors, VelocityNoise
 
 SIGMA_FLOOR = 1e-6
 """The least standard deviation (m) that is assumed for a range."""
-
-MOVED = 0.01
-"""The fraction of R that a robot must have moved for a range to count as one from another place."""
 
 IMPOSSIBLE = 6.0
 """The number of sigmas beyond R from which a range is an outlier under any guess."""
@@ -94,7 +85,7 @@ class Ranges(NamedTuple):
             kinds = np.repeat(np.arange(3), self.counts)
             return [kinds == kind for kind in range(3) if self.counts[kind]]
         # numpy.unique would import numpy.ma in the first search of a mission
-        return [self.radio == one for one in sorted(set(self.radio.tolist()))]
+        return [self.radio == one for one in sorted(set(self.radio.tolist()) - {-1})]
 
     def rows(self, kind: int) -> slice:
         """Return the rows of a kind: 0 and 1 are the ranges of that robot to its anchor, 2 is mutual."""
@@ -102,27 +93,9 @@ class Ranges(NamedTuple):
         return slice(begin, begin + self.counts[kind])
 
     def only(self, kind: int) -> Ranges:
-        """Return the ranges of one kind, as the ranges of a single robot.
-
-        For `kind` 0 or 1, these are the ranges of a or b to the anchor of its guess; for 2, the mutual
-        ranges.
-        """
+        """Return the ranges of one kind, as the ranges of a single robot."""
         rows = self.rows(kind)
-        if self.place is None or kind == 2:
-            return Ranges(self.rho[rows], self.tick[rows], self.sigma[rows], (self.counts[kind], 0, 0))
-        return self._alone(rows, ~np.any(self.place[rows], 1))
-
-    def to_others(self, robot: int) -> list[Ranges]:
-        """Return the ranges of `robot` to each of its other anchors, as the ranges of a single robot."""
-        if self.place is None or self.radio is None:
-            return []
-        rows = self.rows(robot)
-        radios = np.where(np.any(self.place[rows], 1), self.radio[rows], -1)
-        return [self._alone(rows, radios == one) for one in sorted(set(radios.tolist()) - {-1})]
-
-    def _alone(self, rows: slice, some: NDArray[np.bool]) -> Ranges:
-        count = int(np.count_nonzero(some))
-        return Ranges(self.rho[rows][some], self.tick[rows][some], self.sigma[rows][some], (count, 0, 0))
+        return Ranges(self.rho[rows], self.tick[rows], self.sigma[rows], (self.counts[kind], 0, 0))
 
     def common_errors(self, priors: Priors) -> Array:
         """Return the effect (m) of one sigma of each constant error on the ranges; shape (N, m).
@@ -139,17 +112,6 @@ class Ranges(NamedTuple):
         if priors.pair_bias:
             columns += [np.where(own, priors.pair_bias, 0.0) for own in self.pairs]
         return np.array(columns).T if columns else np.zeros((len(rho), 0))
-
-    def slow_errors(self, priors: Priors, period: float) -> Array | None:
-        """Return the covariance (m^2) of slowly varying errors, within each pair of radios; None without."""
-        if not priors.slow_sigma:
-            return None
-        covariance = np.zeros((len(self.rho), len(self.rho)))
-        for own in self.pairs:
-            rows = np.flatnonzero(own)
-            apart = np.abs(np.subtract.outer(self.tick[rows], self.tick[rows])) * (period / priors.slow_time)
-            covariance[np.ix_(rows, rows)] = priors.slow_sigma**2 * np.exp(-apart)
-        return covariance
 
     def loosened(self, priors: Priors) -> Array:
         """Return the variance (m^2) that constant and slow errors add to each range; shape (N,)."""
@@ -197,139 +159,6 @@ class Ranges(NamedTuple):
         radio = None if self.radio is None else self.radio[some]
         counts = (first, second, mutual)
         return Ranges(self.rho[some], self.tick[some], self.sigma[some], counts, place, radio)
-
-
-class PairRanges(msgspec.Struct, frozen=True, eq=False, dict=True):
-    """The measurements of both robots; robot 0 is the paper's a."""
-
-    paths: tuple[Track, Track]
-    ranges: Ranges
-    silent: tuple[Places, Places, Places]
-    """The ticks without a range: of a to its anchor, of b to its anchor, and between the two."""
-    apart: tuple[float, float]
-    """The vector M2 - M1 (m) in <W>."""
-    sensing_range: float
-    noise: Noise
-
-    def __eq__(self, other: object) -> bool:
-        """Return whether `other` has the same measurements, to the bit."""
-        return isinstance(other, PairRanges) and self.content == other.content
-
-    def __hash__(self) -> int:
-        """Return the hash of all measurements."""
-        return self._hash
-
-    @cached_property
-    def _hash(self) -> int:
-        return hash(self.content)
-
-    @cached_property
-    def content(self) -> tuple[object, ...]:
-        """All measurements as values that can be compared."""
-        silent = tuple([ticks.tobytes() for ticks in self.silent])
-        paths = tuple([path.content for path in self.paths])
-        return paths, self.ranges.content, silent, self.apart, self.sensing_range, self.noise
-
-    @cached_property
-    def places(self) -> Places:
-        """The indices of the first mutual range, and of each that follows a motion of a robot."""
-        ticks = self.ranges.tick[self.ranges.rows(2)]
-        moved = np.zeros(len(ticks), bool)
-        moved[:1] = True
-        for path in self.paths:
-            x, y = path.x[ticks], path.y[ticks]
-            moved[1:] |= np.hypot(np.diff(x), np.diff(y)) > MOVED * self.sensing_range
-        return np.flatnonzero(moved)
-
-
-class Predicted(NamedTuple):
-    """The ranges that guesses predict, and their derivatives."""
-
-    distance: Array
-    """The predicted ranges (m); shape (..., N)."""
-    jacobian: Array
-    """The derivatives with respect to the guess; shape (..., N, 3 robots)."""
-    directions: Array
-    """The derivatives with respect to each robot's position, in the frame of its odometry.
-
-    They are 0 if a range does not involve the robot; shape (..., robots, 2, N).
-    """
-
-
-def predict(guess: Array, paths: Sequence[Track], ranges: Ranges, apart: tuple[float, float]) -> Predicted:
-    """Return the ranges that `guess` predicts with the robots on `paths`; see `predicted`."""
-    ticks = [np.minimum(ranges.tick, len(path.v)) for path in paths]
-    return predicted(
-        guess,
-        np.stack([(path.x[tick], path.y[tick]) for path, tick in zip(paths, ticks, strict=True)]),
-        ranges,
-        apart,
-    )
-
-
-def predicted(guess: Array, places: Array, ranges: Ranges, apart: tuple[float, float]) -> Predicted:
-    """Return the ranges that guesses predict with the robots at `places`.
-
-    A guess contains for each robot the x and y (m) of its anchor in the frame of its odometry, and the
-    rotation (rad) of this frame in <W>; shape (..., 3) or (..., 6). `places` are the positions (m) of the
-    robots at the ticks of the ranges, in these frames; shape (..., robots, 2, N). `apart` is M2 - M1 (m) in
-    <W>. With a single robot there are only ranges to its anchor, and they do not determine the rotation.
-    """
-    robots, n = places.shape[-3], len(ranges.rho)
-    anchors = guess.reshape(*guess.shape[:-1], robots, 3)
-    away = places - anchors[..., :2, None]
-    if ranges.place is not None and robots == 1:
-        return _to_places(anchors[..., 0, 2:], away[..., 0, :, :], ranges.place)
-    distances = np.maximum(np.hypot(away[..., 0, :], away[..., 1, :]), SMALLEST_DISTANCE)
-    directions = away / distances[..., None, :]
-    distance, jacobian = distances[..., 0, :], np.zeros((*guess.shape[:-1], n, 3 * robots))
-    if robots == 2:
-        of_a, of_b, mutual = (ranges.rows(kind) for kind in range(3))
-        distance[..., of_b] = distances[..., 1, of_b]
-        directions[..., 0, :, of_b], directions[..., 1, :, of_a] = 0.0, 0.0
-        c, s = np.cos(anchors[..., 2:]), np.sin(anchors[..., 2:])
-        x, y = away[..., 0, mutual], away[..., 1, mutual]
-        wx, wy = rotated(c, s, x, y)
-        dx, dy = wx[..., 0, :] - wx[..., 1, :] - apart[0], wy[..., 0, :] - wy[..., 1, :] - apart[1]
-        gap = np.maximum(np.hypot(dx, dy), SMALLEST_DISTANCE)
-        distance[..., mutual] = gap
-        nx, ny = (dx / gap)[..., None, :] * SIGNS, (dy / gap)[..., None, :] * SIGNS
-        jacobian[..., mutual, 2::3] = (ny * wx - nx * wy).mT
-        directions[..., 0, mutual], directions[..., 1, mutual] = rotated_back(c, s, nx, ny)
-        for robot, rows in enumerate((of_a, of_b) if ranges.place is not None else ()):
-            assert ranges.place is not None
-            own = _to_places(anchors[..., robot, 2:], away[..., robot, :, rows], ranges.place[rows])
-            distance[..., rows], directions[..., robot, :, rows] = own.distance, own.directions[..., 0, :, :]
-            jacobian[..., rows, 3 * robot + 2] = own.jacobian[..., 2]
-    for robot in range(robots):
-        np.negative(directions[..., robot, :, :].mT, out=jacobian[..., 3 * robot : 3 * robot + 2])
-    return Predicted(distance, jacobian, directions)
-
-
-def _to_places(rotation: Array, away: Array, place: Array) -> Predicted:
-    """Return the predicted ranges of one robot to several anchors.
-
-    `rotation` is the rotation (rad) of the robot's frame, shape (..., 1). `away` has its positions (m) in
-    its frame, relative to the anchor of its guess, shape (..., 2, N). `place` is `Ranges.place` of these
-    ranges, shape (N, 2).
-    """
-    c, s = np.cos(rotation), np.sin(rotation)
-    x, y = away[..., 0, :], away[..., 1, :]
-    wx, wy = rotated(c, s, x, y)
-    dx, dy = wx - place[:, 0], wy - place[:, 1]
-    distance = np.maximum(np.hypot(dx, dy), SMALLEST_DISTANCE)
-    nx, ny = dx / distance, dy / distance
-    along, across = rotated_back(c, s, nx, ny)
-    jacobian = np.stack((-along, -across, ny * wx - nx * wy), -1)
-    return Predicted(distance, jacobian, np.stack((along, across), -2)[..., None, :, :])
-
-
-def placed(guess: Array, path: Track, ticks: Places) -> tuple[Array, Array]:
-    """Return the position (m) of a robot at `ticks`, relative to its anchor, along the axes of <W>."""
-    mx, my, theta = guess
-    c, s = math.cos(theta), math.sin(theta)
-    x, y = path.x[ticks] - mx, path.y[ticks] - my
-    return rotated(c, s, x, y)
 
 
 def inlier_probability(residuals: Array, sigma: Array, noise: Noise) -> Array:

@@ -15,20 +15,20 @@ from itertools import pairwise
 import numpy as np
 from msgspec.structs import replace
 
-from agent.estimation.gaussian.fitted_poses import deviation, poses
-from agent.estimation.gaussian.least_squares import fit
+from agent.estimation.fit import Ending, Start, deviation, fits
 from agent.estimation.gaussian.odometry_noise import (
     Array,
     Projection,
     Ticks,
-    Track,
     spread,
     track,
     variances,
     wander,
 )
-from agent.estimation.gaussian.range_model import Ranges, predict
+from agent.estimation.gaussian.pair_ranges import PairRanges
+from agent.estimation.gaussian.range_model import Ranges
 from protocol.mission import Mission
+from protocol.motion import rotated
 from protocol.noise import Noise, VelocityNoise
 from protocol.sweep_strips import Place
 from protocol.sweep_ticks import straight_ticks
@@ -121,32 +121,44 @@ def reference_sigma(mission: Mission, distance: float, noise: Noise) -> float:
     reach, period = mission.sensing_range, mission.period
     turn = math.tau / AROUND_ANCHOR
     radius = 0.3 * reach
-    paths, guess = [], []
-    for way, sign in ((max(distance - 0.8 * reach, 0.0), 1.0), (0.0, -0.7)):
+    anchor, apart = (0.25 * reach, 0.5 * reach), (distance, 0.0)
+    paths, starts, lists, places = [], [], [], []
+    for way, sign, turned, at in (
+        (max(distance - 0.8 * reach, 0.0), 1.0, 0.0, (0.0, 0.0)),
+        (0.0, -0.7, 0.7, apart),
+    ):
         around = np.full(AROUND_ANCHOR, 2.0 * radius * math.sin(0.5 * turn) / np.sinc(0.5 * turn / math.pi))
         again = np.full(TOGETHER, around[0])
         v = np.concatenate((around, (way,), again)) / period
         omega = (
             np.concatenate((np.full(AROUND_ANCHOR, turn), (0.0,), np.full(TOGETHER, sign * turn))) / period
         )
-        paths.append(track(v, omega, period))
-        guess += [0.25 * reach, 0.5 * reach, 0.0]
-    guess[5] = 0.7
-    apart = (distance, 0.0)
-    lists = [_ranges(path, guess[i : i + 2], reach) for path, i in zip(paths, (0, 3), strict=True)]
-    mutual = [(tick, 0.0) for tick in range(AROUND_ANCHOR + 1, AROUND_ANCHOR + TOGETHER + 2)]
+        path = track(v, omega, period)
+        rho = np.hypot(path.x - anchor[0], path.y - anchor[1])
+        lists.append([(tick, float(rho[tick])) for tick in np.flatnonzero(rho <= reach).tolist()])
+        c, s = math.cos(turned), math.sin(turned)
+        x, y = rotated(c, s, path.x - anchor[0], path.y - anchor[1])
+        places.append((at[0] + x, at[1] + y))
+        starts.append((places[-1][0][0], places[-1][1][0], turned))
+        paths.append(path)
+    (ax, ay), (bx, by) = places
+    gap = np.hypot(ax - bx, ay - by)
+    together = range(AROUND_ANCHOR + 1, AROUND_ANCHOR + TOGETHER + 2)
     white = replace(noise, odometry=VelocityNoise(), outliers=0.0, strays=0.0, sigma_degrees=0.0)
-    ranges = Ranges.of_lists(lists[0], lists[1], mutual, white)
-    start = np.array(guess)
-    ranges = ranges._replace(rho=predict(start, paths, ranges, apart).distance)
-    covariance = poses(fit(start, paths, ranges, white, apart, steps=0), apart)[1]
-    return max([deviation(covariance[i, i] + covariance[i + 1, i + 1]) for i in (0, 3)])
+    ranges = Ranges.of_lists(lists[0], lists[1], [(tick, float(gap[tick])) for tick in together], white)
+    nothing = np.empty(0, np.intp)
+    pair = PairRanges((paths[0], paths[1]), ranges, (nothing, nothing, nothing), apart, reach, white)
+    return max(position_sigmas(pair, np.array(starts)))
 
 
-def _ranges(path: Track, anchor: list[float], reach: float) -> list[tuple[int, float]]:
-    """Return the ticks of `path` within `reach` of the anchor; the ranges are filled in later."""
-    rho = np.hypot(path.x - anchor[0], path.y - anchor[1])
-    return [(tick, 0.0) for tick in np.flatnonzero(rho <= reach).tolist()]
+def position_sigmas(pair: PairRanges, poses: Array) -> list[float]:
+    """Return the sigma (m) of each robot's last position if their `poses` at tick 0, (2, 3), are the truth.
+
+    It is infinite if the ranges do not determine the poses.
+    """
+    for fit in fits(pair.measured, [Start(poses)], Ending(0)):
+        return [deviation(float(fit.covariance[i, i] + fit.covariance[i + 1, i + 1])) for i in (0, 3)]
+    return [math.inf, math.inf]
 
 
 def swept_sigma(mission: Mission, way: Sequence[Place]) -> float:

@@ -7,11 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.fit import JointFit
-from agent.estimation.gaussian.fitted import Fit
+from agent.estimation.fit import Fit
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.known_anchors import AnchoredRobot
-from agent.estimation.gaussian.range_model import PairRanges
+from agent.estimation.gaussian.pair_ranges import PairRanges
 from agent.estimation.posterior import Certainty
 from compose.recording.estimating.prepared_steps import OneRobot
 from compose.recording.ranging.range_recording import Numbers
@@ -44,7 +43,7 @@ GIVEN_UP = (
 class EpochFit(NamedTuple):
     """The fit of the first hypothesis, and what it was fitted to."""
 
-    fit: Fit | JointFit
+    fit: Fit
     used: PairRanges | AnchoredRobot | JointMeasurements
     """The measurements up to the end of the epoch."""
 

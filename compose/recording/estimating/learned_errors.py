@@ -3,15 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import msgspec
-import numpy as np
 
-from agent.estimation.fit import JointFit
-from agent.estimation.gaussian.fitted import Fit
-from agent.estimation.gaussian.odometry_noise import Array, Projection, Ticks, constant_effects
-from compose.recording.ranging.range_recording import Numbers
+from agent.estimation.fit import Fit
 
 
 class LearnedError(msgspec.Struct, frozen=True):
@@ -42,25 +37,13 @@ class LearnedErrors(msgspec.Struct, frozen=True):
     """The bias of the turn rate of each robot while it moves, in rad/s, to be added to the measured one."""
 
 
-class _Posterior(NamedTuple):
-    """The constant errors in sigmas of their priors."""
-
-    mean: Numbers
-    sigma: Numbers
-
-
-def learned_errors(fit: Fit | JointFit, names: Sequence[str], pairs: Sequence[str]) -> LearnedErrors:
+def learned_errors(fit: Fit, names: Sequence[str], pairs: Sequence[str]) -> LearnedErrors:
     """Return the errors that `fit` has learned.
 
     `names` are those of the robots, and `pairs` those of the pairs of radios that have ranges, in order.
     """
     priors = fit.problem.noise.priors
-    posterior = (
-        _Posterior(fit.constants, fit.constant_sigmas)
-        if isinstance(fit, JointFit)
-        else _posterior(fit, _effects(fit))
-    )
-    taken = iter(zip(posterior.mean.tolist(), posterior.sigma.tolist(), strict=True))
+    taken = iter(zip(fit.constants.tolist(), fit.constant_sigmas.tolist(), strict=True))
 
     def next_of(prior: float) -> LearnedError:
         mean, sigma = next(taken)
@@ -77,22 +60,3 @@ def learned_errors(fit: Fit | JointFit, names: Sequence[str], pairs: Sequence[st
             wheels[name], turns[name] = next_of(priors.wheel_scale), next_of(priors.wheel_scale)
             gyros[name] = next_of(priors.gyro_bias)
     return LearnedErrors(fit.level**0.5, bias, scale, of_pairs, wheels, turns, gyros)
-
-
-def _effects(fit: Fit) -> Array:
-    """Return the effects (m) of one sigma of each constant error on the ranges; shape (N, m)."""
-    columns = [fit.problem.common_at(fit.linear.predicted.distance[fit.row])]
-    if fit.errors:
-        for robot, (path, u) in enumerate(zip(fit.paths, fit.directions, strict=True)):
-            rows = Projection.positions(path, Ticks.of(fit.ticks, len(path.v)), u)
-            columns.append(constant_effects(fit.drift(robot), rows)[:-1].T)
-    return np.concatenate(columns, 1)
-
-
-def _posterior(fit: Fit, effects: Array) -> _Posterior:
-    """Return the constant errors given all ranges, to first order."""
-    system = fit.system
-    weighted = system.covariance.solve(effects)
-    explained = system.jacobian.T @ weighted
-    variance = 1.0 - np.sum(effects * weighted, 0) + np.sum(explained * (system.of_guess @ explained), 0)
-    return _Posterior(effects.T @ system.multipliers, np.sqrt(np.maximum(variance, 0.0)))

@@ -7,7 +7,7 @@ from msgspec.structs import replace
 from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.hypotheses import follow, search
 from agent.estimation.gaussian.inference import to_second_order
-from agent.estimation.gaussian.range_model import PairRanges
+from agent.estimation.gaussian.pair_ranges import PairRanges
 from agent.estimation.knowledge import Belief, Knowledge
 from agent.planning.pair_claim import (
     FEWEST_FOR_CLAIM,

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from agent.estimation.gaussian.range_model import PairRanges, Ranges
+from agent.estimation.gaussian.pair_ranges import PairRanges
+from agent.estimation.gaussian.range_model import Ranges
 from compose.errors import UserError
 from compose.recording.estimating.prepared_steps import (
     Measurements,
