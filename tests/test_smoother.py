@@ -97,10 +97,12 @@ def test_a_step_is_that_of_least_squares_with_all_errors_as_unknowns(seed: int) 
     problem = problem_of(seed, 2, 5, slow=0.0, survey=0.0, prior=False)
     of = problem.measured
     poses, constant, white = point_of(of, seed)
-    constant, white = 0.3 * constant, 0.3 * white
-    step = Kernel(of).step(
-        Kernel(of).walked(poses, constant, white), poses, np.square(problem.sigma), 0.0, np.inf
-    )
+    constant, white, kernel = 0.3 * constant, 0.3 * white, Kernel(of)
+    step = kernel.step(kernel.walked(poses, constant, white), poses, np.square(problem.sigma), 0.0, np.inf)
+    while not np.array_equal(step.change, step.limited):  # to a place from where no step is limited
+        poses = problem.moved(poses, step.limited[: 3 * of.robots])
+        walk = kernel.walked(poses, constant, white)
+        step = kernel.step(walk, poses, np.square(problem.sigma), 0.0, np.inf)
     jacobian, right, x = dense(problem, poses, constant, white)
     change, *_ = np.linalg.lstsq(jacobian, right)
     after, size = x + change, of.size

@@ -41,8 +41,8 @@ Steps of Gauss-Newton decrease by a constant factor, about 0.1 with ranges of a 
 linear model is not computed again after the last step.
 """
 
-LARGEST_STEP = 1.0
-"""The largest change of an unknown, in m and rad, in one step."""
+LARGEST_STEP = 0.3
+"""The largest change of a start position in one step, in units of the longest range."""
 
 SHORTER_STEPS = (1.0, 0.5, 0.25, 0.0625)
 """The fractions of a step that are tried in turn until one descends.
@@ -286,8 +286,8 @@ def held_fit(measured: JointMeasurements, begun: Fit, steps: int) -> HeldFit:
     point = _begin(problem, kernel, start)
     weights = _first_weights(problem, kernel, start, point)
     for number in range(steps + 1):
-        variance = weighted_variance(sigma, weights)
-        step = kernel.step(point.walk, point.poses, variance, RIDGE, LARGEST_STEP)
+        variance = weighted_variance(sigma, weights, problem.longest)
+        step = kernel.step(point.walk, point.poses, variance, RIDGE, LARGEST_STEP * problem.longest)
         if number == steps:
             break
         point = _after(problem, kernel, point, step, 1.0)
@@ -329,8 +329,8 @@ def _fitted(problem: Problem, kernel: Kernel, start: Start, ending: Ending) -> F
     for number in range(ending.steps + 1):
         if problem.robust and number == 0:
             weights = _first_weights(problem, kernel, start, point)
-        variance = weighted_variance(sigma, weights)
-        step = kernel.step(point.walk, point.poses, variance, RIDGE, LARGEST_STEP)
+        variance = weighted_variance(sigma, weights, problem.longest)
+        step = kernel.step(point.walk, point.poses, variance, RIDGE, LARGEST_STEP * problem.longest)
         if not math.isfinite(step.chi2):
             raise Singular("an error is too large for a float")
         updated = weights
@@ -462,7 +462,7 @@ def _evidence(problem: Problem, point: _Point, step: FitStep, weights: Array) ->
     """
     noise, sigma, good = problem.noise, problem.sigma, weights > INLIER
     count = int(np.count_nonzero(good))
-    volume = step.volume - float(np.sum(np.log(weighted_variance(sigma, weights)[~good])))
+    volume = step.volume - float(np.sum(np.log(weighted_variance(sigma, weights, problem.longest)[~good])))
     weight = -0.5 * (volume - problem.log_information + math.log(2.0 * math.pi) * count)
     weight += misfit_log_likelihood(step.chi2, count - problem.free, noise)
     if noise.outliers or noise.strays:

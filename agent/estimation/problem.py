@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges
 from agent.estimation.gaussian.odometry_noise import Array, Places, Track, constant_errors, variances
+from agent.estimation.gaussian.range_model import SIGMA_FLOOR
 from agent.estimation.smoother import Measured
 from protocol.motion import rotated, rotated_back
 from protocol.noise import Noise
@@ -36,6 +37,8 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
     """The ranges of the fit in the order of the measurements; shape (N,)."""
     sigma: Array
     """The standard deviation of each range in m; shape (N,)."""
+    longest: float
+    """The longest range in m: the size of the geometry."""
     exact: NDArray[np.bool]
     """True for a range that has no error but a white one: see `JointRanges.radio`; shape (N,)."""
     lengths: tuple[int, ...]
@@ -99,6 +102,7 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
             noise,
             back,
             ranges.sigma[order],
+            max(float(np.max(ranges.rho[order[~exact]], initial=0.0)), SIGMA_FLOOR),
             exact,
             lengths,
             3 * n - (0 if prior is None else prior.rank),

@@ -26,6 +26,7 @@ const char *compiler(void)
 
 #define SLIGHT 1e-4
 #define SMALLEST_DISTANCE 1e-12
+#define LARGEST_TURN 1.0
 
 typedef long long Index;
 
@@ -364,11 +365,13 @@ static int limited(const Measured *of, double largest, const double *change, Wor
 {
     const Index n3 = 3 * of->robots, q = unknowns(of), size = estimated(of);
     double most = 0.0;
-    for (Index a = 0; a < n3; a++)
-        if (fabs(change[a]) > most) most = fabs(change[a]);
+    for (Index a = 0; a < n3; a++) {
+        const double share = fabs(change[a]) / (a % 3 == 2 ? LARGEST_TURN : largest);
+        if (share > most) most = share;
+    }
     memcpy(found, change, sizeof(double) * size);
-    if (most <= largest) return 1;
-    for (Index a = 0; a < n3; a++) found[a] = change[a] * (largest / most);
+    if (most <= 1.0) return 1;
+    for (Index a = 0; a < n3; a++) found[a] = change[a] / most;
     for (Index a = n3; a < size; a++)
         w->vector[a - n3] = w->gradient[a] - dot(w->information + a * q, found, n3);
     if (!cholesky(w->information, q, n3, size, w->inner)) return 0;

@@ -34,6 +34,9 @@ SLIGHT = 1e-4
 SMALLEST_DISTANCE = 1e-12
 """The distance in m below which a direction is not defined."""
 
+LARGEST_TURN = 1.0
+"""The largest change of a heading in a step, in rad."""
+
 
 class Measured(NamedTuple):
     """The measurements, and the priors of their errors: all that does not change during a fit.
@@ -382,7 +385,7 @@ def step(of: Measured, walk: Walk, poses: Array, variance: Array, ridge: float, 
     """Return a Gauss-Newton step from `poses`; `variance` is the own variance of each range in m^2.
 
     `ridge` is a share of the information of each pose that is added to it, so that what the ranges leave open
-    has a large variance; `largest` bounds the change of each pose in m and rad. Raises Singular.
+    has a large variance; `largest` bounds the change of each start position in m. Raises Singular.
     """
     n3, size = 3 * of.robots, of.size
     passed = forward(of, walk, poses, variance)
@@ -418,13 +421,13 @@ def step(of: Measured, walk: Walk, poses: Array, variance: Array, ridge: float, 
 
 
 def _limited(passed: Passed, change: Vector, n3: int, largest: float) -> Vector:
-    """Return a shorter change of the poses, of at most `largest`, with the best constant errors beside it."""
+    """Return a change of at most `largest` and LARGEST_TURN, with the best constant errors beside it."""
     most = 0.0
     for a in range(n3):
-        most = max(most, abs(change[a]))
-    if most <= largest:
+        most = max(most, abs(change[a]) / (LARGEST_TURN if a % 3 == 2 else largest))
+    if most <= 1.0:
         return change
-    poses = [one * (largest / most) for one in change[:n3]]
+    poses = [one / most for one in change[:n3]]
     left = [passed.gradient[a] - dot(passed.information[a][:n3], poses) for a in range(n3, len(change))]
     return poses + solved(cholesky(passed.information, n3, len(change)), left)
 

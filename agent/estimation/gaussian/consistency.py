@@ -277,10 +277,13 @@ def _distance_score(fitted: Fit, pair: PairRanges) -> float:
     score, information = fitted.linear.score(np.where(of.second >= 0, -along, 0.0))
     level = max(min(fitted.level, HIGHEST_LEVEL), 1.0)
     surveyed = 2.0 * pair.noise.priors.survey_error**2  # the variance of the known distance
-    if information <= LEAST_INFORMATION:
+    if information * (pair.apart[0] ** 2 + pair.apart[1] ** 2) <= LEAST_INFORMATION:
         return 0.0
     return score / math.sqrt(information * (level + surveyed * information))
 
 
-LEAST_INFORMATION = 1e-3
-"""The information (1 / m^2) below which the ranges do not determine the distance, and the score is 0."""
+LEAST_INFORMATION = 0.1
+"""The information on the distance below which the ranges do not determine it, and the score is 0.
+
+It is in units of that of a distance with a sigma of its own length.
+"""

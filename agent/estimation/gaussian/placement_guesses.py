@@ -81,8 +81,8 @@ FINER_TURN = 0.2
 TURN = 0.3
 """The largest change of a heading (rad) in one of these steps."""
 
-SHORTEST_LEVER = 0.1
-"""The least lever (m) that is assumed for a heading."""
+SHORTEST_LEVER = 0.03
+"""The least lever that is assumed for a heading, as a fraction of R."""
 
 
 class Placed(NamedTuple):
@@ -187,7 +187,7 @@ def placements(own: tuple[Fit, Fit], pair: PairRanges) -> list[Placed]:
     near, far = (0, 1) if radii[0] < radii[1] else (1, 0)
     sign = 1.0 if far == 0 else -1.0
     apart = (sign * pair.apart[0], sign * pair.apart[1])  # from the far robot's anchor to the near one's
-    lever = np.array([max(radii[robot], SHORTEST_LEVER) for robot in (near, far)])
+    lever = np.array([max(radii[robot], SHORTEST_LEVER * pair.sensing_range) for robot in (near, far)])
     ends = sorted({0, len(ticks) - 1})
     z = np.concatenate([_scanned(robots[near], robots[far], i, float(rho[i]), apart, lever) for i in ends])
     z, likely = _turned(z, (robots[near], robots[far]), middle, rho, sigma, apart, lever, pair)

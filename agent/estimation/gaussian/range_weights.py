@@ -8,16 +8,16 @@ from agent.estimation.gaussian.odometry_noise import Array
 from agent.estimation.gaussian.range_model import inlier_probability
 from protocol.noise import Noise
 
-FAR = 100.0
-"""The standard deviation (m) of a range with the weight 0."""
+FAR = 32.0
+"""The standard deviation of a range with the weight 0, in units of the longest range."""
 
 BLIND = 1e-9
 """The least precision of a range's prediction, as a fraction of that with a known guess."""
 
 
-def weighted_variance(sigma: Array, weights: Array) -> Array:
-    """Return the variance (m^2) of each range, which is large for a small weight."""
-    variance: Array = np.square(sigma) / np.maximum(weights, np.square(sigma / FAR))
+def weighted_variance(sigma: Array, weights: Array, longest: float) -> Array:
+    """Return the variance (m^2) of each range, which is large for a small weight; see FAR."""
+    variance: Array = np.square(sigma) / np.maximum(weights, np.square(sigma / (FAR * longest)))
     return variance
 
 
