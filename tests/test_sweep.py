@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from distributed import Client
 from matplotlib.figure import Figure
 from scipy.stats import binom, binomtest  # type: ignore[import-untyped]
 
@@ -186,31 +187,67 @@ def dask(stack: ExitStack, module: str, *arguments: str | Path, cwd: Path) -> su
 
 
 @pytest.mark.long
-def test_rows_are_the_same_by_a_scheduler_and_workers_started_by_hand_even_if_one_is_lost(
-    folder: Path,
+def test_rows_are_the_same_by_a_scheduler_that_is_slow_and_loses_workers_and_connections(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     played(folder, "lengthy.toml", "here")
     with ExitStack() as stack:
         file = folder / "scheduler.json"
         arguments = ("--host", "127.0.0.1", "--no-dashboard")
-        dask(stack, "dask_scheduler", "--port", "0", "--scheduler-file", file, *arguments, cwd=folder)
+        scheduler = dask(
+            stack, "dask_scheduler", "--port", "0", "--scheduler-file", file, *arguments, cwd=folder
+        )
         until(lambda: file.exists() and file.read_text().endswith("}"), "the scheduler listens")
         address = json.loads(file.read_text())["address"]
-        workers = [
-            dask(stack, "dask_worker", address, "--nthreads", "1", "--no-nanny", *arguments, cwd=folder)
-            for _ in range(2)
-        ]
-        with TandemProcess(
-            "sweep", "lengthy.toml", "--out", "there", "--scheduler", address, cwd=folder
-        ) as command:
-            command.until(lambda: parts(folder / "there") >= 2, "two chunks are done")
-            workers[0].kill()
-            assert command.ended().status == 1
+        watcher = stack.enter_context(Client(address, set_as_default=False))
+
+        def worker() -> subprocess.Popen[bytes]:
+            return dask(
+                stack, "dask_worker", address, "--nthreads", "1", "--no-nanny", *arguments, cwd=folder
+            )
+
+        def command(out: str) -> TandemProcess:
+            return TandemProcess("sweep", "lengthy.toml", "--out", out, "--scheduler", address, cwd=folder)
+
+        first, second = worker(), worker()
+        with command("there") as sweep:
+            sweep.until(lambda: parts(folder / "there") >= 2, "two chunks are done")
+            sweep.tell(SIGSTOP)
+            until(lambda: set(watcher.processing().values()) == {()}, "all submitted chunks are done")
+            first.kill()
+            until(lambda: len(watcher.nthreads()) == 1, "the scheduler has lost the worker")
+            sweep.tell(SIGCONT)  # it reads that a chunk is done, then that the rows are lost
+            done = parts(folder / "there")
+            sweep.until(lambda: parts(folder / "there") > done, "the sweep goes on")
+            known = watcher.id
+            watcher.run_on_scheduler(
+                lambda dask_scheduler: [
+                    connection.abort()
+                    for client, connection in dask_scheduler.client_comms.items()
+                    if client != known
+                ]
+            )
+            third = worker()
+            until(lambda: len(watcher.nthreads()) == 2, "another worker has come")
+            second.kill()
+            scheduler.send_signal(SIGSTOP)
+            time.sleep(cluster.SCHEDULER_S + 2.0)  # as on a busy machine
+            scheduler.send_signal(SIGCONT)
+            assert sweep.ended().status == 1, sweep.err
         until(lambda: not trial_processes(folder), "the workers keep no process of a sweep that is over")
-        for worker in workers[1:]:
-            worker.terminate()
-            worker.wait(20.0)
-    assert rows(folder / "there") == rows(folder / "here")
+        assert rows(folder / "there") == rows(folder / "here")
+        monkeypatch.setenv("DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT", "2s")
+        with command("gone") as sweep:
+            sweep.until(lambda: parts(folder / "gone"), "a chunk is done")
+            watcher.close()
+            scheduler.kill()
+            ended = sweep.ended()
+        assert ended.status == 3
+        assert re.fullmatch(
+            r"tandem sweep: the connection to the scheduler is lost: \d+ of 80 trials are done; [^\n]+\n",
+            ended.err,
+        ), ended.err
+        third.wait(20.0)
 
 
 @pytest.mark.long
@@ -352,29 +389,6 @@ def test_a_sweep_goes_on_after_its_machine_has_slept(folder: Path, monkeypatch: 
         command.tell(SIGCONT)
         assert command.ended().status == 1  # some of the missions are undecided
     assert len(rows(folder / "out")) == 80
-
-
-def test_an_answer_that_comes_after_the_machine_has_slept_is_in_time() -> None:
-    """A sweep whose machine fell asleep in this wait once took its scheduler for lost."""
-    code = """
-import time
-from compose.sweep.cluster import _within
-
-def ask() -> int:
-    print("asked", flush=True)
-    for _ in range(40):  # each of them takes 10 ms, or as long as the process is suspended
-        time.sleep(0.01)
-    return 7
-
-print(_within(1.0, ask))
-"""
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "asked\n"
-        process.send_signal(SIGSTOP)
-        time.sleep(1.5)  # longer than the wait
-        process.send_signal(SIGCONT)
-        assert process.stdout.read() == "7\n"
 
 
 @pytest.mark.long

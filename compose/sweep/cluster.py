@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import math
 import secrets
 import tempfile
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Sequence
+from concurrent.futures import CancelledError, Future
 from contextlib import contextmanager, suppress
-from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
 import dask
 import msgspec
-from distributed import Client, Future, KilledWorker, LocalCluster
+from distributed import Client, KilledWorker, LocalCluster
 from distributed.comm.addressing import parse_address, parse_host_port
 from distributed.core import rpc
 from distributed.security import Security
@@ -36,15 +34,16 @@ CHUNKS_PER_THREAD = 2
 SCHEMES = ("tcp", "tls", "ws", "wss")
 """The schemes that the address of a scheduler may have."""
 SCHEDULER_S = 5.0
-"""The time in s within which a scheduler must answer."""
-SLICE_S = 0.1
-"""The time in s of which a wait for the scheduler is made up."""
-RESULT_S = 60.0
-"""The time in s within which a worker must deliver a result that it has; generous for busy machines."""
+"""The time in s within which a scheduler must answer when a sweep begins, and its workers when it ends."""
+COUNTED_S = 0.1
+"""The time in s between two looks whether the worker threads are counted."""
 THREADS_COUNT_S = 1.0
 """The time in s between two counts of the worker threads."""
 CHUNK_RETRIES = 2
 """The number of retries of a chunk whose worker could not start a process for trials."""
+CONNECTED = ("running", "connecting")
+"""The states of a client that has a connection to its scheduler, or tries to restore it."""
+CONNECTION_LOST = "the connection to the scheduler is lost"
 SCHEDULER_ADDRESS = "127.0.0.1:0"
 
 
@@ -54,14 +53,14 @@ def connect(workers: int, scheduler: str | None) -> Iterator[Client]:
 
     Raises UserError if the scheduler cannot be reached.
     """
-    dask.config.set({"distributed.comm.timeouts.connect": SCHEDULER_S, "distributed.admin.tick.limit": "1h"})
+    dask.config.set({"distributed.admin.tick.limit": "1h"})
     for name in ["distributed", *logging.root.manager.loggerDict]:
         if name.partition(".")[0] == "distributed":
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # this program reports errors itself
     if scheduler is not None:
         try:
             asyncio.run(_look_for(scheduler))
-            client = Client(scheduler, timeout=SCHEDULER_S, set_as_default=False)
+            client = Client(scheduler, set_as_default=False)
         except (OSError, ValueError, TypeError, RuntimeError, ImportError) as error:
             why = one_line(str(error).splitlines()[0] if str(error) else type(error).__name__)
             raise UserError(f"--scheduler: {scheduler} cannot be reached: {why}") from None
@@ -127,56 +126,86 @@ def play(
 ) -> None:
     """Run all of `work`, and call `done` with the rows of each chunk as it completes.
 
+    A scheduler that is slow to answer, as on a busy machine, is waited for as long as its connection lives.
+
     Raises Interrupted if `inbox` receives a signal, and EngineFailed if the connection to the scheduler is
     lost. In any case, all chunks are cancelled and their processes ended.
     """
     sweep = secrets.token_hex(8)
-    submitted: dict[str, tuple[Future[Any], Chunk, Work]] = {}
+    running: dict[str, tuple[Future[list[bytes]], Chunk, Work]] = {}
+    counted = _begun(client, _threads(client))
     try:
-        threads, looked = _threads(client), time.monotonic()
+        while not counted.done():
+            inbox.next(COUNTED_S)
+        threads, looked = counted.result(), time.monotonic()
         if not threads:
             inbox.say("the scheduler has no workers yet")
         chunks = chunks_of(work, orders, lambda: max(threads, 1))
         while True:
             while (
-                len(submitted) < CHUNKS_PER_THREAD * max(threads, 1)
+                len(running) < CHUNKS_PER_THREAD * max(threads, 1)
                 and (following := next(chunks, None)) is not None
             ):
                 chunk, source = following
-                future = client.submit(
-                    worker_pool.run, sweep, msgspec.msgpack.encode(chunk), pure=False, retries=CHUNK_RETRIES
-                )
-                submitted[str(future.key)] = future, chunk, source
-                future.add_done_callback(lambda ended: inbox.put("ended", str(ended.key)))
-            if not submitted:
+                outcome = _begun(client, _outcome(client, sweep, msgspec.msgpack.encode(chunk)))
+                running[str(id(outcome))] = outcome, chunk, source
+                outcome.add_done_callback(lambda ended: inbox.put("ended", str(id(ended))))
+            if not running:
                 return
             arrival = inbox.next(THREADS_COUNT_S)
-            if arrival.key in submitted:
-                future, chunk, source = submitted.pop(arrival.key)
-                rows = _rows(future, chunk)
+            if arrival.key in running:
+                outcome, chunk, source = running.pop(arrival.key)
+                rows = _rows(outcome, chunk)
                 source.took(rows, orders.timeout)
                 done(rows)
-            if time.monotonic() - looked > THREADS_COUNT_S:
-                if client.status not in ("running", "connecting"):
-                    raise EngineFailed("the connection to the scheduler is lost")
-                threads, looked = _threads(client), time.monotonic()
+            if counted.done() and time.monotonic() - looked > THREADS_COUNT_S:
+                threads, looked = counted.result(), time.monotonic()
+                counted = _begun(client, _threads(client))
     finally:
-        _leave(client, sweep, [future for future, _, _ in submitted.values()])
+        counted.cancel()
+        for outcome, _, _ in running.values():
+            outcome.cancel()
+        _begun(client, _dismiss(client, sweep)).result()
+        worker_pool.dismiss(sweep)
 
 
-def _rows(future: Future[Any], chunk: Chunk) -> list[TrialRow]:
+def _begun(client: Client, coroutine: Coroutine[Any, Any, T]) -> Future[T]:
+    """Run a coroutine in the thread of the client, where its state does not change meanwhile."""
+    loop: asyncio.AbstractEventLoop = client.loop.asyncio_loop  # type: ignore[union-attr]  # tornado's is one
+    return asyncio.run_coroutine_threadsafe(coroutine, loop)
+
+
+async def _outcome(client: Client, sweep: str, encoded: bytes) -> list[bytes]:
+    """Return the encoded rows of an encoded chunk, which the workers of `client` run.
+
+    If a worker dies while it runs the chunk, or before its rows are here, Dask runs the chunk on another one.
+    If the connection to the scheduler breaks, Dask cancels the chunk and connects again, and the chunk is
+    submitted again. Raises EngineFailed if Dask cannot connect, and any error of the chunk.
+    """
+    future = None
+    while client.status in CONNECTED:
+        if future is None or future.cancelled():
+            future = client.submit(worker_pool.run, sweep, encoded, pure=False, retries=CHUNK_RETRIES)
+        try:
+            rows: list[bytes] = await future
+        except (CancelledError, OSError):
+            if future.status == "error":  # of the chunk
+                raise
+        else:
+            return rows
+    raise EngineFailed(CONNECTION_LOST)
+
+
+def _rows(outcome: Future[list[bytes]], chunk: Chunk) -> list[TrialRow]:
     """Return the rows of a chunk that has ended; if its worker or process died, each row is a lost trial.
 
-    Raises EngineFailed if the result is lost, or if the worker failed for another reason.
+    Raises EngineFailed if the connection to the scheduler is lost, or the worker failed for another reason.
     """
-    try:
-        if future.status == "finished":
-            return [msgspec.msgpack.decode(row, type=TrialRow) for row in future.result(RESULT_S)]
-        error = future.exception(RESULT_S) if future.status == "error" else None
-    except TimeoutError:  # the worker with the result is lost
-        error = None
+    error = outcome.exception()
     if error is None:
-        raise EngineFailed("the connection to the scheduler is lost")
+        return [msgspec.msgpack.decode(row, type=TrialRow) for row in outcome.result()]
+    if isinstance(error, EngineFailed):
+        raise error
     error_text = one_line(f"lost: {type(error).__name__}: {error}")[:MAX_ERROR]
     if not isinstance(error, KilledWorker | worker_pool.Died | worker_pool.Hung):
         # every chunk would fail like this one
@@ -187,38 +216,17 @@ def _rows(future: Future[Any], chunk: Chunk) -> list[TrialRow]:
     ]
 
 
-def _threads(client: Client) -> int:
-    """Return the number of worker threads. Raises EngineFailed if the scheduler does not answer."""
-    known = _within(SCHEDULER_S, client.nthreads)
-    if known is None:
-        raise EngineFailed(f"the scheduler has not answered for {SCHEDULER_S:g} s")
-    return sum(known.values())
+async def _threads(client: Client) -> int:
+    """Return the number of worker threads. Raises EngineFailed if the connection to the scheduler is lost."""
+    while client.status in CONNECTED:
+        with suppress(OSError):  # Dask connects again
+            return sum((await client.nthreads()).values())
+        await asyncio.sleep(COUNTED_S)
+    raise EngineFailed(CONNECTION_LOST)
 
 
-def _within(seconds: float, ask: Callable[[], T]) -> T | None:
-    """Return the result of `ask`; None if it fails, or takes longer than `seconds` (a frozen host).
-
-    The time in which this process is suspended, as when the machine sleeps, counts as one SLICE_S.
-    """
-    answers: SimpleQueue[T] = SimpleQueue()
-
-    def wait() -> None:
-        with suppress(Exception):  # a failure counts as no answer
-            answers.put(ask())
-
-    threading.Thread(target=wait, daemon=True).start()
-    for _ in range(math.ceil(seconds / SLICE_S)):
-        with suppress(Empty):
-            return answers.get(timeout=SLICE_S)
-    return None
-
-
-def _leave(client: Client, sweep: str, submitted: Sequence[Future[Any]]) -> None:
-    """Cancel the futures `submitted`, and end all processes of the sweep."""
-
-    def dismiss() -> None:
-        client.cancel(submitted, force=True)
-        client.run(worker_pool.dismiss, sweep)
-
-    _within(SCHEDULER_S, dismiss)  # if the scheduler is lost, its workers' processes end by themselves
-    worker_pool.dismiss(sweep)
+async def _dismiss(client: Client, sweep: str) -> None:
+    """End all processes of the sweep on the workers."""
+    with suppress(Exception):  # if the scheduler is lost, its workers' processes end by themselves
+        async with asyncio.timeout(SCHEDULER_S):
+            await client.run(worker_pool.dismiss, sweep)
