@@ -35,8 +35,6 @@ SCHEMES = ("tcp", "tls", "ws", "wss")
 """The schemes that the address of a scheduler may have."""
 SCHEDULER_S = 5.0
 """The time in s within which a scheduler must answer when a sweep begins, and its workers when it ends."""
-COUNTED_S = 0.1
-"""The time in s between two looks whether the worker threads are counted."""
 THREADS_COUNT_S = 1.0
 """The time in s between two counts of the worker threads."""
 CHUNK_RETRIES = 2
@@ -127,16 +125,16 @@ def play(
     """Run all of `work`, and call `done` with the rows of each chunk as it completes.
 
     A scheduler that is slow to answer, as on a busy machine, is waited for as long as its connection lives.
-
     Raises Interrupted if `inbox` receives a signal, and EngineFailed if the connection to the scheduler is
     lost. In any case, all chunks are cancelled and their processes ended.
     """
     sweep = secrets.token_hex(8)
     running: dict[str, tuple[Future[list[bytes]], Chunk, Work]] = {}
     counted = _begun(client, _threads(client))
+    counted.add_done_callback(lambda _: inbox.put("ended"))
     try:
         while not counted.done():
-            inbox.next(COUNTED_S)
+            inbox.next(THREADS_COUNT_S)
         threads, looked = counted.result(), time.monotonic()
         if not threads:
             inbox.say("the scheduler has no workers yet")
@@ -171,8 +169,7 @@ def play(
 
 def _begun(client: Client, coroutine: Coroutine[Any, Any, T]) -> Future[T]:
     """Run a coroutine in the thread of the client, where its state does not change meanwhile."""
-    loop: asyncio.AbstractEventLoop = client.loop.asyncio_loop  # type: ignore[union-attr]  # tornado's is one
-    return asyncio.run_coroutine_threadsafe(coroutine, loop)
+    return asyncio.run_coroutine_threadsafe(coroutine, client.loop.asyncio_loop)  # type: ignore[union-attr]
 
 
 async def _outcome(client: Client, sweep: str, encoded: bytes) -> list[bytes]:
@@ -221,7 +218,7 @@ async def _threads(client: Client) -> int:
     while client.status in CONNECTED:
         with suppress(OSError):  # Dask connects again
             return sum((await client.nthreads()).values())
-        await asyncio.sleep(COUNTED_S)
+        await asyncio.sleep(THREADS_COUNT_S)
     raise EngineFailed(CONNECTION_LOST)
 
 
