@@ -62,6 +62,13 @@ RIDGE = 1e-12
 With it, the variance of an unknown that the ranges leave undetermined is large but finite.
 """
 
+GRAIN = 1e-12
+"""The least variance of a range, as a fraction of the largest one that the noise of the odometry leaves.
+
+With less, RIDGE would be more than what inaccurate ranges tell beside exact ones: steps would be too short,
+and variances too small.
+"""
+
 SOFT = 0.1
 """The least smoothing of the ends of the outlier density, as a fraction of the least bias."""
 
@@ -226,8 +233,9 @@ class _Point(NamedTuple):
         cost = float(squares + off @ of.information @ off + errors.slow @ errors.of_slow)
         own = walk.residual - of.common @ errors.common - errors.slow
         if of.scaled >= 0:  # the scale error multiplies the predicted ranges
-            by_scale = of.common[:, of.scaled] - of.scale * (of.rho - walk.residual)
-            own += by_scale * errors.common[of.scaled]
+            told = of.common[:, of.scaled]
+            by_scale = np.where(told == 0.0, 0.0, of.scale * (of.rho - walk.residual))
+            own += (told - by_scale) * errors.common[of.scaled]
         return _Point(poses, errors, walk, own, cost)
 
     def cost(self, variance: Array) -> float:
@@ -325,11 +333,14 @@ def without_outliers(measured: JointMeasurements, starts: Sequence[Start]) -> li
 def _fitted(problem: Problem, kernel: Kernel, start: Start, ending: Ending) -> Fit:
     noise, sigma = problem.noise, problem.sigma
     point = _begin(problem, kernel, start)
-    weights, before = np.ones(len(sigma)), 0.0
+    weights, least, before = np.ones(len(sigma)), 0.0, 0.0
+    if problem.noisy:
+        loose = kernel.loosened(point.walk, point.poses, np.square(sigma))
+        least = GRAIN * float(np.max(loose, initial=0.0))
     for number in range(ending.steps + 1):
         if problem.robust and number == 0:
             weights = _first_weights(problem, kernel, start, point)
-        variance = weighted_variance(sigma, weights, problem.longest)
+        variance = weighted_variance(sigma, weights, problem.longest) + least
         step = kernel.step(point.walk, point.poses, variance, RIDGE, LARGEST_STEP * problem.longest)
         if not math.isfinite(step.chi2):
             raise Singular("an error is too large for a float")
