@@ -10,8 +10,9 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian.fitted import Fit
-from protocol.motion import Pose, compose
+from agent.estimation.fit import Fit
+from protocol.motion import Pose
+from tests.pair_starts import pair_start
 
 Array = NDArray[np.float64]
 
@@ -25,7 +26,7 @@ class Optimum(NamedTuple):
     """The optimum of the graph, computed by gtsam."""
 
     mean: Array
-    """The poses of both robots at the last tick, in the order of `fitted_poses.poses`."""
+    """The poses of both robots at the last tick, in the order of `Fit.poses`."""
     covariance: Array
     error: float
     """Half the sum of squared residuals."""
@@ -87,13 +88,10 @@ def optimum(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: Seque
     return Optimum(mean, turn @ local @ turn.T, graph.error(values))
 
 
-def nudged(fit: Fit, anchors: Sequence[Array], draw: np.random.Generator) -> list[Pose]:
+def nudged(fit: Fit, apart: tuple[float, float], draw: np.random.Generator) -> list[Pose]:
     """Return random starts of both robots, drawn from the estimated distribution."""
-    guess = draw.multivariate_normal(fit.guess, fit.covariance)
-    starts = []
-    for (mx, my, turn), (x, y) in zip(guess.reshape(2, 3).tolist(), anchors, strict=True):
-        starts.append(compose(Pose(float(x), float(y), turn), Pose(-mx, -my, 0.0)))
-    return starts
+    start = pair_start(draw.multivariate_normal(fit.guess, fit.of_start), apart)
+    return [Pose(x, y, heading) for x, y, heading in start.poses.tolist()]
 
 
 def wrapped(change: Array) -> Array:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from agent.estimation import fit
-from agent.estimation.gaussian import hypotheses, inference, least_squares
+from agent.estimation.gaussian import hypotheses, inference
 from agent.estimation.gaussian.range_model import Ranges
 from agent.planning import phase3_last_manoeuvre
 from compose.scenario import group_meetings
@@ -51,8 +51,7 @@ def gate() -> None:
     def wide(before: Any, errors: Any, sigma: Any, noise: Any) -> Any:
         return before(errors, 2.0 * sigma, noise)
 
-    for module in (least_squares, fit):
-        wrapped(module, "weights_by_errors", wide)
+    wrapped(fit, "weights_by_errors", wide)
 
 
 def hypothesis() -> None:

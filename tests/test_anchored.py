@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from agent.estimation.gaussian.consistency import chi2_p_value
-from agent.estimation.gaussian.range_model import Ranges, predicted
+from agent.estimation.gaussian.known_anchors import predicted
 from compose.errors import UserError
 from compose.recording.estimating.anchored_estimate import AnchoredMeasurements
 from compose.recording.estimating.calibration import calibrated
@@ -146,22 +146,13 @@ def test_ranges_belong_to_their_anchor() -> None:
 
 def test_the_derivatives_of_ranges_to_several_anchors_are_right() -> None:
     draws = np.random.default_rng(3)
-    place = draws.uniform(-5.0, 5.0, (6, 2))
-    ranges = Ranges(np.ones(6), np.arange(6), np.ones(6), (6, 0, 0), place, np.arange(6))
-    at = draws.uniform(-5.0, 5.0, (1, 2, 6))
-    guess = draws.uniform(-2.0, 2.0, 3)
-    model, small = predicted(guess, at, ranges, (0.0, 0.0)), 1e-6
+    place, at = draws.uniform(-5.0, 5.0, (6, 2)), draws.uniform(-5.0, 5.0, (2, 6))
+    guesses, small = draws.uniform(-2.0, 2.0, (2, 3)), 1e-6
+    _, derivatives = predicted(guesses, at, place)
     for i in range(3):
         step = small * np.eye(3)[i]
-        more = predicted(guess + step, at, ranges, (0.0, 0.0)).distance
-        less = predicted(guess - step, at, ranges, (0.0, 0.0)).distance
-        np.testing.assert_allclose((more - less) / (2.0 * small), model.jacobian[:, i], atol=1e-6)
-    for axis in range(2):
-        shift = np.zeros((1, 2, 1))
-        shift[0, axis] = small
-        more = predicted(guess, at + shift, ranges, (0.0, 0.0)).distance
-        less = predicted(guess, at - shift, ranges, (0.0, 0.0)).distance
-        np.testing.assert_allclose((more - less) / (2.0 * small), model.directions[0, axis], atol=1e-6)
+        more, less = (predicted(guesses + sign * step, at, place)[0] for sign in (1.0, -1.0))
+        np.testing.assert_allclose((more - less) / (2.0 * small), derivatives[..., i], atol=1e-6)
 
 
 def test_the_radios_of_one_robot_are_calibrated_without_truth() -> None:

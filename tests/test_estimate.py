@@ -18,10 +18,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from agent.estimation.gaussian.linear_model import Problem
 from agent.estimation.gaussian.odometry_noise import track
-from agent.estimation.gaussian.pair_ranges import PairRanges
+from agent.estimation.gaussian.pair_ranges import PairRanges, alone
 from agent.estimation.gaussian.range_model import Ranges
+from agent.estimation.problem import Problem
 from compose.errors import NOT_LOCALISED, USER_ERROR, UserError
 from compose.recording.estimating.estimate_epoch import ClaimRule
 from compose.recording.estimating.estimate_files import ESTIMATE_COLUMNS, estimate_csv
@@ -262,13 +262,10 @@ def test_lateral_slip_turns_the_path_and_extra_variances_add_to_the_noise() -> N
     extra = np.array([[0.0, 0.0, 3.0, 0.0], [0.0, 2.0, 0.0, 0.0]])
     ranges = Ranges.of_lists([(1, 1.0), (3, 2.0)], (), (), noise)
     plain, more = (
-        Problem.of([path], ranges, noise, (0.0, 0.0)) for path in (straight, left._replace(extra=extra))
+        Problem.of(alone(path, ranges, noise)).measured for path in (straight, left._replace(extra=extra))
     )
-    assert plain.variances is not None
-    assert more.variances is not None
-    assert plain.slip is None
-    assert more.slip is not None
-    np.testing.assert_allclose(more.variances - plain.variances, [extra])
+    np.testing.assert_allclose(more.white - plain.white, [extra])
+    np.testing.assert_array_equal(plain.slip, np.zeros((1, 4)))
     np.testing.assert_array_equal(more.slip, [np.full(4, 0.5 * math.pi)])
 
 

@@ -13,8 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from agent.estimation.gaussian.fitted import Fit
-from agent.estimation.gaussian.fitted_poses import poses
+from agent.estimation.fit import Fit
 from agent.estimation.gaussian.pair_ranges import PairRanges
 from compose.recording.estimating.estimate_epoch import ClaimRule
 from compose.recording.estimating.estimate_run import estimated, measurements
@@ -93,7 +92,7 @@ def measured_range(
 
 def graph_of(pair: PairRanges, fit: Fit) -> gtsam.NonlinearFactorGraph:
     """Return the graph of all poses, manoeuvres, ranges and common errors, without priors on the starts."""
-    graph, problem, ranges = gtsam.NonlinearFactorGraph(), fit.problem, pair.ranges
+    graph, ranges = gtsam.NonlinearFactorGraph(), pair.ranges
     unit = gtsam.noiseModel.Unit.Create
     priors, noise = pair.noise.priors, pair.noise.odometry
     for robot, path in enumerate(pair.paths):
@@ -113,11 +112,11 @@ def graph_of(pair: PairRanges, fit: Fit) -> gtsam.NonlinearFactorGraph:
             graph.add(odometry(robot, tick, np.array((v, omega)), effects, np.sqrt(white)))
             graph.add(arc(robot, tick, path.period, 0.0 if path.slip is None else float(path.slip[tick])))
         graph.add(gtsam.PriorFactorVector(constants_of(robot), np.zeros(3), unit(3)))
-    columns, correlated = common_errors(pair), problem.slow is not None
+    columns, covariance = common_errors(pair), slow_covariance(pair)
     graph.add(gtsam.PriorFactorVector(COMMON, np.zeros(columns.shape[1]), unit(columns.shape[1])))
-    if problem.slow is not None:
-        covariance = gtsam.noiseModel.Gaussian.Covariance(problem.slow)
-        graph.add(gtsam.PriorFactorVector(SLOW, np.zeros(len(ranges.rho)), covariance))
+    if priors.slow_sigma:
+        of_slow = gtsam.noiseModel.Gaussian.Covariance(covariance)
+        graph.add(gtsam.PriorFactorVector(SLOW, np.zeros(len(ranges.rho)), of_slow))
     sigmas = ranges.sigma / np.sqrt(fit.weights)
     places = np.zeros(2), np.array(pair.apart)
     for row, (rho, tick, sigma) in enumerate(
@@ -129,7 +128,7 @@ def graph_of(pair: PairRanges, fit: Fit) -> gtsam.NonlinearFactorGraph:
             ends = [(pose_of(0, tick), None), (pose_of(1, tick), None)]
         else:
             ends = [(pose_of(kind, tick), None), (-1, places[kind])]
-        graph.add(measured_range(ends, rho, columns[row], row, float(sigma), slow=correlated))
+        graph.add(measured_range(ends, rho, columns[row], row, float(sigma), slow=priors.slow_sigma > 0.0))
     return graph
 
 
@@ -139,6 +138,15 @@ def common_errors(pair: PairRanges) -> Array:
     kind = np.repeat(np.arange(3), ranges.counts)
     columns = [np.full(len(kind), priors.range_bias), priors.range_scale * ranges.rho]
     return np.stack([*columns, *[priors.pair_bias * (kind == one) for one in range(3)]], 1)
+
+
+def slow_covariance(pair: PairRanges) -> Array:
+    """Return the covariance (m^2) of the slow errors of the ranges; each pair of radios has its own."""
+    priors, ranges = pair.noise.priors, pair.ranges
+    kind = np.repeat(np.arange(3), ranges.counts)
+    apart = pair.paths[0].period * np.abs(ranges.tick[:, None] - ranges.tick)
+    correlation = np.exp(-apart / priors.slow_time) * (kind[:, None] == kind)
+    return np.asarray(priors.slow_sigma**2 * correlation)
 
 
 def begun(pair: PairRanges, starts: list[Pose]) -> gtsam.Values:
@@ -181,21 +189,19 @@ def window(request: pytest.FixtureRequest) -> Compared:
     ours, pair = last.fitted
     assert isinstance(pair, PairRanges)
     assert isinstance(ours, Fit)
-    starts = nudged(ours, (np.zeros(2), np.array(pair.apart)), np.random.default_rng(request.param))
+    starts = nudged(ours, pair.apart, np.random.default_rng(request.param))
     ends = [pose_of(robot, len(path.v)) for robot, path in enumerate(pair.paths)]
     return Compared(pair, ours, optimum(graph_of(pair, ours), begun(pair, starts), ends))
 
 
 def test_both_recorded_poses_are_gtsams_within_a_hundredth_of_a_sigma(window: Compared) -> None:
-    mean, _ = poses(window.ours, window.pair.apart)
     sigmas = np.sqrt(np.diagonal(window.theirs.covariance))
-    off = np.abs(wrapped(mean - window.theirs.mean)) / sigmas
+    off = np.abs(wrapped(window.ours.poses.ravel() - window.theirs.mean)) / sigmas
     assert off.max() <= AGREED, off
 
 
 def test_the_covariance_of_both_recorded_poses_is_gtsams_within_a_hundredth(window: Compared) -> None:
-    _, covariance = poses(window.ours, window.pair.apart)
     theirs = window.ours.level * window.theirs.covariance
     sigmas = np.sqrt(np.diagonal(theirs))
-    off = np.abs(covariance - theirs) / np.outer(sigmas, sigmas)
+    off = np.abs(window.ours.covariance - theirs) / np.outer(sigmas, sigmas)
     assert off.max() <= (1.0 + AGREED) ** 2 - 1.0, off

@@ -15,31 +15,31 @@ from msgspec.structs import replace
 
 from agent.estimation import closed_forms
 from agent.estimation.closed_forms import Placement, same_placement
+from agent.estimation.fit import Ending, fits
 from agent.estimation.gaussian import hypotheses, inference
 from agent.estimation.gaussian.detections import no_detection_log_likelihood
 from agent.estimation.gaussian.evidence import anchor_evidence
-from agent.estimation.gaussian.fitted_poses import poses
 from agent.estimation.gaussian.hypotheses import (
+    COARSE_STILL,
     ScoredHypothesis,
     _alone,
     follow,
     missing,
     of_anchor,
     search,
+    starts_about,
 )
-from agent.estimation.gaussian.least_squares import COARSE_STILL, fit, fits
 from agent.estimation.gaussian.odometry_noise import Array, constant_errors, track
+from agent.estimation.gaussian.pair_ranges import PairRanges, alone
 from agent.estimation.gaussian.placement_guesses import Residuals, _encounter, _likeliest
 from agent.estimation.gaussian.range_model import (
     MOST_CORRELATED_RANGES,
     MOST_RANGES_BY_EXACT_ODOMETRY,
-    PairRanges,
     Ranges,
-    placed,
-    predict,
 )
 from protocol.motion import Pose, step, wrap
 from protocol.noise import Noise, VelocityNoise
+from tests.pair_starts import pair_fit
 
 REACH = 3.0
 NONE = np.array([], np.intp)
@@ -94,7 +94,7 @@ SIGMA = 0.02
 RANGES = Noise(anchor_sigma=SIGMA, mutual_sigma=SIGMA)
 
 
-def alone(
+def survey(
     commands: Sequence[tuple[float, float]], anchor: tuple[float, float], seed: int
 ) -> tuple[ScoredHypothesis, ...]:
     """Return the hypotheses of a robot that has driven so from the origin, with its anchor there."""
@@ -112,11 +112,11 @@ def test_mirror_images_are_equally_likely_until_a_range_differs(seed: int) -> No
     """On a straight path, a robot cannot distinguish the sides of its anchor."""
     anchor = (1.2, 0.9)
     straight = [(0.5, 0.0)] * 4
-    one, other = alone(straight, anchor, seed)
+    one, other = survey(straight, anchor, seed)
     assert one.hypothesis.probability == pytest.approx(0.5, abs=1e-6)
     assert one.hypothesis.probability + other.hypothesis.probability == pytest.approx(1.0)
     assert one.fit.guess[:2] == pytest.approx(other.fit.guess[:2] * (1.0, -1.0), abs=1e-6)
-    turned = alone([*straight, (0.0, math.pi / 2), (0.5, 0.0)], anchor, seed)
+    turned = survey([*straight, (0.0, math.pi / 2), (0.5, 0.0)], anchor, seed)
     assert turned[0].hypothesis.probability > 0.9999
     assert turned[0].fit.guess[:2] == pytest.approx(anchor, abs=5.0 * SIGMA)
 
@@ -184,7 +184,7 @@ def sigmas(one: ScoredHypothesis, other: Array) -> float:
     """Return the distance of the two, in standard deviations of the first."""
     error = one.fit.guess - other
     error[2::3] = np.remainder(error[2::3] + math.pi, math.tau) - math.pi
-    return math.sqrt(float(error @ one.fit.information @ error))
+    return math.sqrt(float(error @ np.linalg.solve(one.fit.of_start, error)))
 
 
 @pytest.mark.parametrize(
@@ -203,7 +203,7 @@ def test_the_truth_is_a_hypothesis_and_the_probabilities_sum_to_one(noise: Noise
         probability = [one.hypothesis.probability for one in found]
         assert sum(probability) == pytest.approx(1.0)
         assert probability == sorted(probability, reverse=True)
-        best = fit(truth, pair.paths, pair.ranges, pair.noise, pair.apart)
+        best = pair_fit(truth, pair)
         off = [sigmas(one, best.guess) for one in found]
         assert min(off) < 1.0, (seed, off, probability)
         tried, first = tried + 1, first + (off[0] < 1.0)
@@ -253,7 +253,7 @@ def test_odometry_noise_before_the_encounter_does_not_hide_the_truth() -> None:
         if pair.ranges.counts[2] < ENOUGH:
             continue
         tried += 1
-        best = fit(truth, pair.paths, pair.ranges, pair.noise, pair.apart, steps=20)
+        best = pair_fit(truth, pair, Ending(20))
         found = search(pair)
         assert min([sigmas(one, best.guess) for one in found]) < 1.0, seed
     assert tried > 12
@@ -274,7 +274,7 @@ def test_a_hypothesis_is_followed_on_the_path_that_it_believes_in() -> None:
     held = search(pair)[0]
     start = held.hypothesis.start
     assert [error.omega.tolist() for error in start.errors] == [
-        error.omega.tolist() for error in held.fit.errors
+        error.omega.tolist() for error in held.fit.start.errors
     ]
     (followed,) = follow((held.hypothesis,), pair)
     assert followed.fit.last_step < 1e-2
@@ -287,12 +287,12 @@ def test_the_branches_of_a_robot_that_has_left_its_anchor_are_those_of_its_whole
     path, ranges = pair.paths[0], pair.ranges.only(0)
     assert ranges.tick[-1] < len(path.v) - 10
     for branch in _alone(pair, 0):
-        (whole,) = fits([branch.hypothesis.start], [path], ranges, pair.noise)
-        sigmas = np.sqrt(np.diagonal(whole.covariance))
+        (whole,) = fits(pair.of(0), [branch.hypothesis.start])
+        sigmas = np.sqrt(np.diagonal(whole.of_start)[:2])
         assert np.max(np.abs(branch.fit.guess - whole.guess)[:2] / sigmas) < 0.01
-        assert len(branch.fit.paths[0].v) == len(branch.fit.errors[0].v) == len(path.v)
-        assert branch.fit.paths[0].x[-1] == pytest.approx(whole.paths[0].x[-1], abs=1e-3)
-        assert branch.fit.log_likelihood == pytest.approx(whole.log_likelihood, abs=1e-2)
+        assert branch.fit.paths.shape[1] - 1 == len(branch.fit.start.errors[0].v) == len(path.v)
+        assert branch.fit.poses[0, 0] == pytest.approx(whole.poses[0, 0], abs=1e-3)
+        assert branch.fit.weight == pytest.approx(whole.weight, abs=1e-2)
 
 
 def test_a_search_is_repeated_only_if_a_measurement_differs_in_a_bit() -> None:
@@ -324,9 +324,9 @@ def test_a_followed_anchor_ends_after_one_linear_model_near_the_fit_of_all_steps
     before = Ranges.of_lists(list(enumerate(rho[:-1].tolist())), (), (), noise)
     held = of_anchor((), path.until(count - 1), before, NONE, REACH, noise)
     (followed, *_) = of_anchor([one.hypothesis for one in held], path, ranges, NONE, REACH, noise)
-    (whole,) = fits([held[0].hypothesis.start], [path], ranges, noise)
-    sigmas = np.sqrt(np.diagonal(whole.covariance))
-    assert followed.fit.linear_guess.tolist() == list(held[0].hypothesis.guess), "no second linear model"
+    (whole,) = fits(alone(path, ranges, noise), [held[0].hypothesis.start])
+    sigmas = np.sqrt(np.diagonal(whole.of_start)[:2])
+    assert followed.fit.linear.poses.tolist() == list(held[0].hypothesis.poses[0]), "no second linear model"
     assert followed.fit.last_step < COARSE_STILL
     assert np.max(np.abs(followed.fit.guess - whole.guess)[:2] / sigmas) < 0.01
 
@@ -350,25 +350,25 @@ def test_two_placements_between_which_the_likelihood_falls_are_not_merged(sigma:
 def test_a_fit_begins_on_a_path_that_is_off_by_what_its_placement_assumes(seed: int, z: list[float]) -> None:
     """The offset at the encounter is due to the anchor, and to the odometry since the last range to it."""
     pair, truth = after_a_long_way(seed)
-    ranges, base = pair.ranges.only(0), 20
-    own = fit(np.array([*truth[:2], 0.0]), [pair.paths[0]], ranges, pair.noise)
+    base = 20
+    (own,) = fits(pair.of(0), starts_about([truth[:2]]))
     robot = _encounter(own, base, np.array([base]))
     anchor, (errors,) = robot.begun(own, np.array(z))
     driven = pair.paths[0]
     patterns = constant_errors(driven.v, driven.omega, pair.noise)
     v, omega = np.stack((errors.v, errors.omega)) + np.tensordot(errors.constant, patterns, 1)
     path = track(driven.v + v, driven.omega + omega, driven.period)
-    before = own.paths[0]
+    x, _, heading = own.paths[0].T
     off = np.array(
         (
             path.x[base] - anchor[0] - robot.x[0],
             path.y[base] - anchor[1] - robot.y[0],
-            path.heading[base] - before.heading[base],
+            path.heading[base] - heading[base],
         )
     )
     assert off == pytest.approx(robot.root @ np.array(z), abs=0.02), "to first order"
     last = int(np.max(own.ticks))
-    assert path.x[: last + 1] == pytest.approx(before.x[: last + 1]), "as it was up to the last range"
+    assert path.x[: last + 1] == pytest.approx(x[: last + 1] - x[0]), "as it was up to the last range"
     assert float(np.linalg.norm(robot.root[:2])) > 0.1
 
 
@@ -503,26 +503,27 @@ def test_nearly_exact_ranges_give_the_placements_of_eq_7(corner: bool, turn: flo
     pair, exact = met(corner, start, Pose(9.2 - c + 0.5 * s, 1.3 - s - 0.5 * c, turn))
     found = []
     for one in search(pair):
-        ax, ay, heading, bx, by, b_heading = poses(one.fit, pair.apart)[0].tolist()
+        ax, ay, heading, bx, by, b_heading = one.fit.poses.ravel().tolist()
         found.append(seen(Pose(ax, ay, heading), Pose(bx, by, b_heading)))
     assert len(found) == len(exact) == (2 if corner else 4)
     for placement in exact:
         assert any(same_placement(placement, one, 1e-4) for one in found), placement
 
 
-def test_the_poses_of_a_long_contact_take_memory_in_proportion_to_its_ranges() -> None:
+def test_the_fit_of_a_long_contact_takes_memory_in_proportion_to_its_ranges() -> None:
     noise, ticks = Noise(anchor_sigma=0.1, mutual_sigma=0.1), np.arange(1000)
     a, b = (track(np.full(1000, 0.5), turn + 0.2 * np.sin(ticks), 1.0) for turn in (0.5, -0.35))
     every = [(tick, 0.0) for tick in range(1001)]
     ranges = Ranges.of_lists(every, every, every, noise)
     truth, apart = np.array((0.4, 0.9, 0.3, -0.2, 1.0, -0.8)), (1.5, 0.0)
-    ranges = ranges._replace(rho=predict(truth, [a, b], ranges, apart).distance)
-    fitted = fit(truth, [a, b], ranges, noise, apart)
+    pair = PairRanges((a, b), ranges, (NONE, NONE, NONE), apart, REACH, noise)
+    there = pair_fit(truth, pair, Ending(0))
+    pair = replace(pair, ranges=ranges._replace(rho=-there.residuals))
     tracemalloc.start()
     try:
-        mean, _ = poses(fitted, apart)
+        found = pair_fit(truth, pair)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    assert mean[0] == pytest.approx(placed(truth[:3], a, np.array([1000]))[0][0], abs=1e-6)
+    assert found.poses == pytest.approx(there.poses, abs=1e-6)
     assert peak < 0.2 * 8 * len(ranges.rho) ** 2, "as much as a matrix with a row and a column for each range"

@@ -7,15 +7,15 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from msgspec.structs import replace
 from scipy import stats  # type: ignore[import-untyped]
 
+from agent.estimation.fit import Fit, fits
 from agent.estimation.gaussian.consistency import beta_binomial_tail, f_tail, fisher, sigmas
-from agent.estimation.gaussian.least_squares import fit
+from agent.estimation.gaussian.hypotheses import starts_about
 from agent.estimation.gaussian.noise_level import LEAST_LEVEL, noise_level, residual_correlation
 from agent.estimation.gaussian.odometry_noise import (
+    Array,
     Errors,
     Track,
     constant_errors,
@@ -24,7 +24,7 @@ from agent.estimation.gaussian.odometry_noise import (
     track,
 )
 from agent.estimation.gaussian.own_sensors import doubt
-from agent.estimation.gaussian.range_covariance import range_covariance
+from agent.estimation.gaussian.pair_ranges import alone
 from agent.estimation.gaussian.range_model import Ranges, inlier_probability, mixture
 from agent.estimation.gaussian.reachable_accuracy import reference_sigma
 from agent.peer.peer_state import PeerState
@@ -132,27 +132,14 @@ def test_the_profile_of_uncalibrated_radios_needs_a_coarser_accuracy_than_a_tent
     parsed('"uwb-calibrated"', 0.1)
 
 
-# --- the covariance of ranges -------------------------------------------------------------------------
-
-
-@settings(max_examples=30)
-@given(st.integers(0, 2**32 - 1), st.integers(1, 12), st.integers(0, 5), st.booleans())
-def test_products_with_the_inverse_covariance_are_those_of_the_dense_matrix(
-    seed: int, count: int, constant: int, slow: bool
-) -> None:
-    draw = np.random.default_rng(seed)
-    variance, columns = draw.uniform(0.1, 2.0, count), draw.normal(size=(count, constant))
-    root = draw.normal(size=(count, count))
-    dense = root @ root.T if slow else None
-    whole = np.diag(variance) + columns @ columns.T
-    whole += 0.0 if dense is None else dense
-    covariance = range_covariance(variance, columns, dense)
-    assert covariance.solve(np.eye(count)) == pytest.approx(np.linalg.inv(whole), rel=1e-6, abs=1e-8)
-    assert covariance.precisions == pytest.approx(np.diagonal(np.linalg.inv(whole)), rel=1e-6)
-    assert covariance.log_determinant == pytest.approx(np.linalg.slogdet(whole)[1], abs=1e-8)
-
-
 # --- what a robot learns ------------------------------------------------------------------------------
+
+
+def fitted(path: Track, rho: Array, noise: Noise, anchor: Array) -> Fit:
+    """Return the fit to a range in each tick that begins with the anchor at `anchor` (m)."""
+    ranges = Ranges.of_lists(list(enumerate(rho.tolist())), (), (), noise)
+    (found,) = fits(alone(path, ranges, noise), starts_about([anchor]))
+    return found
 
 
 def drawn(seed: int, noise: Noise, level: float = 1.0) -> tuple[float, float]:
@@ -166,10 +153,9 @@ def drawn(seed: int, noise: Noise, level: float = 1.0) -> tuple[float, float]:
     rho = np.hypot(driven.x - anchor[0], driven.y - anchor[1])
     bias, pair, factor = draw.normal(size=3) * (priors.range_bias, priors.pair_bias, priors.range_scale)
     rho = (rho + bias + pair + level * noise.anchor_sigma * draw.normal(size=count + 1)) / (1.0 - factor)
-    ranges = Ranges.of_lists(list(enumerate(rho.tolist())), (), (), noise)
-    found = fit(np.array((*anchor, 0.0)), [measured], ranges, noise)
+    found = fitted(measured, rho, noise, anchor)
     error = found.guess[:2] - anchor
-    return float(error @ found.information @ error), found.level
+    return float(error @ np.linalg.solve(found.of_start[:2, :2], error)), found.level
 
 
 @pytest.mark.parametrize("noise", ['"uwb"', '"uwb-calibrated"', "{anchor_sigma = 0.05, mutual_sigma = 0.05}"])
@@ -388,6 +374,5 @@ def test_many_ranges_are_not_shrunk_to_make_their_noise_smaller() -> None:
     noise = Noise(anchor_sigma=0.05, mutual_sigma=0.05, range_bias=0.4, range_scale=0.05, wheel_scale=0.02)
     anchor, white = np.array((0.4, 1.5)), np.random.default_rng(1).standard_normal(1001)
     rho = np.hypot(path.x - anchor[0], path.y - anchor[1]) + 0.05 * white
-    ranges = Ranges.of_lists(list(enumerate(rho.tolist())), (), (), noise)
-    found = fit(np.array([*anchor, 0.0]), [path], ranges, noise)
+    found = fitted(path, rho, noise, anchor)
     assert np.hypot(*(found.guess[:2] - anchor)) < 0.05

@@ -647,7 +647,7 @@ def test_the_covariance_has_the_surveying_errors_of_both_anchors(seed: int, odom
         """Return the poses that the ranges tell if the anchors are off by `error`: x and y of each."""
         (ax, ay, bx, by), (x, y) = error, one.pair.apart
         moved = one._replace(pair=replace(one.pair, apart=(float(x + bx - ax), float(y + by - ay))))
-        return settled(moved).poses.ravel() + np.array((ax, ay, 0.0, ax, ay, 0.0))
+        return np.asarray(settled(moved).poses.ravel() + (ax, ay, 0.0, ax, ay, 0.0))
 
     surveyed = one._replace(pair=replace(one.pair, noise=replace(noise, survey_error=0.02)))
     more = settled(surveyed).covariance - settled(one).covariance
@@ -688,9 +688,10 @@ def test_the_heading_of_a_robot_alone_is_held_and_its_evidence_does_not_depend_o
 
 def repeated(pair: PairRanges, times: int) -> PairRanges:
     """Return `pair` with each range `times` times."""
-    rows = np.repeat(np.arange(len(pair.ranges.rho)), times)
-    counts = [times * count for count in pair.ranges.counts]
-    more = Ranges(*[part[rows] for part in pair.ranges[:3]], (counts[0], counts[1], counts[2]))
+    ranges, (a, b, mutual) = pair.ranges, pair.ranges.counts
+    rows = np.repeat(np.arange(len(ranges.rho)), times)
+    counts = times * a, times * b, times * mutual
+    more = Ranges(ranges.rho[rows], ranges.tick[rows], ranges.sigma[rows], counts)
     return replace(pair, ranges=more)
 
 

@@ -352,7 +352,7 @@ def test_a_robot_whose_first_range_is_impossible_localises() -> None:
 
 def test_a_waiting_robot_fits_its_anchor_again_when_a_quarter_more_ranges_are_in() -> None:
     def due(fitted: int, ranges: int, probability: float = 1.0) -> bool:
-        belief = Belief(own=(Hypothesis((0.0, 0.0, 0.0), probability),), ranges_at_last_fit=fitted)
+        belief = Belief(own=(Hypothesis(((0.0, 0.0, 0.0),), probability),), ranges_at_last_fit=fitted)
         log = MotionLog(ranges=tuple([Ranged(tick, 1.0) for tick in range(ranges)]))
         return inference.is_fit_due(RobotState(scenario_of(SIGMA, 1).config("b"), log=log, belief=belief))
 
