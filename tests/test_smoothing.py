@@ -746,20 +746,39 @@ def test_the_distance_score_is_the_derivative_of_the_likelihood_by_the_distance_
 ) -> None:
     one = told(seed, noise)
     assume(clear(one))
-    found = settled(one)
-    assume(converged(found))
-    along = np.array(one.pair.apart) / math.hypot(*one.pair.apart)
-
-    def likelihood(farther: float) -> float:
-        """Return the log-likelihood at the optimum if the anchors are `farther` (m) apart."""
-        x, y = np.array(one.pair.apart) + farther * along
-        moved = one._replace(pair=replace(one.pair, apart=(float(x), float(y))))
-        return -0.5 * settled(moved).chi2
-
-    of, direction = found.problem.measured, found.linear.walk.direction
-    score, information = found.linear.score(np.where(of.second >= 0, -direction @ along, 0.0))
+    score, information = distance_score(settled(one), one.pair)
     small = 0.02 / math.sqrt(information)
-    less, here, more = (likelihood(step) for step in (-small, 0.0, small))
+    less, more = (likelihood(one, step) for step in (-small, small))
     tolerance = 1e-2 * math.sqrt(information)
     assert score == pytest.approx((more - less) / (2.0 * small), abs=tolerance, rel=1e-2)
-    assert information == pytest.approx((2.0 * here - more - less) / small**2, rel=0.1)
+
+
+@few
+@given(seeds, noises)
+def test_the_information_of_the_distance_score_is_the_curvature_of_the_likelihood(
+    seed: int, noise: Noise
+) -> None:
+    """Ranges without errors: residuals would add to the curvature."""
+    one = told(seed, noise)
+    assume(clear(one))
+    one = one.ranging(one.pair.ranges._replace(rho=distances(one.pair, one.guess)))
+    found = settled(one)
+    _, information = distance_score(found, one.pair)
+    small = 0.02 / math.sqrt(information)
+    less, here, more = (likelihood(one, step) for step in (-small, 0.0, small))
+    assert information == pytest.approx((2.0 * here - more - less) / small**2, rel=0.05)
+
+
+def distance_score(found: Fit, pair: PairRanges) -> tuple[float, float]:
+    """Return the score and its information for M2 farther from M1, and b with it."""
+    along = np.array(pair.apart) / math.hypot(*pair.apart)
+    effect = np.where(found.problem.measured.second >= 0, -found.linear.walk.direction @ along, 0.0)
+    score, information = found.linear.score(effect)
+    assert found.linear.score(1e-3 * effect) == pytest.approx((1e-3 * score, 1e-6 * information), rel=1e-6)
+    return score, information
+
+
+def likelihood(told: Told, farther: float) -> float:
+    """Return the log-likelihood at the optimum if the anchors are `farther` (m) apart."""
+    x, y = np.array(told.pair.apart) * (1.0 + farther / math.hypot(*told.pair.apart))
+    return -0.5 * settled(told._replace(pair=replace(told.pair, apart=(float(x), float(y))))).chi2

@@ -64,19 +64,15 @@ class Track(NamedTuple):
 
     def until(self, tick: int) -> Track:
         """Return the path of one robot up to `tick`."""
-        path = self.one((), tick)
-        return path if self.extra is None else path._replace(extra=self.extra[:, :tick])
-
-    def one(self, which: tuple[int, ...], ticks: int) -> Track:
-        """Return the first `ticks` of the path with this index in the further axes."""
         return Track(
-            self.v[which][:ticks],
-            self.omega[which][:ticks],
+            self.v[:tick],
+            self.omega[:tick],
             self.period,
-            self.place[which][:, : ticks + 1],
-            self.heading[which][: ticks + 1],
-            self.shift[which][:, :ticks],
-            None if self.slip is None else self.slip[which][:ticks],
+            self.place[:, : tick + 1],
+            self.heading[: tick + 1],
+            self.shift[:, :tick],
+            None if self.slip is None else self.slip[:tick],
+            None if self.extra is None else self.extra[:, :tick],
         )
 
 
