@@ -292,7 +292,7 @@ def held_fit(measured: JointMeasurements, begun: Fit, steps: int) -> HeldFit:
     kernel, noise, sigma = Kernel(problem.measured), problem.noise, problem.sigma
     start = begun.start._replace(weights=np.append(begun.weights, 1.0))
     point = _begin(problem, kernel, start)
-    weights = _first_weights(problem, kernel, start, point)
+    weights = _first_weights(problem, start, point, np.square(sigma))
     for number in range(steps + 1):
         variance = weighted_variance(sigma, weights, problem.longest)
         step = kernel.step(point.walk, point.poses, variance, RIDGE, LARGEST_STEP * problem.longest)
@@ -333,13 +333,10 @@ def without_outliers(measured: JointMeasurements, starts: Sequence[Start]) -> li
 def _fitted(problem: Problem, kernel: Kernel, start: Start, ending: Ending) -> Fit:
     noise, sigma = problem.noise, problem.sigma
     point = _begin(problem, kernel, start)
-    weights, least, before = np.ones(len(sigma)), 0.0, 0.0
-    if problem.noisy:
-        loose = kernel.loosened(point.walk, point.poses, np.square(sigma))
-        least = GRAIN * float(np.max(loose, initial=0.0))
+    loose = kernel.loosened(point.walk, point.poses, np.square(sigma))
+    least = GRAIN * float(np.max(loose, initial=0.0)) if problem.noisy else 0.0
+    weights, before = _first_weights(problem, start, point, loose), 0.0
     for number in range(ending.steps + 1):
-        if problem.robust and number == 0:
-            weights = _first_weights(problem, kernel, start, point)
         variance = weighted_variance(sigma, weights, problem.longest) + least
         step = kernel.step(point.walk, point.poses, variance, RIDGE, LARGEST_STEP * problem.longest)
         if not math.isfinite(step.chi2):
@@ -366,15 +363,19 @@ def _fitted(problem: Problem, kernel: Kernel, start: Start, ending: Ending) -> F
     raise AssertionError("the last step returns")
 
 
-def _first_weights(problem: Problem, kernel: Kernel, start: Start, point: _Point) -> Array:
-    """Return the weights with which a fit begins: those of its start, or by the residuals."""
+def _first_weights(problem: Problem, start: Start, point: _Point, loose: Array) -> Array:
+    """Return the weights with which a fit begins: those of its start, or by the residuals.
+
+    `loose` are the variances (m^2) of the ranges before any fit.
+    """
     if start.weights is not None:
         weights = np.empty(len(start.weights))
         weights[problem.back] = start.weights
         return weights
-    loose = kernel.loosened(point.walk, point.poses, np.square(problem.sigma))
-    weights = weights_by_errors(point.walk.residual, np.sqrt(loose), problem.noise)
-    weights[problem.exact] = 1.0
+    weights = np.ones(len(loose))
+    if problem.robust:
+        weights = weights_by_errors(point.walk.residual, np.sqrt(loose), problem.noise)
+        weights[problem.exact] = 1.0
     return weights
 
 
