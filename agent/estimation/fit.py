@@ -302,7 +302,7 @@ def held_fit(measured: JointMeasurements, begun: Fit, steps: int) -> HeldFit:
         if problem.robust and number == 0:
             loose = np.square(sigma) + np.sum(np.square(problem.measured.common), 1)
             weights = weights_by_errors(point.walk.residual, np.sqrt(loose), noise)
-            weights[problem.exact] = 1.0
+            weights[problem.holding] = 1.0
         elif problem.robust:
             weights = _inliers(problem, step, variance)
     n3 = len(point.poses)
@@ -375,7 +375,7 @@ def _first_weights(problem: Problem, start: Start, point: _Point, loose: Array) 
     weights = np.ones(len(loose))
     if problem.robust:
         weights = weights_by_errors(point.walk.residual, np.sqrt(loose), problem.noise)
-        weights[problem.exact] = 1.0
+        weights[problem.holding] = 1.0
     return weights
 
 
@@ -383,7 +383,7 @@ def _inliers(problem: Problem, step: FitStep, variance: Array) -> Array:
     """Return the probability that each range is an inlier, given the prediction from all others."""
     told = (step.multipliers, step.alone, step.explained)
     weights = inlier_probabilities(*told, variance, problem.sigma, problem.noise)
-    weights[problem.exact] = 1.0
+    weights[problem.holding] = 1.0
     return weights
 
 

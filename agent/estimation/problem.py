@@ -39,7 +39,7 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
     """The standard deviation of each range in m; shape (N,)."""
     longest: float
     """The longest range in m: the size of the geometry."""
-    exact: NDArray[np.bool]
+    holding: NDArray[np.bool]
     """True for a range that has no error but a white one: see `JointRanges.radio`; shape (N,)."""
     lengths: tuple[int, ...]
     """The number of ticks of each path."""
@@ -64,10 +64,10 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
         order = np.argsort(tick, kind="stable")
         back = np.empty_like(order)
         back[order] = np.arange(len(order))
-        radios, exact = sorted(set(ranges.radio.tolist()) - {-1}), ranges.radio[order] < 0
-        radio = np.where(exact, -1, np.searchsorted(radios, ranges.radio[order]))  # without gaps
+        radios, holding = sorted(set(ranges.radio.tolist()) - {-1}), ranges.radio[order] < 0
+        radio = np.where(holding, -1, np.searchsorted(radios, ranges.radio[order]))  # without gaps
         common = ranges.single.common_errors(priors)[order]
-        common[exact] = 0.0
+        common[holding] = 0.0
         by_radio = np.argsort(radio, kind="stable")
         v, omega, slip = _velocities(measured.paths, ticks)
         anchor, anchors = _unsure_anchors(ranges) if priors.survey_error else (np.full(len(order), -1), 0)
@@ -102,8 +102,8 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
             noise,
             back,
             ranges.sigma[order],
-            max(float(np.max(ranges.rho[order[~exact]], initial=0.0)), SIGMA_FLOOR),
-            exact,
+            max(float(np.max(ranges.rho[order[~holding]], initial=0.0)), SIGMA_FLOOR),
+            holding,
             lengths,
             3 * n - (0 if prior is None else prior.rank),
             0.0 if prior is None else prior.log_information,
