@@ -20,6 +20,7 @@ Floor = Annotated[float, Meta(ge=0.0, le=1e4)]
 Bias = Annotated[float, Meta(ge=0.0, le=1e6)]
 Degrees = Annotated[float, Meta(ge=0.0, le=1e6)]
 Drift = Annotated[float, Meta(ge=0.0, le=1e4)]
+Delay = Annotated[float, Meta(ge=0.0, le=1e4)]
 Correlation = Annotated[float, Meta(ge=1e-6, le=1e6)]
 
 ProfileName = Literal["uwb", "uwb-calibrated", "wheels"]
@@ -60,6 +61,7 @@ class Priors(NamedTuple):
     wheel_scale: float
     gyro_bias: float
     survey_error: float
+    range_delay: float
 
     @property
     def of_odometry(self) -> bool:
@@ -67,7 +69,7 @@ class Priors(NamedTuple):
         return self.wheel_scale > 0.0 or self.gyro_bias > 0.0
 
 
-UNTOLD = Priors(0.02, 0.01, 0.005, 0.0, 2.0, 0.005, 0.003, 0.0)
+UNTOLD = Priors(0.02, 0.01, 0.005, 0.0, 2.0, 0.005, 0.003, 0.0, 0.0)
 """The priors of whoever tells none, for ranges with a sigma of UNTOLD_SIGMA or more.
 
 They are as wide as costs at most 5 % more ticks if the noise is as told: see docs/assumptions.md.
@@ -123,6 +125,8 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
     """The degrees of freedom of the prior of the factor of all sigmas; 0: the sigmas are exactly as told."""
     survey_error: Sigma = 0.0
     """The prior of the difference of each anchor from its surveyed position along each axis, in m."""
+    range_delay: Delay = 0.0
+    """The prior of the delay in s of all ranges: of their stamps after the time of the measurement."""
     strays: Probability = 1e-3
     """The probability that a range has an error of any size and sign; without noise, there are none."""
 
@@ -131,7 +135,7 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
         """True if there is no noise. Then each range is exact, and no detection means out of range."""
         ranges = self.anchor_sigma or self.mutual_sigma or self.outliers or self.drop_outs
         told = self.range_bias or self.pair_bias or self.range_scale or self.slow_sigma
-        if ranges or told or self.wheel_scale or self.gyro_bias or self.survey_error:
+        if ranges or told or self.wheel_scale or self.gyro_bias or self.survey_error or self.range_delay:
             return False
         return self.actuation == self.odometry == VelocityNoise()
 
@@ -153,6 +157,7 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
             share * UNTOLD.wheel_scale if self.wheel_scale is None else self.wheel_scale,
             share * UNTOLD.gyro_bias if self.gyro_bias is None else self.gyro_bias,
             self.survey_error,
+            self.range_delay,
         )
 
     @cached_property
@@ -167,6 +172,7 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
             wheel_scale=0.0,
             gyro_bias=0.0,
             survey_error=0.0,
+            range_delay=0.0,
             sigma_degrees=0.0,
             strays=0.0,
         )
@@ -195,6 +201,7 @@ PROFILES: Mapping[ProfileName, Mapping[str, Any]] = {
         "slow_time": 2.0,
         "wheel_scale": 0.02,
         "gyro_bias": 0.005,
+        "range_delay": 0.1,
         "strays": 0.05,
     },
     "uwb-calibrated": {

@@ -231,7 +231,7 @@ class _Point(NamedTuple):
         of_white = np.square(errors.white) / np.maximum(of.white, LEAST_VARIANCE)
         squares = np.sum(np.square(errors.common)) + np.sum(np.square(errors.constant)) + np.sum(of_white)
         cost = float(squares + off @ of.information @ off + errors.slow @ errors.of_slow)
-        own = walk.residual - of.common @ errors.common - errors.slow
+        own = walk.residual - of.effects(walk) @ errors.common - errors.slow
         if of.scaled >= 0:  # the scale error multiplies the predicted ranges
             told = of.common[:, of.scaled]
             by_scale = np.where(told == 0.0, 0.0, of.scale * (of.rho - walk.residual))
@@ -300,7 +300,7 @@ def held_fit(measured: JointMeasurements, begun: Fit, steps: int) -> HeldFit:
             break
         point = _after(problem, kernel, point, step, 1.0)
         if problem.robust and number == 0:
-            loose = np.square(sigma) + np.sum(np.square(problem.measured.common), 1)
+            loose = np.square(sigma) + np.sum(np.square(problem.measured.effects(point.walk)), 1)
             weights = weights_by_errors(point.walk.residual, np.sqrt(loose), noise)
             weights[problem.holding] = 1.0
         elif problem.robust:
@@ -321,7 +321,7 @@ def without_outliers(measured: JointMeasurements, starts: Sequence[Start]) -> li
     if not problem.robust:
         return []
     kernel, ranges, found = Kernel(problem.measured), measured.ranges, []
-    sigma = np.sqrt(np.square(ranges.sigma) + ranges.single.loosened(measured.noise.priors))
+    sigma = np.sqrt(np.square(ranges.sigma) + ranges.single.loosened(measured.noise.priors, measured.speeds))
     for start in starts:
         residuals = _begin(problem, kernel, start).walk.residual[problem.back]
         weights = weights_by_errors(residuals, sigma, measured.noise)

@@ -26,7 +26,7 @@ class _Measured(ctypes.Structure):
 
     _fields_ = [
         *[(name, ctypes.c_longlong) for name in ("robots", "ticks", "ranges", "common", "constant")],
-        *[(name, ctypes.c_longlong) for name in ("anchors", "radios", "scaled")],
+        *[(name, ctypes.c_longlong) for name in ("anchors", "radios", "scaled", "delayed")],
         *[(name, ctypes.c_double) for name in ("period", "survey", "slow", "decay", "scale")],
         *[(name, Pointer) for name in ("v", "omega", "slip", "white", "patterns", "place", "rho", "effects")],
         *[(name, Pointer) for name in ("mean", "information", "pivot")],
@@ -75,7 +75,8 @@ class Kernel:
         size, s, n3 = of.size, 3 * n + of.radios, 3 * n
         q = size + 2 * of.anchors
         self._measured = _Measured(
-            *(n, k, count, of.common.shape[1], of.patterns.shape[1], of.anchors, of.radios, of.scaled),
+            *(n, k, count, of.common.shape[1], of.patterns.shape[1], of.anchors),
+            *(of.radios, of.scaled, of.delayed),
             *(of.period, of.survey, of.slow, of.decay, of.scale),
             *[
                 one.ctypes.data
@@ -92,7 +93,8 @@ class Kernel:
     def walked(self, poses: Array, constants: Array, white: Array) -> Walk:
         """Return the paths; see `smoother.walked`."""
         n, k, count = self.of.robots, self.of.ticks, len(self.of.rho)
-        walk = Walk(np.empty((n, k + 1, 3)), np.empty((n, k, 8)), np.empty((count, 2)), np.empty(count))
+        shapes = ((n, k + 1, 3), (n, k, 8), (count, 2), count, count)
+        walk = Walk._make([np.empty(shape) for shape in shapes])
         library().walked(
             ctypes.byref(self._measured), *map(_at, (poses, constants, white)), _addresses(*walk)
         )

@@ -88,6 +88,7 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
                 common=common,
                 scaled=-1 if not priors.range_scale or few else SCALE_AFTER_BIAS * bool(priors.range_bias),
                 scale=priors.range_scale,
+                delayed=common.shape[1] - 1 if priors.range_delay else -1,
                 anchor=anchor[order],
                 anchors=anchors,
                 survey=priors.survey_error,

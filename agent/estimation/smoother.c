@@ -32,7 +32,7 @@ typedef long long Index;
 
 /* smoother.Measured: first the numbers, then the arrays. */
 typedef struct {
-    Index robots, ticks, ranges, common, constant, anchors, radios, scaled;
+    Index robots, ticks, ranges, common, constant, anchors, radios, scaled, delayed;
     double period, survey, slow, decay, scale;
     const double *v, *omega, *slip, *white, *patterns, *place, *rho, *effects, *mean, *information, *pivot;
     const Index *begin, *first, *second, *anchor, *radio;
@@ -40,7 +40,7 @@ typedef struct {
 
 /* smoother.Walk */
 typedef struct {
-    double *place, *moves, *direction, *residual;
+    double *place, *moves, *direction, *residual, *rate;
 } Walk;
 
 /* smoother.Passed and smoother.Told; `row_of` has the places and derivatives of a range. */
@@ -130,6 +130,16 @@ static Index unknowns(const Measured *of) { return estimated(of) + 2 * of->ancho
 
 /* --- the paths -------------------------------------------------------------------------------------- */
 
+/* The velocity of robot `i` at the end of the tick before `k`. */
+static void velocity_of(const Measured *of, const Walk *walk, Index i, Index k, double by[2])
+{
+    const Index K = of->ticks, before = i * K + k - 1;
+    const double v = of->v[before] + walk->moves[8 * before + 6];
+    const double course = walk->place[3 * (i * (K + 1) + k) + 2] + of->slip[before];
+    by[0] = v * cos(course);
+    by[1] = v * sin(course);
+}
+
 void walked(const Measured *of, const double *poses, const double *constants, const double *white, Walk *to)
 {
     const Index K = of->ticks, m = of->constant;
@@ -175,6 +185,17 @@ void walked(const Measured *of, const double *poses, const double *constants, co
             to->direction[2 * j] = dx / distance;
             to->direction[2 * j + 1] = dy / distance;
             to->residual[j] = of->rho[j] - distance;
+            to->rate[j] = 0.0;
+            if (of->delayed >= 0 && k > 0) {
+                double by[2], of_other[2];
+                velocity_of(of, to, of->first[j], k, by);
+                if (of->second[j] >= 0) {
+                    velocity_of(of, to, of->second[j], k, of_other);
+                    by[0] -= of_other[0];
+                    by[1] -= of_other[1];
+                }
+                to->rate[j] = to->direction[2 * j] * by[0] + to->direction[2 * j + 1] * by[1];
+            }
         }
 }
 
@@ -266,7 +287,9 @@ static int measured(const Measured *of, const Walk *walk, Index j, double varian
         add(gain, row.by[t], w->p + row.at[t] * s, s);
     }
     for (Index e = 0; e < of->common; e++) {
-        const double by_scale = of->scale * (of->rho[j] - walk->residual[j]), told = of->effects[j * of->common + e];
+        const double by_scale = of->scale * (of->rho[j] - walk->residual[j]);
+        double told = of->effects[j * of->common + e];
+        if (e == of->delayed) told = -told * walk->rate[j];
         effect[3 * of->robots + e] += e == of->scaled && told != 0.0 ? by_scale : told;
     }
     if (of->anchor[j] >= 0)

@@ -72,6 +72,8 @@ class Measured(NamedTuple):
     """the one of them that is proportional to the predicted range, where it is not 0; -1: none"""
     scale: float
     """its effect on a range of 1 m"""
+    delayed: int
+    """the one of them that is a delay, whose `common` is in s, and 0 where there is none; -1: none"""
     anchor: Places
     """the anchor of each range, among those that are not surveyed exactly; -1 for any other; (N,)"""
     anchors: int
@@ -108,6 +110,14 @@ class Measured(NamedTuple):
         """The number of unknowns that are estimated."""
         return int(3 * self.robots + self.common.shape[1] + self.robots * self.patterns.shape[1])
 
+    def effects(self, walk: Walk) -> Array:
+        """Return `common` with the effect of the delay in m at a point; shape (N, c)."""
+        if self.delayed < 0:
+            return self.common
+        found = self.common.copy()
+        found[:, self.delayed] *= -walk.rate
+        return found
+
 
 class Walk(NamedTuple):
     """The paths of all robots with their errors at a point, and the ranges that they predict."""
@@ -121,6 +131,8 @@ class Walk(NamedTuple):
     """unit vectors from the anchor or the second robot; (N, 2)"""
     residual: Array
     """measured minus predicted ranges in m; (N,)"""
+    rate: Array
+    """range rates in m/s, at the end of the tick before; 0 at tick 0, and without a delay; (N,)"""
 
 
 class FitStep(NamedTuple):
@@ -184,7 +196,7 @@ def walked(of: Measured, poses: Array, constants: Array, white: Array) -> Walk:
             gy = v * slope * sy + 0.5 * of.period * dx
             moves[i].append([sx, sy, dx, dy, gx, gy, error_v, error_omega])
             place[i].append([x + dx, y + dy, heading + of.period * omega])
-    direction, residual = [], []
+    direction, residual, rate = [], [], []
     for k in range(of.ticks + 1):
         for j in range(of.begin[k], of.begin[k + 1]):
             at, other = place[of.first[j]][k], of.place[j]
@@ -194,12 +206,26 @@ def walked(of: Measured, poses: Array, constants: Array, white: Array) -> Walk:
             distance = max(math.sqrt(dx * dx + dy * dy), SMALLEST_DISTANCE)
             direction.append([dx / distance, dy / distance])
             residual.append(of.rho[j] - distance)
+            rate.append(0.0)
+            if of.delayed >= 0 and k > 0:
+                vx, vy = _velocity(of, place, moves, of.first[j], k)
+                if of.second[j] >= 0:
+                    other_vx, other_vy = _velocity(of, place, moves, of.second[j], k)
+                    vx, vy = vx - other_vx, vy - other_vy
+                rate[j] = direction[j][0] * vx + direction[j][1] * vy
     return Walk(
         np.array(place),
         np.array(moves).reshape(of.robots, of.ticks, 8),
         np.array(direction),
         np.array(residual),
+        np.array(rate),
     )
+
+
+def _velocity(of: Measured, place: list[Matrix], moves: list[Matrix], i: int, k: int) -> tuple[float, float]:
+    """Return the velocity of robot `i` in m/s at the end of the tick before `k`."""
+    v, course = of.v[i, k - 1] + moves[i][k - 1][6], place[i][k][2] + of.slip[i, k - 1]
+    return v * math.cos(course), v * math.sin(course)
 
 
 class Passed(NamedTuple):
@@ -340,6 +366,8 @@ def _measured(of: Measured, walk: Walk, j: int, variance: float, found: Passed) 
         add(gain, h, found.p[a])
     for e in range(len(of.common[j])):
         by_scale, told = of.scale * (of.rho[j] - walk.residual[j]), of.common[j, e]
+        if e == of.delayed:
+            told = -told * walk.rate[j]
         effect[3 * of.robots + e] += by_scale if e == of.scaled and told != 0.0 else told
     if of.anchor[j] >= 0:
         for e in range(2):

@@ -63,7 +63,7 @@ def anchors(
     if not len(points):
         return points
     variance = np.square(ranges.sigma) + _odometry_variance(path, ranges, noise)
-    variance += ranges.loosened(noise.priors)
+    variance += ranges.loosened(noise.priors, path.speeds(ranges.tick))
     return _polished(points, path, ranges, np.sqrt(variance), noise, sensing_range)
 
 

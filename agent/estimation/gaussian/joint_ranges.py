@@ -103,6 +103,15 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
     prior: PosePrior | None = None
     """The prior of the poses at tick 0; None if nothing is known of them besides the ranges."""
 
+    @property
+    def speeds(self) -> Array:
+        """The largest possible rate (m/s) of each range: the speed of the robot, or of both; shape (N,)."""
+        found = np.zeros(len(self.ranges.rho))
+        for robot, path in enumerate(self.paths):
+            rows = self.ranges.of(robot)
+            found[rows] += path.speeds(self.ranges.tick[rows])
+        return found
+
     def until(self, tick: int) -> JointMeasurements:
         """Return what was measured up to `tick`."""
         return msgspec.structs.replace(
@@ -118,7 +127,7 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
         the longest range (m) that is expected.
         """
         ranges, priors = self.ranges, self.noise.priors
-        loose = np.sqrt(np.square(ranges.sigma) + ranges.single.loosened(priors))
+        loose = np.sqrt(np.square(ranges.sigma) + ranges.single.loosened(priors, self.speeds))
         ranges = ranges.rows(ranges.rho <= reach + IMPOSSIBLE * loose)
         pairs = ranges.pairs
         mutual = sum(1 for own in pairs if ranges.second[np.argmax(own)] >= 0)

@@ -138,7 +138,8 @@ def refined(guesses: Array, robot: AnchoredRobot) -> list[Array]:
     """Return the likeliest of `guesses` after Gauss-Newton steps on all ranges, with measured odometry."""
     ranges, path = robot.ranges, robot.path
     at = np.stack((path.x[ranges.tick], path.y[ranges.tick]))
-    sigma = np.sqrt(np.square(ranges.sigma) + ranges.loosened(robot.noise.priors))
+    loose = ranges.loosened(robot.noise.priors, path.speeds(ranges.tick))
+    sigma = np.sqrt(np.square(ranges.sigma) + loose)
     longest = max(float(np.max(ranges.rho)), SIGMA_FLOOR)
     for step in range(REFINEMENTS):
         s = np.hypot(sigma, COARSE * longest * ERROR_FINER**step)

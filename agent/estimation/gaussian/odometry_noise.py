@@ -62,6 +62,11 @@ class Track(NamedTuple):
         parts = (self.v, self.omega, self.slip, self.extra)
         return (*[None if part is None else part.tobytes() for part in parts], self.period)
 
+    def speeds(self, tick: Places) -> Array:
+        """Return the speed (m/s) of one robot over the tick before each `tick`; 0 before tick 0."""
+        found: Array = np.append(0.0, np.abs(self.v))[np.minimum(tick, len(self.v))]
+        return found
+
     def until(self, tick: int) -> Track:
         """Return the path of one robot up to `tick`."""
         return Track(

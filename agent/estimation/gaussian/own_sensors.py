@@ -182,6 +182,7 @@ SHRINKING = (
     "wheel_scale",
     "gyro_bias",
     "survey_error",
+    "range_delay",
 )
 """The priors of a profile that are smaller for more accurate ranges."""
 

@@ -179,7 +179,8 @@ def placements(own: tuple[Fit, Fit], pair: PairRanges) -> list[Placed]:
     ticks, rho, sigma = pair.ranges.tick[mutual], pair.ranges.rho[mutual], pair.ranges.sigma[mutual]
     places = pair.places if len(pair.places) >= SEED_RANGES else np.arange(len(ticks))
     some = places[spread_out(len(places))]
-    sigma = np.sqrt(np.square(sigma) + pair.ranges.loosened(pair.noise.priors)[mutual])
+    loose = pair.ranges.loosened(pair.noise.priors, pair.measured.speeds)
+    sigma = np.sqrt(np.square(sigma) + loose[mutual])
     ticks, rho, sigma = ticks[some], rho[some], sigma[some]
     middle = len(ticks) // 2
     robots = [_encounter(one, int(ticks[middle]), ticks) for one in own]

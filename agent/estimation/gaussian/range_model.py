@@ -100,8 +100,9 @@ class Ranges(NamedTuple):
     def common_errors(self, priors: Priors) -> Array:
         """Return the effect (m) of one sigma of each constant error on the ranges; shape (N, m).
 
-        The errors are a bias of all ranges, one of each pair of radios, and a scale. The scale multiplies the
-        measured ranges: then the effects are the same under each guess.
+        The errors are a bias of all ranges, a scale, a bias of each pair of radios, and a delay. The scale
+        multiplies the measured ranges: then the effects are the same under each guess. The column of the delay
+        is in s: its effect is minus the range rate (see `smoother`).
         """
         rho = self.rho
         columns: list[Array] = []
@@ -111,17 +112,26 @@ class Ranges(NamedTuple):
             columns.append(priors.range_scale * rho)
         if priors.pair_bias:
             columns += [np.where(own, priors.pair_bias, 0.0) for own in self.pairs]
+        if priors.range_delay:
+            columns.append(np.full(len(rho), priors.range_delay))
         return np.array(columns).T if columns else np.zeros((len(rho), 0))
 
-    def loosened(self, priors: Priors) -> Array:
-        """Return the variance (m^2) that constant and slow errors add to each range; shape (N,)."""
+    def loosened(self, priors: Priors, speed: Array | float) -> Array:
+        """Return the variance (m^2) that constant and slow errors add to each range; shape (N,).
+
+        `speed` (m/s) is the largest possible rate of the ranges, which a delay multiplies.
+        """
         of_biases = priors.range_bias**2 + priors.pair_bias**2 + priors.slow_sigma**2
         variance: Array = np.square(priors.range_scale * self.rho) + of_biases
+        variance += np.square(priors.range_delay * speed)
         return variance
 
-    def within(self, sensing_range: float, priors: Priors) -> Ranges:
-        """Return the ranges without those that are too long to be anything but outliers."""
-        sigma = np.sqrt(np.square(self.sigma) + self.loosened(priors))
+    def within(self, sensing_range: float, priors: Priors, speed: float) -> Ranges:
+        """Return the ranges without those that are too long to be anything but outliers.
+
+        `speed` (m/s) is as in `loosened`.
+        """
+        sigma = np.sqrt(np.square(self.sigma) + self.loosened(priors, speed))
         return self._only(self.rho <= sensing_range + IMPOSSIBLE * sigma)
 
     def thinned(self, noise: Noise) -> Ranges:

@@ -41,6 +41,7 @@ PRIORS = {
     "wheel_scale": "drive a known distance, and a known number of turns",
     "gyro_bias": "measure the gyro at rest, and while a robot drives straight on",
     "survey_error": "survey the anchors more accurately",
+    "range_delay": "stamp ranges with the time of their measurement",
 }
 """The priors that may forbid an accuracy, and what makes each of them narrower."""
 

@@ -71,7 +71,7 @@ class AnchoredMeasurements(Measurements, frozen=True, kw_only=True):
         reach = horizon(some)
         path = self.robot.path.until(epoch * self.ticks_per_epoch)
         return AnchoredRobot(
-            path, some.within(reach, self.noise.priors).thinned(self.noise), reach, self.noise
+            path, some.within(reach, self.noise.priors, 0.0).thinned(self.noise), reach, self.noise
         )
 
 

@@ -29,6 +29,8 @@ class LearnedErrors(msgspec.Struct, frozen=True):
     """The relative error of all ranges: the part by which they are too long."""
     pair_bias_m: dict[str, LearnedError]
     """The further bias of each pair of radios, in m."""
+    range_delay_s: LearnedError | None
+    """The delay of all ranges in s: the time by which their stamps are late."""
     wheel_scale: dict[str, LearnedError]
     """The relative error of the distance of each robot: the part by which its odometry is too short."""
     turn_scale: dict[str, LearnedError]
@@ -52,6 +54,7 @@ def learned_errors(fit: Fit, names: Sequence[str], pairs: Sequence[str]) -> Lear
     bias = next_of(priors.range_bias) if priors.range_bias else None
     scale = next_of(priors.range_scale) if priors.range_scale else None
     of_pairs = {name: next_of(priors.pair_bias) for name in pairs} if priors.pair_bias else {}
+    delay = next_of(priors.range_delay) if priors.range_delay else None
     wheels: dict[str, LearnedError] = {}
     turns: dict[str, LearnedError] = {}
     gyros: dict[str, LearnedError] = {}
@@ -59,4 +62,4 @@ def learned_errors(fit: Fit, names: Sequence[str], pairs: Sequence[str]) -> Lear
         for name in names:
             wheels[name], turns[name] = next_of(priors.wheel_scale), next_of(priors.wheel_scale)
             gyros[name] = next_of(priors.gyro_bias)
-    return LearnedErrors(fit.level**0.5, bias, scale, of_pairs, wheels, turns, gyros)
+    return LearnedErrors(fit.level**0.5, bias, scale, of_pairs, delay, wheels, turns, gyros)

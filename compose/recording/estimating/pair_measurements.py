@@ -69,7 +69,7 @@ class PairMeasurements(Measurements, frozen=True, kw_only=True):
         nothing = np.empty(0, np.intp)
         return PairRanges(
             (self.a.path.until(ticks), self.b.path.until(ticks)),
-            some.within(reach, self.noise.priors).thinned(self.noise),
+            some.within(reach, self.noise.priors, 0.0).thinned(self.noise),
             (nothing, nothing, nothing),
             self.apart,
             reach,
