@@ -16,6 +16,7 @@ from agent.estimation.fit import FIT_STEPS, Ending, Fit, Start, fits
 from agent.estimation.gaussian.anchor_guesses import anchors
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, consistency_test
 from agent.estimation.gaussian.hypotheses import search, starts_about
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.odometry_noise import Track, rescaled
 from agent.estimation.gaussian.pair_ranges import PairRanges, alone
 from agent.estimation.gaussian.range_model import Ranges
@@ -79,7 +80,7 @@ class Doubt(NamedTuple):
 
 
 OWN_SENSORS = "the own ranges to the anchor and the own odometry"
-"""The measurements that do not depend on the peer."""
+"""The measurements that do not depend on the peer, and those of a single robot."""
 
 BOTH = "the ranges and the odometry of both robots"
 """All measurements."""
@@ -117,22 +118,27 @@ def doubt(
 
 @lru_cache(maxsize=2)
 def claim_doubt(fitted: Fit, pair: PairRanges) -> Doubt | None:
-    """Return the profile that explains the ranges of both robots much better than the told noise.
+    """Return the `contradiction` of the fit of a pair that would be claimed."""
+    return contradiction(fitted, pair.measured, BOTH)
 
-    `fitted` is the fit that would be claimed. Only constant errors are compared: slow ones and strays do not
-    move a pose by more than the noise level that robots learn.
+
+def contradiction(fitted: Fit, measured: JointMeasurements, what: str) -> Doubt | None:
+    """Return the profile that explains the ranges in `measured` much better than the told noise.
+
+    `fitted` is the fit to them that would be claimed; `what` names them. Only constant errors are compared:
+    slow ones and strays do not move a pose by more than the noise level that robots learn.
     """
-    noise = pair.noise
+    noise = measured.noise
     others = {}
     for name, other in claim_profiles(noise):
         errors = tuple([rescaled(one, noise, other) for one in fitted.start.errors])
-        start, measured = Start(fitted.start.poses, errors), replace(pair.measured, noise=other)
+        start, again = Start(fitted.start.poses, errors), replace(measured, noise=other)
         for steps in (0, FIT_STEPS):
-            found = [again.weight for again in fits(measured, [start], Ending(steps))]
+            found = [one.weight for one in fits(again, [start], Ending(steps))]
             others[name] = max(found, default=-math.inf) - fitted.weight
             if others[name] < DOUBTFUL_CLAIM - ONE_MODEL_ERROR:
                 break
-    return _best(BOTH, others, DOUBTFUL_CLAIM)
+    return _best(what, others, DOUBTFUL_CLAIM)
 
 
 def claim_profiles(noise: Noise) -> list[tuple[ProfileName, Noise]]:

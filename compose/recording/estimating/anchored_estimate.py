@@ -20,6 +20,7 @@ from compose.recording.estimating.estimate_epoch import (
     ClaimRule,
     EpochFit,
     EstimateEpoch,
+    doubted,
     of_centres,
 )
 from compose.recording.estimating.pair_measurements import NoAnchors, listed
@@ -152,4 +153,5 @@ class AnchoredEstimator:
         return EstimateEpoch(t, counts, hypotheses, (not reason,), reason, EpochFit(scored[0].fit, robot))
 
     def _reason(self, robot: AnchoredRobot, scored: tuple[JointHypothesis, ...]) -> str:
-        return blocking_reason(scored, robot, self._rule.accuracy, self._rule.confidence)
+        reason = blocking_reason(scored, robot, self._rule.accuracy, self._rule.confidence)
+        return reason or doubted(scored[0].fit, robot.measured)

@@ -23,6 +23,7 @@ from compose.recording.estimating.estimate_epoch import (
     ClaimRule,
     EpochFit,
     EstimateEpoch,
+    doubted,
     of_centres,
 )
 from compose.recording.estimating.pair_measurements import PairMeasurements
@@ -139,7 +140,11 @@ def _tested(known: list[Knowledge], pair: PairRanges, found: PairInference) -> l
     if found.searched:
         own = replace(own, ranges_at_last_search=pair.ranges.counts[2])
     peer = weighed(known[1], pair, found.scored, searched=found.searched).belief
-    return [inference.with_convergence_check(one, found.scored) for one in (own, peer)]
+    beliefs = [inference.with_convergence_check(one, found.scored) for one in (own, peer)]
+    if not any(may_claim(one, pair) for one in beliefs):
+        return beliefs
+    doubt = doubted(found.scored[0].fit, pair.measured) or None
+    return [replace(one, blocking_reason=one.blocking_reason or doubt) for one in beliefs]
 
 
 def _second_order(found: PairInference, pair: PairRanges) -> list[tuple[float, Numbers, Numbers]]:
