@@ -19,6 +19,7 @@ from agent.estimation.facts import (
     mutual_range,
 )
 from agent.estimation.gaussian.odometry_noise import track
+from protocol.motion import Pose, step
 from protocol.noise import Noise, VelocityNoise
 
 Array = NDArray[np.float64]
@@ -43,6 +44,8 @@ class MovingGroup(NamedTuple):
     """The true pose of each robot at the last tick; shape (n, 3)."""
     paths: Array
     """The true x and y of each robot at each tick; shape (n, 2, k + 1)."""
+    delay: float
+    """The delay of all ranges in s."""
 
 
 def moving_group(
@@ -65,6 +68,8 @@ def moving_group(
     names = [f"r{i:02}" for i in range(robots)]
     centres = draw.uniform(0.0, side, (robots, 2))
     bias, scale = priors.range_bias * draw.normal(), priors.range_scale * draw.normal()
+    delay = priors.range_delay * draw.normal() if priors.range_delay else 0.0
+    late: list[Array] = []
     pair_bias: dict[frozenset[str], float] = {}
     known: list[Fact] = []
     starts, ends, paths = np.empty((robots, 3)), np.empty((robots, 3)), np.empty((robots, 2, ticks + 1))
@@ -77,6 +82,9 @@ def moving_group(
         c, s = math.cos(starts[i, 2]), math.sin(starts[i, 2])
         paths[i] = starts[i, :2, None] + np.stack((c * path.x - s * path.y, s * path.x + c * path.y))
         ends[i] = *paths[i, :, -1], starts[i, 2] + path.heading[-1]
+        at = [Pose(*place, starts[i, 2] + turn) for *place, turn in zip(*paths[i], path.heading, strict=True)]
+        before = map(step, at, -np.append(0.0, v), -np.append(0.0, omega), [delay] * len(at))
+        late.append(np.array([(pose.x, pose.y) for pose in before]).T)
         of_v, of_omega, of_gyro = draw.normal(size=3) * (
             priors.wheel_scale,
             priors.wheel_scale,
@@ -100,7 +108,7 @@ def moving_group(
             continue
         known.append(anchor(f"M{name}", *centres[i].tolist()))
         for tick in range(0, ticks + 1, 2):
-            away = float(np.hypot(*(paths[i, :, tick] - centres[i])))
+            away = float(np.hypot(*(late[i][:, tick] - centres[i])))
             known.append(
                 anchor_range(name, f"M{name}", tick, measured((name, "anchor"), away), noise.anchor_sigma)
             )
@@ -109,7 +117,7 @@ def moving_group(
             if neighbours is not None and min(j - i, robots - j + i) > neighbours:
                 continue
             for tick in range(1, ticks + 1, 2):
-                apart = float(np.hypot(*(paths[i, :, tick] - paths[j, :, tick])))
+                apart = float(np.hypot(*(late[i][:, tick] - late[j][:, tick])))
                 rho = measured((names[i], names[j]), apart)
                 known.append(mutual_range(names[i], names[j], tick, rho, noise.mutual_sigma))
-    return MovingGroup(Facts(frozenset(known)), noise, starts, ends, paths)
+    return MovingGroup(Facts(frozenset(known)), noise, starts, ends, paths, delay)

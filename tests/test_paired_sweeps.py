@@ -47,6 +47,7 @@ OTHER: dict[str, Any] = {
     "mission.noise.gyro_bias": 0.01,
     "mission.noise.sigma_degrees": 10.0,
     "mission.noise.survey_error": 0.01,
+    "mission.noise.range_delay": 0.01,
     "mission.noise.strays": 0.01,
     "mission.noise.anchor_sigma": 0.2,
     "mission.noise.mutual_sigma": 0.2,

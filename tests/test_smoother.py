@@ -16,14 +16,17 @@ from agent.estimation.gaussian.joint_ranges import PosePrior, joint_measurements
 from agent.estimation.kernel import Kernel
 from agent.estimation.problem import Problem
 from agent.estimation.smoother import Measured, Singular
+from protocol.motion import Pose, step
 from tests.moving_groups import NOISE, PERIOD_S, moving_group
 
 Array = smoother.Array
 
 
-def problem_of(seed: int, robots: int, ticks: int, *, slow: float, survey: float, prior: bool) -> Problem:
-    """Return the problem of a random group: with slow errors, surveying errors and a prior of the poses."""
-    noise = replace(NOISE, slow_sigma=slow, survey_error=survey)
+def problem_of(
+    seed: int, robots: int, ticks: int, *, slow: float, survey: float, prior: bool, delay: float = 0.0
+) -> Problem:
+    """Return the problem of a random group: with slow and surveying errors, a prior of the poses and a delay."""
+    noise = replace(NOISE, slow_sigma=slow, survey_error=survey, range_delay=delay)
     measured = joint_measurements(moving_group(robots, seed, ticks=ticks, noise=noise).facts, noise, PERIOD_S)
     if prior:
         root = np.random.default_rng(seed).normal(size=(3 * robots, 3 * robots))
@@ -49,11 +52,20 @@ def point_of(of: Measured, seed: int) -> tuple[Array, Array, Array]:
     st.booleans(),
     st.sampled_from([1e-3, 1.0, 1e9]),
     st.sampled_from([-1, 1]),
+    st.sampled_from([0.0, 0.2]),
 )
 def test_the_kernel_equals_its_text_to_the_bit(
-    seed: int, robots: int, ticks: int, slow: float, survey: float, prior: bool, largest: float, scaled: int
+    seed: int,
+    robots: int,
+    ticks: int,
+    slow: float,
+    survey: float,
+    prior: bool,
+    largest: float,
+    scaled: int,
+    delay: float,
 ) -> None:
-    problem = problem_of(seed, robots, ticks, slow=slow, survey=survey, prior=prior)
+    problem = problem_of(seed, robots, ticks, slow=slow, survey=survey, prior=prior, delay=delay)
     of, variance = problem.measured._replace(scaled=scaled), np.square(problem.sigma)
     of.radio[::3] = -1
     of.common[::4] = 0.0
@@ -68,6 +80,44 @@ def test_the_kernel_equals_its_text_to_the_bit(
     for name, one in kernel.step(*given)._asdict().items():
         expected = getattr(smoother.step(of, *given), name)
         assert np.asarray(one).tobytes() == np.asarray(expected).tobytes(), name
+
+
+def test_the_effect_of_a_delay_is_the_derivative_of_the_ranges_by_it() -> None:
+    problem, small = problem_of(5, 3, 6, slow=0.0, survey=0.0, prior=False, delay=0.2), 1e-6
+    of = problem.measured
+    of.common[1] = 0.0
+    walk = Kernel(of).walked(*point_of(of, 5))
+    v, omega = of.v + walk.moves[..., 6], of.omega + walk.moves[..., 7]
+
+    def late(i: int, k: int, delay: float) -> Array:
+        pose = step(Pose(*walk.place[i, k]), -v[i, k - 1], -omega[i, k - 1], delay)
+        return np.array((pose.x, pose.y))
+
+    def distance(j: int, k: int, delay: float) -> float:
+        other = late(of.second[j], k, delay) if of.second[j] >= 0 else of.place[j]
+        return float(np.hypot(*(late(of.first[j], k, delay) - other)))
+
+    ticks = np.searchsorted(of.begin, np.arange(len(of.rho)), side="right") - 1
+    slopes = [(distance(j, k, small) - distance(j, k, -small)) / (2.0 * small) for j, k in enumerate(ticks)]
+    expected = 0.2 * np.array(slopes) * (ticks > 0)  # robots were at rest before
+    expected[1] = 0.0
+    np.testing.assert_allclose(of.effects(walk)[:, of.delayed], expected, atol=1e-7)
+    assert np.ptp(expected) > 0.05
+
+
+def test_a_delay_of_the_ranges_is_estimated_within_its_sigma() -> None:
+    noise, off = replace(NOISE, range_delay=0.3), []
+    for seed in range(20):
+        group = moving_group(2, seed, ticks=60, noise=noise)
+        measured = joint_measurements(group.facts, noise, PERIOD_S)
+        starts = group.starts.copy()
+        starts[:, :2] -= measured.origin
+        (fit,) = fits(measured, [Start(starts)])
+        column = fit.problem.measured.delayed
+        assert fit.constant_sigmas[column] < 0.3
+        off.append((group.delay / 0.3 - fit.constants[column]) / fit.constant_sigmas[column])
+    assert max(map(abs, off)) < 4.0
+    assert 6.0 < np.sum(np.square(off)) < 42.0  # chi-square of 20 degrees of freedom: 0.2 and 99.7 %
 
 
 def dense(problem: Problem, poses: Array, constant: Array, white: Array) -> tuple[Array, Array, Array]:

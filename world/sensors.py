@@ -29,7 +29,7 @@ def anchor_ranges(truth: Truth, scenario: Scenario) -> list[float | None]:
             else _exact_range(pose.x - (anchor.x - at.x), pose.y - (anchor.y - at.y), sensors.reach)
             for pose, at, robot in zip(truth.local, truth.origins, scenario.robots, strict=True)
         ]
-    lobed = sensors.world.lobe_depth
+    lobed, late = sensors.world.lobe_depth, truth.before(sensors.world.range_delay)
     ranges: list[float | None] = []
     for i, (pose, origin, robot) in enumerate(zip(truth.local, truth.origins, scenario.robots, strict=True)):
         if robot.given_anchor is None:
@@ -49,6 +49,7 @@ def anchor_ranges(truth: Truth, scenario: Scenario) -> list[float | None]:
         elif sensors.exact:
             ranges.append(rho)
         else:
+            rho = math.hypot(x + (late[i].x - pose.x), y + (late[i].y - pose.y))
             ranges.append(_modelled(sensors.measured(sensors.anchors[i], rho, truth.tick), model, radios))
     return ranges
 
@@ -87,7 +88,7 @@ def mutual_ranges(truth: Truth, scenario: Scenario, pairs: Sequence[tuple[int, i
             exact = _exact_range(one.x - other.x, one.y - other.y, sensors.reach)
             ranges.append(None if exact is None else Mutual(exact))
         return ranges
-    lobed = sensors.world.lobe_depth
+    lobed, late = sensors.world.lobe_depth, truth.before(sensors.world.range_delay)
     for i, j in pairs:
         sensor = sensors.mutual[i, j]
         one, other, robot = truth.local[i], truth.local[j], sensor.robot
@@ -112,6 +113,7 @@ def mutual_ranges(truth: Truth, scenario: Scenario, pairs: Sequence[tuple[int, i
         elif sensors.exact:
             ranges.append(Mutual(rho))
         else:
+            rho = math.hypot(late[i].x - late[j].x, late[i].y - late[j].y)
             measured = sensors.measured(sensor, rho, truth.tick)
             ranges.append(Mutual(_modelled(measured, model, radios)))
     return ranges

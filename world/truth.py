@@ -49,6 +49,20 @@ class Truth(msgspec.Struct, frozen=True):
             for origin, pose in zip(self.origins, self.local, strict=True)
         )
 
+    def before(self, delay: float) -> tuple[Pose, ...]:
+        """Return the poses `delay` s ago, at most one tick, in the same frames as `local`.
+
+        Before tick 0, the robots were at rest.
+        """
+        if not delay or not self.legs:
+            return self.local
+        return tuple(
+            [
+                step(pose, -leg.controls.v, -leg.controls.omega, delay)
+                for pose, leg in zip(self.local, self.legs, strict=True)
+            ]
+        )
+
     def moved(self, controls: Sequence[Controls], period: float) -> Truth:
         """Return the truth one tick later, after all robots have driven `controls` for `period` s."""
         legs: list[Leg] = []

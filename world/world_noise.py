@@ -12,7 +12,8 @@ import msgspec
 from msgspec import Meta
 from msgspec.structs import asdict, replace
 
-from protocol.noise import Bias, Floor, Noise, VelocityNoise
+from protocol.mission import Mission
+from protocol.noise import Bias, Delay, Floor, Noise, VelocityNoise
 from protocol.units import Fraction, Probability, RobotId, Sigma
 
 Offset = Annotated[float, Meta(ge=-1e4, le=1e4)]
@@ -109,6 +110,8 @@ class WorldNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The standard deviation in m of a bias drawn for each radio; a range has those of its two radios."""
     radio_scale_sigma: Fraction = 0.0
     """The standard deviation of a relative error drawn for each radio; a range has both radios'."""
+    range_delay: Delay = 0.0
+    """The time in s by which all ranges are late: they are those of the poses before. At most a tick."""
     sensing_range_factor: Annotated[float, Meta(ge=0.1, le=10.0)] = 1.0
     """The true sensing range, as a multiple of `mission.sensing_range`."""
     detection_exponent: Annotated[float, Meta(ge=0.1, le=1000.0)] | None = None
@@ -167,14 +170,16 @@ def of_robot(value: float | dict[str, float], robot: str) -> float:
 
 
 def world_noise_mistake(
-    noise: WorldNoise, told: Noise, pairs: Sequence[tuple[str, str]]
+    noise: WorldNoise, mission: Mission, pairs: Sequence[tuple[str, str]]
 ) -> tuple[str, str] | None:
     """Return the field of `[world.noise]` that is invalid, and why; None if all are valid.
 
     `pairs` are the ids of the robots of each pair.
     """
+    if noise.range_delay > mission.period:
+        return "range_delay", f"it is longer than a tick (mission.period), {mission.period:g} s"
     for name, (least, most) in (
-        ("outlier_bias", noise.shared(told).outlier_bias),
+        ("outlier_bias", noise.shared(mission.noise).outlier_bias),
         ("short_outlier_bias", noise.short_outlier_bias),
     ):
         if least > most:

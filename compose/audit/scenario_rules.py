@@ -119,7 +119,7 @@ def _off_world_noise(found: Scenario) -> str | None:
     if noise is None:
         return None
     pairs = [(found.robots[i].id, found.robots[j].id) for i, j in found.pairs()]
-    mistake = world_noise_mistake(noise, told, pairs)
+    mistake = world_noise_mistake(noise, found.mission, pairs)
     if mistake is not None:
         return f"world.noise.{mistake[0]}: {mistake[1]}"
     why = world_noise_infeasibility(noise, told)

@@ -350,7 +350,7 @@ def _check_world_noise(file: ScenarioFile, pairs: Sequence[tuple[str, str]], sou
 
     `pairs` holds each pair of robots in both orders.
     """
-    mistake = world_noise_mistake(file.world.noise, file.mission.noise, pairs)
+    mistake = world_noise_mistake(file.world.noise, file.mission, pairs)
     if mistake is not None:
         raise BadScenario(f"{source}: world.noise.{mistake[0]}: {mistake[1]}")
     why = world_noise_infeasibility(file.world.noise, file.mission.noise)

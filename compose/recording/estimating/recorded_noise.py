@@ -17,6 +17,14 @@ RESIDUAL = VelocityNoise(v_floor=1e-3, omega_floor=1e-4)
 It sets the bound below which a robot counts as standing, with which a gyro has no bias.
 """
 
+UNTOLD_DELAY_S = 0.1
+"""The prior in s of a delay of ranges whose sigmas a recording states: they say nothing of its clocks.
+
+It is that of the profile `uwb`. Of ranges that are 0.3 s late at 1 m/s, 5 claims of 107 were wrong without it
+(by 5 of their sigmas along an axis), 2 of 113 with it, and the median error of a claim is 0.10 m, not 0.3 m.
+Where stamps are right, as many poses are claimed.
+"""
+
 FALLBACK: ProfileName = "uwb"
 """The profile for recordings that do not state the sigma of each range."""
 
@@ -41,7 +49,9 @@ def recorded_noise(recording: RangeRecording, told: Noise | None, name: str = ""
     if len(sigmas) and np.all(np.isfinite(sigmas)):
         usual = float(np.median(sigmas))
         return RecordedNoise(
-            Noise(anchor_sigma=usual, mutual_sigma=usual, odometry=RESIDUAL), True, "stated in the recording"
+            Noise(anchor_sigma=usual, mutual_sigma=usual, odometry=RESIDUAL, range_delay=UNTOLD_DELAY_S),
+            True,
+            "stated in the recording",
         )
     return recorded_noise(recording, profile_noise(FALLBACK), FALLBACK)
 
