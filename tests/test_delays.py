@@ -138,7 +138,9 @@ def late_pair() -> RangeRecording:
         heading = np.append(0.0, np.cumsum(turn))
         place = begin + np.append(0.0, np.cumsum(0.02 * np.exp(1j * (heading[:-1] + 0.5 * turn))))
         poses = np.stack((place.real, place.imag, heading), 1)
-        odometry = RobotOdometry(t[:-1], t[1:], relative(poses[:-1], poses[1:]), np.full((2000, 3, 3), np.nan))
+        odometry = RobotOdometry(
+            t[:-1], t[1:], relative(poses[:-1], poses[1:]), np.full((2000, 3, 3), np.nan)
+        )
         robots.append(RecordedRobot(name, odometry, TruePath(t, poses)))
         places.append(place)
     anchors = FixedAnchor("M1", 0.0, 0.0), FixedAnchor("M2", 9.0, 2.0)

@@ -25,7 +25,7 @@ Array = smoother.Array
 def problem_of(
     seed: int, robots: int, ticks: int, *, slow: float, survey: float, prior: bool, delay: float = 0.0
 ) -> Problem:
-    """Return the problem of a random group: with slow and surveying errors, a prior of the poses and a delay."""
+    """Return the problem of a random group: with slow errors, surveying errors, a prior and a delay."""
     noise = replace(NOISE, slow_sigma=slow, survey_error=survey, range_delay=delay)
     measured = joint_measurements(moving_group(robots, seed, ticks=ticks, noise=noise).facts, noise, PERIOD_S)
     if prior:
@@ -200,9 +200,9 @@ def test_a_fit_in_which_rounding_leaves_no_variance_is_singular_and_is_left_out(
         kernel, poses = Kernel(wide), np.zeros(6)
         walk = kernel.walked(poses, np.zeros(wide.patterns.shape[:2]), np.zeros(of.white.shape))
         given = (walk, poses, np.full(len(of.rho), 0.01), 1e-12, 1.0)
-        for step in (kernel.step, partial(smoother.step, wide)):
+        for one_step in (kernel.step, partial(smoother.step, wide)):
             with pytest.raises(Singular), np.errstate(all="ignore"):
-                step(*given)
+                one_step(*given)
     paths = tuple([path._replace(extra=np.full((2, 5), np.nan)) for path in measured.paths])
     assert fits(replace(measured, paths=paths), [Start(np.zeros((2, 3)))]) == []
 

@@ -25,6 +25,7 @@ import pyarrow.parquet as pq
 import pytest
 from distributed import Client
 from matplotlib.figure import Figure
+from msgspec.structs import replace
 from scipy.stats import binom, binomtest  # type: ignore[import-untyped]
 
 from compose.cli.sweep import status_of
@@ -761,7 +762,9 @@ def test_the_sensors_of_each_row_of_mismatch_differ_whatever_robots_are_told(nam
     assert len(scenarios) == len(settings)
     *scenarios, last = scenarios
     if last.mission.noise.profile is None:
-        assert last.world_noise == scenarios[-1].world_noise, "the last row tells what the one before does not"
+        assert last.world_noise == scenarios[-1].world_noise, (
+            "the last row tells what the one before does not"
+        )
         assert last.mission.noise == replace(scenarios[-1].mission.noise, range_delay=0.1)
     else:
         scenarios.append(last)

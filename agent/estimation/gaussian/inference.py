@@ -122,7 +122,9 @@ def own_anchor(knowledge: Knowledge) -> tuple[ScoredHypothesis, ...]:
     """Return the hypotheses about the anchor in the frame of the odometry, the most probable first."""
     mission = knowledge.config.mission
     path, ranges = _own_measurements(knowledge)
-    possible = ranges.within(mission.sensing_range, mission.noise.priors, 2.0 * mission.max_speed).thinned(mission.noise)
+    possible = ranges.within(mission.sensing_range, mission.noise.priors, 2.0 * mission.max_speed).thinned(
+        mission.noise
+    )
     if not len(possible.rho):
         return ()
     silent = missing(ranges.tick, knowledge.tick + 1, _own_beginning(knowledge))
@@ -296,7 +298,9 @@ def pair_of(knowledge: Knowledge) -> PairRanges:
     lists = [_ranges_within(log, *within) for log, *within in zip(logs, firsts, ends, strict=False)]
     ranges = Ranges.of_lists(lists[0], lists[1], mutual, mission.noise)
     silent = [missing(ranges.tick[ranges.rows(kind)], ends[kind] + 1, firsts[kind]) for kind in range(3)]
-    ranges = ranges.within(mission.sensing_range, mission.noise.priors, 2.0 * mission.max_speed).thinned(mission.noise)
+    ranges = ranges.within(mission.sensing_range, mission.noise.priors, 2.0 * mission.max_speed).thinned(
+        mission.noise
+    )
     own, other = config.anchor, config.peer_anchor
     sign = 1.0 if config.role == "a" else -1.0
     return PairRanges(

@@ -101,8 +101,8 @@ class Ranges(NamedTuple):
         """Return the effect (m) of one sigma of each constant error on the ranges; shape (N, m).
 
         The errors are a bias of all ranges, a scale, a bias of each pair of radios, and a delay. The scale
-        multiplies the measured ranges: then the effects are the same under each guess. The column of the delay
-        is in s: its effect is minus the range rate (see `smoother`).
+        multiplies the measured ranges: then the effects are the same under each guess. The column of the
+        delay is in s: its effect is minus the range rate (see `smoother`).
         """
         rho = self.rho
         columns: list[Array] = []

@@ -95,8 +95,8 @@ def doubted(fit: Fit, measured: JointMeasurements) -> str:
     if found is None:
         return ""
     return (
-        f"{found.what} contradict the assumed noise; the profile '{found.profile}' explains them {found.how}: "
-        f"try --noise {found.profile}, or calibrate the radios"
+        f"{found.what} contradict the assumed noise; the profile '{found.profile}' explains them "
+        f"{found.how}: try --noise {found.profile}, or calibrate the radios"
     )
 
 
