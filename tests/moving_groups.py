@@ -82,7 +82,8 @@ def moving_group(
         c, s = math.cos(starts[i, 2]), math.sin(starts[i, 2])
         paths[i] = starts[i, :2, None] + np.stack((c * path.x - s * path.y, s * path.x + c * path.y))
         ends[i] = *paths[i, :, -1], starts[i, 2] + path.heading[-1]
-        at = [Pose(*place, starts[i, 2] + turn) for *place, turn in zip(*paths[i], path.heading, strict=True)]
+        turns = starts[i, 2] + path.heading
+        at = [Pose(x, y, heading) for x, y, heading in zip(*paths[i], turns, strict=True)]
         before = map(step, at, -np.append(0.0, v), -np.append(0.0, omega), [delay] * len(at))
         late.append(np.array([(pose.x, pose.y) for pose in before]).T)
         of_v, of_omega, of_gyro = draw.normal(size=3) * (

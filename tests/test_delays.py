@@ -148,8 +148,8 @@ def late_pair() -> RangeRecording:
     a, b = places[0][at - 20], places[1][at - 20]
     lengths = np.stack((np.abs(a), np.abs(b - (9.0 + 2.0j)), np.abs(a - b)), 1).ravel()
     lengths += 0.05 * draws.normal(size=len(lengths))
-    ends = [np.tile(np.array(one), len(at)) for one in ((0, 1, 0), (2, 3, 1))]
-    series = RangeSeries(np.repeat(t[at], 3), *ends, lengths, np.full(len(lengths), 0.05))
+    first, second = (np.tile(np.array(one), len(at)) for one in ((0, 1, 0), (2, 3, 1)))
+    series = RangeSeries(np.repeat(t[at], 3), first, second, lengths, np.full(len(lengths), 0.05))
     return RangeRecording("late", tuple(robots), anchors, series)
 
 
