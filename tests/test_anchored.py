@@ -10,7 +10,6 @@ import pytest
 from agent.estimation.gaussian.consistency import chi2_p_value
 from agent.estimation.gaussian.known_anchors import predicted
 from compose.errors import UserError
-from compose.recording.estimating.anchored_estimate import AnchoredMeasurements
 from compose.recording.estimating.calibration import calibrated
 from compose.recording.estimating.estimate_epoch import ClaimRule
 from compose.recording.estimating.estimate_files import estimate_csv
@@ -116,7 +115,7 @@ def test_a_straight_way_leaves_the_mirror_image_at_two_anchors() -> None:
     assert last.hypotheses == 2
     assert 0.3 < last.probability < 0.7
     assert not any(row.claim for row in found.rows)
-    assert "the most probable of 2 hypotheses has probability" in found.summary.blocking_reason
+    assert "the most probable of 2 poses has probability" in found.summary.blocking_reason
 
 
 def test_one_place_is_not_enough() -> None:
@@ -131,17 +130,10 @@ def test_equal_recordings_give_equal_estimates() -> None:
 
 def test_ranges_belong_to_their_anchor() -> None:
     measured = measurements(driven(), None, "uwb-calibrated", None).measured
-    assert isinstance(measured, AnchoredMeasurements)
-    ranges = measured.ranges
-    assert ranges.radio is not None
-    assert ranges.place is not None
-    for k, anchor in enumerate(measured.anchors):
-        own = ranges.radio == k
-        np.testing.assert_array_equal(ranges.place[own, 0], anchor.x - measured.anchors[0].x)
-        np.testing.assert_array_equal(ranges.place[own, 1], anchor.y - measured.anchors[0].y)
-    assert [int(np.count_nonzero(own)) for own in ranges.pairs] == [
-        int(np.count_nonzero(ranges.radio == k)) for k in range(4)
-    ]
+    ranges, place = measured.joint.ranges, {one.id: (one.x, one.y) for one in measured.anchors}
+    for k, (_, anchor) in enumerate(measured.joint.radios):
+        own = ranges.place[ranges.radio == k] + measured.joint.origin
+        np.testing.assert_allclose(own, np.broadcast_to(place[anchor], own.shape), atol=1e-12)
 
 
 def test_the_derivatives_of_ranges_to_several_anchors_are_right() -> None:

@@ -15,9 +15,10 @@ import pytest
 from numpy.typing import NDArray
 
 import tandem as api
-from agent.planning.pair_claim import PairInference, inferred
+from agent.estimation.gaussian.joint_search import search
+from agent.estimation.posterior import JointHypotheses
 from compose.errors import ENDED, NOT_LOCALISED, USER_ERROR, UserError
-from compose.recording.estimating import pair_estimate
+from compose.recording.estimating import group_estimate
 from compose.recording.estimating.calibration import calibrated
 from compose.recording.estimating.doubtful_units import doubtful_units
 from compose.recording.estimating.estimate_epoch import ClaimRule
@@ -196,16 +197,15 @@ def test_a_recording_that_contradicts_itself_is_searched_a_bounded_number_of_tim
     recording, searched = simulated(), []
     shuffled = np.random.default_rng(1).permutation(recording.ranges.range)
 
-    def counted(*given: Any) -> PairInference:
-        found = inferred(*given)
-        searched.append(found.searched)
-        return found
+    def counted(*given: Any) -> JointHypotheses:
+        searched.append(given)
+        return search(*given)
 
-    monkeypatch.setattr(pair_estimate, "inferred", counted)
-    monkeypatch.setattr(pair_estimate, "MOST_SEARCHES", 5)
+    monkeypatch.setattr(group_estimate, "search", counted)
+    monkeypatch.setattr(group_estimate, "MOST_SEARCHES", 5)
     found = estimated(measurements(with_ranges(recording, shuffled), None, "uwb", (0.0, 16.0)), ClaimRule())
     assert not any(row.claim for row in found.rows)
-    assert 5 <= sum(searched) <= 5 + len([8, 16])
+    assert len(searched) <= 5 + len(group_estimate.GROUP_SEARCHES)
 
 
 # --- all anchors ------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from agent.estimation.gaussian.odometry_noise import track
-from agent.estimation.gaussian.pair_ranges import PairRanges, alone
+from agent.estimation.gaussian.pair_ranges import alone
 from agent.estimation.gaussian.range_model import Ranges
 from agent.estimation.problem import Problem
 from compose.errors import NOT_LOCALISED, USER_ERROR, UserError
@@ -46,6 +46,7 @@ from docs import recorded_claims
 from protocol.motion import Pose, step
 from protocol.noise import Noise, VelocityNoise
 from tests.commands import tandem
+from tests.pair_starts import pair_of
 
 SAMPLE = Path(__file__).parent / "data" / "uwb" / "tiers-a-b-30-s.pyfg"
 NEES_99_9 = 16.27
@@ -194,7 +195,7 @@ def test_only_the_last_estimate_keeps_its_fit(of_sample: RecordingEstimate) -> N
 def test_a_claim_waits_for_the_accuracy_that_is_asked_for(sample: RangeRecording) -> None:
     strict = sample_estimates(sample, accuracy=0.01)
     assert not any(row.claim for row in strict.rows)
-    assert re.match(r"the sigma of [AB]'s position is .* m, required 0.01", strict.summary.blocking_reason)
+    assert re.match(r"[AB]: the sigma of the position is .* m, required 0.01", strict.summary.blocking_reason)
 
 
 @pytest.mark.long
@@ -270,8 +271,8 @@ def test_lateral_slip_turns_the_path_and_extra_variances_add_to_the_noise() -> N
 
 
 def test_measurements_that_differ_in_slip_variance_or_sigma_are_not_the_same(sample: RangeRecording) -> None:
-    pair = measurements(sample, ("A", "B"), "uwb-calibrated", None).measured.until(10)
-    assert isinstance(pair, PairRanges)
+    used, reach = measurements(sample, ("A", "B"), "uwb-calibrated", None).measured.until(10)
+    pair = pair_of(used, reach)
     path, ranges = pair.paths[0], pair.ranges
     assert path.slip is not None
     assert path.extra is not None
@@ -441,8 +442,8 @@ def test_each_pair_of_radios_has_one_range_a_second_at_the_nearest_tick(sample: 
     measured = measurements(sample, ("A", "B"), "uwb-calibrated", None).measured
     ticks = (measured.t - measured.t0) / measured.period
     assert np.max(np.abs(ticks - measured.ranges.tick)) <= 0.5 + 1e-6
-    for kind in range(3):
-        assert np.min(np.diff(measured.t[measured.ranges.rows(kind)])) >= EPOCH_S - 1e-6
+    for rows in measured.ranges.pairs:
+        assert np.min(np.diff(measured.t[rows])) >= EPOCH_S - measured.period - 1e-6
 
 
 def test_known_errors_of_ranges_are_removed(sample: RangeRecording, tmp_path: Path) -> None:

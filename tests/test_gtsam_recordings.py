@@ -7,6 +7,7 @@ errors that the ranges have in common. A range that may be an outlier has the we
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +18,6 @@ from agent.estimation.fit import Fit
 from agent.estimation.gaussian.pair_ranges import PairRanges
 from compose.recording.estimating.estimate_epoch import ClaimRule
 from compose.recording.estimating.estimate_run import estimated, measurements
-from compose.recording.estimating.pair_measurements import PairMeasurements
 from compose.recording.ranging.range_files import read_ranges
 from protocol.motion import Pose, step
 
@@ -25,6 +25,7 @@ pytest.importorskip("gtsam", reason="gtsam has no wheel for this platform or thi
 import gtsam
 
 from tests.factor_graph import Array, Optimum, arc, manoeuvre_of, nudged, optimum, pose_of, wrapped
+from tests.pair_starts import pair_of
 
 pytestmark = pytest.mark.long
 
@@ -183,12 +184,9 @@ class Compared(NamedTuple):
 def window(request: pytest.FixtureRequest) -> Compared:
     begin_s = APART_S * request.param
     problem = measurements(read_ranges(SAMPLE), None, PROFILE, (begin_s, begin_s + LENGTH_S))
-    assert isinstance(problem.measured, PairMeasurements)
     last = estimated(problem, ClaimRule()).epochs[-1]
     assert last.fitted is not None
-    ours, pair = last.fitted
-    assert isinstance(pair, PairRanges)
-    assert isinstance(ours, Fit)
+    ours, pair = last.fitted.fit, pair_of(last.fitted.used, math.inf)
     starts = nudged(ours, pair.apart, np.random.default_rng(request.param))
     ends = [pose_of(robot, len(path.v)) for robot, path in enumerate(pair.paths)]
     return Compared(pair, ours, optimum(graph_of(pair, ours), begun(pair, starts), ends))

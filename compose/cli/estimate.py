@@ -212,7 +212,7 @@ def _about(robot: RecordedRobot, one: RobotEstimate) -> Iterator[str]:
 
 
 def _row(name: str, one: RobotEstimate, begin_s: float) -> list[str]:
-    from compose.recording.estimating.pair_measurements import listed  # noqa: PLC0415  # it takes time
+    from compose.recording.estimating.group_measurements import listed  # noqa: PLC0415  # it takes time
 
     first, last = one.first_claim, one.final
     if last is None:

@@ -18,7 +18,7 @@ from compose.figures.sheet import Sheet, around
 from compose.figures.style import INK, PALE, ROLE_MARKERS, SCREEN, Medium
 from compose.recording.estimating.estimate_rows import PoseEstimateRow
 from compose.recording.estimating.estimate_run import EstimationProblem, RecordingEstimate
-from compose.recording.estimating.pair_measurements import listed
+from compose.recording.estimating.group_measurements import listed
 from compose.recording.ranging.range_recording import Numbers, TruePath
 from compose.view.colours import COLOURS
 from compose.view.outlines import OUTLINE_SIGMAS, outline

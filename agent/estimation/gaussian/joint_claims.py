@@ -47,19 +47,19 @@ def blocking_reason(
 
 
 def decisive_ranges(robot: int, used: JointMeasurements, reach: float) -> int:
-    """Return the number of ranges of a robot from different places, without those to its first anchor.
+    """Return the number of ranges of a robot from different places, if it has one anchor without those to it.
 
-    That is the anchor to which it has the most. A range counts if one of the two has moved since the last.
+    Ranges to one anchor leave a circle. A range counts if one of the two ends has moved since the last.
     """
-    ranges, total, of_anchor = used.ranges, 0, 0
+    ranges, total, of_anchors = used.ranges, 0, []
     for pair in ranges.pairs:
         rows = np.flatnonzero(pair)
         ends = int(ranges.first[rows[0]]), int(ranges.second[rows[0]])
         if robot in ends:
             count = _places(ends, ranges.tick[rows], used, reach)
             total += count
-            of_anchor = max(of_anchor, count if ends[1] < 0 else 0)
-    return total - of_anchor
+            of_anchors += [count] if ends[1] < 0 else []
+    return total - (sum(of_anchors) if len(of_anchors) == 1 else 0)
 
 
 def _places(ends: tuple[int, int], ticks: Places, used: JointMeasurements, reach: float) -> int:

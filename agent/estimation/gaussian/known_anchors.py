@@ -13,10 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from agent.estimation.fit import TO_THE_END, Ending, Fit, Start, deviation, fits
-from agent.estimation.gaussian.anchor_guesses import anchors
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, HIGHEST_LEVEL, chi2_p_value
-from agent.estimation.gaussian.hypotheses import WARM_STEPS
-from agent.estimation.gaussian.inference import sufficient_mutual_ranges
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges
 from agent.estimation.gaussian.noise_level import INLIER
 from agent.estimation.gaussian.odometry_noise import Array, Places, Track
@@ -51,9 +48,6 @@ FEWEST_FOR_POSE = 4
 LARGEST_STRAY_SHARE = 0.15
 """The largest fraction of ranges that may be strays, in addition to the outliers that were told."""
 
-FEWEST_OF_ANCHOR = 3
-"""The least number of ranges to one anchor from which its place in the odometry's frame is guessed."""
-
 
 class AnchoredRobot(NamedTuple):
     """The measurements of one robot with several anchors."""
@@ -84,19 +78,6 @@ class AnchoredRobot(NamedTuple):
         return JointMeasurements(("",), (), (), (self.path,), own, self.path.period, (0.0, 0.0), self.noise)
 
 
-def search(robot: AnchoredRobot, known: Sequence[JointHypothesis] = ()) -> tuple[JointHypothesis, ...]:
-    """Return the hypotheses of a search of the whole plane, and those `known`, the likeliest first."""
-    if len(robot.ranges.rho) < FEWEST_FOR_POSE:
-        return ()
-    starts = [one.fit.start for one in known]
-    return scored_fits(robot, [*starts, *map(start_of, _candidates(robot))])
-
-
-def follow(robot: AnchoredRobot, known: Sequence[JointHypothesis]) -> tuple[JointHypothesis, ...]:
-    """Return the hypotheses that follow from those `known` before the latest ranges."""
-    return scored_fits(robot, [one.fit.start for one in known], Ending(WARM_STEPS))
-
-
 def scored_fits(
     robot: AnchoredRobot, starts: Sequence[Start], ending: Ending = TO_THE_END
 ) -> tuple[JointHypothesis, ...]:
@@ -109,23 +90,6 @@ def start_of(guess: Array) -> Start:
     mx, my, turn = guess.tolist()
     x, y = rotated(math.cos(turn), math.sin(turn), mx, my)
     return Start(np.array([[-x, -y, turn]]))
-
-
-def _candidates(robot: AnchoredRobot) -> list[Array]:
-    """Return initial guesses: each place of an anchor by its ranges alone, with all rotations, refined."""
-    ranges, places = robot.ranges, ranges_places(robot)
-    turns = np.linspace(-math.pi, math.pi, ROTATIONS, endpoint=False)
-    guesses = []
-    for own in sorted(ranges.pairs, key=lambda rows: -int(np.count_nonzero(rows)))[:2]:
-        count = int(np.count_nonzero(own))
-        if count < FEWEST_OF_ANCHOR:
-            continue
-        alone = Ranges(ranges.rho[own], ranges.tick[own], ranges.sigma[own], (count, 0, 0))
-        ox, oy = places[np.flatnonzero(own)[0]]
-        c, s = np.cos(turns), np.sin(turns)
-        for mx, my in anchors(robot.path, alone, robot.sensing_range, robot.noise):
-            guesses.append(np.stack((mx - c * ox - s * oy, my - c * oy + s * ox, turns), 1))
-    return refined(np.concatenate(guesses), robot) if guesses else []
 
 
 def ranges_places(robot: AnchoredRobot) -> Array:
@@ -199,23 +163,6 @@ def _distinct(guesses: Array, likely: Array, last: Array, longest: float) -> lis
         far = np.hypot(*(ends[left] - ends[best]).T) > APART * longest
         left = left[far | (np.abs(turn) > TURNED)]
     return chosen
-
-
-def blocking_reason(
-    scored: Sequence[JointHypothesis], robot: AnchoredRobot, accuracy: float, sure: float
-) -> str:
-    """Return the first condition for a claim that is not met, or an empty text.
-
-    The conditions are those of two robots: the probability `sure`, enough ranges, their consistency, and the
-    `accuracy` (m) of the position.
-    """
-    best, count = scored[0], len(robot.ranges.rho)
-    required = sufficient_mutual_ranges(robot.noise)
-    if count < required:
-        return f"{count} of {required} required ranges"
-    if best.probability < sure:
-        return f"the most probable of {len(scored)} hypotheses has probability {best.probability:.6f}"
-    return unsound_fit(best.fit, np.arange(count), best.fit.covariance, accuracy)
 
 
 def unsound_fit(fit: Fit, own: Places, covariance: Array, accuracy: float) -> str:

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from compose.errors import UserError
 from compose.recording.estimating.doubtful_units import doubtful_lengths
 from compose.recording.estimating.estimate_epoch import ClaimRule
-from compose.recording.estimating.estimate_rows import names_of
 from compose.recording.estimating.estimate_run import estimated, measurements, numerics
 from compose.recording.estimating.learned_errors import learned_errors
 from compose.recording.estimating.radio_errors import (
@@ -82,9 +81,8 @@ def _by_fit(
             f"{recording.source}: without true poses, {FEWEST_ERRORS} ranges of a pair of radios are needed, "
             f"and the estimate uses at most {most}: one a second of each pair, and of many ranges only a part"
         )
-    names = names_of(used, problem.measured.sides)
     found = range_calibration(errors, "the fit")
-    learned = learned_errors(fit, names, ["-".join(pair) for pair in ranged])
+    learned = learned_errors(fit, used.robots, ["-".join(pair) for pair in ranged])
     bias, scale = learned.range_bias_m, learned.range_scale
     return found._replace(
         bias_sigma=bias.sigma if bias is not None else 0.0,

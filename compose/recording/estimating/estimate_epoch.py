@@ -9,9 +9,7 @@ import numpy as np
 
 from agent.estimation.fit import Fit
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
-from agent.estimation.gaussian.known_anchors import AnchoredRobot
 from agent.estimation.gaussian.own_sensors import contradiction
-from agent.estimation.gaussian.pair_ranges import PairRanges
 from agent.estimation.posterior import Certainty
 from compose.recording.estimating.prepared_steps import OneRobot
 from compose.recording.ranging.range_recording import Numbers
@@ -45,7 +43,7 @@ class EpochFit(NamedTuple):
     """The fit of the first hypothesis, and what it was fitted to."""
 
     fit: Fit
-    used: PairRanges | AnchoredRobot | JointMeasurements
+    used: JointMeasurements
     """The measurements up to the end of the epoch."""
 
 
@@ -65,7 +63,7 @@ class EstimateEpoch(NamedTuple):
     fitted: EpochFit | None
     """The fit of the first hypothesis; None without one, and if there is a later epoch."""
     certainties: tuple[Certainty, ...] = ()
-    """The certainty of the pose of each robot of a group; empty for one robot and for two."""
+    """The certainty of the pose of each robot; empty without hypotheses."""
     undetermined: Mapping[str, str] = {}
     """The robots of a group that have no pose, with the reason."""
 

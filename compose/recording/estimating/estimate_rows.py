@@ -8,10 +8,9 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from compose.recording.estimating.estimate_epoch import ClaimRule, EstimateEpoch
+from compose.recording.estimating.group_measurements import listed
 from compose.recording.estimating.learned_errors import LearnedErrors, learned_errors
-from compose.recording.estimating.pair_measurements import listed
 from compose.recording.estimating.prepared_steps import Measurements, OneRobot
 from compose.recording.ranging.range_recording import Numbers, RecordedRobot
 from protocol.motion import wrap
@@ -25,7 +24,7 @@ class PoseEstimateRow(msgspec.Struct, frozen=True):
     robot: str
     """The robot."""
     hypotheses: int
-    """The number of hypotheses; of three or more robots, those that differ in the pose of this one."""
+    """The number of hypotheses that differ in the pose of this robot."""
     probability: float
     """The probability of the most probable one."""
     x: float
@@ -180,9 +179,7 @@ def rows_of(epoch: EstimateEpoch, robots: Sequence[RecordedRobot]) -> list[PoseE
         best = epoch.hypotheses[0]
         pose, covariance = best.poses[i], best.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
         x, y, heading = pose.tolist()
-        count, probability = len(epoch.hypotheses), best.probability
-        if epoch.certainties:
-            count, probability = epoch.certainties[i]
+        count, probability = epoch.certainties[i]
         row = PoseEstimateRow(
             t_s=epoch.t,
             robot=robot.id,
@@ -258,7 +255,7 @@ def summary_of(
     if last is not None and last.fitted is not None:
         ranged = [name for name, count in zip(pairs, last.ranges, strict=True) if count]
         fit, used = last.fitted
-        calibration = learned_errors(fit, names_of(used, sides), ranged)
+        calibration = learned_errors(fit, used.robots, ranged)
     hypotheses = [
         FinalHypothesis(
             one.probability,
@@ -280,11 +277,6 @@ def summary_of(
         reason,
         dict(last.undetermined) if last is not None else {},
     )
-
-
-def names_of(used: object, sides: Sequence[OneRobot]) -> Sequence[str]:
-    """Return the names of the robots of a fit to the measurements `used`, in its order."""
-    return used.robots if isinstance(used, JointMeasurements) else [side.id for side in sides]
 
 
 def _standing(sides: Sequence[OneRobot], measured: Measurements) -> str:

@@ -9,27 +9,18 @@ from typing import NamedTuple
 import numpy as np
 
 from compose.errors import NoEstimate, UserError
-from compose.recording.estimating.anchored_estimate import (
-    AnchoredEstimator,
-    AnchoredMeasurements,
-    anchored_measurements,
-)
 from compose.recording.estimating.doubtful_units import doubtful_units
 from compose.recording.estimating.estimate_epoch import ClaimRule, EstimateEpoch, add_epoch
 from compose.recording.estimating.estimate_rows import EstimateSummary, PoseEstimateRow, rows_of, summary_of
 from compose.recording.estimating.group_estimate import GroupEstimator
-from compose.recording.estimating.group_measurements import GroupMeasurements, group_measurements
-from compose.recording.estimating.noise_files import ToldNoise, told_noise
-from compose.recording.estimating.pair_estimate import PairEstimator
-from compose.recording.estimating.pair_measurements import (
-    PairMeasurements,
-    pair_measurements,
-    ranged_anchors,
+from compose.recording.estimating.group_measurements import (
+    GroupMeasurements,
+    check_anchors,
+    group_measurements,
 )
+from compose.recording.estimating.noise_files import ToldNoise, told_noise
 from compose.recording.estimating.recorded_noise import recorded_noise
 from compose.recording.ranging.range_recording import RangeRecording, RecordedRobot
-
-AnyMeasurements = PairMeasurements | AnchoredMeasurements | GroupMeasurements
 
 
 @contextmanager
@@ -48,7 +39,7 @@ def numerics(where: str) -> Iterator[None]:
 class EstimationProblem(NamedTuple):
     """The measurements of some robots, and what is known of their source."""
 
-    measured: AnyMeasurements
+    measured: GroupMeasurements
     robots: tuple[RecordedRobot, ...]
     """The robots, with their truth if there is one."""
     source: str
@@ -92,9 +83,8 @@ def measurements_with(
 ) -> EstimationProblem:
     """Return the measurements as `measurements` does, with the noise `told`, whose name is `name`.
 
-    `ticks` is the number of ticks in an epoch; None: by the speed of the robots. Two robots with ranges to
-    one anchor each are a pair, as in a mission; any others are a group, which uses all anchors. The units are
-    examined if `doubtful` is set.
+    `ticks` is the number of ticks in an epoch; None: by the speed of the robots. The units are examined if
+    `doubtful` is set.
     """
     chosen = _chosen(recording, robots)
     begin, end = recording.span
@@ -107,15 +97,9 @@ def measurements_with(
     assumed = recorded_noise(part, told.noise if told is not None else None, name)
     if told is not None and told.correction is not None:
         part = told.correction.corrected(part)
-    ranged = ranged_anchors(part, chosen) if len(chosen) == 2 else []
-    measured: AnyMeasurements
+    check_anchors(part, chosen)
     with numerics(recording.source):
-        if len(chosen) == 1:
-            measured = anchored_measurements(part, chosen[0], assumed, ticks=ticks)
-        elif ranged and all(len(own) == 1 for own in ranged):
-            measured = pair_measurements(part, chosen, assumed, [own[0] for own in ranged], ticks=ticks)
-        else:
-            measured = group_measurements(part, chosen, assumed, ticks=ticks)
+        measured = group_measurements(part, chosen, assumed, ticks=ticks)
         doubt = doubtful_units(part) if doubtful else ""
     return EstimationProblem(measured, part.robots, recording.source, assumed.name, doubt)
 
@@ -134,8 +118,7 @@ class RecordingEstimator:
     """The estimate of any number of robots, which goes on from epoch to epoch."""
 
     def __init__(self, rule: ClaimRule) -> None:
-        self._of_pair, self._of_one = PairEstimator(rule), AnchoredEstimator(rule)
-        self._of_group = GroupEstimator(rule)
+        self._estimator = GroupEstimator(rule)
 
     def epoch(self, problem: EstimationProblem, number: int) -> EstimateEpoch:
         """Return the estimate at the end of the epoch with this `number`, from 1 on, in their order.
@@ -144,20 +127,12 @@ class RecordingEstimator:
         numbers leave the range of floats (see `numerics`).
         """
         with numerics(f"{problem.source}: at {problem.measured.end(number):.15g} s"):
-            epoch = self._epoch(problem.measured, number)
+            epoch = self._estimator.epoch(problem.measured, number)
             known = [i for i, one in enumerate(problem.robots) if one.id not in epoch.undetermined]
             for one in epoch.hypotheses:
                 if not np.all(np.isfinite(one.poses[known])):
                     raise FloatingPointError("a pose is not finite")
             return epoch
-
-    def _epoch(self, measured: AnyMeasurements, number: int) -> EstimateEpoch:
-        match measured:
-            case PairMeasurements():
-                return self._of_pair.epoch(measured, number)
-            case GroupMeasurements():
-                return self._of_group.epoch(measured, number)
-        return self._of_one.epoch(measured, number)
 
 
 def estimated(

@@ -19,8 +19,8 @@ from compose.recording.estimating.estimate_run import (
     numerics,
     with_summary,
 )
+from compose.recording.estimating.group_measurements import NoAnchors
 from compose.recording.estimating.noise_files import ToldNoise
-from compose.recording.estimating.pair_measurements import NoAnchors
 from compose.recording.estimating.prepared_steps import EPOCH_S
 from compose.recording.ranging.range_recording import SAME_TIME_S
 from compose.recording.ranging.range_steps import NoSteps
@@ -40,7 +40,7 @@ EXAMINED_AFTER_S = 4.0
 
 
 class StreamEstimate:
-    """An estimate of one or two robots that grows with the rows of a stream."""
+    """An estimate that grows with the rows of a stream."""
 
     def __init__(
         self,
@@ -83,8 +83,6 @@ class StreamEstimate:
     def _due(self) -> Iterator[PoseEstimateRow]:
         """Yield the estimates of all epochs whose odometry is complete."""
         names = list(self._begins) if self._robots is None else self._robots
-        if len(names) > 2:
-            raise UserError(f"{self._builder.source}: --follow: a stream is estimated for one or two robots")
         if not names or not all(name in self._begins for name in names):
             return
         begin = max(self._begins[name] for name in names)

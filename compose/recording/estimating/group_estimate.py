@@ -1,4 +1,4 @@
-"""The estimates of three or more robots over time, by one fit to everything that is known of them."""
+"""The estimates of robots over time, by one fit to everything that is known of them."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from compose.recording.estimating.estimate_epoch import (
     EpochFit,
     EstimateEpoch,
     PosesHypothesis,
+    doubted,
     of_centres,
 )
 from compose.recording.estimating.group_measurements import GroupMeasurements
@@ -29,7 +30,7 @@ MORE_RANGES = 1.5
 
 
 class GroupEstimator:
-    """The estimate of several robots, which goes on from epoch to epoch.
+    """The estimate of any number of robots, which goes on from epoch to epoch.
 
     Robots that are located are followed. The whole plane is searched at the numbers of ranges GROUP_SEARCHES,
     and before the first claim of each robot.
@@ -88,7 +89,10 @@ class GroupEstimator:
             reasons[part.robots[i]] = open_position(i, found, reach) or blocking_reason(
                 i, found, certainty, part, reach, rule.accuracy, rule.confidence
             )
-        return reasons
+        if "" not in reasons.values():
+            return reasons
+        doubt = doubted(found.scored[0].fit, part)
+        return {name: reason or doubt for name, reason in reasons.items()}
 
 
 def _epoch(

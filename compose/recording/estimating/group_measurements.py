@@ -1,4 +1,4 @@
-"""The measurements of three or more recorded robots: facts, and what the joint estimator makes of them."""
+"""The measurements of recorded robots: facts, and what the estimator makes of them."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from agent.estimation.facts import Fact, Facts, Manoeuvre, anchor, anchor_range, manoeuvre, mutual_range
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, joint_measurements
 from agent.estimation.gaussian.odometry_noise import Track
+from compose.errors import UserError
 from compose.recording.estimating.prepared_steps import (
     EPOCH_S,
     Measurements,
@@ -22,7 +23,7 @@ from compose.recording.ranging.range_recording import FixedAnchor, RangeRecordin
 
 
 class GroupMeasurements(Measurements, frozen=True, kw_only=True):
-    """All measurements of several robots."""
+    """All measurements of some robots."""
 
     members: tuple[OneRobot, ...]
     """The robots, in the order of the user; some may have no anchor."""
@@ -59,7 +60,7 @@ class GroupMeasurements(Measurements, frozen=True, kw_only=True):
 def group_measurements(
     recording: RangeRecording, robots: Sequence[str], assumed: RecordedNoise, *, ticks: int | None = None
 ) -> GroupMeasurements:
-    """Return the measurements of three or more `robots`, with the noise that is `assumed`.
+    """Return the measurements of `robots`, with the noise that is `assumed`.
 
     `ticks` is the number of them in an epoch; None: by the speed of the robots.
     """
@@ -85,6 +86,38 @@ def group_measurements(
         ),
         **prepared.shared(" of all robots", **{others: len(steps.ranges.t) - len(ranges)}),
     )
+
+
+class NoAnchors(UserError):
+    """One robot, or two, have no ranges to two anchors at different places."""
+
+
+def check_anchors(recording: RangeRecording, robots: Sequence[str]) -> None:
+    """Raise NoAnchors if one robot, or two, have no ranges to two anchors at different places.
+
+    Of more robots, some may be estimated.
+    """
+    found = [recording.anchors_of(robot) for robot in range(len(robots))]
+    if len(robots) > 2 or len({(one.x, one.y) for own in found for one in own}) > 1:
+        return
+    heard = [
+        f"{name} has ranges to {listed([one.id for one in own]) or 'no anchor'}"
+        for name, own in zip(robots, found, strict=True)
+    ]
+    who = "two robots need" if len(robots) == 2 else "one robot needs"
+    raise NoAnchors(
+        f"{recording.source}: {who} ranges to two anchors at different places: " + ", ".join(heard)
+    )
+
+
+MOST_LISTED_ANCHORS = 8
+"""The largest number of names in a list for a user."""
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return `names` in one line: the first MOST_LISTED_ANCHORS, and the number of the others."""
+    more = len(names) - MOST_LISTED_ANCHORS
+    return ", ".join(names[:MOST_LISTED_ANCHORS]) + (f" and {more} more" if more > 0 else "")
 
 
 MOST_USED_ANCHORS = 32
