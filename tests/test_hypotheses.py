@@ -444,13 +444,13 @@ def test_a_range_that_is_too_long_is_ignored() -> None:
     without = Ranges.of_lists(few, many, many, RANGES)
     beyond = (3, rho + 1e-9)
     within = Ranges.of_lists([*few, beyond], [*many, beyond], [*many, beyond], RANGES).within(
-        REACH, RANGES.as_told.priors
+        REACH, RANGES.as_told.priors, 0.0
     )
     assert within.counts == without.counts == (2, 1, 1)
     for one, other in zip(within[:3], without[:3], strict=True):
         assert np.array_equal(one, other)
     kept = Ranges.of_lists([*few, (3, rho - 1e-9)], many, many, RANGES)
-    assert kept.within(REACH, RANGES.as_told.priors) is kept
+    assert kept.within(REACH, RANGES.as_told.priors, 0.0) is kept
 
 
 # --- the limit of exact sensors -----------------------------------------------------------------------
