@@ -43,8 +43,7 @@ def test_no_beat_of_a_recording_breaks_a_rule(opened: Open, address: str, look: 
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("dark", [False, True])
-def test_the_other_pages_break_no_rule(opened: Open, tmp_path: Path, dark: bool) -> None:
+def test_the_other_pages_break_no_rule(opened: Open, tmp_path: Path) -> None:
     for name in ("paper-1", "paper-2"):
         (tmp_path / name).mkdir()
         in_process.run_mission(load(name), tmp_path / name)
@@ -60,22 +59,21 @@ def test_the_other_pages_break_no_rule(opened: Open, tmp_path: Path, dark: bool)
         assert tandem(*command).status == 0
     for folder, ready in ((".", "#list a"), ("swept", ".cell"), ("estimated", "#sweep table")):
         with watching(tmp_path / folder) as (_, where):
-            page = opened(where, dark=dark)
-            expect(page.locator(ready).first).to_be_visible()
-            assert not violations(page), folder
+            for dark in (False, True):
+                page = opened(where, dark=dark)
+                expect(page.locator(ready).first).to_be_visible()
+                assert not violations(page), (folder, dark)
 
 
 @chromium_only
 @pytest.mark.long
-@pytest.mark.parametrize("dark", [False, True])
-def test_the_page_in_one_file_breaks_no_rule(
-    browser: Browser, paper_1: Path, tmp_path: Path, dark: bool
-) -> None:
+def test_the_page_in_one_file_breaks_no_rule(browser: Browser, paper_1: Path, tmp_path: Path) -> None:
     assert tandem("export", paper_1, "--html", "--out", tmp_path).status == 0
-    page = browser.new_page(color_scheme="dark" if dark else "light")
-    page.set_default_timeout(BOUND_MS)
-    page.goto(f"{(tmp_path / 'run.html').as_uri()}#tick=47")
-    until_shown(page, 47)
-    picture(page)
-    assert not violations(page)
-    page.close()
+    for dark in (False, True):
+        page = browser.new_page(color_scheme="dark" if dark else "light")
+        page.set_default_timeout(BOUND_MS)
+        page.goto(f"{(tmp_path / 'run.html').as_uri()}#tick=47")
+        until_shown(page, 47)
+        picture(page)
+        assert not violations(page), dark
+        page.close()
