@@ -5,7 +5,6 @@ a block of `python` as a script. A comment in the line before a block changes th
 
 - `<!-- file: NAME -->` writes the block to that file;
 - `<!-- exit status: N -->` is the exit status of its commands, which is 0 otherwise;
-- `<!-- long -->`, or `<!-- long, exit status: N -->`, makes it a long test;
 - `<!-- together -->` is a block whose commands run at the same time, and have a test of their own;
 - `<!-- not run: REASON -->` is a block whose commands are only parsed.
 """
@@ -65,11 +64,6 @@ class Block(NamedTuple):
         return int(found[1]) if found is not None else 0
 
     @property
-    def long(self) -> bool:
-        """True if only a long test runs it."""
-        return self.comment.startswith("long")
-
-    @property
     def file(self) -> str | None:
         """The name of the file that it is."""
         return self.comment.removeprefix("file: ") if self.comment.startswith("file: ") else None
@@ -101,8 +95,8 @@ def mentioned(page: Path) -> list[list[str]]:
     return [quoted.split() for quoted in re.findall(r"`(?:uv run )?tandem ([a-z-][^`]*)`", text)]
 
 
-def run_page(page: Path, folder: Path, *, long: bool) -> None:
-    """Run the blocks of a page in `folder`; the long ones only if `long`."""
+def run_page(page: Path, folder: Path) -> None:
+    """Run the blocks of a page in `folder`."""
     for block in blocks(page):
         if block.file is not None:
             (folder / block.file).write_text(block.text)
@@ -111,7 +105,7 @@ def run_page(page: Path, folder: Path, *, long: bool) -> None:
                 [sys.executable, "-c", block.text], cwd=folder, capture_output=True, text=True, check=False
             )
             assert ran.returncode == 0, f"{block.text}\n{ran.stderr}"
-        elif block.language == "sh" and block.run and (long or not block.long):
+        elif block.language == "sh" and block.run:
             for words in block.commands():
                 if words[0] in DRIVEN:
                     run_command(words, block.status, folder)
@@ -130,20 +124,6 @@ def runnable(page: Path) -> bool:
     return any(one.run and one.language in ("sh", "python") for one in blocks(page))
 
 
-def is_long(page: Path) -> bool:
-    return any(one.long for one in blocks(page))
-
-
-def is_later(page: Path) -> bool:
-    """Return whether a page is read after the first two."""
-    return page.stem not in ("README", "tutorial-mission")
-
-
-def stem(page: Path) -> str:
-    """Return the name of a page in the name of its test."""
-    return page.stem
-
-
 def prepare(folder: Path) -> None:
     """Put into `folder` the file of the repository that commands of the pages name."""
     (folder / "docs").mkdir()
@@ -151,20 +131,11 @@ def prepare(folder: Path) -> None:
 
 
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize(
-    "page", series(sorted(filter(runnable, PAGES), key=is_later)), ids=lambda one: one.stem
-)
+@pytest.mark.parametrize("page", series(filter(runnable, PAGES)), ids=lambda one: one.stem)
 def test_the_commands_of_a_page_run(page: Path, tmp_path: Path) -> None:
+    """README first, which is the one that every run of the tests checks."""
     prepare(tmp_path)
-    run_page(page, tmp_path, long=False)
-
-
-@pytest.mark.long
-@pytest.mark.timeout(600)
-@pytest.mark.parametrize("page", [one for one in PAGES if is_long(one)], ids=lambda one: one.stem)
-def test_the_long_commands_of_a_page_run(page: Path, tmp_path: Path) -> None:
-    prepare(tmp_path)
-    run_page(page, tmp_path, long=True)
+    run_page(page, tmp_path)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda one: one.stem)
