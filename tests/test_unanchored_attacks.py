@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 from itertools import combinations
 from typing import Any
 
@@ -33,7 +34,6 @@ from protocol.rounding import TOLERANCE
 from tests.test_audit import kept
 from tests.test_group_runs import audited
 from tests.test_unanchored import four, last_claim, scenario_of, table_with
-from world.scenario import Scenario
 
 REFRAME = {"kind": "reframe", "size": 1.0}
 """The attack that no meeting contradicts, and that moves all poses which the attacker reports rigidly."""
@@ -48,6 +48,12 @@ def five(attackers: str = "", **fields: Any) -> dict[str, Any]:
         if robot["id"] in attackers:
             robot["attack"] = REFRAME
     return table
+
+
+@cache
+def journals() -> dict[str, list[bytes]]:
+    """Return the journals of `five` with the attacker a."""
+    return kept(scenario_of(five("a")))
 
 
 def claims(run: Run) -> dict[str, float | None]:
@@ -92,9 +98,8 @@ def test_without_an_attacker_the_second_finder_costs_time_within_the_bound() -> 
 
 @pytest.mark.long
 def test_a_recording_with_an_attacker_passes_the_audit_and_the_replay() -> None:
-    journals = kept(scenario_of(five("a")))
-    assert audited(journals) == []
-    assert replayed(of_frames(journals)).differences == ()
+    assert audited(journals()) == []
+    assert replayed(of_frames(journals())).differences == ()
 
 
 def test_a_robot_with_no_second_finder_stays_undecided_and_names_the_one() -> None:
@@ -103,12 +108,11 @@ def test_a_robot_with_no_second_finder_stays_undecided_and_names_the_one() -> No
         robot["dies"] = 0
     table["fault"] = [{"link": "b->u", "loss": 1.0}, {"link": "c->u", "loss": 1.0}]
     table["robot"][1].pop("dies")  # it localises itself with a, but u does not hear it
-    run = of_frames(kept(scenario_of(table)))
+    run = run_mission(scenario_of(table))
     found = claims(run)
     assert found["u"] is None
     assert found["a"] is not None
-    command = run.agents["u"].steps[-1].command
-    assert command is not None
+    command = run.ticks[-1].commands["u"]
     assert command.verdict == Undecided("2 robots must agree on its pose; it is found by: a")
 
 
@@ -286,7 +290,7 @@ def test_a_pose_is_claimed_when_one_more_finder_than_may_lie_agrees_on_it() -> N
 
 
 def test_a_finder_that_has_heard_that_it_is_not_needed_sends_no_pose_and_does_not_stop_again() -> None:
-    agent = of_frames(kept(scenario_of(five("a")))).agents["u"]
+    agent = of_frames(journals()).agents["u"]
     received = [framed.report for one in agent.steps for framed in one.received]
     reports = [one for one in received if one.robot == "a"]
     assert {one.prior is None for one in reports} == {True, False}
@@ -300,10 +304,10 @@ def test_a_finder_that_has_heard_that_it_is_not_needed_sends_no_pose_and_does_no
 
 def test_the_pose_that_an_attacker_reports_follows_from_the_log_that_it_reports() -> None:
     """`reframe` turns it about the anchor of the attacker; a scale of 1 changes nothing."""
-    turned = poses_of(scenario_of(five("a")))
+    turned = poses_of(journals())
     table = five()
     table["robot"][0]["attack"] = {"kind": "scale", "size": 1.0}
-    true = poses_of(scenario_of(table))
+    true = poses_of(kept(scenario_of(table)))
     tick = min(turned.keys() & true.keys())  # until then, both missions are the same
     here, there = true[tick], turned[tick]
     c, s = math.cos(1.0), math.sin(1.0)
@@ -311,12 +315,12 @@ def test_the_pose_that_an_attacker_reports_follows_from_the_log_that_it_reports(
     assert there.y == pytest.approx(s * here.x + c * here.y, abs=1e-9)
 
 
-def poses_of(scenario: Scenario) -> dict[int, Pose]:
+def poses_of(frames: dict[str, list[bytes]]) -> dict[int, Pose]:
     """Return the poses that a reports to robots without an anchor, by tick; its anchor is the origin."""
-    run = of_frames(kept(scenario))
+    run = of_frames(frames)
     return {
         prior.tick: prior.pose
-        for robot in scenario.unanchored
+        for robot in run.scenario.unanchored
         for one in run.agents[robot].steps
         for framed in one.received
         if (prior := framed.report.prior) is not None and framed.report.robot == "a"
