@@ -114,6 +114,15 @@ class Group:
                 )
             )
 
+    def measured(self, name: str, ticks: int) -> None:
+        """Wait until a robot has measured more than that number of ticks."""
+        self.robots[name].until(lambda: len(steps(self._out, name)) > ticks, "some ticks are over")
+
+    def written(self, name: str, amount: int) -> None:
+        """Wait until the journal of a robot has `amount` bytes, or the robot has ended."""
+        path, robot = self._out / name / f"agent-{name}.journal", self.robots[name]
+        until(lambda: size(path) >= amount or not robot.running, self.said)
+
     def kill(self, name: str) -> None:
         """Kill all processes of a robot."""
         self.robots[name].tell(SIGKILL)
@@ -194,38 +203,41 @@ def test_four_robots_localise_in_hardware_mode(tmp_path: Path, text: str, encryp
         assert late or claim[0] == expected.tick
 
 
-@pytest.mark.parametrize("killed", ["a", "c"])
 @pytest.mark.long
-def test_a_killed_robot_of_a_group_resumes(tmp_path: Path, killed: str) -> None:
-    """The first one, whose ticks the others count, or one that waits to be visited."""
+def test_a_killed_robot_of_a_group_resumes(tmp_path: Path) -> None:
+    """The first one, whose ticks the others count, and then one that waits to be visited."""
     with group(tmp_path, FAR) as four:
         four.start("a", "b", "c", "d")
-        four.robots[killed].until(lambda: len(steps(tmp_path, killed)) > 15, "some ticks are over")
-        four.kill(killed)
-        before = len(told(tmp_path, killed).steps)
-        four.start(killed)
+        before = {}
+        for killed, at in (("a", 15), ("c", 20)):
+            four.measured(killed, at)
+            four.kill(killed)
+            before[killed] = len(told(tmp_path, killed).steps)
+            four.start(killed)
         all_are_localised(tmp_path, four)
-        assert f"{killed}: in run four, resumed at tick {before - 1}" in four.robots[killed].out
-    assert len(told(tmp_path, killed).steps) > before
+        for killed, ticks in before.items():
+            assert f"{killed}: in run four, resumed at tick {ticks - 1}" in four.robots[killed].out
+            assert len(told(tmp_path, killed).steps) > ticks
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("killed", "amount"), [("a", 500), ("a", 8500), ("bd", 4500), ("abcd", 500), ("abcd", 8500)]
+    "kills", [(("a", 500), ("bd", 4500), ("abcd", 8500)), (("abcd", 500), ("a", 8500))], ids=str
 )
 def test_robots_of_a_group_that_are_killed_at_any_moment_resume(
-    tmp_path: Path, killed: str, amount: int
+    tmp_path: Path, kills: tuple[tuple[str, int], ...]
 ) -> None:
+    """Each time, once the journals of those that are killed have that number of bytes."""
     with group(tmp_path, FAR) as four:
         four.start("a", "b", "c", "d")
-        for name in killed:
-            path, robot = tmp_path / name / f"agent-{name}.journal", four.robots[name]
-            until(lambda path=path, robot=robot: size(path) >= amount or not robot.running, four.said)  # type: ignore[misc]
-        for name in killed:
-            four.robots[name].tell(SIGKILL)
-        for name in killed:
-            four.kill(name)
-        four.start(*killed)
+        for killed, amount in kills:
+            for name in killed:
+                four.written(name, amount)
+            for name in killed:
+                four.robots[name].tell(SIGKILL)
+            for name in killed:
+                four.kill(name)
+            four.start(*killed)
         all_are_localised(tmp_path, four)
 
 
@@ -245,36 +257,40 @@ def test_a_robot_that_is_killed_before_it_knows_all_results_receives_them_afterw
         all_are_localised(tmp_path, four)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(("killed", "at"), [("", 0), ("a", 16), ("c", 18), ("bd", 17)])
-def test_robots_without_an_anchor_localise_in_hardware_mode(tmp_path: Path, killed: str, at: int) -> None:
-    """Also if the robot that finds them is killed, or they are themselves, while they drive squares."""
-    with group(tmp_path, UNANCHORED) as four:
-        four.start("a", "b", "c", "d")
+def kill_in_turn(four: Group, kills: Sequence[tuple[str, int]]) -> None:
+    """Kill robots, and start them again, each time once they have measured more than that number of ticks."""
+    for killed, at in kills:
         for name in killed:
-            four.robots[name].until(lambda name=name: len(steps(tmp_path, name)) > at, "some ticks are over")  # type: ignore[misc]
+            four.measured(name, at)
         for name in killed:  # once one is killed, the others measure no further ticks
             four.kill(name)
         four.start(*killed)
-        all_are_localised(tmp_path, four)
-        assert all("resumed at tick" in four.robots[name].out for name in killed)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("killed", "at"), [("", 0), ("a", 16), ("bf", 18)])
+@pytest.mark.parametrize("kills", [(), (("a", 16), ("bd", 17), ("c", 18))], ids=str)
+def test_robots_without_an_anchor_localise_in_hardware_mode(
+    tmp_path: Path, kills: tuple[tuple[str, int], ...]
+) -> None:
+    """Also if the robot that finds them is killed, or they are themselves, while they drive squares."""
+    with group(tmp_path, UNANCHORED) as four:
+        four.start("a", "b", "c", "d")
+        kill_in_turn(four, kills)
+        all_are_localised(tmp_path, four)
+        assert all("resumed at tick" in four.robots[name].out for names, _ in kills for name in names)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kills", [(), (("a", 16),), (("bf", 18),)], ids=str)
 def test_robots_that_tolerate_an_attacker_localise_in_hardware_mode(
-    tmp_path: Path, killed: str, at: int
+    tmp_path: Path, kills: tuple[tuple[str, int], ...]
 ) -> None:
     """Also if the attacker is killed, or an honest finder and a robot that waits for a second one are."""
     with group(tmp_path, TOLERANT) as six:
         six.start(*"abcdef")
-        for name in killed:
-            six.robots[name].until(lambda name=name: len(steps(tmp_path, name)) > at, "some ticks are over")  # type: ignore[misc]
-        for name in killed:  # once one is killed, the others measure no further ticks
-            six.kill(name)
-        six.start(*killed)
+        kill_in_turn(six, kills)
         all_are_localised(tmp_path, six)
-        assert all("resumed at tick" in six.robots[name].out for name in killed)
+        assert all("resumed at tick" in six.robots[name].out for names, _ in kills for name in names)
 
 
 @pytest.mark.long
