@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import shutil
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 
 import matplotlib as mpl
@@ -46,19 +48,20 @@ def figures(pair: PairRecord, medium: Medium) -> Iterator[tuple[str, Figure]]:
 
 @pytest.mark.long
 def test_each_figure_is_one_or_two_columns_wide_in_small_text_and_embedded_fonts(
-    folder: Path, tmp_path: Path
+    paper_1: Path, noisy: Path, tmp_path: Path
 ) -> None:
     widths = set()
-    for name, figure in figures(pair_of(folder), PAPER):
-        with mpl.rc_context({"pdf.compression": 0}):
-            pdf, png = save(figure, tmp_path / name, ["pdf", "png"], PAPER.dpi)
+    for name, figure in chain(figures(pair_of(paper_1), PAPER), figures(pair_of(noisy), PAPER)):
         width = figure.get_size_inches()[0]
         points, pixels = WIDTHS[width]
+        formats = ["pdf"] if width in widths else ["pdf", "png"]
         widths.add(width)
+        with mpl.rc_context({"pdf.compression": 0}):
+            pdf, *pngs = save(figure, tmp_path / name, formats, PAPER.dpi)
         content = pdf.read_bytes()
         (box,) = re.findall(rb"/MediaBox \[ 0 0 ([\d.]+) [\d.]+ \]", content)
         assert float(box) == points
-        assert pixels_across(png) == pixels
+        assert all(pixels_across(png) == pixels for png in pngs)
         assert b"/Subtype /Type3" not in content
         assert b"/FontFile2" in content  # an embedded TrueType font, of a Type 42
         sizes = {float(size) for size in re.findall(rb"/\S+ ([\d.]+) Tf", content)}
@@ -67,31 +70,26 @@ def test_each_figure_is_one_or_two_columns_wide_in_small_text_and_embedded_fonts
     assert widths == set(WIDTHS)
 
 
-@pytest.mark.long
-def test_only_figures_to_look_at_have_a_title(folder: Path) -> None:
-    pair = pair_of(folder)
-    for name, figure in figures(pair, PAPER):
-        assert figure.texts == [], name
-        assert figure.get_suptitle() == ""
-    for name, figure in figures(pair, SCREEN):
-        assert figure.texts, name
-
-
 @pytest.mark.parametrize("medium", series([SCREEN, PAPER], 0), ids=["screen", "paper"])
-def test_all_text_is_on_the_sheet_and_no_key_covers_a_panel(folder: Path, medium: Medium) -> None:
+def test_all_text_is_on_the_sheet_no_key_covers_a_panel_and_only_figures_to_look_at_have_a_title(
+    folder: Path, medium: Medium
+) -> None:
     checked(pair_of(folder), medium)
 
 
 @pytest.mark.long
-def test_figures_in_hardware_mode_are_laid_out_as_well(folder: Path, tmp_path: Path) -> None:
-    for robot in "ab":
-        name = f"agent-{robot}.journal"
-        (tmp_path / name).write_bytes((folder / name).read_bytes())
-    checked(pair_of(tmp_path), PAPER)
+def test_figures_in_hardware_mode_are_laid_out_as_well(paper_1: Path, noisy: Path, tmp_path: Path) -> None:
+    for folder in (paper_1, noisy):
+        for robot in "ab":
+            name = f"agent-{robot}.journal"
+            (tmp_path / name).write_bytes((folder / name).read_bytes())
+        checked(pair_of(tmp_path), PAPER)
 
 
 def checked(pair: PairRecord, medium: Medium) -> None:
     for name, figure in figures(pair, medium):
+        assert bool(figure.texts) == medium.titled, name
+        assert medium.titled or figure.get_suptitle() == ""
         figure.set_dpi(medium.dpi)
         figure.draw_without_rendering()
         sheet = figure.bbox.padded(0.5)
@@ -114,7 +112,8 @@ def pixels_across(png: Path) -> int:
         return image.width
 
 
-def test_the_command_draws_for_a_paper(folder: Path) -> None:
+def test_the_command_draws_for_a_paper(paper_1: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(paper_1, tmp_path / "it"))
     ended = tandem("figures", folder, "--paper", "--only", "ranges", "--format", "png")
     assert (ended.status, ended.err) == (0, "")
     assert pixels_across(folder / "figures" / "ranges-a-b.png") == 1050
