@@ -125,7 +125,7 @@ def test_late_ranges_are_learned_and_hardly_a_claim_is_wrong(
 
 def test_late_ranges_contradict_a_profile_without_a_delay() -> None:
     found = estimate_of(read_ranges(LATE), "uwb-calibrated", 20.0)
-    assert found.summary.blocking_reason.startswith(CONTRADICTION)
+    assert CONTRADICTION in found.summary.blocking_reason
     assert found.summary.blocking_reason.endswith("try --noise uwb, or calibrate the radios")
 
 
@@ -161,6 +161,6 @@ def test_a_delay_is_learned_from_two_robots_and_noticed_where_none_is_told() -> 
     assert learned.range_delay_s is not None
     assert abs(learned.range_delay_s.value - 0.4) < 4.0 * learned.range_delay_s.sigma < 0.2
     told = estimate_of(recording, "wheels")
-    noticed = [epoch.t for epoch in told.epochs if epoch.blocking_reason.startswith(CONTRADICTION)]
+    noticed = [epoch.t for epoch in told.epochs if CONTRADICTION in epoch.blocking_reason]
     assert noticed[0] < 20.0
     assert not any(is_wrong(row) for row in told.rows if row.claim and row.t_s >= noticed[0])

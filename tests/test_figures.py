@@ -30,7 +30,7 @@ from protocol.journal.journal_file import read as frames
 from protocol.messages import Estimate
 from protocol.mission import ROLES
 from protocol.motion import Covariance, Pose
-from tests.commands import PAPER_1, Ended, several_pairs, tandem
+from tests.commands import BENT, PAPER_1, Ended, several_pairs, tandem
 from tests.series import series
 from tests.test_album import pair as pair_of
 from world.scenario import Scenario
@@ -212,9 +212,10 @@ def test_an_outline_holds_what_is_within_3_sigma(noisy: Path) -> None:
         assert point @ np.linalg.solve(sigma, point) == pytest.approx(9.0)
 
 
-def test_a_position_along_an_arc_is_drawn_along_it_within_the_range_to_the_peer(noisy: Path) -> None:
-    """A robot that has measured one mutual range knows how far it is from its anchor, and little else."""
-    shown, pair = scenes_of(read(noisy)), pair_of(noisy)
+def test_a_position_along_an_arc_is_drawn_along_it_within_the_range_to_the_peer(tmp_path: Path) -> None:
+    """A robot that has measured few mutual ranges knows how far it is from its anchor, and little else."""
+    bent = recorded(load("noisy", seed=BENT), tmp_path)
+    shown, pair, sizes = scenes_of(read(bent)), pair_of(bent), []
     for role in ROLES:
         sigmas = {
             one.tick: one.covariance.position_sigma for one, _ in pair.robot(role).placed if one.covariance
@@ -224,10 +225,11 @@ def test_a_position_along_an_arc_is_drawn_along_it_within_the_range_to_the_peer(
         assert player.pose
         assert player.held
         assert sigmas[tick] > 10.0
-        assert np.ptp(np.array(player.held.arc), axis=0).max() < 2.5
+        sizes.append(np.ptp(np.array(player.held.arc), axis=0).max())
         assert PlanePath(player.held.arc).contains_point((player.pose.x, player.pose.y))
         estimate = next(one for one, _ in pair.robot(role).placed if one.tick == tick)
         assert outline_of(pair, role, estimate)[:-1] == player.held.arc
+    assert max(sizes) < 2.0 * 3.0 + min(sizes) < sigmas[tick], "the places within 3 m of those of the other"
     assert not any(player.held.arc for player in shown[-1].players if player.held)
 
 

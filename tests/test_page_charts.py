@@ -12,8 +12,10 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
+from compose.launch.in_process import run_mission
 from compose.recording.recording_files import WORLD_JOURNAL
 from compose.recording.run import Run, read
+from compose.scenario.scenario_file import load
 from compose.view import series as series_module
 from compose.view.recorded import run_data, scenes_of
 from compose.view.series import MOST_BINS, Curve, Series, series
@@ -31,7 +33,7 @@ from tests.browser import (
     until_shown,
     watching,
 )
-from tests.commands import tandem
+from tests.commands import BENT, tandem
 from tests.series import series as cases
 from tests.test_accessibility import violations
 from tests.test_page import frames_to
@@ -294,15 +296,15 @@ def test_the_charts_follow_a_mission_while_it_runs(opened: Open, noisy: Path, tm
             expect(page.locator("#status")).to_contain_text("running")
 
 
-def test_a_position_whose_sigma_is_large_is_drawn_along_its_arc(
-    opened: Open, noisy: Path, served: str
-) -> None:
-    shown = scenes_of(read(noisy))
+def test_a_position_whose_sigma_is_large_is_drawn_along_its_arc(opened: Open, tmp_path: Path) -> None:
+    run_mission(load("noisy", seed=BENT), tmp_path)
+    shown = scenes_of(read(tmp_path))
     bent = [scene.tick for scene in shown if all(player.held and player.held.arc for player in scene.players)]
-    page = opened(served)
-    legend = page.locator("#legend")
-    scrub_to(page, bent[0])
-    expect(legend).to_contain_text("uncertainty (3 sigma): along an arc")
-    assert len(legend.get_by_text("uncertainty (3 sigma)").all()) == 1  # and no ellipse
-    scrub_to(page, shown[-1].tick)
-    expect(legend).not_to_contain_text("along an arc")
+    with watching(tmp_path) as (_, served):
+        page = opened(served)
+        legend = page.locator("#legend")
+        scrub_to(page, bent[0])
+        expect(legend).to_contain_text("uncertainty (3 sigma): along an arc")
+        assert len(legend.get_by_text("uncertainty (3 sigma)").all()) == 1  # and no ellipse
+        scrub_to(page, shown[-1].tick)
+        expect(legend).not_to_contain_text("along an arc")

@@ -97,9 +97,9 @@ def measurements_with(
     assumed = recorded_noise(part, told.noise if told is not None else None, name)
     if told is not None and told.correction is not None:
         part = told.correction.corrected(part)
-    check_anchors(part, chosen)
     with numerics(recording.source):
         measured = group_measurements(part, chosen, assumed, ticks=ticks)
+        check_anchors(part, chosen)
         doubt = doubtful_units(part) if doubtful else ""
     return EstimationProblem(measured, part.robots, recording.source, assumed.name, doubt)
 
