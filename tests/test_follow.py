@@ -107,6 +107,24 @@ def test_a_stream_gives_what_its_file_gives(messages: Messages) -> None:
             assert abs(row.y - other.y) < 0.05
 
 
+def test_a_robot_that_joins_a_stream_begins_the_estimate_again(messages: Messages) -> None:
+    late = [
+        one
+        for one in messages
+        if one[0] <= 9.3 and (one[1] == "/anchors" or one[0] > 6.2 or "A" not in one[2].values())
+    ]
+    for end in (7.0, 9.3):  # the time of the first was estimated for one robot already
+        estimate = StreamEstimate("it", None, (told_noise(PROFILE), PROFILE), ClaimRule())
+        data = written([one for one in late if one[0] <= end])
+        list(estimate.rows(rows_as_they_arrive(io.BytesIO(data), "it")))
+        _, result = estimate.result()
+        assert set(result.summary.robots) == {"A", "B"}
+        times = [one.t for one in result.epochs]
+        assert times == sorted(set(times))
+        assert len(result.epochs[-1].claims) == 2
+        assert times[-1] > end - 0.6
+
+
 @pytest.mark.long
 def test_a_stream_that_breaks_off_gives_the_estimates_before_that(messages: Messages) -> None:
     def rows(data: bytes) -> str:

@@ -1,11 +1,12 @@
 """The estimate of a stream of rows, at the rate of their arrival.
 
-An epoch is computed as soon as the odometry of both robots has reached its end. Rows must arrive in the order
+An epoch is computed as soon as the odometry of all robots has reached its end. Rows must arrive in the order
 of time, as in a file: a range that comes later counts from the next epoch on.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from compose.errors import UserError
@@ -50,8 +51,9 @@ class StreamEstimate:
         rule: ClaimRule,
         doubted: Callable[[str], None] = lambda _: None,
     ) -> None:
-        """Begin the estimate of `robots` (None: the only two of the stream), with the noise and its name.
+        """Begin the estimate of `robots`, with the noise and its name.
 
+        None: all robots of the stream. With each further one, the estimate begins again.
         `doubted` is called with the suspicion that parts of the stream are in different units; as long as it
         lasts, nothing is estimated.
         """
@@ -67,7 +69,10 @@ class StreamEstimate:
         self._next = 1
         self._due_after_s = EPOCH_S
         """The time after the first odometry of all robots at which there may be an epoch."""
+        self._count = 0
+        """The number of robots in the estimate."""
         self._problem: EstimationProblem | None = None
+        """That of the last epoch."""
         self._rows: list[PoseEstimateRow] = []
         self._epochs: list[EstimateEpoch] = []
 
@@ -85,6 +90,9 @@ class StreamEstimate:
         names = list(self._begins) if self._robots is None else self._robots
         if not names or not all(name in self._begins for name in names):
             return
+        if len(names) > self._count:
+            self._count = len(names)
+            self._begin_again()
         begin = max(self._begins[name] for name in names)
         end = min(self._ends[name] for name in names)
         if end - begin < self._due_after_s - SAME_TIME_S * EPOCH_S:
@@ -107,22 +115,31 @@ class StreamEstimate:
             if problem.doubt and problem.doubt != self._doubt:
                 self._doubted(problem.doubt)
             self._doubt = problem.doubt
-        self._problem = problem._replace(doubt=self._doubt)
+        self._problem = (self._problem if self._problem and self._epochs else problem)._replace(
+            doubt=self._doubt
+        )
         measured = problem.measured
         if self._doubt:
             self._next = measured.epochs + 1
         while self._next <= measured.epochs:
             number = self._next
             self._next += 1
-            if measured.is_silent(number):
+            before = self._epochs[-1].t if self._epochs else -math.inf
+            if measured.is_silent(number) or measured.end(number) <= before:
                 continue
             epoch = self._estimator.epoch(problem, number)
-            with numerics(self._problem.source):
-                found = rows_of(epoch, self._problem.robots)
+            self._problem = problem
+            with numerics(problem.source):
+                found = rows_of(epoch, problem.robots)
             self._rows += found
             add_epoch(self._epochs, epoch)
             yield from found
         self._due_after_s = measured.end(measured.epochs) - measured.t0 + EPOCH_S
+
+    def _begin_again(self) -> None:
+        """Forget what follows from the rows so far, but not the estimates: they are of other robots."""
+        self._estimator = RecordingEstimator(self._rule)
+        self._next, self._due_after_s, self._examined_after_s = 1, EPOCH_S, EXAMINED_AFTER_S
 
     def result(self) -> tuple[EstimationProblem, RecordingEstimate]:
         """Return all estimates so far. Raises UserError if no epoch is complete."""
