@@ -15,8 +15,9 @@ from msgspec.structs import replace
 
 from agent.estimation import closed_forms
 from agent.estimation.closed_forms import Placement, same_placement
-from agent.estimation.fit import Ending, fits
-from agent.estimation.gaussian import hypotheses, inference
+from agent.estimation.fit import Ending, Fit, HeldFit, fits
+from agent.estimation.gaussian import claim_rivals, evidence, hypotheses, inference
+from agent.estimation.gaussian.consistency import consistency_test
 from agent.estimation.gaussian.detections import no_detection_log_likelihood
 from agent.estimation.gaussian.evidence import anchor_evidence
 from agent.estimation.gaussian.hypotheses import (
@@ -29,6 +30,7 @@ from agent.estimation.gaussian.hypotheses import (
     search,
     starts_about,
 )
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.odometry_noise import Array, constant_errors, track
 from agent.estimation.gaussian.pair_ranges import PairRanges, alone
 from agent.estimation.gaussian.placement_guesses import Residuals, _encounter, _likeliest
@@ -37,6 +39,7 @@ from agent.estimation.gaussian.range_model import (
     MOST_RANGES_BY_EXACT_ODOMETRY,
     Ranges,
 )
+from agent.estimation.smoother import Singular
 from protocol.motion import Pose, step, wrap
 from protocol.noise import Noise, VelocityNoise
 from tests.pair_starts import pair_fit
@@ -508,6 +511,24 @@ def test_nearly_exact_ranges_give_the_placements_of_eq_7(corner: bool, turn: flo
     assert len(found) == len(exact) == (2 if corner else 4)
     for placement in exact:
         assert any(same_placement(placement, one, 1e-4) for one in found), placement
+
+
+def test_numbers_beyond_floats_block_a_claim(monkeypatch: pytest.MonkeyPatch) -> None:
+    pair, _ = met(True, Pose(0.3, -0.6, 0.1 - math.pi / 2), Pose(9.7, 0.3, 1.0))
+    first = search(pair)[0]
+    one_stray = first.fit._replace(weights=np.append(0.0, first.fit.weights[1:]))
+
+    def held(_: JointMeasurements, begun: Fit, steps: int) -> HeldFit:
+        if steps == 0:
+            raise Singular
+        return HeldFit(-100.0, begun.poses)
+
+    monkeypatch.setattr(claim_rivals, "held_fit", held)
+    claimed = inference.pair_planning_hypotheses([first])[0]
+    assert claim_rivals.likeliest_rival(first.fit, pair, claimed, (0, 1)).log_likelihood_ratio == math.inf
+    monkeypatch.setattr(evidence, "fits", lambda *_: [])
+    assert consistency_test(one_stray, pair, 0).p_value == 0.0
+    assert evidence.mutual_evidence(one_stray, pair) == -math.inf
 
 
 def test_the_fit_of_a_long_contact_takes_memory_in_proportion_to_its_ranges() -> None:

@@ -296,6 +296,8 @@ def held_fit(measured: JointMeasurements, begun: Fit, steps: int) -> HeldFit:
     for number in range(steps + 1):
         variance = weighted_variance(sigma, weights, problem.longest)
         step = kernel.step(point.walk, point.poses, variance, RIDGE, LARGEST_STEP * problem.longest)
+        if not math.isfinite(step.chi2):
+            raise Singular("an error is too large for a float")
         if number == steps:
             break
         point = _after(problem, kernel, point, step, 1.0)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
-from agent.estimation.fit import Fit, HeldFit, held_fit
+from agent.estimation.fit import Fit, HeldFit, deviation, held_fit
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis
 from agent.estimation.gaussian.inference import PlanningHypothesis, to_second_order
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges
@@ -69,14 +69,16 @@ def likeliest_rival(
     for robot in robots:
         i = 3 * robot
         variances, axes = np.linalg.eigh(covariance[i : i + 2, i : i + 2])
-        along, far = axes[:, 1], WRONG_SIGMAS * math.sqrt(float(np.sum(variances)))
+        along, far = axes[:, 1], WRONG_SIGMAS * deviation(float(np.sum(variances)))
         place = claimed.poses[i : i + 2]
         here, *there = [
             _held(_holding(pair, robot, place, along, offset, HOLDING_SIGMA * far), fitted, steps)
             for offset, steps in ((0.0, 0), (far, HELD_STEPS), (-far, HELD_STEPS))
         ]
         best = max(there, key=lambda one: one.log_likelihood)
-        ratio = best.log_likelihood - here.log_likelihood
+        ratio = math.inf  # a claim whose own likelihood is not known may have any rival
+        if math.isfinite(here.log_likelihood):
+            ratio = best.log_likelihood - here.log_likelihood
         probability = math.exp(min(ratio, 0.0))
         poses = PlanningHypothesis(probability, best.poses.ravel(), claimed.covariance)
         rivals.append(Rival(robot, ratio, poses))

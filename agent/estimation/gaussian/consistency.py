@@ -101,6 +101,8 @@ def consistency_test(fitted: Fit, pair: PairRanges, robot: int) -> Inconsistency
     own = None
     if learned or fitted.inliers < count:  # the own ranges, without the peer's reports
         own = own_fit(fitted, robot, pair)
+        if own is None:
+            return Inconsistency("ranges to one anchor that no motion explains", 0.0, 0.0)
     if learned and own is not None:
         p_value, misfit = _against_own(fitted, own, pair.noise)
     what = (

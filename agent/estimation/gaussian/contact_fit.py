@@ -229,7 +229,8 @@ def _rival(best: Fit, measured: JointMeasurements, mission: Mission) -> str:
         poses[OWN, :2] = mean[OWN, :2]
         found = fits(held, [Start(poses, best.start.errors)])
         weights += [one.weight for one in found] or [math.inf]
-    ratio, most = max(weights[1:]) - weights[0], math.log1p(-mission.confidence)
+    ratio = max(weights[1:]) - weights[0] if math.isfinite(weights[0]) else math.inf
+    most = math.log1p(-mission.confidence)
     if ratio <= most:
         return ""
     return (

@@ -12,7 +12,6 @@ from agent.estimation.fit import Fit, Start, fits
 from agent.estimation.gaussian.odometry_noise import Track
 from agent.estimation.gaussian.pair_ranges import PairRanges
 from agent.estimation.gaussian.range_model import Ranges
-from agent.estimation.smoother import Singular
 
 
 def anchor_evidence(one: Fit, path: Track, ranges: Ranges, sensing_range: float) -> float:
@@ -27,17 +26,14 @@ def anchor_evidence(one: Fit, path: Track, ranges: Ranges, sensing_range: float)
 
 
 @lru_cache(maxsize=4)
-def own_fit(joint: Fit, robot: int, pair: PairRanges) -> Fit:
+def own_fit(joint: Fit, robot: int, pair: PairRanges) -> Fit | None:
     """Return the fit of one robot (0 or 1) to its own anchor alone, which begins at that of both robots.
 
-    Raises Singular if a number is too large for a float.
+    There is none if a number is too large for a float.
     """
     guess, measured = joint.guess[3 * robot : 3 * robot + 2], pair.of(robot)
     start = Start(np.array([[-guess[0], -guess[1], 0.0]]), joint.start.errors[robot : robot + 1])
-    found = fits(measured, [start])
-    if not found:
-        raise Singular("the ranges to one anchor have no fit")
-    return found[0]
+    return next(iter(fits(measured, [start])), None)
 
 
 @lru_cache(maxsize=2)
@@ -45,9 +41,13 @@ def mutual_evidence(one: Fit, pair: PairRanges) -> float:
     """Return the logarithm of the Bayes factor for the mutual ranges under a fit of both robots.
 
     It is that of `anchor_evidence`, given the ranges to the anchors. All headings are equally probable.
+    Without a fit to these ranges, there is no evidence at all.
     """
+    own = [fit.weight for robot in (0, 1) if (fit := own_fit(one, robot, pair)) is not None]
+    if len(own) < 2:
+        return -math.inf
     weight = one.weight - math.log(2.0 * math.pi)
-    weight -= sum([own_fit(one, robot, pair).weight for robot in (0, 1)])
+    weight -= sum(own)
     return weight + _log_widths(pair.paths, pair.ranges.only(2), pair.sensing_range)
 
 
