@@ -1,7 +1,7 @@
-"""Hypotheses about one robot from its ranges to several anchors, whose positions are known.
+"""One robot with ranges to beacons at known places: guesses of its pose that are refined, and its fits.
 
-The unknowns are those of a robot with one anchor, and the rotation of its odometry's frame, which several
-anchors determine.
+The unknowns of a guess are the place of the origin in the frame of the odometry, and the rotation of this
+frame, which several beacons determine.
 """
 
 from __future__ import annotations

@@ -25,9 +25,8 @@ IMPOSSIBLE = 6.0
 MOST_CORRELATED_RANGES = 96
 """The most ranges of a kind that a fit weighs if odometry is noisy.
 
-The cost of a fit is cubic in their number: with 3 x 96, a search takes about 0.2 s. Old ranges tell little of
-the present pose then. Missions of the sweep `noise` have up to 70; with a bound of less than that, they would
-take longer, and with 1000, a search would take seconds.
+The cost of a fit is linear in their number. Old ranges tell little of the present pose then. Missions of the
+sweep `noise` have up to 70; with a bound of less than that, they would take longer; with more, each search.
 """
 
 MOST_RANGES_BY_EXACT_ODOMETRY = 2048
