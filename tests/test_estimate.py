@@ -440,10 +440,12 @@ def test_poses_by_three_anchors_are_off_by_what_their_covariance_says() -> None:
 
 def test_each_pair_of_radios_has_one_range_a_second_at_the_nearest_tick(sample: RangeRecording) -> None:
     measured = measurements(sample, ("A", "B"), "uwb-calibrated", None).measured
-    ticks = (measured.t - measured.t0) / measured.period
-    assert np.max(np.abs(ticks - measured.ranges.tick)) <= 0.5 + 1e-6
-    for rows in measured.ranges.pairs:
-        assert np.min(np.diff(measured.t[rows])) >= EPOCH_S - measured.period - 1e-6
+    ranges = measured.joint.ranges
+    t = measured.time_of(ranges.tick)
+    ticks = (t - measured.t0) / measured.period
+    assert np.max(np.abs(ticks - ranges.tick)) <= 0.5 + 1e-6
+    for rows in ranges.pairs:
+        assert np.min(np.diff(t[rows])) >= EPOCH_S - measured.period - 1e-6
 
 
 def test_known_errors_of_ranges_are_removed(sample: RangeRecording, tmp_path: Path) -> None:

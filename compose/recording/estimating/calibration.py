@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from compose.errors import UserError
 from compose.recording.estimating.doubtful_units import doubtful_lengths
 from compose.recording.estimating.estimate_epoch import ClaimRule
-from compose.recording.estimating.estimate_run import estimated, measurements, numerics
+from compose.recording.estimating.estimate_run import chosen_robots, estimated, measurements, numerics
 from compose.recording.estimating.learned_errors import learned_errors
 from compose.recording.estimating.radio_errors import (
     FEWEST_ERRORS,
@@ -36,11 +36,7 @@ def calibrated(
 
     They are against the truth if there is some, unless `by_fit`; else against an estimate. Raises UserError.
     """
-    known = [one.id for one in recording.robots]
-    chosen = known if robots is None else list(robots)
-    for name in chosen:
-        if name not in known:
-            raise UserError(f"--robots: {recording.source} has no robot {name}; it has {', '.join(known)}")
+    chosen = chosen_robots(recording, robots)
     begin, end = recording.span
     part = recording.part(
         chosen, *((begin, end) if window is None else (begin + window[0], begin + window[1]))

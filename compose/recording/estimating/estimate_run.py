@@ -14,11 +14,11 @@ from compose.recording.estimating.estimate_epoch import ClaimRule, EstimateEpoch
 from compose.recording.estimating.estimate_rows import EstimateSummary, PoseEstimateRow, rows_of, summary_of
 from compose.recording.estimating.group_estimate import GroupEstimator
 from compose.recording.estimating.group_measurements import (
-    GroupMeasurements,
     check_anchors,
     group_measurements,
 )
 from compose.recording.estimating.noise_files import ToldNoise, told_noise
+from compose.recording.estimating.prepared_steps import Measurements
 from compose.recording.estimating.recorded_noise import recorded_noise
 from compose.recording.ranging.range_recording import RangeRecording, RecordedRobot
 
@@ -39,7 +39,7 @@ def numerics(where: str) -> Iterator[None]:
 class EstimationProblem(NamedTuple):
     """The measurements of some robots, and what is known of their source."""
 
-    measured: GroupMeasurements
+    measured: Measurements
     robots: tuple[RecordedRobot, ...]
     """The robots, with their truth if there is one."""
     source: str
@@ -86,7 +86,7 @@ def measurements_with(
     `ticks` is the number of ticks in an epoch; None: by the speed of the robots. The units are examined if
     `doubtful` is set.
     """
-    chosen = _chosen(recording, robots)
+    chosen = chosen_robots(recording, robots)
     begin, end = recording.span
     if window is not None:
         begin, end = begin + window[0], min(begin + window[1], end)
@@ -104,8 +104,8 @@ def measurements_with(
     return EstimationProblem(measured, part.robots, recording.source, assumed.name, doubt)
 
 
-def _chosen(recording: RangeRecording, robots: Sequence[str] | None) -> Sequence[str]:
-    """Return the robots to be estimated. Raises UserError."""
+def chosen_robots(recording: RangeRecording, robots: Sequence[str] | None) -> Sequence[str]:
+    """Return `robots`, or all of the recording. Raises UserError if it has not all of them."""
     known = [one.id for one in recording.robots]
     names = known if robots is None else robots
     for name in names:

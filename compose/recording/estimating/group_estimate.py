@@ -20,7 +20,7 @@ from compose.recording.estimating.estimate_epoch import (
     doubted,
     of_centres,
 )
-from compose.recording.estimating.group_measurements import GroupMeasurements
+from compose.recording.estimating.prepared_steps import Measurements
 
 GROUP_SEARCHES = tuple(8 * 2**n for n in range(16))
 """The numbers of ranges at which the whole plane is searched again."""
@@ -43,7 +43,7 @@ class GroupEstimator:
         self._failed: dict[tuple[int, ...], int] = {}
         self._claimed: set[str] = set()
 
-    def epoch(self, measured: GroupMeasurements, number: int) -> EstimateEpoch:
+    def epoch(self, measured: Measurements, number: int) -> EstimateEpoch:
         """Return the estimate at the end of the epoch with this `number`, from 1 on, in their order."""
         t, (used, reach) = measured.end(number), measured.until(number)
         found = self._extended(self._followed(used), used, reach)
@@ -97,7 +97,7 @@ class GroupEstimator:
 
 def _epoch(
     t: float,
-    measured: GroupMeasurements,
+    measured: Measurements,
     used: JointMeasurements,
     found: JointHypotheses,
     reasons: dict[str, str],
@@ -135,7 +135,7 @@ def _of_all(
     names: list[str],
     place: dict[str, int],
     without: dict[str, str],
-    measured: GroupMeasurements,
+    measured: Measurements,
 ) -> PosesHypothesis:
     """Return the poses of the centres of all robots; NaN for those in `without`."""
     mean = np.full((len(names), 3), np.nan)

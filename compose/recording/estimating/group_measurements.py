@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from agent.estimation.facts import Fact, Facts, Manoeuvre, anchor, anchor_range, manoeuvre, mutual_range
-from agent.estimation.gaussian.joint_ranges import JointMeasurements, joint_measurements
+from agent.estimation.gaussian.joint_ranges import joint_measurements
 from agent.estimation.gaussian.odometry_noise import Track
 from compose.errors import UserError
 from compose.recording.estimating.prepared_steps import (
@@ -15,51 +15,15 @@ from compose.recording.estimating.prepared_steps import (
     Measurements,
     OneRobot,
     PreparedSteps,
-    horizon,
     prepared_steps,
 )
 from compose.recording.estimating.recorded_noise import RecordedNoise
 from compose.recording.ranging.range_recording import FixedAnchor, RangeRecording
 
 
-class GroupMeasurements(Measurements, frozen=True, kw_only=True):
-    """All measurements of some robots."""
-
-    members: tuple[OneRobot, ...]
-    """The robots, in the order of the user; some may have no anchor."""
-    joint: JointMeasurements
-    """The same, with the robots in the order of their names."""
-
-    @property
-    def sides(self) -> tuple[OneRobot, ...]:
-        """The robots."""
-        return self.members
-
-    @property
-    def pairs(self) -> tuple[tuple[str, str], ...]:
-        """The names of each pair of radios."""
-        return self.joint.radios
-
-    @property
-    def anchors(self) -> tuple[FixedAnchor, ...]:
-        """The anchors of all robots."""
-        return tuple({one.id: one for side in self.members for one in side.anchors}.values())
-
-    @property
-    def origin(self) -> tuple[float, float]:
-        """The position (m) to which estimates are relative."""
-        return self.joint.origin
-
-    def until(self, epoch: int) -> tuple[JointMeasurements, float]:
-        """Return what was measured up to the end of `epoch`, and the assumed sensing range (m)."""
-        known = self.joint.until(epoch * self.ticks_per_epoch)
-        reach = horizon(known.ranges.single)
-        return known.thinned(reach), reach
-
-
 def group_measurements(
     recording: RangeRecording, robots: Sequence[str], assumed: RecordedNoise, *, ticks: int | None = None
-) -> GroupMeasurements:
+) -> Measurements:
     """Return the measurements of `robots`, with the noise that is `assumed`.
 
     `ticks` is the number of them in an epoch; None: by the speed of the robots.
@@ -76,15 +40,21 @@ def group_measurements(
         known += _manoeuvres(one.id, one.path)
     joint = joint_measurements(Facts(frozenset(known)), assumed.noise, EPOCH_S / prepared.ticks_per_epoch)
     others = f"to others than the {MOST_USED_ANCHORS} anchors with the most"
-    return GroupMeasurements(
-        members=members,
+    unused = {
+        others: len(steps.ranges.t) - len(ranges),
+        "within a second after another": steps.thinned,
+        "without odometry of all robots": steps.outside,
+        "in a gap of the odometry": steps.in_gaps,
+    }
+    return Measurements(
+        sides=members,
         joint=joint,
-        ranges=joint.ranges.single,
-        t=np.asarray(
-            float(steps.t[0]) + joint.period * joint.ranges.tick + steps.skipped_s[joint.ranges.tick],
-            np.float64,
-        ),
-        **prepared.shared(" of all robots", **{others: len(steps.ranges.t) - len(ranges)}),
+        t0=float(steps.t[0]),
+        ticks_per_epoch=prepared.ticks_per_epoch,
+        noise=assumed.noise,
+        unused={why: count for why, count in unused.items() if count},
+        skipped_s=steps.skipped_s,
+        arrivals=prepared.arrivals,
     )
 
 

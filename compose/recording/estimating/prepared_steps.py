@@ -1,4 +1,4 @@
-"""The recorded steps and ranges of robots, prepared for the estimates of one robot and of two.
+"""The recorded steps and ranges of robots, prepared for the estimate of any number of them.
 
 The estimator counts in ticks. A tick is so short that no robot moves further in half of it than a small part
 of a range's sigma, and each range counts at the nearest tick.
@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.odometry_noise import Track, track
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges
 from compose.errors import BadRecording
@@ -75,28 +76,23 @@ class OneRobot(NamedTuple):
 
     id: str
     anchors: tuple[FixedAnchor, ...]
-    """The anchors to which it has ranges. Poses are relative to the first, which has the most."""
+    """The anchors to which it has ranges, that with the most first; there may be none."""
     path: Track
     """The path of the antenna, in the frame of its first pose."""
     sound: SoundOdometry
     antenna: tuple[float, float, float]
 
-    @property
-    def anchor(self) -> FixedAnchor:
-        """The first of its anchors."""
-        return self.anchors[0]
-
 
 class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     """The measurements of the robots of an estimate."""
 
+    sides: tuple[OneRobot, ...]
+    """The robots, in the order of the user."""
+    joint: JointMeasurements
+    """The same for a fit, with the robots in the order of their names."""
     t0: float
     """The time in s of tick 0."""
     ticks_per_epoch: int
-    ranges: Ranges
-    """The ranges; `radio` is the index among the anchors."""
-    t: Numbers
-    """The time in s of each range; shape (N,)."""
     noise: Noise
     unused: dict[str, int]
     """The number of ranges that are not used, by the reason."""
@@ -127,8 +123,13 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def origin(self) -> tuple[float, float]:
-        """The position (m) to which estimates are relative: that of the first anchor."""
-        return self.sides[0].anchor.x, self.sides[0].anchor.y
+        """The position (m) to which estimates are relative."""
+        return self.joint.origin
+
+    @property
+    def anchors(self) -> tuple[FixedAnchor, ...]:
+        """The anchors of all robots."""
+        return tuple({one.id: one for side in self.sides for one in side.anchors}.values())
 
     @property
     def epochs(self) -> int:
@@ -138,12 +139,13 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def pairs(self) -> tuple[tuple[str, str], ...]:
         """The names of each pair of radios."""
-        raise NotImplementedError
+        return self.joint.radios
 
-    @property
-    def sides(self) -> tuple[OneRobot, ...]:
-        """The robots."""
-        raise NotImplementedError
+    def until(self, epoch: int) -> tuple[JointMeasurements, float]:
+        """Return what was measured up to the end of `epoch`, and the assumed sensing range (m)."""
+        known = self.joint.until(epoch * self.ticks_per_epoch)
+        reach = horizon(known.ranges.single)
+        return known.thinned(reach), reach
 
 
 class PreparedSteps(NamedTuple):
@@ -183,27 +185,6 @@ class PreparedSteps(NamedTuple):
         if self.assumed.stated:
             sigma = np.where(np.isfinite(ranges.sigma), ranges.sigma, sigma)
         return rho, np.maximum(sigma, SIGMA_FLOOR) * ratio
-
-    def shared(self, robots: str, **left_out: int) -> dict[str, Any]:
-        """Return the fields that all Measurements have in common; `robots` are those with odometry.
-
-        `left_out` are further numbers of ranges that are not used, by the reason.
-        """
-        steps = self.steps
-        unused = {
-            **left_out,
-            "within a second after another": steps.thinned,
-            f"without odometry{robots}": steps.outside,
-            "in a gap of the odometry": steps.in_gaps,
-        }
-        return {
-            "t0": float(steps.t[0]),
-            "ticks_per_epoch": self.ticks_per_epoch,
-            "noise": self.assumed.noise,
-            "unused": {why: count for why, count in unused.items() if count},
-            "skipped_s": steps.skipped_s,
-            "arrivals": self.arrivals,
-        }
 
 
 def prepared_steps(
