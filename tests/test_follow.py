@@ -113,7 +113,7 @@ def test_a_robot_that_joins_a_stream_begins_the_estimate_again(messages: Message
         for one in messages
         if one[0] <= 9.3 and (one[1] == "/anchors" or one[0] > 6.2 or "A" not in one[2].values())
     ]
-    for end in (7.0, 9.3):  # the time of the first was estimated for one robot already
+    for end in (7.0, 9.3):  # in the first, both have moved for a shorter time than one alone
         estimate = StreamEstimate("it", None, (told_noise(PROFILE), PROFILE), ClaimRule())
         data = written([one for one in late if one[0] <= end])
         list(estimate.rows(rows_as_they_arrive(io.BytesIO(data), "it")))
