@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from agent.estimation.fit import TO_THE_END, Ending, Fit, Start, fits
+from agent.estimation.fit import TO_THE_END, Convergence, Fit, Start, fits
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.known_anchors import start_of
 from agent.estimation.gaussian.odometry_noise import Array, Errors
@@ -21,7 +21,7 @@ def pair_start(guess: Array, apart: tuple[float, float], errors: Sequence[Errors
     return Start(poses, tuple(errors))
 
 
-def pair_fit(guess: Array, pair: PairRanges, ending: Ending = TO_THE_END) -> Fit:
+def pair_fit(guess: Array, pair: PairRanges, ending: Convergence = TO_THE_END) -> Fit:
     """Return the fit to all ranges of `pair` that begins at `guess`, shape (6,)."""
     (found,) = fits(pair.measured, [pair_start(guess, pair.apart)], ending)
     return found

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from agent.estimation import closed_forms
 from agent.estimation.closed_forms import Placement, same_placement
-from agent.estimation.fit import Ending, Fit, HeldFit, fits
+from agent.estimation.fit import Convergence, Fit, HeldFit, fits
 from agent.estimation.gaussian import claim_rivals, evidence, hypotheses, inference
 from agent.estimation.gaussian.consistency import consistency_test
 from agent.estimation.gaussian.detections import no_detection_log_likelihood
@@ -256,7 +256,7 @@ def test_odometry_noise_before_the_encounter_does_not_hide_the_truth() -> None:
         if pair.ranges.counts[2] < ENOUGH:
             continue
         tried += 1
-        best = pair_fit(truth, pair, Ending(20))
+        best = pair_fit(truth, pair, Convergence(20))
         found = search(pair)
         assert min([sigmas(one, best.guess) for one in found]) < 1.0, seed
     assert tried > 12
@@ -538,7 +538,7 @@ def test_the_fit_of_a_long_contact_takes_memory_in_proportion_to_its_ranges() ->
     ranges = Ranges.of_lists(every, every, every, noise)
     truth, apart = np.array((0.4, 0.9, 0.3, -0.2, 1.0, -0.8)), (1.5, 0.0)
     pair = PairRanges((a, b), ranges, (NONE, NONE, NONE), apart, REACH, noise)
-    there = pair_fit(truth, pair, Ending(0))
+    there = pair_fit(truth, pair, Convergence(0))
     pair = replace(pair, ranges=ranges._replace(rho=-there.residuals))
     tracemalloc.start()
     try:

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares  # type: ignore[import-untyped]
 from scipy.stats import binom, chi2  # type: ignore[import-untyped]
 
 from agent.estimation.facts import Facts, Manoeuvre, anchor, anchor_range, manoeuvre, mutual_range
-from agent.estimation.fit import Ending, Fit, Start, fits
+from agent.estimation.fit import Convergence, Fit, Start, fits
 from agent.estimation.gaussian.hypotheses import search as search_of_pair
 from agent.estimation.gaussian.joint_claims import blocking_reason, undetermined
 from agent.estimation.gaussian.joint_ranges import MOST_MUTUAL_RANGES, JointMeasurements, joint_measurements
@@ -121,7 +121,7 @@ def test_the_joint_fit_is_the_optimum_that_scipy_finds(unanchored: list[int]) ->
     noise = replace(NOISE, strays=0.0, sigma_degrees=0.0)
     group = moving_group(3, 5, ticks=14, noise=noise, unanchored=unanchored)
     measured = measured_of(group)
-    (fit,) = fits(measured, [at_truth(group, measured)], Ending(20))
+    (fit,) = fits(measured, [at_truth(group, measured)], Convergence(20))
     ends, covariance = Reference(measured).optimum(at_truth(group, measured).poses)
     sigmas = np.sqrt(np.diagonal(covariance))
     assert np.max(np.abs((fit.poses - ends).ravel()) / sigmas) < 0.01

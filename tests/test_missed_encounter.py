@@ -52,11 +52,9 @@ odometry = {v = 0.05, omega = 0.05}
 actuation = {v = 0.05, omega = 0.05}"""
 """Noise with which one of twelve robots a meets b, and cannot claim after 60 mutual ranges."""
 UNSETTLED = (
-    1077452619412565400,
-    903395225165945070,
-    4565738891504476827,
-    2386190808387697108,  # a leaves b twice
     2010375696666685743,
+    2386190808387697108,
+    1077452619412565400,
 )
 """Seeds of WHEELS, from a sweep of 300, which ended undecided when a did not begin again after a meeting."""
 PASSED = 49

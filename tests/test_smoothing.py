@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from agent.estimation import smoother
-from agent.estimation.fit import LAST_STEP, Ending, Fit, Start, deviation, fits, held_fit
+from agent.estimation.fit import LAST_STEP, Convergence, Fit, Start, deviation, fits, held_fit
 from agent.estimation.gaussian import odometry_noise, pair_ranges
 from agent.estimation.gaussian.claim_rivals import _holding
 from agent.estimation.gaussian.consistency import FINISHED
@@ -266,7 +266,7 @@ def with_other_anchors(pair: PairRanges, seed: int) -> JointMeasurements:
 @given(seeds)
 def test_the_true_start_predicts_the_true_ranges(seed: int) -> None:
     pair, guess, poses = told(seed, EXACT)
-    found = pair_fit(guess, pair, Ending(0))
+    found = pair_fit(guess, pair, Convergence(0))
     assert found.guess == pytest.approx(guess, abs=1e-12)
     assert found.residuals == pytest.approx(np.zeros(len(pair.ranges.rho)), abs=1e-12)
     assert found.poses.ravel() == pytest.approx(poses, abs=1e-12)
@@ -522,7 +522,7 @@ def cost(told: Told, found: Fit) -> float:
 def test_no_step_of_a_fit_climbs(seed: int, noise: Noise, by: float) -> None:
     one = told(seed, noise)
     guess = nudged(one, seed, by)
-    costs = [cost(one, pair_fit(guess, one.pair, Ending(steps))) for steps in range(7)]
+    costs = [cost(one, pair_fit(guess, one.pair, Convergence(steps))) for steps in range(7)]
     assert all(later <= earlier + 1e-5 for earlier, later in pairwise(costs)), costs
 
 
@@ -531,14 +531,14 @@ def test_no_step_of_a_fit_climbs(seed: int, noise: Noise, by: float) -> None:
 def test_a_fit_begins_on_the_path_that_it_is_given(seed: int) -> None:
     one = told(seed, DRIFTING)
     assume(clear(one))
-    first = pair_fit(one.guess, one.pair, Ending(30))
+    first = pair_fit(one.guess, one.pair, Convergence(30))
     assume(first.last_step < LAST_STEP)
-    (there,) = fits(one.pair.measured, [first.start], Ending(0))
+    (there,) = fits(one.pair.measured, [first.start], Convergence(0))
     assert there.last_step < 0.3, (
         "the last step has been taken; among 938 draws, the next one had at most 0.073"
     )
     assert there.poses.tolist() == first.poses.tolist()
-    assert cost(one, there) < cost(one, pair_fit(first.guess, one.pair, Ending(0)))
+    assert cost(one, there) < cost(one, pair_fit(first.guess, one.pair, Convergence(0)))
 
 
 ROUGH = Noise(
@@ -712,7 +712,7 @@ def test_a_range_that_holds_a_coordinate_is_no_outlier_and_has_no_bias(
     measured = _holding(pair, 1, place, along, offset, sigma)
     held = held_fit(measured, begun, 5)
     assert 0.5 < (held.poses[1, :2] - place) @ along / offset < 1.5, "after a few steps"
-    (whole,) = fits(measured, [begun.start], Ending(20))
+    (whole,) = fits(measured, [begun.start], Convergence(20))
     assert whole.weights[-1] == 1.0
     assert (whole.poses[1, :2] - place) @ along == pytest.approx(offset, abs=10.0 * sigma)
 

@@ -243,8 +243,8 @@ class _Point(NamedTuple):
         return float(np.sum(np.square(self.own) / variance)) + self.prior_cost
 
 
-class Ending(NamedTuple):
-    """When fits end."""
+class Convergence(NamedTuple):
+    """When fits have converged."""
 
     steps: int = FIT_STEPS
     """The maximum number of steps."""
@@ -255,11 +255,11 @@ class Ending(NamedTuple):
     fits to almost the same ranges."""
 
 
-TO_THE_END = Ending()
+TO_THE_END = Convergence()
 """The end of fits from which a claim may follow."""
 
 
-def fits(measured: JointMeasurements, starts: Iterable[Start], ending: Ending = TO_THE_END) -> list[Fit]:
+def fits(measured: JointMeasurements, starts: Iterable[Start], ending: Convergence = TO_THE_END) -> list[Fit]:
     """Return the fits to all ranges in `measured` that begin at `starts`.
 
     A start from which there is none, because a number is too large for a float, is left out.
@@ -332,7 +332,7 @@ def without_outliers(measured: JointMeasurements, starts: Sequence[Start]) -> li
     return found
 
 
-def _fitted(problem: Problem, kernel: Kernel, start: Start, ending: Ending) -> Fit:
+def _fitted(problem: Problem, kernel: Kernel, start: Start, ending: Convergence) -> Fit:
     noise, sigma = problem.noise, problem.sigma
     point = _begin(problem, kernel, start)
     loose = kernel.loosened(point.walk, point.poses, np.square(sigma))

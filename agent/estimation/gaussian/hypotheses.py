@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.fit import Ending, Fit, Start, fits, without_outliers
+from agent.estimation.fit import Convergence, Fit, Start, fits, without_outliers
 from agent.estimation.gaussian.anchor_guesses import MOST_FOLLOWED, SEED_RANGES, UNLIKELY, anchors
 from agent.estimation.gaussian.detections import anchor_log_likelihood, detection_log_likelihood
 from agent.estimation.gaussian.odometry_noise import Array, Errors, Places, Track
@@ -43,7 +43,7 @@ With one step, that is every third tick; with more, each tick takes longer."""
 
 
 COARSE_STILL = 0.05
-"""The `Ending.shortest` of fits on which only the robot's way depends.
+"""The `Convergence.shortest` of fits on which only the robot's way depends.
 
 No claim does: each search fits all ranges again. With LAST_STEP, such a fit takes twice as long.
 """
@@ -148,7 +148,9 @@ def of_anchor(
     else:
         places = [(-x, -y) for (x, y, _), *_ in [one.poses for one in known]]
         starts = starts_about(anchors(path, ranges, sensing_range, noise, places))
-    ending = Ending(WARM_STEPS, COARSE_STILL, WARM_DECREASE) if warm else Ending(shortest=COARSE_STILL)
+    ending = (
+        Convergence(WARM_STEPS, COARSE_STILL, WARM_DECREASE) if warm else Convergence(shortest=COARSE_STILL)
+    )
     found = fits(alone(path, ranges, noise), starts, ending)
     return with_probability(
         [(one, anchor_log_likelihood(one, 0, silent, ranges.tick, sensing_range, noise)) for one in found]
@@ -241,7 +243,7 @@ def _up_to_last_range(own: _OwnRanges) -> tuple[ScoredHypothesis, ...]:
 def follow(before: tuple[Hypothesis, ...], pair: PairRanges) -> tuple[ScoredHypothesis, ...]:
     """Return the hypotheses that follow from those of the previous tick, `before`."""
     starts = [one.start for one in before]
-    return _scored(fits(pair.measured, starts, Ending(WARM_STEPS)), pair)
+    return _scored(fits(pair.measured, starts, Convergence(WARM_STEPS)), pair)
 
 
 def _scored(found: Sequence[Fit], pair: PairRanges) -> tuple[ScoredHypothesis, ...]:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.fit import Ending, Start, fits
+from agent.estimation.fit import Convergence, Start, fits
 from agent.estimation.gaussian import hypotheses
 from agent.estimation.gaussian.beacon_guesses import beacon_guesses
 from agent.estimation.gaussian.hypotheses import (
@@ -62,7 +62,7 @@ def search(measured: JointMeasurements, reach: float) -> JointHypotheses:
 def follow(known: JointHypotheses, measured: JointMeasurements, steps: int = WARM_STEPS) -> JointHypotheses:
     """Return the hypotheses that follow from those `known` before the latest facts."""
     part = measured.some(known.located)
-    found = fits(part, [one.fit.start for one in known.scored], Ending(steps))
+    found = fits(part, [one.fit.start for one in known.scored], Convergence(steps))
     return JointHypotheses(known.located, with_probability(found))
 
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.fit import TO_THE_END, Ending, Fit, Start, deviation, fits
+from agent.estimation.fit import TO_THE_END, Convergence, Fit, Start, deviation, fits
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, HIGHEST_LEVEL, chi2_p_value
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges
 from agent.estimation.gaussian.noise_level import INLIER
@@ -79,7 +79,7 @@ class AnchoredRobot(NamedTuple):
 
 
 def scored_fits(
-    robot: AnchoredRobot, starts: Sequence[Start], ending: Ending = TO_THE_END
+    robot: AnchoredRobot, starts: Sequence[Start], ending: Convergence = TO_THE_END
 ) -> tuple[JointHypothesis, ...]:
     """Return the hypotheses of the fits that begin at `starts`, the likeliest first."""
     return with_probability(fits(robot.measured, starts, ending))

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import msgspec
 from msgspec.structs import replace
 
-from agent.estimation.fit import FIT_STEPS, Ending, Fit, Start, fits
+from agent.estimation.fit import FIT_STEPS, Convergence, Fit, Start, fits
 from agent.estimation.gaussian.anchor_guesses import anchors
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, consistency_test
 from agent.estimation.gaussian.hypotheses import search, starts_about
@@ -134,7 +134,7 @@ def contradiction(fitted: Fit, measured: JointMeasurements, what: str) -> Doubt 
         errors = tuple([rescaled(one, noise, other) for one in fitted.start.errors])
         start, again = Start(fitted.start.poses, errors), replace(measured, noise=other)
         for steps in (0, FIT_STEPS):
-            found = [one.weight for one in fits(again, [start], Ending(steps))]
+            found = [one.weight for one in fits(again, [start], Convergence(steps))]
             others[name] = max(found, default=-math.inf) - fitted.weight
             if others[name] < DOUBTFUL_CLAIM - ONE_MODEL_ERROR:
                 break

@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 from msgspec.structs import replace
 
-from agent.estimation.fit import Ending, Start, deviation, fits
+from agent.estimation.fit import Convergence, Start, deviation, fits
 from agent.estimation.gaussian.odometry_noise import (
     Array,
     Projection,
@@ -157,7 +157,7 @@ def position_sigmas(pair: PairRanges, poses: Array) -> list[float]:
 
     It is infinite if the ranges do not determine the poses.
     """
-    for fit in fits(pair.measured, [Start(poses)], Ending(0)):
+    for fit in fits(pair.measured, [Start(poses)], Convergence(0)):
         return [deviation(float(fit.covariance[i, i] + fit.covariance[i + 1, i + 1])) for i in (0, 3)]
     return [math.inf, math.inf]
 
