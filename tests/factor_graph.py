@@ -18,6 +18,11 @@ Array = NDArray[np.float64]
 
 STILL = 1e-7
 """The size of a step, in m, m/s and rad, below which gtsam's Gauss-Newton iteration ends."""
+ROUNDED, SAME_ERROR = 1e-3, 1e-9
+"""The size of a step, and the relative change of the error, that may be due to rounding.
+
+Where constant errors are hardly determined, steps stay at up to 1e-4, and the error has ten equal digits.
+"""
 STEPS = 200
 """The maximum number of steps."""
 
@@ -69,12 +74,14 @@ def arc(robot: int, tick: int, period: float, slip: float = 0.0) -> gtsam.Custom
 
 def optimum(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: Sequence[int]) -> Optimum:
     """Return the optimum, by single Gauss-Newton steps: gtsam's `optimize` ends when the error grows once."""
+    error = math.inf
     for _ in range(STEPS):
         optimiser = gtsam.GaussNewtonOptimizer(graph, values)
         optimiser.iterate()
         change = values.localCoordinates(optimiser.values()).norm()
         values = optimiser.values()
-        if change < STILL:
+        before, error = error, float(graph.error(values))
+        if change < STILL or (change < ROUNDED and abs(before - error) < SAME_ERROR * error):
             break
     else:
         raise AssertionError("gtsam has found no optimum")
