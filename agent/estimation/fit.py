@@ -256,10 +256,10 @@ class Convergence(NamedTuple):
 
 
 TO_THE_END = Convergence()
-"""The end of fits from which a claim may follow."""
+"""The convergence of fits from which a claim may follow."""
 
 
-def fits(measured: JointMeasurements, starts: Iterable[Start], ending: Convergence = TO_THE_END) -> list[Fit]:
+def fits(measured: JointMeasurements, starts: Iterable[Start], until: Convergence = TO_THE_END) -> list[Fit]:
     """Return the fits to all ranges in `measured` that begin at `starts`.
 
     A start from which there is none, because a number is too large for a float, is left out.
@@ -268,7 +268,7 @@ def fits(measured: JointMeasurements, starts: Iterable[Start], ending: Convergen
     kernel, found = Kernel(problem.measured), []
     for start in starts:
         try:
-            found.append(_fitted(problem, kernel, start, ending))
+            found.append(_fitted(problem, kernel, start, until))
         except Singular:
             continue
     return found
@@ -332,13 +332,13 @@ def without_outliers(measured: JointMeasurements, starts: Sequence[Start]) -> li
     return found
 
 
-def _fitted(problem: Problem, kernel: Kernel, start: Start, ending: Convergence) -> Fit:
+def _fitted(problem: Problem, kernel: Kernel, start: Start, until: Convergence) -> Fit:
     noise, sigma = problem.noise, problem.sigma
     point = _begin(problem, kernel, start)
     loose = kernel.loosened(point.walk, point.poses, np.square(sigma))
     least = GRAIN * float(np.max(loose, initial=0.0)) if problem.noisy else 0.0
     weights, before = _first_weights(problem, start, point, loose), 0.0
-    for number in range(ending.steps + 1):
+    for number in range(until.steps + 1):
         variance = weighted_variance(sigma, weights, problem.longest) + least
         step = kernel.step(point.walk, point.poses, variance, RIDGE, LARGEST_STEP * problem.longest)
         if not math.isfinite(step.chi2):
@@ -349,17 +349,17 @@ def _fitted(problem: Problem, kernel: Kernel, start: Start, ending: Convergence)
         freedom = int(np.count_nonzero(weights > INLIER)) - problem.free
         level = noise_level(step.chi2, freedom, noise)
         length = step.length / math.sqrt(level)
-        before = length / ending.decrease if number == 0 else before
+        before = length / until.decrease if number == 0 else before
         expected = length**2 / max(length, before, LAST_STEP)
         still = float(np.max(np.abs(updated - weights), initial=0.0)) < SETTLED_WEIGHT
         linear = Linear(kernel, point.walk, point.poses, variance, step)
-        if number == ending.steps:
+        if number == until.steps:
             off = _off_model(point, step, variance, level)
             return _fit(problem, point, linear, weights, off if off > 1.0 else length)
         point = _stepped(problem, kernel, point, step, variance)
         # the path is corrected at least once
-        still = still and (number > 0 or ending.decrease < 1.0 or not problem.noisy)
-        if still and expected < ending.shortest and _off_model(point, step, variance, level) <= 1.0:
+        still = still and (number > 0 or until.decrease < 1.0 or not problem.noisy)
+        if still and expected < until.shortest and _off_model(point, step, variance, level) <= 1.0:
             return _fit(problem, point, linear, weights, expected)
         weights, before = updated, length
     raise AssertionError("the last step returns")

@@ -148,10 +148,10 @@ def of_anchor(
     else:
         places = [(-x, -y) for (x, y, _), *_ in [one.poses for one in known]]
         starts = starts_about(anchors(path, ranges, sensing_range, noise, places))
-    ending = (
+    until = (
         Convergence(WARM_STEPS, COARSE_STILL, WARM_DECREASE) if warm else Convergence(shortest=COARSE_STILL)
     )
-    found = fits(alone(path, ranges, noise), starts, ending)
+    found = fits(alone(path, ranges, noise), starts, until)
     return with_probability(
         [(one, anchor_log_likelihood(one, 0, silent, ranges.tick, sensing_range, noise)) for one in found]
     )

@@ -118,13 +118,16 @@ def _own_measurements(knowledge: Knowledge) -> tuple[Track, Ranges]:
     return path_of(knowledge.log, first, now, mission), ranges
 
 
+def _possible(ranges: Ranges, mission: Mission) -> Ranges:
+    """Return the ranges that need not be outliers; two robots change one by twice their speed at the most."""
+    return ranges.within(mission.sensing_range, mission.noise.priors, 2.0 * mission.max_speed)
+
+
 def own_anchor(knowledge: Knowledge) -> tuple[ScoredHypothesis, ...]:
     """Return the hypotheses about the anchor in the frame of the odometry, the most probable first."""
     mission = knowledge.config.mission
     path, ranges = _own_measurements(knowledge)
-    possible = ranges.within(mission.sensing_range, mission.noise.priors, 2.0 * mission.max_speed).thinned(
-        mission.noise
-    )
+    possible = _possible(ranges, mission).thinned(mission.noise)
     if not len(possible.rho):
         return ()
     silent = missing(ranges.tick, knowledge.tick + 1, _own_beginning(knowledge))
@@ -216,7 +219,7 @@ def is_anchor_known(knowledge: Knowledge, scored: Sequence[ScoredHypothesis]) ->
     if mission.noise.outliers or good >= ANCHOR_RANGES:
         return good >= (ANCHOR_RANGES_WITH_OUTLIERS if mission.noise.outliers else ANCHOR_RANGES)
     path, ranges = _own_measurements(knowledge)
-    possible = ranges.within(mission.sensing_range, mission.noise.priors, 2.0 * mission.max_speed)
+    possible = _possible(ranges, mission)
     evidence = anchor_evidence(best.fit, path, possible, mission.sensing_range)
     return evidence >= ANCHOR_EVIDENCE
 
@@ -298,9 +301,7 @@ def pair_of(knowledge: Knowledge) -> PairRanges:
     lists = [_ranges_within(log, *within) for log, *within in zip(logs, firsts, ends, strict=False)]
     ranges = Ranges.of_lists(lists[0], lists[1], mutual, mission.noise)
     silent = [missing(ranges.tick[ranges.rows(kind)], ends[kind] + 1, firsts[kind]) for kind in range(3)]
-    ranges = ranges.within(mission.sensing_range, mission.noise.priors, 2.0 * mission.max_speed).thinned(
-        mission.noise
-    )
+    ranges = _possible(ranges, mission).thinned(mission.noise)
     own, other = config.anchor, config.peer_anchor
     sign = 1.0 if config.role == "a" else -1.0
     return PairRanges(

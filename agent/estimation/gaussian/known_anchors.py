@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.fit import TO_THE_END, Convergence, Fit, Start, deviation, fits
+from agent.estimation.fit import Fit, Start, deviation, fits
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, HIGHEST_LEVEL, chi2_p_value
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges
 from agent.estimation.gaussian.noise_level import INLIER
@@ -78,11 +78,9 @@ class AnchoredRobot(NamedTuple):
         return JointMeasurements(("",), (), (), (self.path,), own, self.path.period, (0.0, 0.0), self.noise)
 
 
-def scored_fits(
-    robot: AnchoredRobot, starts: Sequence[Start], ending: Convergence = TO_THE_END
-) -> tuple[JointHypothesis, ...]:
+def scored_fits(robot: AnchoredRobot, starts: Sequence[Start]) -> tuple[JointHypothesis, ...]:
     """Return the hypotheses of the fits that begin at `starts`, the likeliest first."""
-    return with_probability(fits(robot.measured, starts, ending))
+    return with_probability(fits(robot.measured, starts))
 
 
 def start_of(guess: Array) -> Start:

@@ -89,7 +89,7 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     sides: tuple[OneRobot, ...]
     """The robots, in the order of the user."""
     joint: JointMeasurements
-    """The same for a fit, with the robots in the order of their names."""
+    """The measurements as a fit takes them, with the robots in the order of their names."""
     t0: float
     """The time in s of tick 0."""
     ticks_per_epoch: int

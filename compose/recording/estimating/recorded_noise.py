@@ -9,7 +9,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from compose.recording.ranging.range_recording import RangeRecording
-from protocol.noise import Noise, ProfileName, VelocityNoise, with_profile
+from protocol.noise import PROFILES, Noise, ProfileName, VelocityNoise, with_profile
 
 RESIDUAL = VelocityNoise(v_floor=1e-3, omega_floor=1e-4)
 """The noise of odometry in addition to that of each increment, in m/s and rad/s.
@@ -17,10 +17,10 @@ RESIDUAL = VelocityNoise(v_floor=1e-3, omega_floor=1e-4)
 It sets the bound below which a robot counts as standing, with which a gyro has no bias.
 """
 
-UNTOLD_DELAY_S = 0.1
+UNTOLD_DELAY_S: float = PROFILES["uwb"]["range_delay"]
 """The prior in s of a delay of ranges whose sigmas a recording states: they say nothing of its clocks.
 
-It is that of the profile `uwb`. Of ranges that are 0.3 s late at 1 m/s, 5 claims of 107 were wrong without it
+Of ranges that are 0.3 s late at 1 m/s, 5 claims of 107 were wrong without it
 (by 5 of their sigmas along an axis), 2 of 113 with it, and the median error of a claim is 0.10 m, not 0.3 m.
 Where stamps are right, as many poses are claimed.
 """
