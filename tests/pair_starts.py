@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from agent.estimation.fit import TO_THE_END, Convergence, Fit, Start, fits
+from agent.estimation.fit import TO_THE_END, Fit, Start, fits
+from agent.estimation.gauss_newton import Convergence
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.known_anchors import start_of
 from agent.estimation.gaussian.odometry_noise import Array, Errors

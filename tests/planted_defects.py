@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from agent.estimation import fit
 from agent.estimation.gaussian import hypotheses, inference
 from agent.estimation.gaussian.range_model import Ranges
+from agent.estimation.gaussian.range_weights import Weighing
 from agent.planning import phase3_last_manoeuvre
 from compose.scenario import group_meetings
 from protocol.mission import Mission
@@ -48,10 +48,14 @@ def confidence() -> None:
 def gate() -> None:
     """The gate of outliers is twice as wide."""
 
-    def wide(before: Any, errors: Any, sigma: Any, noise: Any) -> Any:
-        return before(errors, 2.0 * sigma, noise)
+    before = Weighing.of
 
-    wrapped(fit, "weights_by_errors", wide)
+    def wide(*given: Any, **named: Any) -> Weighing:
+        by = before(*given, **named)
+        farther = [by.inlier + 4.0 * (share - by.inlier) for share in (by.outlier, by.stray)]
+        return by._replace(outlier=farther[0], stray=farther[1])
+
+    setattr(Weighing, "of", staticmethod(wide))  # noqa: B010  # mypy takes it for a method
 
 
 def hypothesis() -> None:

@@ -15,7 +15,8 @@ from msgspec.structs import replace
 
 from agent.estimation import closed_forms
 from agent.estimation.closed_forms import Placement, same_placement
-from agent.estimation.fit import Convergence, Fit, HeldFit, fits
+from agent.estimation.fit import Fit, HeldFit, fits
+from agent.estimation.gauss_newton import Convergence
 from agent.estimation.gaussian import claim_rivals, evidence, hypotheses, inference
 from agent.estimation.gaussian.consistency import consistency_test
 from agent.estimation.gaussian.detections import no_detection_log_likelihood

@@ -12,7 +12,8 @@ from scipy.optimize import least_squares  # type: ignore[import-untyped]
 from scipy.stats import binom, chi2  # type: ignore[import-untyped]
 
 from agent.estimation.facts import Facts, Manoeuvre, anchor, anchor_range, manoeuvre, mutual_range
-from agent.estimation.fit import Convergence, Fit, Start, fits
+from agent.estimation.fit import Fit, Start, fits
+from agent.estimation.gauss_newton import Convergence
 from agent.estimation.gaussian.hypotheses import search as search_of_pair
 from agent.estimation.gaussian.joint_claims import blocking_reason, undetermined
 from agent.estimation.gaussian.joint_ranges import MOST_MUTUAL_RANGES, JointMeasurements, joint_measurements

@@ -179,35 +179,32 @@ def test_a_noise_level_is_learned_from_the_residuals() -> None:
     noise = Noise(0.05, 0.05)
     assert np.mean([drawn(seed, noise)[1] for seed in range(40)]) == pytest.approx(1.0, abs=0.2)
     assert np.mean([drawn(seed, noise, level=2.0)[1] for seed in range(40)]) == pytest.approx(4.0, rel=0.25)
-    assert noise_level(100.0, 10, noise.as_told) == 1.0
+    assert noise_level(100.0, 10, noise.as_told.sigma_degrees) == 1.0
 
 
 def test_small_residuals_that_are_alike_do_not_make_a_robot_sure() -> None:
-    noise, ranges = Noise(0.05, 0.05), own(0.0)[1]
-    alike, alternating = np.full(21, 0.01), 0.01 * np.resize([1.0, -1.0], 21)
-    weights = np.ones(21)
+    alike, given, degrees = [0.01] * 21, ([1.0] * 21, [0.05] * 21), Noise(0.05, 0.05).sigma_degrees
+    of_one_kind = [0] * 21
     by_chance = 2.0 / math.sqrt(21.0)
-    assert residual_correlation(alike, weights, ranges.sigma, (), 1.0) == pytest.approx(20 / 21 - by_chance)
-    assert residual_correlation(alternating, weights, ranges.sigma, (), 1.0) == 0.0
-    assert noise_level(1.0, 19, noise, 0.5) > 2.0 * noise_level(1.0, 19, noise)
-    assert noise_level(1.0, 19, noise) < 0.6
-    white = np.random.default_rng(1).normal(size=21)
-    assert residual_correlation(white, weights, ranges.sigma, (), 1.0) == 0.0
-    of_two_kinds = residual_correlation(alike, weights, ranges.sigma, (10,), 1.0)
+    found = residual_correlation(alike, *given, of_one_kind, 1.0)
+    assert found == pytest.approx(20 / 21 - by_chance)
+    assert residual_correlation([0.01, -0.01] * 10 + [0.01], *given, of_one_kind, 1.0) == 0.0
+    assert noise_level(1.0, 19, degrees, 0.5) > 2.0 * noise_level(1.0, 19, degrees)
+    assert noise_level(1.0, 19, degrees) < 0.6
+    white = np.random.default_rng(1).normal(size=21).tolist()
+    assert residual_correlation(white, *given, of_one_kind, 1.0) == 0.0
+    of_two_kinds = residual_correlation(alike, *given, [0] * 10 + [1] * 11, 1.0)
     assert of_two_kinds == pytest.approx(19 / 21 - by_chance)
 
 
 def test_residuals_that_are_too_small_count_only_as_far_as_they_are_white() -> None:
     """Slow errors look like a constant one: 3 of 1 000 claims of robots with AR(1) errors were wrong."""
-    noise, ranges = Noise(0.05, 0.05), own(0.0)[1]
-    alike, weights = np.full(21, 0.01), np.ones(21)
+    alike, given = [0.01] * 21, ([1.0] * 21, [0.05] * 21, [0] * 21)
     less_by_chance = 0.4 * 2.0 / math.sqrt(21.0)
-    accurate, inaccurate = (
-        residual_correlation(alike, weights, ranges.sigma, (), level) for level in (0.4, 3.0)
-    )
+    accurate, inaccurate = (residual_correlation(alike, *given, level) for level in (0.4, 3.0))
     assert accurate == pytest.approx(20 / 21 - less_by_chance)
     assert inaccurate < 20 / 21 - less_by_chance
-    assert noise_level(0.0, 100, noise) == LEAST_LEVEL
+    assert noise_level(0.0, 100, Noise(0.05, 0.05).sigma_degrees) == LEAST_LEVEL
 
 
 def test_a_bias_of_all_ranges_is_no_correlation_of_their_errors() -> None:

@@ -15,7 +15,8 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from agent.estimation import smoother
-from agent.estimation.fit import LAST_STEP, Convergence, Fit, Start, deviation, fits, held_fit
+from agent.estimation.fit import Fit, Start, deviation, fits, held_fit
+from agent.estimation.gauss_newton import LAST_STEP, Convergence, moved
 from agent.estimation.gaussian import odometry_noise, pair_ranges
 from agent.estimation.gaussian.claim_rivals import _holding
 from agent.estimation.gaussian.consistency import FINISHED
@@ -35,7 +36,6 @@ from agent.estimation.gaussian.odometry_noise import (
 )
 from agent.estimation.gaussian.pair_ranges import PairRanges, alone
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges
-from agent.estimation.kernel import Kernel
 from agent.estimation.problem import MOST_MEASURED_LENGTHS, Problem
 from protocol.motion import ORIGIN, Pose, compose, rotated, step
 from protocol.noise import Noise, VelocityNoise
@@ -299,19 +299,19 @@ def test_a_range_changes_with_all_unknowns_as_the_linear_model_predicts(
     one = told(seed, noise)
     assume(clear(one))
     problem = Problem.of(with_other_anchors(one.pair, seed) if anchors == "several" else one.pair.measured)
-    of, kernel, begin = problem.measured, Kernel(problem.measured), pair_start(one.guess, one.pair.apart)
+    of, kernel, begin = problem.measured, problem.kernel, pair_start(one.guess, one.pair.apart)
     draw, poses, white = np.random.default_rng(seed), begin.poses.ravel(), np.zeros(of.white.shape)
     at = np.concatenate((np.zeros(6), draw.normal(size=of.size - 6)))
     parts = (6, 6 + of.common.shape[1])
 
     def predicted(unknowns: Array) -> Array:
         change, common, constant = np.split(unknowns, parts)
-        walk = kernel.walked(problem.moved(poses, change), constant.reshape(2, -1), white)
+        walk = kernel.walked(moved(of, poses, change), constant.reshape(2, -1), white)
         return np.asarray(of.rho - walk.residual + of.common @ common)
 
     assume(float(np.min(predicted(at) - of.common @ at[6 : parts[1]])) > 0.1)
     walk = kernel.walked(poses, at[parts[1] :].reshape(2, -1), white)
-    effects = smoother.forward(of, walk, poses, np.square(problem.sigma), update=False).effects
+    effects = smoother.forward(of, walk, poses, np.square(problem.weighing.sigma), update=False).effects
     assert np.array(effects) == pytest.approx(derivative(predicted, at), abs=1e-6)
 
 

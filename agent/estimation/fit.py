@@ -1,8 +1,7 @@
 """A fit to the facts about n robots: their poses at tick 0, and all errors that have a prior.
 
-Each step of Gauss-Newton is a pass over the ticks (`smoother`). The weight of a range is the probability that
-it is an inlier, given the prediction from all others. Without a prior, nothing is known of the start poses;
-the noise level, a factor of all variances, is integrated out.
+`gauss_newton` says how it converges. Without a prior, nothing is known of the start poses; the noise level, a
+factor of all variances, is integrated out.
 """
 
 from __future__ import annotations
@@ -13,67 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from agent.estimation.gauss_newton import RIDGE, Convergence, Fitted
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
-from agent.estimation.gaussian.noise_level import (
-    INLIER,
-    misfit_log_likelihood,
-    noise_level,
-    residual_correlation,
-)
+from agent.estimation.gaussian.noise_level import INLIER, misfit_log_likelihood
 from agent.estimation.gaussian.odometry_noise import Array, Errors, Places
-from agent.estimation.gaussian.range_model import outliers
-from agent.estimation.gaussian.range_weights import (
-    inlier_probabilities,
-    weighted_variance,
-    weights_by_errors,
-)
 from agent.estimation.kernel import Kernel
 from agent.estimation.problem import Problem
 from agent.estimation.smoother import FitStep, Singular, Walk
-
-FIT_STEPS = 8
-"""The maximum number of Gauss-Newton steps."""
-
-LAST_STEP = 3e-3
-"""The expected length in sigmas of the next step from which on a step is the last.
-
-Steps of Gauss-Newton decrease by a constant factor, about 0.1 with ranges of a tenth of their length. The
-linear model is not computed again after the last step.
-"""
-
-LARGEST_STEP = 0.3
-"""The largest change of a start position in one step, in units of the longest range."""
-
-SHORTER_STEPS = (1.0, 0.5, 0.25, 0.0625)
-"""The fractions of a step that are tried in turn until one descends.
-
-Gauss-Newton with full steps may alternate between two guesses for ever.
-"""
-
-DESCENT = 1e-6
-"""The increase of the cost, in units of chi-square, that is due to rounding."""
-
-SETTLED_WEIGHT = 1e-2
-"""The change of a weight below which the weights have converged."""
-
-RIDGE = 1e-12
-"""The fraction of the information that is added to its diagonal, and an absolute part of the same size.
-
-With it, the variance of an unknown that the ranges leave undetermined is large but finite.
-"""
-
-GRAIN = 1e-12
-"""The least variance of a range, as a fraction of the largest one that the noise of the odometry leaves.
-
-With less, RIDGE would be more than what inaccurate ranges tell beside exact ones: steps would be too short,
-and variances too small.
-"""
-
-SOFT = 0.1
-"""The least smoothing of the ends of the outlier density, as a fraction of the least bias."""
-
-LEAST_VARIANCE = 1e-300
-"""The variance of a white error that is 0."""
 
 
 def deviation(variance: float) -> float:
@@ -137,7 +82,7 @@ class Fit(NamedTuple):
     @property
     def guess(self) -> Array:
         """The pivots in the robots' frames (m) and the headings (rad) at tick 0 (see `smoother`); (3 n,)."""
-        return self.problem.guess(self.start.poses.ravel())
+        return self.problem.kernel.guess(self.start.poses)
 
     @property
     def of_start(self) -> Array:
@@ -158,13 +103,14 @@ class Fit(NamedTuple):
     @property
     def freedom(self) -> int:
         """The degrees of freedom of `chi2`, at least 1."""
-        return max(self.inliers - self.problem.free, 1)
+        return max(self.inliers - self.problem.weighing.free, 1)
 
     def continued(self, measured: JointMeasurements) -> Fit:
         """Return this fit with longer paths in `measured`, and no further range."""
         problem = Problem.of(measured)
-        point = _begin(problem, Kernel(problem.measured), self.start)
-        start, paths = _start_of(problem, point), point.walk.place
+        poses, constant, white, _ = _begin(problem, self.start)
+        paths = problem.kernel.walked(poses, constant, white).place
+        start = _start_of(problem, poses, constant, white)
         return self._replace(start=start, poses=paths[:, -1], paths=paths, problem=problem)
 
     def places(self, robot: int, ticks: Places) -> Array:
@@ -196,65 +142,6 @@ class Linear(NamedTuple):
         return float(effect @ self.step.multipliers), float(effect @ back.multipliers)
 
 
-class _Errors(NamedTuple):
-    """The errors of the ranges and of the odometry at a point, in the order of the fit."""
-
-    common: Array
-    """Constant errors of ranges in their sigmas; shape (c,)."""
-    constant: Array
-    """Constant errors of each robot's odometry in their sigmas; shape (n, m)."""
-    white: Array
-    """White errors of v and omega; shape (n, 2, K)."""
-    slow: Array
-    """Slow errors of ranges in m; shape (N,)."""
-    of_slow: Array
-    """The slow errors, multiplied by their inverse covariance; shape (N,)."""
-
-
-class _Point(NamedTuple):
-    """Start poses and errors, with the ranges that they predict."""
-
-    poses: Array
-    """Start poses; shape (3 n,)."""
-    errors: _Errors
-    walk: Walk
-    own: Array
-    """The residuals without the constant and slow errors of ranges, in m; shape (N,)."""
-    prior_cost: float
-    """Twice the negative log-density of all errors that have a prior, up to a constant."""
-
-    @staticmethod
-    def of(problem: Problem, kernel: Kernel, poses: Array, errors: _Errors) -> _Point:
-        """Return the point with these start poses and errors."""
-        of, walk = problem.measured, kernel.walked(poses, errors.constant, errors.white)
-        off = of.mean - poses
-        of_white = np.square(errors.white) / np.maximum(of.white, LEAST_VARIANCE)
-        squares = np.sum(np.square(errors.common)) + np.sum(np.square(errors.constant)) + np.sum(of_white)
-        cost = float(squares + off @ of.information @ off + errors.slow @ errors.of_slow)
-        own = walk.residual - of.effects(walk) @ errors.common - errors.slow
-        if of.scaled >= 0:  # the scale error multiplies the predicted ranges
-            told = of.common[:, of.scaled]
-            by_scale = np.where(told == 0.0, 0.0, of.scale * (of.rho - walk.residual))
-            own += (told - by_scale) * errors.common[of.scaled]
-        return _Point(poses, errors, walk, own, cost)
-
-    def cost(self, variance: Array) -> float:
-        """Return twice the negative log-density of all errors; `variance` is that of each range (m^2)."""
-        return float(np.sum(np.square(self.own) / variance)) + self.prior_cost
-
-
-class Convergence(NamedTuple):
-    """When fits have converged."""
-
-    steps: int = FIT_STEPS
-    """The maximum number of steps."""
-    shortest: float = LAST_STEP
-    """A step is the last if the next one is expected to be shorter, in sigmas."""
-    decrease: float = 1.0
-    """The factor by which the second step is expected to be shorter than the first: below 1 if starts are
-    fits to almost the same ranges."""
-
-
 TO_THE_END = Convergence()
 """The convergence of fits from which a claim may follow."""
 
@@ -264,11 +151,10 @@ def fits(measured: JointMeasurements, starts: Iterable[Start], until: Convergenc
 
     A start from which there is none, because a number is too large for a float, is left out.
     """
-    problem = Problem.of(measured)
-    kernel, found = Kernel(problem.measured), []
+    problem, found = Problem.of(measured), []
     for start in starts:
         try:
-            found.append(_fitted(problem, kernel, start, until))
+            found.append(_fit(problem, problem.kernel.fitted(*_begin(problem, start), until)))
         except Singular:
             continue
     return found
@@ -289,27 +175,11 @@ def held_fit(measured: JointMeasurements, begun: Fit, steps: int) -> HeldFit:
     The last of the ranges is not one of those of that fit. It holds a coordinate. Raises Singular.
     """
     problem = Problem.of(measured)
-    kernel, noise, sigma = Kernel(problem.measured), problem.noise, problem.sigma
-    start = begun.start._replace(weights=np.append(begun.weights, 1.0))
-    point = _begin(problem, kernel, start)
-    weights = _first_weights(problem, start, point, np.square(sigma))
-    for number in range(steps + 1):
-        variance = weighted_variance(sigma, weights, problem.longest)
-        step = kernel.step(point.walk, point.poses, variance, RIDGE, LARGEST_STEP * problem.longest)
-        if not math.isfinite(step.chi2):
-            raise Singular("an error is too large for a float")
-        if number == steps:
-            break
-        point = _after(problem, kernel, point, step, 1.0)
-        if problem.robust and number == 0:
-            loose = np.square(sigma) + np.sum(np.square(problem.measured.effects(point.walk)), 1)
-            weights = weights_by_errors(point.walk.residual, np.sqrt(loose), noise)
-            weights[problem.holding] = 1.0
-        elif problem.robust:
-            weights = _inliers(problem, step, variance)
-    n3 = len(point.poses)
-    volume = float(np.linalg.slogdet(step.inverse[:n3, :n3])[1])
-    return HeldFit(_evidence(problem, point, step, weights) - 0.5 * volume, point.walk.place[:, -1])
+    poses, constant, white, _ = _begin(problem, begun.start)
+    weights = np.append(begun.weights, 1.0)[problem.order]
+    found = problem.kernel.held(poses, constant, white, weights, steps)
+    volume = 0.5 * found.step.of_start
+    return HeldFit(_evidence(problem, found) - volume, found.final.walk.place[:, -1])
 
 
 def without_outliers(measured: JointMeasurements, starts: Sequence[Start]) -> list[Start]:
@@ -320,77 +190,21 @@ def without_outliers(measured: JointMeasurements, starts: Sequence[Start]) -> li
     and draw the fit away from the start.
     """
     problem = Problem.of(measured)
-    if not problem.robust:
+    if not problem.weighing.robust:
         return []
-    kernel, ranges, found = Kernel(problem.measured), measured.ranges, []
-    sigma = np.sqrt(np.square(ranges.sigma) + ranges.single.loosened(measured.noise.priors, measured.speeds))
+    kernel, ranges, found = problem.kernel, measured.ranges, []
+    loose = np.square(ranges.sigma) + ranges.single.loosened(measured.noise.priors, measured.speeds)
+    sigma = np.sqrt(loose)[problem.order]
     for start in starts:
-        residuals = _begin(problem, kernel, start).walk.residual[problem.back]
-        weights = weights_by_errors(residuals, sigma, measured.noise)
+        poses, constant, white, _ = _begin(problem, start)
+        weights = kernel.weights_by_errors(kernel.walked(poses, constant, white).residual, sigma)
         if weights.min() < INLIER:
-            found.append(start._replace(weights=weights))
+            found.append(start._replace(weights=weights[problem.back]))
     return found
 
 
-def _fitted(problem: Problem, kernel: Kernel, start: Start, until: Convergence) -> Fit:
-    noise, sigma = problem.noise, problem.sigma
-    point = _begin(problem, kernel, start)
-    loose = kernel.loosened(point.walk, point.poses, np.square(sigma))
-    least = GRAIN * float(np.max(loose, initial=0.0)) if problem.noisy else 0.0
-    weights, before = _first_weights(problem, start, point, loose), 0.0
-    for number in range(until.steps + 1):
-        variance = weighted_variance(sigma, weights, problem.longest) + least
-        step = kernel.step(point.walk, point.poses, variance, RIDGE, LARGEST_STEP * problem.longest)
-        if not math.isfinite(step.chi2):
-            raise Singular("an error is too large for a float")
-        updated = weights
-        if problem.robust:
-            updated = _inliers(problem, step, variance)
-        freedom = int(np.count_nonzero(weights > INLIER)) - problem.free
-        level = noise_level(step.chi2, freedom, noise)
-        length = step.length / math.sqrt(level)
-        before = length / until.decrease if number == 0 else before
-        expected = length**2 / max(length, before, LAST_STEP)
-        still = float(np.max(np.abs(updated - weights), initial=0.0)) < SETTLED_WEIGHT
-        linear = Linear(kernel, point.walk, point.poses, variance, step)
-        if number == until.steps:
-            off = _off_model(point, step, variance, level)
-            return _fit(problem, point, linear, weights, off if off > 1.0 else length)
-        point = _stepped(problem, kernel, point, step, variance)
-        # the path is corrected at least once
-        still = still and (number > 0 or until.decrease < 1.0 or not problem.noisy)
-        if still and expected < until.shortest and _off_model(point, step, variance, level) <= 1.0:
-            return _fit(problem, point, linear, weights, expected)
-        weights, before = updated, length
-    raise AssertionError("the last step returns")
-
-
-def _first_weights(problem: Problem, start: Start, point: _Point, loose: Array) -> Array:
-    """Return the weights with which a fit begins: those of its start, or by the residuals.
-
-    `loose` are the variances (m^2) of the ranges before any fit.
-    """
-    if start.weights is not None:
-        weights = np.empty(len(start.weights))
-        weights[problem.back] = start.weights
-        return weights
-    weights = np.ones(len(loose))
-    if problem.robust:
-        weights = weights_by_errors(point.walk.residual, np.sqrt(loose), problem.noise)
-        weights[problem.holding] = 1.0
-    return weights
-
-
-def _inliers(problem: Problem, step: FitStep, variance: Array) -> Array:
-    """Return the probability that each range is an inlier, given the prediction from all others."""
-    told = (step.multipliers, step.alone, step.explained)
-    weights = inlier_probabilities(*told, variance, problem.sigma, problem.noise)
-    weights[problem.holding] = 1.0
-    return weights
-
-
-def _begin(problem: Problem, kernel: Kernel, start: Start) -> _Point:
-    """Return the point at `start`."""
+def _begin(problem: Problem, start: Start) -> tuple[Array, Array, Array, Array | None]:
+    """Return the poses, the constant and the white errors of the odometry, and the weights of `start`."""
     of = problem.measured
     constant, white = np.zeros(of.patterns.shape[:2]), np.zeros(of.white.shape)
     for i, one in enumerate(start.errors):
@@ -398,90 +212,45 @@ def _begin(problem: Problem, kernel: Kernel, start: Start) -> _Point:
         white[i, 0, :known], white[i, 1, :known] = one.v[:known], one.omega[:known]
         if len(one.constant):
             constant[i] = one.constant
-    nothing = np.zeros(len(of.rho))
-    errors = _Errors(np.zeros(of.common.shape[1]), constant, white, nothing, nothing)
-    return _Point.of(problem, kernel, np.array(start.poses, np.float64).ravel(), errors)
+    weights = None if start.weights is None else start.weights[problem.order]
+    return np.array(start.poses, np.float64).ravel(), constant, white, weights
 
 
-def _off_model(point: _Point, step: FitStep, variance: Array, level: float) -> float:
-    """Return the sigmas by which the errors at `point` exceed those of the linear model.
-
-    The length of a step tells how far the start poses are from their optimum, but not how far the path is:
-    where ranges are exact, the second order of a step of the path can leave residuals of thousands of their
-    sigmas. More than one sigma is a step that the path still has to take.
-    """
-    return math.sqrt(max(point.cost(variance) - step.chi2, 0.0) / level)
-
-
-def _stepped(problem: Problem, kernel: Kernel, point: _Point, step: FitStep, variance: Array) -> _Point:
-    """Return the point after a step, or after that fraction of it that descends; else `point`."""
-    most = point.cost(variance) + DESCENT
-    for fraction in SHORTER_STEPS:
-        following = _after(problem, kernel, point, step, fraction)
-        if following.cost(variance) <= most:
-            return following
-    return point
-
-
-def _after(problem: Problem, kernel: Kernel, point: _Point, step: FitStep, fraction: float) -> _Point:
-    """Return the point after a `fraction` of a step."""
-    n3, c = len(point.poses), problem.measured.common.shape[1]
-    common, constant = np.split(step.limited[n3:], [c])
-    errors = _Errors(common, constant.reshape(point.errors.constant.shape), step.white, step.slow, step.own)
-    if fraction < 1.0:
-        between = [one + fraction * (other - one) for one, other in zip(point.errors, errors, strict=True)]
-        errors = _Errors(*between)
-    return _Point.of(problem, kernel, problem.moved(point.poses, fraction * step.limited[:n3]), errors)
-
-
-def _fit(problem: Problem, point: _Point, linear: Linear, weights: Array, last_step: float) -> Fit:
-    """Return the fit that has ended at `point`, with the linear model of the last step."""
-    n3, back, step = len(point.poses), problem.back, linear.step
-    freedom = int(np.count_nonzero(weights > INLIER)) - problem.free
-    level = noise_level(step.chi2, freedom, problem.noise)
-    if problem.noise.sigma_degrees:
-        rows = problem.by_radio
-        own, sigma = point.own[rows], problem.sigma[rows]
-        correlation = residual_correlation(own, weights[rows], sigma, problem.ends, level)
-        level = noise_level(step.chi2, freedom, problem.noise, correlation)
+def _fit(problem: Problem, found: Fitted) -> Fit:
+    """Return the fit that the loop has `found`, with the linear model of its last step."""
+    n3, back, step, model = 3 * problem.measured.robots, problem.back, found.step, found.model
+    final, level = found.final, found.level
     return Fit(
-        _start_of(problem, point),
-        point.walk.place[:, -1],
+        _start_of(problem, final.poses, final.constant, final.white),
+        final.walk.place[:, -1],
         level * step.ends,
-        _evidence(problem, point, step, weights),
-        point.walk.residual[back],
-        weights[back],
+        _evidence(problem, found),
+        final.walk.residual[back],
+        found.weights[back],
         step.chi2,
-        last_step,
+        found.last_step,
         level,
         step.change[n3:],
         np.sqrt(np.maximum(np.diagonal(step.inverse)[n3:], 0.0)),
-        point.walk.place,
+        final.walk.place,
         problem,
-        linear,
+        Linear(problem.kernel, model.walk, model.poses, found.variance, step),
     )
 
 
-def _start_of(problem: Problem, point: _Point) -> Start:
-    """Return the poses at tick 0 and the errors at `point`."""
-    parts = zip(point.errors.white, point.errors.constant, problem.lengths, strict=True)
-    errors = [Errors(v[:ticks], omega[:ticks], constant) for (v, omega), constant, ticks in parts]
-    return Start(point.poses.reshape(-1, 3), tuple(errors))
+def _start_of(problem: Problem, poses: Array, constant: Array, white: Array) -> Start:
+    """Return the poses at tick 0 with the errors of the odometry."""
+    parts = zip(white, constant, problem.lengths, strict=True)
+    errors = [Errors(v[:ticks], omega[:ticks], own) for (v, omega), own, ticks in parts]
+    return Start(poses.reshape(-1, 3), tuple(errors))
 
 
-def _evidence(problem: Problem, point: _Point, step: FitStep, weights: Array) -> float:
+def _evidence(problem: Problem, found: Fitted) -> float:
     """Return the log-likelihood of the ranges, with all unknowns integrated out, up to a constant.
 
     Outliers count by their bias.
     """
-    noise, sigma, good = problem.noise, problem.sigma, weights > INLIER
-    count = int(np.count_nonzero(good))
-    volume = step.volume - float(np.sum(np.log(weighted_variance(sigma, weights, problem.longest)[~good])))
-    weight = -0.5 * (volume - problem.log_information + math.log(2.0 * math.pi) * count)
-    weight += misfit_log_likelihood(step.chi2, count - problem.free, noise)
-    if noise.outliers or noise.strays:
-        weight += count * math.log1p(-noise.outliers - noise.strays)
-        soft = SOFT * noise.outlier_bias[0] if noise.outliers else 0.0
-        residuals = point.walk.residual[~good]
-        weight += float(np.sum(outliers(residuals, np.maximum(sigma[~good], soft), noise)))
-    return weight
+    noise, count = problem.noise, found.inliers
+    weight = -0.5 * (found.step.volume - problem.log_information + math.log(2.0 * math.pi) * count)
+    weight += misfit_log_likelihood(found.step.chi2, count - problem.weighing.free, noise.sigma_degrees)
+    return weight + count * math.log1p(-noise.outliers - noise.strays) + found.outliers

@@ -1,6 +1,6 @@
 """The kernel of the estimator: `smoother.c`, which is compiled when Tandem is installed, called by ctypes.
 
-Its functions are those of `smoother`, and equal to the bit.
+Its functions are those of `smoother` and `gauss_newton`, and equal to the bit.
 """
 
 from __future__ import annotations
@@ -8,11 +8,15 @@ from __future__ import annotations
 import ctypes
 import errno
 import hashlib
+import math
 from functools import cache
+from itertools import accumulate, pairwise
 from pathlib import Path
 
 import numpy as np
 
+from agent.estimation.gauss_newton import Convergence, Fitted, Point
+from agent.estimation.gaussian.range_weights import Weighing
 from agent.estimation.smoother import Array, FitStep, Measured, Singular, Walk
 
 KERNEL_SOURCE = Path(__file__).with_name("smoother.c")
@@ -34,6 +38,23 @@ class _Measured(ctypes.Structure):
     ]
 
 
+class _Weighing(ctypes.Structure):
+    """`Weighing` of smoother.c."""
+
+    _fields_ = [
+        *[(name, ctypes.c_double) for name in ("longest", "inlier", "outlier", "stray", "least", "most")],
+        ("degrees", ctypes.c_double),
+        *[(name, ctypes.c_longlong) for name in ("free", "robust", "noisy")],
+        *[(name, Pointer) for name in ("sigma", "holding", "by_radio")],
+    ]
+
+
+class _Convergence(ctypes.Structure):
+    """`Convergence` of smoother.c."""
+
+    _fields_ = [("steps", ctypes.c_longlong), ("shortest", ctypes.c_double), ("decrease", ctypes.c_double)]
+
+
 class NoKernel(OSError):
     """The file of the kernel cannot be loaded, or is not compiled from the present source."""
 
@@ -49,8 +70,8 @@ def library() -> ctypes.CDLL:
     text = KERNEL_SOURCE.read_bytes() if KERNEL_SOURCE.exists() else None
     if text is not None and found.source() != hashlib.sha256(text).hexdigest().encode():
         raise _no_kernel(f"it is of another {KERNEL_SOURCE.name}")
-    found.walked.restype = None
-    found.loosened.restype = found.step.restype = ctypes.c_int
+    for name in ("walked", "guess", "weights_by_errors"):
+        getattr(found, name).restype = None
     return found
 
 
@@ -64,61 +85,138 @@ def compiler() -> str:
 
 
 class Kernel:
-    """The functions of `smoother` for the measurements of a fit, with a workspace for them."""
+    """The functions of `smoother` and `gauss_newton` for the measurements of a fit, with a workspace."""
 
-    def __init__(self, of: Measured) -> None:
+    def __init__(self, of: Measured, by: Weighing) -> None:
         """Prepare the workspace."""
         self.of = of = Measured._make(
             [np.ascontiguousarray(one) if isinstance(one, np.ndarray) else one for one in of]
         )
-        n, k, count = of.robots, of.ticks, len(of.rho)
+        self.by = by
+        n, k, count, c, m = of.robots, of.ticks, len(of.rho), of.common.shape[1], of.patterns.shape[1]
         size, s, n3 = of.size, 3 * n + of.radios, 3 * n
         q = size + 2 * of.anchors
-        self._measured = _Measured(
-            *(n, k, count, of.common.shape[1], of.patterns.shape[1], of.anchors),
-            *(of.radios, of.scaled, of.delayed),
-            *(of.period, of.survey, of.slow, of.decay, of.scale),
-            *[
-                one.ctypes.data
-                for one in (
-                    *(of.v, of.omega, of.slip, of.white, of.patterns, of.place, of.rho, of.common, of.mean),
-                    *(of.information, of.pivot, of.begin, of.first, of.second, of.anchor, of.radio),
-                )
-            ],
+        arrays = (
+            *(of.v, of.omega, of.slip, of.white, of.patterns, of.place, of.rho, of.common, of.mean),
+            *(of.information, of.pivot, of.begin, of.first, of.second, of.anchor, of.radio),
         )
+        self._measured = ctypes.byref(
+            _Measured(
+                *(n, k, count, c, m, of.anchors, of.radios, of.scaled, of.delayed),
+                *(of.period, of.survey, of.slow, of.decay, of.scale),
+                *[one.ctypes.data for one in arrays],
+            )
+        )
+        self._weighing = ctypes.byref(
+            _Weighing(
+                *(by.longest, by.inlier, by.outlier, by.stray, by.least, by.most, by.degrees),
+                *(by.free, by.robust, by.noisy),
+                *[one.ctypes.data for one in (by.sigma, by.holding, by.by_radio)],
+            )
+        )
+        of_walk = ((n, k + 1, 3), (n, k, 8), (count, 2), (count,), (count,))
+        of_point = ((n3,), (c,), (n, m), (n, 2, k), (count,), (count,), *of_walk, (count,), (1,))
+        of_step = ((size,), (size,), (size, size), (n, 2, k), *[(count,)] * 5, (n3, n3), (4,))
+        self._walk, self._step = _Layout(*of_walk), _Layout(*of_step)
+        self._fitted = _Layout(*of_point, *of_point, *of_step, (count,), (count,), (6,))
         vectors = (count, count, count * q, count * s, s, s * q, s * s, q * q, q)
         spaces = (s, s * size, s * s, s, size, size * size, max(size, n3) ** 2, *[max(q, of.radios)] * 2)
-        self._work, self._spaces = _pointers(*vectors, *spaces)
+        self._work, self._spaces = _Layout(*vectors, *spaces, *[count] * 4, n3).new()
 
     def walked(self, poses: Array, constants: Array, white: Array) -> Walk:
         """Return the paths; see `smoother.walked`."""
-        n, k, count = self.of.robots, self.of.ticks, len(self.of.rho)
-        shapes = ((n, k + 1, 3), (n, k, 8), (count, 2), count, count)
-        walk = Walk._make([np.empty(shape) for shape in shapes])
-        library().walked(
-            ctypes.byref(self._measured), *map(_at, (poses, constants, white)), _addresses(*walk)
-        )
-        return walk
+        at, arrays = self._walk.new()
+        library().walked(self._measured, *map(_at, (poses, constants, white)), at)
+        return Walk._make(arrays)
 
     def loosened(self, walk: Walk, poses: Array, variance: Array) -> Array:
         """Return the variances of the ranges before any fit; see `smoother.loosened`. Raises Singular."""
         found = np.empty(len(self.of.rho))
-        given = (ctypes.byref(self._measured), _addresses(*walk), _at(poses), _at(variance))
+        given = (self._measured, _addresses(*walk), _at(poses), _at(variance))
         if not library().loosened(*given, self._work, _at(found)):
             raise Singular("the errors of the odometry are too large for a float")
         return found
 
     def step(self, walk: Walk, poses: Array, variance: Array, ridge: float, largest: float) -> FitStep:
         """Return a Gauss-Newton step; see `smoother.step`. Raises Singular."""
-        n, k, count, size = self.of.robots, self.of.ticks, len(self.of.rho), self.of.size
-        shapes = (size, size, (size, size), (n, 2, k), *[count] * 5, (3 * n, 3 * n), 3)
-        *found, numbers = [np.empty(shape) for shape in shapes]
-        if not library().step(
-            *(ctypes.byref(self._measured), _addresses(*walk), _at(poses), _at(variance)),
-            *(ctypes.c_double(ridge), ctypes.c_double(largest), self._work, _addresses(*found, numbers)),
+        at, arrays = self._step.new()
+        if not library().gauss_newton_step(
+            *(self._measured, _addresses(*walk), _at(poses), _at(variance)),
+            *(ctypes.c_double(ridge), ctypes.c_double(largest), self._work, at),
         ):
             raise Singular("the ranges do not determine all unknowns")
-        return FitStep._make([*found, *numbers.tolist()])
+        return _step_of(arrays)
+
+    def guess(self, poses: Array) -> Array:
+        """Return pivots in the robots' frames and headings; see `gauss_newton.guess`."""
+        found = np.empty(3 * self.of.robots)
+        library().guess(self._measured, _at(np.ascontiguousarray(poses)), _at(found))
+        return found
+
+    def weights_by_errors(self, errors: Array, sigma: Array) -> Array:
+        """Return the probability that each range is an inlier; see `range_weights.weights_by_errors`."""
+        found, ratios = np.empty((2, len(errors)))
+        given = (ctypes.c_longlong(len(errors)), _at(errors), _at(sigma), _at(ratios), _at(found))
+        library().weights_by_errors(self._weighing, *given)
+        return found
+
+    def fitted(
+        self, poses: Array, constant: Array, white: Array, weights: Array | None, until: Convergence
+    ) -> Fitted:
+        """Return the fit that begins at these start poses and errors; see `gauss_newton.fitted`.
+
+        Raises Singular.
+        """
+        at, arrays = self._begun(poses, constant, white, weights)
+        end, weighed = ctypes.byref(_Convergence(*until)), ctypes.c_int(weights is not None)
+        if not library().fitted(self._measured, self._weighing, end, weighed, self._work, at):
+            raise Singular("the ranges do not determine all unknowns, or an error is too large for a float")
+        return _fitted_of(arrays)
+
+    def held(self, poses: Array, constant: Array, white: Array, weights: Array, steps: int) -> Fitted:
+        """Return the fit in which a range holds a coordinate; see `gauss_newton.held`. Raises Singular."""
+        at, arrays = self._begun(poses, constant, white, weights)
+        number = ctypes.c_longlong(steps)
+        if not library().held(self._measured, self._weighing, number, self._work, at):
+            raise Singular("the ranges do not determine all unknowns, or an error is too large for a float")
+        return _fitted_of(arrays)
+
+    def _begun(
+        self, poses: Array, constant: Array, white: Array, weights: Array | None
+    ) -> tuple[ctypes.Array[Pointer], list[Array]]:
+        """Return the memory of a fit that begins at these start poses and errors."""
+        at, arrays = self._fitted.new()
+        of_poses, common, of_constant, of_white, slow, of_slow = arrays[:6]
+        of_poses[...], of_constant[...], of_white[...] = poses, constant, white
+        common[...] = slow[...] = of_slow[...] = 0.0
+        if weights is not None:
+            arrays[-3][...] = weights
+        return at, arrays
+
+
+POINT = len(Walk._fields) + 8
+"""The number of arrays of a point."""
+
+
+def _point_of(arrays: list[Array]) -> Point:
+    """Return the point with these arrays."""
+    (*errors, own, prior_cost), walk = [*arrays[:6], *arrays[-2:]], Walk._make(arrays[6:-2])
+    return Point._make([*errors, walk, own, float(prior_cost[0])])
+
+
+def _step_of(arrays: list[Array]) -> FitStep:
+    """Return the step with these arrays, of which the last one contains its numbers."""
+    return FitStep._make([*arrays[:-1], *arrays[-1].tolist()])
+
+
+def _fitted_of(arrays: list[Array]) -> Fitted:
+    """Return the fit with these arrays."""
+    last_step, level, inliers, outliers, model, final = arrays[-1].tolist()
+    points = arrays[:POINT], arrays[POINT : 2 * POINT]
+    step, (weights, variance, _) = _step_of(arrays[2 * POINT : -3]), arrays[-3:]
+    at = _point_of(points[int(model)])
+    after = at if final == model else _point_of(points[int(final)])
+    return Fitted(at, after, step, weights, variance, last_step, level, int(inliers), outliers)
 
 
 def _at(array: Array) -> Pointer:
@@ -130,8 +228,19 @@ def _addresses(*arrays: Array) -> ctypes.Array[Pointer]:
     return (Pointer * len(arrays))(*[one.ctypes.data for one in arrays])
 
 
-def _pointers(*sizes: int) -> tuple[ctypes.Array[Pointer], Array]:
-    """Return the addresses of consecutive arrays of these sizes, and the memory that contains them."""
-    memory = np.empty(sum(sizes))
-    begin = np.cumsum([0, *sizes[:-1]]) * memory.itemsize + memory.ctypes.data
-    return (Pointer * len(sizes))(*begin.tolist()), memory
+class _Layout:
+    """Consecutive arrays in one piece of memory."""
+
+    def __init__(self, *shapes: tuple[int, ...] | int) -> None:
+        self._shapes = shapes
+        ends = [0, *accumulate([math.prod(one) if isinstance(one, tuple) else one for one in shapes])]
+        self._parts = [slice(*each) for each in pairwise(ends)]
+        self._bytes = [np.dtype(np.float64).itemsize * begin for begin in ends[:-1]]
+        self._pointers, self._size = Pointer * len(shapes), ends[-1]
+
+    def new(self) -> tuple[ctypes.Array[Pointer], list[Array]]:
+        """Return the addresses of new arrays, and the arrays."""
+        memory = np.empty(self._size)
+        begin = memory.ctypes.data
+        arrays = [memory[part].reshape(shape) for part, shape in zip(self._parts, self._shapes, strict=True)]
+        return self._pointers(*[begin + one for one in self._bytes]), arrays

@@ -6,13 +6,13 @@ import math
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges
 from agent.estimation.gaussian.odometry_noise import Array, Places, Track, constant_errors, variances
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
+from agent.estimation.gaussian.range_weights import Weighing
+from agent.estimation.kernel import Kernel
 from agent.estimation.smoother import Measured
-from protocol.motion import rotated, rotated_back
 from protocol.noise import Noise
 
 MOST_MEASURED_LENGTHS = 200
@@ -32,25 +32,17 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
     """The part of a fit that does not change during it. Ranges are in the order of their ticks."""
 
     measured: Measured
+    weighing: Weighing
+    kernel: Kernel
     noise: Noise
+    order: Places
+    """The ranges of the measurements in the order of the fit; shape (N,)."""
     back: Places
     """The ranges of the fit in the order of the measurements; shape (N,)."""
-    sigma: Array
-    """The standard deviation of each range in m; shape (N,)."""
-    longest: float
-    """The longest range in m: the size of the geometry."""
-    holding: NDArray[np.bool]
-    """True for a range that has no error but a white one: see `JointRanges.radio`; shape (N,)."""
     lengths: tuple[int, ...]
     """The number of ticks of each path."""
-    free: int
-    """The number of unknowns of the start poses that only the ranges determine."""
     log_information: float
     """The logarithm of the determinant of what the prior tells; see `PosePrior`."""
-    by_radio: Places
-    """The ranges of the fit, those of each pair of radios together; shape (N,)."""
-    ends: tuple[int, ...]
-    """The place in `by_radio` after the last one of each pair of radios."""
     ticks: Places
     """The tick of each range, in the order of the measurements; shape (N,)."""
 
@@ -68,83 +60,47 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
         radio = np.where(holding, -1, np.searchsorted(radios, ranges.radio[order]))  # without gaps
         common = ranges.single.common_errors(priors)[order]
         common[holding] = 0.0
-        by_radio = np.argsort(radio, kind="stable")
         v, omega, slip = _velocities(measured.paths, ticks)
         anchor, anchors = _unsure_anchors(ranges) if priors.survey_error else (np.full(len(order), -1), 0)
         prior, few = measured.prior, len(order) <= MOST_MEASURED_LENGTHS
-        return Problem(
-            Measured(
-                period=measured.period,
-                v=v,
-                omega=omega,
-                slip=slip,
-                white=_variances(measured.paths, v, omega, noise),
-                patterns=constant_errors(v, omega, noise),
-                begin=np.searchsorted(tick[order], np.arange(ticks + 2)),
-                first=ranges.first[order],
-                second=ranges.second[order],
-                place=ranges.place[order],
-                rho=ranges.rho[order],
-                common=common,
-                scaled=-1 if not priors.range_scale or few else SCALE_AFTER_BIAS * bool(priors.range_bias),
-                scale=priors.range_scale,
-                delayed=common.shape[1] - 1 if priors.range_delay else -1,
-                anchor=anchor[order],
-                anchors=anchors,
-                survey=priors.survey_error,
-                radio=radio,
-                radios=int(radio.max(initial=-1)) + 1 if priors.slow_sigma else 0,
-                slow=priors.slow_sigma**2,
-                decay=math.exp(-measured.period / priors.slow_time),
-                mean=np.zeros(3 * n) if prior is None else prior.mean.ravel(),
-                information=np.zeros((3 * n, 3 * n)) if prior is None else prior.information,
-                pivot=_pivots(n, ranges),
-            ),
-            noise,
-            back,
-            ranges.sigma[order],
-            max(float(np.max(ranges.rho[order[~holding]], initial=0.0)), SIGMA_FLOOR),
-            holding,
-            lengths,
-            3 * n - (0 if prior is None else prior.rank),
-            0.0 if prior is None else prior.log_information,
-            by_radio,
-            tuple((np.flatnonzero(np.diff(radio[by_radio])) + 1).tolist()),
-            ranges.tick,
+        of = Measured(
+            period=measured.period,
+            v=v,
+            omega=omega,
+            slip=slip,
+            white=_variances(measured.paths, v, omega, noise),
+            patterns=constant_errors(v, omega, noise),
+            begin=np.searchsorted(tick[order], np.arange(ticks + 2)),
+            first=ranges.first[order],
+            second=ranges.second[order],
+            place=ranges.place[order],
+            rho=ranges.rho[order],
+            common=common,
+            scaled=-1 if not priors.range_scale or few else SCALE_AFTER_BIAS * bool(priors.range_bias),
+            scale=priors.range_scale,
+            delayed=common.shape[1] - 1 if priors.range_delay else -1,
+            anchor=anchor[order],
+            anchors=anchors,
+            survey=priors.survey_error,
+            radio=radio,
+            radios=int(radio.max(initial=-1)) + 1 if priors.slow_sigma else 0,
+            slow=priors.slow_sigma**2,
+            decay=math.exp(-measured.period / priors.slow_time),
+            mean=np.zeros(3 * n) if prior is None else prior.mean.ravel(),
+            information=np.zeros((3 * n, 3 * n)) if prior is None else prior.information,
+            pivot=_pivots(n, ranges),
         )
-
-    def guess(self, poses: Array) -> Array:
-        """Return the pivots in the robots' frames (m) and the headings (rad) of `poses`; (3 n,) each."""
-        found = poses.copy()
-        for i, (at_x, at_y) in enumerate(self.measured.pivot.tolist()):
-            x, y, heading = poses[3 * i : 3 * i + 3].tolist()
-            away = (0.0, 0.0) if math.isnan(at_x) else (at_x - x, at_y - y)
-            found[3 * i : 3 * i + 2] = rotated_back(math.cos(heading), math.sin(heading), *away)
-        return found
-
-    def moved(self, poses: Array, change: Array) -> Array:
-        """Return the start `poses` with a `change` of the pivots in the robots' frames and of the headings.
-
-        All have the shape (3 n,); see `smoother`.
-        """
-        after, found = self.guess(poses) + change, np.empty(len(poses))
-        for i, pivot in enumerate(self.measured.pivot.tolist()):
-            start = slice(3 * i, 3 * i + 3)
-            mx, my, heading = after[start].tolist()
-            x, y, _ = poses[start].tolist() if math.isnan(pivot[0]) else (*pivot, 0.0)
-            dx, dy = rotated(math.cos(heading), math.sin(heading), mx, my)
-            found[start] = x - dx, y - dy, heading
-        return found
-
-    @property
-    def noisy(self) -> bool:
-        """True if odometry may differ from the executed motion."""
-        return bool(self.measured.patterns.shape[1]) or bool(self.measured.white.any())
-
-    @property
-    def robust(self) -> bool:
-        """True if a range may be an outlier."""
-        return bool(self.noise.outliers or self.noise.strays)
+        by = Weighing.of(
+            noise,
+            ranges.sigma[order],
+            holding.astype(np.intp),
+            np.argsort(radio, kind="stable"),
+            max(float(np.max(ranges.rho[order[~holding]], initial=0.0)), SIGMA_FLOOR),
+            free=3 * n - (0 if prior is None else prior.rank),
+            noisy=bool(of.patterns.shape[1]) or bool(of.white.any()),
+        )
+        log_information = 0.0 if prior is None else prior.log_information
+        return Problem(of, by, Kernel(of, by), noise, order, back, lengths, log_information, ranges.tick)
 
 
 def _velocities(paths: tuple[Track, ...], ticks: int) -> tuple[Array, Array, Array]:

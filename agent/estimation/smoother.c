@@ -1,4 +1,5 @@
-/* The functions of smoother.py, which explains them, in the same order and with the same operations.
+/* The functions of smoother.py, range_weights.py, noise_level.py and gauss_newton.py, which explain them, with
+   the same operations in the same order.
 
    Matrices are stored row by row. Compile without contraction of products and sums (-ffp-contract=off) and
    without fast math: results then follow from this text and from the functions of the C library alone. */
@@ -27,6 +28,23 @@ const char *compiler(void)
 #define SLIGHT 1e-4
 #define SMALLEST_DISTANCE 1e-12
 #define LARGEST_TURN 1.0
+#define FAR 32.0
+#define BLIND 1e-9
+#define MEDIAN 0.6745
+#define SOFT 0.1
+#define LARGEST_RATIO 700.0
+#define INLIER 0.5
+#define BY_CHANCE 2.0
+#define LEAST_LEVEL 0.25
+#define MOST_CORRELATED 0.8
+#define LAST_STEP 3e-3
+#define LARGEST_STEP 0.3
+#define DESCENT 1e-6
+#define SETTLED_WEIGHT 1e-2
+#define RIDGE 1e-12
+#define GRAIN 1e-12
+#define LEAST_VARIANCE 1e-300
+static const double SHORTER_STEPS[] = {1.0, 0.5, 0.25, 0.0625};
 
 typedef long long Index;
 
@@ -43,10 +61,12 @@ typedef struct {
     double *place, *moves, *direction, *residual, *rate;
 } Walk;
 
-/* smoother.Passed and smoother.Told; `row_of` has the places and derivatives of a range. */
+/* smoother.Passed and smoother.Told; `row_of` has the places and derivatives of a range. The last four are
+   vectors of a fit, with an element for each range, and the limited step with one for each unknown. */
 typedef struct {
     double *innovation, *variance, *effects, *gain, *state, *u, *p, *information, *gradient;
     double *told, *by_unknowns, *weight, *weighted, *effect, *lower, *inner, *vector, *other;
+    double *updated, *errors, *spread, *ratios, *shorter;
 } Work;
 
 /* smoother.Step */
@@ -54,11 +74,45 @@ typedef struct {
     double *change, *limited, *inverse, *white, *own, *slow, *multipliers, *alone, *explained, *ends, *numbers;
 } Step;
 
+/* range_weights.Weighing: first the numbers, then the arrays. */
+typedef struct {
+    double longest, inlier, outlier, stray, least, most, degrees;
+    Index free, robust, noisy;
+    const double *sigma;
+    const Index *holding, *by_radio;
+} Weighing;
+
+/* gauss_newton.Convergence */
+typedef struct {
+    Index steps;
+    double shortest, decrease;
+} Convergence;
+
+/* gauss_newton.Point */
+typedef struct {
+    double *poses, *common, *constant, *white, *slow, *of_slow;
+    Walk walk;
+    double *own, *prior_cost;
+} Point;
+
+/* gauss_newton.Fitted: `model` and `final` are places in `points`; `numbers` are the last step, the noise
+   level, the number of inliers, the part of the outliers, and the places. */
+typedef struct {
+    Point points[2];
+    Step step;
+    double *weights, *variance, *numbers;
+} Fitted;
+
 typedef struct {
     Index at[5];
     double by[5];
     int count;
 } Row;
+
+/* Those of Python: the first one unless the other one is larger, or less. */
+static double larger(double one, double other) { return other > one ? other : one; }
+
+static double smaller(double one, double other) { return other < one ? other : one; }
 
 /* --- linear algebra --------------------------------------------------------------------------------- */
 
@@ -273,6 +327,14 @@ static Row row_of(const Measured *of, const Walk *walk, Index j)
     return row;
 }
 
+/* The effect of one sigma of the constant error `e` on range `j`. */
+static double effect_of(const Measured *of, const Walk *walk, Index j, Index e)
+{
+    const double told = of->effects[j * of->common + e];
+    if (e == of->delayed) return -told * walk->rate[j];
+    return e == of->scaled && told != 0.0 ? of->scale * (of->rho[j] - walk->residual[j]) : told;
+}
+
 /* Returns 0 if rounding has left no variance. */
 static int measured(const Measured *of, const Walk *walk, Index j, double variance, Work *w)
 {
@@ -286,12 +348,7 @@ static int measured(const Measured *of, const Walk *walk, Index j, double varian
         add(effect, row.by[t], w->u + row.at[t] * q, q);
         add(gain, row.by[t], w->p + row.at[t] * s, s);
     }
-    for (Index e = 0; e < of->common; e++) {
-        const double by_scale = of->scale * (of->rho[j] - walk->residual[j]);
-        double told = of->effects[j * of->common + e];
-        if (e == of->delayed) told = -told * walk->rate[j];
-        effect[3 * of->robots + e] += e == of->scaled && told != 0.0 ? by_scale : told;
-    }
+    for (Index e = 0; e < of->common; e++) effect[3 * of->robots + e] += effect_of(of, walk, j, e);
     if (of->anchor[j] >= 0)
         for (Index e = 0; e < 2; e++)
             effect[size + 2 * of->anchor[j] + e] -= of->survey * walk->direction[2 * j + e];
@@ -535,9 +592,10 @@ static void ends_of(const Measured *of, Work *w, Step *to)
     }
 }
 
-/* Returns 0 if the information of the unknowns is not positive definite. */
-int step(const Measured *of, const Walk *walk, const double *poses, const double *variance, double ridge,
-         double largest, Work *w, Step *to)
+/* smoother.step; glibc has a function of that name, which would be called in its place. Returns 0 if the
+   information of the unknowns is not positive definite. */
+int gauss_newton_step(const Measured *of, const Walk *walk, const double *poses, const double *variance,
+                      double ridge, double largest, Work *w, Step *to)
 {
     const Index n3 = 3 * of->robots, q = unknowns(of), size = estimated(of);
     if (!forward(of, walk, poses, variance, 1, w)) return 0;
@@ -551,6 +609,8 @@ int step(const Measured *of, const Walk *walk, const double *poses, const double
     if (!cholesky(to->inverse, size, 0, n3, w->inner)) return 0;
     substituted(w->inner, n3, to->change, w->vector);
     const double length = sqrt(dot(w->vector, w->vector, n3));
+    double of_start = 0.0;
+    for (Index a = 0; a < n3; a++) of_start += 2.0 * log(w->inner[a * n3 + a]);
     if (!limited(of, largest, to->change, w, to->limited)) return 0;
     backward(of, walk, w, to);
     double volume = 0.0;
@@ -561,5 +621,330 @@ int step(const Measured *of, const Walk *walk, const double *poses, const double
     to->numbers[0] = chi2_of(of, poses, to->change, w);
     to->numbers[1] = length;
     to->numbers[2] = volume;
+    to->numbers[3] = of_start;
+    return 1;
+}
+
+/* --- weights of ranges ------------------------------------------------------------------------------ */
+
+static void weighted_variance(const Measured *of, const Weighing *by, const double *weights, double *to)
+{
+    for (Index j = 0; j < of->ranges; j++) {
+        const double least = by->sigma[j] / (FAR * by->longest);
+        to[j] = by->sigma[j] * by->sigma[j] / larger(weights[j], least * least);
+    }
+}
+
+/* The element that would be at `place` of the sorted `values`, which change their places. */
+static double selected(double *values, Index count, Index place)
+{
+    Index low = 0, high = count - 1;
+    while (low < high) {
+        const double pivot = values[place];
+        Index i = low, j = high;
+        do {
+            while (values[i] < pivot) i++;
+            while (pivot < values[j]) j--;
+            if (i <= j) {
+                const double value = values[i];
+                values[i++] = values[j];
+                values[j--] = value;
+            }
+        } while (i <= j);
+        if (j < place) low = i;
+        if (place < i) high = j;
+    }
+    return values[place];
+}
+
+static double log_sum(double one, double other)
+{
+    const double most = larger(one, other), least = smaller(one, other);
+    return most + log1p(exp(least - most));
+}
+
+static double inlier_probability(double error, double sigma, const Weighing *by)
+{
+    const double in_sigmas = error / sigma, width = by->most - by->least;
+    const double misfit = 0.5 * in_sigmas * in_sigmas;
+    const double beyond = (error - smaller(larger(error, by->least), by->most)) / sigma;
+    const double wide = log(sigma / larger(width, sigma)) + (by->outlier - by->inlier);
+    const double ratio = log_sum(misfit - 0.5 * beyond * beyond + wide, misfit + (by->stray - by->inlier));
+    return 1.0 / (1.0 + exp(smaller(ratio, LARGEST_RATIO)));
+}
+
+void weights_by_errors(
+    const Weighing *by, Index count, const double *errors, const double *sigma, double *ratios, double *to)
+{
+    double scale = 1.0;
+    for (Index j = 0; j < count; j++) {
+        to[j] = 1.0;
+        ratios[j] = fabs(errors[j] / sigma[j]);
+    }
+    if (!by->robust || count == 0) return;
+    if (by->degrees != 0.0) scale = larger(1.0, selected(ratios, count, count / 2) / MEDIAN);
+    for (Index j = 0; j < count; j++)
+        if (!by->holding[j]) to[j] = inlier_probability(errors[j], scale * sigma[j], by);
+}
+
+static void inlier_probabilities(
+    const Measured *of, const Weighing *by, const Step *step, const double *variance, Work *w, double *to)
+{
+    for (Index j = 0; j < of->ranges; j++) {
+        const double precision = larger(step->alone[j] - step->explained[j], BLIND * step->alone[j]);
+        w->errors[j] = step->multipliers[j] / precision;
+        w->spread[j] = sqrt(larger(1.0 / precision - variance[j], 0.0) + by->sigma[j] * by->sigma[j]);
+    }
+    weights_by_errors(by, of->ranges, w->errors, w->spread, w->ratios, to);
+}
+
+static double outlier_log_density(
+    const Measured *of, const Weighing *by, const double *residuals, const double *weights, Work *w)
+{
+    double total = 0.0;
+    const double soft = by->outlier > -INFINITY ? SOFT * by->least : 0.0;
+    weighted_variance(of, by, weights, w->spread);
+    for (Index j = 0; j < of->ranges; j++) {
+        if (weights[j] > INLIER) continue;
+        const double sigma = larger(by->sigma[j], soft);
+        const double off = larger(larger(by->least - residuals[j], residuals[j] - by->most), 0.0) / sigma;
+        const double wide = by->outlier - log(larger(by->most - by->least, sigma));
+        total += 0.5 * log(w->spread[j]);
+        total += log_sum(wide - 0.5 * off * off, by->stray - log(sigma));
+    }
+    return total;
+}
+
+static Index inliers(const Measured *of, const double *weights)
+{
+    Index count = 0;
+    for (Index j = 0; j < of->ranges; j++) count += weights[j] > INLIER;
+    return count;
+}
+
+/* --- the noise level -------------------------------------------------------------------------------- */
+
+static double noise_level(double chi2, Index degrees, double nu, double correlation)
+{
+    if (nu == 0.0) return 1.0;
+    const double worth = (1.0 - correlation) / (1.0 + correlation), n = degrees > 0 ? (double)degrees : 0.0;
+    return larger((nu + worth * chi2) / (nu + worth * n), LEAST_LEVEL) / worth;
+}
+
+static double residual_correlation(
+    const Measured *of, const Weighing *by, const double *own, const double *weights, double level)
+{
+    double power = 0.0, neighbours = 0.0, before = 0.0;
+    for (Index r = 0; r < of->ranges; r++) {
+        const Index j = by->by_radio[r];
+        const double scaled = weights[j] > INLIER ? own[j] / by->sigma[j] : 0.0;
+        power += scaled * scaled;
+        if (r > 0 && of->radio[j] == of->radio[by->by_radio[r - 1]]) neighbours += scaled * before;
+        before = scaled;
+    }
+    if (!(power > 0.0)) return 0.0;
+    const double found = neighbours / power - BY_CHANCE * smaller(level, 1.0) / sqrt((double)of->ranges);
+    return smaller(larger(found, 0.0), MOST_CORRELATED);
+}
+
+/* --- the loop of a fit ------------------------------------------------------------------------------ */
+
+/* Set what follows from the poses and the errors of a point. */
+static void predicted(const Measured *of, Point *at)
+{
+    const Index n3 = 3 * of->robots, c = of->common;
+    double cost = 0.0;
+    walked(of, at->poses, at->constant, at->white, &at->walk);
+    for (Index e = 0; e < c; e++) cost += at->common[e] * at->common[e];
+    for (Index e = 0; e < of->robots * of->constant; e++) cost += at->constant[e] * at->constant[e];
+    for (Index e = 0; e < 2 * of->robots * of->ticks; e++)
+        cost += at->white[e] * at->white[e] / larger(of->white[e], LEAST_VARIANCE);
+    for (Index a = 0; a < n3; a++) {
+        double told = 0.0;
+        for (Index e = 0; e < n3; e++) told += of->information[a * n3 + e] * (of->mean[e] - at->poses[e]);
+        cost += (of->mean[a] - at->poses[a]) * told;
+    }
+    for (Index j = 0; j < of->ranges; j++) {
+        double left = at->walk.residual[j];
+        cost += at->slow[j] * at->of_slow[j];
+        for (Index e = 0; e < c; e++) left -= effect_of(of, &at->walk, j, e) * at->common[e];
+        at->own[j] = left - at->slow[j];
+    }
+    *at->prior_cost = cost;
+}
+
+static double cost_of(const Measured *of, const Point *at, const double *variance)
+{
+    double total = *at->prior_cost;
+    for (Index j = 0; j < of->ranges; j++) total += at->own[j] * at->own[j] / variance[j];
+    return total;
+}
+
+/* The start poses with the pivots in the robots' frames instead of the positions. */
+void guess(const Measured *of, const double *poses, double *to)
+{
+    for (Index a = 0; a < 3 * of->robots; a += 3) {
+        const double heading = poses[a + 2], c = cos(heading), s = sin(heading);
+        double x = of->pivot[a / 3 * 2] - poses[a], y = of->pivot[a / 3 * 2 + 1] - poses[a + 1];
+        if (isnan(x)) x = y = 0.0;
+        to[a] = c * x + s * y;
+        to[a + 1] = c * y - s * x;
+        to[a + 2] = heading;
+    }
+}
+
+static void moved_poses(const Measured *of, const double *poses, const double *change, double *to)
+{
+    guess(of, poses, to);
+    for (Index a = 0; a < 3 * of->robots; a += 3) {
+        const double mx = to[a] + change[a], my = to[a + 1] + change[a + 1], heading = to[a + 2] + change[a + 2];
+        const int pivoted = !isnan(of->pivot[a / 3 * 2]);
+        const double x = pivoted ? of->pivot[a / 3 * 2] : poses[a];
+        const double y = pivoted ? of->pivot[a / 3 * 2 + 1] : poses[a + 1];
+        const double c = cos(heading), s = sin(heading);
+        to[a] = x - (c * mx - s * my);
+        to[a + 1] = y - (s * mx + c * my);
+        to[a + 2] = heading;
+    }
+}
+
+static void between(const double *one, const double *other, double fraction, Index count, double *to)
+{
+    for (Index e = 0; e < count; e++)
+        to[e] = fraction < 1.0 ? one[e] + fraction * (other[e] - one[e]) : other[e];
+}
+
+static void after_step(
+    const Measured *of, const Point *at, const Step *step, double fraction, Work *w, Point *to)
+{
+    const Index n3 = 3 * of->robots, c = of->common;
+    for (Index a = 0; a < n3; a++) w->shorter[a] = fraction * step->limited[a];
+    moved_poses(of, at->poses, w->shorter, to->poses);
+    between(at->common, step->limited + n3, fraction, c, to->common);
+    between(at->constant, step->limited + n3 + c, fraction, of->robots * of->constant, to->constant);
+    between(at->white, step->white, fraction, 2 * of->robots * of->ticks, to->white);
+    between(at->slow, step->slow, fraction, of->ranges, to->slow);
+    between(at->of_slow, step->own, fraction, of->ranges, to->of_slow);
+    predicted(of, to);
+}
+
+/* Returns 0 if no fraction of the step descends: then there is no point after it. */
+static int stepped(const Measured *of, const Point *at, const Step *step, const double *variance, Work *w,
+                   Point *to)
+{
+    const double most = cost_of(of, at, variance) + DESCENT;
+    for (size_t t = 0; t < sizeof SHORTER_STEPS / sizeof *SHORTER_STEPS; t++) {
+        after_step(of, at, step, SHORTER_STEPS[t], w, to);
+        if (cost_of(of, to, variance) <= most) return 1;
+    }
+    return 0;
+}
+
+static double off_model(
+    const Measured *of, const Point *at, const Step *step, const double *variance, double level)
+{
+    return sqrt(larger(cost_of(of, at, variance) - step->numbers[0], 0.0) / level);
+}
+
+/* Returns 0 if the unknowns have no solution that is finite. */
+static int step_of(const Measured *of, const Weighing *by, const Point *at, Work *w, Fitted *to)
+{
+    const double largest = LARGEST_STEP * by->longest;
+    return gauss_newton_step(of, &at->walk, at->poses, to->variance, RIDGE, largest, w, &to->step)
+        && isfinite(to->step.numbers[0]);
+}
+
+static void ended(
+    const Measured *of, const Weighing *by, Index model, Index final, double last_step, Work *w, Fitted *to)
+{
+    const Index count = inliers(of, to->weights);
+    double level = noise_level(to->step.numbers[0], count - by->free, by->degrees, 0.0);
+    if (by->degrees != 0.0) {
+        const double correlation =
+            residual_correlation(of, by, to->points[final].own, to->weights, level);
+        level = noise_level(to->step.numbers[0], count - by->free, by->degrees, correlation);
+    }
+    to->numbers[0] = last_step;
+    to->numbers[1] = level;
+    to->numbers[2] = (double)count;
+    to->numbers[3] = outlier_log_density(of, by, to->points[final].walk.residual, to->weights, w);
+    to->numbers[4] = (double)model;
+    to->numbers[5] = (double)final;
+}
+
+/* The fit that begins at the poses and errors of the first of `points`; unless `weighed`, its weights follow
+   from the residuals there. Returns 0 if it is singular. */
+int fitted(const Measured *of, const Weighing *by, const Convergence *until, int weighed, Work *w, Fitted *to)
+{
+    Index at = 0;
+    double before = 0.0, least = 0.0;
+    predicted(of, to->points);
+    for (Index j = 0; j < of->ranges; j++) w->updated[j] = by->sigma[j] * by->sigma[j];
+    if (!loosened(of, &to->points->walk, to->points->poses, w->updated, w, w->spread)) return 0;
+    for (Index j = 0; j < of->ranges; j++) {
+        least = j > 0 ? larger(least, w->spread[j]) : w->spread[j];
+        w->spread[j] = sqrt(w->spread[j]);
+    }
+    least = by->noisy ? GRAIN * least : 0.0;
+    if (!weighed)
+        weights_by_errors(by, of->ranges, to->points->walk.residual, w->spread, w->ratios, to->weights);
+    for (Index number = 0; number <= until->steps; number++) {
+        const Point *here = to->points + at;
+        weighted_variance(of, by, to->weights, to->variance);
+        for (Index j = 0; j < of->ranges; j++) to->variance[j] += least;
+        if (!step_of(of, by, here, w, to)) return 0;
+        inlier_probabilities(of, by, &to->step, to->variance, w, w->updated);
+        const Index freedom = inliers(of, to->weights) - by->free;
+        const double level = noise_level(to->step.numbers[0], freedom, by->degrees, 0.0);
+        const double length = to->step.numbers[1] / sqrt(level);
+        if (number == 0) before = length / until->decrease;
+        const double expected = length * length / larger(larger(length, before), LAST_STEP);
+        if (number == until->steps) {
+            const double off = off_model(of, here, &to->step, to->variance, level);
+            ended(of, by, at, at, off > 1.0 ? off : length, w, to);
+            return 1;
+        }
+        const Index after = stepped(of, here, &to->step, to->variance, w, to->points + 1 - at) ? 1 - at : at;
+        int still = number > 0 || until->decrease < 1.0 || !by->noisy;
+        for (Index j = 0; j < of->ranges; j++)
+            still = still && fabs(w->updated[j] - to->weights[j]) < SETTLED_WEIGHT;
+        if (still && expected < until->shortest
+            && off_model(of, to->points + after, &to->step, to->variance, level) <= 1.0) {
+            ended(of, by, at, after, expected, w, to);
+            return 1;
+        }
+        memcpy(to->weights, w->updated, sizeof(double) * of->ranges);
+        before = length;
+        at = after;
+    }
+    return 0;
+}
+
+/* The fit after full steps from the first of `points`, with the weights there. Returns 0 if it is singular. */
+int held(const Measured *of, const Weighing *by, Index steps, Work *w, Fitted *to)
+{
+    Index at = 0;
+    predicted(of, to->points);
+    for (Index number = 0;; number++, at = 1 - at) {
+        Point *here = to->points + at, *next = to->points + 1 - at;
+        weighted_variance(of, by, to->weights, to->variance);
+        if (!step_of(of, by, here, w, to)) return 0;
+        if (number == steps) break;
+        after_step(of, here, &to->step, 1.0, w, next);
+        if (number > 0) {
+            inlier_probabilities(of, by, &to->step, to->variance, w, to->weights);
+            continue;
+        }
+        for (Index j = 0; j < of->ranges; j++) {
+            double spread = by->sigma[j] * by->sigma[j];
+            for (Index e = 0; e < of->common; e++) {
+                const double effect = effect_of(of, &next->walk, j, e);
+                spread += effect * effect;
+            }
+            w->spread[j] = sqrt(spread);
+        }
+        weights_by_errors(by, of->ranges, next->walk.residual, w->spread, w->ratios, to->weights);
+    }
+    ended(of, by, at, at, to->step.numbers[1], w, to);
     return 1;
 }

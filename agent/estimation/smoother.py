@@ -110,14 +110,6 @@ class Measured(NamedTuple):
         """The number of unknowns that are estimated."""
         return int(3 * self.robots + self.common.shape[1] + self.robots * self.patterns.shape[1])
 
-    def effects(self, walk: Walk) -> Array:
-        """Return `common` with the effect of the delay in m at a point; shape (N, c)."""
-        if self.delayed < 0:
-            return self.common
-        found = self.common.copy()
-        found[:, self.delayed] *= -walk.rate
-        return found
-
 
 class Walk(NamedTuple):
     """The paths of all robots with their errors at a point, and the ranges that they predict."""
@@ -164,6 +156,8 @@ class FitStep(NamedTuple):
     """length of the change of the start poses in sigmas"""
     volume: float
     """logarithm of the determinants of the covariance of ranges and of the information of unknowns"""
+    of_start: float
+    """logarithm of the determinant of the covariance of the start poses"""
 
 
 class Singular(ArithmeticError):
@@ -356,6 +350,16 @@ def _row(of: Measured, walk: Walk, j: int) -> list[tuple[int, float]]:
     return row
 
 
+def effect_of(of: Measured, walk: Walk, j: int, e: int) -> float:
+    """Return the effect in m of one sigma of the constant error `e` on range `j`."""
+    told = float(of.common[j, e])
+    if e == of.delayed:
+        return -told * float(walk.rate[j])
+    if e == of.scaled and told != 0.0:
+        return of.scale * float(of.rho[j] - walk.residual[j])
+    return told
+
+
 def _measured(of: Measured, walk: Walk, j: int, variance: float, found: Passed) -> None:
     """Predict range `j` from the state: its innovation, and the gain before division by its variance."""
     row = _row(of, walk, j)
@@ -365,10 +369,7 @@ def _measured(of: Measured, walk: Walk, j: int, variance: float, found: Passed) 
         add(effect, h, found.u[a])
         add(gain, h, found.p[a])
     for e in range(len(of.common[j])):
-        by_scale, told = of.scale * (of.rho[j] - walk.residual[j]), of.common[j, e]
-        if e == of.delayed:
-            told = -told * walk.rate[j]
-        effect[3 * of.robots + e] += by_scale if e == of.scaled and told != 0.0 else told
+        effect[3 * of.robots + e] += effect_of(of, walk, j, e)
     if of.anchor[j] >= 0:
         for e in range(2):
             effect[of.size + 2 * of.anchor[j] + e] -= of.survey * walk.direction[j, e]
@@ -423,7 +424,8 @@ def step(of: Measured, walk: Walk, poses: Array, variance: Array, ridge: float, 
     lower = cholesky(information, 0, size)
     change = solved(lower, passed.gradient[:size])
     inverse = inverted(lower)
-    whitened = substituted(cholesky(inverse, 0, n3), change[:n3])
+    inner = cholesky(inverse, 0, n3)
+    whitened = substituted(inner, change[:n3])
     limited = _limited(passed, change, n3, largest)
     white, own, multipliers, alone, explained = _backward(of, walk, passed, inverse, change, limited)
     volume = 0.0
@@ -431,6 +433,9 @@ def step(of: Measured, walk: Walk, poses: Array, variance: Array, ridge: float, 
         volume += math.log(one)
     for a in range(size):
         volume += 2.0 * math.log(lower[a][a])
+    of_start = 0.0
+    for a in range(n3):
+        of_start += 2.0 * math.log(inner[a][a])
     return FitStep(
         np.array(change),
         np.array(limited),
@@ -445,6 +450,7 @@ def step(of: Measured, walk: Walk, poses: Array, variance: Array, ridge: float, 
         _chi2(of, passed, poses, change),
         math.sqrt(dot(whitened, whitened)),
         volume,
+        of_start,
     )
 
 

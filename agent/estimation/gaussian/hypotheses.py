@@ -14,7 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.fit import Convergence, Fit, Start, fits, without_outliers
+from agent.estimation.fit import Fit, Start, fits, without_outliers
+from agent.estimation.gauss_newton import Convergence
 from agent.estimation.gaussian.anchor_guesses import MOST_FOLLOWED, SEED_RANGES, UNLIKELY, anchors
 from agent.estimation.gaussian.detections import anchor_log_likelihood, detection_log_likelihood
 from agent.estimation.gaussian.odometry_noise import Array, Errors, Places, Track

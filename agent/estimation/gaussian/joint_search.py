@@ -13,7 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.fit import Convergence, Start, fits
+from agent.estimation.fit import Start, fits
+from agent.estimation.gauss_newton import Convergence
 from agent.estimation.gaussian import hypotheses
 from agent.estimation.gaussian.beacon_guesses import beacon_guesses
 from agent.estimation.gaussian.hypotheses import (

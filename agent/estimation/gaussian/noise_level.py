@@ -7,10 +7,7 @@ level integrated out, the ranges have a Student t distribution.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
-
-from agent.estimation.gaussian.odometry_noise import Array
-from protocol.noise import Noise
+from collections.abc import Sequence
 
 INLIER = 0.5
 """The weight from which on a range counts as an inlier."""
@@ -30,42 +27,51 @@ MOST_CORRELATED = 0.8
 """The largest correlation: the noise level grows by a factor of 9 at most."""
 
 
-def noise_level(chi2: float, degrees: int, noise: Noise, correlation: float = 0.0) -> float:
+def noise_level(chi2: float, degrees: int, nu: float, correlation: float = 0.0) -> float:
     """Return the posterior mean of the factor tau^2 of all variances (scaled inverse chi-square).
 
-    With the `correlation` r of neighbours, residuals are worth (1 - r) / (1 + r) of their number, for the
-    level and for everything else that they tell. The level grows by as much.
+    Its prior has `nu` degrees of freedom; with 0, the level is 1. With the `correlation` r of neighbours,
+    residuals are worth (1 - r) / (1 + r) of their number, for the level and for everything else that they
+    tell. The level grows by as much.
     """
-    nu, n = noise.sigma_degrees, max(degrees, 0)
     if not nu:
         return 1.0
     worth = (1.0 - correlation) / (1.0 + correlation)
-    return max((nu + worth * chi2) / (nu + worth * n), LEAST_LEVEL) / worth
+    return max((nu + worth * chi2) / (nu + worth * max(degrees, 0)), LEAST_LEVEL) / worth
 
 
 def residual_correlation(
-    residuals: Array, weights: Array, sigma: Array, ends: Collection[int], level: float
+    residuals: Sequence[float],
+    weights: Sequence[float],
+    sigma: Sequence[float],
+    radios: Sequence[int],
+    level: float,
 ) -> float:
     """Return the correlation of each residual with the one before, from 0 to MOST_CORRELATED.
 
-    Both are of the same kind, and `ends` are the rows after the last one of each. The correlation is reduced
-    by what chance may cause (see BY_CHANCE), and strays count as 0. `level` is the noise level without
+    Both are of the same pair of `radios`, whose residuals follow each other. The correlation is reduced by
+    what chance may cause (see BY_CHANCE), and strays count as 0. `level` is the noise level without
     correlation.
     """
-    scaled = (weights > INLIER) * (residuals / sigma)
-    power, neighbours = float(scaled @ scaled), float(scaled[1:] @ scaled[:-1])
-    for end in ends:
-        if 0 < end < len(scaled):
-            neighbours -= float(scaled[end] * scaled[end - 1])
+    power = neighbours = before = 0.0
+    for j in range(len(residuals)):
+        scaled = residuals[j] / sigma[j] if weights[j] > INLIER else 0.0
+        power += scaled * scaled
+        if j > 0 and radios[j] == radios[j - 1]:
+            neighbours += scaled * before
+        before = scaled
     if not power > 0.0:
         return 0.0
-    found = neighbours / power - BY_CHANCE * min(level, 1.0) / math.sqrt(len(scaled))
+    found = neighbours / power - BY_CHANCE * min(level, 1.0) / math.sqrt(len(residuals))
     return min(max(found, 0.0), MOST_CORRELATED)
 
 
-def misfit_log_likelihood(chi2: float, degrees: int, noise: Noise) -> float:
-    """Return the log-likelihood of a chi-square, with the noise level integrated out (Student's t)."""
-    nu, n = noise.sigma_degrees, max(degrees, 0)
+def misfit_log_likelihood(chi2: float, degrees: int, nu: float) -> float:
+    """Return the log-likelihood of a chi-square, with the noise level integrated out (Student's t).
+
+    `nu` is as in `noise_level`.
+    """
+    n = max(degrees, 0)
     if not nu:
         return -0.5 * chi2
     scale = math.lgamma(0.5 * (nu + n)) - math.lgamma(0.5 * nu) - 0.5 * n * math.log(0.5 * nu)

@@ -12,7 +12,8 @@ from typing import NamedTuple
 import msgspec
 from msgspec.structs import replace
 
-from agent.estimation.fit import FIT_STEPS, Convergence, Fit, Start, fits
+from agent.estimation.fit import Fit, Start, fits
+from agent.estimation.gauss_newton import FIT_STEPS, Convergence
 from agent.estimation.gaussian.anchor_guesses import anchors
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, consistency_test
 from agent.estimation.gaussian.hypotheses import search, starts_about

@@ -146,7 +146,7 @@ def _encounter(own: Fit, base: int, ticks: Places) -> Encounter:
     of_anchor = np.zeros((3, 3))
     of_anchor[:2, :2] = own.of_start[:2, :2]
     covariance, odometry, since = of_anchor, None, 0
-    if own.problem.noisy:
+    if own.problem.weighing.noisy:
         earlier = own.ticks[own.ticks <= base]
         since = int(earlier[-1]) if len(earlier) else 0
         of, (errors,) = own.problem.measured, own.start.errors

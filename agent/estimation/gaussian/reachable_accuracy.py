@@ -15,7 +15,8 @@ from itertools import pairwise
 import numpy as np
 from msgspec.structs import replace
 
-from agent.estimation.fit import Convergence, Start, deviation, fits
+from agent.estimation.fit import Start, deviation, fits
+from agent.estimation.gauss_newton import Convergence
 from agent.estimation.gaussian.odometry_noise import (
     Array,
     Projection,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from agent.estimation.fit import FIT_STEPS
+from agent.estimation.gauss_newton import FIT_STEPS
 from agent.estimation.gaussian.consistency import FINISHED
 from agent.estimation.gaussian.joint_claims import blocking_reason, open_position, undetermined
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
