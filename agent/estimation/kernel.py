@@ -114,18 +114,17 @@ class Kernel:
                 *[one.ctypes.data for one in (by.sigma, by.holding, by.by_radio)],
             )
         )
-        of_walk = ((n, k + 1, 3), (n, k, 8), (count, 2), (count,), (count,))
-        of_point = ((n3,), (c,), (n, m), (n, 2, k), (count,), (count,), *of_walk, (count,), (1,))
-        of_step = ((size,), (size,), (size, size), (n, 2, k), *[(count,)] * 5, (n3, n3), (4,))
-        self._walk, self._step = _Layout(*of_walk), _Layout(*of_step)
-        self._fitted = _Layout(*of_point, *of_point, *of_step, (count,), (count,), (6,))
+        self._of_walk = ((n, k + 1, 3), (n, k, 8), (count, 2), (count,), (count,))
+        self._of_step = ((size,), (size,), (size, size), (n, 2, k), *[(count,)] * 5, (n3, n3), (4,))
+        of_point = ((n3,), (c,), (n, m), (n, 2, k), (count,), (count,), *self._of_walk, (count,), (1,))
+        self._fitted = _Layout(*of_point, *of_point, *self._of_step, (count,), (count,), (6,))
         vectors = (count, count, count * q, count * s, s, s * q, s * s, q * q, q)
         spaces = (s, s * size, s * s, s, size, size * size, max(size, n3) ** 2, *[max(q, of.radios)] * 2)
         self._work, self._spaces = _Layout(*vectors, *spaces, *[count] * 4, n3).new()
 
     def walked(self, poses: Array, constants: Array, white: Array) -> Walk:
         """Return the paths; see `smoother.walked`."""
-        at, arrays = self._walk.new()
+        at, arrays = _Layout(*self._of_walk).new()
         library().walked(self._measured, *map(_at, (poses, constants, white)), at)
         return Walk._make(arrays)
 
@@ -139,7 +138,7 @@ class Kernel:
 
     def step(self, walk: Walk, poses: Array, variance: Array, ridge: float, largest: float) -> FitStep:
         """Return a Gauss-Newton step; see `smoother.step`. Raises Singular."""
-        at, arrays = self._step.new()
+        at, arrays = _Layout(*self._of_step).new()
         if not library().gauss_newton_step(
             *(self._measured, _addresses(*walk), _at(poses), _at(variance)),
             *(ctypes.c_double(ridge), ctypes.c_double(largest), self._work, at),
