@@ -78,7 +78,7 @@ LEAST_VARIANCE = 1e-300
 
 
 class Convergence(NamedTuple):
-    """When fits have converged."""
+    """The conditions under which a fit has converged."""
 
     steps: int = FIT_STEPS
     """The maximum number of steps."""

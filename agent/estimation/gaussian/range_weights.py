@@ -28,7 +28,7 @@ SOFT = 0.1
 
 
 class Weighing(NamedTuple):
-    """What the weights of N ranges depend on, besides their residuals."""
+    """The quantities on which the weights of N ranges depend, besides their residuals."""
 
     sigma: Array
     """the standard deviation of each range in m; (N,)"""
