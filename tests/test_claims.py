@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2  # type: ignore[import-untyped]
 
 from compose.launch.in_process import run_mission
-from compose.recording.claim import nees, truth_held
+from compose.recording.claim_errors import nees, truth_held
 from compose.recording.run import Run, read
 from compose.recording.summary_json import leave, summary
 from compose.scenario.scenario_file import load, parse

@@ -28,7 +28,7 @@ from compose.audit.replay import replayed
 from compose.audit.rules import audit_run
 from compose.errors import UserError
 from compose.launch.in_process import run_mission
-from compose.recording.claim import nees
+from compose.recording.claim_errors import nees
 from compose.recording.recording_files import agent_journal
 from compose.recording.run import Run, of_frames
 from protocol.messages import (

@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator, NullLocator
 from compose.figures.pair import PairRecord, error, others
 from compose.figures.sheet import ANCHORS, NO_TRUTH, Absent, Sheet
 from compose.figures.style import INK, PALE, ROLE_MARKERS, SCREEN, SHADE, Medium
-from compose.recording.claim import Claim
+from compose.recording.claim_errors import Claim
 from compose.view.colours import COLOURS
 from protocol.mission import ROLES, Role
 from protocol.motion import Covariance, Pose, wrap

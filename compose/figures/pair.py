@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from agent.planning.planner import Planner
 from agent.planning.state import RobotState
 from compose.figures.agent_replay import AgentReplay
-from compose.recording.claim import Claim
+from compose.recording.claim_errors import Claim
 from compose.recording.group_localisation import PastMeeting, past_meetings
 from compose.recording.run import Run
 from protocol.messages import Command, Estimate, RobotConfig

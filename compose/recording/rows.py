@@ -15,7 +15,7 @@ import msgspec
 from msgspec.structs import astuple
 
 from compose.recording import run as recorded
-from compose.recording.claim import Claim, nees
+from compose.recording.claim_errors import Claim, nees
 from compose.recording.frames import Journaled, verdict_name
 from protocol.messages import Estimate
 from protocol.motion import Pose, wrap

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 from msgspec.structs import replace
 
-from compose.recording.claim import Claim, claim, truth_held
+from compose.recording.claim_errors import Claim, claim, truth_held
 from compose.recording.kills_file import Killed, kills_in
 from compose.recording.reasons import ended
 from compose.recording.recording_files import (

@@ -6,7 +6,7 @@ import math
 
 import msgspec
 
-from compose.recording.claim import Claim
+from compose.recording.claim_errors import Claim
 from compose.recording.corrected_bounds import corrected_bounds
 from compose.recording.group_localisation import meeting_results, search_results
 from compose.recording.run import Run

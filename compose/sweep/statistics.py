@@ -16,7 +16,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from scipy.special import bdtr, gammainccinv, gammaincinv  # type: ignore[import-untyped]
 
-from compose.recording.claim import DEGREES_OF_FREEDOM
+from compose.recording.claim_errors import DEGREES_OF_FREEDOM
 from compose.sweep.cells import Cell
 from compose.sweep.field_paths import canonical
 from compose.sweep.spec import Sweep

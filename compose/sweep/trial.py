@@ -9,7 +9,7 @@ import msgspec
 from msgspec.structs import asdict, replace
 
 from compose.audit.findings import Findings
-from compose.recording.claim import Claim
+from compose.recording.claim_errors import Claim
 from compose.recording.closest_approach import nearest
 from compose.recording.group_localisation import TICK_ROUNDING
 from compose.recording.reasons import reason_for
