@@ -13,12 +13,13 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 from msgspec import NODEFAULT
 from msgspec import inspect as types
 
+from agent.estimation import claim
 from compose.cli.main import COMMANDS, command_parser
 from compose.cli.removed import REMOVED
 from compose.recording import rows
@@ -256,6 +257,20 @@ def _participant(name: str) -> str:
     return {"robot": "robot ROBOT", "peer": "robot PEER", "robots": "all robots"}.get(name, name)
 
 
+def claim_conditions() -> str:
+    """Return the table of the conditions for a claim, in their order, and of those whom each concerns."""
+    users = get_args(claim.User)
+    rows = [
+        [
+            f"`{one.name}`",
+            " ".join((one.blocks.__doc__ or "").format_map(vars(claim)).split()),
+            *["yes" if user in one.users else "-" for user in users],
+        ]
+        for one in claim.CONDITIONS
+    ]
+    return _table(["condition", "statement", *users], rows)
+
+
 def command_line() -> str:
     """Return a chapter for each command: its help, its usage and its options."""
     return "\n\n".join([_command(one.name, command_parser(one)) for one in COMMANDS])
@@ -328,6 +343,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "estimate-pose-fields": partial(fields_of, PoseEstimate, defaults=False),
     "learned-fields": partial(fields_of, LearnedErrors, defaults=False),
     "final-report": partial(columns_of, messages.FinalReport),
+    "claim-conditions": claim_conditions,
     "wire-version": wire_version,
     "wire-keys": wire_keys,
     "wire-messages": wire_messages,

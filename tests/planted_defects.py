@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from agent.estimation.gaussian import hypotheses, inference
+from agent.estimation import claim
+from agent.estimation.gaussian import hypotheses
 from agent.estimation.gaussian.range_model import Ranges
 from agent.estimation.gaussian.range_weights import Weighing
 from agent.planning import phase3_last_manoeuvre
@@ -118,7 +119,7 @@ def bias() -> None:
 def consistency() -> None:
     """The test of consistency never alarms."""
     wrapped(
-        inference, "consistency_test", lambda before, *given: before(*given)._replace(sigmas=0.0, p_value=1.0)
+        claim, "consistency_test", lambda before, *given: before(*given)._replace(sigmas=0.0, p_value=1.0)
     )
 
 

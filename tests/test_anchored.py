@@ -115,7 +115,7 @@ def test_a_straight_way_leaves_the_mirror_image_at_two_anchors() -> None:
     assert last.hypotheses == 2
     assert 0.3 < last.probability < 0.7
     assert not any(row.claim for row in found.rows)
-    assert "the most probable of 2 poses has probability" in found.summary.blocking_reason
+    assert "the most probable of 2 hypotheses has probability" in found.summary.blocking_reason
 
 
 def test_one_place_is_not_enough() -> None:

@@ -9,8 +9,9 @@ import pytest
 
 import tandem
 from agent.estimation.gaussian import claim_rivals
-from agent.planning import active_sensing, pair_claim
+from agent.planning import accuracy_seeking, active_sensing, pair_claim
 from agent.planning.accuracy_seeking import AccuracySeeking
+from agent.planning.state import RobotState
 from compose.launch.in_process import run_mission
 from compose.recording.summary_json import summary
 from tests.groups import random_group
@@ -45,17 +46,17 @@ def test_the_next_manoeuvre_is_planned_with_the_rival_that_blocks_a_claim(
 ) -> None:
     rivals, planned = [], []
 
-    def blocking_rival(*args: Any) -> claim_rivals.Rival | None:
-        rival = claim_rivals.blocking_rival(*args)
+    def with_claim(*args: Any) -> tuple[RobotState, claim_rivals.Rival | None]:
+        state, rival = pair_claim.with_claim(*args)
         if rival is not None:
             rivals.append(rival)
-        return rival
+        return state, rival
 
     def plan_together(hypotheses: Any, *args: Any) -> Any:
         planned.append(hypotheses)
         return active_sensing.plan_together(hypotheses, *args)
 
-    monkeypatch.setattr(pair_claim, "blocking_rival", blocking_rival)
+    monkeypatch.setattr(accuracy_seeking, "with_claim", with_claim)
     monkeypatch.setattr(AccuracySeeking, "joint_manoeuvres", lambda _, *args: plan_together(*args))
     assert_localised(run_mission(scenario_of(SIGMA, 384, reach=1.5)))
     assert rivals

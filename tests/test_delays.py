@@ -126,7 +126,7 @@ def test_late_ranges_are_learned_and_hardly_a_claim_is_wrong(
 def test_late_ranges_contradict_a_profile_without_a_delay() -> None:
     found = estimate_of(read_ranges(LATE), "uwb-calibrated", 20.0)
     assert CONTRADICTION in found.summary.blocking_reason
-    assert found.summary.blocking_reason.endswith("try --noise uwb, or calibrate the radios")
+    assert found.summary.blocking_reason.endswith("try --noise uwb, or calibrate the sensors")
 
 
 def late_pair() -> RangeRecording:

@@ -14,13 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import astuple, replace
 
-from agent.estimation.gaussian.claim_agreement import agreement, difference, minus
-from agent.estimation.gaussian.covariance_union import covariance_union
-from agent.estimation.gaussian.later_pose import later_pose
+from agent.estimation.gaussian.claim_agreement import agreement, covariance_union, difference, minus
 from agent.peer.motion_log import MotionLog
 from agent.planning.active_sensing import Listening, Surveying
 from agent.planning.confirmation import ConfirmingPlanner
 from agent.planning.group_state import GroupState
+from agent.planning.own_pose import later_pose
 from agent.planning.range_seeking import Homing
 from compose.audit.replay import replayed
 from compose.errors import Unworkable

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from msgspec.structs import replace
+from msgspec.structs import astuple, replace
 
 from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis, search
@@ -251,12 +251,11 @@ def mission(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
 
 def test_the_claim_came_of_this_fit(mission: Compared) -> None:
     (held,) = inference.pair_planning_hypotheses([mission.ours])
-    pose, covariance = inference.claim(held, 0, mission.pair)
     anchor = mission.config.anchor
+    stated = inference.to_second_order(held, mission.pair.apart)
+    ours, covariance = astuple(inference.localised(stated, 0, (anchor.x, anchor.y)))
     assert mission.claimed.covariance is not None
-    off = np.array(
-        (mission.claimed.pose.x - anchor.x, mission.claimed.pose.y - anchor.y, mission.claimed.pose.heading)
-    ) - np.array((pose.x, pose.y, pose.heading))
+    off = np.array(astuple(mission.claimed.pose)) - np.array(astuple(ours))
     sigmas = (covariance.position_sigma, covariance.position_sigma, covariance.heading_sigma)
     assert np.all(np.abs(off) < AGREED * np.array(sigmas)), "it began at what the robot held, this one anew"
     assert mission.claimed.covariance.xx == pytest.approx(covariance.xx, rel=AGREED_COVARIANCE)

@@ -525,8 +525,9 @@ def test_numbers_beyond_floats_block_a_claim(monkeypatch: pytest.MonkeyPatch) ->
         return HeldFit(-100.0, begun.poses)
 
     monkeypatch.setattr(claim_rivals, "held_fit", held)
-    claimed = inference.pair_planning_hypotheses([first])[0]
-    assert claim_rivals.likeliest_rival(first.fit, pair, claimed, (0, 1)).log_likelihood_ratio == math.inf
+    (claimed,) = inference.pair_planning_hypotheses([first])
+    rival = claim_rivals.likeliest_rival(first.fit, pair.measured, pair.sensing_range, claimed, (0, 1))
+    assert rival.log_likelihood_ratio == math.inf
     monkeypatch.setattr(evidence, "fits", lambda *_: [])
     assert consistency_test(one_stray, pair, 0).p_value == 0.0
     assert evidence.mutual_evidence(one_stray, pair) == -math.inf

@@ -11,17 +11,18 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares  # type: ignore[import-untyped]
 from scipy.stats import binom, chi2  # type: ignore[import-untyped]
 
+from agent.estimation.claim import BEFORE_SEARCH, blocked, of_joint
 from agent.estimation.facts import Facts, Manoeuvre, anchor, anchor_range, manoeuvre, mutual_range
 from agent.estimation.fit import Fit, Start, fits
 from agent.estimation.gauss_newton import Convergence
 from agent.estimation.gaussian.hypotheses import search as search_of_pair
-from agent.estimation.gaussian.joint_claims import blocking_reason, undetermined
+from agent.estimation.gaussian.joint_claims import undetermined
 from agent.estimation.gaussian.joint_ranges import MOST_MUTUAL_RANGES, JointMeasurements, joint_measurements
 from agent.estimation.gaussian.joint_search import search
 from agent.estimation.gaussian.odometry_noise import constant_errors, track, variances
 from agent.estimation.gaussian.pair_ranges import PairRanges
 from agent.estimation.gaussian.range_model import Ranges
-from agent.estimation.posterior import JointHypotheses, certainties
+from agent.estimation.posterior import Certainty, JointHypotheses, certainties
 from tests.moving_groups import NOISE, PERIOD_S, MovingGroup, moving_group
 
 Array = NDArray[np.float64]
@@ -160,6 +161,15 @@ def test_two_robots_have_the_same_poses_as_by_the_search_of_a_pair() -> None:
 # --- accuracy -----------------------------------------------------------------------------------------------
 
 
+def blocking_reason(
+    robot: int, found: JointHypotheses, certainty: Certainty, measured: JointMeasurements
+) -> str:
+    """Return what blocks the claim of a robot, but for other profiles."""
+    judged = of_joint("recording", robot, found, certainty, measured, REACH, 0.3, SURE)
+    blocking = blocked(judged, BEFORE_SEARCH)
+    return blocking.reason if blocking is not None else ""
+
+
 class Scores:
     """The errors and the NEES of many groups."""
 
@@ -177,8 +187,7 @@ class Scores:
             errors = errors_of(fit, group, measured)
             sure = certainties(found)
             for i, nees in enumerate(nees_of(fit, errors)):
-                args = (i, found, sure[i], measured, REACH, 0.3, SURE)
-                if not blocking_reason(*args):
+                if not blocking_reason(i, found, sure[i], measured):
                     self.nees.append(nees)
                     self.errors.append(math.hypot(*errors[i, :2]))
                     self.wrong += nees > 5.0**2 + 3.0
@@ -275,9 +284,9 @@ def test_only_the_robot_with_a_mirror_image_is_uncertain() -> None:
     assert [one.poses for one in sure] == [1, 1, 2]
     assert sure[0].probability == sure[1].probability == 1.0
     assert 0.3 < sure[2].probability < 0.7
-    reasons = [blocking_reason(i, found, sure[i], measured, REACH, 0.3, SURE) for i in range(3)]
+    reasons = [blocking_reason(i, found, sure[i], measured) for i in range(3)]
     assert reasons[:2] == ["", ""]
-    assert reasons[2].startswith("the most probable of 2 poses has probability 0.")
+    assert reasons[2].startswith("the most probable of 2 hypotheses has probability 0.")
 
 
 def test_a_component_without_two_anchors_has_no_pose_and_says_why() -> None:

@@ -77,4 +77,4 @@ def test_the_ranges_of_the_paper_planner_never_suffice_with_outliers(sigma: floa
     said = summary(recording, "in-process", None)
     assert said["outcome"] == "undecided"
     assert "the paper's manoeuvres give no further ranges: " in said["reason"]
-    assert "of 12 required mutual ranges" in said["reason"]
+    assert "of 12 required ranges from different places" in said["reason"]

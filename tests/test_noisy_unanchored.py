@@ -17,7 +17,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from agent.estimation.gaussian.contact_fit import ContactRanges, estimated, is_definite
+from agent.estimation.claim import is_definite
+from agent.estimation.gaussian.contact_fit import ContactRanges, estimated
 from agent.estimation.gaussian.odometry_noise import Track, track
 from agent.planning.accuracy_seeking import AccuracySeeking
 from agent.planning.group_state import GroupState
@@ -585,7 +586,7 @@ def test_malformed_references_are_refused() -> None:
     assert good.prior is not None
     assert planner.malformed(good) is None
     flat = Covariance(1.0, 2.0, 0.0, 1.0, 0.0, 1.0)
-    assert not is_definite(flat)
+    assert not is_definite(np.array(flat.matrix))
     tiny = Covariance(1e-300, 0.0, 0.0, 1e-300, 0.0, 1e-300)
     for wrong in ({"covariance": flat}, {"covariance": tiny}, {"covariance": None}, {"tick": good.since + 1}):
         assert planner.malformed(replace(good, prior=replace(good.prior, **wrong))) is not None

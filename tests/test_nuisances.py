@@ -282,7 +282,7 @@ def test_a_robot_whose_own_ranges_contradict_its_odometry_names_the_profile_to_t
     found = doubt(path, ranges, 3.0, Noise(0.05, 0.05))
     assert found is not None
     assert found.profile == "uwb"
-    assert 'noise = "uwb"' in found.reason
+    assert 'noise = "uwb"' in found.reason()
     path, ranges = own(0.0)
     assert doubt(path, ranges, 3.0, Noise(0.05, 0.05)) is None
 
@@ -337,7 +337,7 @@ def test_a_bias_of_the_anchors_only_ends_undecided_and_names_the_profile_to_try(
     assert end is not None
     assert end.outcome == "undecided"
     assert 'noise = "uwb' in str(reason_for(end))
-    assert "contradict mission.noise" in str(reason_for(end))
+    assert "contradict the assumed noise" in str(reason_for(end))
 
 
 @pytest.mark.parametrize("heading", [0.0, 1.5, 3.1])

@@ -18,7 +18,7 @@ from agent.estimation import smoother
 from agent.estimation.fit import Fit, Start, deviation, fits, held_fit
 from agent.estimation.gauss_newton import LAST_STEP, Convergence, moved
 from agent.estimation.gaussian import odometry_noise, pair_ranges
-from agent.estimation.gaussian.claim_rivals import _holding
+from agent.estimation.gaussian.claim_rivals import FAR_ANCHOR, _holding
 from agent.estimation.gaussian.consistency import FINISHED
 from agent.estimation.gaussian.hypotheses import starts_about
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
@@ -709,7 +709,8 @@ def test_a_range_that_holds_a_coordinate_is_no_outlier_and_has_no_bias(
     begun = pair_fit(one.guess, pair)
     along = np.array((math.cos(seed), math.sin(seed)))
     place, sigma = begun.poses[1, :2], 1e-4
-    measured = _holding(pair, 1, place, along, offset, sigma)
+    away = FAR_ANCHOR * pair.sensing_range
+    measured = _holding(pair.measured, 1, place - away * along, away + offset, sigma)
     held = held_fit(measured, begun, 5)
     # a few full steps: each is bounded, and none is made shorter if it does not descend
     assert 0.0 < (held.poses[1, :2] - place) @ along / offset < 1.5

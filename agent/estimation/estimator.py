@@ -92,11 +92,9 @@ class Estimator(Protocol):
     def fitted(self, knowledge: Knowledge, branch: Branch) -> FittedBranch:
         """Return `branch` as it is at the end of phase 1."""
 
-    def pair(
-        self, knowledge: Knowledge, first_tick: int, required_ranges: int, *, second_range: bool
-    ) -> PairEstimate | None:
+    def pair(self, knowledge: Knowledge, first_tick: int, *, second_range: bool) -> PairEstimate | None:
         """Return the hypotheses about both poses; None if the measurements do not suffice yet.
 
-        Mutual ranges before `first_tick` are not used if the ranges after it suffice alone. A claim needs
-        `required_ranges` noisy mutual ranges. `second_range` says that a has reported its second one.
+        Mutual ranges before `first_tick` are not used if the ranges after it suffice alone. `second_range`
+        says that a has reported its second one.
         """

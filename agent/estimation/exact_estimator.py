@@ -71,15 +71,13 @@ class ExactEstimator(msgspec.Struct, frozen=True):
         branch, accuracy = precision.fitted(knowledge, branch)
         return FittedBranch(branch, accuracy.error, accuracy.enough)
 
-    def pair(
-        self, knowledge: Knowledge, first_tick: int, required_ranges: int, *, second_range: bool
-    ) -> PairEstimate | None:
+    def pair(self, knowledge: Knowledge, first_tick: int, *, second_range: bool) -> PairEstimate | None:
         """Return the placements of eq. (7) that agree with every tick from `first_tick` on.
 
         The number of ranges does not matter: the claim needs a redundant one that confirms the placement. The
         result is None until a has moved between two ranges while b stood still.
         """
-        del required_ranges, second_range
+        del second_range
         observations = knowledge.pair_observations(first_tick)
         ranged = [at for at in observations if at.range is not None]
         away_from_m2 = [at for at in ranged if off_anchor(at.b, knowledge.config.rendezvous.b)]

@@ -13,6 +13,7 @@ from functools import partial
 
 from msgspec.structs import replace
 
+from agent.estimation.claim import FEWEST_FOR_CLAIM, sufficient_mutual_ranges
 from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis
 from agent.estimation.gaussian.inference import MANY_MUTUAL_RANGES, PlanningHypothesis
@@ -21,14 +22,7 @@ from agent.estimation.gaussian.pair_ranges import PairRanges
 from agent.planning import active_sensing, exchange, phase2_orbit, range_seeking, transitions
 from agent.planning.active_sensing import CONTINUED, STALLED, Listening, Objective, Retreating, Surveying
 from agent.planning.assured import AssuredExact
-from agent.planning.pair_claim import (
-    FEWEST_FOR_CLAIM,
-    inferred,
-    may_claim,
-    required_mutual_ranges,
-    with_claim,
-    with_consistency_test,
-)
+from agent.planning.pair_claim import inferred, with_claim, with_consistency_test
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent
 from agent.planning.range_seeking import Backing, Beacon, Circling, Homing, Straight, Turning
 from agent.planning.stalls import is_stalled
@@ -102,10 +96,6 @@ class AccuracySeeking(AssuredExact):
         nor when one of them has claimed its pose.
         """
         return active_sensing.plan_together(hypotheses, m2, rho, mission)
-
-    def required_mutual_ranges(self, mission: Mission) -> int:
-        """Return the minimum number of mutual ranges before a claim."""
-        return required_mutual_ranges(mission)
 
 
 def _observe(state: RobotState, observation: Observation) -> RobotState:
@@ -376,14 +366,14 @@ def _decide_phase3(state: RobotState, planned: JointManoeuvres) -> RobotState:
     mutual = pair.ranges.counts[2]
     if mutual < FEWEST_FOR_CLAIM:
         return _drive_without_hypotheses(state)
-    scored, hypotheses, belief, searched = inferred(state, pair)
+    scored, hypotheses, belief, judged, searched = inferred(state, pair)
     if searched:
         belief = replace(belief, ranges_at_last_search=mutual)
-    tested = replace(state, belief=inference.with_convergence_check(belief, scored))
-    if searched and len(pair.places) >= inference.sufficient_mutual_ranges(mission.noise):
+    tested = replace(state, belief=belief)
+    if searched and len(pair.places) >= sufficient_mutual_ranges(mission.noise):
         tested = with_consistency_test(tested)
-    if tested.verdict is None and may_claim(tested.belief, pair):
-        tested, rival = with_claim(tested, scored, hypotheses, pair)
+    if tested.verdict is None and belief.blocking_reason is None:
+        tested, rival = with_claim(tested, judged)
         if rival is not None:
             hypotheses = (hypotheses[0], rival.hypothesis, *hypotheses[1:])
     if tested.verdict is not None:

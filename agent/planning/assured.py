@@ -17,7 +17,6 @@ from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent, Tra
 from agent.planning.phase3_last_manoeuvre import LAST_SPEEDS, Standing, Waiting
 from agent.planning.state import MODE_NAMES, Done, RobotState
 from protocol.messages import Command, Localised, Report
-from protocol.mission import Mission
 from protocol.motion import REST
 
 PEER_RESTS = (MODE_NAMES[Standing], MODE_NAMES[Waiting])
@@ -58,11 +57,6 @@ class AssuredExact(LogPlanner):
         """Return the command for the next tick, with the phase, the task and the verdict."""
         return exchange.command(state, REST if self._must_wait(state) else transitions.controls(state))
 
-    def required_mutual_ranges(self, mission: Mission) -> int:
-        """Return 0: not the number of exact ranges counts, but a redundant one."""
-        del mission
-        return 0
-
     def _must_wait(self, state: RobotState) -> bool:
         """Return whether the robot stands still, in range of a peer with which phase 3 cannot begin yet.
 
@@ -101,9 +95,7 @@ class AssuredExact(LogPlanner):
         evaluated = transitions.with_new_ticks(state)
         if evaluated is None:
             return state
-        state, estimate = transitions.pair_estimate(
-            evaluated, 0, self.required_mutual_ranges(state.config.mission), second_range=True
-        )
+        state, estimate = transitions.pair_estimate(evaluated, 0, second_range=True)
         if estimate is None:  # There are too few ranges, or b was still driving while a drove straight on.
             b_is_standing = isinstance(state.mode, Waiting) and state.peer_state.state == MODE_NAMES[Standing]
             return transitions.begin_phase3(state) if b_is_standing else state

@@ -14,18 +14,17 @@ from itertools import combinations
 
 from msgspec.structs import replace
 
-from agent.estimation.gaussian.claim_agreement import agreement
-from agent.estimation.gaussian.covariance_union import covariance_union
-from agent.estimation.gaussian.later_pose import later_pose
+from agent.estimation.gaussian.claim_agreement import agreement, covariance_union
 from agent.planning import group_transitions
 from agent.planning.group import TRAVELLING_MODE, GroupPlanner
 from agent.planning.group_state import Fix, GroupState
+from agent.planning.own_pose import later_pose
 from agent.planning.state import UNCONFIRMED
 from protocol.messages import Command, Localised, Report, Undecided
 from protocol.mission import HEADING_ACCURACY
 
 RANGES_AGAIN, SHARE_AGAIN = 6, 1.1
-"""After so many more ranges to its anchor, and so many times more, a robot compares its meetings again."""
+"""The further ranges to its anchor, and their factor, after which a robot compares its meetings again."""
 
 BEGINS_WITHIN = 0.3
 """The fraction of the time of a visit within which it may begin, if the robot is not free at once."""

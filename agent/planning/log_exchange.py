@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import msgspec
 
+from agent.estimation.claim import required_mutual_ranges
 from agent.peer import peer_state
 from agent.planning import exchange, phase3_last_manoeuvre, transitions
 from agent.planning.manoeuvres import Manoeuvres
@@ -59,6 +60,10 @@ class LogPlanner(Planner[RobotState, Report]):
         return phase3_last_manoeuvre.last_manoeuvre(
             question.mover, question.a, question.b, question.candidates, mission, self.MANOEUVRES
         )
+
+    def required_mutual_ranges(self, mission: Mission) -> int:
+        """Return the minimum number of noisy mutual ranges before a claim."""
+        return required_mutual_ranges(mission.noise)
 
     def malformed(self, body: Report) -> str | None:
         """Return the reason why the log in a report is malformed, or None."""

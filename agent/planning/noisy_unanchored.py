@@ -14,11 +14,11 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from agent.estimation.gaussian.contact_fit import ContactEstimate, ContactRanges, estimated, is_definite
+from agent.estimation.claim import is_definite, sufficient_mutual_ranges
+from agent.estimation.gaussian.contact_fit import ContactEstimate, ContactRanges, estimated
 from agent.estimation.gaussian.gaussian_estimator import GAUSSIAN
-from agent.estimation.gaussian.inference import sufficient_mutual_ranges
+from agent.estimation.gaussian.inference import path_of
 from agent.estimation.gaussian.known_anchors import FEWEST_FOR_POSE
-from agent.estimation.gaussian.odometry_noise import Track, track
 from agent.estimation.kernel import library
 from agent.peer import peer_state
 from agent.peer.motion_log import MotionLog
@@ -39,7 +39,7 @@ from protocol.messages import (
     Undecided,
 )
 from protocol.mission import Mission
-from protocol.motion import Covariance, Pose, Segment
+from protocol.motion import Covariance, Pose
 from protocol.sweep_strips import OWN_SIDE
 from protocol.sweep_ticks import contact_ticks
 
@@ -164,7 +164,7 @@ class NoisyUnanchoredPlanner(Planner[NoisyUnanchoredState, Report]):
         if (prior := body.prior) is not None:
             if prior.tick > body.since:
                 return f"a log from tick {body.since} on, before its pose at tick {prior.tick}"
-            if prior.covariance is None or not is_definite(prior.covariance):
+            if prior.covariance is None or not is_definite(np.array(prior.covariance.matrix)):
                 return "a covariance of a pose that is not positive definite"
         return peer_state.contradiction(body)
 
@@ -232,13 +232,9 @@ def _estimated(state: NoisyUnanchoredState) -> NoisyUnanchoredState:
         or state.tick < state.estimated_tick + EACH
     ):
         return state
-    contact = ContactRanges(
-        finder.pose,
-        finder.covariance,
-        _path(finder.log.runs, mission),
-        _path(state.log.between(finder.reference, state.tick), mission),
-        ranges,
-    )
+    own = MotionLog(state.tick, state.log.between(finder.reference, state.tick))
+    there, here = (path_of(log, 0, log.through, mission) for log in (finder.log, own))
+    contact = ContactRanges(finder.pose, finder.covariance, there, here, ranges)
     estimate = estimated(contact, mission)
     state = replace(state, estimate=estimate, estimated_tick=state.tick, ranges_at_estimate=len(ranges))
     if estimate is None:
@@ -246,16 +242,6 @@ def _estimated(state: NoisyUnanchoredState) -> NoisyUnanchoredState:
     if estimate.blocking_reason:
         return replace(state, failure=f"{finder.robot} has found it: {estimate.blocking_reason}")
     return replace(state, verdict=Localised(estimate.poses[0], estimate.covariance))
-
-
-def _path(runs: Sequence[Segment], mission: Mission) -> Track:
-    """Return the odometry of `runs`."""
-    ticks = [run.ticks for run in runs]
-    v, omega = (
-        np.repeat(np.array(one, np.float64), ticks)
-        for one in ([run.v for run in runs], [run.omega for run in runs])
-    )
-    return track(v + 0.0, omega + 0.0, mission.period)
 
 
 def _moved_on(state: NoisyUnanchoredState) -> NoisyUnanchoredState:

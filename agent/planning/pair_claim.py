@@ -1,44 +1,38 @@
-"""The inference and the claims of two robots with noisy sensors.
-
-`tandem estimate` applies the same to recorded robots.
-"""
+"""The inference and the claims of two robots with noisy sensors."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 from msgspec.structs import replace
 
+from agent.estimation.claim import (
+    BEFORE_SEARCH,
+    FEWEST_FOR_CLAIM,
+    Blocked,
+    Judged,
+    blocked,
+    claim,
+    early_consistency,
+    of_pair,
+    profiles,
+    rivals,
+)
 from agent.estimation.gaussian import inference
-from agent.estimation.gaussian.claim_rivals import Rival, blocking_rival, rival_reason
+from agent.estimation.gaussian.claim_rivals import Rival
 from agent.estimation.gaussian.consistency import (
     CLAIM_P_VALUE,
-    EARLY_CLAIM_P_VALUE,
     FINISHED,
     INCONSISTENT_SEARCHES,
     rejecting_p_value,
 )
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis, follow, search
 from agent.estimation.gaussian.inference import PlanningHypothesis
+from agent.estimation.gaussian.own_sensors import DOUBTFUL_CLAIMS
 from agent.estimation.gaussian.pair_ranges import PairRanges
 from agent.estimation.knowledge import Belief, Knowledge
 from agent.planning.state import Done, RobotState
 from protocol.messages import Localised
-from protocol.mission import Mission
-
-FEWEST_FOR_CLAIM = 3
-"""The minimum number of mutual ranges for hypotheses, and before a claim.
-
-With fewer, there are too many hypotheses, and no range checks them. How many more a claim needs depends on
-their evidence (`inference.with_evidence_check`).
-"""
-
-EARLY_RANGES = 16
-"""The number of mutual ranges below which EARLY_CLAIM_P_VALUE applies.
-
-Few ranges leave room for a wrong hypothesis that fits by chance. With more, only the p-value of the search
-counts. The bound delays one of a hundred right claims by a few ticks."""
 
 PAIR_SEARCHES = frozenset((FEWEST_FOR_CLAIM, *(8 * 2**n for n in range(12))))
 """The numbers of mutual ranges at which the whole plane is searched again for hypotheses.
@@ -48,17 +42,14 @@ whenever the best fit still moves. More searches cost time; with fewer, robots p
 """
 
 
-def required_mutual_ranges(mission: Mission) -> int:
-    """Return the minimum number of mutual ranges before a claim."""
-    return inference.MUTUAL_RANGES_WITH_OUTLIERS if mission.noise.outliers else FEWEST_FOR_CLAIM
-
-
 class PairInference(NamedTuple):
     """The hypotheses about both robots in one tick."""
 
     scored: tuple[ScoredHypothesis, ...]
     hypotheses: tuple[PlanningHypothesis, ...]
     belief: Belief
+    judged: Judged | None
+    """The first hypothesis, as the conditions for a claim see it; None if there is none."""
     searched: bool
     """True if the hypotheses are from a search of the whole plane."""
 
@@ -74,9 +65,8 @@ def inferred(state: Knowledge, pair: PairRanges) -> PairInference:
         scored = follow(known, pair)
         if scored and scored[0].fit.last_step <= FINISHED:
             followed = weighed(state, pair, scored, searched=False)
-            if followed.belief.blocking_reason is not None and not _p_value_below(
-                followed.belief, CLAIM_P_VALUE
-            ):
+            blocking, test = followed.belief.blocking_reason, followed.belief.inconsistency
+            if blocking is not None and (test is None or test.p_value >= CLAIM_P_VALUE):
                 return followed
         known = tuple([one.hypothesis for one in scored])
     return weighed(state, pair, search(pair, known), searched=True)
@@ -86,52 +76,36 @@ def weighed(
     state: Knowledge, pair: PairRanges, scored: tuple[ScoredHypothesis, ...], *, searched: bool
 ) -> PairInference:
     """Return the hypotheses `scored` with the belief that follows from them."""
-    mission = state.config.mission
     hypotheses = inference.pair_planning_hypotheses(scored)
-    belief = inference.with_pair(state, scored, hypotheses, pair, required_mutual_ranges(mission))
-    return PairInference(
-        scored, hypotheses, inference.with_evidence_check(belief, scored, pair, mission), searched
+    judged = of_pair("assured", state.config, scored, pair)
+    if judged is not None and not isinstance(state.peer_state.verdict, Localised):
+        judged = judged._replace(rivals_of=(0, 1))
+    found = blocked(judged, BEFORE_SEARCH)
+    belief = inference.with_pair(
+        state, scored, hypotheses, pair, judged and judged.inconsistency, found and found.reason
     )
+    return PairInference(scored, hypotheses, belief, judged, searched)
 
 
-def may_claim(belief: Belief, pair: PairRanges) -> bool:
-    """Return whether a search has left no reason against a claim."""
-    few_ranges = len(pair.places) < EARLY_RANGES
-    return belief.blocking_reason is None and not (few_ranges and _p_value_below(belief, EARLY_CLAIM_P_VALUE))
-
-
-def with_claim(
-    state: RobotState,
-    scored: Sequence[ScoredHypothesis],
-    hypotheses: Sequence[PlanningHypothesis],
-    pair: PairRanges,
-) -> tuple[RobotState, Rival | None]:
+def with_claim(state: RobotState, judged: Judged | None) -> tuple[RobotState, Rival | None]:
     """Return `state`, and the rival that blocks its claim or None.
 
-    The state has the claim if nothing blocks it. It is Undecided if other profiles of the sensors contradict
-    all of its latest claims (`inference.with_doubt_check`).
+    The state has the claim if no condition blocks it. It is Undecided if other profiles of the sensors
+    contradict all of its latest claims: then more ranges have not helped.
     """
-    mission = state.config.mission
-    belief, rival = inference.with_doubt_check(state.belief, scored, pair), None
-    if belief.blocking_reason is None:
-        robot = 0 if state.config.role == "a" else 1
-        robots = (robot,) if isinstance(state.peer_state.verdict, Localised) else (0, 1)
-        rival = blocking_rival(scored, hypotheses[0], pair, mission, robots)
-        if rival is not None:
-            belief = replace(belief, blocking_reason=rival_reason(rival, mission))
-    state = replace(state, belief=belief)
-    reason = belief.blocking_reason
-    if reason is None:
-        belief = replace(belief, p_value=_least_p_value(belief))
-        claim = Localised(belief.poses[0], belief.covariance)
-        return replace(state, mode=Done(3, claim), belief=belief), None
-    return state.undecided(reason) if inference.ends_in_doubt(belief) else state, rival
-
-
-def _p_value_below(belief: Belief, bound: float) -> bool:
-    """Return whether the p-value of the consistency test is below `bound`; False without a test."""
-    inconsistency = belief.inconsistency
-    return inconsistency is not None and inconsistency.p_value < bound
+    match claim(judged):
+        case Localised() as claimed:
+            belief = replace(state.belief, doubtful_claims=0, p_value=_least_p_value(state.belief))
+            return replace(state, mode=Done(3, claimed), belief=belief), None
+        case Blocked(condition, reason):
+            doubtful = state.belief.doubtful_claims
+            if condition != early_consistency:
+                doubtful = doubtful + 1 if condition == profiles else 0
+            belief = replace(state.belief, blocking_reason=reason, doubtful_claims=doubtful)
+            state = replace(state, belief=belief)
+            if doubtful >= DOUBTFUL_CLAIMS:
+                return state.undecided(reason), None
+            return state, judged.rival if judged and condition == rivals else None
 
 
 def with_consistency_test(state: RobotState) -> RobotState:
@@ -150,7 +124,7 @@ def with_consistency_test(state: RobotState) -> RobotState:
     if inconsistent_searches < INCONSISTENT_SEARCHES:
         return state
     doubt = inference.sensor_doubt(state)
-    return state.inconsistent(inconsistency.verdict) if doubt is None else state.undecided(doubt.reason)
+    return state.inconsistent(inconsistency.verdict) if doubt is None else state.undecided(doubt.reason())
 
 
 def _least_p_value(belief: Belief) -> float | None:

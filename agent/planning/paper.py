@@ -22,12 +22,6 @@ from protocol.messages import Command, Report
 from protocol.mission import Mission
 from protocol.orbits import Rendezvous, rendezvous
 
-CHECKED, CHECKED_WITH_OUTLIERS = 3, 12
-"""The minimum number of mutual ranges before a claim with noisy sensors, without and with outliers.
-
-The paper's manoeuvres give three. With outliers, three do not say which of them is one, so `paper` does not
-claim."""
-
 
 class Paper(LogPlanner):
     """The algorithm as published. Subclasses may plan another last manoeuvre."""
@@ -60,10 +54,6 @@ class Paper(LogPlanner):
         """Return the command for the next tick, with the phase, the task and the verdict."""
         return exchange.command(state, transitions.controls(state))
 
-    def required_mutual_ranges(self, mission: Mission) -> int:
-        """Return the minimum number of noisy mutual ranges before a claim."""
-        return CHECKED_WITH_OUTLIERS if mission.noise.outliers else CHECKED
-
     def _after_range(self, state: RobotState) -> RobotState:
         """Continue phase 1 with the branches +alpha and -alpha that the ranges allow (eq. (2)).
 
@@ -91,12 +81,8 @@ class Paper(LogPlanner):
         first_tick, planned = state.belief.encounter_tick, state.plan is not None
         assert first_tick is not None
         a_waits = not isinstance(state.mode, Standing) or state.peer_state.state == MODE_NAMES[Waiting]
-        state, estimate = transitions.pair_estimate(
-            evaluated,
-            first_tick,
-            self.required_mutual_ranges(state.config.mission),
-            second_range=a_waits or planned,
-        )
+        second = a_waits or planned
+        state, estimate = transitions.pair_estimate(evaluated, first_tick, second_range=second)
         if estimate is None or state.verdict is not None or state.config.role == "a":
             return state
         if planned:

@@ -204,13 +204,13 @@ def with_new_ticks(state: RobotState) -> RobotState | None:
 
 
 def pair_estimate(
-    state: RobotState, first_tick: int, required_ranges: int, *, second_range: bool
+    state: RobotState, first_tick: int, *, second_range: bool
 ) -> tuple[RobotState, PairEstimate | None]:
     """Return `state` with the belief and the verdict of the estimate of both poses, and the estimate.
 
     The arguments are those of `Estimator.pair`. The estimate is None if the measurements do not suffice yet.
     """
-    estimate = state.estimator.pair(state, first_tick, required_ranges, second_range=second_range)
+    estimate = state.estimator.pair(state, first_tick, second_range=second_range)
     if estimate is None:
         return state, None
     mode = state.mode if estimate.verdict is None else Done(3, estimate.verdict)

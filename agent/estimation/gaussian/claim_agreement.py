@@ -1,13 +1,15 @@
-"""The agreement of two poses of one robot that it has determined in different meetings."""
+"""The agreement of poses of one robot that it has determined in different meetings, and their union."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from agent.estimation.gaussian import inference
+from agent.estimation.gaussian.inference import covariance_of
 from agent.estimation.gaussian.odometry_noise import (
     Array,
     Projection,
@@ -96,6 +98,30 @@ def agreement(one: Localised, other: Localised) -> float:
     """
     off = minus(one.pose, other.pose)
     return _p_value(float(off @ np.linalg.solve(matrix(one) + matrix(other), off)))
+
+
+def covariance_union(claims: Sequence[Localised]) -> Localised:
+    """Return the last of `claims`, of one robot and tick, with a covariance that covers all of them.
+
+    If one of them is right, and nobody knows which, the error of the last one is its own, or that of the
+    right one and the difference of the two. So the covariance is at least C_i + d_i d_i^T for each claim i,
+    where d_i is its difference from the last one (covariance union; Uhlmann 2003).
+    """
+    best = claims[-1]
+    union = matrix(best)
+    for one in claims[:-1]:
+        off = minus(one.pose, best.pose)
+        union = _larger(union, matrix(one) + np.outer(off, off))
+    return Localised(best.pose, covariance_of(union))
+
+
+def _larger(one: Array, other: Array) -> Array:
+    """Return the smallest matrix that is at least as large as both, which are positive definite."""
+    root = np.linalg.cholesky(one)
+    scaled = np.linalg.solve(root, np.linalg.solve(root, other).T)
+    values, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
+    turned = root @ vectors
+    return np.asarray((turned * np.maximum(values, 1.0)) @ turned.T)
 
 
 def matrix(claim: Localised) -> Array:

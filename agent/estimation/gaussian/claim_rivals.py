@@ -9,7 +9,6 @@ there and everything else is free, the weights of the ranges included (a profile
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -17,13 +16,10 @@ import numpy as np
 from msgspec.structs import replace
 
 from agent.estimation.fit import Fit, HeldFit, deviation, held_fit
-from agent.estimation.gaussian.hypotheses import ScoredHypothesis
-from agent.estimation.gaussian.inference import PlanningHypothesis, to_second_order
+from agent.estimation.gaussian.inference import PlanningHypothesis
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges
 from agent.estimation.gaussian.odometry_noise import Array
-from agent.estimation.gaussian.pair_ranges import PairRanges
 from agent.estimation.smoother import Singular
-from protocol.mission import Mission
 
 WRONG_SIGMAS = 5.0
 """The number of claimed sigmas from which on the referee calls a claim wrong."""
@@ -57,22 +53,25 @@ class Rival(NamedTuple):
 
 @lru_cache(maxsize=2)
 def likeliest_rival(
-    fitted: Fit, pair: PairRanges, claimed: PlanningHypothesis, robots: tuple[int, ...]
+    fitted: Fit,
+    measured: JointMeasurements,
+    reach: float,
+    stated: PlanningHypothesis,
+    robots: tuple[int, ...],
 ) -> Rival:
-    """Return the likeliest rival of the claims of `robots` (0 and 1), which follow from `fitted`.
+    """Return the likeliest rival of the claims of `robots` (indices) by the fit to what was `measured`.
 
-    `claimed` contains the poses and the covariance of both robots. The coordinate that is held is that along
-    the longest axis of the ellipse of a robot's position.
+    `stated` has the covariance of the claims, and `reach` (m) bounds the ranges. The coordinate that is held
+    is that along the longest axis of the ellipse of a robot's position.
     """
-    _, covariance = to_second_order(claimed, pair.apart)
-    rivals = []
+    covariance, rivals = stated.covariance, []
     for robot in robots:
         i = 3 * robot
         variances, axes = np.linalg.eigh(covariance[i : i + 2, i : i + 2])
         along, far = axes[:, 1], WRONG_SIGMAS * deviation(float(np.sum(variances)))
-        place = claimed.poses[i : i + 2]
+        place, away, held = fitted.poses[robot, :2], FAR_ANCHOR * reach, HOLDING_SIGMA * far
         here, *there = [
-            _held(_holding(pair, robot, place, along, offset, HOLDING_SIGMA * far), fitted, steps)
+            _held(_holding(measured, robot, place - away * along, away + offset, held), fitted, steps)
             for offset, steps in ((0.0, 0), (far, HELD_STEPS), (-far, HELD_STEPS))
         ]
         best = max(there, key=lambda one: one.log_likelihood)
@@ -80,7 +79,7 @@ def likeliest_rival(
         if math.isfinite(here.log_likelihood):
             ratio = best.log_likelihood - here.log_likelihood
         probability = math.exp(min(ratio, 0.0))
-        poses = PlanningHypothesis(probability, best.poses.ravel(), claimed.covariance)
+        poses = PlanningHypothesis(probability, best.poses.ravel(), fitted.covariance)
         rivals.append(Rival(robot, ratio, poses))
     return max(rivals, key=lambda one: one.log_likelihood_ratio)
 
@@ -94,18 +93,16 @@ def _held(measured: JointMeasurements, fitted: Fit, steps: int) -> HeldFit:
 
 
 def _holding(
-    pair: PairRanges, robot: int, place: Array, along: Array, offset: float, sigma: float
+    measured: JointMeasurements, robot: int, anchor: Array, rho: float, sigma: float
 ) -> JointMeasurements:
-    """Return the measurements of `pair` with one more range, which holds a coordinate of a robot.
+    """Return what was `measured` with one more range, which holds a coordinate of a robot.
 
-    It is one of the last tick to an anchor far away: the robot is `offset` (m) beside `place` in the
-    direction `along`, within `sigma` (m). No error that ranges have in common affects it.
+    It is one of the last tick to an `anchor` (m) far away: the distance is `rho` (m), within `sigma` (m). No
+    error that ranges have in common affects it.
     """
-    away, measured = FAR_ANCHOR * pair.sensing_range, pair.measured
-    anchor = place - away * along
     more = JointRanges(
-        np.array([away + offset]),
-        np.array([len(pair.paths[robot].v)]),
+        np.array([rho]),
+        np.array([len(measured.paths[robot].v)]),
         np.array([sigma]),
         np.array([robot]),
         np.array([-1]),
@@ -113,32 +110,3 @@ def _holding(
         np.array([-1]),
     )
     return replace(measured, ranges=measured.ranges.then(more))
-
-
-def blocking_rival(
-    scored: Sequence[ScoredHypothesis],
-    claimed: PlanningHypothesis,
-    pair: PairRanges,
-    mission: Mission,
-    robots: tuple[int, ...],
-) -> Rival | None:
-    """Return the likeliest rival of the claims of `robots` if it is too likely for a claim, else None.
-
-    A rival may be as likely as other hypotheses may be probable: 1 - confidence.
-    """
-    rival = likeliest_rival(scored[0].fit, pair, claimed, robots)
-    return None if rival.log_likelihood_ratio <= _allowed_ratio(mission) else rival
-
-
-def _allowed_ratio(mission: Mission) -> float:
-    """Return the largest log-likelihood ratio that a rival of a claim may have."""
-    return math.log1p(-mission.confidence)
-
-
-def rival_reason(rival: Rival, mission: Mission) -> str:
-    """Return why `rival` blocks a claim."""
-    ratio, allowed = rival.log_likelihood_ratio, _allowed_ratio(mission)
-    return (
-        f"poses {WRONG_SIGMAS:g} sigmas away explain the ranges nearly as well: "
-        f"their log-likelihood ratio is {ratio:.3g}, allowed {allowed:.3g}"
-    )

@@ -16,15 +16,14 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from agent.estimation.fit import Fit, Start, deviation, fits
+from agent.estimation.claim import blocked, of_joint
+from agent.estimation.fit import Start, fits
 from agent.estimation.gaussian.beacon_guesses import beacon_guesses
-from agent.estimation.gaussian.claim_rivals import WRONG_SIGMAS
-from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, EARLY_CLAIM_P_VALUE, chi2_p_value
-from agent.estimation.gaussian.joint_claims import blocking_reason
+from agent.estimation.gaussian.consistency import chi2_p_value
+from agent.estimation.gaussian.inference import covariance_of
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges, PosePrior
 from agent.estimation.gaussian.known_anchors import FEWEST_FOR_POSE, AnchoredRobot, scored_fits, start_of
 from agent.estimation.gaussian.odometry_noise import Errors, Track
-from agent.estimation.gaussian.own_sensors import DOUBTFUL_CLAIM, claim_profiles
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges
 from agent.estimation.posterior import JointHypotheses, JointHypothesis, certainties, with_probability
 from protocol.messages import Ranged
@@ -33,12 +32,6 @@ from protocol.motion import Covariance, Pose, rotated, wrap
 
 FINDER, OWN = 0, 1
 """The places of the two robots in a fit."""
-
-HOLDING = 1e-3
-"""The sigma with which a coordinate of a rival is held, as a fraction of its distance from the claim."""
-
-SMALLEST_EIGENVALUE = 1e-12
-"""The smallest eigenvalue of a covariance that is accepted, as a fraction of its largest one."""
 
 SAME_LEVEL = 0.05
 """The relative change of the noise level below which a fit is not repeated with it."""
@@ -70,15 +63,6 @@ class ContactEstimate(NamedTuple):
     """The first condition for a claim that is not met; empty if all are."""
     p_value: float
     """The p-value of the consistency test of the most probable pose."""
-
-
-def is_definite(covariance: Covariance) -> bool:
-    """Return whether the covariance of a report is positive definite, and can be inverted."""
-    values = np.array(covariance.matrix)
-    if not np.all(np.isfinite(values)):
-        return False
-    least, _, most = np.linalg.eigvalsh(values).tolist()
-    return bool(least > max(SMALLEST_EIGENVALUE * most, SMALLEST_EIGENVALUE**2))
 
 
 def estimated(contact: ContactRanges, mission: Mission) -> ContactEstimate | None:
@@ -166,83 +150,20 @@ def _with_level(measured: JointMeasurements, level: float) -> JointMeasurements:
     return replace(measured, prior=prior._replace(information=level * prior.information))
 
 
-# --- claims -----------------------------------------------------------------------------------------------
-
-
 def _estimate(
     found: Sequence[JointHypothesis], measured: JointMeasurements, mission: Mission
 ) -> ContactEstimate:
-    best = found[0].fit
+    best, joint = found[0].fit, JointHypotheses((FINDER, OWN), tuple(found))
     mine = slice(3 * OWN, 3 * OWN + 3)
-    covariance = best.covariance[mine, mine]
     poses = [one.fit.poses[OWN].tolist() for one in found]
-    p_value = chi2_p_value(best.chi2, best.freedom)
-    xx, xy, xh, yy, yh, hh = [float(covariance[i, j]) for i in range(3) for j in range(i, 3)]
+    reach, certainty = mission.sensing_range, certainties(joint)[OWN]
+    blocking = blocked(
+        of_joint("unanchored", OWN, joint, certainty, measured, reach, mission.accuracy, mission.confidence)
+    )
     return ContactEstimate(
         tuple([Pose(measured.origin[0] + x, measured.origin[1] + y, wrap(turn)) for x, y, turn in poses]),
         tuple([one.probability for one in found]),
-        Covariance(xx, xy, xh, yy, yh, hh),
-        _reason(found, measured, mission),
-        p_value,
+        covariance_of(best.covariance[mine, mine]),
+        blocking.reason if blocking is not None else "",
+        chi2_p_value(best.chi2, best.freedom),
     )
-
-
-def _reason(found: Sequence[JointHypothesis], measured: JointMeasurements, mission: Mission) -> str:
-    """Return the first condition for a claim that is not met: those of pairs and of joint estimates."""
-    joint = JointHypotheses((FINDER, OWN), tuple(found))
-    own = certainties(joint)[OWN]
-    reach, accuracy = mission.sensing_range, mission.accuracy
-    reason = blocking_reason(OWN, joint, own, measured, reach, accuracy, mission.confidence)
-    if reason:
-        return reason
-    best = found[0].fit
-    least = EARLY_CLAIM_P_VALUE if best.freedom < EARLY_FREEDOM else CLAIM_P_VALUE
-    level = max(best.level, 1.0)
-    if chi2_p_value(best.chi2 / level, best.freedom) < least:
-        return (
-            f"the residuals are too large: chi-square {best.chi2:.3g} for {best.freedom} degrees of freedom"
-        )
-    return _rival(best, measured, mission) or _doubt(best, measured)
-
-
-EARLY_FREEDOM = 13
-"""The degrees of freedom below which EARLY_CLAIM_P_VALUE applies: those of 16 ranges, as in pairs."""
-
-
-def _rival(best: Fit, measured: JointMeasurements, mission: Mission) -> str:
-    """Return why poses that would make a claim wrong are likely, or an empty text; see `claim_rivals`.
-
-    They are fits in which the start of this robot is held, to either side along the longest axis.
-    """
-    prior, i = measured.prior, 3 * OWN
-    assert prior is not None
-    variances, axes = np.linalg.eigh(best.covariance[i : i + 2, i : i + 2])
-    along, far = axes[:, 1], WRONG_SIGMAS * deviation(float(np.sum(variances)))
-    information = prior.information.copy()
-    information[i : i + 2, i : i + 2] += np.outer(along, along) / (HOLDING * far) ** 2
-    weights: list[float] = []
-    for offset in (0.0, far, -far):
-        mean = prior.mean.copy()
-        mean[OWN, :2] = best.start.poses[OWN, :2] + offset * along
-        held = replace(measured, prior=PosePrior(mean, information, prior.rank + 1))
-        poses = best.start.poses.copy()
-        poses[OWN, :2] = mean[OWN, :2]
-        found = fits(held, [Start(poses, best.start.errors)])
-        weights += [one.weight for one in found] or [math.inf]
-    ratio = max(weights[1:]) - weights[0] if math.isfinite(weights[0]) else math.inf
-    most = math.log1p(-mission.confidence)
-    if ratio <= most:
-        return ""
-    return (
-        f"poses {WRONG_SIGMAS:g} sigmas away explain the ranges nearly as well: "
-        f"their log-likelihood ratio is {ratio:.3g}, allowed {most:.3g}"
-    )
-
-
-def _doubt(best: Fit, measured: JointMeasurements) -> str:
-    """Return which profile explains the measurements much better than the given noise, or an empty text."""
-    for name, other in claim_profiles(measured.noise):
-        found = fits(replace(measured, noise=other), [Start(best.start.poses)])
-        if any(again.weight - best.weight > DOUBTFUL_CLAIM for again in found):
-            return f"the profile '{name}' explains the ranges and the odometry of both robots better"
-    return ""

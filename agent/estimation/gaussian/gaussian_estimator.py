@@ -7,6 +7,7 @@ from typing import ClassVar
 
 import msgspec
 
+from agent.estimation.claim import Blocked, claim, of_pair
 from agent.estimation.closed_forms import Placement
 from agent.estimation.estimator import AnchorEstimate, Estimator, FittedBranch, PairEstimate
 from agent.estimation.exact import Branch
@@ -64,9 +65,7 @@ class GaussianEstimator(msgspec.Struct, frozen=True):
         del knowledge
         return FittedBranch(branch, 0.0, enough=True)
 
-    def pair(
-        self, knowledge: Knowledge, first_tick: int, required_ranges: int, *, second_range: bool
-    ) -> PairEstimate | None:
+    def pair(self, knowledge: Knowledge, first_tick: int, *, second_range: bool) -> PairEstimate | None:
         """Return the hypotheses from a search of the whole plane with all ranges.
 
         The result is None until a has its second range and the logs of both robots reach the present tick.
@@ -80,15 +79,16 @@ class GaussianEstimator(msgspec.Struct, frozen=True):
             return None
         scored = search(pair)
         hypotheses = inference.pair_planning_hypotheses(scored)
-        belief = inference.with_pair(knowledge, scored, hypotheses, pair, required_ranges)
-        belief = inference.with_convergence_check(belief, scored)
-        belief = inference.with_doubt_check(belief, scored, pair)
-        failure = f"the paper's manoeuvres give no further ranges: {belief.blocking_reason}"
-        verdict: Verdict | None = None
-        if belief.blocking_reason is None:
-            verdict = Localised(belief.poses[0], belief.covariance)
-        elif not scored:
+        judged = of_pair("paper", knowledge.config, scored, pair)
+        found = claim(judged)
+        reason = found.reason if isinstance(found, Blocked) else None
+        verdict: Verdict | None = found if isinstance(found, Localised) else None
+        failure = f"the paper's manoeuvres give no further ranges: {reason}"
+        if not scored:
             verdict = Undecided(failure)
+        belief = inference.with_pair(
+            knowledge, scored, hypotheses, pair, judged and judged.inconsistency, reason
+        )
         placements = tuple([_pose_in_b_frame(one) for one in hypotheses])
         return PairEstimate(
             belief, verdict, placements, ORIGIN, ORIGIN, checked=False, observations=(), failure=failure

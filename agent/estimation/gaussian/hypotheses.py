@@ -17,6 +17,7 @@ import numpy as np
 from agent.estimation.fit import Fit, Start, fits, without_outliers
 from agent.estimation.gauss_newton import Convergence
 from agent.estimation.gaussian.anchor_guesses import MOST_FOLLOWED, SEED_RANGES, UNLIKELY, anchors
+from agent.estimation.gaussian.consistency import FINISHED
 from agent.estimation.gaussian.detections import anchor_log_likelihood, detection_log_likelihood
 from agent.estimation.gaussian.odometry_noise import Array, Errors, Places, Track
 from agent.estimation.gaussian.pair_ranges import PairRanges, alone
@@ -245,6 +246,21 @@ def follow(before: tuple[Hypothesis, ...], pair: PairRanges) -> tuple[ScoredHypo
     """Return the hypotheses that follow from those of the previous tick, `before`."""
     starts = [one.start for one in before]
     return _scored(fits(pair.measured, starts, Convergence(WARM_STEPS)), pair)
+
+
+def settled(before: tuple[Hypothesis, ...], pair: PairRanges) -> tuple[ScoredHypothesis, ...]:
+    """Return the hypotheses that follow from those of some time ago: until the likeliest has converged."""
+    scored: tuple[ScoredHypothesis, ...] = ()
+    for _ in range(MOST_FITS):
+        scored = follow(before, pair)
+        before = tuple([one.hypothesis for one in scored])
+        if not scored or scored[0].fit.last_step <= FINISHED:
+            break
+    return scored
+
+
+MOST_FITS = 4
+"""The most fits in a tick: after a long way, the steps of one do not suffice to correct the path."""
 
 
 def _scored(found: Sequence[Fit], pair: PairRanges) -> tuple[ScoredHypothesis, ...]:

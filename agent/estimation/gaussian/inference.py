@@ -8,45 +8,37 @@ from collections.abc import Sequence
 from functools import lru_cache
 from itertools import pairwise
 from operator import attrgetter
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from msgspec.structs import replace
 
 from agent.estimation.exact import Branch
 from agent.estimation.fit import Fit, deviation
-from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, Inconsistency, consistency_test
-from agent.estimation.gaussian.evidence import anchor_evidence, mutual_evidence
+from agent.estimation.gaussian.consistency import Inconsistency
+from agent.estimation.gaussian.evidence import anchor_evidence
 from agent.estimation.gaussian.hypotheses import ScoredHypothesis, missing, of_anchor
 from agent.estimation.gaussian.odometry_noise import Array, Track, track, variances
-from agent.estimation.gaussian.own_sensors import DOUBTFUL_CLAIMS, Doubt, claim_doubt, doubt
+from agent.estimation.gaussian.own_sensors import Doubt, doubt
 from agent.estimation.gaussian.pair_ranges import PairRanges
 from agent.estimation.gaussian.placement_guesses import STARTS
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges
 from agent.estimation.knowledge import Belief, Knowledge
 from agent.peer.motion_log import MotionLog
-from protocol.messages import RobotConfig
-from protocol.mission import HEADING_ACCURACY, Mission
+from protocol.messages import Localised
+from protocol.mission import Mission
 from protocol.motion import Covariance, Pose, Segment, compose, inverse, relative, wrap
-from protocol.noise import Noise, VelocityNoise
+from protocol.noise import VelocityNoise
 
 
-class PlanningHypothesis(NamedTuple):
-    """A hypothesis in the form that planning needs."""
+class PlanningHypothesis(msgspec.Struct, frozen=True, eq=False):
+    """A hypothesis in the form that planning needs. What follows from one is computed once."""
 
     probability: float
     poses: Array
     """The poses in m and rad: (3,) of one robot relative to its anchor, or (6,) of a and b relative to M1."""
     covariance: Array
     """The covariance of the anchor's position, (2, 2), or of both poses, (6, 6)."""
-
-    def __hash__(self) -> int:
-        """Return the hash of this object."""
-        return id(self)
-
-    def __eq__(self, other: object) -> bool:
-        """Return whether `other` is this hypothesis itself: what follows from one is computed once."""
-        return self is other
 
 
 def beginning(knowledge: Knowledge, through: int) -> int:
@@ -267,13 +259,6 @@ Set on the sweep `noise`. With sigmas of R / 30 and more, ranges give little evi
 many of them. With fewer, wrong branches reach phase 3, which takes longer; with more, phase 1 takes longer.
 """
 
-MUTUAL_RANGES, MUTUAL_RANGES_WITH_OUTLIERS = 8, 12
-"""The numbers of mutual ranges from different places with which a claim needs no evidence against chance.
-
-Set on the sweep `noise`, in which 1 of 30 000 missions was wrong. With sigmas of R / 30 and more, evidence
-would need 11. With fewer ranges, claims are too often wrong; with more, each mission takes longer.
-"""
-
 
 def known_through(knowledge: Knowledge) -> int:
     """Return the last tick that both logs cover."""
@@ -324,158 +309,52 @@ def _pair_planning_hypothesis(probability: float, one: Fit) -> PlanningHypothesi
     return PlanningHypothesis(probability, one.poses.ravel(), one.covariance)
 
 
-def blocking_reason_for(
-    scored: Sequence[ScoredHypothesis],
-    hypotheses: Sequence[PlanningHypothesis],
-    inconsistency: Inconsistency | None,
-    pair: PairRanges,
-    config: RobotConfig,
-) -> str | None:
-    """Return the first condition for a claim that is not met, or None; there are enough mutual ranges."""
-    mission = config.mission
-    if inconsistency is None:
-        return "no hypothesis explains the ranges"
-    probability = scored[0].hypothesis.probability
-    if probability < mission.confidence:
-        return (
-            f"the most probable of {len(scored)} hypotheses has probability {probability:.6f}, "
-            f"required {mission.confidence:g}"
-        )
-    if not inconsistency.p_value >= CLAIM_P_VALUE:
-        return f"the most probable hypothesis fails the consistency test: {inconsistency.what}"
-    _, covariance = to_second_order(hypotheses[0], pair.apart)
-    ids = (config.robot, config.peer) if config.role == "a" else (config.peer, config.robot)
-    of_heading = config.heading_accuracy if len(pair.places) < ENOUGH_FOR_HEADING else HEADING_ACCURACY
-    for i, robot in zip((0, 3), ids, strict=True):
-        position = deviation(covariance[i, i] + covariance[i + 1, i + 1])
-        if not position <= mission.accuracy:
-            return f"the sigma of {robot}'s position is {position:.3g} m, required {mission.accuracy:g}"
-        heading = deviation(covariance[i + 2, i + 2])
-        required = of_heading if robot == config.robot else HEADING_ACCURACY
-        if not heading <= required:
-            return f"the sigma of {robot}'s heading is {heading:.3g} rad, required {required:.3g}"
-    return None
-
-
-ENOUGH_FOR_HEADING = 20
-"""The number of mutual ranges from different places after which HEADING_ACCURACY suffices for a claim.
-
-More ranges may not make the heading more accurate: then the robot searches longer at the end of its way.
-"""
-
-
-def sufficient_mutual_ranges(noise: Noise) -> int:
-    """Return the number of mutual ranges from different places from which on evidence is not required.
-
-    Without evidence, a claim needs as many. With fewer, no suspicion of the peer counts either: the tests of
-    a few ranges repeat each other.
-    """
-    return MUTUAL_RANGES_WITH_OUTLIERS if noise.outliers else MUTUAL_RANGES
-
-
-def with_evidence_check(
-    belief: Belief, scored: Sequence[ScoredHypothesis], pair: PairRanges, mission: Mission
-) -> Belief:
-    """Return `belief` with a blocking reason if the mutual ranges may agree by chance.
-
-    A few noisy ranges do; three exact ones do not. The probability that they do must be at most
-    1 - confidence, if both are equally probable before. MUTUAL_RANGES suffice in any case. With outliers, a
-    claim needs that number: agreement of a few ranges among which one is an outlier is not chance.
-    """
-    if belief.blocking_reason is not None or len(pair.places) >= sufficient_mutual_ranges(mission.noise):
-        return belief
-    evidence, required = mutual_evidence(scored[0].fit, pair), -math.log1p(-mission.confidence)
-    if evidence >= required:
-        return belief
-    return replace(
-        belief,
-        blocking_reason=(
-            f"the mutual ranges may agree by chance: the log evidence against it is {evidence:.3g}, "
-            f"required {required:.3g}"
-        ),
-    )
-
-
-def with_convergence_check(belief: Belief, scored: Sequence[ScoredHypothesis]) -> Belief:
-    """Return `belief` with a blocking reason if the fit of the most probable hypothesis has not converged."""
-    if belief.blocking_reason is not None or scored[0].fit.last_step <= FINISHED:
-        return belief
-    blocking_reason = (
-        f"the fit of the most probable hypothesis has not converged: its last step is "
-        f"{scored[0].fit.last_step:.3g} sigmas"
-    )
-    return replace(belief, blocking_reason=blocking_reason)
-
-
-def with_doubt_check(belief: Belief, scored: Sequence[ScoredHypothesis], pair: PairRanges) -> Belief:
-    """Return `belief` with a blocking reason if a profile contradicts the claim that would follow.
-
-    The profile explains the ranges of both robots much better. After DOUBTFUL_CLAIMS such claims, more ranges
-    have not helped, and `belief.doubtful_claims` says so.
-    """
-    if belief.blocking_reason is not None:
-        return belief
-    found = claim_doubt(scored[0].fit, pair)
-    if found is None:
-        return replace(belief, doubtful_claims=0)
-    return replace(belief, blocking_reason=found.reason, doubtful_claims=belief.doubtful_claims + 1)
-
-
-def ends_in_doubt(belief: Belief) -> bool:
-    """Return whether a robot gives up because a profile contradicts all of its latest claims."""
-    return belief.doubtful_claims >= DOUBTFUL_CLAIMS
-
-
 def with_pair(
     knowledge: Knowledge,
     scored: Sequence[ScoredHypothesis],
     hypotheses: Sequence[PlanningHypothesis],
     pair: PairRanges,
-    mutual: int,
+    inconsistency: Inconsistency | None,
+    blocking_reason: str | None,
 ) -> Belief:
     """Return the belief with the hypotheses `scored` about both robots' poses in <W>.
 
-    `hypotheses` contains the same in the form that planning needs. A claim needs `mutual` mutual
-    ranges from different places.
+    `hypotheses` contains the same in the form that planning needs. The others are what follows from the
+    first one for a claim: the result of its consistency test, and what blocks the claim.
     """
     config = knowledge.config
     robot, m1 = 0 if config.role == "a" else 1, config.m1
-    enough = len(pair.places) >= mutual
-    inconsistency = consistency_test(scored[0].fit, pair, robot) if enough and scored else None
-    blocking_reason = blocking_reason_for(scored, hypotheses, inconsistency, pair, config)
-    claims = [claim(one, robot, pair) for one in hypotheses]
+    claims = [localised(to_second_order(one, pair.apart), robot, (m1.x, m1.y)) for one in hypotheses]
     first, _ = knowledge.belief.candidates or (len(scored), 0)
     return replace(
         knowledge.belief,
         pair=tuple(one.hypothesis for one in scored),
-        poses=tuple(Pose(m1.x + pose.x, m1.y + pose.y, pose.heading) for pose, _ in claims),
+        poses=tuple([one.pose for one in claims]),
         odometry=knowledge.odometry,
-        covariance=claims[0][1] if claims else None,
+        covariance=claims[0].covariance if claims else None,
         candidates=(first, len(scored)),
         inconsistency=inconsistency,
-        blocking_reason=blocking_reason
-        if enough
-        else f"{len(pair.places)} of {mutual} required mutual ranges",
+        blocking_reason=blocking_reason,
     )
 
 
-def claim(hypothesis: PlanningHypothesis, robot: int, pair: PairRanges) -> tuple[Pose, Covariance]:
-    """Return the mean and the covariance of one robot's pose relative to M1.
-
-    Ranges confine a robot to an arc, so both are computed to second order (see `to_second_order`).
-    """
-    mean, covariance = to_second_order(hypothesis, pair.apart)
-    i = 3 * robot
-    x, y, heading = mean[i : i + 3].tolist()
-    block = covariance[i : i + 3, i : i + 3]
-    return Pose(x, y, wrap(heading)), Covariance(
-        *[float(block[j, k]) for j, k in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))]
+def localised(hypothesis: PlanningHypothesis, robot: int, origin: tuple[float, float]) -> Localised:
+    """Return the pose of a robot in <W> and its covariance; `hypothesis` is relative to `origin` (m)."""
+    own = slice(3 * robot, 3 * robot + 3)
+    x, y, heading = hypothesis.poses[own].tolist()
+    return Localised(
+        Pose(origin[0] + x, origin[1] + y, wrap(heading)), covariance_of(hypothesis.covariance[own, own])
     )
+
+
+def covariance_of(matrix: Array) -> Covariance:
+    """Return a covariance of x, y (m) and heading (rad), (3, 3), as messages have it."""
+    return Covariance(*matrix[np.triu_indices(3)].tolist())
 
 
 @lru_cache(maxsize=STARTS)
-def to_second_order(hypothesis: PlanningHypothesis, m2: tuple[float, float]) -> tuple[Array, Array]:
-    """Return the mean and the covariance of both poses, if ranges and bearings are Gaussian.
+def to_second_order(hypothesis: PlanningHypothesis, m2: tuple[float, float]) -> PlanningHypothesis:
+    """Return `hypothesis` with the mean and covariance of both poses if ranges and bearings are Gaussian.
 
     These are the range and the bearing of b from M2, and those of a from b.
 
@@ -506,7 +385,7 @@ def to_second_order(hypothesis: PlanningHypothesis, m2: tuple[float, float]) -> 
     scaled_curvature = second @ polar
     mean += 0.5 * np.trace(scaled_curvature, axis1=1, axis2=2)
     covariance = covariance + 0.5 * np.einsum("iab,jba->ij", scaled_curvature, scaled_curvature)
-    return mean, covariance
+    return PlanningHypothesis(hypothesis.probability, mean, covariance)
 
 
 def _limited(polar: Array) -> Array:

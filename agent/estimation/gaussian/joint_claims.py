@@ -1,4 +1,4 @@
-"""The conditions for the claim of a robot among n, and the reasons why a robot has no pose."""
+"""The ranges that determine the pose of a robot among n, and the reasons why a robot has no pose."""
 
 from __future__ import annotations
 
@@ -6,44 +6,14 @@ import math
 
 import numpy as np
 
-from agent.estimation.fit import deviation
-from agent.estimation.gaussian.inference import sufficient_mutual_ranges
+from agent.estimation.fit import Fit, deviation
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.joint_search import FEWEST_DECISIVE, beacons
-from agent.estimation.gaussian.known_anchors import unsound_fit
 from agent.estimation.gaussian.odometry_noise import Places
 from agent.estimation.gaussian.pair_ranges import MOVED
-from agent.estimation.posterior import Certainty, JointHypotheses
 
 OPEN = 0.5
 """The sigma of a position from which on a robot has no pose, as a fraction of the longest range."""
-
-
-def blocking_reason(
-    robot: int,
-    found: JointHypotheses,
-    certainty: Certainty,
-    used: JointMeasurements,
-    reach: float,
-    accuracy: float,
-    sure: float,
-) -> str:
-    """Return the first condition for a claim of the robot that is not met, or an empty text.
-
-    `robot` is its place among those that are located, and `used` are the measurements of these. The
-    conditions are those of other estimates: enough ranges from different places, the probability `sure`, a
-    fit that has converged, its consistency, and the `accuracy` (m) of the position.
-    """
-    fit, ranges = found.scored[0].fit, used.ranges
-    required = sufficient_mutual_ranges(used.noise)
-    count = decisive_ranges(robot, used, reach)
-    if count < required:
-        return f"{count} of {required} required ranges from different places"
-    if certainty.probability < sure:
-        many = f"the most probable of {certainty.poses} poses"
-        return f"{many} has probability {certainty.probability:.6f}, required {sure:g}"
-    own = slice(3 * robot, 3 * robot + 3)
-    return unsound_fit(fit, np.flatnonzero(ranges.of(robot)), fit.covariance[own, own], accuracy)
 
 
 def decisive_ranges(robot: int, used: JointMeasurements, reach: float) -> int:
@@ -93,10 +63,10 @@ def undetermined(robot: int, located: tuple[int, ...], measured: JointMeasuremen
     return "too few of its ranges are from different places, or no pose explains them"
 
 
-def open_position(robot: int, found: JointHypotheses, reach: float) -> str:
+def open_position(robot: int, fit: Fit, reach: float) -> str:
     """Return why a located robot has no pose: its ranges leave its position open; else an empty text."""
-    covariance = found.scored[0].fit.covariance
-    sigma = deviation(float(covariance[3 * robot, 3 * robot] + covariance[3 * robot + 1, 3 * robot + 1]))
+    own = np.diagonal(fit.covariance)[3 * robot : 3 * robot + 2]
+    sigma = deviation(float(own[0] + own[1]))
     if sigma <= OPEN * reach:
         return ""
     how = f"to a sigma of {sigma:.3g} m" if math.isfinite(sigma) else "without a bound"

@@ -12,15 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.fit import Fit, Start, deviation, fits
-from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, FINISHED, HIGHEST_LEVEL, chi2_p_value
+from agent.estimation.fit import Start, fits
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges
-from agent.estimation.gaussian.noise_level import INLIER
 from agent.estimation.gaussian.odometry_noise import Array, Places, Track
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges, mixture
 from agent.estimation.posterior import JointHypothesis, with_probability
 from agent.estimation.smoother import SMALLEST_DISTANCE
-from protocol.mission import HEADING_ACCURACY
 from protocol.motion import rotated, rotated_back
 from protocol.noise import Noise
 
@@ -44,9 +41,6 @@ APART, TURNED = 0.05, 0.2
 
 FEWEST_FOR_POSE = 4
 """The least number of ranges for hypotheses: there are three unknowns, and one range checks them."""
-
-LARGEST_STRAY_SHARE = 0.15
-"""The largest fraction of ranges that may be strays, in addition to the outliers that were told."""
 
 
 class AnchoredRobot(NamedTuple):
@@ -161,26 +155,3 @@ def _distinct(guesses: Array, likely: Array, last: Array, longest: float) -> lis
         far = np.hypot(*(ends[left] - ends[best]).T) > APART * longest
         left = left[far | (np.abs(turn) > TURNED)]
     return chosen
-
-
-def unsound_fit(fit: Fit, own: Places, covariance: Array, accuracy: float) -> str:
-    """Return why a robot may not claim its pose by `fit`, whatever its probability, or an empty text.
-
-    The fit has to converge and to be consistent, and the position needs the `accuracy` (m). `own` are the
-    ranges of the robot, and `covariance` is that of its pose, (3, 3).
-    """
-    if fit.last_step > FINISHED:
-        return "the fit of the most probable hypothesis has not converged"
-    free = fit.freedom
-    if chi2_p_value(fit.chi2 / HIGHEST_LEVEL, free) < CLAIM_P_VALUE:
-        return f"the residuals are too large: chi-square {fit.chi2:.3g} for {free} degrees of freedom"
-    total, strays = len(own), int(np.count_nonzero(fit.weights[own] <= INLIER))
-    if strays > (LARGEST_STRAY_SHARE + fit.problem.noise.outliers) * total:
-        return f"{strays} of {total} ranges fit no other"
-    position = deviation(float(covariance[0, 0] + covariance[1, 1]))
-    if not position <= accuracy:
-        return f"the sigma of the position is {position:.3g} m, required {accuracy:g}"
-    heading = deviation(float(covariance[2, 2]))
-    if not heading <= HEADING_ACCURACY:
-        return f"the sigma of the heading is {heading:.3g} rad, required {HEADING_ACCURACY:g}"
-    return ""

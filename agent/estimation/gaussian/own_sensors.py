@@ -71,19 +71,18 @@ class Doubt(NamedTuple):
     how: str
     """The words for how much better the profile explains them."""
 
-    @property
-    def reason(self) -> str:
-        """Return the reason for the verdict Undecided."""
+    def reason(self, option: str = 'noise = "{}"') -> str:
+        """Return the reason against a claim; `option` is how a user states a profile."""
         return (
-            f"{self.what} contradict mission.noise; the profile '{self.profile}' explains them {self.how}: "
-            f'try noise = "{self.profile}", or calibrate the sensors'
+            f"{self.what} contradict the assumed noise; the profile '{self.profile}' explains them "
+            f"{self.how}: try {option.format(self.profile)}, or calibrate the sensors"
         )
 
 
 OWN_SENSORS = "the own ranges to the anchor and the own odometry"
 """The measurements that do not depend on the peer, and those of a single robot."""
 
-BOTH = "the ranges and the odometry of both robots"
+ALL = "the ranges and the odometry"
 """All measurements."""
 
 
@@ -112,26 +111,22 @@ def doubt(
         return found
     possible = [name for name in others if others[name] > NOT_AGAINST]
     return next(
-        (Doubt(BOTH, name, "without a contradiction") for name in possible if _explains(name, pair, robot)),
+        (Doubt(ALL, name, "without a contradiction") for name in possible if _explains(name, pair, robot)),
         None,
     )
 
 
 @lru_cache(maxsize=2)
-def claim_doubt(fitted: Fit, pair: PairRanges) -> Doubt | None:
-    """Return the `contradiction` of the fit of a pair that would be claimed."""
-    return contradiction(fitted, pair.measured, BOTH)
+def contradiction(fitted: Fit, measured: JointMeasurements) -> Doubt | None:
+    """Return the profile that explains what was `measured` much better than the told noise.
 
-
-def contradiction(fitted: Fit, measured: JointMeasurements, what: str) -> Doubt | None:
-    """Return the profile that explains the ranges in `measured` much better than the told noise.
-
-    `fitted` is the fit to them that would be claimed; `what` names them. Only constant errors are compared:
-    slow ones and strays do not move a pose by more than the noise level that robots learn.
+    `fitted` is the fit to it that would be claimed. Only constant errors are compared: slow ones and strays
+    do not move a pose by more than the noise level that robots learn.
     """
     noise = measured.noise
     others = {}
-    for name, other in claim_profiles(noise):
+    for name in _others(noise):
+        other = replace(_profile(name, noise), slow_sigma=noise.slow_sigma, strays=noise.strays)
         errors = tuple([rescaled(one, noise, other) for one in fitted.start.errors])
         start, again = Start(fitted.start.poses, errors), replace(measured, noise=other)
         for steps in (0, FIT_STEPS):
@@ -139,15 +134,7 @@ def contradiction(fitted: Fit, measured: JointMeasurements, what: str) -> Doubt 
             others[name] = max(found, default=-math.inf) - fitted.weight
             if others[name] < DOUBTFUL_CLAIM - ONE_MODEL_ERROR:
                 break
-    return _best(what, others, DOUBTFUL_CLAIM)
-
-
-def claim_profiles(noise: Noise) -> list[tuple[ProfileName, Noise]]:
-    """Return the profiles with which a claim is compared, with the slow errors and strays of `noise`."""
-    return [
-        (name, replace(_profile(name, noise), slow_sigma=noise.slow_sigma, strays=noise.strays))
-        for name in _others(noise)
-    ]
+    return _best(ALL, others, DOUBTFUL_CLAIM)
 
 
 def _explains(name: ProfileName, pair: PairRanges, robot: int) -> bool:

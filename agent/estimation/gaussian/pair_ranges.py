@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import msgspec
 import numpy as np
@@ -81,17 +81,23 @@ class PairRanges(msgspec.Struct, frozen=True, eq=False, dict=True):
         """The places (m) of M1 and M2 relative to M1."""
         return (0.0, 0.0), self.apart
 
-    @cached_property
+    @property
     def measured(self) -> JointMeasurements:
         """All measurements for a fit; M1 is the origin."""
-        ranges, kind = self.ranges, np.repeat(np.arange(3), self.ranges.counts)
-        place = np.zeros((len(kind), 2))
-        place[kind == 1] = self.apart
-        second = np.where(kind == 2, 1, -1)
-        own = JointRanges(ranges.rho, ranges.tick, ranges.sigma, kind % 2, second, place, kind)
-        period = self.paths[0].period
-        return JointMeasurements(("a", "b"), (), (), self.paths, own, period, (0.0, 0.0), self.noise)
+        return _measured(self)
 
     def of(self, robot: int) -> JointMeasurements:
         """Return the path of one robot (0 or 1) and its ranges to its own anchor alone."""
         return alone(self.paths[robot], self.ranges.only(robot), self.noise)
+
+
+@lru_cache(maxsize=4)
+def _measured(pair: PairRanges) -> JointMeasurements:
+    """Return the measurements for a fit: the same object for both robots, whose claims have the same fits."""
+    ranges, kind = pair.ranges, np.repeat(np.arange(3), pair.ranges.counts)
+    place = np.zeros((len(kind), 2))
+    place[kind == 1] = pair.apart
+    second = np.where(kind == 2, 1, -1)
+    own = JointRanges(ranges.rho, ranges.tick, ranges.sigma, kind % 2, second, place, kind)
+    period = pair.paths[0].period
+    return JointMeasurements(("a", "b"), (), (), pair.paths, own, period, (0.0, 0.0), pair.noise)

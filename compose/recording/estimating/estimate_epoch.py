@@ -9,7 +9,6 @@ import numpy as np
 
 from agent.estimation.fit import Fit
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
-from agent.estimation.gaussian.own_sensors import contradiction
 from agent.estimation.posterior import Certainty
 from compose.recording.estimating.prepared_steps import OneRobot
 from compose.recording.ranging.range_recording import Numbers
@@ -82,20 +81,6 @@ class ClaimRule(NamedTuple):
     """The largest sigma of the position in m: the root of the trace of its covariance."""
     confidence: float = 0.9999
     """The least probability of the hypothesis."""
-
-
-def doubted(fit: Fit, measured: JointMeasurements) -> str:
-    """Return which profile explains what was `measured` much better than the assumed noise, or an empty text.
-
-    `fit` is the fit to it that would be claimed.
-    """
-    found = contradiction(fit, measured, "the ranges and the odometry")
-    if found is None:
-        return ""
-    return (
-        f"{found.what} contradict the assumed noise; the profile '{found.profile}' explains them "
-        f"{found.how}: try --noise {found.profile}, or calibrate the radios"
-    )
 
 
 def of_centres(

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from agent.estimation.claim import blocked, of_joint
 from agent.estimation.gauss_newton import FIT_STEPS
 from agent.estimation.gaussian.consistency import FINISHED
-from agent.estimation.gaussian.joint_claims import blocking_reason, open_position, undetermined
+from agent.estimation.gaussian.joint_claims import open_position, undetermined
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.joint_search import candidates, extended, follow, merged, search
 from agent.estimation.posterior import NO_HYPOTHESES, Certainty, JointHypotheses, JointHypothesis, certainties
@@ -17,7 +18,6 @@ from compose.recording.estimating.estimate_epoch import (
     EpochFit,
     EstimateEpoch,
     PosesHypothesis,
-    doubted,
     of_centres,
 )
 from compose.recording.estimating.prepared_steps import Measurements
@@ -86,13 +86,10 @@ class GroupEstimator:
         """Return what blocks the claim of each located robot; an empty text if nothing does."""
         part, rule, reasons = used.some(found.located), self._rule, {}
         for i, certainty in enumerate(certainties(found)):
-            reasons[part.robots[i]] = open_position(i, found, reach) or blocking_reason(
-                i, found, certainty, part, reach, rule.accuracy, rule.confidence
-            )
-        if "" not in reasons.values():
-            return reasons
-        doubt = doubted(found.scored[0].fit, part)
-        return {name: reason or doubt for name, reason in reasons.items()}
+            judged = of_joint("recording", i, found, certainty, part, reach, rule.accuracy, rule.confidence)
+            blocking = blocked(judged)
+            reasons[part.robots[i]] = blocking.reason if blocking is not None else ""
+        return reasons
 
 
 def _epoch(
@@ -107,7 +104,7 @@ def _epoch(
     part = used.some(found.located)
     place = {used.robots[robot]: i for i, robot in enumerate(found.located)}
     without = {
-        name: open_position(place[name], found, reach)
+        name: open_position(place[name], found.scored[0].fit, reach)
         if name in place
         else undetermined(used.robots.index(name), found.located, used)
         for name in names
