@@ -273,6 +273,8 @@ def rows_to_make(raw: Path | None) -> list[tuple[str, Change, str, float]]:
         if raw is not None:
             rows.append(("raw radios", partial(with_raw_errors, raw=raw), "uwb", accuracy))
     rows += [("+0.35 m", bias, OTHERS, 0.3), ("x 1.07", scale, OTHERS, 0.3)]
+    if raw is not None:
+        rows.append(("raw radios", partial(with_raw_errors, raw=raw), OTHERS, 0.3))
     return rows
 
 

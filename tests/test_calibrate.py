@@ -143,11 +143,22 @@ def test_a_profile_of_other_radios_has_their_mean_bias_and_its_spread(raw: Range
     correction, table = correction_of(of_pairs), noise_table(of_pairs, frozenset({"LC0", "LC1"}))
     biases = [one.bias for one in of_pairs.pairs.values()]
     assert correction.range_bias == pytest.approx(np.mean(biases), abs=1e-3)
-    assert table["pair_bias"] == pytest.approx(np.std(biases, ddof=1), abs=1e-3)
+    assert table["pair_bias"] == pytest.approx(np.sqrt((np.var(biases) * 3 + 0.1**2) / 3), abs=1e-3)
     unknown = replace(correction, pairs={}).corrected(raw).ranges.range
     np.testing.assert_allclose(
         raw.ranges.range - unknown, correction.range_bias + correction.range_scale * raw.ranges.range
     )
+
+
+def test_the_scales_of_pairs_that_differ_widen_the_prior_of_the_scale(sample: RangeRecording) -> None:
+    lengths = sample.ranges.range.copy()
+    for share, rows in zip((0.0, 0.08, 0.16), sample.pairs().values(), strict=True):
+        lengths[rows] *= 1.0 + share
+    alike, unlike = calibrated(sample, None, None), calibrated(with_ranges(sample, lengths), None, None)
+    assert alike.scale_spread < 0.01
+    assert unlike.scale_spread == pytest.approx(np.std([0.0, 0.08, 0.16], ddof=1), abs=0.04)
+    priors = [noise_table(one, frozenset({"LC0", "LC1"}))["range_scale"] for one in (alike, unlike)]
+    assert priors[0] < 0.01 < unlike.scale_spread <= priors[1]
 
 
 @pytest.mark.long

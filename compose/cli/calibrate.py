@@ -94,4 +94,5 @@ def _lines(found: RangeCalibration) -> list[str]:
         alike = "the distances of each pair are too much alike to tell a scale from a bias"
         return [*shown(("radios",), right, rows), f"no common scale: {alike}; against {found.source}"]
     common = f"common scale {100.0 * found.scale:+.2f} % +- {100.0 * found.scale_sigma:.2f} %"
+    common += f", from which those of pairs differ by {100.0 * found.scale_spread:.1f} %"
     return [*shown(("radios",), right, rows), f"{common}; against {found.source}"]

@@ -23,8 +23,8 @@ than a long recording tells."""
 DIGITS = 4
 """The decimals of numbers in the file."""
 
-UNKNOWN_SPREAD: ProfileName = "uwb"
-"""The profile with the spread of the pairs' biases where a single pair does not tell it."""
+UNCALIBRATED: ProfileName = "uwb"
+"""The profile with the spread of the biases of pairs that counts as one pair more."""
 
 WHEELS: ProfileName = "uwb-calibrated"
 """The profile with the priors of odometry, which a calibration of radios does not change."""
@@ -44,7 +44,7 @@ def noise_table(calibration: RangeCalibration, anchors: frozenset[str]) -> dict[
     mutual = [one for pair, one in pairs.items() if anchors.isdisjoint(pair)]
     slow = _root_mean_square([one.slow_sigma for one in pairs.values()])
     biases = [one.bias for one in pairs.values()]
-    spread = float(np.std(biases, ddof=1)) if len(biases) > 1 else PROFILES[UNKNOWN_SPREAD]["pair_bias"]
+    spread = _spread(biases, PROFILES[UNCALIBRATED]["pair_bias"])
     outliers = sum([one.outliers * one.ranges for one in pairs.values()]) / sum(
         [one.ranges for one in pairs.values()]
     )
@@ -53,7 +53,7 @@ def noise_table(calibration: RangeCalibration, anchors: frozenset[str]) -> dict[
         "mutual_sigma": _white(mutual or to_anchor, slow),
         "range_bias": max(spread / math.sqrt(len(biases)), LEAST_BIAS, calibration.bias_sigma),
         "pair_bias": max(spread, LEAST_BIAS),
-        "range_scale": max(calibration.scale_sigma, LEAST_SCALE),
+        "range_scale": max(math.hypot(calibration.scale_sigma, calibration.scale_spread), LEAST_SCALE),
         "slow_sigma": slow,
         "slow_time": SLOW_TIME_S,
         "wheel_scale": PROFILES[WHEELS]["wheel_scale"],
@@ -65,6 +65,14 @@ def noise_table(calibration: RangeCalibration, anchors: frozenset[str]) -> dict[
 
 LARGEST_OUTLIER_SHARE = 0.5
 """The largest fraction of outliers for which a profile is written."""
+
+
+def _spread(values: list[float], usual: float) -> float:
+    """Return the standard deviation of `values` from their mean, with one more value off by `usual`.
+
+    Of two or three values, it may be small by chance.
+    """
+    return math.sqrt(float(np.var(values)) + usual**2 / len(values))
 
 
 def _root_mean_square(values: list[float]) -> float:

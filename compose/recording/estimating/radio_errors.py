@@ -49,6 +49,8 @@ class RadioErrors(NamedTuple):
     """The standard deviation in m."""
     scale: float | None
     """The relative error by this pair alone; None if its ranges are too similar to tell."""
+    scale_sigma: float
+    """The standard deviation of that; 0 if it is not told."""
     sigma: float
     """The standard deviation in m of the errors without outliers."""
     slow_sigma: float
@@ -70,6 +72,8 @@ class RangeCalibration(NamedTuple):
     """The reference: the truth, or the fit."""
     bias_sigma: float = 0.0
     """The standard deviation (m) of what all biases have in common, if it is more than the lines tell."""
+    scale_spread: float = 0.0
+    """The standard deviation of the scales of pairs about the common one, beyond what noise explains."""
     scale_told: bool = True
     """False if the distances of each pair are too much alike to tell a scale from a bias: it is 0 then."""
 
@@ -144,12 +148,19 @@ def range_calibration(errors: Mapping[tuple[str, str], PairErrors], source: str)
             int(np.count_nonzero(own)),
             float(found[i]),
             math.sqrt(covariance[i, i]),
-            _own_scale(reference[inliers], error[inliers]),
+            *_own_scale(reference[inliers], error[inliers], repeated[i]),
             float(np.std(off[inliers])),
             _slow_sigma(errors[name].t[good[own]], off[inliers]),
             1.0 - float(np.count_nonzero(inliers)) / float(np.count_nonzero(own)),
         )
-    return RangeCalibration(pairs, float(found[-1]), math.sqrt(covariance[-1, -1]), source, scale_told=told)
+    return RangeCalibration(
+        pairs,
+        float(found[-1]),
+        math.sqrt(covariance[-1, -1]),
+        source,
+        scale_spread=_scale_spread(list(pairs.values()), float(found[-1])),
+        scale_told=told,
+    )
 
 
 def _lines(
@@ -224,11 +235,23 @@ LEAST_RANGE_SIGMA = 1e-4
 """The least sigma of ranges in m."""
 
 
-def _own_scale(reference: Numbers, error: Numbers) -> float | None:
+def _own_scale(reference: Numbers, error: Numbers, repeated: float) -> tuple[float | None, float]:
+    """Return the scale of one pair by its own line, and its standard deviation; None and 0 if not told."""
     if np.std(reference) < LEAST_SPREAD:
-        return None
-    slope = float(np.polyfit(reference, error, 1)[0])
-    return slope / (1.0 + slope)
+        return None, 0.0
+    slope, bias = np.polyfit(reference, error, 1).tolist()
+    off = error - bias - slope * reference
+    variance = float(np.var(off)) * repeated / (len(off) * float(np.var(reference)))
+    return slope / (1.0 + slope), math.sqrt(variance)
+
+
+def _scale_spread(pairs: list[RadioErrors], common: float) -> float:
+    """Return the standard deviation of the scales of `pairs` about the common one, beyond their noise.
+
+    It is 0 if fewer than two tell theirs.
+    """
+    scales = [(one.scale - common) ** 2 - one.scale_sigma**2 for one in pairs if one.scale is not None]
+    return math.sqrt(max(sum(scales) / (len(scales) - 1), 0.0)) if len(scales) > 1 else 0.0
 
 
 def _slow_sigma(t: Numbers, off: Numbers) -> float:
