@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 import msgspec
@@ -70,6 +72,29 @@ def test_a_stray_range_changes_neither_bias_nor_scale(stray: float, sample: Rang
     for pair, one in expected.pairs.items():
         assert found.pairs[pair].bias == pytest.approx(one.bias, abs=1e-2)
         assert found.pairs[pair].sigma == pytest.approx(one.sigma, abs=1e-2)
+
+
+def with_seldom_truth(sample: RangeRecording, spacing_s: float) -> RangeRecording:
+    """Return the sample with true poses at least `spacing_s` apart."""
+    robots = []
+    for one in sample.robots:
+        assert one.truth is not None
+        number = (one.truth.t - one.truth.t[0]) // spacing_s
+        kept = np.insert(np.diff(number) > 0.0, 0, True)
+        robots.append(one._replace(truth=TruePath(one.truth.t[kept], one.truth.poses[kept])))
+    return sample._replace(robots=tuple(robots))
+
+
+def test_true_poses_that_are_seconds_apart_calibrate_nearly_as_well(sample: RangeRecording) -> None:
+    expected, found = calibrated(sample, None, None), calibrated(with_seldom_truth(sample, 9.0), None, None)
+    assert found.source == "the truth"
+    used = sum(one.ranges for one in found.pairs.values())
+    begin, end = sample.span
+    assert used + found.unused == np.count_nonzero((sample.ranges.t >= begin) & (sample.ranges.t <= end))
+    assert used > 0.85 * len(sample.ranges.t)
+    for pair, one in expected.pairs.items():
+        assert abs(found.pairs[pair].bias - one.bias) < 0.02
+        assert found.pairs[pair].sigma < 1.3 * one.sigma
 
 
 def with_true_distances(sample: RangeRecording, spread: float, sigma: float) -> RangeRecording:
@@ -163,8 +188,14 @@ def test_the_scales_of_pairs_that_differ_widen_the_prior_of_the_scale(sample: Ra
 
 @pytest.mark.long
 def test_without_truth_the_fit_is_the_reference(sample: RangeRecording) -> None:
-    blind = sample._replace(robots=tuple([one._replace(truth=None) for one in sample.robots]))
-    found = calibrated(blind, None, None)
+    said: list[tuple[str, int]] = []
+
+    def fitting(why: str, epochs: int) -> AbstractContextManager[Callable[[], None]]:
+        said.append((why, epochs))
+        return nullcontext(lambda: None)
+
+    found = calibrated(with_seldom_truth(sample, 12.0), None, None, fitting=fitting)
+    assert said == [("no 8 ranges of a pair have true poses within 10 s", 59)]
     assert found.source == "the fit"
     assert set(found.pairs) == {("A", "LC0"), ("B", "LC1"), ("A", "B")}
     table = noise_table(found, frozenset({"LC0", "LC1"}))

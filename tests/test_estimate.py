@@ -25,12 +25,13 @@ from agent.estimation.problem import Problem
 from compose.errors import NOT_LOCALISED, USER_ERROR, UserError
 from compose.recording.estimating.estimate_epoch import ClaimRule
 from compose.recording.estimating.estimate_files import ESTIMATE_COLUMNS, estimate_csv
-from compose.recording.estimating.estimate_rows import PoseEstimate, true_pose
+from compose.recording.estimating.estimate_rows import PoseEstimate
 from compose.recording.estimating.estimate_run import RecordingEstimate, estimated, measurements
 from compose.recording.estimating.group_measurements import MOST_USED_ANCHORS
 from compose.recording.estimating.noise_files import RangeCorrection, told_noise
 from compose.recording.estimating.prepared_steps import EPOCH_S
 from compose.recording.estimating.sound_odometry import GAP_MOTION_S, sound
+from compose.recording.estimating.true_poses import true_pose
 from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.range_recording import (
     FixedAnchor,

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
 from compose.cli.arguments import add_closing, add_part_of_recording, folder, names
 from compose.errors import ENDED, CannotWrite, UserError
+from compose.terminal.outcome import counting
 from compose.terminal.text_width import tell
 from protocol import files
 from protocol.output import say
@@ -58,7 +61,9 @@ def main(options: argparse.Namespace) -> int:
     if options.out is not None and options.out.suffix != ".toml":
         raise UserError(f"--out: {options.out} is not the path of a .toml file")
     recording = read_ranges(options.recording, options.anchors)
-    found = calibrated(recording, options.robots, options.window, by_fit=options.without_truth)
+    found = calibrated(
+        recording, options.robots, options.window, by_fit=options.without_truth, fitting=_fitting
+    )
     anchors = frozenset([one.id for one in recording.anchors])
     source = f"{found.source} of {recording.source}"
     text = profile_toml(noise_table(found, anchors), correction_of(found), source)
@@ -72,9 +77,18 @@ def main(options: argparse.Namespace) -> int:
     return ENDED
 
 
+def _fitting(why: str, epochs: int) -> AbstractContextManager[Callable[[], None]]:
+    """Say why there is a fit, and return a progress bar for it."""
+    if why:
+        say(f"tandem calibrate: {why}: the reference is an estimate of {epochs} epochs", error=True)
+    return counting("tandem calibrate", epochs)
+
+
 def _lines(found: RangeCalibration) -> list[str]:
     """Return the table of the errors of each pair of radios."""
-    from compose.terminal.tables import shown  # noqa: PLC0415  # it takes time
+    from compose.recording.estimating.radio_errors import FEWEST_ERRORS  # noqa: PLC0415  # they take time
+    from compose.recording.estimating.true_poses import TRUTH_GAP_S  # noqa: PLC0415
+    from compose.terminal.tables import shown  # noqa: PLC0415
 
     rows = [
         (
@@ -90,9 +104,12 @@ def _lines(found: RangeCalibration) -> list[str]:
         for pair, one in found.pairs.items()
     ]
     right = ("ranges", "bias m", "+-", "own scale %", "sigma m", "slow m", "outliers %")
-    if not found.scale_told:
-        alike = "the distances of each pair are too much alike to tell a scale from a bias"
-        return [*shown(("radios",), right, rows), f"no common scale: {alike}; against {found.source}"]
     common = f"common scale {100.0 * found.scale:+.2f} % +- {100.0 * found.scale_sigma:.2f} %"
     common += f", from which those of pairs differ by {100.0 * found.scale_spread:.1f} %"
-    return [*shown(("radios",), right, rows), f"{common}; against {found.source}"]
+    if not found.scale_told:
+        common = "no common scale: the distances of each pair are too much alike to tell a scale from a bias"
+    lines = [*shown(("radios",), right, rows), f"{common}; against {found.source}"]
+    if found.unused:
+        why = f"no true poses within {TRUTH_GAP_S:g} s, or fewer than {FEWEST_ERRORS} ranges of the pair"
+        lines.append(f"{found.unused} {'range' if found.unused == 1 else 'ranges'} not used: {why}")
+    return lines

@@ -21,7 +21,7 @@ from protocol.output import discard, say
 
 if TYPE_CHECKING:
     from compose.recording.estimating.estimate_epoch import ClaimRule
-    from compose.recording.estimating.estimate_rows import EstimateSummary, RobotEstimate
+    from compose.recording.estimating.estimate_rows import PoseEstimateRow, RobotEstimate
     from compose.recording.estimating.estimate_run import EstimationProblem, RecordingEstimate
     from compose.recording.ranging.range_recording import RecordedRobot
 
@@ -103,7 +103,7 @@ def main(options: argparse.Namespace) -> int:
         written = _written(options.out, problem, estimate)
         say(*map(str, written), error=options.follow)
     if not options.follow:
-        tell(*_lines(problem, estimate.summary))
+        tell(*_lines(problem, estimate))
     if stopped is not None:
         return stopped
     robots = estimate.summary.robots.values()
@@ -172,10 +172,11 @@ def _drawn(out: Path, problem: EstimationProblem, estimate: RecordingEstimate) -
         ]
 
 
-def _lines(problem: EstimationProblem, summary: EstimateSummary) -> list[str]:
+def _lines(problem: EstimationProblem, estimate: RecordingEstimate) -> list[str]:
     """Return the table of the estimates, what limits them, and last which claims do not hold at the end."""
     from compose.terminal.tables import shown  # noqa: PLC0415  # it takes time
 
+    summary = estimate.summary
     rows = [_row(name, one, summary.begin_s) for name, one in summary.robots.items()]
     right = ("first claim s", "x, y, heading", "sigma m", "error m", "NEES")
     found = shown(("robot", "anchors"), right, rows)
@@ -189,6 +190,7 @@ def _lines(problem: EstimationProblem, summary: EstimateSummary) -> list[str]:
         found.append(f"{count} {'range' if count == 1 else 'ranges'} not used: {why}")
     for robot in problem.robots:
         found += _about(robot, summary.robots[robot.id])
+        found += _without_truth(robot, [row for row in estimate.rows if row.robot == robot.id])
     for name, one in summary.robots.items():
         if one.first_claim is not None and one.withdrawn_s is not None:
             after = f"{one.withdrawn_s - summary.begin_s:.1f}"
@@ -197,7 +199,7 @@ def _lines(problem: EstimationProblem, summary: EstimateSummary) -> list[str]:
 
 
 def _about(robot: RecordedRobot, one: RobotEstimate) -> Iterator[str]:
-    """Yield what was changed in the odometry of a robot, and why its last estimate has no error."""
+    """Yield what was changed in the odometry of a robot."""
     if one.whole_turns:
         what = "increments of odometry turned" if one.whole_turns > 1 else "increment of odometry turned"
         yield f"{robot.id}: {one.whole_turns} {what} by 2 pi or more too far: whole turns were removed"
@@ -207,8 +209,16 @@ def _about(robot: RecordedRobot, one: RobotEstimate) -> Iterator[str]:
             f"{robot.id}: {one.gross_increments} {what} replaced: more than three times as fast as nearly "
             "all others"
         )
-    if robot.truth is not None and one.final is not None and one.final.position_error_m is None:
-        yield f"{robot.id}: no error of the last estimate: no true poses around it are within a second"
+
+
+def _without_truth(robot: RecordedRobot, rows: list[PoseEstimateRow]) -> Iterator[str]:
+    """Yield how many estimates of a robot with true poses have no error."""
+    from compose.recording.estimating.true_poses import TRUTH_GAP_S  # noqa: PLC0415  # it takes time
+
+    without = sum([row.true_x is None for row in rows])
+    if robot.truth is not None and without:
+        why = f"no true poses around them are within {TRUTH_GAP_S:g} s"
+        yield f"{robot.id}: {without} of {len(rows)} estimates have no error: {why}"
 
 
 def _row(name: str, one: RobotEstimate, begin_s: float) -> list[str]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 
 from compose.errors import UserError
 from compose.recording.estimating.doubtful_units import doubtful_lengths
@@ -16,6 +18,7 @@ from compose.recording.estimating.radio_errors import (
     range_calibration,
     true_errors,
 )
+from compose.recording.estimating.true_poses import TRUTH_GAP_S
 from compose.recording.ranging.range_recording import RangeRecording
 
 ASSUMED = "uwb"
@@ -25,12 +28,24 @@ RULE = ClaimRule(accuracy=1.0)
 """The claim rule of that estimate: the radios' errors need the right hypothesis, not an accurate one."""
 
 
+Fitting = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
+"""A function that is called before a fit, with the reason for it and the number of epochs.
+
+It returns the context of the fit, with a callback for each epoch.
+"""
+
+
+def _quietly(_why: str, _epochs: int) -> AbstractContextManager[Callable[[], None]]:
+    return nullcontext(lambda: None)
+
+
 def calibrated(
     recording: RangeRecording,
     robots: Sequence[str] | None,
     window: tuple[float, float] | None,
     *,
     by_fit: bool = False,
+    fitting: Fitting = _quietly,
 ) -> RangeCalibration:
     """Return the errors of the radios of `robots`, or of all, within `window` (s from the first odometry on).
 
@@ -44,19 +59,25 @@ def calibrated(
     with numerics(recording.source):
         errors = {} if by_fit else true_errors(part)
         if not errors:
-            return _by_fit(recording, chosen, window)
+            why = f"no {FEWEST_ERRORS} ranges of a pair have true poses within {TRUTH_GAP_S:g} s"
+            return _by_fit(recording, chosen, window, partial(fitting, "" if by_fit else why))
         lengths = {pair: (one.measured, one.measured - one.error) for pair, one in errors.items()}
         if doubt := doubtful_lengths(lengths, "true poses and anchors"):
             raise UserError(f"{recording.source}: {doubt}")
-        return range_calibration(errors, "the truth")
+        used = sum([len(one.t) for one in errors.values()])
+        return range_calibration(errors, "the truth")._replace(unused=len(part.ranges.t) - used)
 
 
 def _by_fit(
-    recording: RangeRecording, robots: Sequence[str], window: tuple[float, float] | None
+    recording: RangeRecording,
+    robots: Sequence[str],
+    window: tuple[float, float] | None,
+    fitting: Callable[[int], AbstractContextManager[Callable[[], None]]],
 ) -> RangeCalibration:
     """Return the errors against the ranges that the estimate of `robots` predicts."""
     problem = measurements(recording, robots, ASSUMED, window)
-    estimate = estimated(problem, RULE)
+    with fitting(problem.measured.epochs) as done:
+        estimate = estimated(problem, RULE, done)
     last = estimate.epochs[-1] if estimate.epochs else None
     if last is None or last.fitted is None or not all(last.claims):
         why = estimate.summary.blocking_reason or "too few ranges"

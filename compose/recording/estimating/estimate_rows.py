@@ -12,6 +12,7 @@ from compose.recording.estimating.estimate_epoch import ClaimRule, EstimateEpoch
 from compose.recording.estimating.group_measurements import listed
 from compose.recording.estimating.learned_errors import LearnedErrors, learned_errors
 from compose.recording.estimating.prepared_steps import Measurements, OneRobot
+from compose.recording.estimating.true_poses import true_pose
 from compose.recording.ranging.range_recording import Numbers, RecordedRobot
 from protocol.motion import wrap
 
@@ -135,39 +136,6 @@ class EstimateSummary(msgspec.Struct, frozen=True):
     """The condition for a claim that is not met at the end; empty if all are."""
     undetermined: dict[str, str]
     """The robots without a pose at the end, with the reason; none if all are estimated as one hypothesis."""
-
-
-def true_pose(robot: RecordedRobot, t: float) -> Numbers | None:
-    """Return the true pose at `t` s, shape (3,); None without truth around that time.
-
-    Between two true poses at most TRUTH_GAP_S apart, the robot moves with constant speed on one arc. The
-    first and the last arc go on for as long as they last. A true pose farther from others holds for
-    TRUTH_END_S.
-    """
-    truth = robot.truth
-    if truth is None or not len(truth.t):
-        return None
-    after = min(max(int(np.searchsorted(truth.t, t)), 1), len(truth.t) - 1)
-    before = max(after - 1, 0)
-    lasts = float(truth.t[after] - truth.t[before])
-    if not 0.0 < lasts <= TRUTH_GAP_S:
-        nearest = min((before, after), key=lambda one: abs(float(truth.t[one]) - t))
-        return truth.poses[nearest].copy() if abs(float(truth.t[nearest]) - t) <= TRUTH_END_S else None
-    share = (t - float(truth.t[before])) / lasts
-    if not -1.0 <= share <= 2.0:
-        return None
-    x, y, heading = truth.poses[before].tolist()
-    dx, dy, turned = (truth.poses[after] - truth.poses[before]).tolist()
-    half = 0.5 * wrap(turned)
-    way = math.hypot(dx, dy) * (share if half == 0.0 else math.sin(share * half) / math.sin(half))
-    course = math.atan2(dy, dx) + (share - 1.0) * half
-    return np.array((x + way * math.cos(course), y + way * math.sin(course), heading + share * 2.0 * half))
-
-
-TRUTH_GAP_S = 1.0
-"""The longest time in s between true poses within which they are interpolated."""
-TRUTH_END_S = 0.02
-"""The time in s for which a true pose holds that is farther from others than TRUTH_GAP_S."""
 
 
 def rows_of(epoch: EstimateEpoch, robots: Sequence[RecordedRobot]) -> list[PoseEstimateRow]:

@@ -20,6 +20,7 @@ from compose.recording.estimating.group_measurements import (
 from compose.recording.estimating.noise_files import ToldNoise, told_noise
 from compose.recording.estimating.prepared_steps import Measurements
 from compose.recording.estimating.recorded_noise import recorded_noise
+from compose.recording.estimating.true_poses import with_bridged_truth
 from compose.recording.ranging.range_recording import RangeRecording, RecordedRobot
 
 
@@ -101,7 +102,8 @@ def measurements_with(
         measured = group_measurements(part, chosen, assumed, ticks=ticks)
         check_anchors(part, chosen)
         doubt = doubtful_units(part) if doubtful else ""
-    return EstimationProblem(measured, part.robots, recording.source, assumed.name, doubt)
+        true = tuple([with_bridged_truth(one) for one in part.robots])
+    return EstimationProblem(measured, true, recording.source, assumed.name, doubt)
 
 
 def chosen_robots(recording: RangeRecording, robots: Sequence[str] | None) -> Sequence[str]:

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.gaussian.range_weights import MEDIAN
-from compose.recording.estimating.estimate_rows import TRUTH_GAP_S
-from compose.recording.ranging.range_recording import Numbers, Places, RangeRecording, RecordedRobot
+from compose.recording.estimating.true_poses import true_antenna, with_bridged_truth
+from compose.recording.ranging.range_recording import Numbers, Places, RangeRecording
 
 OUTLIER_SIGMAS = 4.0
 """The distance from the line, in sigmas, from which on an error is an outlier.
@@ -74,6 +74,8 @@ class RangeCalibration(NamedTuple):
     """The standard deviation (m) of what all biases have in common, if it is more than the lines tell."""
     scale_spread: float = 0.0
     """The standard deviation of the scales of pairs about the common one, beyond what noise explains."""
+    unused: int = 0
+    """The number of ranges of which no errors follow."""
     scale_told: bool = True
     """False if the distances of each pair are too much alike to tell a scale from a bias: it is 0 then."""
 
@@ -92,14 +94,14 @@ class PairErrors(NamedTuple):
 def true_errors(recording: RangeRecording) -> dict[tuple[str, str], PairErrors]:
     """Return the errors of all ranges whose both ends have a true position, by pair of radios."""
     found = {}
-    robots = {one.id: one for one in recording.robots}
+    robots = {one.id: with_bridged_truth(one) for one in recording.robots}
     fixed = {one.id: one for one in recording.anchors}
     for pair, rows in recording.pairs().items():
         t, measured = recording.ranges.t[rows], recording.ranges.range[rows]
         ends = []
         for name in pair:
             if name in robots:
-                ends.append(_antenna(robots[name], t))
+                ends.append(true_antenna(robots[name], t))
             else:
                 one = fixed[name]
                 ends.append(np.tile(np.array((one.x, one.y, one.height)), (len(t), 1)))
@@ -108,23 +110,6 @@ def true_errors(recording: RangeRecording) -> dict[tuple[str, str], PairErrors]:
         if np.count_nonzero(known) >= FEWEST_ERRORS:
             found[pair] = PairErrors(t[known], measured[known], (measured - distance)[known])
     return found
-
-
-def _antenna(robot: RecordedRobot, t: Numbers) -> Numbers:
-    """Return the true positions of the antenna at `t`; NaN where they are unknown; shape (N, 3)."""
-    truth = robot.truth
-    if truth is None:
-        return np.full((len(t), 3), np.nan)
-    forward, left, height = robot.antenna
-    heading = np.interp(t, truth.t, np.unwrap(truth.poses[:, 2]))
-    offset = (forward + 1j * left) * np.exp(1j * heading)
-    after = np.clip(np.searchsorted(truth.t, t), 1, len(truth.t) - 1)
-    unknown = (t < truth.t[0]) | (t > truth.t[-1]) | (truth.t[after] - truth.t[after - 1] > TRUTH_GAP_S)
-    x = np.interp(t, truth.t, truth.poses[:, 0]) + offset.real
-    y = np.interp(t, truth.t, truth.poses[:, 1]) + offset.imag
-    place = np.stack((x, y, np.full(len(t), height)), 1)
-    place[unknown] = np.nan
-    return place
 
 
 def range_calibration(errors: Mapping[tuple[str, str], PairErrors], source: str) -> RangeCalibration:
