@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from compose.errors import USER_ERROR
+from compose.errors import USER_ERROR, UserError
 from compose.recording.estimating.calibration import calibrated
 from compose.recording.estimating.estimate_epoch import ClaimRule
 from compose.recording.estimating.estimate_run import estimated, measurements
@@ -212,6 +213,48 @@ def test_the_command_prints_a_table_and_writes_the_profile(tmp_path: Path) -> No
     assert "against the truth" in ended.out
     printed = tandem("calibrate", str(SAMPLE), cwd=tmp_path).out
     assert (tmp_path / "radios.toml").read_text() in printed + "\n"
+
+
+@pytest.mark.parametrize(
+    ("bias", "scale", "says"),
+    [
+        (-30.0, 0.0, "a bias of -30"),
+        (0.0, 0.5, "a scale of +0."),
+    ],
+)
+def test_biases_and_scales_that_no_radio_has_are_refused(
+    bias: float, scale: float, says: str, sample: RangeRecording, tmp_path: Path
+) -> None:
+    lengths = sample.ranges.range * (1.0 + scale) + bias
+    with pytest.raises(UserError, match="by its true poses, A-B has " + re.escape(says)):
+        calibrated(with_ranges(sample, lengths), None, None)
+    (tmp_path / "it.toml").write_text(
+        f"[mission.noise]\n[calibration]\nrange_bias = {bias}\nrange_scale = {scale}\n"
+    )
+    ended = tandem("estimate", SAMPLE, "--noise", "it.toml", cwd=tmp_path)
+    assert (ended.status, ended.err.count("\n")) == (USER_ERROR, 1)
+    assert f"[calibration] range_bias has {says}" in ended.err
+
+
+def test_stamps_that_are_all_equal_are_refused(tmp_path: Path) -> None:
+    lines = []
+    for line in SAMPLE.read_text().splitlines():
+        words = line.split()
+        lines.append(" ".join([words[0], "0.0", *words[2:]]) if words[0].startswith("EDGE") else line)
+    (tmp_path / "it.pyfg").write_text("\n".join(lines))
+    ranges = "\n".join(["t,from,to,range", *["3.0,A,L,1.0"] * 8, ""])
+    (tmp_path / "odometry.csv").write_text("robot,t0,t1,dx,dy,dheading\nA,0,9,1,0,0\n")
+    (tmp_path / "anchors.csv").write_text("anchor,x,y\nL,0,0\n")
+    (tmp_path / "ranges.csv").write_text(ranges)
+    said = {
+        "it.pyfg": "increments of A are of 0 s: stamps are missing",
+        ".": "all 8 ranges of A and L are of 3 s",
+    }
+    for name, says in said.items():
+        for command in ("calibrate", "estimate"):
+            ended = tandem(command, name, cwd=tmp_path)
+            assert (ended.status, ended.err.count("\n")) == (USER_ERROR, 1)
+            assert says in ended.err
 
 
 @pytest.mark.parametrize(

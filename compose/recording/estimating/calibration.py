@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 
+import numpy as np
+
 from compose.errors import UserError
 from compose.recording.estimating.doubtful_units import doubtful_lengths
 from compose.recording.estimating.estimate_epoch import ClaimRule
@@ -15,6 +17,7 @@ from compose.recording.estimating.radio_errors import (
     FEWEST_ERRORS,
     PairErrors,
     RangeCalibration,
+    absurd_error,
     range_calibration,
     true_errors,
 )
@@ -64,8 +67,14 @@ def calibrated(
         lengths = {pair: (one.measured, one.measured - one.error) for pair, one in errors.items()}
         if doubt := doubtful_lengths(lengths, "true poses and anchors"):
             raise UserError(f"{recording.source}: {doubt}")
-        used = sum([len(one.t) for one in errors.values()])
-        return range_calibration(errors, "the truth")._replace(unused=len(part.ranges.t) - used)
+        found = range_calibration(errors, "the truth")
+        for pair, one in found.pairs.items():
+            if why := absurd_error(one.bias, one.sure_scale, float(np.max(errors[pair].measured))):
+                what = (
+                    f"by its true poses, {'-'.join(pair)} has {why}: are stamps, positions and units right?"
+                )
+                raise UserError(f"{recording.source}: {what}")
+        return found._replace(unused=len(part.ranges.t) - sum([len(one.t) for one in errors.values()]))
 
 
 def _by_fit(

@@ -174,7 +174,9 @@ def _doubtful_factor(measured: Numbers, true: Numbers) -> float:
 
 
 MOST_BIAS = 10.0
-"""The largest bias in m of radios whose ranges are all alike, so that a factor may explain them, too."""
+"""The largest bias in m that is taken for one of radios at any distance.
+
+It is thirty times that of UWB radios. If ranges are all alike, a factor may explain a larger one."""
 
 
 def _suspicion(by_odometry: float, by_anchors: float, located: bool) -> str:

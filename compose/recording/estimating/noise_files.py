@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 
 from compose.errors import UserError
+from compose.recording.estimating.radio_errors import absurd_error
 from compose.recording.estimating.recorded_noise import profile_noise
 from compose.recording.ranging.range_recording import RangeRecording, locked
 from compose.scenario.toml_file import field_first, read_text, table_in
@@ -34,7 +35,14 @@ class RangeCorrection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The bias (m) of each pair of radios, by their names with a hyphen between."""
 
     def corrected(self, recording: RangeRecording) -> RangeRecording:
-        """Return `recording` with the known errors removed from its ranges."""
+        """Return `recording` with the known errors removed from its ranges.
+
+        Raises UserError if no radio has such errors.
+        """
+        longest = float(np.max(recording.ranges.range, initial=0.0))
+        for name, value in {"range_bias": self.range_bias, **self.pairs}.items():
+            if why := absurd_error(value, self.range_scale, longest):
+                raise UserError(f"--noise: [calibration] {name} has {why}")
         bias = np.full(len(recording.ranges.t), self.range_bias)
         for (first, second), rows in recording.pairs().items():
             for name in (f"{first}-{second}", f"{second}-{first}"):

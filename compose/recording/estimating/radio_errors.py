@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.gaussian.range_weights import MEDIAN
+from compose.recording.estimating.doubtful_units import MOST_BIAS
 from compose.recording.estimating.true_poses import true_antenna, with_bridged_truth
 from compose.recording.ranging.range_recording import Numbers, Places, RangeRecording
 
@@ -58,6 +59,12 @@ class RadioErrors(NamedTuple):
     outliers: float
     """The fraction of outliers."""
 
+    @property
+    def sure_scale(self) -> float:
+        """The part of the pair's own scale beyond its noise."""
+        size = max(abs(self.scale or 0.0) - OUTLIER_SIGMAS * self.scale_sigma, 0.0)
+        return math.copysign(size, self.scale or 0.0)
+
 
 class RangeCalibration(NamedTuple):
     """The errors of all pairs of radios."""
@@ -78,6 +85,24 @@ class RangeCalibration(NamedTuple):
     """The number of ranges of which no errors follow."""
     scale_told: bool = True
     """False if the distances of each pair are too much alike to tell a scale from a bias: it is 0 then."""
+
+
+MOST_BIAS_SHARE, MOST_SCALE = 0.25, 0.25
+"""The largest bias, as a fraction of the longest range, and the largest scale that are taken for a radio's.
+
+Radios and sonars without any calibration are off by less than a tenth. With less, short ranges would be
+refused; with more, wrong stamps, positions or units are taken for errors of radios.
+"""
+
+
+def absurd_error(bias: float, scale: float, longest: float) -> str:
+    """Return which of these, a bias (m) or a scale, no radio has whose ranges are up to `longest` (m)."""
+    most = max(MOST_BIAS, MOST_BIAS_SHARE * longest)
+    if abs(bias) > most:
+        return f"a bias of {bias:+.4g} m, and at most {most:.4g} m are taken for one of radios"
+    if abs(scale) > MOST_SCALE:
+        return f"a scale of {scale:+.4g}, and at most {MOST_SCALE:g} is taken for one of radios"
+    return ""
 
 
 class PairErrors(NamedTuple):

@@ -270,7 +270,22 @@ class RecordingBuilder:
                 raise BadRecording(f"{self.source}: {anchor} is a robot and an anchor")
         robots = tuple([self._robot(name) for name in self._odometry])
         anchors = tuple([FixedAnchor(one.anchor, one.x, one.y, one.height) for one in self._anchors.values()])
-        return RangeRecording(self.source, robots, anchors, self._range_series(), dict(self.unused))
+        recording = RangeRecording(self.source, robots, anchors, self._range_series(), dict(self.unused))
+        self._check_times(recording)
+        return recording
+
+    def _check_times(self, recording: RangeRecording) -> None:
+        """Raise BadRecording if all ranges of a pair, or all increments of a robot, are of one time."""
+        for one in recording.robots:
+            t0, t1 = one.odometry.t0, one.odometry.t1
+            if len(t1) >= NOT_AT_ONCE and t0[-1] == t1[0]:
+                what = f"all {len(t1)} increments of {one.id} are of {t1[0]:.15g} s"
+                raise BadRecording(f"{self.source}: {what}: stamps are missing")
+        for pair, rows in recording.pairs().items():
+            t = recording.ranges.t[rows]
+            if len(t) >= NOT_AT_ONCE and t[0] == t[-1]:
+                what = f"all {len(t)} ranges of {' and '.join(pair)} are of {t[0]:.15g} s"
+                raise BadRecording(f"{self.source}: {what}: stamps are missing")
 
     def _robot(self, name: str) -> RecordedRobot:
         rows = self._odometry[name]
@@ -313,6 +328,12 @@ class RecordingBuilder:
         )
         return unsorted.rows(np.argsort(times, kind="stable"))
 
+
+NOT_AT_ONCE = 8
+"""The number of ranges of two radios, or of increments of a robot, that cannot all be of one time.
+
+A driver may send a few in one message; an estimate needs eight.
+"""
 
 UNSTATED_COVARIANCE = (np.nan,) * 6
 
