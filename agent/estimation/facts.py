@@ -67,12 +67,14 @@ class MeasuredRange(NamedTuple):
 
 
 class AnchorPlace(NamedTuple):
-    """The known position of an anchor in <W>."""
+    """The position of an anchor in <W>."""
 
     x: float
     """The x coordinate in m."""
     y: float
     """The y coordinate in m."""
+    sigma: float = 0.0
+    """The standard deviation of each coordinate in m. 0: surveyed; infinite: unknown."""
 
 
 Value = Manoeuvre | MeasuredRange | AnchorPlace
@@ -95,9 +97,9 @@ class ContradictoryFacts(ValueError):
 
 
 def _text(value: Value) -> str:
-    """Return the numbers of a value with their names; the trailing zeros of a manoeuvre are left out."""
+    """Return the numbers of a value with their names, without those that are mostly 0 if all of them are."""
     numbers = [f"{name} = {one!r}" for name, one in value._asdict().items()]
-    if isinstance(value, Manoeuvre) and not any(value[2:]):
+    if not isinstance(value, MeasuredRange) and not any(value[2:]):
         numbers = numbers[:2]
     return f"({', '.join(numbers)})"
 
@@ -157,9 +159,15 @@ def _contradiction(facts: Iterable[Fact]) -> ContradictoryFacts:
 # --- facts ------------------------------------------------------------------------------------------------
 
 
-def anchor(name: str, x: float, y: float) -> Fact:
-    """Return the fact that an anchor is at x, y (m). Raises ValueError unless they are finite."""
-    return _fact(FactKey(name, 0, "anchor"), AnchorPlace(x + 0.0, y + 0.0))
+def anchor(name: str, x: float, y: float, sigma: float = 0.0) -> Fact:
+    """Return the fact that an anchor is at x, y (m), each with a standard deviation of `sigma` (m).
+
+    An infinite sigma is that of an unknown position. Raises ValueError if another number is not finite.
+    """
+    key = FactKey(name, 0, "anchor")
+    if sigma == math.inf:
+        return Fact(key, AnchorPlace(0.0, 0.0, sigma))
+    return _fact(key, AnchorPlace(x + 0.0, y + 0.0, sigma + 0.0))
 
 
 def anchor_range(robot: str, name: str, tick: int, rho: float, sigma: float) -> Fact:

@@ -68,7 +68,7 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
             v=v,
             omega=omega,
             slip=slip,
-            white=_variances(measured.paths, v, omega, noise),
+            white=_variances(measured, v, omega),
             patterns=constant_errors(v, omega, noise),
             begin=np.searchsorted(tick[order], np.arange(ticks + 2)),
             first=ranges.first[order],
@@ -114,10 +114,15 @@ def _velocities(paths: tuple[Track, ...], ticks: int) -> tuple[Array, Array, Arr
     return v, omega, slip
 
 
-def _variances(paths: tuple[Track, ...], v: Array, omega: Array, noise: Noise) -> Array:
-    """Return the variances of v and omega of all paths, (n, 2, K): those of the noise, and the extra ones."""
-    white = variances(v, omega, noise.odometry)
-    for i, path in enumerate(paths):
+def _variances(measured: JointMeasurements, v: Array, omega: Array) -> Array:
+    """Return the variances of v and omega of all paths, (n, 2, K): those of the noise, and the extra ones.
+
+    An anchor stands still.
+    """
+    white = variances(v, omega, measured.noise.odometry)
+    for i, path in enumerate(measured.paths):
+        if measured.is_anchor(i):
+            white[i] = 0.0
         known = len(path.v)
         white[i, :, known:] = 0.0
         if path.extra is not None:

@@ -28,7 +28,7 @@ def decisive_ranges(robot: int, used: JointMeasurements, reach: float) -> int:
         if robot in ends:
             count = _places(ends, ranges.tick[rows], used, reach)
             total += count
-            of_anchors += [count] if ends[1] < 0 else []
+            of_anchors += [count] if ends[1] < 0 or used.is_anchor(ends[1]) else []
     return total - (sum(of_anchors) if len(of_anchors) == 1 else 0)
 
 
@@ -37,7 +37,7 @@ def _places(ends: tuple[int, int], ticks: Places, used: JointMeasurements, reach
     moved = np.zeros(len(ticks), bool)
     moved[:1] = True
     for end in ends:
-        if end >= 0:
+        if end >= 0 and not used.is_anchor(end):
             x, y = used.paths[end].x[ticks], used.paths[end].y[ticks]
             moved[1:] |= np.hypot(np.diff(x), np.diff(y)) > MOVED * reach
     return int(np.count_nonzero(moved))
@@ -45,11 +45,12 @@ def _places(ends: tuple[int, int], ticks: Places, used: JointMeasurements, reach
 
 def undetermined(robot: int, located: tuple[int, ...], measured: JointMeasurements) -> str:
     """Return why a robot that is not among those `located` has no pose."""
+    measured = measured.as_surveyed
     ranges, linked = measured.ranges, _linked(robot, measured)
     anchored = (ranges.second < 0) & np.isin(ranges.first, linked)
     places = {tuple(one) for one in ranges.place[anchored].tolist()}
     if len(places) < 2:
-        others = [measured.robots[one] for one in linked if one != robot]
+        others = [measured.robots[one] for one in linked if one != robot and not measured.is_anchor(one)]
         with_others = (
             f"it and the robots with which it has ranges ({_listed(others)}) have" if others else "it has"
         )

@@ -1,10 +1,12 @@
 """The measurements of any number of robots for one fit: paths, ranges to anchors and ranges between robots.
 
 They are a function of a set of facts, in canonical order: robots by name, ranges by kind, radios and tick.
+An anchor that is not surveyed is a robot that stands: its position is estimated with the poses.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
@@ -88,6 +90,7 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
     """The odometry and the ranges of n robots."""
 
     robots: tuple[str, ...]
+    """The names of the robots, then of the anchors without a position, then of those with a sigma."""
     anchors: tuple[str, ...]
     """The anchors to which there are ranges."""
     radios: tuple[tuple[str, str], ...]
@@ -102,6 +105,40 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
     noise: Noise
     prior: PosePrior | None = None
     """The prior of the poses at tick 0; None if nothing is known of them besides the ranges."""
+    surveyed: tuple[AnchorPlace | None, ...] = ()
+    """The place of each of `robots` that is an anchor, relative to the origin; None of one that drives.
+
+    Empty if none is an anchor.
+    """
+
+    def is_anchor(self, robot: int) -> bool:
+        """Return whether one of `robots` is an anchor."""
+        return bool(self.surveyed) and self.surveyed[robot] is not None
+
+    @property
+    def driving(self) -> tuple[str, ...]:
+        """The names of the robots that are no anchors."""
+        return tuple([name for k, name in enumerate(self.robots) if not self.is_anchor(k)])
+
+    @property
+    def placed(self) -> tuple[int, ...]:
+        """The anchors among `robots` with a position and a sigma."""
+        return tuple([k for k, one in enumerate(self.surveyed) if one is not None and one.sigma < math.inf])
+
+    @cached_property
+    def as_surveyed(self) -> JointMeasurements:
+        """These measurements as if anchors with a sigma were surveyed, and ranges to them less accurate."""
+        if not self.placed:
+            return self
+        ranges = self.ranges
+        second, place, sigma = ranges.second.copy(), ranges.place.copy(), ranges.sigma.copy()
+        for k in self.placed:
+            one, own = self.surveyed[k], ranges.second == k
+            assert one is not None
+            second[own], place[own] = -1, (one.x, one.y)
+            sigma[own] = np.hypot(sigma[own], one.sigma)
+        told = msgspec.structs.replace(ranges, second=second, place=place, sigma=sigma)
+        return msgspec.structs.replace(self, ranges=told)
 
     @property
     def speeds(self) -> Array:
@@ -140,7 +177,12 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
         return msgspec.structs.replace(self, ranges=ranges if left.all() else ranges.rows(left))
 
     def some(self, chosen: Sequence[int]) -> JointMeasurements:
-        """Return the measurements of the `chosen` robots alone, in ascending order."""
+        """Return the measurements of the `chosen` robots alone, in ascending order.
+
+        All anchors with a sigma are chosen, too: they are the last ones.
+        """
+        chosen = (*[one for one in chosen if one not in self.placed], *self.placed)
+        surveyed = tuple([self.surveyed[one] for one in chosen]) if self.surveyed else ()
         index = np.full(len(self.robots) + 1, -2)  # the last entry is that of second == -1
         index[list(chosen)] = np.arange(len(chosen))
         index[-1] = -1
@@ -152,6 +194,8 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
             robots=tuple([self.robots[one] for one in chosen]),
             paths=tuple([self.paths[one] for one in chosen]),
             ranges=moved.rows((first >= 0) & (second >= -1)),
+            surveyed=surveyed,
+            prior=_prior(surveyed),
         )
 
 
@@ -186,6 +230,7 @@ def joint_measurements(facts: Facts, noise: Noise, period: float) -> JointMeasur
     anchors of which no position is known.
     """
     places = {key.robot: value for key, value in facts.known if isinstance(value, AnchorPlace)}
+    surveyed = {name: one for name, one in places.items() if not one.sigma}
     steps: dict[str, list[Manoeuvre]] = {name: [] for name in facts.robots}
     for key, value in facts.of_kind("manoeuvre"):
         if isinstance(value, Manoeuvre) and key.tick == len(steps[key.robot]):
@@ -198,30 +243,57 @@ def joint_measurements(facts: Facts, noise: Noise, period: float) -> JointMeasur
         if key.tick <= len(steps[key.other]) if mutual else key.other in places:
             rows.append(_Row(mutual, key.robot, key.other, key.tick, value))
     rows.sort(key=lambda row: row[:4])
-    index = {name: number for number, name in enumerate(facts.robots)}
+    used = tuple(sorted({row.second for row in rows if not row.mutual}))
+    unsure = [one for one in used if one not in surveyed]
+    unsure.sort(key=lambda name: places[name].sigma < math.inf)
+    index = {name: number for number, name in enumerate((*facts.robots, *unsure))}
     radios = tuple(dict.fromkeys([(row.first, row.second) for row in rows]))
     radio = {names: number for number, names in enumerate(radios)}
-    used = tuple(sorted({row.second for row in rows if not row.mutual}))
-    origin = places[used[0]] if used else AnchorPlace(0.0, 0.0)
-    at = [AnchorPlace(*origin) if row.mutual else places[row.second] for row in rows]
+    first = sorted(used, key=lambda name: places[name].sigma)[:1]
+    origin = places[first[0]] if first else AnchorPlace(0.0, 0.0)
+    at = [surveyed.get(row.second, origin) for row in rows]
+    standing = [Manoeuvre(0.0, 0.0)] * max(map(len, steps.values()), default=0)
+    relative = [
+        places[name]._replace(x=places[name].x - origin.x, y=places[name].y - origin.y) for name in unsure
+    ]
+    anchors = (*[None] * len(facts.robots), *relative) if unsure else ()
     return JointMeasurements(
-        facts.robots,
+        tuple(index),
         used,
         radios,
-        tuple([_path(steps[name], period) for name in facts.robots]),
+        tuple([_path(steps.get(name, standing), period) for name in index]),
         JointRanges(
             np.array([row.measured.range for row in rows], np.float64),
             np.array([row.tick for row in rows], np.intp),
             np.maximum(np.array([row.measured.sigma for row in rows], np.float64), SIGMA_FLOOR),
             np.array([index[row.first] for row in rows], np.intp),
-            np.array([index[row.second] if row.mutual else -1 for row in rows], np.intp),
+            np.array([index.get(row.second, -1) for row in rows], np.intp),
             np.array([(one.x - origin.x, one.y - origin.y) for one in at], np.float64).reshape(-1, 2),
             np.array([radio[row.first, row.second] for row in rows], np.intp),
         ),
         period,
         (origin.x, origin.y),
         noise,
+        _prior(anchors),
+        anchors,
     )
+
+
+def _prior(surveyed: tuple[AnchorPlace | None, ...]) -> PosePrior | None:
+    """Return what is known of the poses of robots, some of which are anchors; None if none are.
+
+    The heading of an anchor means nothing, and is held.
+    """
+    if not any(surveyed):
+        return None
+    mean, information = np.zeros((len(surveyed), 3)), np.zeros((3 * len(surveyed), 3 * len(surveyed)))
+    for k, one in enumerate(surveyed):
+        if one is not None:
+            mean[k, :2] = one.x, one.y
+            told = np.array((one.sigma**-2, one.sigma**-2, 1.0))
+            information[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = np.diag(told)
+    known = np.diagonal(information)[np.diagonal(information) > 0.0].tolist()
+    return PosePrior(mean, information, len(known), sum(map(math.log, known)))
 
 
 def _path(steps: Sequence[Manoeuvre], period: float) -> Track:

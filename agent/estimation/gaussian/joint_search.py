@@ -46,6 +46,13 @@ A claim needs 8.
 """
 
 
+FEWEST_TO_LOCATE_ANCHOR = 8
+"""The least number of ranges of located robots to an anchor without a position with which it is located.
+
+As many as for a claim: with fewer, it may stand in many places, and each would be a hypothesis.
+"""
+
+
 class Candidate(NamedTuple):
     """Robots that may be located next."""
 
@@ -96,6 +103,7 @@ def merged(found: JointHypotheses, other: JointHypotheses) -> JointHypotheses:
 
 def candidates(located: Sequence[int], measured: JointMeasurements) -> list[Candidate]:
     """Return which robots may be located next, those with the most decisive ranges first."""
+    measured = measured.as_surveyed
     found = [*_single(located, measured), *_paired(located, measured)]
     return sorted(found, key=lambda one: (-one.decisive, -len(one.robots), one.robots))
 
@@ -103,13 +111,13 @@ def candidates(located: Sequence[int], measured: JointMeasurements) -> list[Cand
 def _single(located: Sequence[int], measured: JointMeasurements) -> Iterator[Candidate]:
     ranges = measured.ranges
     for robot in range(len(measured.robots)):
-        if robot in located:
+        if robot in located or robot in measured.placed:
             continue
         rows = beacons(robot, located, measured)
         fixed = rows[ranges.second[rows] < 0]
         places = [tuple(one) for one in ranges.place[fixed].tolist()]
         decisive = len(rows) - max([places.count(one) for one in set(places)], default=0)
-        if decisive >= FEWEST_DECISIVE:
+        if decisive >= (FEWEST_TO_LOCATE_ANCHOR if measured.is_anchor(robot) else FEWEST_DECISIVE):
             yield Candidate(decisive, (robot,))
 
 
@@ -182,13 +190,16 @@ def _with(
     # all poses of the new robots under the first hypothesis, and the first pose under all others
     found.sort(key=lambda each: (each[0] > 0, -each[1]))
     part, order = measured.some(located), np.argsort([*known.located, *candidate.robots])
+    count = len(known.located)
+    anchors = np.zeros((0, 3)) if part.prior is None else part.prior.mean[len(located) :]
     starts = []
     for rank, (others, weight, one, new) in enumerate(found[:MOST_POSES]):
         if weight >= least and (others == 0 or rank < MOST_JOINT):
-            begun = one.fit.start if one is not None else Start(np.zeros((0, 3)))
-            poses = np.concatenate((begun.poses, new.start.poses))[order]
-            errors = [*begun.errors, *new.start.errors]
-            starts.append(Start(poses, tuple([errors[k] for k in order])))
+            begun = one.fit.start if one is not None else Start(anchors)
+            poses = np.concatenate((begun.poses[:count], new.start.poses))[order]
+            errors = [*begun.errors[:count], *new.start.errors]
+            with_anchors = np.concatenate((poses, begun.poses[count:]))
+            starts.append(Start(with_anchors, tuple([errors[k] for k in order])))
     return JointHypotheses(located, with_probability(fits(part, starts)))
 
 
@@ -200,6 +211,7 @@ def _new(
     reach: float,
 ) -> list[_Located]:
     """Return the start poses of the robots of `candidate` under the hypothesis `one`."""
+    measured = measured.as_surveyed
     match candidate.robots:
         case (robot,):
             return _of_robot(among_beacons(robot, one, located, measured, reach))

@@ -108,7 +108,7 @@ def _by_fit(
             f"and the estimate uses at most {most}: one a second of each pair, and of many ranges only a part"
         )
     found = range_calibration(errors, "the fit")
-    learned = learned_errors(fit, used.robots, ["-".join(pair) for pair in ranged])
+    learned = learned_errors(fit, used.driving, ["-".join(pair) for pair in ranged])
     bias, scale = learned.range_bias_m, learned.range_scale
     return found._replace(
         bias_sigma=bias.sigma if bias is not None else 0.0,

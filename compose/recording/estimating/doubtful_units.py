@@ -64,7 +64,7 @@ DEGREES = "the turns of odometry agree with the ranges only as degrees: are they
 @np.errstate(all="ignore")  # where numbers overflow, nothing is suspected
 def doubtful_units(recording: RangeRecording) -> str:
     """Return which data of `recording` seem to be in another unit, and in which; an empty text if none do."""
-    robots = {}
+    recording, robots = recording.with_places(), {}
     for robot in range(len(recording.robots)):
         if one := _of_robot(recording, robot):
             robots[recording.robots[robot].id] = one

@@ -223,7 +223,7 @@ def summary_of(
     if last is not None and last.fitted is not None:
         ranged = [name for name, count in zip(pairs, last.ranges, strict=True) if count]
         fit, used = last.fitted
-        calibration = learned_errors(fit, used.robots, ranged)
+        calibration = learned_errors(fit, used.driving, ranged)
     hypotheses = [
         FinalHypothesis(
             one.probability,

@@ -86,6 +86,8 @@ class GroupEstimator:
         """Return what blocks the claim of each located robot; an empty text if nothing does."""
         part, rule, reasons = used.some(found.located), self._rule, {}
         for i, certainty in enumerate(certainties(found)):
+            if part.is_anchor(i):
+                continue
             judged = of_joint("recording", i, found, certainty, part, reach, rule.accuracy, rule.confidence)
             blocking = blocked(judged)
             reasons[part.robots[i]] = blocking.reason if blocking is not None else ""

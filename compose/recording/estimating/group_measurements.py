@@ -59,15 +59,16 @@ def group_measurements(
 
 
 class NoAnchors(UserError):
-    """One robot, or two, have no ranges to two anchors at different places."""
+    """One robot, or two, have no ranges to two anchors with positions at different places."""
 
 
 def check_anchors(recording: RangeRecording, robots: Sequence[str]) -> None:
-    """Raise NoAnchors if one robot, or two, have no ranges to two anchors at different places.
+    """Raise NoAnchors if one robot, or two, have no ranges to two anchors with positions at different places.
 
     Of more robots, some may be estimated.
     """
-    found = [recording.anchors_of(robot) for robot in range(len(robots))]
+    placed = recording.with_places()
+    found = [placed.anchors_of(robot) for robot in range(len(robots))]
     if len(robots) > 2 or len({(one.x, one.y) for own in found for one in own}) > 1:
         return
     heard = [
@@ -96,7 +97,7 @@ MOST_USED_ANCHORS = 32
 
 def _anchors(anchors: Sequence[FixedAnchor]) -> Iterator[Fact]:
     for one in anchors:
-        yield anchor(one.id, one.x, one.y)
+        yield anchor(one.id, one.x, one.y, one.sigma)
 
 
 def _manoeuvres(robot: str, path: Track) -> Iterator[Fact]:

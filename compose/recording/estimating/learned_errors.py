@@ -42,7 +42,8 @@ class LearnedErrors(msgspec.Struct, frozen=True):
 def learned_errors(fit: Fit, names: Sequence[str], pairs: Sequence[str]) -> LearnedErrors:
     """Return the errors that `fit` has learned.
 
-    `names` are those of the robots, and `pairs` those of the pairs of radios that have ranges, in order.
+    `names` are those of the robots that drive, and `pairs` those of the pairs of radios that have ranges, in
+    order.
     """
     priors = fit.problem.noise.priors
     taken = iter(zip(fit.constants.tolist(), fit.constant_sigmas.tolist(), strict=True))

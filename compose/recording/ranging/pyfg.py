@@ -264,6 +264,8 @@ def written_pyfg(recording: RangeRecording) -> WrittenGraph:
     for anchor in recording.anchors:
         if anchor.height:
             raise UserError(f"{recording.source}: a .pyfg file cannot hold the height of {anchor.id}")
+        if anchor.sigma == math.inf:
+            raise UserError(f"{recording.source}: the position of {anchor.id}, which a .pyfg file needs, is unknown")
         lines.append(f"VERTEX_XY {names[anchor.id]} {anchor.x!r} {anchor.y!r}")
     return WrittenGraph("\n".join([*lines, *edges, *_range_lines(recording, names, stamps), ""]), names)
 

@@ -10,7 +10,7 @@ from compose.extras import need
 from compose.recording.ranging.pyfg import read_pyfg
 from compose.recording.ranging.range_csv import REQUIRED, read_csv, rows_in
 from compose.recording.ranging.range_recording import RangeRecording
-from compose.recording.ranging.recording_rows import AnchorRow
+from compose.recording.ranging.recording_rows import AnchorRow, check_anchor
 from compose.recording.ranging.run_ranges import ranges_of_run
 from compose.recording.recording_files import journals_in, user_errors
 from compose.recording.run import read
@@ -50,6 +50,7 @@ def _anchors(path: Path) -> list[AnchorRow]:
     for row, place in rows_in(path, AnchorRow):
         if row.anchor in found:
             raise BadRecording(f"{place}: there are two anchors {row.anchor}")
+        check_anchor(row, place)
         found[row.anchor] = row
     return [*found.values()]
 

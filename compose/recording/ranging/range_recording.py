@@ -74,15 +74,17 @@ class RecordedRobot(NamedTuple):
 
 
 class FixedAnchor(NamedTuple):
-    """A radio at a known position that does not move."""
+    """A radio that does not move."""
 
     id: str
     x: float
-    """The x coordinate in m."""
+    """The x coordinate in m; NaN if it is unknown."""
     y: float
-    """The y coordinate in m."""
+    """The y coordinate in m; NaN if it is unknown."""
     height: float = 0.0
     """The height in m, above the same level as those of the robots' radios."""
+    sigma: float = 0.0
+    """The standard deviation of both coordinates in m. 0: surveyed; infinite: unknown."""
 
 
 class RangeSeries(NamedTuple):
@@ -166,14 +168,29 @@ class RangeRecording(NamedTuple):
         Raises KeyError if there is no such robot.
         """
         found = tuple([_between(self.robot(name), first_s, last_s) for name in robots])
-        radios = [*[one.id for one in found], *[one.id for one in self.anchors]]
+        return self._among(found, self.anchors, first_s, last_s)
+
+    def with_places(self) -> RangeRecording:
+        """Return this recording without the anchors whose position is unknown, and without their ranges."""
+        anchors = tuple([one for one in self.anchors if one.sigma < np.inf])
+        return self if anchors == self.anchors else self._among(self.robots, anchors, -np.inf, np.inf)
+
+    def _among(
+        self,
+        robots: tuple[RecordedRobot, ...],
+        anchors: tuple[FixedAnchor, ...],
+        first_s: float,
+        last_s: float,
+    ) -> RangeRecording:
+        """Return the recording of these robots and anchors, with the ranges in [first_s, last_s]."""
+        radios = [*[one.id for one in robots], *[one.id for one in anchors]]
         places = {name: number for number, name in reversed([*enumerate(radios)])}
         place = np.array([places.get(one, -1) for one in self.radios], np.intp)
         ranges = self.ranges
         first, second = place[ranges.first], place[ranges.second]
         kept = (first >= 0) & (second >= 0) & (first_s <= ranges.t) & (ranges.t <= last_s)
         moved = ranges._replace(first=first, second=second)
-        return RangeRecording(self.source, found, self.anchors, moved.rows(kept))
+        return RangeRecording(self.source, robots, anchors, moved.rows(kept))
 
 
 LONGEST_GAP_S = 3600.0

@@ -24,7 +24,7 @@ from compose.recording.ranging.range_recording import (
     TruePath,
     locked,
 )
-from protocol.units import Angle, Coordinate, Range, RobotId
+from protocol.units import Angle, Coordinate, Range, RobotId, Sigma
 
 Stamp = Annotated[float, Meta(ge=-1e12, le=1e12)]
 """A time in s, on a clock that all robots and radios of a recording share."""
@@ -86,16 +86,25 @@ class RangeRow(Row, frozen=True):
 
 
 class AnchorRow(Row, frozen=True):
-    """An anchor at a known position."""
+    """An anchor. Without a position, or with a sigma, its position is estimated with the poses."""
 
     anchor: RobotId
     """The name of the anchor."""
-    x: Coordinate
-    """The x coordinate in m."""
-    y: Coordinate
+    x: Coordinate | None = None
+    """The x coordinate in m; both coordinates or none."""
+    y: Coordinate | None = None
     """The y coordinate in m."""
     height: Coordinate = 0.0
     """The height in m, above the same level as those of the robots' radios."""
+    sigma: Sigma = 0.0
+    """The standard deviation of each coordinate in m; 0: surveyed."""
+
+    @property
+    def fixed(self) -> FixedAnchor:
+        """This anchor in the model of a recording."""
+        if self.x is None or self.y is None:
+            return FixedAnchor(self.anchor, np.nan, np.nan, self.height, np.inf)
+        return FixedAnchor(self.anchor, self.x, self.y, self.height, self.sigma)
 
 
 class AntennaRow(Row, frozen=True):
@@ -201,6 +210,7 @@ class RecordingBuilder:
             case RangeRow():
                 self._add_range(row, place)
             case AnchorRow():
+                check_anchor(row, place)
                 if self._stated.setdefault(row.anchor, row) != row:
                     raise BadRecording(f"{place}: there are two anchors {row.anchor}")
                 self._anchors[row.anchor] = self._given.get(row.anchor, row)
@@ -269,7 +279,7 @@ class RecordingBuilder:
             if anchor in self._odometry:
                 raise BadRecording(f"{self.source}: {anchor} is a robot and an anchor")
         robots = tuple([self._robot(name) for name in self._odometry])
-        anchors = tuple([FixedAnchor(one.anchor, one.x, one.y, one.height) for one in self._anchors.values()])
+        anchors = tuple([one.fixed for one in self._anchors.values()])
         recording = RangeRecording(self.source, robots, anchors, self._range_series(), dict(self.unused))
         self._check_times(recording)
         return recording
@@ -327,6 +337,14 @@ class RecordingBuilder:
             times, ends[:, 0], ends[:, 1], np.array([row.range for row, _ in self._ranges]), np.array(sigmas)
         )
         return unsorted.rows(np.argsort(times, kind="stable"))
+
+
+def check_anchor(row: AnchorRow, place: object) -> None:
+    """Raise BadRecording if the row at `place` has one coordinate, or none and a sigma."""
+    if (row.x is None) != (row.y is None):
+        raise BadRecording(f"{place}: it has one of x and y, and an anchor has both or none")
+    if row.x is None and row.sigma:
+        raise BadRecording(f"{place}: sigma: an anchor without x and y has none")
 
 
 NOT_AT_ONCE = 8
