@@ -17,7 +17,7 @@ from compose.launch import in_process
 from compose.recording.ranging.pyfg import written_pyfg
 from compose.recording.ranging.range_csv import read_csv
 from compose.recording.ranging.range_files import read_ranges
-from compose.recording.ranging.range_recording import RangeRecording
+from compose.recording.ranging.range_recording import FixedAnchor, RangeRecording
 from compose.recording.ranging.run_ranges import ADDED_SIGMA, increment_covariance, ranges_of_run
 from compose.recording.run import Run
 from compose.scenario.scenario_file import load
@@ -112,7 +112,7 @@ def test_a_csv_folder_is_read_with_everything_that_it_states(tmp_path: Path) -> 
     assert a.truth is not None
     np.testing.assert_array_equal(a.truth.poses[-1], [1.1, 2.1, 3.1])
     assert b.truth is None
-    assert recording.anchors[0] == ("M1", 3.0, -4.0, 1.25)
+    assert recording.anchors[0] == FixedAnchor("M1", 3.0, -4.0, 1.25)
     np.testing.assert_array_equal(recording.ranges.t, [0.2, 0.3])  # in the order of time
     np.testing.assert_array_equal(recording.ranges.first, [0, 0])  # the robot is always first
     np.testing.assert_array_equal(recording.ranges.second, [2, 1])
@@ -145,7 +145,7 @@ def test_anchors_of_another_file_are_added_and_replace_those_of_the_same_names(t
     for path in (written_csv(tmp_path / "csv", tables), written_mcap(tmp_path / "one.mcap", tables)):
         assert "M2 is neither a robot" in refused(path)
         recording = read_ranges(path, other)
-        assert recording.anchors == (("M1", 30.0, 40.0, 0.0), ("M2", 5.0, 6.0, 0.0))
+        assert recording.anchors == (FixedAnchor("M1", 30.0, 40.0), FixedAnchor("M2", 5.0, 6.0))
         assert recording.radios[recording.ranges.second[-1]] == "M2"
     for text, says in (
         ("LC0,30,x", "line 2: y: expected a number, got 'x'"),
@@ -156,7 +156,7 @@ def test_anchors_of_another_file_are_added_and_replace_those_of_the_same_names(t
             read_ranges(SAMPLE, other)
         assert str(error.value) == f"{other}, {says}"
     other.write_text("anchor,x,y\nLC0,30,40\n")
-    assert read_ranges(SAMPLE, other).anchors[0] == ("LC0", 30.0, 40.0, 0.0)
+    assert read_ranges(SAMPLE, other).anchors[0] == FixedAnchor("LC0", 30.0, 40.0)
 
 
 def test_the_sample_has_its_licence_and_is_small() -> None:
@@ -244,7 +244,8 @@ def test_the_stamps_of_edges_are_the_ends_of_increments_or_their_starts(tmp_path
     np.testing.assert_array_equal(ends.robots[0].odometry.covariance[0], np.diag([0.01, 0.02, 0.03]))
     np.testing.assert_array_equal(ends.ranges.sigma, [0.2])
     assert ends.radios == ("A", "L0")
-    assert ends.unused == {"EDGE_SE2 between poses that do not follow each other": 1, "VERTEX_XY:PRIOR": 1}
+    assert ends.unused == {"EDGE_SE2 between poses that do not follow each other": 1}
+    assert ends.anchors == (FixedAnchor("L0", 4.0, 5.0, 0.0, 1.0),)
 
 
 # --- runs of Tandem ---------------------------------------------------------------------------------------

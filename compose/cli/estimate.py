@@ -184,6 +184,11 @@ def _lines(problem: EstimationProblem, estimate: RecordingEstimate) -> list[str]
     found.append(
         f"noise: {summary.noise}; last pose in m and rad; time from the first odometry of {every} on"
     )
+    for name, anchor in summary.anchors.items():
+        x, y = anchor.position
+        found.append(f"anchor {name}: {x:.2f} {y:.2f}, with a sigma of {anchor.sigma:.2f} m")
+    for name, why in summary.doubtful_anchors.items():
+        found.append(f"anchor {name} seems to stand elsewhere: {why}")
     if summary.blocking_reason:
         found.append(f"no claim at the end: {summary.blocking_reason}")
     for why, count in summary.unused_ranges.items():

@@ -150,8 +150,11 @@ def _path(drawn: Drawn, medium: Medium) -> Figure:
                 points += around_it
         axes.plot(rows[0].x, rows[0].y, ls="", ms=5, **marks)
     for anchor, marker in zip(drawn.problem.measured.anchors, cycle(ANCHOR_MARKS), strict=False):
-        axes.plot(anchor.x, anchor.y, ls="", marker=marker, ms=5, color=INK, label=f"anchor {anchor.id}")
-        points.append((anchor.x, anchor.y))
+        estimated = drawn.estimates.summary.anchors.get(anchor.id)
+        at = estimated.position if estimated is not None else (anchor.x, anchor.y)
+        if math.isfinite(at[0]):
+            axes.plot(*at, ls="", marker=marker, ms=5, color=INK, label=f"anchor {anchor.id}")
+            points.append(at)
     axes.plot([], [], color=PALE, lw=6.0, alpha=0.3, label="3 sigma")
     sheet.plane("plane", around(points, PATH_MARGIN), TALLEST)
     sheet.key(axes)

@@ -1,18 +1,18 @@
-"""The files of an estimate: `estimate.csv` and `estimate.json`."""
+"""The files of an estimate: `estimate.csv`, `estimate.json`, and `anchors.csv` with estimated anchors."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import msgspec
 
-from compose.recording.estimating.estimate_rows import EstimateSummary, PoseEstimateRow
+from compose.recording.estimating.estimate_rows import AnchorEstimate, EstimateSummary, PoseEstimateRow
 from protocol import files
 
-CSV_NAME, JSON_NAME = "estimate.csv", "estimate.json"
+CSV_NAME, JSON_NAME, ANCHORS_NAME = "estimate.csv", "estimate.json", "anchors.csv"
 ESTIMATE_COLUMNS = PoseEstimateRow.__struct_fields__
 """The columns of `estimate.csv`."""
 
@@ -35,11 +35,24 @@ def _cell(value: object) -> object:
     return "" if value is None else value
 
 
-def write_estimate(
-    folder: Path, rows: Sequence[PoseEstimateRow], summary: EstimateSummary
-) -> tuple[Path, Path]:
-    """Write both files into `folder`, and return their paths. Raises OSError."""
-    table, record = folder / CSV_NAME, folder / JSON_NAME
+def anchors_csv(anchors: Mapping[str, AnchorEstimate]) -> str:
+    """Return the table of anchors that `--anchors` reads: each is surveyed with the sigma of its estimate."""
+    rows = [
+        f"{name},{one.position[0]!r},{one.position[1]!r},{one.height!r},{one.sigma!r}"
+        for name, one in anchors.items()
+    ]
+    return "\n".join(["anchor,x,y,height,sigma", *rows, ""])
+
+
+def write_estimate(folder: Path, rows: Sequence[PoseEstimateRow], summary: EstimateSummary) -> list[Path]:
+    """Write the files into `folder`, and return their paths. Raises OSError.
+
+    That of the anchors is written if some are not surveyed.
+    """
+    table, record, anchors = [folder / name for name in (CSV_NAME, JSON_NAME, ANCHORS_NAME)]
     files.write(table, estimate_csv(rows))
     files.write(record, msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n")
-    return table, record
+    if not summary.anchors:
+        return [table, record]
+    files.write(anchors, anchors_csv(summary.anchors))
+    return [table, record, anchors]

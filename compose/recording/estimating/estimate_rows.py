@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import msgspec
 import numpy as np
 
-from compose.recording.estimating.estimate_epoch import ClaimRule, EstimateEpoch
+from agent.estimation.gaussian.noise_level import INLIER
+from compose.recording.estimating.estimate_epoch import ClaimRule, EpochFit, EstimateEpoch
 from compose.recording.estimating.group_measurements import listed
 from compose.recording.estimating.learned_errors import LearnedErrors, learned_errors
 from compose.recording.estimating.prepared_steps import Measurements, OneRobot
@@ -109,6 +110,43 @@ class FinalHypothesis(msgspec.Struct, frozen=True):
     """The pose of each robot: x and y in m, and the heading in rad."""
 
 
+class AnchorEstimate(msgspec.Struct, frozen=True):
+    """The estimated position of an anchor that is not surveyed, by the likeliest hypothesis at the end."""
+
+    position: tuple[float, float]
+    """x and y in m."""
+    covariance: tuple[tuple[float, float], tuple[float, float]]
+    """The covariance of x and y in m^2."""
+    given: tuple[float, float] | None
+    """The position in the recording; null without one."""
+    given_sigma: float | None
+    """The standard deviation of each of its coordinates in m."""
+    height: float
+    """The height in m, which is not estimated."""
+
+    @property
+    def sigma(self) -> float:
+        """The standard deviation of each coordinate in m, on average."""
+        return math.sqrt(0.5 * (self.covariance[0][0] + self.covariance[1][1]))
+
+    @property
+    def moved(self) -> float | None:
+        """The distance in m from the position in the recording."""
+        return math.dist(self.position, self.given) if self.given is not None else None
+
+    @property
+    def elsewhere(self) -> bool:
+        """True if it is further away than ELSEWHERE_SIGMAS of that position."""
+        return (self.moved or 0.0) > ELSEWHERE_SIGMAS * (self.given_sigma or 0.0)
+
+
+ELSEWHERE_SIGMAS = 4.0
+"""The distance, in sigmas of each coordinate, from which on an anchor stands elsewhere than surveyed.
+
+An anchor that was surveyed as stated is so far off once in 3 000.
+"""
+
+
 class EstimateSummary(msgspec.Struct, frozen=True):
     """The content of `estimate.json`."""
 
@@ -136,6 +174,10 @@ class EstimateSummary(msgspec.Struct, frozen=True):
     """The condition for a claim that is not met at the end; empty if all are."""
     undetermined: dict[str, str]
     """The robots without a pose at the end, with the reason; none if all are estimated as one hypothesis."""
+    anchors: dict[str, AnchorEstimate]
+    """The estimated positions of anchors that are not surveyed; those of which none follows are left out."""
+    doubtful_anchors: dict[str, str]
+    """The anchors that seem to stand elsewhere than the recording says, with the reason."""
 
 
 def rows_of(epoch: EstimateEpoch, robots: Sequence[RecordedRobot]) -> list[PoseEstimateRow]:
@@ -219,11 +261,12 @@ def summary_of(
     if not reason:
         reason = last.blocking_reason if last is not None else "there is no epoch"
     pairs = ["-".join(pair) for pair in measured.pairs]
-    calibration = None
+    calibration, anchors, doubtful = None, {}, {}
     if last is not None and last.fitted is not None:
         ranged = [name for name, count in zip(pairs, last.ranges, strict=True) if count]
-        fit, used = last.fitted
-        calibration = learned_errors(fit, used.driving, ranged)
+        calibration = learned_errors(last.fitted.fit, last.fitted.used.driving, ranged)
+        anchors = _anchors(last.fitted, measured)
+        doubtful = _doubtful(last.fitted, anchors)
     hypotheses = [
         FinalHypothesis(
             one.probability,
@@ -244,7 +287,55 @@ def summary_of(
         measured.unused,
         reason,
         dict(last.undetermined) if last is not None else {},
+        anchors,
+        doubtful,
     )
+
+
+def _anchors(fitted: EpochFit, measured: Measurements) -> dict[str, AnchorEstimate]:
+    """Return the estimates of the anchors that are not surveyed."""
+    fit, used = fitted
+    given, found = {one.id: one for one in measured.anchors}, {}
+    for i, name in enumerate(used.robots):
+        if not used.is_anchor(i):
+            continue
+        place, one = fit.poses[i, :2] + used.origin, given[name]
+        own = fit.covariance[3 * i : 3 * i + 2, 3 * i : 3 * i + 2]
+        (xx, xy), (_, yy) = own.tolist()
+        surveyed = one.sigma < math.inf
+        found[name] = AnchorEstimate(
+            (float(place[0]), float(place[1])),
+            ((xx, xy), (xy, yy)),
+            (one.x, one.y) if surveyed else None,
+            one.sigma if surveyed else None,
+            one.height,
+        )
+    return found
+
+
+def _doubtful(fitted: EpochFit, anchors: Mapping[str, AnchorEstimate]) -> dict[str, str]:
+    """Return why anchors seem to stand elsewhere: by their estimates, or since most ranges fit no other."""
+    doubtful = {}
+    for name, one in anchors.items():
+        if one.elsewhere and one.given_sigma is not None and one.moved is not None:
+            sigmas = f"{one.moved / one.given_sigma:.1f} of the stated sigmas"
+            doubtful[name] = f"it is estimated {one.moved:.2f} m from where it was surveyed: {sigmas}"
+    ranges = fitted.used.ranges
+    strays: dict[str, list[int]] = {}
+    for radio, weight in zip(ranges.radio.tolist(), fitted.fit.weights.tolist(), strict=True):
+        name = fitted.used.radios[radio][1]
+        if name in fitted.used.anchors:
+            counts = strays.setdefault(name, [0, 0])
+            counts[0] += weight <= INLIER
+            counts[1] += 1
+    for name, (count, total) in strays.items():
+        if total >= FEWEST_OF_ANCHOR and count > MOST_STRAYS * total:
+            doubtful.setdefault(name, f"{count} of {total} of its ranges fit no other")
+    return doubtful
+
+
+MOST_STRAYS, FEWEST_OF_ANCHOR = 0.5, 8
+"""The share of ranges that fit no other above which an anchor is doubted, and the least number of ranges."""
 
 
 def _standing(sides: Sequence[OneRobot], measured: Measurements) -> str:

@@ -37,11 +37,12 @@ COVARIANCE_FIELDS = ("cov_xx", "cov_xy", "cov_xh", "cov_yy", "cov_yh", "cov_hh")
 LINE_FIELDS = {
     "VERTEX_SE2": ("t", "name", "x", "y", "heading"),
     "VERTEX_XY": ("anchor", "x", "y"),
+    "VERTEX_XY:PRIOR": ("t", "anchor", "x", "y", "cov_xx", "cov_xy", "cov_yy"),
     "EDGE_SE2": ("t", "from", "to", "dx", "dy", "dheading", *COVARIANCE_FIELDS),
     "EDGE_RANGE": ("t", "from", "to", "range", "variance"),
 }
 """The fields of each kind of line that is used."""
-UNUSED = ("VERTEX_SE2:PRIOR", "VERTEX_XY:PRIOR", "EDGE_SE2_XY")
+UNUSED = ("VERTEX_SE2:PRIOR", "EDGE_SE2_XY")
 """The kinds of lines that are not used."""
 
 
@@ -114,6 +115,8 @@ def _take(
             _take_edge(values, place, graph, builder)
         case "EDGE_RANGE":
             builder.add(_range_row(values, place), place)
+        case "VERTEX_XY:PRIOR":
+            builder.add_prior(_prior_row(values, place))
         case _:
             builder.add(row_of(values, AnchorRow, place), place)
 
@@ -168,6 +171,15 @@ def _is_covariance(xx: float, xy: float, xh: float, yy: float, yh: float, hh: fl
 
 DECIMALS_ROUNDING = 1e-6
 """The error of correlations from the decimals of a file."""
+
+
+def _prior_row(values: Mapping[str, str], place: SourcePlace) -> AnchorRow:
+    """Return the anchor of a prior, with the mean of both variances."""
+    xx, _, yy = [_number(values[name], name, place) for name in ("cov_xx", "cov_xy", "cov_yy")]
+    if min(xx, yy) < 0.0:
+        raise BadRecording(f"{place}: cov_xx, cov_yy: a variance is negative")
+    told = {name: values[name] for name in ("anchor", "x", "y")}
+    return row_of({**told, "sigma": repr(math.sqrt(0.5 * (xx + yy)))}, AnchorRow, place)
 
 
 def _range_row(values: Mapping[str, str], place: SourcePlace) -> RangeRow:
@@ -265,7 +277,9 @@ def written_pyfg(recording: RangeRecording) -> WrittenGraph:
         if anchor.height:
             raise UserError(f"{recording.source}: a .pyfg file cannot hold the height of {anchor.id}")
         if anchor.sigma == math.inf:
-            raise UserError(f"{recording.source}: the position of {anchor.id}, which a .pyfg file needs, is unknown")
+            raise UserError(
+                f"{recording.source}: the position of {anchor.id}, which a .pyfg file needs, is unknown"
+            )
         lines.append(f"VERTEX_XY {names[anchor.id]} {anchor.x!r} {anchor.y!r}")
     return WrittenGraph("\n".join([*lines, *edges, *_range_lines(recording, names, stamps), ""]), names)
 

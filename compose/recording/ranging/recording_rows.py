@@ -226,6 +226,10 @@ class RecordingBuilder:
                 path.append(row)
                 self._claims.append((row.robot, place))
 
+    def add_prior(self, row: AnchorRow) -> None:
+        """Add an anchor in place of one of the same name, unless that was given from outside."""
+        self._given.setdefault(row.anchor, row)
+
     def add_robot(self, robot: str) -> None:
         """Add a robot, which may have no odometry."""
         self._odometry.setdefault(robot, [])
