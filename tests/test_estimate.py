@@ -552,6 +552,28 @@ def test_without_truth_there_are_no_errors(tmp_path: Path) -> None:
     assert {row["nees"] for row in rows} == {""}
 
 
+def test_anchors_with_a_sigma_are_estimated_and_written_as_the_next_estimate_reads_them(
+    sample: RangeRecording, tmp_path: Path
+) -> None:
+    lines = [f"{one.id},{one.x + 0.1},{one.y - 0.1},0.1" for one in sample.anchors]
+    (tmp_path / "anchors.csv").write_text("\n".join(["anchor,x,y,sigma", *lines, ""]))
+    ended = tandem(
+        "estimate", str(SAMPLE), "--noise", "uwb-calibrated", "--anchors", "anchors.csv", "--accuracy", "0.5",
+        "--window", "0..16", "--out", "found", cwd=tmp_path,
+    )  # fmt: skip
+    assert ended.err == ""
+    summary = json.loads((tmp_path / "found" / "estimate.json").read_text())
+    assert set(summary["anchors"]) == {"LC0", "LC1"}
+    (again, _) = read_ranges(SAMPLE, tmp_path / "found" / "anchors.csv").anchors
+    one = summary["anchors"]["LC0"]
+    assert [again.x, again.y] == one["position"]
+    assert 0.02 < again.sigma < 0.15
+    assert f"anchor LC0: {again.x:.2f} {again.y:.2f}, with a sigma of {again.sigma:.2f} m" in ended.out
+    for true in sample.anchors:
+        position = summary["anchors"][true.id]["position"]
+        assert math.dist(position, (true.x, true.y)) < 0.4
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [
@@ -567,12 +589,16 @@ def test_without_truth_there_are_no_errors(tmp_path: Path) -> None:
         ((str(SAMPLE), "--window", "40..50"), "has odometry of 30.0"),
         ((str(SAMPLE), "--window", "10"), "'10' is not a window in seconds such as 10..40"),
         ((str(SAMPLE), "--anchors", "bad.csv"), "bad.csv, line 2: y: expected a number, got 'x'"),
+        ((str(SAMPLE), "--anchors", "half.csv"), "half.csv, line 2: it has one of x and y"),
+        ((str(SAMPLE), "--anchors", "none.csv"), "two robots need ranges to two anchors"),
     ],
 )
 def test_bad_input_is_one_line_with_its_place(words: tuple[str, ...], says: str, tmp_path: Path) -> None:
     (tmp_path / "bad.pyfg").write_text("VERTEX_XY L0 4.0 5.0\nEDGE_RANGE 0.6 A1 B1\n")
     (tmp_path / "bad.toml").write_text("[mission.noise]\nrange_bais = 0.1\n")
     (tmp_path / "bad.csv").write_text("anchor,x,y\nLC0,1,x\n")
+    (tmp_path / "half.csv").write_text("anchor,x\nLC0,1\n")
+    (tmp_path / "none.csv").write_text("anchor\nLC0\n")
     ended = tandem("estimate", *words, cwd=tmp_path)
     assert ended.status == USER_ERROR
     assert ended.out == ""

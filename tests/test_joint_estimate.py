@@ -12,11 +12,19 @@ from scipy.optimize import least_squares  # type: ignore[import-untyped]
 from scipy.stats import binom, chi2  # type: ignore[import-untyped]
 
 from agent.estimation.claim import BEFORE_SEARCH, blocked, of_joint
-from agent.estimation.facts import Facts, Manoeuvre, anchor, anchor_range, manoeuvre, mutual_range
+from agent.estimation.facts import (
+    AnchorPlace,
+    Facts,
+    Manoeuvre,
+    anchor,
+    anchor_range,
+    manoeuvre,
+    mutual_range,
+)
 from agent.estimation.fit import Fit, Start, fits
 from agent.estimation.gauss_newton import Convergence
 from agent.estimation.gaussian.hypotheses import search as search_of_pair
-from agent.estimation.gaussian.joint_claims import undetermined
+from agent.estimation.gaussian.joint_claims import displaced_anchor, undetermined
 from agent.estimation.gaussian.joint_ranges import MOST_MUTUAL_RANGES, JointMeasurements, joint_measurements
 from agent.estimation.gaussian.joint_search import search
 from agent.estimation.gaussian.odometry_noise import constant_errors, track, variances
@@ -257,6 +265,83 @@ def test_a_joint_fit_is_at_least_as_accurate_as_pairs() -> None:
         joint += [math.hypot(*error[:2]) for error in errors_of(fit, group, measured)]
         pairwise += pairwise_errors(group)
     assert np.median(joint) <= np.median(pairwise)
+
+
+# --- anchors that are not surveyed -------------------------------------------------------------------------
+
+
+def with_anchors(
+    group: MovingGroup, sigmas: dict[str, float], seed: int = 0
+) -> tuple[JointMeasurements, dict[str, Array]]:
+    """Return the measurements with some anchors told with errors of their sigmas, and their true places."""
+    draw, known, true = np.random.default_rng(seed), [], {}
+    for one in group.facts.ordered:
+        name, value = one.key.robot, one.value
+        if isinstance(value, AnchorPlace) and name in sigmas:
+            true[name] = np.array((value.x, value.y))
+            off = draw.normal(size=2) * (sigmas[name] if sigmas[name] < math.inf else 0.0)
+            known.append(anchor(name, *(true[name] + off).tolist(), sigmas[name]))
+        else:
+            known.append(one)
+    return joint_measurements(Facts(frozenset(known)), group.noise, PERIOD_S), true
+
+
+def anchor_errors(fit: Fit, used: JointMeasurements, true: dict[str, Array]) -> tuple[Array, list[float]]:
+    """Return the errors (m) of the anchors in `true`, (n, 2), and their normalised squares."""
+    errors, nees = [], []
+    for i, name in enumerate(used.robots):
+        if used.is_anchor(i):
+            error = fit.poses[i, :2] + used.origin - true[name]
+            errors.append(error)
+            own = fit.covariance[3 * i : 3 * i + 2, 3 * i : 3 * i + 2]
+            nees.append(float(error @ np.linalg.solve(own, error)))
+    return np.array(errors), nees
+
+
+def test_an_anchor_without_a_position_is_located_by_located_robots() -> None:
+    measured, true = with_anchors(moving_group(3, 4), {"Mr00": math.inf})
+    found = search(measured, REACH)
+    assert [measured.robots[one] for one in found.located] == ["r00", "r01", "r02", "Mr00"]
+    fit = found.scored[0].fit
+    errors, nees = anchor_errors(fit, measured.some(found.located), true)
+    assert float(np.hypot(*errors[0])) < 0.5
+    assert nees[0] < chi2.isf(1e-3, 2)
+
+
+@pytest.mark.long
+def test_covariances_of_anchors_that_are_not_surveyed_are_right() -> None:
+    of_anchors, of_robots = [], []
+    for seed in range(30):
+        group = moving_group(4, seed)
+        sigmas = {"Mr00": math.inf, "Mr01": 0.5, "Mr02": 0.1, "Mr03": 0.1}
+        measured, true = with_anchors(group, sigmas, seed)
+        found = search(measured, REACH)
+        part, fit = measured.some(found.located), found.scored[0].fit
+        assert len(part.driving) == 4
+        of_anchors += anchor_errors(fit, part, true)[1]
+        errors = errors_of(fit._replace(poses=fit.poses[:4]), group, measured)
+        of_robots += nees_of(fit, errors)
+    assert len(of_anchors) == 120
+    for nees, free in ((of_anchors, 2), (of_robots, 3)):
+        assert np.mean(nees) < 1.15 * free
+        outside = int(np.count_nonzero(np.array(nees) > chi2.isf(0.01, free)))
+        assert binom.sf(outside - 1, len(nees), 0.01) > 1e-3
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.1])
+def test_an_anchor_that_stands_elsewhere_than_surveyed_is_named(sigma: float) -> None:
+    group = moving_group(4, 5)
+    moved = [
+        anchor(one.key.robot, one.value.x + 2.0, one.value.y, sigma)
+        if isinstance(one.value, AnchorPlace) and one.key.robot == "Mr02"
+        else one
+        for one in group.facts.ordered
+    ]
+    for known, name in ((group.facts.ordered, None), (moved, "Mr02")):
+        measured = joint_measurements(Facts(frozenset(known)), group.noise, PERIOD_S)
+        found = search(measured, REACH)
+        displaced = displaced_anchor(found.scored[0].fit, measured.some(found.located))
+        assert (displaced.anchor if displaced is not None else None) == name
 
 
 # --- what is not determined ---------------------------------------------------------------------------------

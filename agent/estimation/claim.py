@@ -31,7 +31,7 @@ from agent.estimation.gaussian.inference import (
     pair_planning_hypotheses,
     to_second_order,
 )
-from agent.estimation.gaussian.joint_claims import decisive_ranges, open_position
+from agent.estimation.gaussian.joint_claims import DISPLACED_SIGMAS, decisive_ranges, displaced_anchor, open_position
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.noise_level import INLIER
 from agent.estimation.gaussian.odometry_noise import Array
@@ -375,6 +375,15 @@ def early_consistency(judged: Judged) -> str:
     return f"the fit is too improbable for so few ranges: {found.what}"
 
 
+@condition("recording")
+def anchors(judged: Judged) -> str:
+    """No anchor seems to stand {DISPLACED_SIGMAS:g} sigmas or more from where it was surveyed."""
+    found = displaced_anchor(judged.fit, judged.measured)
+    if found is None:
+        return ""
+    return f"anchor {found.anchor} seems to stand elsewhere than surveyed: {found.what}"
+
+
 @condition(*FIRST_CLAIMS)
 def profiles(judged: Judged) -> str:
     """No profile of common sensors explains the measurements much better than the assumed noise."""
@@ -415,7 +424,7 @@ BEFORE_SEARCH = (
 )
 """The conditions that a robot asks in each tick. If they hold, it searches the whole plane, and asks all."""
 
-CONDITIONS = (*BEFORE_SEARCH, early_consistency, profiles, rivals)
+CONDITIONS = (*BEFORE_SEARCH, early_consistency, anchors, profiles, rivals)
 """All conditions for a claim, cheap ones first."""
 
 

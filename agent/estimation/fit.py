@@ -138,8 +138,13 @@ class Linear(NamedTuple):
         moves = self.walk.moves.copy()
         moves[..., 6:] = 0.0  # the errors of the odometry at the point
         still = self.walk._replace(moves=moves, residual=effect)
-        back = self.kernel.step(still, self.poses, self.variance, RIDGE, math.inf)
-        return float(effect @ self.step.multipliers), float(effect @ back.multipliers)
+        told = self._multipliers(still)
+        if self.kernel.of.information.any():  # what the prior of the poses tells is no part of it
+            told = told - self._multipliers(still._replace(residual=np.zeros(len(effect))))
+        return float(effect @ self.step.multipliers), float(effect @ told)
+
+    def _multipliers(self, walk: Walk) -> Array:
+        return self.kernel.step(walk, self.poses, self.variance, RIDGE, math.inf).multipliers
 
 
 TO_THE_END = Convergence()

@@ -188,7 +188,7 @@ def _lines(problem: EstimationProblem, estimate: RecordingEstimate) -> list[str]
         x, y = anchor.position
         found.append(f"anchor {name}: {x:.2f} {y:.2f}, with a sigma of {anchor.sigma:.2f} m")
     for name, why in summary.doubtful_anchors.items():
-        found.append(f"anchor {name} seems to stand elsewhere: {why}")
+        found.append(f"anchor {name} seems to stand elsewhere than surveyed: {why}")
     if summary.blocking_reason:
         found.append(f"no claim at the end: {summary.blocking_reason}")
     for why, count in summary.unused_ranges.items():

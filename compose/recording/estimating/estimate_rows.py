@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
 
+from agent.estimation.gaussian.joint_claims import displaced_anchor
 from agent.estimation.gaussian.noise_level import INLIER
 from compose.recording.estimating.estimate_epoch import ClaimRule, EpochFit, EstimateEpoch
 from compose.recording.estimating.group_measurements import listed
@@ -129,23 +130,6 @@ class AnchorEstimate(msgspec.Struct, frozen=True):
         """The standard deviation of each coordinate in m, on average."""
         return math.sqrt(0.5 * (self.covariance[0][0] + self.covariance[1][1]))
 
-    @property
-    def moved(self) -> float | None:
-        """The distance in m from the position in the recording."""
-        return math.dist(self.position, self.given) if self.given is not None else None
-
-    @property
-    def elsewhere(self) -> bool:
-        """True if it is further away than ELSEWHERE_SIGMAS of that position."""
-        return (self.moved or 0.0) > ELSEWHERE_SIGMAS * (self.given_sigma or 0.0)
-
-
-ELSEWHERE_SIGMAS = 4.0
-"""The distance, in sigmas of each coordinate, from which on an anchor stands elsewhere than surveyed.
-
-An anchor that was surveyed as stated is so far off once in 3 000.
-"""
-
 
 class EstimateSummary(msgspec.Struct, frozen=True):
     """The content of `estimate.json`."""
@@ -266,7 +250,7 @@ def summary_of(
         ranged = [name for name, count in zip(pairs, last.ranges, strict=True) if count]
         calibration = learned_errors(last.fitted.fit, last.fitted.used.driving, ranged)
         anchors = _anchors(last.fitted, measured)
-        doubtful = _doubtful(last.fitted, anchors)
+        doubtful = _doubtful(last.fitted)
     hypotheses = [
         FinalHypothesis(
             one.probability,
@@ -313,14 +297,10 @@ def _anchors(fitted: EpochFit, measured: Measurements) -> dict[str, AnchorEstima
     return found
 
 
-def _doubtful(fitted: EpochFit, anchors: Mapping[str, AnchorEstimate]) -> dict[str, str]:
-    """Return why anchors seem to stand elsewhere: by their estimates, or since most ranges fit no other."""
-    doubtful = {}
-    for name, one in anchors.items():
-        if one.elsewhere and one.given_sigma is not None and one.moved is not None:
-            sigmas = f"{one.moved / one.given_sigma:.1f} of the stated sigmas"
-            doubtful[name] = f"it is estimated {one.moved:.2f} m from where it was surveyed: {sigmas}"
-    ranges = fitted.used.ranges
+def _doubtful(fitted: EpochFit) -> dict[str, str]:
+    """Return why anchors seem to stand elsewhere: by a test, or since most of their ranges fit no other."""
+    ranges, displaced = fitted.used.ranges, displaced_anchor(*fitted)
+    doubtful = {displaced.anchor: displaced.what} if displaced is not None else {}
     strays: dict[str, list[int]] = {}
     for radio, weight in zip(ranges.radio.tolist(), fitted.fit.weights.tolist(), strict=True):
         name = fitted.used.radios[radio][1]
