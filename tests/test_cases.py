@@ -14,6 +14,7 @@ import tandem
 from compose.errors import LOCALISED, NOT_LOCALISED, USER_ERROR, BadRecording
 from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.range_mcap import rows_as_they_arrive
+from compose.recording.ranging.range_recording import FixedAnchor
 from tests.commands import tandem as command
 from tests.mutated_recordings import (
     End,
@@ -159,7 +160,7 @@ def test_numbers_are_read_as_c_and_spreadsheets_write_them(tmp_path: Path) -> No
         same_numbers(read_ranges(tmp_path / "plain.pyfg"), read_ranges(tmp_path / "it.pyfg"))
     anchors = tmp_path / "anchors.csv"
     anchors.write_text("anchor,x,y,height\nn1,.5,+5.,-.5\n")
-    assert read_ranges(tmp_path / "plain", anchors).anchors[0] == ("n1", 0.5, 5.0, -0.5)
+    assert read_ranges(tmp_path / "plain", anchors).anchors[0] == FixedAnchor("n1", 0.5, 5.0, -0.5)
 
 
 @pytest.mark.parametrize("stream", [False, True])

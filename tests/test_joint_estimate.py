@@ -280,7 +280,8 @@ def with_anchors(
         if isinstance(value, AnchorPlace) and name in sigmas:
             true[name] = np.array((value.x, value.y))
             off = draw.normal(size=2) * (sigmas[name] if sigmas[name] < math.inf else 0.0)
-            known.append(anchor(name, *(true[name] + off).tolist(), sigmas[name]))
+            x, y = (true[name] + off).tolist()
+            known.append(anchor(name, x, y, sigmas[name]))
         else:
             known.append(one)
     return joint_measurements(Facts(frozenset(known)), group.noise, PERIOD_S), true

@@ -31,7 +31,11 @@ from agent.estimation.gaussian.inference import (
     pair_planning_hypotheses,
     to_second_order,
 )
-from agent.estimation.gaussian.joint_claims import DISPLACED_SIGMAS, decisive_ranges, displaced_anchor, open_position
+from agent.estimation.gaussian.joint_claims import (
+    Displacement,
+    decisive_ranges,
+    open_position,
+)
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.noise_level import INLIER
 from agent.estimation.gaussian.odometry_noise import Array
@@ -156,6 +160,8 @@ class Judged(NamedTuple):
     """The robots of which rivals are looked for."""
     pair: PairRanges | None = None
     """The measurements of a pair, for the evidence of its mutual ranges."""
+    displaced: Displacement | None = None
+    """The anchor that seems to stand elsewhere than it was surveyed, if one does."""
 
     @property
     def rival(self) -> Rival:
@@ -378,7 +384,7 @@ def early_consistency(judged: Judged) -> str:
 @condition("recording")
 def anchors(judged: Judged) -> str:
     """No anchor seems to stand {DISPLACED_SIGMAS:g} sigmas or more from where it was surveyed."""
-    found = displaced_anchor(judged.fit, judged.measured)
+    found = judged.displaced
     if found is None:
         return ""
     return f"anchor {found.anchor} seems to stand elsewhere than surveyed: {found.what}"

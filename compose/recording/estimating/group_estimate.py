@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from agent.estimation.claim import blocked, of_joint
+from agent.estimation.claim import BEFORE_SEARCH, blocked, of_joint
 from agent.estimation.gauss_newton import FIT_STEPS
 from agent.estimation.gaussian.consistency import FINISHED
-from agent.estimation.gaussian.joint_claims import open_position, undetermined
+from agent.estimation.gaussian.joint_claims import (
+    Displacement,
+    displaced_anchor,
+    open_position,
+    undetermined,
+)
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.joint_search import candidates, extended, follow, merged, search
 from agent.estimation.posterior import NO_HYPOTHESES, Certainty, JointHypotheses, JointHypothesis, certainties
@@ -24,6 +29,12 @@ from compose.recording.estimating.prepared_steps import Measurements
 
 GROUP_SEARCHES = tuple(8 * 2**n for n in range(16))
 """The numbers of ranges at which the whole plane is searched again."""
+
+RETESTED = 1.1
+"""The factor by which ranges must have grown before the places of the anchors are tested again.
+
+With less, claims of robots with many anchors take twice as long; with more, a false place is found later.
+"""
 
 MORE_RANGES = 1.5
 """The factor by which the decisive ranges of a robot must have grown before it is tried again."""
@@ -42,6 +53,8 @@ class GroupEstimator:
         self._searched = self._searches = 0
         self._failed: dict[tuple[int, ...], int] = {}
         self._claimed: set[str] = set()
+        self._displaced: Displacement | None = None
+        self._tested = 0
 
     def epoch(self, measured: Measurements, number: int) -> EstimateEpoch:
         """Return the estimate at the end of the epoch with this `number`, from 1 on, in their order."""
@@ -84,14 +97,29 @@ class GroupEstimator:
 
     def _reasons(self, found: JointHypotheses, used: JointMeasurements, reach: float) -> dict[str, str]:
         """Return what blocks the claim of each located robot; an empty text if nothing does."""
-        part, rule, reasons = used.some(found.located), self._rule, {}
-        for i, certainty in enumerate(certainties(found)):
-            if part.is_anchor(i):
-                continue
-            judged = of_joint("recording", i, found, certainty, part, reach, rule.accuracy, rule.confidence)
-            blocking = blocked(judged)
-            reasons[part.robots[i]] = blocking.reason if blocking is not None else ""
-        return reasons
+        part, rule = used.some(found.located), self._rule
+        judged = {
+            part.robots[i]: of_joint(
+                "recording", i, found, certainty, part, reach, rule.accuracy, rule.confidence
+            )
+            for i, certainty in enumerate(certainties(found))
+            if not part.is_anchor(i)
+        }
+        claiming = {name for name, one in judged.items() if blocked(one, BEFORE_SEARCH) is None}
+        if claiming:
+            displaced = self._displaced_anchor(found, part, claiming)
+            judged = {name: one._replace(displaced=displaced) for name, one in judged.items()}
+        reasons = {name: blocked(one) for name, one in judged.items()}
+        return {name: one.reason if one is not None else "" for name, one in reasons.items()}
+
+    def _displaced_anchor(
+        self, found: JointHypotheses, part: JointMeasurements, claiming: set[str]
+    ) -> Displacement | None:
+        """Return the anchor that seems to stand elsewhere, for robots that claim their poses."""
+        count = len(part.ranges.rho)
+        if count >= RETESTED * self._tested or not claiming <= self._claimed:
+            self._tested, self._displaced = count, displaced_anchor(found.scored[0].fit, part)
+        return self._displaced
 
 
 def _epoch(
