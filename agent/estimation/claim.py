@@ -32,6 +32,7 @@ from agent.estimation.gaussian.inference import (
     to_second_order,
 )
 from agent.estimation.gaussian.joint_claims import (
+    DISPLACED_SIGMAS,
     Displacement,
     decisive_ranges,
     open_position,
@@ -385,7 +386,7 @@ def early_consistency(judged: Judged) -> str:
 def anchors(judged: Judged) -> str:
     """No anchor seems to stand {DISPLACED_SIGMAS:g} sigmas or more from where it was surveyed."""
     found = judged.displaced
-    if found is None:
+    if found is None or found.sigmas < DISPLACED_SIGMAS:
         return ""
     return f"anchor {found.anchor} seems to stand elsewhere than surveyed: {found.what}"
 
