@@ -29,7 +29,6 @@ from protocol.network.inbox import Inbox
 from protocol.wire import encode
 from tests.broken_drivers import LosesAReading
 from tests.commands import BOUND_S, TandemProcess, processes_of, size, tandem, until
-from tests.series import series
 from tests.storm import stranger_at
 from tests.test_field import ASSURED, STARTS, beacon, both_have_ended, told
 from world.hardware import driver_journal
@@ -105,17 +104,6 @@ def all_is_well(out: Path, pair: Pair) -> None:
         shutil.copy(pair.path(name), both)
     audited = tandem("audit", both)
     assert audited.status == 0, audited.out
-
-
-@pytest.mark.parametrize("killed", series(["a", "b"], 0))
-def test_a_killed_robot_resumes_from_its_journal(pair: Pair, killed: str, tmp_path: Path) -> None:
-    pair.robots[killed].until_written(pair.path(killed), 2500)
-    pair.kill(killed)
-    before = len(told(tmp_path, killed).steps)
-    pair.again(killed)
-    all_is_well(tmp_path, pair)
-    assert f"{killed}: in run field, resumed at tick " in pair.robots[killed].out
-    assert len(told(tmp_path, killed).steps) > before
 
 
 @pytest.mark.long
@@ -223,13 +211,18 @@ def test_a_robot_that_is_killed_before_it_knows_its_mission_begins_it(pair: Pair
 
 
 @pytest.mark.long
-def test_a_motion_during_a_crash_is_reported_and_within_its_command(pair: Pair, tmp_path: Path) -> None:
+def test_a_killed_robot_resumes_and_reports_a_motion_within_its_last_command(
+    pair: Pair, tmp_path: Path
+) -> None:
     """The robot at most completes the current manoeuvre, and then rests."""
     pair.robots["a"].until_written(pair.path("a"), 2500)
     pair.kill("a")
+    measured = len(told(tmp_path, "a").steps)
     pair.again("a")
     all_is_well(tmp_path, pair)  # the peer computes its position from all its Reports
+    assert "a: in run field, resumed at tick " in pair.robots["a"].out
     steps = told(tmp_path, "a").steps
+    assert len(steps) > measured
     for before, step in pairwise(steps):
         assert before.command is not None
         assert step.observation.executed is not None
@@ -283,16 +276,16 @@ def test_a_rover_whose_body_is_not_on_file_is_not_made_up_elsewhere(pair: Pair, 
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("amount", range(200, 8000, 600))
-@pytest.mark.parametrize("killed", ["a", "b", "ab"])
-def test_a_robot_that_is_killed_at_any_moment_goes_on(
-    pair: Pair, killed: str, amount: int, tmp_path: Path
-) -> None:
-    for name in killed:
-        path, robot = pair.path(name), pair.robots[name]
-        until(lambda path=path, robot=robot: size(path) >= amount or not robot.running, pair.said)  # type: ignore[misc]
-    pair.kill(*killed)
-    pair.again(*killed)
+@pytest.mark.parametrize("turn", range(3))
+def test_a_robot_that_is_killed_at_any_moment_goes_on(pair: Pair, turn: int, tmp_path: Path) -> None:
+    """Again and again: each time, once the journals of those that are killed have that number of bytes."""
+    for number, amount in enumerate(range(200 + 600 * turn, 8000, 1800)):
+        killed = ("a", "b", "ab")[(number + turn) % 3]
+        for name in killed:
+            path, robot = pair.path(name), pair.robots[name]
+            until(lambda: size(path) >= amount or not robot.running, pair.said)  # noqa: B023
+        pair.kill(*killed)
+        pair.again(*killed)
     all_is_well(tmp_path, pair)
 
 
