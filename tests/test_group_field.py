@@ -204,41 +204,26 @@ def test_four_robots_localise_in_hardware_mode(tmp_path: Path, text: str, encryp
 
 
 @pytest.mark.long
-def test_a_killed_robot_of_a_group_resumes(tmp_path: Path) -> None:
-    """The first one, whose ticks the others count, and then one that waits to be visited."""
+def test_robots_of_a_group_that_are_killed_at_any_moment_resume(tmp_path: Path) -> None:
+    """All, the first one, whose ticks the others count, two, one that waits to be visited, and all again.
+
+    Each time, once the journals of those that are killed have that number of bytes.
+    """
     with group(tmp_path, FAR) as four:
         four.start("a", "b", "c", "d")
-        before = {}
-        for killed, at in (("a", 15), ("c", 20)):
-            four.measured(killed, at)
-            four.kill(killed)
-            before[killed] = len(told(tmp_path, killed).steps)
-            four.start(killed)
-        all_are_localised(tmp_path, four)
-        for killed, ticks in before.items():
-            assert f"{killed}: in run four, resumed at tick {ticks - 1}" in four.robots[killed].out
-            assert len(told(tmp_path, killed).steps) > ticks
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    "kills", [(("a", 500), ("bd", 4500), ("abcd", 8500)), (("abcd", 500), ("a", 8500))], ids=str
-)
-def test_robots_of_a_group_that_are_killed_at_any_moment_resume(
-    tmp_path: Path, kills: tuple[tuple[str, int], ...]
-) -> None:
-    """Each time, once the journals of those that are killed have that number of bytes."""
-    with group(tmp_path, FAR) as four:
-        four.start("a", "b", "c", "d")
-        for killed, amount in kills:
+        for killed, amount in (("abcd", 500), ("a", 2500), ("bd", 4500), ("c", 6500), ("abcd", 8500)):
             for name in killed:
                 four.written(name, amount)
             for name in killed:
                 four.robots[name].tell(SIGKILL)
             for name in killed:
                 four.kill(name)
+            before = {name: len(told(tmp_path, name).steps) for name in killed}
             four.start(*killed)
         all_are_localised(tmp_path, four)
+        for name, ticks in before.items():
+            assert f"{name}: in run four, resumed at tick {ticks - 1}" in four.robots[name].out
+            assert len(told(tmp_path, name).steps) > ticks
 
 
 @pytest.mark.long
@@ -268,29 +253,23 @@ def kill_in_turn(four: Group, kills: Sequence[tuple[str, int]]) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("kills", [(), (("a", 16), ("bd", 17), ("c", 18))], ids=str)
-def test_robots_without_an_anchor_localise_in_hardware_mode(
-    tmp_path: Path, kills: tuple[tuple[str, int], ...]
-) -> None:
-    """Also if the robot that finds them is killed, or they are themselves, while they drive squares."""
+def test_robots_without_an_anchor_localise_in_hardware_mode(tmp_path: Path) -> None:
+    """The robot that finds them is killed, and they are themselves, while they drive squares."""
     with group(tmp_path, UNANCHORED) as four:
         four.start("a", "b", "c", "d")
-        kill_in_turn(four, kills)
+        kill_in_turn(four, (("a", 16), ("bd", 17), ("c", 18)))
         all_are_localised(tmp_path, four)
-        assert all("resumed at tick" in four.robots[name].out for names, _ in kills for name in names)
+        assert all("resumed at tick" in robot.out for robot in four.robots.values())
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("kills", [(), (("a", 16),), (("bf", 18),)], ids=str)
-def test_robots_that_tolerate_an_attacker_localise_in_hardware_mode(
-    tmp_path: Path, kills: tuple[tuple[str, int], ...]
-) -> None:
-    """Also if the attacker is killed, or an honest finder and a robot that waits for a second one are."""
+def test_robots_that_tolerate_an_attacker_localise_in_hardware_mode(tmp_path: Path) -> None:
+    """The attacker is killed, and then an honest finder and a robot that waits for a second one."""
     with group(tmp_path, TOLERANT) as six:
         six.start(*"abcdef")
-        kill_in_turn(six, kills)
+        kill_in_turn(six, (("a", 16), ("bf", 18)))
         all_are_localised(tmp_path, six)
-        assert all("resumed at tick" in six.robots[name].out for names, _ in kills for name in names)
+        assert all("resumed at tick" in six.robots[name].out for name in "abf")
 
 
 @pytest.mark.long
