@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from itertools import cycle
 from pathlib import Path
 from random import Random
 from signal import SIGHUP, SIGINT, SIGKILL, SIGSTOP, SIGTERM
@@ -69,12 +70,14 @@ def concluded(_run: TandemProcess, out: Path) -> bool:
 MOMENTS: dict[str, Moment] = {
     "ready": ready,
     **{f"{number} processes": processes(number) for number in (2, 3, 4)},
-    **{f"{size} bytes": journaled(size) for size in sorted(int(200_000 * draw()) for _ in range(14))},
+    **{f"{size} bytes": journaled(size) for size in sorted(int(200_000 * draw()) for _ in range(8))},
 }
 LAST_MOMENTS: dict[str, Moment] = {
     "99.9 %": journaled(int(0.999 * LONG_JOURNAL_BYTES)),
     "concluded": concluded,
 }
+SIGNALS = dict(zip([*MOMENTS, *LAST_MOMENTS], cycle([SIGINT, SIGTERM]), strict=False))
+"""The signal that is sent at each moment: both in turn."""
 
 
 @pytest.fixture
@@ -96,12 +99,11 @@ def long(tmp_path: Path) -> Path:
 # --- stopped by a signal ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("number", series([SIGINT, SIGTERM]), ids=["SIGINT", "SIGTERM"])
 @pytest.mark.parametrize("moment", series(MOMENTS, 4))
 def test_an_interrupted_run_reports_it_and_leaves_no_process(
-    moment: str, number: signal.Signals, endless: Path, tmp_path: Path
+    moment: str, endless: Path, tmp_path: Path
 ) -> None:
-    out = tmp_path / "out"
+    out, number = tmp_path / "out", SIGNALS[moment]
     with TandemProcess("run", endless, "--out", out, "-q") as run:
         run.until(lambda: MOMENTS[moment](run, out), moment)
         run.tell(number)
@@ -132,12 +134,11 @@ def test_a_signal_that_does_not_interrupt_a_wait_ends_it_all_the_same() -> None:
         signal.signal(signal.SIGUSR1, before)
 
 
-@pytest.mark.parametrize("number", series([SIGINT, SIGTERM]), ids=["SIGINT", "SIGTERM"])
-@pytest.mark.parametrize("moment", LAST_MOMENTS)
+@pytest.mark.parametrize("moment", series(LAST_MOMENTS))
 def test_a_run_interrupted_as_it_ends_reports_the_outcome_or_the_interruption(
-    moment: str, number: signal.Signals, long: Path, tmp_path: Path
+    moment: str, long: Path, tmp_path: Path
 ) -> None:
-    out = tmp_path / "out"
+    out, number = tmp_path / "out", SIGNALS[moment]
     with TandemProcess("run", long, "--out", out, "-q") as run:
         until(lambda: LAST_MOMENTS[moment](run, out) or not run.running, moment)
         run.tell(number)

@@ -6,7 +6,6 @@ import socket
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
-from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +51,11 @@ def test_an_endpoint_is_not_given_to_two_even_if_nothing_listens_there_yet() -> 
 # --- any order ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("order", series(permutations(["world", "a", "b"]), 2), ids="-".join)
+ORDERS = [("world", "a", "b"), ("world", "b", "a"), ("a", "world", "b"), ("b", "a", "world")]
+"""The world first, between the robots, and last."""
+
+
+@pytest.mark.parametrize("order", series(ORDERS, 2), ids="-".join)
 def test_any_order_of_starting_gives_the_same_recording(
     order: tuple[str, ...], paper_1: Path, tmp_path: Path
 ) -> None:
