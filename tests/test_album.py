@@ -344,7 +344,7 @@ def test_a_noisy_plan_of_the_paper_planner_is_drawn_in_bs_frame(recordings: Path
 ABSENT = {"undecided": {"phase-1-a", "plan-a-b", "encounter-a-b"}}
 
 
-@pytest.mark.parametrize("name", series(["noisy", "undecided", "assured", "faulty", "letter"], 0))
+@pytest.mark.parametrize("name", series(["undecided", "assured", "faulty", "letter"], 0))
 def test_each_kind_of_figure_is_drawn_or_the_reason_is_printed(
     name: str, recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
