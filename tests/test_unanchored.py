@@ -383,10 +383,14 @@ def test_a_recording_whose_searching_robots_are_not_those_with_an_anchor_is_refu
 
 
 @pytest.mark.long
-def test_processes_write_the_same_journals_and_each_command_shows_the_recording(tmp_path: Path) -> None:
+def test_killed_processes_write_the_same_journals_and_each_command_shows_the_recording(
+    tmp_path: Path,
+) -> None:
+    """A finder, a robot without an anchor and the world are killed."""
     scenario = tmp_path / "four.toml"
     scenario.write_text(FILE, encoding="utf-8")
-    for name, mode in (("processes", []), ("inline", ["--in-process"])):
+    kills = ["--kill", "a@60", "--kill", "u@40", "--kill", "world@70"]
+    for name, mode in (("processes", kills), ("inline", ["--in-process"])):
         done = tandem_command("run", str(scenario), "--out", str(tmp_path / name), *mode)
         assert done.status == 0, done.err
     for journal in (tmp_path / "inline").glob("*.journal"):
@@ -395,22 +399,10 @@ def test_processes_write_the_same_journals_and_each_command_shows_the_recording(
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     assert [one["robot"] for one in summary["group"]["without_anchor"]] == ["u", "v"]
     assert summary["group"]["localised_tick"] <= summary["group"]["bound_ticks"] == summary["t_max_s"]
-    for command in (["audit"], ["replay"], ["figures"], ["export"], ["export", "--rerun"]):
+    for command in (["audit"], ["replay"], ["figures", "--format", "svg"], ["export"], ["export", "--rerun"]):
         done = tandem_command(command[0], str(folder), *command[1:])
         assert done.status == 0, done.err
     assert "start-u" in (folder / "figures" / "meetings.svg").read_text(encoding="utf-8")
-
-
-@pytest.mark.long
-def test_a_finder_and_a_robot_without_an_anchor_that_are_killed_resume_to_the_bit(tmp_path: Path) -> None:
-    scenario = tmp_path / "four.toml"
-    scenario.write_text(FILE, encoding="utf-8")
-    kills = ["--kill", "a@60", "--kill", "u@40", "--kill", "world@70"]
-    for name, more in (("killed", kills), ("whole", ["--in-process"])):
-        done = tandem_command("run", str(scenario), "--out", str(tmp_path / name), *more)
-        assert done.status == 0, done.err
-    for journal in (tmp_path / "whole").glob("*.journal"):
-        assert journal.read_bytes() == (tmp_path / "killed" / journal.name).read_bytes()
 
 
 def test_a_run_of_frames_has_the_robots_without_an_anchor() -> None:
