@@ -195,7 +195,7 @@ WRITING = (
     "run paper-1 --in-process --out OUT --no-export",
     "run paper-1 --out OUT --export",
     "sweep ../few.toml --out OUT --workers 1",
-    "figures RECORDING --format svg",
+    "figures RECORDING --only ranges --format svg",
     "export RECORDING --out OUT",
     "export RECORDING --pyfg --out OUT",
     "estimate tests/data/uwb/tiers-a-b-30-s.pyfg --noise uwb-calibrated --out OUT",

@@ -670,6 +670,7 @@ def test_a_search_that_is_stopped_leaves_a_recording_that_is_replayed_until_then
 
 @pytest.mark.long
 def test_each_command_shows_a_search_under_noise(inline: Path) -> None:
-    for command in (["audit"], ["replay"], ["figures", "--format", "svg"], ["export"], ["export", "--rerun"]):
+    figures = ["figures", "--only", "meetings", "--only", "errors", "--only", "robot", "--format", "svg"]
+    for command in (["audit"], ["replay"], figures, ["export"], ["export", "--rerun"]):
         done = tandem_command(command[0], inline / "inline", *command[1:])
         assert done.status == 0, done.err

@@ -168,9 +168,9 @@ def test_the_search_is_near_the_optimum(robots: int) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("robots", [5, 6, 7, 8])
-def test_the_search_is_near_the_optimum_in_200_groups(robots: int) -> None:
-    ratios = [ratio_of_search(drawn_anchors(robots, seed)) for seed in range(200)]
+@pytest.mark.parametrize(("robots", "groups"), [(5, 50), (8, 100)])
+def test_the_search_is_near_the_optimum_in_many_groups(robots: int, groups: int) -> None:
+    ratios = [ratio_of_search(drawn_anchors(robots, seed)) for seed in range(groups)]
     assert mean(ratios) < 1.001
     assert max(ratios) < 1.01
 
