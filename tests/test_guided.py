@@ -8,7 +8,8 @@ from collections.abc import Iterator
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.browser import INKS, Open, chromium_only, picture, stop_clock, until_shown
+from tests.browser import INKS, Open, chromium_only, picture, shot, stop_clock, until_shown
+from tests.test_page_labels import SIZES, overlaps
 
 STEP_MS = 250
 """The time in ms between two frames of the page."""
@@ -18,9 +19,11 @@ NOW = f"""() => [
 ]"""
 
 
-def started(opened: Open, address: str, tick: int = 0, *, reduced: bool = False) -> Page:
+def started(
+    opened: Open, address: str, tick: int = 0, *, reduced: bool = False, size: tuple[int, int] = SIZES[0]
+) -> Page:
     """Return a page on which guided play has begun. From then on, time passes only by `played`."""
-    page = opened(f"{address}#tick={tick}")
+    page = opened(f"{address}#tick={tick}", width=size[0], height=size[1])
     page.emulate_media(reduced_motion="reduce" if reduced else "no-preference")
     until_shown(page, tick)
     stop_clock(page)
@@ -39,13 +42,26 @@ def played(page: Page, most_s: float = 90.0) -> Iterator[tuple[int, str]]:
     raise AssertionError(f"the page still plays after {most_s} s")
 
 
+PLANE = "(({ clientWidth, clientHeight }) => [clientWidth, clientHeight])(document.getElementById('canvas'))"
+"""An expression of the page: the size of the plane in pixels."""
+
+
 @pytest.mark.long
-def test_guided_play_tells_paper_1_in_less_than_a_minute_most_of_them_at_the_encounter(
-    opened: Open, address: str
+@pytest.mark.parametrize("size", [SIZES[0], SIZES[-1]], ids=str)
+def test_guided_play_tells_paper_1_in_less_than_a_minute_and_at_no_moment_does_text_overlap(
+    size: tuple[int, int], opened: Open, address: str
 ) -> None:
-    page = started(opened, address)
+    """Most of the time is that of the encounter, and the plane keeps its size."""
+    page = started(opened, address, size=size)
     expect(page.locator("#guide")).to_have_attribute("aria-pressed", "true")
-    seen = list(played(page))
+    seen, planes = [], set()
+    for now in played(page):
+        assert not overlaps(page), now
+        planes.add(str(page.evaluate(PLANE)))
+        if now[1] not in [caption for _, caption in seen]:
+            shot(page, f"guided-{size[0]}-{len(seen)}")
+        seen.append(now)
+    assert len(planes) == 1
     told = list(dict.fromkeys(caption for _, caption in seen))
     assert [re.split(r"[.,]", one)[0] for one in told] == [
         "Each robot knows where the anchors are and how it moves",

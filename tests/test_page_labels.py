@@ -16,13 +16,21 @@ from compose.launch import in_process
 from compose.recording.kills_file import KILLS, Killed
 from compose.scenario.scenario_file import load, parse
 from protocol.attack import Attack
-from tests.browser import Open, picture, scrub_to, shot, stop_clock, until_shown, watching
+from tests.browser import Open, picture, scrub_to, shot, until_shown, watching
 from tests.commands import SECTION_IV
 from tests.series import series
 from world.scenario import Scenario
 
 SIZES = [(1280, 720), (1600, 1000), (800, 600), (390, 844)]
-STEP_MS = 250
+SHOWN = [
+    *[("paper-1", size) for size in SIZES],
+    *[
+        (name, size)
+        for number, name in enumerate(["noisy", "attack", "crashes", "loss", "six", "two-hundred"])
+        for size in SIZES[number % 2 :: 2]
+    ],
+]
+"""The missions that are shown, and the sizes of the window: one in all of them, the others in every other."""
 TEXTS = """() => {
   const canvas = document.getElementById('canvas'), { left, top } = canvas.getBoundingClientRect();
   const found = canvas.labels.map(({ text, box: [l, t, r, b] }) => (
@@ -141,12 +149,12 @@ def address_of(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Address]:
 # --- what is shown ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("size", series(SIZES, 1), ids=str)
-@pytest.mark.parametrize("name", series(MISSIONS, 1))
+@pytest.mark.parametrize("shown", series(SHOWN), ids=str)
 def test_no_text_overlaps_another(
-    name: str, size: tuple[int, int], opened: Open, browser: Browser, address_of: Address
+    shown: tuple[str, tuple[int, int]], opened: Open, browser: Browser, address_of: Address
 ) -> None:
     """With the whole scenario in view, near the robots, and with the sequence diagram, light and dark."""
+    name, size = shown
     page = opened(address_of(name), width=size[0], height=size[1])
     for tick in TICKS[name]:
         scrub_to(page, tick)
@@ -184,25 +192,3 @@ def test_no_label_covers_a_robot_whose_bearing_is_unknown(opened: Open, address:
         picture(page)
         assert any("bearing unknown" in text for text, *_ in page.evaluate(TEXTS))
         assert not page.evaluate(COVERED), tick
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("size", SIZES, ids=str)
-def test_no_text_overlaps_another_at_any_moment_of_guided_play(
-    size: tuple[int, int], opened: Open, address_of: Address
-) -> None:
-    page = opened(f"{address_of('paper-1')}#tick=0", width=size[0], height=size[1])
-    until_shown(page, 0)
-    stop_clock(page)
-    page.keyboard.press("Space")
-    told = ""
-    for _ in range(60_000 // STEP_MS):
-        page.clock.fast_forward(STEP_MS)
-        assert not overlaps(page), page.locator("#tick").text_content()
-        caption = page.locator("#caption").text_content() or ""
-        if caption != told:
-            told = caption
-            shot(page, f"guided-{size[0]}-{len(caption)}")
-        if page.locator("#play").get_attribute("aria-label") == "Play":
-            break
-    assert told.startswith("Both are localised:")

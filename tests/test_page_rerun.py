@@ -331,8 +331,9 @@ def test_in_a_narrow_window_the_handles_stay_in_view_while_the_form_is_scrolled(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("dark", [False, True])
-@pytest.mark.parametrize(("width", "height"), [(1280, 720), (800, 600), (390, 844)])
+@pytest.mark.parametrize(
+    ("width", "height", "dark"), [(1280, 720, False), (800, 600, True), (390, 844, True)]
+)
 def test_the_form_is_legible(opened: Open, address: str, width: int, height: int, dark: bool) -> None:
     page = opened_form(opened, address, width=width, height=height, dark=dark)
     shot(page, f"rerun-{width}-{'dark' if dark else 'light'}")

@@ -23,7 +23,6 @@ STORY = """() => ({
   caption: document.getElementById('caption').textContent,
   title: document.querySelector('#predictions:not([hidden]) .title')?.textContent ?? null,
   out: document.querySelectorAll('#predictions:not([hidden]) .out').length,
-  plane: [document.getElementById('canvas').clientWidth, document.getElementById('canvas').clientHeight],
   marks: [...document.querySelectorAll('#legend li')].map((one) => one.textContent),
   busy: document.getElementById('play').getAttribute('aria-label') === 'Pause',
 })"""
@@ -57,15 +56,6 @@ def test_captions_speak_of_the_manoeuvre_and_of_what_is_left_when_it_is_drawn(
     assert [min(measured), max(measured)] == [0, 3]
     assert measured == sorted(measured)
     assert set(crossed["Only one of"]) == {3}
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("size", [(1280, 720), (800, 600), (390, 844)], ids=str)
-def test_the_plane_keeps_its_size_through_guided_play(
-    size: tuple[int, int], opened: Open, address: str
-) -> None:
-    page = opened(f"{address}#tick=0", width=size[0], height=size[1])
-    assert len({str(shown["plane"]) for shown in played(page, 0)}) == 1
 
 
 # --- the legend -----------------------------------------------------------------------------------------
