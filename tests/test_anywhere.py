@@ -48,8 +48,8 @@ def test_missions_in_any_setting_from_any_start_localise_or_are_refused() -> Non
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("first", range(100, 3000, 290))
-def test_thousands_of_missions_in_any_setting_localise_or_are_refused(first: int) -> None:
+@pytest.mark.parametrize("first", range(100, 1260, 290))
+def test_a_thousand_missions_in_any_setting_localise_or_are_refused(first: int) -> None:
     outcomes = Counter(played(trial) for trial in range(first, first + 290))
     assert set(outcomes) <= {"localised", "refused"}, outcomes
     assert outcomes["refused"] < 0.12 * outcomes.total()

@@ -428,15 +428,15 @@ def position_sigma(pose: PoseEstimate) -> float:
 
 @pytest.mark.long
 def test_poses_by_three_anchors_are_off_by_what_their_covariance_says() -> None:
-    """The mean of 2 x 20 values of NEES with 3 degrees of freedom is 3 +- 1.3 in 99.9 %."""
+    """The mean of 2 x 10 values of NEES with 3 degrees of freedom is 3 +- 1.8 in 99.9 %."""
     nees = []
-    for seed in range(20):
+    for seed in range(10):
         recording = with_third_anchor(simulated(), seed)
         problem = measurements(recording, None, "uwb-calibrated", None)
         found = estimated(problem, ClaimRule()).summary
         nees += [one.final.nees for one in found.robots.values() if one.final and one.final.nees is not None]
-    assert len(nees) == 40
-    assert 1.0 < np.mean(nees) < 4.3
+    assert len(nees) == 20
+    assert 1.0 < np.mean(nees) < 4.8
 
 
 def test_each_pair_of_radios_has_one_range_a_second_at_the_nearest_tick(sample: RangeRecording) -> None:

@@ -229,15 +229,15 @@ def test_a_robot_compares_its_meetings_once_more_before_it_gives_up() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [1, 2, 8867783836166564671])
-def test_an_attacker_in_a_first_meeting_does_not_leave_robots_undecided(seed: int) -> None:
-    assert honest(run_mission(scenario_with(seed, SHIFTED))) == (3, 0, 0)
+def test_an_attacker_in_a_first_meeting_does_not_leave_robots_undecided() -> None:
+    assert honest(run_mission(scenario_with(1, SHIFTED))) == (3, 0, 0)
 
 
 @pytest.mark.long
 def test_a_visitor_does_not_drive_home_because_of_ranges_of_earlier_meetings() -> None:
     """With more than 60 of them, it drove home as soon as it had met the other robot again."""
     run = of_frames(kept(scenario_with(8867783836166564671, SHIFTED)))
+    assert honest(run) == (3, 0, 0)
     met_again = 0
     for robot in run.agents:
         for before, after in pairwise([state.pair for state in states(run, robot)]):
@@ -252,6 +252,7 @@ def test_a_visitor_does_not_drive_home_because_of_ranges_of_earlier_meetings() -
 def test_a_second_meeting_of_two_robots_has_file_names_of_its_own() -> None:
     """Figures of two meetings of the same robots; those of the second replaced those of the first."""
     run = of_frames(kept(scenario_with(2, SHIFTED)))
+    assert honest(run) == (3, 0, 0)
     pairs = list(pairs_of(run, {robot: agent_replay(run, robot) for robot in run.robots}))
     names = [pair.name for pair in pairs]
     assert len(set(names)) == len(names) == len(past_meetings(run))

@@ -220,7 +220,7 @@ def test_the_covariances_of_groups_are_right(unanchored: list[int]) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("robots", "unanchored"), [(3, []), (3, [2]), (4, []), (4, [3]), (6, [1, 4])])
+@pytest.mark.parametrize(("robots", "unanchored"), [(3, []), (6, [1, 4])])
 def test_the_covariances_of_many_groups_are_right(robots: int, unanchored: list[int]) -> None:
     scores = Scores(robots, range(1000, 1060), unanchored)
     assert len(scores.nees) >= 0.95 * 60 * robots
