@@ -53,10 +53,10 @@ INTERVAL = re.compile(
 def test_figures_that_a_page_shows_agree_with_what_fewer_trials_print(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The 200 trials of the page take minutes; the first 20 of the same trials must not contradict them."""
+    """The 200 trials of the page take minutes; the first 10 of the same trials must not contradict them."""
     page = (EXAMPLES.parent / "own-planner.md").read_text()
     shown = page.partition("<!-- printed by: greedy_planner -->")[2]
-    import_module("docs.examples.greedy_planner").main(str(tmp_path / "figure.png"), trials=20)
+    import_module("docs.examples.greedy_planner").main(str(tmp_path / "figure.png"), trials=10)
     printed = capsys.readouterr().out
     few, many = ({one["what"]: one for one in INTERVAL.finditer(text)} for text in (printed, shown))
     assert {*few} == {*many} == {"greedy - assured"}

@@ -85,7 +85,7 @@ def marks(page: Page) -> int:
     return int(page.evaluate(MARKS))
 
 
-@pytest.mark.long
+@pytest.mark.long("slow")
 def test_a_killed_robot_keeps_its_phase_and_is_shown_as_down_until_it_is_back(
     opened: Open, tmp_path: Path
 ) -> None:
@@ -337,8 +337,8 @@ def state(page: Page) -> list[object]:
 @pytest.mark.long
 def test_space_plays_though_the_closed_help_still_has_the_focus(opened: Open, address: str) -> None:
     """For a moment after it closes, longer on a slow machine, keys still go to its button."""
-    page = opened(f"{address}#tick=20")
-    until_shown(page, 20)
+    page = opened(f"{address}#tick=45")
+    until_shown(page, 45)
     page.locator("#keys button").first.dispatch_event("keydown", {"key": " ", "bubbles": True})
     until_shown(page, 48)
 
