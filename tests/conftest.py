@@ -40,11 +40,23 @@ def pytest_configure(config: pytest.Config) -> None:
                 signal.signal(number, handler)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Give long tests a time limit of their own."""
+@pytest.hookimpl(trylast=True)  # after those that -m and -k select
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Give long tests a time limit of their own, and let each worker begin with some of the slow ones.
+
+    A worker gets an equal part of the tests, in this order, and takes some from the end of another's part.
+    """
     for item in items:
         if item.get_closest_marker("long"):
             item.add_marker(pytest.mark.timeout(LONG_TIMEOUT_S))
+    slow = [item for item in items if any(one.args == ("slow",) for one in item.iter_markers("long"))]
+    others = [item for item in items if item not in slow]
+    workers = getattr(config, "workerinput", {}).get("workercount", 1)
+    items.clear()
+    for left in range(workers, 0, -1):
+        begun = (len(slow) + len(others)) // left - len(slow) // left
+        items += [slow.pop(0) for _ in range(len(slow) // left)] + others[:begun]
+        del others[:begun]
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:  # noqa: ARG001  # the hook requires the name

@@ -20,7 +20,7 @@ def test_no_figure_of_the_documentation_is_stale() -> None:
     assert not list(picture.stale(quick=True)), "uv run docs/picture.py FIGURE draws them again"
 
 
-@pytest.mark.long
+@pytest.mark.long("slow")
 def test_no_figure_of_a_sweep_or_an_estimate_is_stale() -> None:
     assert not list(picture.stale())
 

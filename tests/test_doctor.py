@@ -398,7 +398,7 @@ def test_access_rules_without_the_robot_are_a_problem(keys: Path, tmp_path: Path
 # --- no mission is disturbed ----------------------------------------------------------------------------
 
 
-@pytest.mark.long
+@pytest.mark.long("slow")
 def test_the_doctor_does_not_change_the_recording_of_a_mission(keys: Path, tmp_path: Path) -> None:
     """It runs before b joins, while all robots move, and several times at once."""
     expected, out = record_of(LONG, tmp_path), tmp_path / "out"

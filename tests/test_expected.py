@@ -137,7 +137,7 @@ def test_each_shipped_sweep_has_expected_results_of_all_its_cells(name: str) -> 
     assert {len(one.outcomes) for one in file.sample} == {min(20, file.trials)}
 
 
-@pytest.mark.long
+@pytest.mark.long("slow")
 @pytest.mark.timeout(900)
 def test_shipped_sweeps_have_their_expected_results() -> None:
     """The command forks, so it is a process of its own, without the threads of other tests."""

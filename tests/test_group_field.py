@@ -226,7 +226,7 @@ def test_robots_of_a_group_that_are_killed_at_any_moment_resume(tmp_path: Path) 
             assert len(told(tmp_path, name).steps) > ticks
 
 
-@pytest.mark.long
+@pytest.mark.long("slow")
 def test_a_robot_that_is_killed_before_it_knows_all_results_receives_them_afterwards(tmp_path: Path) -> None:
     """The others have its result, and do not end while it is down: nobody else could tell it theirs."""
     with group(tmp_path, FAR, "--lost", "3") as four:
@@ -272,7 +272,7 @@ def test_robots_that_tolerate_an_attacker_localise_in_hardware_mode(tmp_path: Pa
         assert all("resumed at tick" in six.robots[name].out for name in "abf")
 
 
-@pytest.mark.long
+@pytest.mark.long("slow")
 def test_a_robot_that_is_dead_for_good_keeps_the_others_from_nothing(tmp_path: Path) -> None:
     """Robot a, whose ticks the others count, dies on the way to c: another one visits c later."""
     with group(tmp_path, FAR, "--lost", "2") as four:

@@ -191,7 +191,7 @@ def test_reports_under_odometry_noise_fit_in_a_frame_and_no_claim_is_wrong() -> 
     assert run.end.outcome in ("localised", "undecided")
 
 
-@pytest.mark.long
+@pytest.mark.long("slow")
 def test_random_groups_make_no_wrong_claim_under_noise_and_reported_poses_have_right_covariances() -> None:
     scores: list[float] = []
     outcomes: list[str] = []

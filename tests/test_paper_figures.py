@@ -38,7 +38,7 @@ def figures(pair: PairRecord, medium: Medium) -> Iterator[tuple[str, Figure]]:
                     yield name, figure
 
 
-@pytest.mark.long
+@pytest.mark.long("slow")
 def test_each_figure_is_laid_out_one_or_two_columns_wide_in_small_text_and_embedded_fonts(
     paper_1: Path, noisy: Path, tmp_path: Path
 ) -> None:

@@ -214,7 +214,7 @@ anchor = [10.0, 0.0]
 """
 
 
-@pytest.mark.long
+@pytest.mark.long("slow")
 @pytest.mark.timeout(300)
 def test_a_base_behind_a_bridge_fulfils_the_driver_contract(tmp_path: Path) -> None:
     """The base uses another CDR library, has its own watchdog, and its headings wrap.

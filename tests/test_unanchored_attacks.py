@@ -122,7 +122,7 @@ def test_lost_and_late_reports_only_cost_time_with_an_attacker(fault: dict[str, 
     assert all_right(run_mission(scenario_of(five("a", fault=[fault]))))
 
 
-@pytest.mark.long
+@pytest.mark.long("slow")
 def test_no_shipped_attack_leads_to_a_wrong_claim() -> None:
     shipped = spec.load("group-attacks-unanchored")
     for cell in cells(shipped):

@@ -422,7 +422,7 @@ def test_a_mission_is_followed_to_its_end_from_its_journals_and_from_the_network
             assert b.ended().status == 0
 
 
-@pytest.mark.long
+@pytest.mark.long("slow")
 def test_a_page_keeps_up_with_a_mission_as_fast_as_it_goes(opened: Open, tmp_path: Path) -> None:
     """It skips frames: after thousands of ticks, it has never been far behind for long."""
     scenario, out = tmp_path / "endless.toml", tmp_path / "out"
