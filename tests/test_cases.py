@@ -193,8 +193,7 @@ def test_mcap_files_after_each_other_are_read_as_one(stream: bool, tmp_path: Pat
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", range(2))
-def test_mutated_recordings_end_with_a_status_and_one_line(seed: int) -> None:
-    found = list(trials(50, seed, jobs=1))
+def test_mutated_recordings_end_with_a_status_and_one_line() -> None:
+    found = list(trials(60, 0, jobs=1))
     assert not any(one.problem for one in found), "\n".join(summary(found))
-    assert sum(one.accepted for one in found) >= 15  # of 50; the command requires half of all
+    assert sum(one.accepted for one in found) >= 18  # of 60; the command requires half of all

@@ -192,7 +192,12 @@ def test_a_recording_that_a_power_cut_may_have_shortened_is_refused(
 
 
 @pytest.mark.long
-def test_a_robot_that_has_ended_prints_its_outcome_again(pair: Pair, tmp_path: Path) -> None:
+def test_a_robot_that_is_killed_before_it_knows_its_mission_begins_it_and_one_that_has_ended_says_so_again(
+    pair: Pair, tmp_path: Path
+) -> None:
+    pair.robots["b"].until(lambda: pair.path("b", "driver").exists(), "b has opened its journal")
+    pair.kill("b")
+    pair.again("b")
     all_is_well(tmp_path, pair)
     before = {path.name: path.read_bytes() for path in (tmp_path / "a").iterdir()}
     outcome = pair.robots["a"].out.splitlines()[-1]
@@ -200,14 +205,6 @@ def test_a_robot_that_has_ended_prints_its_outcome_again(pair: Pair, tmp_path: P
     ended = pair.robots["a"].ended()
     assert (ended.status, ended.out.splitlines()[-1]) == (0, outcome)
     assert {path.name: path.read_bytes() for path in (tmp_path / "a").iterdir()} == before
-
-
-@pytest.mark.long
-def test_a_robot_that_is_killed_before_it_knows_its_mission_begins_it(pair: Pair, tmp_path: Path) -> None:
-    pair.robots["b"].until(lambda: pair.path("b", "driver").exists(), "b has opened its journal")
-    pair.kill("b")
-    pair.again("b")
-    all_is_well(tmp_path, pair)
 
 
 @pytest.mark.long

@@ -31,7 +31,6 @@ from protocol.messages import Estimate
 from protocol.mission import ROLES
 from protocol.motion import Covariance, Pose
 from tests.commands import BENT, PAPER_1, Ended, several_pairs, tandem
-from tests.series import series
 from tests.test_album import pair as pair_of
 from world.scenario import Scenario
 
@@ -274,8 +273,7 @@ def test_probabilities_are_shown_with_their_significant_digits(probability: floa
 # --- all kinds of recordings ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("noise", series(["", NOISE]))
-@pytest.mark.parametrize("planner_name", series(["assured", "paper"]))
+@pytest.mark.parametrize(("planner_name", "noise"), [("assured", NOISE), ("paper", "")])
 @pytest.mark.long
 def test_a_mission_that_ends_undecided_is_drawn(noise: str, planner_name: str, tmp_path: Path) -> None:
     text = BRIEF.replace("assured", planner_name).replace("[planner]", f"{noise}[planner]")
