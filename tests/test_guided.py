@@ -54,7 +54,8 @@ def test_guided_play_tells_paper_1_in_less_than_a_minute_and_at_no_moment_does_t
     """Most of the time is that of the encounter, and the plane keeps its size."""
     page = started(opened, address, size=size)
     expect(page.locator("#guide")).to_have_attribute("aria-pressed", "true")
-    seen, planes = [], set()
+    seen: list[tuple[float, str]] = []
+    planes = set()
     for now in played(page):
         assert not overlaps(page), now
         planes.add(str(page.evaluate(PLANE)))
