@@ -24,7 +24,7 @@ from compose.cli.main import COMMANDS, command_parser
 from compose.cli.removed import REMOVED
 from compose.recording import rows
 from compose.recording.estimating.estimate_rows import (
-    AnchorEstimate,
+    EstimatedAnchor,
     EstimateSummary,
     PoseEstimate,
     PoseEstimateRow,
@@ -342,7 +342,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "estimate-fields": partial(fields_of, EstimateSummary, defaults=False),
     "robot-estimate-fields": partial(fields_of, RobotEstimate, defaults=False),
     "estimate-pose-fields": partial(fields_of, PoseEstimate, defaults=False),
-    "anchor-estimate-fields": partial(fields_of, AnchorEstimate, defaults=False),
+    "anchor-estimate-fields": partial(fields_of, EstimatedAnchor, defaults=False),
     "learned-fields": partial(fields_of, LearnedErrors, defaults=False),
     "final-report": partial(columns_of, messages.FinalReport),
     "claim-conditions": claim_conditions,

@@ -594,7 +594,8 @@ def tried(number: int, seed: int) -> Trial:
         end = ended(words)
     problem = ""
     lines = end.errors.count("\n")
-    most_lines = 2 if "--follow" in words else 1  # a stream may tell a suspicion before it breaks off
+    # a stream may tell a suspicion before it breaks off, and a calibration why it needs a fit
+    most_lines = 2 if "--follow" in words or "calibrate" in words else 1
     if end.status not in (0, 1, 2):
         problem = f"status {end.status}"
     elif "Traceback" in end.errors or lines > most_lines or (end.status == 2 and not lines):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import msgspec
 
-from compose.recording.estimating.estimate_rows import AnchorEstimate, EstimateSummary, PoseEstimateRow
+from compose.recording.estimating.estimate_rows import EstimatedAnchor, EstimateSummary, PoseEstimateRow
 from protocol import files
 
 CSV_NAME, JSON_NAME, ANCHORS_NAME = "estimate.csv", "estimate.json", "anchors.csv"
@@ -35,7 +35,7 @@ def _cell(value: object) -> object:
     return "" if value is None else value
 
 
-def anchors_csv(anchors: Mapping[str, AnchorEstimate]) -> str:
+def anchors_csv(anchors: Mapping[str, EstimatedAnchor]) -> str:
     """Return the table of anchors that `--anchors` reads: each is surveyed with the sigma of its estimate."""
     rows = [
         f"{name},{one.position[0]!r},{one.position[1]!r},{one.height!r},{one.sigma!r}"

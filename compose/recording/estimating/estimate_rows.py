@@ -111,7 +111,7 @@ class FinalHypothesis(msgspec.Struct, frozen=True):
     """The pose of each robot: x and y in m, and the heading in rad."""
 
 
-class AnchorEstimate(msgspec.Struct, frozen=True):
+class EstimatedAnchor(msgspec.Struct, frozen=True):
     """The estimated position of an anchor that is not surveyed, by the likeliest hypothesis at the end."""
 
     position: tuple[float, float]
@@ -158,7 +158,7 @@ class EstimateSummary(msgspec.Struct, frozen=True):
     """The condition for a claim that is not met at the end; empty if all are."""
     undetermined: dict[str, str]
     """The robots without a pose at the end, with the reason; none if all are estimated as one hypothesis."""
-    anchors: dict[str, AnchorEstimate]
+    anchors: dict[str, EstimatedAnchor]
     """The estimated positions of anchors that are not surveyed; those of which none follows are left out."""
     doubtful_anchors: dict[str, str]
     """The anchors that seem to stand elsewhere than the recording says, with the reason."""
@@ -276,7 +276,7 @@ def summary_of(
     )
 
 
-def _anchors(fitted: EpochFit, measured: Measurements) -> dict[str, AnchorEstimate]:
+def _anchors(fitted: EpochFit, measured: Measurements) -> dict[str, EstimatedAnchor]:
     """Return the estimates of the anchors that are not surveyed."""
     fit, used = fitted
     given, found = {one.id: one for one in measured.anchors}, {}
@@ -287,7 +287,7 @@ def _anchors(fitted: EpochFit, measured: Measurements) -> dict[str, AnchorEstima
         own = fit.covariance[3 * i : 3 * i + 2, 3 * i : 3 * i + 2]
         (xx, xy), (_, yy) = own.tolist()
         surveyed = one.sigma < math.inf
-        found[name] = AnchorEstimate(
+        found[name] = EstimatedAnchor(
             (float(place[0]), float(place[1])),
             ((xx, xy), (xy, yy)),
             (one.x, one.y) if surveyed else None,
