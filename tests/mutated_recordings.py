@@ -595,7 +595,7 @@ def tried(number: int, seed: int) -> Trial:
     problem = ""
     lines = end.errors.count("\n")
     # a stream may tell a suspicion before it breaks off, and a calibration why it needs a fit
-    most_lines = 2 if "--follow" in words or "calibrate" in words else 1
+    most_lines = 2 if "--follow" in words or ": the reference is an estimate of " in end.errors else 1
     if end.status not in (0, 1, 2):
         problem = f"status {end.status}"
     elif "Traceback" in end.errors or lines > most_lines or (end.status == 2 and not lines):

@@ -25,7 +25,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.mark.long
 def test_every_printed_command_succeeds_in_a_shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those for uv if there is one, as in CI; those on the PATH otherwise, which the pages have as well."""
+    """The commands for uv if there is one, as in CI; else those on the PATH, which the pages have as well."""
     uv = shutil.which("uv")
     if uv is not None:
         (tmp_path / "bin").mkdir()

@@ -48,13 +48,16 @@ from protocol.mission import HEADING_ACCURACY
 from protocol.noise import Noise
 
 User = Literal["paper", "assured", "meeting", "finder", "unanchored", "recording"]
-"""Those who state a pose: a robot of a pair with the planner `paper`, or `assured`, also in a group; one that
-confirms the pose of an earlier meeting; a finder that passes its pose on; a robot without an anchor by its
-finder; a robot of a recording."""
+"""The kinds of robots that state a pose.
+
+They are a robot of a pair with the planner `paper`, or `assured`, also in a group; one that confirms the pose
+of an earlier meeting; a finder that passes its pose on; a robot without an anchor by its finder; a robot of a
+recording.
+"""
 
 EVERYBODY = frozenset(get_args(User))
 FIRST_CLAIMS = EVERYBODY - {"meeting", "finder"}
-"""Those who state a pose for the first time; the others have claimed one in a meeting before."""
+"""The users that state a pose for the first time; the others have claimed one in a meeting before."""
 
 FEWEST_FOR_CLAIM = 3
 """The number of mutual ranges for hypotheses, and before a claim of a pair.
@@ -257,7 +260,7 @@ class Condition(NamedTuple):
 
     name: str
     users: frozenset[User]
-    """Those whom it concerns."""
+    """The users whom it concerns."""
     blocks: Callable[[Judged], str]
     """Return why the condition is not met; an empty text if it is.
 
@@ -300,7 +303,7 @@ def probability(judged: Judged) -> str:
 
 @condition(*EVERYBODY)
 def convergence(judged: Judged) -> str:
-    """Its fit has converged: a further step would be at most {FINISHED:g} sigmas long."""
+    """The fit has converged: a further step would be at most {FINISHED:g} sigmas long."""
     last = judged.fit.last_step
     return "" if last <= FINISHED else f"the fit has not converged: its last step is {last:.3g} sigmas"
 

@@ -92,7 +92,7 @@ class Kernel:
         self.of = of = Measured._make(
             [np.ascontiguousarray(one) if isinstance(one, np.ndarray) else one for one in of]
         )
-        self.by = by
+        self.by = by  # the kernel has the addresses of its arrays
         n, k, count, c, m = of.robots, of.ticks, len(of.rho), of.common.shape[1], of.patterns.shape[1]
         size, s, n3 = of.size, 3 * n + of.radios, 3 * n
         q = size + 2 * of.anchors

@@ -17,8 +17,8 @@ ARC_S = 1.0
 TRUTH_GAP_S = 10.0
 """The longest time in s between true poses within which they are interpolated, along the odometry.
 
-Of true poses 10 s apart, those of TIERS, LIAS and MRCLAM in between are off by 0.01 to 0.03 m (RMS), less
-than the sigma of most ranges, and by at most 0.06 rad; with 30 s, by up to 0.12 m and 0.1 rad.
+Of true poses 10 s apart, those of TIERS, LIAS and MRCLAM in between are off by 0.01 to 0.03 m, less than
+the sigma of most ranges, and by up to 0.06 rad (RMS); with 30 s, by up to 0.12 m and 0.1 rad.
 """
 
 TRUTH_END_S = 0.02
