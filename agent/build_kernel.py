@@ -1,4 +1,4 @@
-"""The build hook that compiles the kernel of the estimator, `smoother.c`, when Tandem is installed.
+"""The build hook that compiles the library of the estimator when Tandem is installed.
 
 It uses the C compiler of the machine, which `CC` or `cc` names; where there is none, that of the PyPI package
 `ziglang`. An editable installation, as in a clone, finds the library beside its source.
@@ -18,7 +18,7 @@ from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
-SOURCE = "agent/estimation/smoother.c"
+SOURCES = ("agent/estimation/smoother.c", "agent/estimation/elementary.c")
 LIBRARY = "agent/estimation/libsmoother.so"
 FLAGS = ("-O3", "-ffp-contract=off", "-fPIC", "-shared")
 """The options: without contraction and fast math, results follow from the source and the C library alone."""
@@ -42,19 +42,20 @@ class KernelHook(BuildHookInterface):  # type: ignore[misc]  # hatchling has no 
         """Compile the kernel; a source distribution contains its source alone."""
         if self.target_name != "wheel":
             return
-        source, library = Path(self.root) / SOURCE, Path(self.root) / LIBRARY
+        sources, library = [Path(self.root) / one for one in SOURCES], Path(self.root) / LIBRARY
         if version != "editable":
             self._folder = TemporaryDirectory()  # the sources may be read-only, or a clone that is in use
             library = Path(self._folder.name) / library.name
             build_data["force_include"][str(library)] = LIBRARY
         # By default, ziglang compiles for the processor of this machine; a wheel is for others, too.
         compiler = machine_compiler() or [sys.executable, "-m", "ziglang", "cc", "-mcpu=baseline"]
-        digest = hashlib.sha256(source.read_bytes()).hexdigest()
+        digest = hashlib.sha256(b"".join([one.read_bytes() for one in sources])).hexdigest()
         part = library.with_name(f"{library.name}.{os.getpid()}")  # a process may have loaded the old one
-        command = [*compiler, *FLAGS, f'-DSOURCE="{digest}"', "-o", str(part), str(source), "-lm"]
+        command = [*compiler, *FLAGS, f'-DSOURCE="{digest}"', "-o", str(part), *map(str, sources), "-lm"]
         ended = subprocess.run(command, capture_output=True, text=True, check=False)
         if ended.returncode:
-            what = f"{SOURCE} does not compile; set CC to a compiler that works, or to nothing for ziglang's"
+            files = " and ".join(SOURCES)
+            what = f"{files} do not compile; set CC to a compiler that works, or to nothing for ziglang's"
             raise SystemExit(f"{what}: {' '.join(command)}\n{ended.stderr}")
         part.replace(library)
         platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")

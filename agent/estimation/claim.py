@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
+from agent.estimation.elementary import eigh
 from agent.estimation.fit import Fit, deviation
 from agent.estimation.gaussian.claim_rivals import WRONG_SIGMAS, Rival, likeliest_rival
 from agent.estimation.gaussian.consistency import (
@@ -123,7 +124,7 @@ def is_definite(covariance: Array) -> bool:
     """Return whether a covariance, (3, 3), is positive definite, and can be inverted."""
     if not np.all(np.isfinite(covariance)):
         return False
-    least, _, most = np.linalg.eigvalsh(covariance).tolist()
+    least, _, most = eigh(covariance)[0].tolist()
     return bool(least > max(SMALLEST_EIGENVALUE * most, SMALLEST_EIGENVALUE**2))
 
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from agent.estimation.elementary import dot
 from agent.estimation.gauss_newton import RIDGE, Convergence, Fitted
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.noise_level import INLIER, misfit_log_likelihood
@@ -141,7 +142,7 @@ class Linear(NamedTuple):
         told = self._multipliers(still)
         if self.kernel.of.information.any():  # what the prior of the poses tells is no part of it
             told = told - self._multipliers(still._replace(residual=np.zeros(len(effect))))
-        return float(effect @ self.step.multipliers), float(effect @ told)
+        return dot(effect, self.step.multipliers), dot(effect, told)
 
     def _multipliers(self, walk: Walk) -> Array:
         return self.kernel.step(walk, self.poses, self.variance, RIDGE, math.inf).multipliers

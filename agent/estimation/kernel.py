@@ -6,23 +6,15 @@ Its functions are those of `smoother` and `gauss_newton`, and equal to the bit.
 from __future__ import annotations
 
 import ctypes
-import errno
-import hashlib
 import math
-from functools import cache
 from itertools import accumulate, pairwise
-from pathlib import Path
 
 import numpy as np
 
+from agent.estimation.compiled import Pointer, address, library
 from agent.estimation.gauss_newton import Convergence, Fitted, Point
 from agent.estimation.gaussian.range_weights import Weighing
 from agent.estimation.smoother import Array, FitStep, Measured, Singular, Walk
-
-KERNEL_SOURCE = Path(__file__).with_name("smoother.c")
-KERNEL = Path(__file__).with_name("libsmoother.so")
-REINSTALL = "install Tandem again (in a clone: uv sync --reinstall-package tandem-ranging)"
-Pointer = ctypes.c_void_p
 
 
 class _Measured(ctypes.Structure):
@@ -53,35 +45,6 @@ class _Convergence(ctypes.Structure):
     """`Convergence` of smoother.c."""
 
     _fields_ = [("steps", ctypes.c_longlong), ("shortest", ctypes.c_double), ("decrease", ctypes.c_double)]
-
-
-class NoKernel(OSError):
-    """The file of the kernel cannot be loaded, or is not compiled from the present source."""
-
-
-@cache
-def library() -> ctypes.CDLL:
-    """Return the compiled kernel. Raises NoKernel."""
-    try:
-        found = ctypes.CDLL(str(KERNEL))
-        found.source.restype = found.compiler.restype = ctypes.c_char_p
-    except (OSError, AttributeError) as error:  # AttributeError: another library
-        raise _no_kernel(str(error).removeprefix(f"{KERNEL}: ")) from error
-    text = KERNEL_SOURCE.read_bytes() if KERNEL_SOURCE.exists() else None
-    if text is not None and found.source() != hashlib.sha256(text).hexdigest().encode():
-        raise _no_kernel(f"it is of another {KERNEL_SOURCE.name}")
-    for name in ("walked", "guess", "weights_by_errors"):
-        getattr(found, name).restype = None
-    return found
-
-
-def _no_kernel(why: str) -> NoKernel:
-    return NoKernel(errno.ENOEXEC, f"the estimator is not compiled: {why}; {REINSTALL}", str(KERNEL))
-
-
-def compiler() -> str:
-    """Return the name and version of the compiler of the kernel. Raises NoKernel."""
-    return str(library().compiler().decode()).strip()
 
 
 class Kernel:
@@ -125,14 +88,14 @@ class Kernel:
     def walked(self, poses: Array, constants: Array, white: Array) -> Walk:
         """Return the paths; see `smoother.walked`."""
         at, arrays = _Layout(*self._of_walk).new()
-        library().walked(self._measured, *map(_at, (poses, constants, white)), at)
+        library().walked(self._measured, *map(address, (poses, constants, white)), at)
         return Walk._make(arrays)
 
     def loosened(self, walk: Walk, poses: Array, variance: Array) -> Array:
         """Return the variances of the ranges before any fit; see `smoother.loosened`. Raises Singular."""
         found = np.empty(len(self.of.rho))
-        given = (self._measured, _addresses(*walk), _at(poses), _at(variance))
-        if not library().loosened(*given, self._work, _at(found)):
+        given = (self._measured, _addresses(*walk), address(poses), address(variance))
+        if not library().loosened(*given, self._work, address(found)):
             raise Singular("the errors of the odometry are too large for a float")
         return found
 
@@ -140,7 +103,7 @@ class Kernel:
         """Return a Gauss-Newton step; see `smoother.step`. Raises Singular."""
         at, arrays = _Layout(*self._of_step).new()
         if not library().gauss_newton_step(
-            *(self._measured, _addresses(*walk), _at(poses), _at(variance)),
+            *(self._measured, _addresses(*walk), address(poses), address(variance)),
             *(ctypes.c_double(ridge), ctypes.c_double(largest), self._work, at),
         ):
             raise Singular("the ranges do not determine all unknowns")
@@ -149,13 +112,19 @@ class Kernel:
     def guess(self, poses: Array) -> Array:
         """Return pivots in the robots' frames and headings; see `gauss_newton.guess`."""
         found = np.empty(3 * self.of.robots)
-        library().guess(self._measured, _at(np.ascontiguousarray(poses)), _at(found))
+        library().guess(self._measured, address(np.ascontiguousarray(poses)), address(found))
         return found
 
     def weights_by_errors(self, errors: Array, sigma: Array) -> Array:
         """Return the probability that each range is an inlier; see `range_weights.weights_by_errors`."""
         found, ratios = np.empty((2, len(errors)))
-        given = (ctypes.c_longlong(len(errors)), _at(errors), _at(sigma), _at(ratios), _at(found))
+        given = (
+            ctypes.c_longlong(len(errors)),
+            address(errors),
+            address(sigma),
+            address(ratios),
+            address(found),
+        )
         library().weights_by_errors(self._weighing, *given)
         return found
 
@@ -216,11 +185,6 @@ def _fitted_of(arrays: list[Array]) -> Fitted:
     at = _point_of(points[int(model)])
     after = at if final == model else _point_of(points[int(final)])
     return Fitted(at, after, step, weights, variance, last_step, level, int(inliers), outliers)
-
-
-def _at(array: Array) -> Pointer:
-    """Return the address of a contiguous array."""
-    return Pointer(array.ctypes.data)
 
 
 def _addresses(*arrays: Array) -> ctypes.Array[Pointer]:

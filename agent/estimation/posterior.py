@@ -8,8 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from agent.estimation.elementary import eigh, product
 from agent.estimation.fit import Fit
 from agent.estimation.gaussian.hypotheses import NEGLIGIBLE_PROBABILITY, SAME_SIGMAS
+from agent.estimation.smoother import Array
 
 MOST_JOINT = 12
 """The largest number of joint hypotheses whose poses are all in more probable ones, too.
@@ -73,9 +75,21 @@ def same(one: Fit, other: Fit) -> list[bool]:
     change[:, 2] = np.remainder(change[:, 2] + math.pi, math.tau) - math.pi
     blocks = [slice(3 * i, 3 * i + 3) for i in range(len(change))]
     return [
-        float(moved @ np.linalg.pinv(other.covariance[own, own], hermitian=True) @ moved) < SAME_SIGMAS**2
+        _squared_sigmas(moved, other.covariance[own, own]) < SAME_SIGMAS**2
         for moved, own in zip(change, blocks, strict=True)
     ]
+
+
+def _squared_sigmas(change: Array, covariance: Array) -> float:
+    """Return change' covariance^+ change: directions without variance are left out."""
+    variances, axes = eigh(covariance)
+    some = variances > SINGULAR * max(float(np.max(np.abs(variances))), 0.0)
+    along = product(change[None], axes[:, some])[0]
+    return float(np.add.reduce(np.square(along) / variances[some]))
+
+
+SINGULAR = 1e-15
+"""The fraction of the largest variance up to which a variance is 0 by rounding."""
 
 
 class Certainty(NamedTuple):

@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.estimation.elementary import eigh, exp, hypot, inverted, product
 from agent.estimation.gaussian.inference import PlanningHypothesis
 from agent.estimation.gaussian.odometry_noise import Array, Places
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
@@ -106,7 +107,7 @@ def plan_alone(
     distances = []
     for one in hypotheses:
         x, y = ways.ends(one.poses)
-        distances.append(np.maximum(np.hypot(x, y), SIGMA_FLOOR))
+        distances.append(np.maximum(hypot(x, y), SIGMA_FLOOR))
         if one is best:
             ux, uy = x / distances[0], y / distances[0]
     sigma = max(mission.noise.anchor_sigma, NEGLIGIBLE_GAIN * mission.accuracy)
@@ -199,9 +200,9 @@ def _best_of(
         ax, ay = ways.ends(one.poses[:3], of_a)
         bx, by = ways.ends(one.poses[3:], of_b)
         dx, dy = ax - bx, ay - by
-        distance = np.maximum(np.hypot(dx, dy), SIGMA_FLOOR)
+        distance = np.maximum(hypot(dx, dy), SIGMA_FLOOR)
         distances.append(distance)
-        off_anchor = np.hypot(bx[:, 0] - m2[0], by[:, 0] - m2[1])
+        off_anchor = hypot(bx[:, 0] - m2[0], by[:, 0] - m2[1])
         for beyond, loss in (
             (distance[:, 0] - FARTHEST_PLANNED * reach, objective.outside_cost),
             (off_anchor - FARTHEST_PLANNED * reach, objective.outside_cost),
@@ -222,14 +223,14 @@ def _best_of(
             rows[:, :ahead, i + 1] = sign * ny * weight
             rows[:, :ahead, i + 2] = sign * (ny * (x - px) - nx * (y - py)) * weight
             ox, oy = x - anchors[robot][0], y - anchors[robot][1]
-            rho = np.maximum(np.hypot(ox, oy), SIGMA_FLOOR)
+            rho = np.maximum(hypot(ox, oy), SIGMA_FLOOR)
             own = (rho <= reach) / rho / own_sigma
             own_rows = slice((robot + 1) * ahead, (robot + 2) * ahead)
             rows[:, own_rows, i] = ox * own
             rows[:, own_rows, i + 1] = oy * own
             rows[:, own_rows, i + 2] = (oy * (x - px) - ox * (y - py)) * own
-        covariance_after = np.linalg.inv(
-            _information(one.covariance, mission) + np.swapaxes(rows, 1, 2) @ rows
+        covariance_after = inverted(
+            _information(one.covariance, mission) + product(np.swapaxes(rows, 1, 2), rows)
         )
         for i, (x, y) in ((0, (ax, ay)), (3, (bx, by))):
             dx, dy = x[:, -1] - one.poses[i], y[:, -1] - one.poses[i + 1]
@@ -268,9 +269,7 @@ def _keep_apart(
         (ax, ay), (bx, by) = ways.way(one.poses[:3], of_a), ways.way(one.poses[3:], of_b)
         relative = one.covariance[:2, :2] + one.covariance[3:5, 3:5] - 2.0 * one.covariance[:2, 3:5]
         uncertainty = separation.LARGEST_ERROR_SIGMAS * math.sqrt(max(0.0, float(np.trace(relative))))
-        least = (
-            np.min(np.hypot(ax - bx, ay - by), 1) - 0.5 * lengths_of_both / separation.CHORDS - uncertainty
-        )
+        least = np.min(hypot(ax - bx, ay - by), 1) - 0.5 * lengths_of_both / separation.CHORDS - uncertainty
         allowed &= least >= mission.safety_distance
     return allowed | (lengths_of_both <= separation.leeway(rho, mission))
 
@@ -296,12 +295,10 @@ From nearer points, odometry noise would leave open on which side of the anchor 
 
 def _information(covariance: Array, mission: Mission) -> Array:
     """Return the inverse of `covariance`, with variances limited to those of 2 R and half a turn."""
-    variances, axes = np.linalg.eigh(covariance)
+    variances, axes = eigh(covariance)
     most = max(4.0 * mission.sensing_range**2, math.pi**2)
-    information: Array = (
-        axes / (np.clip(variances, 0.0, most) + (NEGLIGIBLE_GAIN * mission.accuracy) ** 2) @ axes.T
-    )
-    return information
+    limited = np.clip(variances, 0.0, most) + (NEGLIGIBLE_GAIN * mission.accuracy) ** 2
+    return product(axes / limited, axes.T)
 
 
 def _confusion(
@@ -312,7 +309,7 @@ def _confusion(
     first = np.minimum(distances[0], FARTHEST_PREDICTION * reach)
     for one, distance in zip(hypotheses[1:], distances[1:], strict=True):
         gap = np.square((np.minimum(distance, FARTHEST_PREDICTION * reach) - first) / (SIGMA_FACTOR * sigma))
-        remaining += math.sqrt(hypotheses[0].probability * one.probability) * np.exp(
+        remaining += math.sqrt(hypotheses[0].probability * one.probability) * exp(
             -np.minimum(np.sum(gap, 1), LARGEST_GAP) / 8.0
         )
     return CONFUSION_COST * remaining

@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.gaussian.odometry_noise import Array, Places
+from agent.estimation.elementary import cos, sin
+from agent.estimation.gaussian.odometry_noise import Array, Places, ratio_of_chord
 from agent.planning import separation
 from protocol.mission import Mission
 from protocol.motion import Pose, placed
@@ -69,21 +70,17 @@ def choice(mission: Mission, strides: int = STRIDES_AHEAD) -> Choice:
     v = np.append(speed.ravel(), 0.0)
     turn = np.append(omega.ravel(), 0.0)
     half = 0.5 * period * turn
-    chord = period * v * np.sinc(half / math.pi)
+    chord = period * v * ratio_of_chord(half)
     course = half[:, None] * (2.0 * np.arange(strides) + 1.0)
     share = half[:, None] * np.arange(1, separation.CHORDS + 1) / separation.CHORDS
     way = (
-        period
-        * v[:, None]
-        * np.arange(1, separation.CHORDS + 1)
-        / separation.CHORDS
-        * np.sinc(share / math.pi)
+        period * v[:, None] * np.arange(1, separation.CHORDS + 1) / separation.CHORDS * ratio_of_chord(share)
     )
     return Choice(
         v,
         turn,
-        np.cumsum(chord[:, None] * np.cos(course), 1),
-        np.cumsum(chord[:, None] * np.sin(course), 1),
-        way * np.cos(share),
-        way * np.sin(share),
+        np.cumsum(chord[:, None] * cos(course), 1),
+        np.cumsum(chord[:, None] * sin(course), 1),
+        way * cos(share),
+        way * sin(share),
     )

@@ -37,11 +37,11 @@ def versions() -> Iterator[Finding]:
         *fitting,
     ]
     if all(one.fits for one in found):
-        from agent.estimation import kernel  # noqa: PLC0415  # it imports numpy, which has to be there
+        from agent.estimation import compiled  # noqa: PLC0415  # it imports numpy, which has to be there
 
         try:
-            installed.append(f"estimator compiled by {kernel.compiler()}")
-        except kernel.NoKernel as error:
+            installed.append(f"estimator compiled by {compiled.compiler()}")
+        except compiled.NoKernel as error:
             yield fix(f"versions: {error_text(error)}")
     installed.append(f"protocol version {VERSION}")
     yield ok(f"versions: {', '.join(installed)}")

@@ -11,6 +11,7 @@ from functools import cache
 
 import numpy as np
 
+from agent.estimation.elementary import hypot
 from agent.estimation.gaussian.odometry_noise import (
     Array,
     Places,
@@ -113,7 +114,7 @@ def _crossings(path: Track, ranges: Ranges) -> Array:
     i, j = _couples(len(ranges.rho))
     x, y, rho = path.x[ranges.tick], path.y[ranges.tick], ranges.rho
     dx, dy = x[j] - x[i], y[j] - y[i]
-    apart = np.hypot(dx, dy)
+    apart = hypot(dx, dy)
     some = apart > SIGMA_FLOOR
     i, j, dx, dy, apart = i[some], j[some], dx[some], dy[some], apart[some]
     along = (apart**2 + rho[i] ** 2 - rho[j] ** 2) / (2.0 * apart)
@@ -140,11 +141,11 @@ def _polished(
 
     def residuals_at(points: Array) -> tuple[Array, Array, Array, Array]:
         dx, dy = x - points[:, :1], y - points[:, 1:]
-        distance = np.maximum(np.hypot(dx, dy), SIGMA_FLOOR)
+        distance = np.maximum(hypot(dx, dy), SIGMA_FLOOR)
         return rho - distance, dx / distance, dy / distance, distance
 
     for step in range(POLISHINGS):
-        s = np.hypot(sigma, near * POSITION_FINER**step)
+        s = hypot(sigma, near * POSITION_FINER**step)
         residual, ux, uy, _ = residuals_at(points)
         weight = inlier_probability(residual, s, noise) / np.square(s)
         wx, wy = weight * ux, weight * uy
@@ -156,7 +157,7 @@ def _polished(
         change = np.stack(((yy * gx - xy * gy) / determinant, (xx * gy - xy * gx) / determinant), 1)
         longest = np.maximum(np.abs(change).max(1, keepdims=True), 1e-12)
         points = points + change * np.minimum(1.0, 0.5 * sensing_range / longest)
-    likely = mixture(residuals_at(points)[0], np.hypot(sigma, near * POSITION_FINER**POLISHINGS), noise)[0]
+    likely = mixture(residuals_at(points)[0], hypot(sigma, near * POSITION_FINER**POLISHINGS), noise)[0]
     return _best(points, likely, near * POSITION_FINER + TWINS * float(np.min(sigma)))
 
 

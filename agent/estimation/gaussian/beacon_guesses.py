@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+from agent.estimation.elementary import cos, hypot, sin
 from agent.estimation.gaussian.known_anchors import COARSE, ROTATIONS, AnchoredRobot, ranges_places, refined
 from agent.estimation.gaussian.odometry_noise import Array
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, mixture
@@ -29,7 +30,7 @@ def beacon_guesses(robot: AnchoredRobot) -> list[Array]:
     """
     ranges, path = robot.ranges, robot.path
     turns = np.linspace(-math.pi, math.pi, ROTATIONS, endpoint=False)
-    c, s = np.cos(turns)[:, None], np.sin(turns)[:, None]
+    c, s = cos(turns)[:, None], sin(turns)[:, None]
     px, py = path.x[ranges.tick], path.y[ranges.tick]
     place = ranges_places(robot)
     # where the robot would have started if it were at the beacon; shape (turns, N)
@@ -39,7 +40,7 @@ def beacon_guesses(robot: AnchoredRobot) -> list[Array]:
     i, j = np.triu_indices(len(chosen), 1)
     i, j = chosen[i], chosen[j]
     dx, dy = x[:, j] - x[:, i], y[:, j] - y[:, i]
-    apart = np.maximum(np.hypot(dx, dy), SIGMA_FLOOR)
+    apart = np.maximum(hypot(dx, dy), SIGMA_FLOOR)
     along = (apart**2 + ranges.rho[i] ** 2 - ranges.rho[j] ** 2) / (2.0 * apart)
     along = np.clip(along, -ranges.rho[i], ranges.rho[i])
     across = np.sqrt(ranges.rho[i] ** 2 - along**2)
@@ -51,9 +52,9 @@ def beacon_guesses(robot: AnchoredRobot) -> list[Array]:
         for side in (1.0, -1.0)
     ]
     sx, sy = np.concatenate([one[0] for one in both], 1), np.concatenate([one[1] for one in both], 1)
-    away = np.hypot(sx[..., None] - x[:, None], sy[..., None] - y[:, None])
+    away = hypot(sx[..., None] - x[:, None], sy[..., None] - y[:, None])
     longest = max(float(np.max(ranges.rho)), SIGMA_FLOOR)
-    likely = mixture(ranges.rho - away, np.hypot(ranges.sigma, COARSE * longest), robot.noise)[0]
+    likely = mixture(ranges.rho - away, hypot(ranges.sigma, COARSE * longest), robot.noise)[0]
     best = np.argsort(-likely, 1, kind="stable")[:, :OF_HEADING]
     sx, sy = np.take_along_axis(sx, best, 1), np.take_along_axis(sy, best, 1)
     guesses = np.stack((-(c * sx + s * sy), s * sx - c * sy, np.broadcast_to(turns[:, None], sx.shape)), -1)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from agent.estimation.elementary import eigh, inverted, product, quadratic, solve
 from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.inference import covariance_of
 from agent.estimation.gaussian.odometry_noise import (
@@ -21,6 +22,7 @@ from agent.estimation.gaussian.odometry_noise import (
     variances,
     wander,
 )
+from agent.estimation.smoother import Singular
 from agent.peer.motion_log import MotionLog
 from protocol.messages import Localised
 from protocol.mission import Mission
@@ -61,7 +63,7 @@ def difference(
     off = minus(now.pose, compose(earlier.pose, way))
     try:
         chi2 = _least_chi2(earlier, since, now, way, path, mission.noise)
-    except np.linalg.LinAlgError:
+    except Singular:
         chi2 = math.inf
     return ClaimDifference(math.hypot(off[0], off[1]), abs(float(off[2])), _p_value(chi2))
 
@@ -71,21 +73,22 @@ def _least_chi2(
 ) -> float:
     """Return the chi-square of the pose at `since` which suits `earlier` and `now`, `way` after it, best.
 
-    Raises LinAlgError if a covariance is singular.
+    Raises Singular if a covariance is singular.
     """
     heading = float(path.heading[since])
-    first = np.linalg.inv(matrix(earlier))
+    first = inverted(matrix(earlier))
     best, chi2 = earlier.pose, math.inf
     for _ in range(AGREEMENT_STEPS):
         begin, end = minus(best, earlier.pose), compose(best, way)
         left = minus(end, now.pose)
         drift = _drift(path, since, best.heading - heading, noise)
-        second = np.linalg.inv(matrix(now) + drift)
-        chi2 = float(begin @ first @ begin + left @ second @ left)
+        second = inverted(matrix(now) + drift)
+        chi2 = quadratic(first, begin) + quadratic(second, left)
         by_begin = np.eye(3)
         by_begin[0, 2], by_begin[1, 2] = best.y - end.y, end.x - best.x
-        weighted = by_begin.T @ second
-        move = np.linalg.solve(first + weighted @ by_begin, first @ begin + weighted @ left)
+        weighted = product(by_begin.T, second)
+        gradient = product(first, begin[:, None]) + product(weighted, left[:, None])
+        move = solve(first + product(weighted, by_begin), gradient)[:, 0]
         best = Pose(*(np.array((best.x, best.y, best.heading)) - move).tolist())
     return chi2
 
@@ -97,7 +100,7 @@ def agreement(one: Localised, other: Localised) -> float:
     positive definite covariances.
     """
     off = minus(one.pose, other.pose)
-    return _p_value(float(off @ np.linalg.solve(matrix(one) + matrix(other), off)))
+    return _p_value(quadratic(inverted(matrix(one) + matrix(other)), off))
 
 
 def covariance_union(claims: Sequence[Localised]) -> Localised:
@@ -117,11 +120,12 @@ def covariance_union(claims: Sequence[Localised]) -> Localised:
 
 def _larger(one: Array, other: Array) -> Array:
     """Return the smallest matrix that is at least as large as both, which are positive definite."""
-    root = np.linalg.cholesky(one)
-    scaled = np.linalg.solve(root, np.linalg.solve(root, other).T)
-    values, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
-    turned = root @ vectors
-    return np.asarray((turned * np.maximum(values, 1.0)) @ turned.T)
+    variances, axes = eigh(one)
+    sigmas = np.sqrt(variances)
+    whitening = axes / sigmas
+    values, vectors = eigh(product(product(whitening.T, other), whitening))
+    turned = product(axes * sigmas, vectors)
+    return product(turned * np.maximum(values, 1.0), turned.T)
 
 
 def matrix(claim: Localised) -> Array:
@@ -145,7 +149,7 @@ def _drift(path: Track, since: int, turn: float, noise: Noise) -> Array:
     rows = Projection.pose(path, len(path.v), turn)
     constant = constant_effects(model, rows)[:-1]
     left, right = spread(model, rows)
-    return np.asarray(left.T @ right + constant.T @ constant)
+    return product(left.T, right) + product(constant.T, constant)
 
 
 def _p_value(chi2: float) -> float:

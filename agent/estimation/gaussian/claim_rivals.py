@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
+from agent.estimation.elementary import eigh
 from agent.estimation.fit import Fit, HeldFit, deviation, held_fit
 from agent.estimation.gaussian.inference import PlanningHypothesis
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges
@@ -67,7 +68,7 @@ def likeliest_rival(
     covariance, rivals = stated.covariance, []
     for robot in robots:
         i = 3 * robot
-        variances, axes = np.linalg.eigh(covariance[i : i + 2, i : i + 2])
+        variances, axes = eigh(covariance[i : i + 2, i : i + 2])
         along, far = axes[:, 1], WRONG_SIGMAS * deviation(float(np.sum(variances)))
         place, away, held = fitted.poses[robot, :2], FAR_ANCHOR * reach, HOLDING_SIGMA * far
         here, *there = [

@@ -17,6 +17,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from agent.estimation.claim import blocked, of_joint
+from agent.estimation.elementary import inverted
 from agent.estimation.fit import Start, fits
 from agent.estimation.gaussian.beacon_guesses import beacon_guesses
 from agent.estimation.gaussian.consistency import chi2_p_value
@@ -99,7 +100,7 @@ def _measured(contact: ContactRanges, mission: Mission) -> JointMeasurements:
     noise, ranges = mission.noise, contact.ranges
     count = len(ranges)
     information = np.zeros((6, 6))
-    information[:3, :3] = np.linalg.inv(np.array(contact.covariance.matrix))
+    information[:3, :3] = inverted(np.array(contact.covariance.matrix))
     mean = np.zeros((2, 3))
     mean[FINDER, 2] = contact.pose.heading
     measured = JointMeasurements(

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from agent.estimation.elementary import hypot, quadratic
 from agent.estimation.fit import Fit, deviation
 from agent.estimation.gaussian.odometry_noise import Array, Places
 from agent.estimation.gaussian.pair_ranges import PairRanges
@@ -32,7 +33,7 @@ def _mutual_log_likelihood(one: Fit, pair: PairRanges) -> float:
         return 0.0
     (wx, wy), (vx, vy) = (one.places(robot, silent) for robot in (0, 1))
     dx, dy = wx - vx, wy - vy
-    distance = np.hypot(dx, dy)
+    distance = hypot(dx, dy)
     k = int(np.argmin(distance))
     beyond = distance - pair.sensing_range
     if beyond[k] > CLEAR * pair.sensing_range:
@@ -45,7 +46,7 @@ def _mutual_log_likelihood(one: Fit, pair: PairRanges) -> float:
         c, s = math.cos(theta), math.sin(theta)
         along, across = rotated_back(c, s, nx, ny)
         gradient[3 * robot : 3 * robot + 3] = (-sign * along, -sign * across, sign * (ny * x - nx * y))
-    sigma = math.hypot(deviation(float(gradient @ one.of_start @ gradient)), EDGE * pair.sensing_range)
+    sigma = math.hypot(deviation(quadratic(one.of_start, gradient)), EDGE * pair.sensing_range)
     return no_detection_log_likelihood(beyond, sigma, pair.noise.drop_outs)
 
 
@@ -61,13 +62,13 @@ def anchor_log_likelihood(
         if not len(ticks):
             continue
         x, y = one.places(robot, ticks) - anchor[:, None]
-        beyond = sign * (np.hypot(x, y) - sensing_range)
+        beyond = sign * (hypot(x, y) - sensing_range)
         worst = int(np.argmin(beyond))
         if beyond[worst] > CLEAR * sensing_range:
             continue
         along = np.array(rotated_back(c, s, x[worst], y[worst]))
         u = along / max(math.hypot(x[worst], y[worst]), SIGMA_FLOOR)
-        sigma = math.hypot(deviation(float(u @ place @ u)), EDGE * sensing_range)
+        sigma = math.hypot(deviation(quadratic(place, u)), EDGE * sensing_range)
         if sign > 0.0:
             weight += no_detection_log_likelihood(beyond, sigma, noise.drop_outs)
         else:

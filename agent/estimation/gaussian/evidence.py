@@ -8,6 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from agent.estimation.elementary import hypot, log
 from agent.estimation.fit import Fit, Start, fits
 from agent.estimation.gaussian.odometry_noise import Track
 from agent.estimation.gaussian.pair_ranges import PairRanges
@@ -60,10 +61,10 @@ def _log_widths(paths: Sequence[Track], ranges: Ranges, sensing_range: float) ->
     moved = np.zeros(max(len(ranges.tick) - 1, 0))
     for path in paths:
         ticks = np.minimum(ranges.tick, len(path.v))
-        moved += np.hypot(np.diff(path.x[ticks]), np.diff(path.y[ticks]))
+        moved += hypot(np.diff(path.x[ticks]), np.diff(path.y[ticks]))
     width = np.full(len(ranges.tick), sensing_range)
-    width[1:] = np.minimum(np.hypot(2.0 * moved, CHANCE_SIGMAS * ranges.sigma[1:]), sensing_range)
-    return float(np.sum(np.log(width)))
+    width[1:] = np.minimum(hypot(2.0 * moved, CHANCE_SIGMAS * ranges.sigma[1:]), sensing_range)
+    return float(np.sum(log(width)))
 
 
 CHANCE_SIGMAS = 6.0

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from agent.estimation.elementary import dot, solve
 from agent.estimation.fit import Fit, Start, fits, without_outliers
 from agent.estimation.gauss_newton import Convergence
 from agent.estimation.gaussian.anchor_guesses import MOST_FOLLOWED, SEED_RANGES, UNLIKELY, anchors
@@ -123,7 +124,7 @@ R may not be as it was told, and detection may fade with range. So they never su
 def _same(one: Fit, other: Fit) -> bool:
     change = one.guess - other.guess
     change[2::3] = np.remainder(change[2::3] + math.pi, math.tau) - math.pi
-    return float(change @ np.linalg.solve(one.of_start, change)) < SAME_SIGMAS**2
+    return dot(change, solve(one.of_start, change[:, None])[:, 0]) < SAME_SIGMAS**2
 
 
 # --- one robot and its anchor -------------------------------------------------------------------------

@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
+from agent.estimation.elementary import product
 from agent.estimation.exact import Branch
 from agent.estimation.fit import Fit, deviation
 from agent.estimation.gaussian.consistency import Inconsistency
@@ -194,7 +195,7 @@ def anchor_planning_hypotheses(knowledge: Knowledge) -> list[PlanningHypothesis]
         pose = compose(branch.start, knowledge.odometry)
         c, s = math.cos(branch.alpha), math.sin(branch.alpha)
         turn = np.array(((c, -s), (s, c)))
-        covariance = turn @ np.array(one.covariance)[:2, :2] @ turn.T
+        covariance = product(product(turn, np.array(one.covariance)[:2, :2]), turn.T)
         now = np.array((pose.x, pose.y, pose.heading))
         hypotheses.append(PlanningHypothesis(one.probability, now, covariance))
     return hypotheses
@@ -372,7 +373,7 @@ def to_second_order(hypothesis: PlanningHypothesis, m2: tuple[float, float]) -> 
             rows[row, plus : plus + 2] = gx, gy
             if minus is not None:
                 rows[row, minus : minus + 2] = -gx, -gy
-    polar = rows @ covariance @ rows.T
+    polar = product(product(rows, covariance), rows.T)
     polar = _limited(polar)
     second = np.zeros((6, 4, 4))
     for k, (x, y), moved in ((0, (bx, by), (0, 3)), (2, (ax, ay), (0,))):
@@ -382,9 +383,11 @@ def to_second_order(hypothesis: PlanningHypothesis, m2: tuple[float, float]) -> 
             second[i + 1, k + 1, k + 1] = -y
             second[i, k, k + 1] = second[i, k + 1, k] = -y / rho
             second[i + 1, k, k + 1] = second[i + 1, k + 1, k] = x / rho
-    scaled_curvature = second @ polar
+    scaled_curvature = product(second, polar)
     mean += 0.5 * np.trace(scaled_curvature, axis1=1, axis2=2)
-    covariance = covariance + 0.5 * np.einsum("iab,jba->ij", scaled_curvature, scaled_curvature)
+    covariance = covariance + 0.5 * product(
+        scaled_curvature.reshape(6, 16), scaled_curvature.mT.reshape(6, 16).T
+    )
     return PlanningHypothesis(hypothesis.probability, mean, covariance)
 
 

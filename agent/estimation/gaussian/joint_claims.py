@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from agent.estimation.elementary import hypot
 from agent.estimation.fit import Fit, deviation
 from agent.estimation.gaussian.consistency import LEAST_INFORMATION
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
@@ -86,7 +87,7 @@ def _places(ends: tuple[int, int], ticks: Places, used: JointMeasurements, reach
     for end in ends:
         if end >= 0 and not used.is_anchor(end):
             x, y = used.paths[end].x[ticks], used.paths[end].y[ticks]
-            moved[1:] |= np.hypot(np.diff(x), np.diff(y)) > MOVED * reach
+            moved[1:] |= hypot(np.diff(x), np.diff(y)) > MOVED * reach
     return int(np.count_nonzero(moved))
 
 

@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.estimation.elementary import hypot
 from agent.estimation.facts import AnchorPlace, Facts, Manoeuvre, MeasuredRange
 from agent.estimation.gaussian.odometry_noise import Array, Places, Track, track
 from agent.estimation.gaussian.range_model import IMPOSSIBLE, MOST_CORRELATED_RANGES, SIGMA_FLOOR, Ranges
@@ -136,7 +137,7 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
             one, own = self.surveyed[k], ranges.second == k
             assert one is not None
             second[own], place[own] = -1, (one.x, one.y)
-            sigma[own] = np.hypot(sigma[own], one.sigma)
+            sigma[own] = hypot(sigma[own], one.sigma)
         told = msgspec.structs.replace(ranges, second=second, place=place, sigma=sigma)
         return msgspec.structs.replace(self, ranges=told)
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from agent.estimation.elementary import cos, hypot, product, sin, solve
 from agent.estimation.fit import Start, fits
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges
 from agent.estimation.gaussian.odometry_noise import Array, Places, Track
@@ -98,19 +99,19 @@ def refined(guesses: Array, robot: AnchoredRobot) -> list[Array]:
     sigma = np.sqrt(np.square(ranges.sigma) + loose)
     longest = max(float(np.max(ranges.rho)), SIGMA_FLOOR)
     for step in range(REFINEMENTS):
-        s = np.hypot(sigma, COARSE * longest * ERROR_FINER**step)
+        s = hypot(sigma, COARSE * longest * ERROR_FINER**step)
         distance, jacobian = predicted(guesses, at, ranges_places(robot))
         residuals = ranges.rho - distance
         weight = mixture(residuals, s, robot.noise)[1] / np.square(s)
         weighted = np.swapaxes(jacobian * weight[..., None], 1, 2)
-        information = weighted @ jacobian
+        information = product(weighted, jacobian)
         information.reshape(len(guesses), -1)[:, ::4] *= 1.0 + DAMPING
         information.reshape(len(guesses), -1)[:, ::4] += DAMPING
-        change = np.linalg.solve(information, (weighted @ residuals[..., None]))[..., 0]
+        change = solve(information, product(weighted, residuals[..., None]))[..., 0]
         most = np.array((LONGEST_STEP * longest, LONGEST_STEP * longest, LARGEST_TURN))
         guesses = guesses + change / np.maximum(np.max(np.abs(change) / most, 1, keepdims=True), 1.0)
     distance, _ = predicted(guesses, at, ranges_places(robot))
-    likely = mixture(ranges.rho - distance, np.hypot(sigma, FINAL * longest), robot.noise)[0]
+    likely = mixture(ranges.rho - distance, hypot(sigma, FINAL * longest), robot.noise)[0]
     return _distinct(guesses, likely, at[:, -1], longest)
 
 
@@ -121,11 +122,11 @@ def predicted(guesses: Array, at: Array, place: Array) -> tuple[Array, Array]:
     frame in <W>; shape (n, 3). `at` are the places (m) of the robot in its frame, (2, N), and `place` those
     of the anchors, (N, 2).
     """
-    c, s = np.cos(guesses[:, 2:]), np.sin(guesses[:, 2:])
+    c, s = cos(guesses[:, 2:]), sin(guesses[:, 2:])
     x, y = at[0] - guesses[:, :1], at[1] - guesses[:, 1:2]
     wx, wy = rotated(c, s, x, y)
     dx, dy = wx - place[:, 0], wy - place[:, 1]
-    distance = np.maximum(np.hypot(dx, dy), SMALLEST_DISTANCE)
+    distance = np.maximum(hypot(dx, dy), SMALLEST_DISTANCE)
     nx, ny = dx / distance, dy / distance
     along, across = rotated_back(c, s, nx, ny)
     return distance, np.stack((-along, -across, ny * wx - nx * wy), -1)
@@ -143,7 +144,7 @@ FINAL = 0.02
 
 def _distinct(guesses: Array, likely: Array, last: Array, longest: float) -> list[Array]:
     """Return the likeliest of `guesses` at different poses at the place `last` (m) of the path."""
-    c, s = np.cos(guesses[:, 2]), np.sin(guesses[:, 2])
+    c, s = cos(guesses[:, 2]), sin(guesses[:, 2])
     x, y = last[0] - guesses[:, 0], last[1] - guesses[:, 1]
     ends = np.stack(rotated(c, s, x, y), 1)
     left: Places = np.argsort(-likely, kind="stable")
@@ -152,6 +153,6 @@ def _distinct(guesses: Array, likely: Array, last: Array, longest: float) -> lis
         best = int(left[0])
         chosen.append(guesses[best])
         turn = np.remainder(guesses[left, 2] - guesses[best, 2] + math.pi, math.tau) - math.pi
-        far = np.hypot(*(ends[left] - ends[best]).T) > APART * longest
+        far = hypot(*(ends[left] - ends[best]).T) > APART * longest
         left = left[far | (np.abs(turn) > TURNED)]
     return chosen

@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.estimation.elementary import cos, product, sin, tan
 from agent.estimation.smoother import SLIGHT
 from protocol.noise import Noise, VelocityNoise
 
@@ -88,12 +89,18 @@ def track(v: Array, omega: Array, period: float, slip: Array | None = None) -> T
     course = heading[..., :-1] + half
     if slip is not None:
         course += slip
-    half = np.where(half == 0.0, NO_TURN, half)
-    unit = period * (np.sin(half) / half)
+    unit = period * ratio_of_chord(half)
     shift = np.empty((*v.shape[:-1], 2, v.shape[-1]))
-    np.multiply(unit, np.cos(course), out=shift[..., 0, :])
-    np.multiply(unit, np.sin(course), out=shift[..., 1, :])
+    np.multiply(unit, cos(course), out=shift[..., 0, :])
+    np.multiply(unit, sin(course), out=shift[..., 1, :])
     return Track(v, omega, period, _summed(v[..., None, :] * shift), heading, shift, slip)
+
+
+def ratio_of_chord(half: Array) -> Array:
+    """Return the length of a chord, as a fraction of its arc, by half of the angle (rad) that it turns by."""
+    half = np.where(half == 0.0, NO_TURN, half)
+    ratio: Array = sin(half) / half
+    return ratio
 
 
 def corrected(measured: Array, correction: Array, period: float, slip: Array | None = None) -> Track:
@@ -214,7 +221,7 @@ def _shortening(half: Array, period: float) -> Array:
     """Return the relative change of a chord with omega, d(ln A) / d omega, in s; `half` is omega T_s / 2."""
     slight = np.abs(half) < SLIGHT
     safe = np.where(slight, 1.0, half)
-    by_half = np.where(slight, half / -3.0, 1.0 / np.tan(safe) - 1.0 / safe)
+    by_half = np.where(slight, half / -3.0, 1.0 / tan(safe) - 1.0 / safe)
     shortening: Array = (0.5 * period) * by_half
     return shortening
 
@@ -302,8 +309,8 @@ MATRIX = np.array(((0, 1, 2), (1, 3, 4), (2, 4, 5)))
 
 def symmetric(left: Array, right: Array, ticks: Ticks) -> Array:
     """Return the covariance of rows from its factors (see `spread`), (..., n, N) each; shape (..., N, N)."""
-    product = left.mT @ right
-    return np.where(ticks.tick[:, None] >= ticks.tick, product, product.mT)
+    both = product(left.mT, right)
+    return np.where(ticks.tick[:, None] >= ticks.tick, both, both.mT)
 
 
 class Errors(NamedTuple):

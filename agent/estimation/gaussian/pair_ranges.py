@@ -8,6 +8,7 @@ from functools import cached_property, lru_cache
 import msgspec
 import numpy as np
 
+from agent.estimation.elementary import hypot
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges, PosePrior
 from agent.estimation.gaussian.odometry_noise import Places, Track
 from agent.estimation.gaussian.range_model import Ranges
@@ -73,7 +74,7 @@ class PairRanges(msgspec.Struct, frozen=True, eq=False, dict=True):
         moved[:1] = True
         for path in self.paths:
             x, y = path.x[ticks], path.y[ticks]
-            moved[1:] |= np.hypot(np.diff(x), np.diff(y)) > MOVED * self.sensing_range
+            moved[1:] |= hypot(np.diff(x), np.diff(y)) > MOVED * self.sensing_range
         return np.flatnonzero(moved)
 
     @property

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from agent.estimation.elementary import arccos, arctan2, cos, dot, eigh, hypot, product, sin, solve, summed
 from agent.estimation.fit import Fit, Start
 from agent.estimation.gaussian.anchor_guesses import (
     POLISHINGS,
@@ -127,15 +128,15 @@ class Encounter(NamedTuple):
 
     def begun(self, own: Fit, z: Array) -> tuple[Array, tuple[Errors, ...]]:
         """Return the anchor (m) and the odometry errors for the whitened offset `z`, shape (3,)."""
-        weights = self.inverse @ z
-        anchor = own.guess[:2] - (self.of_anchor @ weights)[:2]
+        weights = product(self.inverse, z[:, None])[:, 0]
+        anchor = own.guess[:2] - product(self.of_anchor[:2], weights[:, None])[:, 0]
         if self.odometry is None:
             return anchor, own.start.errors
         model, rows = self.odometry
         patterns = own.problem.measured.patterns[0].copy()
         patterns[:, :, : self.since] = 0.0
-        constant = constant_effects(model, rows)[:-1] @ weights
-        more = attributed(model, rows, weights) + np.tensordot(constant, patterns, 1)
+        constant = product(constant_effects(model, rows)[:-1], weights[:, None])[:, 0]
+        more = attributed(model, rows, weights) + summed(constant, patterns)
         (begun,) = own.start.errors
         return anchor, (Errors(begun.v + more[0], begun.omega + more[1], begun.constant),)
 
@@ -150,14 +151,14 @@ def _encounter(own: Fit, base: int, ticks: Places) -> Encounter:
         earlier = own.ticks[own.ticks <= base]
         since = int(earlier[-1]) if len(earlier) else 0
         of, (errors,) = own.problem.measured, own.start.errors
-        correction = np.stack((errors.v, errors.omega)) + np.tensordot(errors.constant, of.patterns[0], 1)
+        correction = np.stack((errors.v, errors.omega)) + summed(errors.constant, of.patterns[0])
         path = corrected(np.stack((of.v[0], of.omega[0])), correction, of.period, of.slip[0])
         model = wander(path, correction, of.patterns[0], of.white[0]).since(since)
         rows = Projection.pose(path, base)
         odometry = (model, rows)
         constant = constant_effects(model, rows)[:-1]
-        covariance = of_anchor + symmetric(*spread(model, rows), rows.ticks) + constant.T @ constant
-    variances, axes = np.linalg.eigh(covariance)
+        covariance = of_anchor + symmetric(*spread(model, rows), rows.ticks) + product(constant.T, constant)
+    variances, axes = eigh(covariance)
     sigmas = np.sqrt(np.maximum(variances, 0.0))
     inverse = axes * np.where(sigmas > LEAST_OFFSET, 1.0 / np.maximum(sigmas, LEAST_OFFSET), 0.0)
     return Encounter(x, y, axes * sigmas, inverse, of_anchor, odometry, since)
@@ -184,7 +185,7 @@ def placements(own: tuple[Fit, Fit], pair: PairRanges) -> list[Placed]:
     ticks, rho, sigma = ticks[some], rho[some], sigma[some]
     middle = len(ticks) // 2
     robots = [_encounter(one, int(ticks[middle]), ticks) for one in own]
-    radii = [float(np.mean(np.hypot(one.x, one.y))) for one in robots]
+    radii = [float(np.mean(hypot(one.x, one.y))) for one in robots]
     near, far = (0, 1) if radii[0] < radii[1] else (1, 0)
     sign = 1.0 if far == 0 else -1.0
     apart = (sign * pair.apart[0], sign * pair.apart[1])  # from the far robot's anchor to the near one's
@@ -214,19 +215,19 @@ def _scanned(
     The columns are the rotations of the near and of the far robot, and the whitened offset of each.
     """
     own = max(math.hypot(far.x[i], far.y[i]), SIGMA_FLOOR)
-    outwards = np.array((far.x[i], far.y[i], 0.0)) / own @ far.root
-    uncertainty = float(np.linalg.norm(outwards))
+    outwards = product(np.array(((far.x[i], far.y[i], 0.0),)) / own, far.root)[0]
+    uncertainty = math.sqrt(dot(outwards, outwards))
     offsets = OFFSETS if uncertainty > WIDE * math.tau / SCAN * lever[0] else OFFSETS[:1]
     turn = np.linspace(-math.pi, math.pi, SCAN if len(offsets) == 1 else SCAN // 2, endpoint=False)
-    c, s = np.cos(turn), np.sin(turn)
+    c, s = cos(turn), sin(turn)
     x = apart[0] + c * near.x[i] - s * near.y[i]
     y = apart[1] + s * near.x[i] + c * near.y[i]
-    gap = np.maximum(np.hypot(x, y), SIGMA_FLOOR)
-    bearing = np.arctan2(y, x) - math.atan2(far.y[i], far.x[i])
+    gap = np.maximum(hypot(x, y), SIGMA_FLOOR)
+    bearing = arctan2(y, x) - math.atan2(far.y[i], far.x[i])
     candidates = []
     for offset in offsets:
         radius = max(own + offset * uncertainty, SIGMA_FLOOR)
-        opening = np.arccos(np.clip((gap**2 + radius**2 - rho**2) / (2.0 * gap * radius), -1.0, 1.0))
+        opening = arccos(np.clip((gap**2 + radius**2 - rho**2) / (2.0 * gap * radius), -1.0, 1.0))
         for way in (1.0, -1.0):
             z = np.zeros((len(turn), 8))
             z[:, 0], z[:, 1] = turn, bearing + way * opening
@@ -256,25 +257,26 @@ def _turned(
     finest = float(np.min(sigma))
     steps = max(POLISHINGS + 1, 1 + math.ceil(math.log(finest / coarse) / math.log(FINER_TURN)))
     for step in range(steps):
-        s = np.hypot(sigma, coarse * FINER_TURN**step)
+        s = hypot(sigma, coarse * FINER_TURN**step)
         unknowns = 8 if len(z) <= CROWD else 2  # of the many candidates of the scan, only the rotations
         residuals, jacobian, _ = residuals_at(z, unknowns)
         weight = inlier_probability(residuals, s, pair.noise) / np.square(s)
         weighted = np.swapaxes(jacobian * weight[..., None], 1, 2)
-        information, gradient = weighted @ jacobian, (weighted @ residuals[..., None])[..., 0]
+        information = product(weighted, jacobian)
+        gradient = product(weighted, residuals[..., None])[..., 0]
         gradient[:, 2:] -= z[:, 2:unknowns]
-        diagonal = np.einsum("...ii->...i", information)
+        each = np.arange(unknowns)
+        diagonal = information[:, each, each]
         diagonal[:, 2:] += 1.0
         diagonal[:, :2] += HEADING_DAMPING * FINER_TURN**step * diagonal[:, :2].sum(1, keepdims=True) + 1e-12
-        change = np.linalg.solve(information, gradient[..., None])[..., 0]
+        information[:, each, each] = diagonal
+        change = solve(information, gradient[..., None])[..., 0]
         longest = np.maximum(np.abs(change[:, :2]).max(1, keepdims=True), 1e-12)
         z[:, :unknowns] += change * np.minimum(1.0, TURN / longest)
         if len(z) > CROWD:
-            likely, gap = _likelihood(
-                z, np.hypot(sigma, coarse * FINER_TURN ** (step + 1)), residuals_at, pair
-            )
+            likely, gap = _likelihood(z, hypot(sigma, coarse * FINER_TURN ** (step + 1)), residuals_at, pair)
             z = z[_thinned(z, likely, gap, lever, SAME_POSITION * pair.sensing_range)]
-    return _likeliest(z, np.hypot(sigma, coarse * FINER_TURN**steps), residuals_at, lever, pair)
+    return _likeliest(z, hypot(sigma, coarse * FINER_TURN**steps), residuals_at, lever, pair)
 
 
 def _thinned(z: Array, likely: Array, gap: Array, lever: Array, near: float) -> list[int]:
@@ -309,15 +311,15 @@ def _residuals_at(
     """Return the residuals of `z`, and their derivatives by the first `unknowns`: 0, 2 (rotations) or 8."""
     moved = []
     for i, one in enumerate(robots):
-        offset = z[:, 2 + 3 * i : 5 + 3 * i] @ one.root.T
+        offset = product(z[:, 2 + 3 * i : 5 + 3 * i], one.root.T)
         qx, qy = one.x - one.x[middle], one.y - one.y[middle]
         x = one.x + offset[:, :1] - offset[:, 2:] * qy
         y = one.y + offset[:, 1:2] + offset[:, 2:] * qx
-        c, s = np.cos(z[:, i : i + 1]), np.sin(z[:, i : i + 1])
+        c, s = cos(z[:, i : i + 1]), sin(z[:, i : i + 1])
         moved.append((*rotated(c, s, x, y), c, s, qx, qy))
     (nx, ny, *_), (fx, fy, *_) = moved
     dx, dy = fx - nx - apart[0], fy - ny - apart[1]
-    distance = np.maximum(np.hypot(dx, dy), SIGMA_FLOOR)
+    distance = np.maximum(hypot(dx, dy), SIGMA_FLOOR)
     gap = np.stack((dx[:, middle], dy[:, middle]), 1)
     jacobian = np.empty((*distance.shape, unknowns))
     if not unknowns:
@@ -330,8 +332,8 @@ def _residuals_at(
     for i, (_, _, c, s, qx, qy) in enumerate(moved):
         sign = 1.0 if i else -1.0
         along, across = (sign * part for part in rotated_back(c, s, ux, uy))
-        by_offset = np.stack((along, across, across * qx - along * qy), -1).reshape(-1, 3) @ robots[i].root
-        jacobian[..., 2 + 3 * i : 5 + 3 * i] = by_offset.reshape(*distance.shape, 3)
+        by_offset = np.stack((along, across, across * qx - along * qy), -1)
+        jacobian[..., 2 + 3 * i : 5 + 3 * i] = product(by_offset, robots[i].root)
     return Residuals(rho - distance, jacobian, gap)
 
 
@@ -357,7 +359,8 @@ def _likeliest(
         chosen.append(best)
         way = z[left] - z[best]
         way[:, :2] = np.remainder(way[:, :2] + math.pi, math.tau) - math.pi
-        distance = np.abs(way[:, :2]) @ lever + np.abs(gap[left] - gap[best]).sum(1)
+        distance = np.abs(way[:, 0]) * lever[0] + np.abs(way[:, 1]) * lever[1]
+        distance += np.abs(gap[left] - gap[best]).sum(1)
         other = distance > near
         close = np.flatnonzero(~other[1:]) + 1
         if len(close):

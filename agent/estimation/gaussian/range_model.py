@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.estimation.elementary import exp, log, logaddexp
 from agent.estimation.gaussian.odometry_noise import Array, Places
 from protocol.noise import Noise, Priors, VelocityNoise
 
@@ -180,11 +181,11 @@ def inlier_probability(residuals: Array, sigma: Array, noise: Noise) -> Array:
     if noise.outliers:
         least, most = noise.outlier_bias
         beyond = residuals - np.minimum(np.maximum(residuals, least), most)
-        wide = np.log(sigma / np.maximum(most - least, sigma)) + (math.log(noise.outliers) - told)
+        wide = log(sigma / np.maximum(most - least, sigma)) + (math.log(noise.outliers) - told)
         outlier = misfit - 0.5 * np.square(beyond / sigma) + wide
-        ratio = outlier if ratio is None else np.logaddexp(outlier, ratio)
+        ratio = outlier if ratio is None else logaddexp(outlier, ratio)
     assert ratio is not None
-    probability: Array = 1.0 / (1.0 + np.exp(np.minimum(ratio, LARGEST_RATIO)))
+    probability: Array = 1.0 / (1.0 + exp(np.minimum(ratio, LARGEST_RATIO)))
     return probability
 
 
@@ -200,13 +201,13 @@ def mixture(residuals: Array, sigma: Array, noise: Noise) -> tuple[Array, Array]
     good = inliers(residuals, sigma, noise)
     if not (noise.outliers or noise.strays):
         return np.sum(good, -1), np.ones_like(residuals)
-    both = np.logaddexp(good, outliers(residuals, sigma, noise))
-    return np.sum(both, -1), np.exp(good - both)
+    both = logaddexp(good, outliers(residuals, sigma, noise))
+    return np.sum(both, -1), exp(good - both)
 
 
 def inliers(residuals: Array, sigma: Array, noise: Noise) -> Array:
     """Return the joint log-density of each residual and of its being an inlier."""
-    density: Array = -0.5 * np.square(residuals / sigma) - np.log(sigma)
+    density: Array = -0.5 * np.square(residuals / sigma) - log(sigma)
     return density + _log_inlier(noise)
 
 
@@ -223,14 +224,14 @@ def outliers(residuals: Array, sigma: Array, noise: Noise) -> Array:
     """
     stray = None
     if noise.strays:
-        stray = np.broadcast_to(math.log(noise.strays / STRAY_WIDTH) - np.log(sigma), residuals.shape)
+        stray = np.broadcast_to(math.log(noise.strays / STRAY_WIDTH) - log(sigma), residuals.shape)
         if not noise.outliers:
             return stray
     least, most = noise.outlier_bias
     beyond = np.maximum(np.maximum(least - residuals, residuals - most), 0.0)
-    density: Array = -np.log(np.maximum(most - least, sigma)) - 0.5 * np.square(beyond / sigma)
+    density: Array = -log(np.maximum(most - least, sigma)) - 0.5 * np.square(beyond / sigma)
     density += math.log(noise.outliers)
-    return density if stray is None else np.logaddexp(density, stray)
+    return density if stray is None else logaddexp(density, stray)
 
 
 STRAY_WIDTH = 100.0

@@ -15,6 +15,7 @@ from itertools import pairwise
 import numpy as np
 from msgspec.structs import replace
 
+from agent.estimation.elementary import hypot
 from agent.estimation.fit import Start, deviation, fits
 from agent.estimation.gauss_newton import Convergence
 from agent.estimation.gaussian.odometry_noise import (
@@ -129,14 +130,14 @@ def reference_sigma(mission: Mission, distance: float, noise: Noise) -> float:
         (max(distance - 0.8 * reach, 0.0), 1.0, 0.0, (0.0, 0.0)),
         (0.0, -0.7, 0.7, apart),
     ):
-        around = np.full(AROUND_ANCHOR, 2.0 * radius * math.sin(0.5 * turn) / np.sinc(0.5 * turn / math.pi))
+        around = np.full(AROUND_ANCHOR, radius * turn)
         again = np.full(TOGETHER, around[0])
         v = np.concatenate((around, (way,), again)) / period
         omega = (
             np.concatenate((np.full(AROUND_ANCHOR, turn), (0.0,), np.full(TOGETHER, sign * turn))) / period
         )
         path = track(v, omega, period)
-        rho = np.hypot(path.x - anchor[0], path.y - anchor[1])
+        rho = hypot(path.x - anchor[0], path.y - anchor[1])
         lists.append([(tick, float(rho[tick])) for tick in np.flatnonzero(rho <= reach).tolist()])
         c, s = math.cos(turned), math.sin(turned)
         x, y = rotated(c, s, path.x - anchor[0], path.y - anchor[1])
@@ -144,7 +145,7 @@ def reference_sigma(mission: Mission, distance: float, noise: Noise) -> float:
         starts.append((places[-1][0][0], places[-1][1][0], turned))
         paths.append(path)
     (ax, ay), (bx, by) = places
-    gap = np.hypot(ax - bx, ay - by)
+    gap = hypot(ax - bx, ay - by)
     together = range(AROUND_ANCHOR + 1, AROUND_ANCHOR + TOGETHER + 2)
     white = replace(noise, odometry=VelocityNoise(), outliers=0.0, strays=0.0, sigma_degrees=0.0)
     ranges = Ranges.of_lists(lists[0], lists[1], [(tick, float(gap[tick])) for tick in together], white)

@@ -1,0 +1,132 @@
+"""Elementary functions of arrays, and linear algebra of small matrices, with the same bits on every machine.
+
+Those of numpy differ between its versions, its linear-algebra libraries and processors in the last bits, and
+a decision may depend on them. These call the C library for each element (`elementary.c`); sums, products and
+square roots are exactly rounded in numpy, too.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from agent.estimation.compiled import library
+from agent.estimation.smoother import Array, Singular
+
+
+def exp(x: Array) -> Array:
+    """Return the exponential of each element."""
+    return _of_each("each_exp", x)
+
+
+def log(x: Array) -> Array:
+    """Return the natural logarithm of each element."""
+    return _of_each("each_log", x)
+
+
+def cos(x: Array) -> Array:
+    """Return the cosine of each element (rad)."""
+    return _of_each("each_cos", x)
+
+
+def sin(x: Array) -> Array:
+    """Return the sine of each element (rad)."""
+    return _of_each("each_sin", x)
+
+
+def tan(x: Array) -> Array:
+    """Return the tangent of each element (rad)."""
+    return _of_each("each_tan", x)
+
+
+def arccos(x: Array) -> Array:
+    """Return the angle (rad) in [0, pi] with this cosine, for each element."""
+    return _of_each("each_arccos", x)
+
+
+def arctan2(y: Array, x: Array) -> Array:
+    """Return the direction (rad) of each vector (x, y)."""
+    return _of_both("each_arctan2", y, x)
+
+
+def logaddexp(one: Array, other: Array) -> Array:
+    """Return log(exp(one) + exp(other)) for each element."""
+    return _of_both("each_logaddexp", one, other)
+
+
+def hypot(x: Array | float, y: Array | float) -> Array:
+    """Return the length of each vector (x, y), whose square has to fit into a float."""
+    return np.asarray(np.sqrt(np.square(x) + np.square(y)), np.float64)
+
+
+def product(left: Array, right: Array) -> Array:
+    """Return the matrix products of (..., p, q) and (..., q, r), in which one may have no further axes."""
+    left, right = np.ascontiguousarray(left, np.float64), np.ascontiguousarray(right, np.float64)
+    leading = left.shape[:-2] or right.shape[:-2]
+    assert right.shape[:-2] in ((), leading)
+    (p, q), r = left.shape[-2:], right.shape[-1]
+    assert right.shape[-2] == q
+    steps = [one.shape[-2] * one.shape[-1] * (one.ndim > 2) for one in (left, right)]
+    to = np.empty((*leading, p, r))
+    with_steps = (left.ctypes.data, steps[0], right.ctypes.data, steps[1])
+    library().products(math.prod(leading), p, q, r, *with_steps, to.ctypes.data)
+    return to
+
+
+def summed(factors: Array, arrays: Array) -> Array:
+    """Return the sum of `arrays`, (n, ...), each multiplied by its element of `factors`, (n,)."""
+    to = product(factors[None], arrays.reshape(len(factors), -1))
+    return to.reshape(arrays.shape[1:])
+
+
+def quadratic(matrix: Array, vector: Array) -> float:
+    """Return vector' matrix vector, of shapes (n, n) and (n,)."""
+    return dot(vector, product(matrix, vector[:, None])[:, 0])
+
+
+def dot(one: Array, other: Array) -> float:
+    """Return the scalar product of two vectors."""
+    return float(np.add.reduce(one * other))
+
+
+def solve(matrix: Array, right: Array) -> Array:
+    """Return the solutions x of matrix x = right, of shapes (..., n, n) and (..., n, m). Raises Singular."""
+    matrix, found = np.array(matrix, np.float64, order="C"), np.array(right, np.float64, order="C")
+    count, size, columns = math.prod(matrix.shape[:-2]), matrix.shape[-1], found.shape[-1]
+    assert found.shape[:-1] == matrix.shape[:-1]
+    if not library().solutions(count, size, columns, matrix.ctypes.data, found.ctypes.data):
+        raise Singular("a matrix is singular")
+    return found
+
+
+def inverted(matrix: Array) -> Array:
+    """Return the inverses of matrices, (..., n, n). Raises Singular."""
+    return solve(matrix, np.broadcast_to(np.eye(matrix.shape[-1]), matrix.shape))
+
+
+def eigh(matrix: Array) -> tuple[Array, Array]:
+    """Return the eigenvalues of a symmetric matrix, ascending, and its eigenvectors as columns."""
+    diagonal, vectors = np.array(matrix, np.float64, order="C"), np.empty(matrix.shape)
+    library().eigen(len(diagonal), diagonal.ctypes.data, vectors.ctypes.data)
+    values = np.diagonal(diagonal)
+    order = np.argsort(values, kind="stable")
+    return values[order], vectors[:, order]
+
+
+def _of_each(name: str, x: Array) -> Array:
+    """Return the C function `name` of each element."""
+    x = np.ascontiguousarray(x, np.float64)
+    to = np.empty(x.shape)
+    getattr(library(), name)(x.size, x.ctypes.data, to.ctypes.data)
+    return to
+
+
+def _of_both(name: str, one: Array, other: Array) -> Array:
+    """Return the C function `name` of each two elements."""
+    if one.shape != other.shape:
+        one, other = np.broadcast_arrays(one, other)
+    one, other = np.ascontiguousarray(one, np.float64), np.ascontiguousarray(other, np.float64)
+    to = np.empty(one.shape)
+    getattr(library(), name)(one.size, one.ctypes.data, other.ctypes.data, to.ctypes.data)
+    return to
