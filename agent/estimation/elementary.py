@@ -76,7 +76,7 @@ def product(left: Array, right: Array) -> Array:
 
 def summed(factors: Array, arrays: Array) -> Array:
     """Return the sum of `arrays`, (n, ...), each multiplied by its element of `factors`, (n,)."""
-    to = product(factors[None], arrays.reshape(len(factors), -1))
+    to = product(factors[None], arrays.reshape(len(factors), math.prod(arrays.shape[1:])))
     return to.reshape(arrays.shape[1:])
 
 
