@@ -90,15 +90,15 @@ def test_a_library_that_is_too_old_is_to_be_installed_anew(
 @pytest.fixture
 def other_kernel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return the file of the compiled estimator in a copy of `agent`, which new processes import."""
-    shutil.copytree(compiled.LIBRARY.parents[1], tmp_path / "agent")
+    shutil.copytree(compiled.LIBRARY_FILE.parents[1], tmp_path / "agent")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    return tmp_path / "agent" / "estimation" / compiled.LIBRARY.name
+    return tmp_path / "agent" / "estimation" / compiled.LIBRARY_FILE.name
 
 
 def test_an_estimator_that_is_compiled_from_another_source_is_to_be_installed_anew(
     other_kernel: Path,
 ) -> None:
-    with other_kernel.with_name(compiled.SOURCES[0].name).open("a") as file:
+    with other_kernel.with_name(compiled.SOURCE_FILES[0].name).open("a") as file:
         file.write("/* changed */")
     with TandemProcess("doctor") as doctor:
         only_fix(

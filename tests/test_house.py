@@ -32,7 +32,7 @@ BELOW = {
 }
 """The packages of the project that each package may import."""
 
-BUDGETS = {"protocol": 4_340, "agent": 16_470, "world": 4_285, "compose": 30_110, "tandem": 1_530}
+BUDGETS = {"protocol": 4_340, "agent": 16_800, "world": 4_285, "compose": 30_110, "tandem": 1_530}
 """The largest number of lines of Python and C of each package. Raising one needs a reason in the commit."""
 
 SHELL = {
@@ -48,7 +48,7 @@ PURE = {
         ".".join(path.relative_to(HOUSE).with_suffix("").parts)
         for room in ("planning", "estimation", "peer")
         for path in sorted((HOUSE / "agent" / room).rglob("*.py"))
-        if path.name not in ("__init__.py", "kernel.py")
+        if path.name not in ("__init__.py", "kernel.py", "elementary.py", "compiled.py")
     ),
     "world.tick",
     "world.truth",
@@ -88,8 +88,8 @@ ALLOWED = {
     "re",
     "hashlib",
 }
-KERNEL = "agent.estimation.kernel"
-"""The module that calls the compiled functions of `agent.estimation.smoother`, which are pure."""
+KERNEL = {f"agent.estimation.{name}" for name in ("kernel", "elementary", "compiled")}
+"""The modules that call compiled functions, which are pure."""
 IMPURE = {
     "open", "print", "input", "eval", "exec", "compile", "globals", "setattr", "delattr", "breakpoint",
     "__import__", "importlib", "os", "sys", "time", "datetime", "random", "secrets", "uuid", "threading",
@@ -204,7 +204,7 @@ def test_a_pure_module_imports_only_what_is_pure() -> None:
 
 def _is_pure(imported: str) -> bool:
     if room(imported) in BELOW:
-        return imported in PURE | {KERNEL} or (room(imported) == "protocol" and imported not in SHELL)
+        return imported in PURE | KERNEL or (room(imported) == "protocol" and imported not in SHELL)
     return imported in ALLOWED or room(imported) == "msgspec"
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-SOURCES = tuple([Path(__file__).with_name(name) for name in ("smoother.c", "elementary.c")])
-LIBRARY = Path(__file__).with_name("libsmoother.so")
+SOURCE_FILES = tuple([Path(__file__).with_name(name) for name in ("smoother.c", "elementary.c")])
+LIBRARY_FILE = Path(__file__).with_name("libsmoother.so")
 REINSTALL = "install Tandem again (in a clone: uv sync --reinstall-package tandem-ranging)"
 Pointer = ctypes.c_void_p
 
@@ -25,14 +25,14 @@ class NoKernel(OSError):
 def library() -> ctypes.CDLL:
     """Return the compiled library. Raises NoKernel."""
     try:
-        found = ctypes.CDLL(str(LIBRARY))
+        found = ctypes.CDLL(str(LIBRARY_FILE))
         found.source.restype = found.compiler.restype = ctypes.c_char_p
     except (OSError, AttributeError) as error:  # AttributeError: another library
-        raise _no_kernel(str(error).removeprefix(f"{LIBRARY}: ")) from error
-    if all(source.exists() for source in SOURCES):
-        text = b"".join([source.read_bytes() for source in SOURCES])
+        raise _no_kernel(str(error).removeprefix(f"{LIBRARY_FILE}: ")) from error
+    if all(source.exists() for source in SOURCE_FILES):
+        text = b"".join([source.read_bytes() for source in SOURCE_FILES])
         if found.source() != hashlib.sha256(text).hexdigest().encode():
-            raise _no_kernel(f"it is of another {' or '.join([source.name for source in SOURCES])}")
+            raise _no_kernel(f"it is of another {' or '.join([source.name for source in SOURCE_FILES])}")
     for name in ("walked", "guess", "weights_by_errors"):
         getattr(found, name).restype = None
     for name, numbers_and_arrays in ELEMENTARY.items():
@@ -53,7 +53,7 @@ ELEMENTARY = {
 
 
 def _no_kernel(why: str) -> NoKernel:
-    return NoKernel(errno.ENOEXEC, f"the estimator is not compiled: {why}; {REINSTALL}", str(LIBRARY))
+    return NoKernel(errno.ENOEXEC, f"the estimator is not compiled: {why}; {REINSTALL}", str(LIBRARY_FILE))
 
 
 def compiler() -> str:

@@ -83,12 +83,12 @@ def same(one: Fit, other: Fit) -> list[bool]:
 def _squared_sigmas(change: Array, covariance: Array) -> float:
     """Return change' covariance^+ change: directions without variance are left out."""
     variances, axes = eigh(covariance)
-    some = variances > SINGULAR * max(float(np.max(np.abs(variances))), 0.0)
+    some = variances > NO_VARIANCE * max(float(np.max(np.abs(variances))), 0.0)
     along = product(change[None], axes[:, some])[0]
     return float(np.add.reduce(np.square(along) / variances[some]))
 
 
-SINGULAR = 1e-15
+NO_VARIANCE = 1e-15
 """The fraction of the largest variance up to which a variance is 0 by rounding."""
 
 
