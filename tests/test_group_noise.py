@@ -80,7 +80,7 @@ def test_a_noisy_group_whose_anchors_are_all_at_one_place_is_refused_in_one_line
 
 def attacked() -> Scenario:
     """Return a group whose attacker r1 turns the path of its visit to r3 by 15 degrees; r3 then visits r2."""
-    return random_group(110, robots=3, attack=TURNED)
+    return random_group(120, robots=3, attack=TURNED)
 
 
 def test_a_claim_that_a_later_meeting_contradicts_is_withdrawn_and_no_claim_is_wrong(tmp_path: Path) -> None:
