@@ -20,7 +20,8 @@ from msgspec import NODEFAULT
 from msgspec import inspect as types
 
 from agent.estimation import claim
-from compose.cli.main import COMMANDS, command_parser
+from compose.cli.commands import COMMANDS
+from compose.cli.main import command_parser
 from compose.cli.removed import REMOVED
 from compose.recording import rows
 from compose.recording.estimating.estimate_rows import (

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from compose.cli import main
+from compose.cli import commands, main
 from compose.cli.removed import REMOVED
 from compose.errors import BadScenario, UserError
 from compose.scenario.scenario_file import parse
@@ -459,7 +459,7 @@ def test_what_was_removed_is_one_line_that_names_what_replaces_it() -> None:
 def test_no_flag_begins_with_the_abbreviation_of_one_that_was_removed() -> None:
     for command, _, flag in (removed.name.partition(" ") for removed in REMOVED):
         if re.fullmatch("--[a-z0-9-]+", flag):
-            entry = next(one for one in main.COMMANDS if one.name == command)
+            entry = next(one for one in commands.COMMANDS if one.name == command)
             assert not re.findall(rf"{flag[:4]}[\w-]*", main.command_parser(entry).format_help())
 
 

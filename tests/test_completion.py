@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from compose.cli.main import COMMANDS
+from compose.cli.commands import COMMANDS
 from compose.figures import PICTURES
 from compose.scenario.shipped_files import shipped
 from tests.commands import tandem

@@ -25,7 +25,7 @@ import pytest
 
 from compose import errors
 from compose.audit import rules
-from compose.cli import main
+from compose.cli import commands, main
 from compose.figures import PICTURES
 from compose.launch.processes import free_endpoint
 from docs import constraints, reference
@@ -163,7 +163,7 @@ def flags() -> dict[str, set[str]]:
         command.name: {
             flag for action in main.command_parser(command)._actions for flag in action.option_strings
         }
-        for command in main.COMMANDS
+        for command in commands.COMMANDS
     }
 
 

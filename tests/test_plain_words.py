@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from compose.cli.main import COMMANDS, CommandEntry, command_parser
+from compose.cli.commands import COMMANDS, CommandEntry
+from compose.cli.main import command_parser
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("agent", "world", "protocol", "compose", "tandem")

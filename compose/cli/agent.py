@@ -8,10 +8,7 @@ from agent.process.discovery import NoWorld, Search, Unwelcome
 from agent.process.node import AgentProcess, run_agent
 from agent.process.recovery import Memory, remember
 from agent.process.robot import Robot
-from compose.cli.arguments import add_closing, add_connect_timeout, add_trusted_planner, name
 from compose.cli.participant import (
-    add_launched,
-    add_participation,
     endpoints_of,
     old_journal,
     participate,
@@ -38,16 +35,6 @@ ENDED_SEARCH_S = 3.0
 """s for which an agent that resumes after its MissionEnd looks for a world that may lack its FinalReport."""
 ENDED_TIMEOUT_S = 10.0
 """s for which that agent then waits for a message of the world."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `tandem agent`."""
-    parser.add_argument("id", type=name, metavar="ID", help="id of the robot in the scenario")
-    add_participation(parser, "the only one that is running")
-    add_connect_timeout(parser, "a world")
-    add_trusted_planner(parser)
-    add_launched(parser)
-    add_closing(parser, "tandem agent a --connect tcp/127.0.0.1:7447 --out recording-a", "docs/network.md")
 
 
 def main(options: argparse.Namespace) -> int:

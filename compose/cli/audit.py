@@ -8,7 +8,6 @@ from msgspec.structs import astuple
 
 from compose.audit.findings import Findings, LinkStatistics
 from compose.audit.rules import audit_run
-from compose.cli.arguments import add_closing, add_recording, add_trusted_planner
 from compose.cli.recording import read_noted
 from compose.errors import CLEAN, VIOLATED
 from compose.launch.class_loader import trust
@@ -19,13 +18,6 @@ from protocol.output import say
 
 SHOWN_VIOLATIONS = 20
 """The number of violations that are printed in full."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `tandem audit`."""
-    add_recording(parser)
-    add_trusted_planner(parser)
-    add_closing(parser, "tandem audit recording", "docs/recordings.md")
 
 
 def main(options: argparse.Namespace) -> int:

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
-from compose.cli.arguments import add_closing, add_part_of_recording, folder, names
 from compose.errors import ENDED, CannotWrite, UserError
 from compose.terminal.outcome import counting
 from compose.terminal.text_width import tell
@@ -16,36 +15,6 @@ from protocol.output import say
 
 if TYPE_CHECKING:
     from compose.recording.estimating.radio_errors import RangeCalibration
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `tandem calibrate`."""
-    parser.add_argument(
-        "recording",
-        type=folder,
-        metavar="FILE",
-        help="range recording: a .pyfg or .mcap file, a folder of CSV files, or a recording of Tandem",
-    )
-    parser.add_argument(
-        "--robots", type=names, metavar="A,B", help="the robots whose radios are calibrated [default: all]"
-    )
-    add_part_of_recording(parser)
-    parser.add_argument(
-        "--without-truth",
-        action="store_true",
-        help="use no true poses, but those of an estimate with the profile uwb",
-    )
-    parser.add_argument(
-        "--out",
-        type=folder,
-        metavar="FILE",
-        help="TOML file for the profile, for `tandem estimate --noise` [default: it is printed]",
-    )
-    add_closing(
-        parser,
-        "tandem calibrate tests/data/uwb/tiers-a-b-30-s.pyfg --out radios.toml",
-        "docs/howto-estimate.md",
-    )
 
 
 def main(options: argparse.Namespace) -> int:

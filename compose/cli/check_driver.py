@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from contextlib import closing
 
-from compose.cli.arguments import add_closing, add_driver_options, name
 from compose.errors import CLEAN, VIOLATED, UserError
 from compose.hardware.conformance import check_results
 from compose.hardware.exercise import Broken, ExerciseRun
@@ -14,22 +13,6 @@ from compose.scenario.run_settings import check_rate
 from compose.terminal import text_width
 from compose.terminal.text_width import tell
 from protocol.output import one_line, say
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `tandem check-driver`."""
-    parser.add_argument("driver", metavar="MODULE:CLASS", help="driver of the robot's wheels and sensors")
-    parser.add_argument(
-        "--mission",
-        default="paper-1",
-        metavar="FILE",
-        help="scenario that gives the robot's limits: a name or a TOML file [default: %(default)s]",
-    )
-    parser.add_argument(
-        "--robot", type=name, default="a", metavar="ID", help="robot of that scenario [default: %(default)s]"
-    )
-    add_driver_options(parser)
-    add_closing(parser, "tandem check-driver docs.rover:Rover --rate 10", "docs/driver.md")
 
 
 def main(options: argparse.Namespace) -> int:

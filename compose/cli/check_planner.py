@@ -4,40 +4,11 @@ from __future__ import annotations
 
 import argparse
 
-from compose.cli.arguments import SEED_HELP, add_closing, natural, planner_option
 from compose.errors import CLEAN, VIOLATED
 from compose.launch import supervisor
 from compose.scenario.scenario_file import setting
 from compose.terminal import text_width
 from protocol.output import one_line, say
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `tandem check-planner`."""
-    parser.add_argument("planner", metavar="MODULE:CLASS", help="planner of your own, or an installed one")
-    parser.add_argument(
-        "--planner-option",
-        type=planner_option,
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="option of the planner; may be repeated",
-    )
-    parser.add_argument(
-        "--mission",
-        default="random",
-        metavar="FILE",
-        help="scenario in which it is tried: a name or a TOML file [default: %(default)s]",
-    )
-    parser.add_argument("--seed", type=natural, metavar="N", help=f"{SEED_HELP} [default: the scenario's]")
-    parser.add_argument(
-        "--fault",
-        action="append",
-        default=[],
-        metavar="FAULT",
-        help="fault of the radio, such as 'a->b: loss=0.3, delay=0..3'; may be repeated",
-    )
-    add_closing(parser, "tandem check-planner mine:Greedy --mission noisy", "docs/own-planner.md")
 
 
 def main(options: argparse.Namespace) -> int:

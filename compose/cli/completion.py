@@ -5,23 +5,16 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Mapping
 
-from compose.cli.arguments import add_closing
-from compose.cli.main import COMMANDS, command_parser
+from compose.cli.commands import COMMANDS
+from compose.cli.main import command_parser
 from compose.errors import ENDED
 from compose.scenario.shipped_files import shipped
 from protocol.output import say
 
-SHELLS = ("bash", "zsh")
 ZSH = "autoload -U +X bashcompinit && bashcompinit"
 """The line with which zsh runs completions of bash."""
 SHIPPED_ARGUMENTS = {"SCENARIO": "scenario", "SPEC": "sweep"}
 """The package with the names that an argument may have, by its metavar."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `tandem completion`."""
-    parser.add_argument("shell", choices=SHELLS, help="the shell that runs the script")
-    add_closing(parser, "tandem completion bash", "docs/command-line.md")
 
 
 def main(options: argparse.Namespace) -> int:

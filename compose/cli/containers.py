@@ -7,7 +7,6 @@ import os
 import shlex
 from pathlib import Path
 
-from compose.cli.arguments import SCENARIO_HELP, add_closing, folder, source
 from compose.errors import ENDED, CannotWrite, UserError
 from compose.hardware.compose_file import compose_file
 from compose.launch.planner_loader import is_shipped
@@ -16,15 +15,6 @@ from compose.terminal.text_width import tell
 from protocol import files
 from protocol.output import say
 from world.scenario import Scenario
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `tandem containers`."""
-    parser.add_argument("scenario", type=source, metavar="SCENARIO", help=SCENARIO_HELP)
-    parser.add_argument(
-        "file", type=folder, metavar="FILE", help="compose file to write; an existing file is not replaced"
-    )
-    add_closing(parser, "tandem containers group-8 containers.yaml", "docs/howto-containers.md")
 
 
 def main(options: argparse.Namespace) -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from itertools import chain
 
-from compose.cli.arguments import add_closing, add_connection, add_listen, add_listening_time
 from compose.doctor.certificate_checks import certificate_findings
 from compose.doctor.finding import FIX
 from compose.doctor.machine_checks import ports, versions
@@ -14,14 +13,6 @@ from compose.errors import AMISS, CLEAN
 from compose.network import reach
 from compose.terminal import text_width
 from protocol.output import one_line, say
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `tandem doctor`."""
-    add_connection(parser)
-    add_listen(parser, "endpoint on which a world, an agent or a router will listen")
-    add_listening_time(parser)
-    add_closing(parser, "tandem doctor --connect tls/10.0.0.1:7447 --keys keys/agent-a", "docs/network.md")
 
 
 def main(options: argparse.Namespace) -> int:

@@ -10,7 +10,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from compose.cli.arguments import add_closing, add_part_of_recording, confidence, folder, names, positive
 from compose.errors import BROKEN_PIPE, ENDED, NOT_LOCALISED, STOPPED_STATUS, CannotWrite, UserError
 from compose.extras import need
 from compose.launch.signals import until_signal
@@ -24,60 +23,6 @@ if TYPE_CHECKING:
     from compose.recording.estimating.estimate_rows import PoseEstimateRow, RobotEstimate
     from compose.recording.estimating.estimate_run import EstimationProblem, RecordingEstimate
     from compose.recording.ranging.range_recording import RecordedRobot
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `tandem estimate`."""
-    parser.add_argument(
-        "recording",
-        type=folder,
-        metavar="FILE",
-        help="range recording: a .pyfg or .mcap file, a folder of CSV files, or a recording of Tandem; "
-        "with --follow, - is standard input",
-    )
-    parser.add_argument(
-        "--follow",
-        action="store_true",
-        help="read an MCAP stream from FILE, a pipe, and print the lines of estimate.csv as it arrives",
-    )
-    parser.add_argument(
-        "--robots",
-        type=names,
-        metavar="A,B,...",
-        help="robots whose poses are estimated; three or more in one fit [default: all of the recording]",
-    )
-    parser.add_argument(
-        "--noise",
-        metavar="PROFILE",
-        help="assumed noise: a profile, or a TOML file with [mission.noise], as `tandem calibrate` writes "
-        "[default: the sigmas that the recording states, else uwb]",
-    )
-    add_part_of_recording(parser)
-    parser.add_argument(
-        "--accuracy",
-        type=positive,
-        default=0.3,
-        metavar="M",
-        help="sigma of the position in m that a claim needs [default: %(default)g]",
-    )
-    parser.add_argument(
-        "--confidence",
-        type=confidence,
-        default=0.9999,
-        metavar="P",
-        help="probability that a claim needs [default: %(default)g]",
-    )
-    parser.add_argument(
-        "--out",
-        type=folder,
-        metavar="DIR",
-        help="folder for estimate.csv, estimate.json and figures [default: none are written]",
-    )
-    add_closing(
-        parser,
-        "tandem estimate tests/data/uwb/tiers-a-b-30-s.pyfg --noise uwb-calibrated --out estimated",
-        "docs/howto-estimate.md",
-    )
 
 
 def main(options: argparse.Namespace) -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from compose.cli.arguments import add_closing, add_recording, folder
 from compose.cli.export_files import EXPORT_MODULES, exported
 from compose.cli.recording import note, read_noted
 from compose.errors import ENDED, FAILED, CannotWrite
@@ -14,34 +13,6 @@ from compose.recording.recording_files import make_folder, user_errors
 from compose.terminal.text_width import tell
 from protocol import files
 from protocol.output import say
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `tandem export`."""
-    add_recording(parser)
-    parser.add_argument(
-        "--out",
-        type=folder,
-        metavar="DIR",
-        help="folder for the files [default: the recording's]",
-    )
-    kinds = parser.add_mutually_exclusive_group()
-    kinds.add_argument(
-        "--pyfg",
-        action="store_true",
-        help="write only run.pyfg: odometry, ranges and true poses as a factor graph for other estimators",
-    )
-    kinds.add_argument(
-        "--html",
-        action="store_true",
-        help="write only run.html: the page of the run in one file, which a browser opens without a server",
-    )
-    kinds.add_argument(
-        "--rerun",
-        action="store_true",
-        help="write only run.rrd: a recording for Rerun, with its views in place (extra rerun)",
-    )
-    add_closing(parser, "tandem export recording --out exported", "docs/recordings.md")
 
 
 def main(options: argparse.Namespace) -> int:

@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from compose.cli.arguments import add_closing, add_recording, add_trusted_planner
 from compose.cli.recording import read_noted
 from compose.errors import ENDED, FAILED, CannotWrite
 from compose.extras import need
@@ -24,31 +23,6 @@ from protocol.output import say
 if TYPE_CHECKING:
     from compose.figures.agent_replay import AgentReplay
     from compose.figures.pair import PairRecord
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `tandem figures`."""
-    add_recording(parser)
-    add_trusted_planner(parser)
-    parser.add_argument(
-        "--only",
-        action="append",
-        choices=PICTURES,
-        metavar="NAME",
-        help=f"draw only this figure; may be repeated [default: all of {', '.join(PICTURES)}]",
-    )
-    parser.add_argument(
-        "--format",
-        action="append",
-        choices=FIGURE_FORMATS,
-        help=f"write only this format; may be repeated [default: all of {', '.join(FIGURE_FORMATS)}]",
-    )
-    parser.add_argument(
-        "--paper",
-        action="store_true",
-        help="draw for a paper: 3.5 or 7.16 inches wide, 8 point text, no title",
-    )
-    add_closing(parser, "tandem figures recording --only encounter --format svg", "docs/recordings.md")
 
 
 def main(options: argparse.Namespace) -> int:

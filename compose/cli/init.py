@@ -9,7 +9,6 @@ import shlex
 from importlib import resources
 from pathlib import Path
 
-from compose.cli.arguments import add_closing, folder
 from compose.errors import ENDED, CannotWrite, UserError
 from compose.scenario.json_schema import json_schema
 from compose.scenario.scenario_tables import ScenarioFile
@@ -20,14 +19,6 @@ from protocol.output import say
 
 TEMPLATE = ".template"
 """The suffix of starter files that are Python modules of the user, and not of Tandem."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `tandem init`."""
-    parser.add_argument(
-        "folder", type=folder, metavar="DIR", help="folder to which the files are written; none is replaced"
-    )
-    add_closing(parser, "tandem init mine", "docs/howto-scenario.md")
 
 
 def main(options: argparse.Namespace) -> int:

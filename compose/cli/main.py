@@ -1,6 +1,6 @@
-"""The command line `tandem`: the table of commands, and the start and end of each.
+"""The command line `tandem`: its parsers, and the start and end of each command.
 
-Each command is a module of `compose.cli` that defines `add_arguments(parser)` and `main(options) -> int`.
+Each command is a row of `COMMANDS`, and a module of `compose.cli` that defines `main(options) -> int`.
 Only the module of the requested command is imported, because importing takes most of the start-up time.
 """
 
@@ -14,8 +14,9 @@ import traceback
 from collections.abc import Sequence
 from functools import cache
 from importlib import import_module
-from typing import NamedTuple, NoReturn
+from typing import NoReturn
 
+from compose.cli.commands import COMMANDS, CommandEntry
 from compose.cli.removed import refuse_removed
 from compose.errors import BROKEN_PIPE, BUG, FAILED, STOPPED_STATUS, USER_ERROR, UserError
 from compose.launch.interruption import INTERRUPTION
@@ -30,48 +31,6 @@ DESCRIPTION = "Cooperative range-only localisation of mobile robots."
 CLOSING = """\
 `tandem COMMAND --help` describes a command.
 Documentation: README.md and docs/ in the repository."""
-
-
-class CommandEntry(NamedTuple):
-    """One command of `tandem`."""
-
-    name: str
-    """The word on the command line."""
-    group: str
-    """The heading under which `tandem --help` lists it."""
-    summary: str
-    """One line that says what it does."""
-
-    @property
-    def module(self) -> str:
-        """The module that defines its `add_arguments` and `main`."""
-        return f"compose.cli.{self.name.replace('-', '_')}"
-
-
-COMMANDS = (
-    CommandEntry("run", "Run", "Run a mission on this machine."),
-    CommandEntry("replay", "Run", "Run a recording again and compare it with the original bit by bit."),
-    CommandEntry("scenarios", "Run", "List the scenarios and sweeps that ship with Tandem."),
-    CommandEntry("init", "Run", "Write a scenario, a sweep, a script and a driver to start from."),
-    CommandEntry("sweep", "Run", "Run many trials of a scenario, over ranges of its fields."),
-    CommandEntry("world", "Deploy", "Run the simulator of a mission; agents connect to it."),
-    CommandEntry("agent", "Deploy", "Run the agent of one robot; it connects to a world."),
-    CommandEntry("robot", "Deploy", "Run one robot on its own hardware, with its driver."),
-    CommandEntry("keys", "Deploy", "Create certificates and access rules for networks without trust."),
-    CommandEntry("containers", "Deploy", "Write a compose file with a container for each robot."),
-    CommandEntry("audit", "Analyse", "Check a recording against the rules of the system."),
-    CommandEntry("figures", "Analyse", "Draw the figures of a recording."),
-    CommandEntry("export", "Analyse", "Convert a recording to MCAP, CSV, Parquet or a factor graph."),
-    CommandEntry("estimate", "Analyse", "Estimate the poses of robots from recorded odometry and ranges."),
-    CommandEntry("calibrate", "Analyse", "Measure the errors of radios in a recording, as a noise profile."),
-    CommandEntry("watch", "Analyse", "Serve a web page that shows recordings or live missions."),
-    CommandEntry("doctor", "Check", "Check this machine, its keys and its network before a mission."),
-    CommandEntry("ps", "Check", "List the missions on a network and the robots in them."),
-    CommandEntry("check-driver", "Check", "Check a driver against its contract; the robot moves."),
-    CommandEntry("check-planner", "Check", "Check a planner of your own against its contract."),
-    CommandEntry("completion", "Check", "Print a script with which bash or zsh completes `tandem`."),
-)
-"""All commands, in the order of `tandem --help`."""
 
 
 class CommandParser(argparse.ArgumentParser):
@@ -169,14 +128,14 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 
 @cache  # a process forked from one that has built the parser does not build it again
 def command_parser(command: CommandEntry) -> CommandParser:
-    """Import the module of `command`, and return its parser."""
+    """Return the parser of `command`."""
     parser = CommandParser(
         prog=f"tandem {command.name}",
         description=command.summary,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.set_defaults(command=command.name)
-    import_module(command.module).add_arguments(parser)
+    command.add_arguments(parser)
     return parser
 
 

@@ -6,7 +6,6 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
-from compose.cli import arguments
 from compose.errors import FAILED, STOPPED_STATUS, UserError
 from compose.launch.signals import stop_with_launcher
 from compose.network import beyond, reach
@@ -17,29 +16,8 @@ from protocol.network import session
 from protocol.network.endpoints import Endpoints
 from protocol.network.inbox import Inbox, Interrupted
 
-LISTEN_PURPOSE = "endpoint on which this process is a Zenoh router"
-"""The purpose of `--listen` of a world and an agent."""
 RELISTEN_S = 5.0
 """s to wait for the port of a participant that has just been killed to become free."""
-
-
-def add_participation(
-    parser: argparse.ArgumentParser, default_run: str, listen: str = LISTEN_PURPOSE
-) -> None:
-    """Add the flags of every participant; `default_run` and `listen` describe `--run` and `--listen`."""
-    arguments.add_running(parser)
-    parser.add_argument(
-        "--run", type=arguments.name, metavar="NAME", help=f"name of the run [default: {default_run}]"
-    )
-    arguments.add_connection(parser)
-    arguments.add_listen(parser, listen)
-    arguments.add_fsync(parser)
-
-
-def add_launched(parser: argparse.ArgumentParser) -> None:
-    """Add the hidden flags of participants that another command launches."""
-    arguments.add_launched(parser)
-    parser.add_argument("--kill", type=arguments.kill, action="append", default=[], help=argparse.SUPPRESS)
 
 
 def participate(

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 
 import msgspec
 
-from compose.cli.arguments import add_closing, add_connection, add_listening_time
 from compose.doctor import running_missions
 from compose.doctor.router_session import Unreached, linked
 from compose.doctor.running_missions import Participant, RunningMission
@@ -20,14 +19,6 @@ from protocol.wire import VERSION
 
 INDENT = 4
 """The spaces before each continuation of a line that is wider than the terminal."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `tandem ps`."""
-    add_connection(parser)
-    add_listening_time(parser)
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    add_closing(parser, "tandem ps --connect tcp/127.0.0.1:7447 --json", "docs/network.md")
 
 
 def main(options: argparse.Namespace) -> int:

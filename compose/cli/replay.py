@@ -6,19 +6,11 @@ import argparse
 
 from compose.audit.findings import Violation
 from compose.audit.replay import replayed
-from compose.cli.arguments import add_closing, add_recording, add_trusted_planner
 from compose.cli.recording import read_noted
 from compose.errors import CLEAN, VIOLATED
 from compose.launch.class_loader import trust
 from compose.recording.recording_files import user_errors
 from compose.terminal.text_width import tell
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `tandem replay`."""
-    add_recording(parser)
-    add_trusted_planner(parser)
-    add_closing(parser, "tandem replay recording", "docs/recordings.md")
 
 
 def main(options: argparse.Namespace) -> int:

@@ -11,8 +11,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
-from compose.cli.arguments import add_closing, add_connect_timeout, add_driver_options, name
-from compose.cli.participant import RELISTEN_S, add_participation, participate, warn_beyond
+from compose.cli.participant import RELISTEN_S, participate, warn_beyond
 from compose.errors import ENDED, status_of
 from compose.hardware.driver_recording import recorded
 from compose.launch.driver_loader import config_of, driver_class, made, mission, options_of
@@ -35,28 +34,6 @@ from world.hardware.bridge import Field, NoStart
 
 LEAST_S = 0.1
 """The least time between two starts of an agent (s): one that ends at once must not load the machine."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `tandem robot`."""
-    parser.add_argument("id", type=name, metavar="ID", help="id of this robot in the mission")
-    parser.add_argument(
-        "--driver", required=True, metavar="MODULE:CLASS", help="driver of the robot's wheels and sensors"
-    )
-    parser.add_argument(
-        "--mission",
-        required=True,
-        metavar="FILE",
-        help="scenario of the mission: a name or a TOML file; start poses are not used",
-    )
-    add_driver_options(parser)
-    add_participation(parser, "the scenario's name", "endpoint on which other robots can reach this one")
-    add_connect_timeout(parser, "the other robots")
-    add_closing(
-        parser,
-        "tandem robot a --mission paper-1 --driver docs.rover:Rover --listen tcp/0.0.0.0:7447",
-        "docs/driver.md",
-    )
 
 
 def main(options: argparse.Namespace) -> int:

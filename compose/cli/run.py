@@ -9,8 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from compose.cli import arguments, export_files
-from compose.cli.removed import another_scenario
+from compose.cli import export_files
 from compose.errors import FAILED, STOPPED_STATUS, UserError
 from compose.extras import need
 from compose.launch import processes, supervisor
@@ -28,41 +27,6 @@ from compose.terminal.outcome import break_off, concluded, shown_live
 from protocol.journal.journal_file import CannotRecord
 from protocol.network.inbox import Inbox, Interrupted
 from world.scenario import Scenario
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `tandem run`."""
-    arguments.add_scenario(parser)
-    parser.add_argument("others", nargs="*", type=another_scenario, help=argparse.SUPPRESS)
-    arguments.add_running(parser)
-    parser.add_argument(
-        "--in-process",
-        action="store_true",
-        help="run in one process, without network; decisions are the same",
-    )
-    parser.add_argument(
-        "--secure", action="store_true", help="encrypt all links, with certificates made for this run only"
-    )
-    parser.add_argument(
-        "--export",
-        action=argparse.BooleanOptionalAction,
-        help="also write run.mcap and tables to --out DIR [default: if the extra `lab` is installed]",
-    )
-    parser.add_argument(
-        "--watch", action="store_true", help="serve a web page that shows the mission, live and afterwards"
-    )
-    arguments.add_port(parser)
-    parser.add_argument(
-        "--kill",
-        type=arguments.kill,
-        action="append",
-        default=[],
-        metavar="WHO@TICK",
-        help="kill a process in a tick and restart it, such as a@17, b@20:report or world@30:journal+5s "
-        "(after 5 s; +never: not); the points of a tick are observation, report, journal, command; "
-        "may be repeated",
-    )
-    arguments.add_closing(parser, "tandem run paper-1 --out recording", "docs/scenarios.md")
 
 
 def main(options: argparse.Namespace) -> int:

@@ -9,24 +9,11 @@ from collections.abc import Mapping
 from itertools import takewhile
 from pathlib import Path
 
-from compose.cli.arguments import add_closing
 from compose.errors import ENDED
 from compose.scenario.scenario_tables import ScenarioFile
 from compose.scenario.shipped_files import shipped
 from compose.terminal import text_width
 from protocol.output import say
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `tandem scenarios`."""
-    parser.add_argument(
-        "--schema",
-        nargs="?",
-        const="scenario",
-        choices=("scenario", "sweep"),
-        help="print the JSON Schema of scenario or sweep files instead, for editors [default: scenario]",
-    )
-    add_closing(parser, "tandem scenarios", "docs/scenarios.md")
 
 
 def main(options: argparse.Namespace) -> int:

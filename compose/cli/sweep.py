@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from compose.cli.arguments import add_closing, cell_and_trial, count, folder, natural, trials
 from compose.errors import FAILED, LOCALISED, NOT_LOCALISED, STOPPED_STATUS, UserError
 from compose.extras import need
 from compose.launch.interruption import INTERRUPTION
@@ -21,52 +20,6 @@ from protocol.output import say
 
 if TYPE_CHECKING:
     from compose.sweep.execution import Results
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `tandem sweep`."""
-    parser.add_argument(
-        "spec", metavar="SPEC", help="name of a sweep that ships with Tandem, or path of a TOML file"
-    )
-    parser.add_argument(
-        "--out",
-        type=folder,
-        metavar="DIR",
-        help="folder for the results; an unfinished sweep in it is resumed [default: sweep-NAME]",
-    )
-    parser.add_argument(
-        "--trials", type=trials, metavar="N", help="trials per cell, 1 to 10^7 [default: the sweep's]"
-    )
-    parser.add_argument(
-        "--seed", type=natural, metavar="S", help="seed of all trials, 0 to 2^63 - 1 [default: the sweep's]"
-    )
-    where = parser.add_mutually_exclusive_group()
-    where.add_argument(
-        "--workers", type=count, metavar="N", help="worker processes, 1 to 1000 [default: one per core]"
-    )
-    where.add_argument(
-        "--scheduler", metavar="ADDRESS", help="address of a running Dask scheduler to use instead"
-    )
-    parser.add_argument(
-        "--processes",
-        action="store_true",
-        help="run each trial as processes over Zenoh [default: in one process]",
-    )
-    parser.add_argument(
-        "--audit",
-        action=argparse.BooleanOptionalAction,
-        default=True,
-        help="audit the journals of every trial, which takes most of the time [default: --audit]",
-    )
-    parser.add_argument("--retry", action="store_true", help="run failed trials of an earlier call again")
-    parser.add_argument(
-        "--print-trial",
-        type=cell_and_trial,
-        metavar="[CELL:]N",
-        help="print the scenario file of a trial and exit [default cell: 0]",
-    )
-    parser.add_argument("-q", "--quiet", action="store_true", help="print only the counts")
-    add_closing(parser, "tandem sweep noise --trials 50 --out results", "docs/sweeps.md")
 
 
 def main(options: argparse.Namespace) -> int:

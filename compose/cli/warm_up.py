@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from compose.cli.main import COMMANDS, command_parser
+from importlib import import_module
+
+from compose.cli.commands import COMMANDS
+from compose.cli.main import command_parser
 from compose.launch import in_process
 from compose.scenario.scenario_file import load
 from protocol import wire
@@ -36,6 +39,7 @@ def missions() -> None:
     for command in COMMANDS:
         if command.name in FORKED:
             command_parser(command)
+            import_module(command.module)
     in_process.run_mission(load(WARM_UP_MISSION))
     for kind in RECEIVED:
         wire.prepare(kind)

@@ -11,16 +11,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from compose.cli.arguments import (
-    add_closing,
-    add_connection,
-    add_launched,
-    add_models,
-    add_port,
-    add_trusted_planner,
-    address,
-    folder,
-)
 from compose.cli.recording import note
 from compose.errors import ENDED, STOPPED_STATUS, UserError
 from compose.extras import need
@@ -33,34 +23,6 @@ if TYPE_CHECKING:
 
 NICENESS = 10
 """The niceness of the page's process, so that the processes of the mission get the CPU first."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `tandem watch`."""
-    parser.add_argument(
-        "recording",
-        type=folder,
-        nargs="*",
-        metavar="DIR",
-        help="folder of a recording, of several recordings, of a sweep or of an estimate; two recordings are "
-        "shown side by side with one clock [default: live missions]",
-    )
-    add_models(parser)
-    add_trusted_planner(parser)
-    add_connection(parser)
-    parser.add_argument(
-        "--address",
-        type=address,
-        default="127.0.0.1",
-        metavar="IP",
-        help="IP address on which the page is served; 0.0.0.0 in a container whose port is published on "
-        "loopback [default: %(default)s]",
-    )
-    add_port(parser)
-    add_launched(parser)
-    add_closing(
-        parser, "tandem watch recording --port 8080\n  tandem watch paper assured", "docs/recordings.md"
-    )
 
 
 def main(options: argparse.Namespace) -> int:

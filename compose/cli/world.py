@@ -7,11 +7,8 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 
-from compose.cli.arguments import add_closing, add_scenario
 from compose.cli.participant import (
     RELISTEN_S,
-    add_launched,
-    add_participation,
     endpoints_of,
     old_journal,
     participate,
@@ -36,14 +33,6 @@ from world.scenario import Scenario
 from world.simulation import Simulation, resumed
 
 LISTEN_MISSING = "--listen ENDPOINT is required, such as tcp/127.0.0.1:7447, or --connect to a router"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `tandem world`."""
-    add_scenario(parser)
-    add_participation(parser, "the scenario's and a random suffix")
-    add_launched(parser)
-    add_closing(parser, "tandem world paper-1 --listen tcp/127.0.0.1:7447 --out recording", "docs/network.md")
 
 
 def main(options: argparse.Namespace) -> int:
