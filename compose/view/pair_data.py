@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import msgspec
 
 from compose.recording.run_setup import RobotSetup
@@ -41,6 +43,13 @@ class PairData(msgspec.Struct, frozen=True):
         """Return the robot's estimates of the tick before and of this one."""
         earlier = self.before.estimates.get(robot) if self.before is not None else None
         return earlier, self.now.estimates.get(robot)
+
+    def estimates(self) -> Iterator[tuple[str, Estimate, Estimate]]:
+        """Yield each robot with its estimates of the tick before and of this one, if both are known."""
+        for robot in self.ids:
+            earlier, held = self.held(robot)
+            if earlier is not None and held is not None:
+                yield robot, earlier, held
 
     def commands(self, robot: str) -> tuple[Command | None, Command | None]:
         """Return the robot's commands of the tick before and of this one."""

@@ -15,7 +15,6 @@ from compose.view.outlines import Point, Reach, arc, ellipse
 from compose.view.run_data import TickData
 from compose.view.story.caption import Caption
 from compose.view.story.captions import captions
-from compose.view.story.group_captions import group_captions
 from compose.view.words import doing
 from protocol.messages import (
     Contact,
@@ -197,13 +196,12 @@ def scene(
     players = tuple([player_of(one, setup, now, false_poses.get(one.id)) for one in setup.robots])
     deliveries = tuple(passages(setup, now))
     found = tuple(events(setup, before, now, deliveries, end))
-    told = group_captions if setup.visits else captions
     return Scene(
         now.tick,
         players,
         deliveries,
         found,
-        tuple(told(setup, before, now, found, end)),
+        tuple(captions(setup, before, now, found, end)),
         tuple(configurations(setup, before, now)),
     )
 

@@ -7,8 +7,10 @@ from typing import Literal
 
 import msgspec
 
+from compose.recording.run_setup import RobotSetup
 from compose.view.events import Event
 from compose.view.pair_data import PairData
+from protocol.messages import Inconsistent, Undecided
 
 CaptionKind = Literal[
     "rules", "ranging", "mirrored", "branch", "path", "search", "contact", "contact-lost", "configurations",
@@ -82,3 +84,15 @@ def attacked(pair: PairData, reports: str) -> str | None:
     """Return a sentence about the attackers; None if there are none. `reports` is its verb."""
     attackers = [robot.id for robot in pair.robots if robot.attack is not None]
     return f"{listed(attackers)} {reports} false data about itself." if attackers else None
+
+
+def without_claim(
+    robot: RobotSetup, verdict: Undecided | Inconsistent, truth: str | None = None
+) -> tuple[CaptionKind, str, str | None]:
+    """Return kind and text for a robot that ends without a claim, and `truth` for a contradiction."""
+    match verdict:
+        case Undecided(reason):
+            return "undecided", f"{robot.id} stops without a claim: {stopped(reason)}", None
+        case Inconsistent(what):
+            text = f"{robot.id} finds that the reports of {robot.peer} contradict what it measured: "
+            return "inconsistent", text + stopped(what), truth
