@@ -21,46 +21,39 @@ def main(options: argparse.Namespace) -> int:
     The export then contains only what the other journals hold about that robot.
     """
     out: Path = options.out or options.recording
-    if options.pyfg:
-        return _pyfg(options.recording, out)
-    if options.html:
-        return _html(options.recording, out)
-    if options.rerun:
-        return _rerun(options.recording, out)
+    for flag, write in ((options.pyfg, _pyfg), (options.html, _html), (options.rerun, _rerun)):
+        if flag:
+            write(options.recording, out)
+            return ENDED
     need(*EXPORT_MODULES)
     done = exported(options.recording, out)
-    for path in done.files:
-        say(str(path))
-    for name, size in done.torn.items():
-        note("export", [f"{name} ends with {size} bytes of a torn write"])
-    for name in done.missing:
-        note("export", [f"{name} is missing"])
+    say(*map(str, done.files))
+    note("export", [f"{name} ends with {size} bytes of a torn write" for name, size in done.torn.items()])
+    note("export", [f"{name} is missing" for name in done.missing])
     return FAILED if done.missing else ENDED
 
 
-def _pyfg(recording: Path, out: Path) -> int:
+def _pyfg(recording: Path, out: Path) -> None:
     """Write run.pyfg to `out`, and print its path and the names that it has for the radios."""
     from compose.recording.ranging.pyfg import written_pyfg  # noqa: PLC0415  # it needs numpy
     from compose.recording.ranging.run_ranges import ranges_of_run  # noqa: PLC0415
 
     with user_errors(recording):
         graph = written_pyfg(ranges_of_run(read_noted(recording, "export")))
-    say(str(_written(out, "run.pyfg", graph.text)))
+    _write(out, "run.pyfg", graph.text)
     tell(", ".join([f"{name} is {letter}" for name, letter in graph.names.items()]))
-    return ENDED
 
 
-def _html(recording: Path, out: Path) -> int:
+def _html(recording: Path, out: Path) -> None:
     """Write run.html to `out`, and print its path and what the recording lacks."""
     from compose.view.web.standalone import standalone_page  # noqa: PLC0415  # it imports Zenoh
 
     page = standalone_page(recording)
-    say(str(_written(out, "run.html", page.html)))
+    _write(out, "run.html", page.html)
     note("export", page.notes)
-    return ENDED
 
 
-def _rerun(recording: Path, out: Path) -> int:
+def _rerun(recording: Path, out: Path) -> None:
     """Write run.rrd to `out`, and print its path."""
     need("rerun", extra="rerun")
     from compose.view.export.rerun_recording import rerun_recording  # noqa: PLC0415  # slow, and optional
@@ -70,15 +63,14 @@ def _rerun(recording: Path, out: Path) -> int:
         run = read_noted(recording, "export")
         _, setup = checked(run)
         content = rerun_recording(setup, scenes_of(run))
-    say(str(_written(out, "run.rrd", content)))
-    return ENDED
+    _write(out, "run.rrd", content)
 
 
-def _written(out: Path, name: str, text: str | bytes) -> Path:
-    """Write a file to the folder `out`, and return its path. Raises UserError."""
+def _write(out: Path, name: str, text: str | bytes) -> None:
+    """Write a file to the folder `out`, and print its path. Raises UserError."""
     make_folder(out)
     try:
         files.write(out / name, text)
     except OSError as error:
         raise CannotWrite(out, error) from None
-    return out / name
+    say(str(out / name))

@@ -13,7 +13,6 @@ from compose.errors import ENDED, FAILED, CannotWrite
 from compose.extras import need
 from compose.figures import FIGURE_FORMATS, PICTURES
 from compose.launch.class_loader import trust
-from compose.recording.group_localisation import PastMeeting, past_meetings
 from compose.recording.recording_files import agent_journal, user_errors
 from compose.recording.run import Run
 from compose.terminal.outcome import counting
@@ -31,7 +30,7 @@ def main(options: argparse.Namespace) -> int:
     Return FAILED if the journal of a robot is missing or cannot be replayed to its end.
     """
     need("matplotlib")
-    from compose.figures.pair import pair_of  # noqa: PLC0415
+    from compose.figures.pair import encounters, pair_of  # noqa: PLC0415
 
     for name in options.planner:
         trust(name)
@@ -40,9 +39,7 @@ def main(options: argparse.Namespace) -> int:
     folder, status = options.recording / "figures", ENDED
     kinds = [kind for kind in PICTURES if kind in (options.only or PICTURES)]
     formats = [one for one in FIGURE_FORMATS if one in (options.format or FIGURE_FORMATS)]
-    past = past_meetings(run)
-    pairs: list[tuple[Sequence[str], PastMeeting | None]] = [((one.a, one.b), one) for one in past]
-    pairs = pairs or [(robots, None) for robots in run.pairs]
+    pairs = encounters(run)
     replayed: dict[str, AgentReplay | None] = {}
     drawn: list[Path] = []
     with (

@@ -244,11 +244,14 @@ def others(estimate: Estimate) -> tuple[Pose, ...]:
     return estimate.world[1:] if estimate.probabilities or len(estimate.world) == 1 else estimate.world
 
 
+def encounters(run: Run) -> list[tuple[Sequence[str], PastMeeting | None]]:
+    """Return the pairs of `run`; in a group, the robots of each meeting that has begun, with the meeting."""
+    return [((one.a, one.b), one) for one in past_meetings(run)] or [(robots, None) for robots in run.pairs]
+
+
 def pairs_of(run: Run, replays: Mapping[str, AgentReplay]) -> Iterator[PairRecord]:
     """Yield the pairs of `run` that have data; in a group, the meetings that have begun."""
-    found: Sequence[PairRecord | None] = [
-        pair_of(run, (one.a, one.b), replays, one) for one in past_meetings(run)
-    ] or [pair_of(run, robots, replays) for robots in run.pairs]
+    found = [pair_of(run, robots, replays, meeting) for robots, meeting in encounters(run)]
     yield from [pair for pair in found if pair is not None]
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import msgspec
 from msgspec.structs import asdict, replace
 
 from compose.audit.findings import Findings
-from compose.recording.claim_errors import Claim
 from compose.recording.closest_approach import nearest
 from compose.recording.group_localisation import TICK_ROUNDING
 from compose.recording.reasons import reason_for
@@ -18,13 +17,17 @@ from compose.recording.summary_json import first_contact
 from compose.scenario.kills import Kill
 from compose.sweep.group_columns import group_columns
 from compose.sweep.trial_mission import as_processes, run_in_process
-from protocol.messages import FinalReport
-from protocol.motion import Covariance
 from world.scenario import Scenario
 
 TrialOutcome = Literal["localised", "undecided", "inconsistent", "wrong", "failed", "refused"]
 """The outcome of a mission, or `refused`: the scenario with the drawn values is infeasible."""
 N = TypeVar("N", int, float)
+LARGEST = ("candidates", "candidates_left", "position_error_m", "heading_error_rad", "hypotheses")
+"""The columns with the largest value of any robot."""
+TOTALS = ("reports_sent", "reports_heard", "reports_refused", "reports_lost", "bytes_sent")
+"""The columns with the sum of a count of the FinalReports."""
+REPORTED = ("branch", "alpha", "hypotheses", "probability", "p_value")
+"""The columns of a robot that its FinalReport has."""
 CLAIMS_WITHIN = 3.0
 """The factor of mission.accuracy within which a position error counts in `claims_within`."""
 
@@ -234,6 +237,9 @@ def row(trial: Trial, run: Run, wall_s: float, findings: Findings | None = None)
     final_reports = run.final_reports.values()
     group = group_columns(run)
     errors = [robot.position_error_m for robot in robots.values() if robot.position_error_m is not None]
+    largest: dict[str, Any] = {
+        name: _most([getattr(one, name) for one in robots.values()]) for name in LARGEST
+    }
     nees = [robot.nees for robot in robots.values() if robot.nees is not None]
     held = [robot.truth_held for robot in robots.values() if robot.truth_held is not None]
     return TrialRow(
@@ -250,21 +256,13 @@ def row(trial: Trial, run: Run, wall_s: float, findings: Findings | None = None)
         t_max_s=t_max_s,
         t_max_ticks=math.ceil(t_max_s / scenario.mission.period - TICK_ROUNDING),
         **(asdict(group) if group is not None else {}),
-        candidates=_most([robot.candidates for robot in robots.values()]),
-        candidates_left=_most([robot.candidates_left for robot in robots.values()]),
-        position_error_m=_most([robot.position_error_m for robot in robots.values()]),
-        heading_error_rad=_most([robot.heading_error_rad for robot in robots.values()]),
-        hypotheses=_most([robot.hypotheses for robot in robots.values()]),
+        **largest,
         nearest_m=nearest(run) if scenario.mission.safety_distance else None,
         claims=len(errors),
         claims_within=sum([error <= CLAIMS_WITHIN * scenario.mission.accuracy for error in errors]),
         nees=sum(nees) / len(nees) if nees else None,
         truth_held=all(held) if held else None,
-        reports_sent=sum([final_report.reports_sent for final_report in final_reports]),
-        reports_heard=sum([final_report.reports_heard for final_report in final_reports]),
-        reports_refused=sum([final_report.reports_refused for final_report in final_reports]),
-        reports_lost=sum([final_report.reports_lost for final_report in final_reports]),
-        bytes_sent=sum([final_report.bytes_sent for final_report in final_reports]),
+        **{name: sum([getattr(report, name) for report in final_reports]) for name in TOTALS},
         violations=len(findings.violations) if findings is not None else None,
         first_violation=findings.violations[0].line if findings is not None and findings.violations else None,
         wall_s=round(wall_s, 6),
@@ -273,40 +271,18 @@ def row(trial: Trial, run: Run, wall_s: float, findings: Findings | None = None)
 
 
 def _robot_row(run: Run, robot: str) -> RobotRow:
-    row = _claimed(_reported(run.final_reports.get(robot)), run.claim(robot))
-    return replace(row, truth_held=run.truth_held(robot))
-
-
-def _reported(final_report: FinalReport | None) -> RobotRow:
-    """Return the columns that a robot reports in its final report."""
-    if final_report is None:
-        return RobotRow()
-    before, left = final_report.candidates if final_report.candidates is not None else (None, None)
-    return RobotRow(
-        branch=final_report.branch,
-        alpha=final_report.alpha,
-        candidates=before,
-        candidates_left=left,
-        hypotheses=final_report.hypotheses,
-        probability=final_report.probability,
-        p_value=final_report.p_value,
-    )
-
-
-def _claimed(row: RobotRow, claim: Claim | None) -> RobotRow:
-    """Return `row` with the errors and the covariance of the robot's standing claim."""
-    if claim is None:
-        return row
-    row = replace(row, position_error_m=claim.position_error, heading_error_rad=claim.heading_error)
-    covariance = claim.covariance
-    if covariance is None:
-        return row
-    return replace(
-        row,
-        position_sigma_m=covariance.position_sigma,
-        nees=claim.nees,
-        **{f"cov_{name}": getattr(covariance, name) for name in Covariance.__struct_fields__},
-    )
+    """Return the columns of a robot: what it reports at the end, and its standing claim with the errors."""
+    found: dict[str, Any] = {"truth_held": run.truth_held(robot)}
+    if (final_report := run.final_reports.get(robot)) is not None:
+        found |= {name: getattr(final_report, name) for name in REPORTED}
+        if final_report.candidates is not None:
+            found["candidates"], found["candidates_left"] = final_report.candidates
+    if (claim := run.claim(robot)) is not None:
+        found |= {"position_error_m": claim.position_error, "heading_error_rad": claim.heading_error}
+        if (covariance := claim.covariance) is not None:
+            found |= {"position_sigma_m": covariance.position_sigma, "nees": claim.nees}
+            found |= {f"cov_{name}": one for name, one in asdict(covariance).items()}
+    return RobotRow(**found)
 
 
 def _bounded(robots: dict[str, RobotRow], run: Run, pair: tuple[int, int]) -> dict[str, RobotRow]:
