@@ -23,11 +23,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from compose.recording.estimating.calibration import calibrated
-from compose.recording.estimating.estimate_epoch import ClaimRule
-from compose.recording.estimating.estimate_rows import PoseEstimate, rows_of, summary_of
-from compose.recording.estimating.estimate_run import RecordingEstimator, measurements
-from compose.recording.estimating.noise_profile import correction_of, noise_table, profile_toml
+from compose.recording.estimating.calibration import calibrated, profile_toml
+from compose.recording.estimating.estimate_rows import PoseEstimate, rows_of
+from compose.recording.estimating.estimate_summary import summary_of
+from compose.recording.estimating.recorded_measurements import measurements
+from compose.recording.estimating.recording_estimator import ClaimRule, RecordingEstimator
 from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.range_recording import (
     FixedAnchor,
@@ -207,24 +207,20 @@ def claimed(trial: Trial) -> Claimed:
             Path(noise).write_text(_profile(trial.change(whole), others))
         problem = measurements(recording, trial.robots, noise, (trial.start_s, LAST_S))
     rule, begun = ClaimRule(trial.accuracy), time.process_time()
-    estimator, rows = RecordingEstimator(rule), []
-    for number in range(1, problem.measured.epochs + 1):
-        epoch = estimator.epoch(problem, number)
-        rows += rows_of(epoch, problem.robots)
-        if all(epoch.claims):
-            break
+    claiming = (one for one in RecordingEstimator(rule).epochs(problem) if all(one.claims))
+    epoch = next(claiming, None)
     cpu_s = time.process_time() - begun
-    if not rows or not all(epoch.claims):
+    if epoch is None:
         return Claimed(math.inf, (), cpu_s)
-    summary = summary_of(problem.measured, rows[-2:], epoch, rule, "", "")
+    summary = summary_of(problem, rows_of(epoch, problem.robots), [epoch], rule)
     claims = tuple([one.final for one in summary.robots.values() if one.final is not None])
-    return Claimed(epoch.t - problem.measured.t0, claims, cpu_s)
+    return Claimed(epoch.t - problem.t0, claims, cpu_s)
 
 
 def _profile(recording: RangeRecording, robots: Sequence[str]) -> str:
     found = calibrated(recording, robots, None)
     anchors = frozenset([one.id for one in recording.anchors])
-    return profile_toml(noise_table(found, anchors), correction_of(found), "the truth")
+    return profile_toml(found, anchors, "the truth")
 
 
 def row_of(name: str, trials: Sequence[Trial], results: Sequence[Claimed]) -> str:

@@ -27,11 +27,11 @@ from compose.recording import rows
 from compose.recording.estimating.estimate_rows import (
     EstimatedAnchor,
     EstimateSummary,
+    LearnedErrors,
     PoseEstimate,
     PoseEstimateRow,
     RobotEstimate,
 )
-from compose.recording.estimating.learned_errors import LearnedErrors
 from compose.recording.group_localisation import MeetingResult
 from compose.recording.ranging import recording_rows
 from compose.scenario.fault_syntax import FaultTable

@@ -13,15 +13,11 @@ import msgspec
 
 from compose.errors import CannotWrite, UserError
 from compose.extras import need
-from compose.recording.estimating.estimate_epoch import ClaimRule
-from compose.recording.estimating.estimate_files import write_estimate
 from compose.recording.estimating.estimate_rows import EstimateSummary, PoseEstimateRow
-from compose.recording.estimating.estimate_run import (
-    EstimationProblem,
-    RecordingEstimate,
-    estimated,
-    measurements,
-)
+from compose.recording.estimating.estimate_run import RecordingEstimate, estimated
+from compose.recording.estimating.estimate_summary import write_estimate
+from compose.recording.estimating.recorded_measurements import Measurements, measurements
+from compose.recording.estimating.recording_estimator import ClaimRule
 from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.run_ranges import ranges_of_run
 from compose.recording.recording_files import make_folder, user_errors
@@ -41,7 +37,7 @@ class PoseEstimates(msgspec.Struct, frozen=True, dict=True, eq=False):
     `tandem.estimate` returns one.
     """
 
-    problem: EstimationProblem
+    problem: Measurements
     """The measurements on which the estimate works; the type may change with any version."""
     result: RecordingEstimate
     """The estimate on which the command line works; likewise."""

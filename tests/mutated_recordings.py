@@ -571,9 +571,8 @@ RUNS: list[dict[str, list[bytes]]] = []
 
 def prepared() -> None:
     """Import what the commands need, before processes are forked."""
-    for name in ("estimating.estimate_run", "estimating.estimate_stream", "estimating.calibration"):
-        import_module(f"compose.recording.{name}")
     for name in (
+        "compose.recording.estimating.calibration",
         "compose.recording.ranging.range_mcap",
         "compose.terminal.tables",
         "rich.table",

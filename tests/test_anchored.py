@@ -11,9 +11,10 @@ from agent.estimation.gaussian.consistency import chi2_p_value
 from agent.estimation.gaussian.known_anchors import predicted
 from compose.errors import UserError
 from compose.recording.estimating.calibration import calibrated
-from compose.recording.estimating.estimate_epoch import ClaimRule
-from compose.recording.estimating.estimate_files import estimate_csv
-from compose.recording.estimating.estimate_run import RecordingEstimate, estimated, measurements
+from compose.recording.estimating.estimate_rows import estimate_csv
+from compose.recording.estimating.estimate_run import RecordingEstimate, estimated
+from compose.recording.estimating.recorded_measurements import measurements
+from compose.recording.estimating.recording_estimator import ClaimRule
 from compose.recording.ranging.range_recording import (
     FixedAnchor,
     Numbers,
@@ -129,7 +130,7 @@ def test_equal_recordings_give_equal_estimates() -> None:
 
 
 def test_ranges_belong_to_their_anchor() -> None:
-    measured = measurements(driven(), None, "uwb-calibrated", None).measured
+    measured = measurements(driven(), None, "uwb-calibrated", None)
     ranges, place = measured.joint.ranges, {one.id: (one.x, one.y) for one in measured.anchors}
     for k, (_, anchor) in enumerate(measured.joint.radios):
         own = ranges.place[ranges.radio == k] + measured.joint.origin

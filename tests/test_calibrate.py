@@ -13,12 +13,12 @@ import pytest
 from msgspec.structs import replace
 
 from compose.errors import USER_ERROR, UserError
-from compose.recording.estimating.calibration import calibrated
-from compose.recording.estimating.estimate_epoch import ClaimRule
-from compose.recording.estimating.estimate_run import estimated, measurements
+from compose.recording.estimating.calibration import calibrated, correction_of, noise_table, profile_toml
+from compose.recording.estimating.estimate_run import estimated
 from compose.recording.estimating.noise_files import told_noise
-from compose.recording.estimating.noise_profile import correction_of, noise_table, profile_toml
 from compose.recording.estimating.radio_errors import true_errors
+from compose.recording.estimating.recorded_measurements import measurements
+from compose.recording.estimating.recording_estimator import ClaimRule
 from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.range_recording import Numbers, RangeRecording, TruePath
 from protocol.noise import Noise
@@ -151,7 +151,7 @@ def test_slow_errors_are_told_from_white_ones(sample: RangeRecording) -> None:
 def test_the_profile_makes_raw_ranges_as_good_as_calibrated_ones(raw: RangeRecording, tmp_path: Path) -> None:
     found = calibrated(raw, None, None)
     anchors = frozenset(one.id for one in raw.anchors)
-    text = profile_toml(noise_table(found, anchors), correction_of(found), "the truth of it")
+    text = profile_toml(found, anchors, "the truth of it")
     (tmp_path / "radios.toml").write_text(text)
     told = told_noise(str(tmp_path / "radios.toml"))
     assert told.correction == correction_of(found)

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from compose.launch.in_process import run_mission
-from compose.recording.estimating.estimate_epoch import ClaimRule
 from compose.recording.estimating.estimate_rows import PoseEstimateRow
-from compose.recording.estimating.estimate_run import RecordingEstimate, estimated, measurements
+from compose.recording.estimating.estimate_run import RecordingEstimate, estimated
+from compose.recording.estimating.recorded_measurements import measurements
+from compose.recording.estimating.recording_estimator import ClaimRule
 from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.range_recording import (
     FixedAnchor,

@@ -23,13 +23,11 @@ from agent.estimation.gaussian.pair_ranges import alone
 from agent.estimation.gaussian.range_model import Ranges
 from agent.estimation.problem import Problem
 from compose.errors import NOT_LOCALISED, USER_ERROR, UserError
-from compose.recording.estimating.estimate_epoch import ClaimRule
-from compose.recording.estimating.estimate_files import ESTIMATE_COLUMNS, estimate_csv
-from compose.recording.estimating.estimate_rows import PoseEstimate
-from compose.recording.estimating.estimate_run import RecordingEstimate, estimated, measurements
-from compose.recording.estimating.group_measurements import MOST_USED_ANCHORS
+from compose.recording.estimating.estimate_rows import ESTIMATE_COLUMNS, PoseEstimate, estimate_csv
+from compose.recording.estimating.estimate_run import RecordingEstimate, estimated
 from compose.recording.estimating.noise_files import RangeCorrection, told_noise
-from compose.recording.estimating.prepared_steps import EPOCH_S
+from compose.recording.estimating.recorded_measurements import EPOCH_S, MOST_USED_ANCHORS, measurements
+from compose.recording.estimating.recording_estimator import ClaimRule
 from compose.recording.estimating.sound_odometry import GAP_MOTION_S, sound
 from compose.recording.estimating.true_poses import true_pose
 from compose.recording.ranging.range_files import read_ranges
@@ -181,7 +179,7 @@ def test_an_estimate_uses_nothing_that_was_measured_later(
     begin = sample.span[0]
     problem = measurements(sample, ("A", "B"), "uwb-calibrated", (0.0, 15.2))
     early = estimated(problem, ClaimRule()).rows
-    assert problem.measured.ticks_per_epoch == 7  # that of the whole sample: the robots are as fast
+    assert problem.ticks_per_epoch == 7  # that of the whole sample: the robots are as fast
     assert early
     assert max(row.t_s for row in early) <= begin + 15.2
     assert estimate_csv(early) == estimate_csv(of_sample.rows[: len(early)])
@@ -240,9 +238,9 @@ def test_a_recording_of_tandem_is_estimated_with_the_noise_that_its_robots_assum
 @pytest.mark.parametrize("slip", [0.0, 0.2])
 def test_the_path_is_that_of_the_odometry_with_its_lateral_slip(slip: float) -> None:
     recording = simulated(slip=slip)
-    measured = measurements(recording, None, "uwb-calibrated", None).measured
-    path = measured.sides[1].path
-    t = measured.t0 + measured.period * np.arange(float(len(path.x)))
+    measured = measurements(recording, None, "uwb-calibrated", None)
+    path = measured.path(recording.robots[1].id)
+    t = measured.t0 + measured.joint.period * np.arange(float(len(path.x)))
     expected = dead_reckoned(recording.robots[1].odometry, t)
     np.testing.assert_allclose(np.stack((path.x, path.y, path.heading), 1), expected, atol=1e-9)
 
@@ -272,7 +270,7 @@ def test_lateral_slip_turns_the_path_and_extra_variances_add_to_the_noise() -> N
 
 
 def test_measurements_that_differ_in_slip_variance_or_sigma_are_not_the_same(sample: RangeRecording) -> None:
-    used, reach = measurements(sample, ("A", "B"), "uwb-calibrated", None).measured.until(10)
+    used, reach = measurements(sample, ("A", "B"), "uwb-calibrated", None).until(9)
     pair = pair_of(used, reach)
     path, ranges = pair.paths[0], pair.ranges
     assert path.slip is not None
@@ -403,9 +401,9 @@ def with_a_range_to_each(recording: RangeRecording, places: Sequence[tuple[float
 
 def test_the_anchors_with_the_most_ranges_are_found_among_thousands_and_the_others_are_counted() -> None:
     many = [(10.0 + number, 0.0) for number in range(20_000)]
-    measured = measurements(with_a_range_to_each(simulated(), many), None, "uwb", None).measured
-    assert [side.anchors[0].id for side in measured.sides] == ["M1", "M2"]
-    assert [len(side.anchors) for side in measured.sides] == [MOST_USED_ANCHORS, 1]
+    measured = measurements(with_a_range_to_each(simulated(), many), None, "uwb", None)
+    assert [side.anchors[0].id for side in measured.robots] == ["M1", "M2"]
+    assert [len(side.anchors) for side in measured.robots] == [MOST_USED_ANCHORS, 1]
     assert (
         measured.unused[f"to others than the {MOST_USED_ANCHORS} anchors with the most"]
         == 20_001 - MOST_USED_ANCHORS
@@ -440,13 +438,13 @@ def test_poses_by_three_anchors_are_off_by_what_their_covariance_says() -> None:
 
 
 def test_each_pair_of_radios_has_one_range_a_second_at_the_nearest_tick(sample: RangeRecording) -> None:
-    measured = measurements(sample, ("A", "B"), "uwb-calibrated", None).measured
+    measured = measurements(sample, ("A", "B"), "uwb-calibrated", None)
     ranges = measured.joint.ranges
     t = measured.time_of(ranges.tick)
-    ticks = (t - measured.t0) / measured.period
+    ticks = (t - measured.t0) / measured.joint.period
     assert np.max(np.abs(ticks - ranges.tick)) <= 0.5 + 1e-6
     for rows in ranges.pairs:
-        assert np.min(np.diff(t[rows])) >= EPOCH_S - measured.period - 1e-6
+        assert np.min(np.diff(t[rows])) >= EPOCH_S - measured.joint.period - 1e-6
 
 
 def test_known_errors_of_ranges_are_removed(sample: RangeRecording, tmp_path: Path) -> None:

@@ -14,12 +14,12 @@ import pytest
 from mcap.writer import Writer
 
 from compose.errors import BROKEN_PIPE, STOPPED_STATUS, USER_ERROR
-from compose.recording.estimating import estimate_stream
-from compose.recording.estimating.estimate_epoch import ClaimRule
-from compose.recording.estimating.estimate_files import ESTIMATE_COLUMNS, estimate_csv
-from compose.recording.estimating.estimate_run import estimated, measurements
-from compose.recording.estimating.estimate_stream import StreamEstimate
+from compose.recording.estimating import estimate_run
+from compose.recording.estimating.estimate_rows import ESTIMATE_COLUMNS, estimate_csv
+from compose.recording.estimating.estimate_run import StreamEstimate, estimated
 from compose.recording.estimating.noise_files import told_noise
+from compose.recording.estimating.recorded_measurements import measurements
+from compose.recording.estimating.recording_estimator import ClaimRule
 from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.range_mcap import rows_as_they_arrive
 from compose.recording.ranging.range_recording import RangeRecording
@@ -90,11 +90,11 @@ def messages() -> Messages:
 @pytest.mark.long
 def test_a_stream_gives_what_its_file_gives(messages: Messages) -> None:
     recording = read_ranges(SAMPLE)
-    followed = StreamEstimate("it", ("A", "B"), (told_noise(PROFILE), PROFILE), ClaimRule())
+    followed = StreamEstimate("it", ("A", "B"), told_noise(PROFILE), ClaimRule())
     rows = list(followed.rows(rows_as_they_arrive(io.BytesIO(written(messages)), "it")))
     problem = measurements(recording, None, PROFILE, None)
-    measured = problem.measured
-    assert measured.ticks_per_epoch != estimate_stream.STREAM_TICKS
+    measured = problem
+    assert measured.ticks_per_epoch != estimate_run.STREAM_TICKS
     _, result = followed.result()
     claims = {name: one.first_claim for name, one in result.summary.robots.items()}
     assert all(one is not None and one.nees is not None and one.nees < 16.27 for one in claims.values())
@@ -114,7 +114,7 @@ def test_a_robot_that_joins_a_stream_begins_the_estimate_again(messages: Message
         if one[0] <= 9.3 and (one[1] == "/anchors" or one[0] > 6.2 or "A" not in one[2].values())
     ]
     for end in (7.0, 9.3):  # in the first, both have moved for a shorter time than one alone
-        estimate = StreamEstimate("it", None, (told_noise(PROFILE), PROFILE), ClaimRule())
+        estimate = StreamEstimate("it", None, told_noise(PROFILE), ClaimRule())
         data = written([one for one in late if one[0] <= end])
         list(estimate.rows(rows_as_they_arrive(io.BytesIO(data), "it")))
         _, result = estimate.result()
@@ -128,7 +128,7 @@ def test_a_robot_that_joins_a_stream_begins_the_estimate_again(messages: Message
 @pytest.mark.long
 def test_a_stream_that_breaks_off_gives_the_estimates_before_that(messages: Messages) -> None:
     def rows(data: bytes) -> str:
-        estimate = StreamEstimate("it", None, (told_noise(PROFILE), PROFILE), ClaimRule())
+        estimate = StreamEstimate("it", None, told_noise(PROFILE), ClaimRule())
         return estimate_csv(list(estimate.rows(rows_as_they_arrive(io.BytesIO(data), "it"))))
 
     early = [one for one in messages if one[0] <= 12.4]

@@ -10,9 +10,10 @@ import pytest
 
 import tandem as api
 from compose.errors import ENDED, NOT_LOCALISED
-from compose.recording.estimating.estimate_epoch import ClaimRule
-from compose.recording.estimating.estimate_files import estimate_csv
-from compose.recording.estimating.estimate_run import RecordingEstimate, estimated, measurements
+from compose.recording.estimating.estimate_rows import estimate_csv
+from compose.recording.estimating.estimate_run import RecordingEstimate, estimated
+from compose.recording.estimating.recorded_measurements import measurements
+from compose.recording.estimating.recording_estimator import ClaimRule
 from compose.recording.ranging.range_recording import (
     FixedAnchor,
     RangeRecording,
@@ -167,8 +168,8 @@ def test_a_group_of_which_some_robot_has_no_pose_ends_with_status_1(mission: Pat
 
 
 def test_measurements_of_a_group_are_facts_in_the_order_of_names() -> None:
-    measured = measurements(recorded(3, 5), ("r02", "r00", "r01"), None, None).measured
+    measured = measurements(recorded(3, 5), ("r02", "r00", "r01"), None, None)
     assert measured.joint.robots == ("r00", "r01", "r02")
-    assert [one.id for one in measured.sides] == ["r02", "r00", "r01"]
-    assert measured.pairs[0] == ("r00", "Mr00")
-    assert measured.pairs[-1] == ("r01", "r02")
+    assert [one.id for one in measured.robots] == ["r02", "r00", "r01"]
+    assert measured.joint.radios[0] == ("r00", "Mr00")
+    assert measured.joint.radios[-1] == ("r01", "r02")

@@ -16,8 +16,9 @@ import pytest
 
 from agent.estimation.fit import Fit
 from agent.estimation.gaussian.pair_ranges import PairRanges
-from compose.recording.estimating.estimate_epoch import ClaimRule
-from compose.recording.estimating.estimate_run import estimated, measurements
+from compose.recording.estimating.estimate_run import estimated
+from compose.recording.estimating.recorded_measurements import measurements
+from compose.recording.estimating.recording_estimator import ClaimRule
 from compose.recording.ranging.range_files import read_ranges
 from protocol.motion import Pose, step
 

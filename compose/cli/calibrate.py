@@ -19,12 +19,7 @@ if TYPE_CHECKING:
 
 def main(options: argparse.Namespace) -> int:
     """Calibrate, print the table, and write or print the profile."""
-    from compose.recording.estimating.calibration import calibrated  # noqa: PLC0415  # they need numpy
-    from compose.recording.estimating.noise_profile import (  # noqa: PLC0415
-        correction_of,
-        noise_table,
-        profile_toml,
-    )
+    from compose.recording.estimating.calibration import calibrated, profile_toml  # noqa: PLC0415  # numpy
     from compose.recording.ranging.range_files import read_ranges  # noqa: PLC0415
 
     if options.out is not None and options.out.suffix != ".toml":
@@ -34,8 +29,7 @@ def main(options: argparse.Namespace) -> int:
         recording, options.robots, options.window, by_fit=options.without_truth, fitting=_fitting
     )
     anchors = frozenset([one.id for one in recording.anchors])
-    source = f"{found.source} of {recording.source}"
-    text = profile_toml(noise_table(found, anchors), correction_of(found), source)
+    text = profile_toml(found, anchors, f"{found.source} of {recording.source}")
     if options.out is not None:
         try:
             files.write(options.out, text)

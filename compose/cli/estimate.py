@@ -19,9 +19,10 @@ from compose.terminal.text_width import tell
 from protocol.output import discard, say
 
 if TYPE_CHECKING:
-    from compose.recording.estimating.estimate_epoch import ClaimRule
     from compose.recording.estimating.estimate_rows import PoseEstimateRow, RobotEstimate
-    from compose.recording.estimating.estimate_run import EstimationProblem, RecordingEstimate
+    from compose.recording.estimating.estimate_run import RecordingEstimate
+    from compose.recording.estimating.recorded_measurements import Measurements
+    from compose.recording.estimating.recording_estimator import ClaimRule
     from compose.recording.ranging.range_recording import RecordedRobot
 
 
@@ -31,18 +32,19 @@ def main(options: argparse.Namespace) -> int:
     Return NOT_LOCALISED if a robot may not claim its pose at the end; if a stream was ended by a signal
     STOPPED_STATUS, and BROKEN_PIPE if the reader of the output has gone.
     """
-    from compose.recording.estimating import estimate_epoch  # noqa: PLC0415
-    from compose.recording.estimating.estimate_run import estimated, measurements  # noqa: PLC0415  # numpy
+    from compose.recording.estimating.estimate_run import estimated  # noqa: PLC0415  # numpy takes time
+    from compose.recording.estimating.recorded_measurements import measurements  # noqa: PLC0415
+    from compose.recording.estimating.recording_estimator import ClaimRule  # noqa: PLC0415
     from compose.recording.ranging.range_files import read_ranges  # noqa: PLC0415
 
     stopped = None
-    rule = estimate_epoch.ClaimRule(options.accuracy, options.confidence)
+    rule = ClaimRule(options.accuracy, options.confidence)
     if options.follow:
         problem, estimate, stopped = _followed(options, rule)
     else:
         recording = read_ranges(options.recording, options.anchors)
         problem = measurements(recording, options.robots, options.noise, options.window)
-        with counting("tandem estimate", problem.measured.epochs) as done:
+        with counting("tandem estimate", len(problem.ends)) as done:
             estimate = estimated(problem, rule, done)
     if options.out is not None:
         written = _written(options.out, problem, estimate)
@@ -58,18 +60,18 @@ def main(options: argparse.Namespace) -> int:
 
 def _followed(
     options: argparse.Namespace, rule: ClaimRule
-) -> tuple[EstimationProblem, RecordingEstimate, int | None]:
+) -> tuple[Measurements, RecordingEstimate, int | None]:
     """Print the estimates of a stream until it ends; return all of them, and the status if it did not end."""
     need("mcap")
-    from compose.recording.estimating.estimate_files import ESTIMATE_COLUMNS, csv_line  # noqa: PLC0415
-    from compose.recording.estimating.estimate_stream import StreamEstimate  # noqa: PLC0415
+    from compose.recording.estimating.estimate_rows import ESTIMATE_COLUMNS, csv_line  # noqa: PLC0415
+    from compose.recording.estimating.estimate_run import StreamEstimate  # noqa: PLC0415
     from compose.recording.estimating.noise_files import told_noise  # noqa: PLC0415
     from compose.recording.ranging.range_mcap import rows_as_they_arrive  # noqa: PLC0415
 
     if options.window is not None or options.anchors is not None:
         raise UserError("--follow: a stream has its own anchors, and no window")
     name = "standard input" if str(options.recording) == "-" else str(options.recording)
-    noise = (told_noise(options.noise), options.noise) if options.noise is not None else None
+    noise = told_noise(options.noise) if options.noise is not None else None
     estimate = StreamEstimate(name, options.robots, noise, rule, partial(_doubted, name))
     try:
         stream = sys.stdin.buffer if str(options.recording) == "-" else options.recording.open("rb")
@@ -90,9 +92,9 @@ def _doubted(name: str, doubt: str) -> None:
     say(f"tandem estimate: {name}: {doubt} Nothing is estimated.", error=True)
 
 
-def _written(out: Path, problem: EstimationProblem, estimate: RecordingEstimate) -> list[Path]:
+def _written(out: Path, problem: Measurements, estimate: RecordingEstimate) -> list[Path]:
     """Write all files into `out`, and return their paths. Raises UserError."""
-    from compose.recording.estimating.estimate_files import write_estimate  # noqa: PLC0415  # they need numpy
+    from compose.recording.estimating.estimate_summary import write_estimate  # noqa: PLC0415  # they need numpy
 
     make_folder(out)
     try:
@@ -101,7 +103,7 @@ def _written(out: Path, problem: EstimationProblem, estimate: RecordingEstimate)
         raise CannotWrite(out, error) from None
 
 
-def _drawn(out: Path, problem: EstimationProblem, estimate: RecordingEstimate) -> list[Path]:
+def _drawn(out: Path, problem: Measurements, estimate: RecordingEstimate) -> list[Path]:
     """Draw the figures into `out`, and return their paths; none without Matplotlib. Raises OSError."""
     if find_spec("matplotlib") is None:
         say("tandem estimate: no figures: they need matplotlib (extra lab)", error=True)
@@ -117,7 +119,7 @@ def _drawn(out: Path, problem: EstimationProblem, estimate: RecordingEstimate) -
         ]
 
 
-def _lines(problem: EstimationProblem, estimate: RecordingEstimate) -> list[str]:
+def _lines(problem: Measurements, estimate: RecordingEstimate) -> list[str]:
     """Return the table of the estimates, what limits them, and last which claims do not hold at the end."""
     from compose.terminal.tables import shown  # noqa: PLC0415  # it takes time
 
@@ -139,8 +141,8 @@ def _lines(problem: EstimationProblem, estimate: RecordingEstimate) -> list[str]
     for why, count in summary.unused_ranges.items():
         found.append(f"{count} {'range' if count == 1 else 'ranges'} not used: {why}")
     for robot in problem.robots:
-        found += _about(robot, summary.robots[robot.id])
-        found += _without_truth(robot, [row for row in estimate.rows if row.robot == robot.id])
+        found += _about(robot.id, summary.robots[robot.id])
+        found += _without_truth(robot.recorded, [row for row in estimate.rows if row.robot == robot.id])
     for name, one in summary.robots.items():
         if one.first_claim is not None and one.withdrawn_s is not None:
             after = f"{one.withdrawn_s - summary.begin_s:.1f}"
@@ -148,15 +150,15 @@ def _lines(problem: EstimationProblem, estimate: RecordingEstimate) -> list[str]
     return found
 
 
-def _about(robot: RecordedRobot, one: RobotEstimate) -> Iterator[str]:
+def _about(name: str, one: RobotEstimate) -> Iterator[str]:
     """Yield what was changed in the odometry of a robot."""
     if one.whole_turns:
         what = "increments of odometry turned" if one.whole_turns > 1 else "increment of odometry turned"
-        yield f"{robot.id}: {one.whole_turns} {what} by 2 pi or more too far: whole turns were removed"
+        yield f"{name}: {one.whole_turns} {what} by 2 pi or more too far: whole turns were removed"
     if one.gross_increments:
         what = "increments of odometry were" if one.gross_increments > 1 else "increment of odometry was"
         yield (
-            f"{robot.id}: {one.gross_increments} {what} replaced: more than three times as fast as nearly "
+            f"{name}: {one.gross_increments} {what} replaced: more than three times as fast as nearly "
             "all others"
         )
 
@@ -172,7 +174,7 @@ def _without_truth(robot: RecordedRobot, rows: list[PoseEstimateRow]) -> Iterato
 
 
 def _row(name: str, one: RobotEstimate, begin_s: float) -> list[str]:
-    from compose.recording.estimating.group_measurements import listed  # noqa: PLC0415  # it takes time
+    from compose.recording.estimating.recorded_measurements import listed  # noqa: PLC0415  # it takes time
 
     first, last = one.first_claim, one.final
     if last is None:

@@ -17,8 +17,8 @@ from matplotlib.patches import Polygon
 from compose.figures.sheet import Sheet, around
 from compose.figures.style import INK, PALE, ROLE_MARKERS, SCREEN, Medium
 from compose.recording.estimating.estimate_rows import PoseEstimateRow
-from compose.recording.estimating.estimate_run import EstimationProblem, RecordingEstimate
-from compose.recording.estimating.group_measurements import listed
+from compose.recording.estimating.estimate_run import RecordingEstimate
+from compose.recording.estimating.recorded_measurements import Measurements, listed
 from compose.recording.ranging.range_recording import Numbers, TruePath
 from compose.view.colours import COLOURS
 from compose.view.outlines import OUTLINE_SIGMAS, outline
@@ -60,7 +60,7 @@ class Look(NamedTuple):
 class Drawn(NamedTuple):
     """The content of the figures."""
 
-    problem: EstimationProblem
+    problem: Measurements
     estimates: RecordingEstimate
 
     @property
@@ -82,16 +82,16 @@ class Drawn(NamedTuple):
     def ranged(self) -> list[tuple[str, str]]:
         """The pairs of radios that have ranges at the end; of a group, the first MOST_PAIRS."""
         counts = self.estimates.epochs[-1].ranges
-        found = [pair for pair, count in zip(self.problem.measured.pairs, counts, strict=True) if count]
+        found = [pair for pair, count in zip(self.problem.joint.radios, counts, strict=True) if count]
         return found if len(self.problem.robots) <= len(ROLES) else found[:MOST_PAIRS]
 
     def truth(self, i: int) -> TruePath | None:
         """Return the true path of the robot with index `i`, if there is one."""
-        return self.problem.robots[i].truth
+        return self.problem.robots[i].recorded.truth
 
     def since_begin(self, times: Any) -> Any:
         """Return times in s from the first odometry of both robots on."""
-        return np.asarray(times, float) - self.problem.measured.t0
+        return np.asarray(times, float) - self.problem.t0
 
     def from_claim(self, i: int) -> list[PoseEstimateRow]:
         """Return the rows of a robot from its first claim on, or those of its last probable hypothesis."""
@@ -108,7 +108,7 @@ PROBABLE = 0.99
 
 
 def estimate_figures(
-    problem: EstimationProblem, estimates: RecordingEstimate, medium: Medium = SCREEN
+    problem: Measurements, estimates: RecordingEstimate, medium: Medium = SCREEN
 ) -> Iterator[tuple[str, Figure]]:
     """Yield the figures and their names; none if there was never a hypothesis."""
     drawn = Drawn(problem, estimates)
@@ -149,7 +149,7 @@ def _path(drawn: Drawn, medium: Medium) -> Figure:
                 axes.add_patch(Polygon(around_it, facecolor=colour, edgecolor=colour, alpha=0.18, lw=0.8))
                 points += around_it
         axes.plot(rows[0].x, rows[0].y, ls="", ms=5, **marks)
-    for anchor, marker in zip(drawn.problem.measured.anchors, cycle(ANCHOR_MARKS), strict=False):
+    for anchor, marker in zip(drawn.problem.anchors, cycle(ANCHOR_MARKS), strict=False):
         estimated = drawn.estimates.summary.anchors.get(anchor.id)
         at = estimated.position if estimated is not None else (anchor.x, anchor.y)
         if math.isfinite(at[0]):
@@ -251,7 +251,7 @@ def _residuals(axes: Axes, drawn: Drawn, which: int, name: str) -> None:
         return
     fit, used = fitted
     rows = used.ranges.pairs[which]
-    measured = drawn.problem.measured
+    measured = drawn.problem
     times = measured.time_of(fit.ticks[rows]) - measured.t0
     residuals, good = fit.residuals[rows], fit.weights[rows] > OUTLIER
     axes.axhline(0.0, color=PALE, lw=0.6)

@@ -8,16 +8,14 @@ between ranges and positions of anchors. Nothing is converted: a user is told wh
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from functools import partial
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 
-from compose.recording.estimating.prepared_steps import levelled
-from compose.recording.estimating.sound_odometry import at_antenna, sound
-from compose.recording.ranging.range_recording import Numbers, Places, RangeRecording, locked
+from compose.recording.estimating.sound_odometry import at_antenna, levelled, sound
+from compose.recording.ranging.range_recording import Numbers, RangeRecording, locked
 from compose.recording.ranging.range_steps import NEARLY_ALL, dead_reckoned, speeds
 
 PART_S, PARTS_OF_PATH = 40.0, 3
@@ -52,38 +50,48 @@ SLOW_TURN = 0.5
 UNITS = {1000.0: "mm", 100.0: "cm", 39.37: "inches", 3.281: "feet"}
 """The units that are suspected, by the number of them in a metre."""
 
-NEAR_UNIT = 1.35
-"""The largest factor between what is measured and the unit that is named."""
+NEAR_UNIT, NEAR_UNIT_OF_USUAL = 1.35, 3.0
+"""The largest factor between what is measured and the unit that is named; if it is measured against the usual
+distance of two robots, which is about as far from the true one."""
+
+MOST_BIAS = 10.0
+"""The largest bias in m that is taken for one of radios at any distance.
+
+It is thirty times that of UWB radios. If ranges are all alike, a factor may explain a larger one."""
+
+LEAST_GAP, SAME_PLACE_S = 1.0, 1.0
+"""The length in m by which ranges between robots must be off: below it, motion and biases count; and the time
+in s between two ranges in which a robot hardly moves."""
 
 BEARINGS, STEPS = 8, 25
 """The number of bearings from which a fit begins, and that of its steps."""
 
-DEGREES = "the turns of odometry agree with the ranges only as degrees: are they in degrees?"
+DAMPING, LONGEST_STEP = 1e-3, 0.5
+"""The damping of a step, as a fraction of the information, and its longest effect, as one of the ranges."""
+
+TINY, MOST_LOG = 1e-12, 20.0
+"""The least length in m, and the largest logarithm of a factor."""
 
 
 @np.errstate(all="ignore")  # where numbers overflow, nothing is suspected
 def doubtful_units(recording: RangeRecording) -> str:
     """Return which data of `recording` seem to be in another unit, and in which; an empty text if none do."""
-    recording, robots = recording.with_places(), {}
-    for robot in range(len(recording.robots)):
-        if one := _of_robot(recording, robot):
-            robots[recording.robots[robot].id] = one
-    between = _between_robots(recording)
-    if between and not any(one.doubt(1.0) for one in robots.values()):
+    recording = recording.with_places()
+    names = [one.id for one in recording.robots]
+    robots = {name: one for i, name in enumerate(names) if (one := _of_robot(recording, i))}
+    between, bound = _between_robots(recording)
+    if between and not any(_doubt([one], 1.0) for one in robots.values()):
         return between
-    bound = _by_polygon(recording)
-    doubts = {name: doubt for name, one in robots.items() if (doubt := one.doubt(bound))}
-    factors = [one.odometry for one in robots.values()]
-    alike = (
-        len(set(doubts.values())) == 1 or max(factors, default=0.0) - min(factors, default=0.0) < LOG_ALIKE
-    )
-    if len(doubts) == len(robots) and alike:
-        return _Factors.of_all(list(robots.values())).doubt(bound)
+    doubts = {name: doubt for name, one in robots.items() if (doubt := _doubt([one], bound))}
+    factors = [_by_odometry([one]) for one in robots.values()]
+    alike = max(factors, default=0.0) - min(factors, default=0.0) < LOG_ALIKE
+    if len(doubts) == len(robots) and (alike or len(set(doubts.values())) == 1):
+        return _doubt(list(robots.values()), bound)
     return "; ".join(f"{name}: {doubt}" for name, doubt in doubts.items())
 
 
 class _Factors(NamedTuple):
-    """The factors between units that the ranges of robots to anchors tell."""
+    """The factors between units that the ranges of a robot to anchors tell."""
 
     degrees: bool
     """True if the turns of odometry are in degrees."""
@@ -92,55 +100,39 @@ class _Factors(NamedTuple):
     by_anchors: list[float]
     """The logarithms of the factors of ranges to positions of anchors."""
 
-    @classmethod
-    def of_all(cls, robots: list[_Factors]) -> _Factors:
-        """Return what `robots` tell together."""
-        return cls(
-            any(one.degrees for one in robots),
-            [factor for one in robots for factor in one.by_odometry],
-            [factor for one in robots for factor in one.by_anchors],
-        )
 
-    @property
-    def odometry(self) -> float:
-        """The median of the logarithms of the factors of ranges to odometry.
+def _by_odometry(robots: Sequence[_Factors]) -> float:
+    """Return the median of the logarithms of the factors of ranges to odometry.
 
-        Odometry that slips, or has a gap, looks like any factor of the ranges to one anchor: alone, these
-        tell only that of a unit.
-        """
-        if len(self.by_odometry) == 1 and not _near_unit(_factor(self.by_odometry[0])):
-            return 0.0
-        return float(np.median(self.by_odometry)) if self.by_odometry else 0.0
-
-    def doubt(self, bound: float) -> str:
-        """Return the suspicion; `bound` is that of `_by_polygon`."""
-        if self.degrees:
-            return DEGREES
-        anchors = _factor(float(np.median(self.by_anchors))) if self.by_anchors else bound
-        return _suspicion(_factor(self.odometry), anchors, bool(self.by_anchors))
+    Odometry that slips, or has a gap, looks like any factor of the ranges to one anchor: alone, these tell
+    only that of a unit.
+    """
+    factors = [factor for one in robots for factor in one.by_odometry]
+    if not factors or (len(factors) == 1 and not _near_unit(_factor(factors[0]), NEAR_UNIT)):
+        return 0.0
+    return float(np.median(factors))
 
 
-def _of_robot(recording: RangeRecording, robot: int) -> _Factors | None:
-    """Return what the ranges of one robot tell; None if it has not enough of them."""
-    groups = list(_groups(recording, robot))
-    fits = _fits(recording, robot, groups, 1.0)
-    if not fits:
-        return None
-    degrees = 0
-    if float(np.percentile(speeds(recording.robots[robot].odometry)[1], NEARLY_ALL)) > SLOW_TURN:
-        converted = _fits(recording, robot, groups, math.pi / 180.0)
-        degrees = sum(one.cost > DECISIVE * other.cost for one, other in zip(fits, converted, strict=True))
-    by_anchors = []
-    for one, other in combinations(fits, 2):
-        apart = abs(one.anchor - other.anchor)
-        if one.part == other.part and apart > 0.0:
-            by_anchors.append(math.log(_to_anchors(one, other, apart)))
-    return _Factors(2 * degrees > len(fits), [math.log(one.factor) for one in fits], by_anchors)
+def _doubt(robots: Sequence[_Factors], bound: float) -> str:
+    """Return the suspicion that `robots` tell together.
 
-
-def _factor(logarithm: float) -> float:
-    """Return the exponential of a logarithm; 1 if that is not a number."""
-    return math.exp(min(max(-MOST_LOG, logarithm), MOST_LOG)) if math.isfinite(logarithm) else 1.0
+    `bound` is that on the factor of ranges to positions of anchors, if none of them tells it.
+    """
+    if any(one.degrees for one in robots):
+        return "the turns of odometry agree with the ranges only as degrees: are they in degrees?"
+    located = [factor for one in robots for factor in one.by_anchors]
+    by_odometry = _factor(_by_odometry(robots))
+    by_anchors = _factor(float(np.median(located))) if located else bound
+    match [max(one, 1.0 / one) > LEAST_FACTOR for one in (by_odometry, by_anchors)]:
+        case [True, True] if (by_odometry > 1.0) == (by_anchors > 1.0):
+            return _sentence("ranges", by_odometry, "odometry and anchors")
+        case [True, False] if by_odometry > 1.0 and not located:
+            return _sentence("ranges", by_odometry, "odometry")
+        case [True, _]:
+            return _sentence("odometry", 1.0 / by_odometry, "ranges and anchors" if located else "ranges")
+        case [False, True]:
+            return _sentence("positions of anchors", 1.0 / by_anchors, "ranges and odometry")
+    return ""
 
 
 def doubtful_lengths(lengths: Mapping[tuple[str, str], tuple[Numbers, Numbers]], others: str) -> str:
@@ -173,187 +165,155 @@ def _doubtful_factor(measured: Numbers, true: Numbers) -> float:
     return factor if decided or (abs(bias) > MOST_BIAS and by_factor < DECISIVE * by_bias) else 0.0
 
 
-MOST_BIAS = 10.0
-"""The largest bias in m that is taken for one of radios at any distance.
-
-It is thirty times that of UWB radios. If ranges are all alike, a factor may explain a larger one."""
-
-
-def _suspicion(by_odometry: float, by_anchors: float, located: bool) -> str:
-    """Return the sentence for the factors of ranges to odometry, and of ranges to positions of anchors.
-
-    `located` is true if the second is measured; otherwise it is 1, or a bound.
-    """
-    doubtful = [max(one, 1.0 / one) > LEAST_FACTOR for one in (by_odometry, by_anchors)]
-    if doubtful == [True, True] and (by_odometry > 1.0) == (by_anchors > 1.0):
-        return _sentence("ranges", by_odometry, "odometry and anchors")
-    if doubtful == [True, False] and by_odometry > 1.0 and not located:
-        return _sentence("ranges", by_odometry, "odometry")
-    if doubtful[0]:
-        return _sentence("odometry", 1.0 / by_odometry, "ranges and anchors" if located else "ranges")
-    if doubtful[1]:
-        return _sentence("positions of anchors", 1.0 / by_anchors, "ranges and odometry")
-    return ""
-
-
-def _sentence(subject: str, factor: float, others: str, near_unit: float = NEAR_UNIT) -> str:
+def _sentence(subject: str, factor: float, others: str, near: float = NEAR_UNIT) -> str:
     """Return the sentence that `subject` is `factor` times what `others` allow."""
-    unit = _near_unit(factor, near_unit)
+    unit = _near_unit(factor, near)
     number = unit or float(f"{max(factor, 1.0 / factor):.2g}")
     many = f"{round(number, 1 if number < 10.0 else 0):,.15g}".replace(",", " ")
-    name = UNITS[unit] if unit else "another unit"
-    verb, allow = "is" if subject == "odometry" else "are", "allows" if others == "odometry" else "allow"
-    if factor > 1.0:
-        pronoun = "it" if subject == "odometry" else "they"
-        return f"{subject} {verb} about {many} times what {others} {allow}: {verb} {pronoun} in {name}?"
-    doubted = "is" if others == "odometry" else "are"
-    return f"{subject} {verb} about 1/{many} of what {others} {allow}: {doubted} {others} in {name}?"
+    verb, pronoun = ("is", "it") if subject == "odometry" else ("are", "they")
+    their_verb, allow = ("is", "allows") if others == "odometry" else ("are", "allow")
+    times = f"{many} times" if factor > 1.0 else f"1/{many} of"
+    asked = f"{verb} {pronoun}" if factor > 1.0 else f"{their_verb} {others}"
+    name = UNITS.get(unit, "another unit")
+    return f"{subject} {verb} about {times} what {others} {allow}: {asked} in {name}?"
 
 
-def _near_unit(factor: float, near_unit: float = NEAR_UNIT) -> float:
+def _near_unit(factor: float, near: float) -> float:
     """Return the number of units in a metre that is near a factor or its inverse; 0 if there is none."""
     ratio = max(factor, 1.0 / factor)
     unit = min(UNITS, key=lambda one: abs(math.log(ratio / one)))
-    return unit if max(ratio / unit, unit / ratio) < near_unit else 0.0
+    return unit if max(ratio / unit, unit / ratio) < near else 0.0
 
 
-# --- the ranges of one robot to one anchor ------------------------------------------------------------------
+def _factor(logarithm: float) -> float:
+    """Return the exponential of a logarithm; 1 if that is not a number."""
+    return math.exp(min(max(-MOST_LOG, logarithm), MOST_LOG)) if math.isfinite(logarithm) else 1.0
+
+
+# --- the ranges of one robot to its anchors -----------------------------------------------------------------
 
 
 class _Group(NamedTuple):
-    """Some ranges of a robot to one anchor within a part of its path."""
+    """Some ranges of a robot to one anchor within a part of its path, and their fit."""
 
     part: int
     anchor: complex
     """The position of the anchor in m."""
     t: Numbers
     rho: Numbers
-
-
-class _Fit(NamedTuple):
-    """The place of an anchor in the frame of the odometry, by the ranges of a group."""
-
-    part: int
-    anchor: complex
     path: Numbers
-    """The places of the robot at the ranges, as complex numbers."""
-    rho: Numbers
-    factor: float
+    """The places of the robot at the ranges, in the frame of the odometry, as complex numbers."""
+    factor: float = 1.0
     """The factor of ranges to odometry; 1 unless the ranges decide that it is another."""
-    place: complex
-    cost: float
+    place: complex = 0j
+    """The place of the anchor in the frame of the odometry."""
+    cost: float = 0.0
     """The mean absolute residual, in the unit of ranges, and the rounding."""
 
 
-def _groups(recording: RangeRecording, robot: int) -> Iterator[_Group]:
-    """Yield the ranges of `robot` in at most PARTS_OF_PATH parts of its path."""
+def _of_robot(recording: RangeRecording, robot: int) -> _Factors | None:
+    """Return what the ranges of one robot tell; None if it has not enough of them."""
+    odometry = recording.robots[robot].odometry
+    fits = list(map(_fitted, _groups(recording, robot, 1.0)))
+    if not fits:
+        return None
+    degrees = 0
+    if float(np.percentile(speeds(odometry)[1], NEARLY_ALL)) > SLOW_TURN:
+        converted = map(_fitted, _groups(recording, robot, math.pi / 180.0))
+        degrees = sum(one.cost > DECISIVE * other.cost for one, other in zip(fits, converted, strict=True))
+    by_anchors = [
+        math.log(_to_anchors(one, other))
+        for one, other in combinations(fits, 2)
+        if one.part == other.part and one.anchor != other.anchor
+    ]
+    return _Factors(2 * degrees > len(fits), [math.log(one.factor) for one in fits], by_anchors)
+
+
+def _groups(recording: RangeRecording, robot: int, turn_unit: float) -> Iterator[_Group]:
+    """Yield the ranges of `robot` in at most PARTS_OF_PATH parts of its path.
+
+    The turns of its odometry are multiplied by `turn_unit`.
+    """
     ranges, base, own = recording.ranges, len(recording.robots), recording.robots[robot]
     if not len(own.odometry.t0):
         return
+    increments = own.odometry.increments * np.array((1.0, 1.0, turn_unit))
+    odometry = sound(own.odometry._replace(increments=locked(increments))).odometry
+    odometry = at_antenna(odometry, *own.antenna[:2])
     begin, end = float(own.odometry.t0[0]), float(own.odometry.t1[-1])
     rows = np.flatnonzero((ranges.first == robot) & (ranges.second >= base))
-    starts = np.linspace(
-        begin, max(end - PART_S, begin), PARTS_OF_PATH if end - begin > PARTS_OF_PATH * PART_S else 1
-    )
-    for part, start in enumerate(starts.tolist()):
+    count = PARTS_OF_PATH if end - begin > PARTS_OF_PATH * PART_S else 1
+    for part, start in enumerate(np.linspace(begin, max(end - PART_S, begin), count).tolist()):
         inside = rows[(ranges.t[rows] >= start) & (ranges.t[rows] <= min(start + PART_S, end))]
         counts = np.bincount(ranges.second[inside] - base, minlength=len(recording.anchors))
         for k in np.argsort(-counts, kind="stable")[:MOST_EXAMINED_ANCHORS].tolist():
             if counts[k] < FEWEST:
                 continue
-            some: Places = inside[ranges.second[inside] == base + k]
+            some, anchor = inside[ranges.second[inside] == base + k], recording.anchors[k]
             some = some[np.unique(np.linspace(0, len(some) - 1, MOST).astype(np.intp))]
-            anchor = recording.anchors[k]
             rho = levelled(ranges.range[some], np.full(len(some), own.antenna[2] - anchor.height))[0]
-            yield _Group(part, complex(anchor.x, anchor.y), ranges.t[some], rho)
+            at = dead_reckoned(odometry, ranges.t[some])
+            yield _Group(part, complex(anchor.x, anchor.y), ranges.t[some], rho, at[:, 0] + 1j * at[:, 1])
 
 
-def _fits(recording: RangeRecording, robot: int, groups: list[_Group], turn_unit: float) -> list[_Fit]:
-    """Return the fits of `groups` with the turns of odometry multiplied by `turn_unit`."""
-    if not groups:
-        return []
-    own = recording.robots[robot]
-    increments = own.odometry.increments * np.array((1.0, 1.0, turn_unit))
-    odometry = sound(own.odometry._replace(increments=locked(increments))).odometry
-    at = dead_reckoned(at_antenna(odometry, *own.antenna[:2]), np.concatenate([one.t for one in groups]))
-    ends = np.cumsum([len(one.t) for one in groups])[:-1]
-    paths = np.split(at[:, 0] + 1j * at[:, 1], ends)
-    return [_fit(one, path) for one, path in zip(groups, paths, strict=True)]
-
-
-def _fit(group: _Group, path: Numbers) -> _Fit:
-    """Return the fit of a group whose robot is at `path`, complex numbers, in the frame of the odometry."""
-    half, rho, usual = len(path) // 2, group.rho, float(np.mean(group.rho))
+def _fitted(group: _Group) -> _Group:
+    """Return `group` with its fit."""
+    path, rho, half = group.path, group.rho, len(group.path) // 2
     moved, change = np.abs(path[half:] - path[:-half]), np.abs(rho[half:] - rho[:-half])
     slope = _factor(math.log(max(TINY, float(np.sum(change)))) - math.log(max(TINY, float(np.sum(moved)))))
-    plain, plain_cost = _least(partial(_ranges_to_one, path), _around(path, usual), rho)
-    starts = [
-        np.insert(_around(path, usual / scale), 2, math.log(scale), 1)
-        for scale in (1.0, slope, 2.0 * slope, 4.0 * slope)
-    ]
-    free, free_cost = _least(partial(_ranges_to_one, path), np.concatenate(starts), rho)
-    factor = _factor(float(free[2]))
-    if plain_cost > DECISIVE * free_cost and max(factor, 1.0 / factor) > LEAST_FACTOR:
-        return _Fit(group.part, group.anchor, path, rho, factor, complex(free[0], free[1]), free_cost)
-    return _Fit(group.part, group.anchor, path, rho, 1.0, complex(plain[0], plain[1]), plain_cost)
+    scales = (1.0, slope, 2.0 * slope, 4.0 * slope)
+    plain, cost = _least(path, 0.0, rho, _starts(path, rho), [0, 1])
+    free, free_cost = _least(path, 0.0, rho, _starts(path, rho, scales), [0, 1, 3])
+    factor = _factor(float(free[3]))
+    if cost > DECISIVE * free_cost and max(factor, 1.0 / factor) > LEAST_FACTOR:
+        return group._replace(factor=factor, place=complex(free[0], free[1]), cost=free_cost)
+    return group._replace(place=complex(plain[0], plain[1]), cost=cost)
 
 
-def _to_anchors(one: _Fit, other: _Fit, apart: float) -> float:
-    """Return the factor of ranges to positions of anchors; 1 unless the ranges decide that it is another.
-
-    The two anchors are `apart` by their positions.
-    """
-    scale = math.sqrt(one.factor * other.factor)
+def _to_anchors(one: _Group, other: _Group) -> float:
+    """Return the factor of ranges to positions of two anchors; 1 unless the ranges decide it is another."""
+    scale, apart = math.sqrt(one.factor * other.factor), abs(one.anchor - other.anchor)
     found = max(TINY, scale * abs(one.place - other.place) / apart)
     if max(found, 1.0 / found) <= LEAST_FACTOR:
         return 1.0
-    around = _around(one.path, float(np.mean(one.rho)) / scale)
-    turns = math.tau * np.arange(BEARINGS) / BEARINGS
-    starts = np.column_stack((np.repeat(around, BEARINGS, 0), np.tile(turns, BEARINGS)))
-    model = partial(_ranges_to_two, one.path, other.path, scale, apart)
-    _, cost = _least(model, starts, np.concatenate((one.rho, other.rho)))
+    starts = _starts(one.path, one.rho, (scale,), np.arange(0.0, math.tau, math.tau / BEARINGS).tolist())
+    lever = np.repeat((0.0, apart / scale), (len(one.path), len(other.path)))
+    both = np.concatenate((one.path, other.path)), lever, np.concatenate((one.rho, other.rho))
+    _, cost = _least(*both, starts, [0, 1, 2])
     return found if cost > DECISIVE * max(one.cost, other.cost) else 1.0
 
 
-def _around(path: Numbers, distance: float) -> Numbers:
-    """Return the places at `distance` from the middle of `path` in all BEARINGS; shape (n, 2)."""
-    places = np.mean(path) + distance * np.exp(2j * math.pi * np.arange(BEARINGS) / BEARINGS)
-    return np.stack((places.real, places.imag), 1)
+def _starts(
+    path: Numbers, rho: Numbers, scales: Sequence[float] = (1.0,), turns: Sequence[float] = (0.0,)
+) -> Numbers:
+    """Return the unknowns of `_least` at the usual distance from the middle of `path`, in all BEARINGS."""
+    bearings = np.exp(2j * math.pi * np.arange(BEARINGS) / BEARINGS)
+    around = [(scale, np.mean(path) + np.mean(rho) / scale * bearings) for scale in scales]
+    rows = [(at.real, at.imag, turn, math.log(scale)) for scale, at in around for at in at for turn in turns]
+    return np.array(rows)
 
 
-_Model = Callable[[Numbers], tuple[Numbers, Numbers]]
-"""The predicted ranges, (n, N), for n starts, (n, unknowns), and their derivatives, (n, N, unknowns)."""
+def _least(
+    path: Numbers, lever: Numbers | float, rho: Numbers, unknowns: Numbers, free: list[int]
+) -> tuple[Numbers, float]:
+    """Return the unknowns that explain the ranges `rho` from `path` best, and their cost (see `_Group`).
 
-
-def _ranges_to_one(path: Numbers, unknowns: Numbers) -> tuple[Numbers, Numbers]:
-    """Return the ranges to an anchor at x and y, multiplied by the exponential of a third unknown."""
-    away = path - unknowns[:, :1] - 1j * unknowns[:, 1:2]
-    scale = np.exp(np.clip(unknowns[:, 2:], -MOST_LOG, MOST_LOG)) if unknowns.shape[1] == 3 else 1.0
-    distance = np.maximum(np.abs(away), TINY)
-    columns = [-scale * away.real / distance, -scale * away.imag / distance, scale * distance]
-    return columns[2], np.stack(columns[: unknowns.shape[1]], 2)
-
-
-def _ranges_to_two(
-    path: Numbers, other: Numbers, scale: float, apart: float, unknowns: Numbers
-) -> tuple[Numbers, Numbers]:
-    """Return the ranges from `path` to an anchor, and from `other` to one `apart` from it in a direction."""
-    first, jacobian = _ranges_to_one(path, unknowns[:, :2])
-    vector = apart / scale * np.exp(1j * unknowns[:, 2:])
-    moved = np.stack((unknowns[:, 0] + vector[:, 0].real, unknowns[:, 1] + vector[:, 0].imag), 1)
-    second, more = _ranges_to_one(other, moved)
-    turned = more[..., 0] * -vector.imag + more[..., 1] * vector.real
-    by_turn = np.concatenate((np.zeros_like(first), turned), 1)[..., None]
-    both = np.concatenate((np.concatenate((jacobian, more), 1), by_turn), 2)
-    return scale * np.concatenate((first, second), 1), scale * both
-
-
-def _least(model: _Model, unknowns: Numbers, rho: Numbers) -> tuple[Numbers, float]:
-    """Return the unknowns that explain the ranges `rho` best, and their cost (see `_Fit`)."""
+    They are x and y of an anchor, the direction in which another is `lever` (m) from it, which ranges with a
+    lever are to, and the logarithm of the factor of all ranges; shape (n, 4), of n starts. Those in `free`
+    are varied.
+    """
     usual = max(float(np.mean(rho)), TINY)
-    for _ in range(STEPS):
-        predicted, jacobian = model(unknowns)
+    for step in range(STEPS + 1):
+        x, y, turn, logarithm = unknowns.T[..., None]
+        arm, scale = lever * np.exp(1j * turn), np.exp(np.clip(logarithm, -MOST_LOG, MOST_LOG))
+        away = path - x - 1j * y - arm
+        predicted = scale * np.maximum(np.abs(away), TINY)
         residuals = rho - predicted
+        if step == STEPS:
+            break
+        unit = scale * away / np.maximum(np.abs(away), TINY)
+        by_turn = np.imag(np.conj(unit) * arm)
+        jacobian = np.stack((-unit.real, -unit.imag, by_turn, predicted), 2)[:, :, free]
         width = 2.0 * np.median(np.abs(residuals), 1, keepdims=True) + SAME_FIT * usual
         weighted = (jacobian / (1.0 + np.square(residuals / width))[..., None]).mT
         information = weighted @ jacobian
@@ -361,38 +321,21 @@ def _least(model: _Model, unknowns: Numbers, rho: Numbers) -> tuple[Numbers, flo
         diagonal += DAMPING * diagonal + TINY
         change = np.linalg.solve(information, weighted @ residuals[..., None])[..., 0]
         effect = np.sqrt(np.mean(np.square(jacobian), 1)) * np.abs(change) / (LONGEST_STEP * usual)
-        unknowns = unknowns + change / np.maximum(np.max(effect, 1, keepdims=True), 1.0)
-    cost = np.mean(np.abs(rho - model(unknowns)[0]), 1)
+        unknowns[:, free] += change / np.maximum(np.max(effect, 1, keepdims=True), 1.0)
+    cost = np.mean(np.abs(residuals), 1)
     best = int(np.argmin(cost))
     return unknowns[best], float(cost[best]) + SAME_FIT * usual
-
-
-DAMPING, LONGEST_STEP = 1e-3, 0.5
-"""The damping of a step, as a fraction of the information, and its longest effect, as one of the ranges."""
-
-TINY, MOST_LOG = 1e-12, 20.0
-"""The least length in m, and the largest logarithm of a factor."""
 
 
 # --- ranges between robots ----------------------------------------------------------------------------------
 
 
-class _Polygon(NamedTuple):
-    """Two robots beside one anchor each: the corners of a polygon.
+def _polygons(recording: RangeRecording) -> Iterator[tuple[tuple[str, str], float, Numbers]]:
+    """Yield the polygons of two robots beside one anchor each: no side is longer than all others together.
 
-    No side is longer than all others together.
+    Each has the names of the robots, the distance (m) of those of their anchors that have the most ranges,
+    and the ranges (m) between the robots, and at those times of each to its anchor; shape (3, N).
     """
-
-    pair: tuple[str, str]
-    """The names of the robots."""
-    apart: float
-    """The distance in m of the anchors by their positions."""
-    lengths: Numbers
-    """Ranges between the robots, and at those times of each to its anchor, in m; shape (3, N)."""
-
-
-def _polygons(recording: RangeRecording) -> Iterator[_Polygon]:
-    """Yield a polygon of each pair of robots with that anchor of each that has the most ranges."""
     pairs, ranges = recording.pairs(), recording.ranges
     anchors = {one.id: np.array((one.x, one.y, one.height)) for one in recording.anchors}
     most = {pair[0]: pair[1] for pair in sorted(pairs, key=lambda one: len(pairs[one])) if pair[1] in anchors}
@@ -408,48 +351,30 @@ def _polygons(recording: RangeRecording) -> Iterator[_Polygon]:
             sides.append(ranges.range[nearest])
         if np.count_nonzero(together) >= FEWEST:
             apart = float(np.linalg.norm(anchors[most[a]] - anchors[most[b]]))
-            yield _Polygon((a, b), apart, np.stack(sides)[:, together])
+            yield (a, b), apart, np.stack(sides)[:, together]
 
 
-def _by_polygon(recording: RangeRecording) -> float:
-    """Return a bound on the factor of ranges to positions of anchors; 1 if all polygons close."""
-    for _, apart, lengths in _polygons(recording):
+def _between_robots(recording: RangeRecording) -> tuple[str, float]:
+    """Return what the ranges between robots tell.
+
+    First, the suspicion that those of two robots are in a larger or a smaller unit than all others, if ranges
+    to anchors and the positions of these are right; then, a bound on the factor of ranges to positions of
+    anchors, which is 1 if all polygons close.
+    """
+    doubts, bounds = [], []
+    for pair, apart, lengths in _polygons(recording):
         whole = float(np.median(np.sum(lengths, 0)))
         excess = float(np.median(2.0 * np.max(lengths, 0) - np.sum(lengths, 0)))
         if apart > LEAST_FACTOR * whole > 0.0:
-            return max(TINY, whole / apart)
-        if excess > LEAST_FACTOR * apart > 0.0:
-            return excess / apart
-    return 1.0
-
-
-def _between_robots(recording: RangeRecording) -> str:
-    """Return the suspicion that ranges between two robots are in a larger or a smaller unit than all others.
-
-    It takes that the ranges to anchors, and the positions of these, are right.
-    """
-    doubts = []
-    for (a, b), apart, lengths in _polygons(recording):
-        between, first, second = lengths
-        most = first + second + apart
-        least = 2.0 * np.maximum(np.maximum(first, second), apart) - most
-        if (
-            max(np.median(between - LEAST_FACTOR * most), np.median(least - LEAST_FACTOR * between))
-            > LEAST_GAP
-        ):
-            usual = np.sqrt(np.square(first) + np.square(second) + apart**2)
+            bounds.append(max(TINY, whole / apart))
+        elif excess > LEAST_FACTOR * apart > 0.0:
+            bounds.append(excess / apart)
+        between, others = lengths[0], np.stack((*lengths[1:], np.full(lengths.shape[1], apart)))
+        most, usual = np.sum(others, 0), np.sqrt(np.sum(np.square(others), 0))
+        least = 2.0 * np.max(others, 0) - most
+        off = np.median(between - LEAST_FACTOR * most), np.median(least - LEAST_FACTOR * between)
+        if max(off) > LEAST_GAP:
             factor = float(np.median(np.maximum(between, TINY) / np.maximum(usual, TINY)))
-            doubts.append(
-                _sentence(f"ranges of {a} and {b}", factor, "ranges to anchors", NEAR_UNIT_OF_USUAL)
-            )
-    return "; ".join(doubts)
-
-
-NEAR_UNIT_OF_USUAL = 3.0
-"""As NEAR_UNIT, for a factor to the usual distance of two robots, which is about as far from the true one."""
-
-LEAST_GAP = 1.0
-"""The length in m by which ranges between robots must be off: below it, motion and biases count."""
-
-SAME_PLACE_S = 1.0
-"""The time in s between two ranges in which a robot hardly moves."""
+            who = f"ranges of {' and '.join(pair)}"
+            doubts.append(_sentence(who, factor, "ranges to anchors", NEAR_UNIT_OF_USUAL))
+    return "; ".join(doubts), bounds[0] if bounds else 1.0

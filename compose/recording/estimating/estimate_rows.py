@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import msgspec
 import numpy as np
 
-from agent.estimation.gaussian.joint_claims import displaced_anchor
-from agent.estimation.gaussian.noise_level import INLIER
-from compose.recording.estimating.estimate_epoch import ClaimRule, EpochFit, EstimateEpoch
-from compose.recording.estimating.group_measurements import listed
-from compose.recording.estimating.learned_errors import LearnedErrors, learned_errors
-from compose.recording.estimating.prepared_steps import Measurements, OneRobot
+from compose.recording.estimating.recorded_measurements import MeasuredRobot
+from compose.recording.estimating.recording_estimator import EstimateEpoch
 from compose.recording.estimating.true_poses import true_pose
-from compose.recording.ranging.range_recording import Numbers, RecordedRobot
+from compose.recording.ranging.range_recording import Numbers
 from protocol.motion import wrap
 
 
@@ -131,6 +128,36 @@ class EstimatedAnchor(msgspec.Struct, frozen=True):
         return math.sqrt(0.5 * (self.covariance[0][0] + self.covariance[1][1]))
 
 
+class LearnedError(msgspec.Struct, frozen=True):
+    """A constant error by the fit, and how well the measurements determine it."""
+
+    value: float
+    """The estimate."""
+    sigma: float
+    """The standard deviation; that of the prior if the measurements tell nothing."""
+
+
+class LearnedErrors(msgspec.Struct, frozen=True):
+    """The constant errors of all sensors. Errors with a prior of 0 are left out."""
+
+    noise_level: float
+    """The factor by which the sigmas of ranges differ from the assumed ones."""
+    range_bias_m: LearnedError | None
+    """The bias that all ranges have in common, in m."""
+    range_scale: LearnedError | None
+    """The relative error of all ranges: the part by which they are too long."""
+    pair_bias_m: dict[str, LearnedError]
+    """The further bias of each pair of radios, in m."""
+    range_delay_s: LearnedError | None
+    """The delay of all ranges in s: the time by which their stamps are late."""
+    wheel_scale: dict[str, LearnedError]
+    """The relative error of the distance of each robot: the part by which its odometry is too short."""
+    turn_scale: dict[str, LearnedError]
+    """The relative error of its turns: the part by which its odometry is too small."""
+    gyro_bias_rad_s: dict[str, LearnedError]
+    """The bias of the turn rate of each robot while it moves, in rad/s, to be added to the measured one."""
+
+
 class EstimateSummary(msgspec.Struct, frozen=True):
     """The content of `estimate.json`."""
 
@@ -164,188 +191,41 @@ class EstimateSummary(msgspec.Struct, frozen=True):
     """The anchors that seem to stand elsewhere than the recording says, with the reason."""
 
 
-def rows_of(epoch: EstimateEpoch, robots: Sequence[RecordedRobot]) -> list[PoseEstimateRow]:
+def rows_of(epoch: EstimateEpoch, robots: Sequence[MeasuredRobot]) -> list[PoseEstimateRow]:
     """Return the rows of all robots at one epoch; none without hypotheses."""
     rows = []
-    for i, robot in enumerate(robots):
-        if not epoch.hypotheses or robot.id in epoch.undetermined:
+    for i, robot in enumerate(robots if epoch.hypotheses else ()):
+        if robot.id in epoch.undetermined:
             continue
-        best = epoch.hypotheses[0]
-        pose, covariance = best.poses[i], best.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
-        x, y, heading = pose.tolist()
-        count, probability = epoch.certainties[i]
-        row = PoseEstimateRow(
-            t_s=epoch.t,
-            robot=robot.id,
-            hypotheses=count,
-            probability=probability,
-            x=x,
-            y=y,
-            heading=heading,
-            xx=float(covariance[0, 0]),
-            xy=float(covariance[0, 1]),
-            xh=float(covariance[0, 2]),
-            yy=float(covariance[1, 1]),
-            yh=float(covariance[1, 2]),
-            hh=float(covariance[2, 2]),
-            claim=epoch.claims[i],
-        )
-        true = true_pose(robot, epoch.t)
-        rows.append(row if true is None else _with_truth(row, pose, covariance, true))
+        pose, covariance = epoch.hypotheses[0].poses[i], epoch.hypotheses[0].covariance[i]
+        values: list[Any] = [epoch.t, robot.id, *epoch.certainties[i], *pose.tolist()]
+        values += [*covariance[np.triu_indices(3)].tolist(), epoch.claims[i]]
+        true = true_pose(robot.recorded, epoch.t)
+        rows.append(PoseEstimateRow(*values, *_errors(pose, covariance, true)))
     return rows
 
 
-def _with_truth(row: PoseEstimateRow, pose: Numbers, covariance: Numbers, true: Numbers) -> PoseEstimateRow:
-    """Return the row of an estimate with the truth and the errors."""
-    error = pose - true
+def _errors(pose: Numbers, covariance: Numbers, true: Numbers | None) -> tuple[float, ...]:
+    """Return the true pose, the errors of position and heading, and the NEES; nothing without truth."""
+    if true is None:
+        return ()
+    error, (x, y, heading) = pose - true, true.tolist()
     error[2] = wrap(float(error[2]))
-    return msgspec.structs.replace(
-        row,
-        true_x=float(true[0]),
-        true_y=float(true[1]),
-        true_heading=wrap(float(true[2])),
-        position_error_m=math.hypot(error[0], error[1]),
-        heading_error_rad=float(error[2]),
-        nees=float(error @ np.linalg.solve(covariance, error)),
-    )
+    nees = float(error @ np.linalg.solve(covariance, error))
+    return x, y, wrap(heading), math.hypot(error[0], error[1]), float(error[2]), nees
 
 
-def summary_of(
-    measured: Measurements,
-    rows: Sequence[PoseEstimateRow],
-    last: EstimateEpoch | None,
-    rule: ClaimRule,
-    source: str,
-    noise: str,
-    doubt: str = "",
-) -> EstimateSummary:
-    """Return the summary of all `rows`; `last` is the last epoch, and `doubt` that about the units."""
-    sides = measured.sides
-    claims = last.claims if last is not None and not doubt else (False,) * len(sides)
-    robots = {}
-    for side, claim in zip(sides, claims, strict=True):
-        own = [row for row in rows if row.robot == side.id]
-        claimed = [i for i, row in enumerate(own) if row.claim]
-        withdrawn_s = None
-        if claimed and not claim:
-            later = own[claimed[-1] + 1 :]
-            withdrawn_s = later[0].t_s if later or last is None else last.t
-        robots[side.id] = RobotEstimate(
-            [one.id for one in side.anchors],
-            _pose(own[claimed[0]]) if claimed else None,
-            _pose(own[-1]) if own else None,
-            len(side.sound.gross),
-            len(side.sound.gaps),
-            len(side.sound.whole_turns),
-            withdrawn_s,
-        )
-    reason = doubt or _standing(
-        [side for side, claim in zip(sides, claims, strict=True) if not claim], measured
-    )
-    if not reason:
-        reason = last.blocking_reason if last is not None else "there is no epoch"
-    pairs = ["-".join(pair) for pair in measured.pairs]
-    calibration, anchors, doubtful = None, {}, {}
-    if last is not None and last.fitted is not None:
-        ranged = [name for name, count in zip(pairs, last.ranges, strict=True) if count]
-        calibration = learned_errors(last.fitted.fit, last.fitted.used.driving, ranged)
-        anchors = _anchors(last.fitted, measured)
-        doubtful = _doubtful(last.fitted)
-    hypotheses = [
-        FinalHypothesis(
-            one.probability,
-            {side.id: _triple(one.poses[i]) for i, side in enumerate(sides) if not np.isnan(one.poses[i, 0])},
-        )
-        for one in (last.hypotheses if last is not None else ())
-    ]
-    return EstimateSummary(
-        source,
-        noise,
-        measured.t0,
-        rule.accuracy,
-        rule.confidence,
-        robots,
-        hypotheses,
-        calibration,
-        dict(zip(pairs, last.ranges if last is not None else (0,) * len(pairs), strict=True)),
-        measured.unused,
-        reason,
-        dict(last.undetermined) if last is not None else {},
-        anchors,
-        doubtful,
-    )
+ESTIMATE_COLUMNS = PoseEstimateRow.__struct_fields__
+"""The columns of `estimate.csv`."""
 
 
-def _anchors(fitted: EpochFit, measured: Measurements) -> dict[str, EstimatedAnchor]:
-    """Return the estimates of the anchors that are not surveyed."""
-    fit, used = fitted
-    given, found = {one.id: one for one in measured.anchors}, {}
-    for i, name in enumerate(used.robots):
-        if not used.is_anchor(i):
-            continue
-        place, one = fit.poses[i, :2] + used.origin, given[name]
-        own = fit.covariance[3 * i : 3 * i + 2, 3 * i : 3 * i + 2]
-        (xx, xy), (_, yy) = own.tolist()
-        surveyed = one.sigma < math.inf
-        found[name] = EstimatedAnchor(
-            (float(place[0]), float(place[1])),
-            ((xx, xy), (xy, yy)),
-            (one.x, one.y) if surveyed else None,
-            one.sigma if surveyed else None,
-            one.height,
-        )
-    return found
+def estimate_csv(rows: Sequence[PoseEstimateRow]) -> str:
+    """Return the table of `rows`, with a line of column names; numbers are exact."""
+    return "\n".join([",".join(ESTIMATE_COLUMNS), *map(csv_line, rows), ""])
 
 
-def _doubtful(fitted: EpochFit) -> dict[str, str]:
-    """Return why anchors seem to stand elsewhere: by a test, or since most of their ranges fit no other."""
-    ranges, displaced = fitted.used.ranges, displaced_anchor(*fitted)
-    doubtful = {displaced.anchor: displaced.what} if displaced is not None else {}
-    strays: dict[str, list[int]] = {}
-    for radio, weight in zip(ranges.radio.tolist(), fitted.fit.weights.tolist(), strict=True):
-        name = fitted.used.radios[radio][1]
-        if name in fitted.used.anchors:
-            counts = strays.setdefault(name, [0, 0])
-            counts[0] += weight <= INLIER
-            counts[1] += 1
-    for name, (count, total) in strays.items():
-        if total >= FEWEST_OF_ANCHOR and count > MOST_STRAYS * total:
-            doubtful.setdefault(name, f"{count} of {total} of its ranges fit no other")
-    return doubtful
-
-
-MOST_STRAYS, FEWEST_OF_ANCHOR = 0.5, 8
-"""The share of ranges that fit no other above which an anchor is doubted, and the least number of ranges."""
-
-
-def _standing(sides: Sequence[OneRobot], measured: Measurements) -> str:
-    """Return a sentence about the robots whose paths are shorter than the sigma of ranges; empty if none."""
-    names = [
-        side.id
-        for side in sides
-        if math.hypot(float(np.ptp(side.path.x)), float(np.ptp(side.path.y))) <= measured.noise.anchor_sigma
-    ]
-    if not names:
-        return ""
-    verb, whose = ("does", "its") if len(names) == 1 else ("do", "their")
-    return (
-        f"{listed(names)} {verb} not move, by {whose} odometry: ranges do not tell the heading of a robot "
-        "that stands"
-    )
-
-
-def _triple(values: Numbers) -> tuple[float, float, float]:
-    first, second, third = values.tolist()
-    return first, second, third
-
-
-def _pose(row: PoseEstimateRow) -> PoseEstimate:
-    return PoseEstimate(
-        row.t_s,
-        (row.x, row.y, row.heading),
-        ((row.xx, row.xy, row.xh), (row.xy, row.yy, row.yh), (row.xh, row.yh, row.hh)),
-        row.probability,
-        row.position_error_m,
-        row.heading_error_rad,
-        row.nees if row.claim else None,  # hypotheses that are not settled are often all false
-    )
+def csv_line(row: PoseEstimateRow) -> str:
+    """Return one row of the table, without the line break. No name has a comma."""
+    values = msgspec.structs.astuple(row)
+    texts = [str(one).lower() if isinstance(one, bool) else "" if one is None else str(one) for one in values]
+    return ",".join(texts)

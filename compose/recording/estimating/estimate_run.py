@@ -1,53 +1,39 @@
-"""A whole estimate: from a recording and a user's choices to its rows and its summary."""
+"""A whole estimate: from measurements to rows and their summary, of a file or as a stream of rows arrives.
+
+In a stream, an epoch is computed as soon as the odometry of all robots has reached its end. Rows must arrive
+in the order of time, as in a file: a range that comes later counts from the next epoch on.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
-import numpy as np
+from msgspec.structs import replace
 
-from compose.errors import NoEstimate, UserError
-from compose.recording.estimating.doubtful_units import doubtful_units
-from compose.recording.estimating.estimate_epoch import ClaimRule, EstimateEpoch, add_epoch
-from compose.recording.estimating.estimate_rows import EstimateSummary, PoseEstimateRow, rows_of, summary_of
-from compose.recording.estimating.group_estimate import GroupEstimator
-from compose.recording.estimating.group_measurements import (
-    check_anchors,
-    group_measurements,
+from compose.errors import UserError
+from compose.recording.estimating.estimate_rows import EstimateSummary, PoseEstimateRow, rows_of
+from compose.recording.estimating.estimate_summary import summary_of
+from compose.recording.estimating.noise_files import AssumedNoise
+from compose.recording.estimating.recorded_measurements import (
+    EPOCH_S,
+    Measurements,
+    NoAnchors,
+    measurements,
+    numerics,
 )
-from compose.recording.estimating.noise_files import ToldNoise, told_noise
-from compose.recording.estimating.prepared_steps import Measurements
-from compose.recording.estimating.recorded_noise import recorded_noise
-from compose.recording.estimating.true_poses import with_bridged_truth
-from compose.recording.ranging.range_recording import RangeRecording, RecordedRobot
+from compose.recording.estimating.recording_estimator import ClaimRule, EstimateEpoch, RecordingEstimator
+from compose.recording.ranging.range_recording import SAME_TIME_S
+from compose.recording.ranging.range_steps import NoSteps
+from compose.recording.ranging.recording_rows import AnyRow, OdometryRow, RecordingBuilder, SourcePlace
 
+STREAM_TICKS = 20
+"""The number of ticks in an epoch of a stream. A robot of 0.5 m/s then moves by a quarter of 0.05 m in half a
+tick; the speed of the robots is not known before they have moved."""
 
-@contextmanager
-def numerics(where: str) -> Iterator[None]:
-    """Raise NoEstimate, which begins with `where`, if numbers in the block leave the range of floats.
-
-    They may in a valid recording, with values of 1e7 m or 1e-300 m. Other errors are not hidden.
-    """
-    try:
-        with np.errstate(all="ignore"):
-            yield
-    except (np.linalg.LinAlgError, ArithmeticError) as error:
-        raise NoEstimate(f"{where}: its numbers are too large or small for an estimate ({error})") from None
-
-
-class EstimationProblem(NamedTuple):
-    """The measurements of some robots, and what is known of their source."""
-
-    measured: Measurements
-    robots: tuple[RecordedRobot, ...]
-    """The robots, with their truth if there is one."""
-    source: str
-    noise: str
-    """The name of the assumed noise."""
-    doubt: str = ""
-    """The suspicion that parts of the recording are in different units; with one, nothing is estimated."""
+EXAMINED_AFTER_S = 4.0
+"""The time in s after which the units are examined for the first time, then whenever it has doubled."""
 
 
 class RecordingEstimate(NamedTuple):
@@ -58,108 +44,119 @@ class RecordingEstimate(NamedTuple):
     summary: EstimateSummary
 
 
-def measurements(
-    recording: RangeRecording,
-    robots: Sequence[str] | None,
-    noise: str | None,
-    window: tuple[float, float] | None,
-) -> EstimationProblem:
-    """Return the measurements of `robots` within `window`, in s from the first odometry on.
-
-    `noise` is the name of a profile or the path of a file; None: what the recording states. Raises UserError.
-    """
-    told = told_noise(noise) if noise is not None else None
-    return measurements_with(recording, robots, told, noise or "", window)
-
-
-def measurements_with(
-    recording: RangeRecording,
-    robots: Sequence[str] | None,
-    told: ToldNoise | None,
-    name: str = "",
-    window: tuple[float, float] | None = None,
-    *,
-    ticks: int | None = None,
-    doubtful: bool = True,
-) -> EstimationProblem:
-    """Return the measurements as `measurements` does, with the noise `told`, whose name is `name`.
-
-    `ticks` is the number of ticks in an epoch; None: by the speed of the robots. The units are examined if
-    `doubtful` is set.
-    """
-    chosen = chosen_robots(recording, robots)
-    begin, end = recording.span
-    if window is not None:
-        begin, end = begin + window[0], min(begin + window[1], end)
-        if begin >= end:
-            lasts = recording.span[1] - recording.span[0]
-            raise UserError(f"--window: {recording.source} has odometry of {lasts:.3f} s")
-    part = recording.part(chosen, begin, end)
-    assumed = recorded_noise(part, told.noise if told is not None else None, name)
-    if told is not None and told.correction is not None:
-        part = told.correction.corrected(part)
-    with numerics(recording.source):
-        measured = group_measurements(part, chosen, assumed, ticks=ticks)
-        check_anchors(part, chosen)
-        doubt = doubtful_units(part) if doubtful else ""
-        true = tuple([with_bridged_truth(one) for one in part.robots])
-    return EstimationProblem(measured, true, recording.source, assumed.name, doubt)
-
-
-def chosen_robots(recording: RangeRecording, robots: Sequence[str] | None) -> Sequence[str]:
-    """Return `robots`, or all of the recording. Raises UserError if it has not all of them."""
-    known = [one.id for one in recording.robots]
-    names = known if robots is None else robots
-    for name in names:
-        if name not in known:
-            raise UserError(f"--robots: {recording.source} has no robot {name}; it has {', '.join(known)}")
-    return names
-
-
-class RecordingEstimator:
-    """The estimate of any number of robots, which goes on from epoch to epoch."""
+class _Estimate:
+    """An estimate that grows with its measurements."""
 
     def __init__(self, rule: ClaimRule) -> None:
-        self._estimator = GroupEstimator(rule)
+        self.rule = rule
+        self.estimator = RecordingEstimator(rule)
+        self.measured: Measurements | None = None
+        """The measurements of the last epoch."""
+        self.rows: list[PoseEstimateRow] = []
+        self.epochs: list[EstimateEpoch] = []
 
-    def epoch(self, problem: EstimationProblem, number: int) -> EstimateEpoch:
-        """Return the estimate at the end of the epoch with this `number`, from 1 on, in their order.
+    def advanced(
+        self, measured: Measurements, done: Callable[[], None] = lambda: None
+    ) -> Iterator[PoseEstimateRow]:
+        """Yield the rows of all further epochs; `done` is called after each."""
+        if self.measured is None or not self.epochs:
+            self.measured = measured
+        self.measured = replace(self.measured, doubt=measured.doubt)
+        for epoch in self.estimator.epochs(measured, done, self.epochs[-1].t if self.epochs else -math.inf):
+            with numerics(measured.source):
+                rows = rows_of(epoch, measured.robots)
+            self.measured = measured
+            self.rows += rows
+            self.epochs[-1:] = [one._replace(fitted=None) for one in self.epochs[-1:]]  # fits are large
+            self.epochs.append(epoch)
+            yield from rows
 
-        The measurements may have grown since the last call, and are otherwise the same. Raises NoEstimate if
-        numbers leave the range of floats (see `numerics`).
-        """
-        with numerics(f"{problem.source}: at {problem.measured.end(number):.15g} s"):
-            epoch = self._estimator.epoch(problem.measured, number)
-            known = [i for i, one in enumerate(problem.robots) if one.id not in epoch.undetermined]
-            for one in epoch.hypotheses:
-                if not np.all(np.isfinite(one.poses[known])):
-                    raise FloatingPointError("a pose is not finite")
-            return epoch
+    def result(self, measured: Measurements) -> RecordingEstimate:
+        """Return all estimates, the last of which follow from what was `measured`."""
+        with numerics(measured.source):
+            summary = summary_of(measured, self.rows, self.epochs, self.rule)
+        return RecordingEstimate(self.rows, self.epochs, summary)
 
 
 def estimated(
-    problem: EstimationProblem, rule: ClaimRule, done: Callable[[], None] = lambda: None
+    measured: Measurements, rule: ClaimRule, done: Callable[[], None] = lambda: None
 ) -> RecordingEstimate:
     """Return all estimates; `done` is called after each epoch. There are none if the units are doubtful."""
-    rows: list[PoseEstimateRow] = []
-    epochs: list[EstimateEpoch] = []
-    estimator = RecordingEstimator(rule)
-    for number in range(1, problem.measured.epochs + 1 if not problem.doubt else 1):
-        if not problem.measured.is_silent(number):
-            epoch = estimator.epoch(problem, number)
-            with numerics(problem.source):
-                rows += rows_of(epoch, problem.robots)
-            add_epoch(epochs, epoch)
-        done()
-    return with_summary(problem, rows, epochs, rule)
+    estimate = _Estimate(rule)
+    for _ in estimate.advanced(measured, done):
+        pass
+    return estimate.result(measured)
 
 
-def with_summary(
-    problem: EstimationProblem, rows: list[PoseEstimateRow], epochs: list[EstimateEpoch], rule: ClaimRule
-) -> RecordingEstimate:
-    """Return the result of all `rows` and `epochs`."""
-    last = epochs[-1] if epochs else None
-    about = problem.source, problem.noise, problem.doubt
-    with numerics(problem.source):
-        summary = summary_of(problem.measured, rows, last, rule, *about)
-    return RecordingEstimate(rows, epochs, summary)
+class StreamEstimate:
+    """An estimate that grows with the rows of a stream."""
+
+    def __init__(
+        self,
+        source: str,
+        robots: Sequence[str] | None,
+        noise: AssumedNoise | None,
+        rule: ClaimRule,
+        doubted: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        """Begin the estimate of `robots`, with the `noise` that is told.
+
+        None: all robots of the stream. With each further one, the estimate begins again.
+        `doubted` is called with the suspicion that parts of the stream are in different units; as long as it
+        lasts, nothing is estimated.
+        """
+        self._builder = RecordingBuilder(source)
+        self._robots, self._noise, self._doubted = robots, noise, doubted
+        self._estimate = _Estimate(rule)
+        self._doubt = ""
+        self._spans: dict[str, tuple[float, float]] = {}
+        """The first and the last time in s of the odometry of each robot."""
+        self._count = 0
+        """The number of robots in the estimate."""
+        self._due_after_s, self._examined_after_s = EPOCH_S, EXAMINED_AFTER_S
+        """The times after the first odometry of all robots at which there may be an epoch, and an exam."""
+
+    def rows(self, arriving: Iterable[tuple[AnyRow, SourcePlace]]) -> Iterator[PoseEstimateRow]:
+        """Yield the estimates that follow from `arriving` rows, as soon as they do. Raises UserError."""
+        for row, place in arriving:
+            self._builder.add(row, place)
+            if isinstance(row, OdometryRow):
+                self._spans[row.robot] = self._spans.get(row.robot, (row.t0,))[0], row.t1
+                yield from self._due()
+
+    def _due(self) -> Iterator[PoseEstimateRow]:
+        """Yield the estimates of all epochs whose odometry is complete."""
+        names = list(self._spans) if self._robots is None else self._robots
+        if not names or not all(name in self._spans for name in names):
+            return
+        if len(names) > self._count:  # the estimates so far are kept, and are of other robots
+            self._count = len(names)
+            self._estimate.estimator = RecordingEstimator(self._estimate.rule)
+            self._due_after_s, self._examined_after_s = EPOCH_S, EXAMINED_AFTER_S
+        lasts = min(self._spans[name][1] for name in names) - max(self._spans[name][0] for name in names)
+        if lasts < self._due_after_s - SAME_TIME_S * EPOCH_S:
+            return
+        self._due_after_s = lasts + EPOCH_S  # if there is none, it is not tried with each row
+        examined = lasts >= self._examined_after_s
+        doubt = None if examined else self._doubt
+        try:
+            measured = measurements(
+                self._builder.recording(), names, self._noise, ticks=STREAM_TICKS, doubt=doubt
+            )
+        except (NoAnchors, NoSteps):
+            return  # there will be ranges and odometry
+        if examined:
+            self._examined_after_s = 2.0 * lasts
+        if measured.doubt and measured.doubt != self._doubt:
+            self._doubted(measured.doubt)
+        self._doubt = measured.doubt
+        yield from self._estimate.advanced(measured)
+        self._due_after_s = max([measured.t0, *measured.ends[-1:].tolist()]) - measured.t0 + EPOCH_S
+
+    def result(self) -> tuple[Measurements, RecordingEstimate]:
+        """Return all estimates so far. Raises UserError if no epoch is complete."""
+        measured = self._estimate.measured
+        if measured is None:
+            what = "no second with odometry of all robots and ranges to two anchors"
+            raise UserError(f"{self._builder.source}: there is {what}")
+        return measured, self._estimate.result(measured)
