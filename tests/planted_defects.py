@@ -13,10 +13,10 @@ from functools import wraps
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
-from agent.estimation import claim
-from agent.estimation.gaussian import hypotheses
-from agent.estimation.gaussian.range_model import Ranges
+from agent.estimation import claim, posterior
+from agent.estimation.gaussian import inference, search
 from agent.estimation.gaussian.range_weights import Weighing
 from agent.planning import phase3_last_manoeuvre
 from compose.scenario import group_meetings
@@ -36,9 +36,12 @@ def wrapped(owner: Any, name: str, change: Callable[..., Any]) -> None:
 
 def sigma() -> None:
     """Ranges are weighted with 0.8 of their sigma."""
-    before = Ranges.of_lists
-    scaled = staticmethod(lambda *given: (found := before(*given))._replace(sigma=0.8 * found.sigma))
-    setattr(Ranges, "of_lists", scaled)  # noqa: B010  # mypy takes it for a method
+
+    def scaled(before: Any, *given: Any, **named: Any) -> Any:
+        found = before(*given, **named)
+        return replace(found, ranges=replace(found.ranges, sigma=0.8 * found.ranges.sigma))
+
+    wrapped(inference, "near_anchors", scaled)
 
 
 def confidence() -> None:
@@ -62,10 +65,11 @@ def gate() -> None:
 def hypothesis() -> None:
     """One hypothesis in fifty is dropped."""
 
-    def fewer(before: Any, found: Sequence[Any]) -> Any:
-        return before([one for one in found if zlib.crc32(one[0].guess.tobytes()) % 50])
+    def fewer(before: Any, found: Sequence[Any], measured: Any) -> Any:
+        return before([one for one in found if zlib.crc32(one.guess.tobytes()) % 50], measured)
 
-    wrapped(hypotheses, "with_probability", fewer)
+    for module in (posterior, search):
+        wrapped(module, "hypotheses_of", fewer)
 
 
 def prior() -> None:

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
+from agent.estimation.gaussian.beacon_guesses import predicted
 from agent.estimation.gaussian.consistency import chi2_p_value
-from agent.estimation.gaussian.known_anchors import predicted
 from compose.errors import UserError
 from compose.recording.estimating.calibration import calibrated
 from compose.recording.estimating.estimate_rows import estimate_csv

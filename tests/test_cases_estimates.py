@@ -15,8 +15,8 @@ import pytest
 from numpy.typing import NDArray
 
 import tandem as api
-from agent.estimation.gaussian.joint_search import search
-from agent.estimation.posterior import JointHypotheses
+from agent.estimation.gaussian.search import search
+from agent.estimation.posterior import Posterior
 from compose.errors import ENDED, NOT_LOCALISED, USER_ERROR, UserError
 from compose.recording.estimating import recording_estimator
 from compose.recording.estimating.calibration import calibrated
@@ -199,7 +199,7 @@ def test_a_recording_that_contradicts_itself_is_searched_a_bounded_number_of_tim
     recording, searched = simulated(), []
     shuffled = np.random.default_rng(1).permutation(recording.ranges.range)
 
-    def counted(*given: Any) -> JointHypotheses:
+    def counted(*given: Any) -> Posterior:
         searched.append(given)
         return search(*given)
 

@@ -51,7 +51,7 @@ WORSE: dict[str, Callable[[Judged], Judged]] = {
     "definite covariance": lambda one: one._replace(
         stated=replace(one.stated, covariance=-1e-9 * one.stated.covariance)
     ),
-    "determined position": lambda one: one._replace(reach=0.001),
+    "determined position": lambda one: one._replace(measured=replace(one.measured, reach=0.001)),
     "position": lambda one: one._replace(accuracy=0.001),
     "heading": lambda one: one._replace(headings=tuple([(i, whose, 1e-4) for i, whose, _ in one.headings])),
     "early consistency": lambda one: with_p_value(one, 0.005),

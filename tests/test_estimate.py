@@ -18,9 +18,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from agent.estimation.gaussian.joint_ranges import near_anchors
 from agent.estimation.gaussian.odometry_noise import track
-from agent.estimation.gaussian.pair_ranges import alone
-from agent.estimation.gaussian.range_model import Ranges
 from agent.estimation.problem import Problem
 from compose.errors import NOT_LOCALISED, USER_ERROR, UserError
 from compose.recording.estimating.estimate_rows import ESTIMATE_COLUMNS, PoseEstimate, estimate_csv
@@ -45,7 +44,6 @@ from docs import recorded_claims
 from protocol.motion import Pose, step
 from protocol.noise import Noise, VelocityNoise
 from tests.commands import tandem
-from tests.pair_starts import pair_of
 
 SAMPLE = Path(__file__).parent / "data" / "uwb" / "tiers-a-b-30-s.pyfg"
 NEES_99_9 = 16.27
@@ -260,9 +258,9 @@ def test_lateral_slip_turns_the_path_and_extra_variances_add_to_the_noise() -> N
     left = track(v, omega, 1.0, np.full(4, 0.5 * math.pi))
     np.testing.assert_allclose(left.y, straight.x, atol=1e-12)
     extra = np.array([[0.0, 0.0, 3.0, 0.0], [0.0, 2.0, 0.0, 0.0]])
-    ranges = Ranges.of_lists([(1, 1.0), (3, 2.0)], (), (), noise)
     plain, more = (
-        Problem.of(alone(path, ranges, noise)).measured for path in (straight, left._replace(extra=extra))
+        Problem.of(near_anchors([path], [[(1, 1.0), (3, 2.0)]], [(0.0, 0.0)], noise, 3.0)).measured
+        for path in (straight, left._replace(extra=extra))
     )
     np.testing.assert_allclose(more.white - plain.white, [extra])
     np.testing.assert_array_equal(plain.slip, np.zeros((1, 4)))
@@ -270,8 +268,7 @@ def test_lateral_slip_turns_the_path_and_extra_variances_add_to_the_noise() -> N
 
 
 def test_measurements_that_differ_in_slip_variance_or_sigma_are_not_the_same(sample: RangeRecording) -> None:
-    used, reach = measurements(sample, ("A", "B"), "uwb-calibrated", None).until(9)
-    pair = pair_of(used, reach)
+    pair = measurements(sample, ("A", "B"), "uwb-calibrated", None).until(9)
     path, ranges = pair.paths[0], pair.ranges
     assert path.slip is not None
     assert path.extra is not None
@@ -279,8 +276,8 @@ def test_measurements_that_differ_in_slip_variance_or_sigma_are_not_the_same(sam
     assert pair == again
     assert hash(pair) == hash(again)
     for other in (path._replace(slip=path.slip + 0.1), path._replace(extra=2.0 * path.extra)):
-        assert pair.content != replace(pair, paths=(other, pair.paths[1])).content
-    assert pair.content != replace(pair, ranges=ranges._replace(sigma=2.0 * ranges.sigma)).content
+        assert pair != replace(pair, paths=(other, pair.paths[1]))
+    assert pair != replace(pair, ranges=replace(ranges, sigma=2.0 * ranges.sigma))
 
 
 @pytest.mark.long

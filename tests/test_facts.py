@@ -22,7 +22,7 @@ from agent.estimation.facts import (
 )
 from agent.estimation.fit import Fit, Start, fits
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, joint_measurements
-from agent.estimation.gaussian.joint_search import search
+from agent.estimation.gaussian.search import search
 from tests.moving_groups import NOISE, PERIOD_S, MovingGroup, moving_group
 
 REACH = 20.0
@@ -50,7 +50,7 @@ def bits_of_fit(fit: Fit) -> tuple[bytes, bytes, float]:
 
 def fitted(facts: Facts, group: MovingGroup) -> Fit:
     """Return the fit to `facts` that begins at the truth."""
-    measured = joint_measurements(facts, group.noise, PERIOD_S)
+    measured = joint_measurements(facts, group.noise, PERIOD_S, REACH)
     starts = group.starts.copy()
     starts[:, :2] -= measured.origin
     (fit,) = fits(measured, [Start(starts)])
@@ -122,8 +122,8 @@ def test_facts_echoed_round_a_ring_of_four_leave_the_covariance_unchanged_to_the
 
 def test_a_hundred_orders_and_partitions_of_the_same_facts_give_the_same_bits() -> None:
     group = moving_group(3, 2, ticks=20, unanchored=[2])
-    expected = bits(joint_measurements(group.facts, group.noise, PERIOD_S))
-    fit = bits_of_fit(search(joint_measurements(group.facts, group.noise, PERIOD_S), REACH).scored[0].fit)
+    expected = bits(joint_measurements(group.facts, group.noise, PERIOD_S, REACH))
+    fit = bits_of_fit(search(joint_measurements(group.facts, group.noise, PERIOD_S, REACH)).hypotheses[0].fit)
     everything = group.facts.ordered
     for seed in range(100):
         draw = random.Random(seed)
@@ -132,17 +132,17 @@ def test_a_hundred_orders_and_partitions_of_the_same_facts_give_the_same_bits() 
         merged = Facts()
         for part in draw.sample(parts, 7) + draw.sample(parts, 3):
             merged = part | merged if draw.random() < 0.5 else merged | part
-        measured = joint_measurements(merged, group.noise, PERIOD_S)
+        measured = joint_measurements(merged, group.noise, PERIOD_S, REACH)
         assert bits(measured) == expected
         if seed % 10 == 0:
-            assert bits_of_fit(search(measured, REACH).scored[0].fit) == fit
+            assert bits_of_fit(search(measured).hypotheses[0].fit) == fit
 
 
 def test_a_path_ends_at_its_first_unknown_manoeuvre_and_so_do_its_ranges() -> None:
     known = [manoeuvre("a", tick, Manoeuvre(1.0, 0.0)) for tick in (0, 1, 3, 4)]
     known += [anchor("M", 0.0, 0.0), *[anchor_range("a", "M", tick, 1.0 + tick, 0.1) for tick in range(5)]]
     known.append(anchor_range("a", "unknown", 1, 2.0, 0.1))
-    measured = joint_measurements(Facts(frozenset(known)), NOISE, PERIOD_S)
+    measured = joint_measurements(Facts(frozenset(known)), NOISE, PERIOD_S, REACH)
     assert len(measured.paths[0].v) == 2
     assert measured.ranges.tick.tolist() == [0, 1, 2]
     assert measured.anchors == ("M",)

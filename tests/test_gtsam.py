@@ -17,8 +17,9 @@ import pytest
 from msgspec.structs import astuple, replace
 
 from agent.estimation.gaussian import inference
-from agent.estimation.gaussian.hypotheses import ScoredHypothesis, search
-from agent.estimation.gaussian.pair_ranges import PairRanges
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.gaussian.search import search
+from agent.estimation.posterior import Hypothesis
 from agent.planning.accuracy_seeking import AccuracySeeking
 from agent.planning.state import Done, RobotState
 from compose.launch.in_process import run_mission
@@ -38,6 +39,7 @@ from protocol.messages import (
 from protocol.motion import Controls, Pose, step
 from protocol.noise import Noise, VelocityNoise
 from protocol.wire import decode
+from tests.pair_starts import m2
 from tests.series import series
 
 pytest.importorskip("gtsam", reason="gtsam has no wheel for this platform or this Python")
@@ -225,8 +227,8 @@ class Compared(NamedTuple):
 
     config: RobotConfig
     claimed: Localised
-    pair: PairRanges
-    ours: ScoredHypothesis
+    pair: JointMeasurements
+    ours: Hypothesis
     theirs: Optimum
 
 
@@ -236,14 +238,13 @@ def mission(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     recorded(request.param, folder)
     state, claimed = remembered(folder, "a")
     pair = inference.pair_of(state)
-    ours = search(pair)[0]
+    ours = search(pair).hypotheses[0]
     robots = [measured(folder, robot) for robot in ("a", "b")]
     assert [len(seen.odometry) for seen in robots] == [state.tick] * 2, "both claim in the same tick"
-    m1, m2 = state.config.anchor, state.config.peer_anchor
-    anchors = (np.zeros(2), np.array((m2.x - m1.x, m2.y - m1.y)))
+    anchors = (np.zeros(2), np.array(m2(pair)))
     period = state.config.mission.period
     graph = graph_of(robots, state.config.mission.noise, period, anchors)
-    starts = nudged(ours.fit, pair.apart, np.random.default_rng(request.param))
+    starts = nudged(ours.fit, m2(pair), np.random.default_rng(request.param))
     values = begun(robots, starts, period, anchors)
     theirs = optimum(graph, values, [pose_of(robot, state.tick) for robot in (0, 1)])
     return Compared(state.config, claimed, pair, ours, theirs)
@@ -252,7 +253,7 @@ def mission(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
 def test_the_claim_came_of_this_fit(mission: Compared) -> None:
     (held,) = inference.pair_planning_hypotheses([mission.ours])
     anchor = mission.config.anchor
-    stated = inference.to_second_order(held, mission.pair.apart)
+    stated = inference.to_second_order(held, m2(mission.pair))
     ours, covariance = astuple(inference.localised(stated, 0, (anchor.x, anchor.y)))
     assert mission.claimed.covariance is not None
     off = np.array(astuple(mission.claimed.pose)) - np.array(astuple(ours))

@@ -7,7 +7,6 @@ errors that the ranges have in common. A range that may be an outlier has the we
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,7 +14,7 @@ import numpy as np
 import pytest
 
 from agent.estimation.fit import Fit
-from agent.estimation.gaussian.pair_ranges import PairRanges
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from compose.recording.estimating.estimate_run import estimated
 from compose.recording.estimating.recorded_measurements import measurements
 from compose.recording.estimating.recording_estimator import ClaimRule
@@ -26,7 +25,7 @@ pytest.importorskip("gtsam", reason="gtsam has no wheel for this platform or thi
 import gtsam
 
 from tests.factor_graph import Array, Optimum, arc, manoeuvre_of, nudged, optimum, pose_of, wrapped
-from tests.pair_starts import pair_of
+from tests.pair_starts import kinds, m2
 
 pytestmark = pytest.mark.long
 
@@ -92,7 +91,7 @@ def measured_range(
     return gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(1, sigma), keys + errors, error)
 
 
-def graph_of(pair: PairRanges, fit: Fit) -> gtsam.NonlinearFactorGraph:
+def graph_of(pair: JointMeasurements, fit: Fit) -> gtsam.NonlinearFactorGraph:
     """Return the graph of all poses, manoeuvres, ranges and common errors, without priors on the starts."""
     graph, ranges = gtsam.NonlinearFactorGraph(), pair.ranges
     unit = gtsam.noiseModel.Unit.Create
@@ -120,11 +119,11 @@ def graph_of(pair: PairRanges, fit: Fit) -> gtsam.NonlinearFactorGraph:
         of_slow = gtsam.noiseModel.Gaussian.Covariance(covariance)
         graph.add(gtsam.PriorFactorVector(SLOW, np.zeros(len(ranges.rho)), of_slow))
     sigmas = ranges.sigma / np.sqrt(fit.weights)
-    places = np.zeros(2), np.array(pair.apart)
+    places = np.zeros(2), np.array(m2(pair))
     for row, (rho, tick, sigma) in enumerate(
         zip(ranges.rho.tolist(), ranges.tick.tolist(), sigmas, strict=True)
     ):
-        kind = int(np.searchsorted(np.cumsum(ranges.counts), row, side="right"))
+        kind = int(kinds(pair)[row])
         ends: list[tuple[int, Array | None]]
         if kind == 2:
             ends = [(pose_of(0, tick), None), (pose_of(1, tick), None)]
@@ -134,24 +133,24 @@ def graph_of(pair: PairRanges, fit: Fit) -> gtsam.NonlinearFactorGraph:
     return graph
 
 
-def common_errors(pair: PairRanges) -> Array:
+def common_errors(pair: JointMeasurements) -> Array:
     """Return the effect of one sigma of each constant error on the ranges: common bias, scale, one a pair."""
     priors, ranges = pair.noise.priors, pair.ranges
-    kind = np.repeat(np.arange(3), ranges.counts)
+    kind = kinds(pair)
     columns = [np.full(len(kind), priors.range_bias), priors.range_scale * ranges.rho]
     return np.stack([*columns, *[priors.pair_bias * (kind == one) for one in range(3)]], 1)
 
 
-def slow_covariance(pair: PairRanges) -> Array:
+def slow_covariance(pair: JointMeasurements) -> Array:
     """Return the covariance (m^2) of the slow errors of the ranges; each pair of radios has its own."""
     priors, ranges = pair.noise.priors, pair.ranges
-    kind = np.repeat(np.arange(3), ranges.counts)
+    kind = kinds(pair)
     apart = pair.paths[0].period * np.abs(ranges.tick[:, None] - ranges.tick)
     correlation = np.exp(-apart / priors.slow_time) * (kind[:, None] == kind)
     return np.asarray(priors.slow_sigma**2 * correlation)
 
 
-def begun(pair: PairRanges, starts: list[Pose]) -> gtsam.Values:
+def begun(pair: JointMeasurements, starts: list[Pose]) -> gtsam.Values:
     """Return the initial values: the measured odometry from `starts`, and no constant or slow errors."""
     values = gtsam.Values()
     for robot, (path, start) in enumerate(zip(pair.paths, starts, strict=True)):
@@ -176,7 +175,7 @@ def begun(pair: PairRanges, starts: list[Pose]) -> gtsam.Values:
 class Compared(NamedTuple):
     """The results of both methods for one window."""
 
-    pair: PairRanges
+    pair: JointMeasurements
     ours: Fit
     theirs: Optimum
 
@@ -187,8 +186,8 @@ def window(request: pytest.FixtureRequest) -> Compared:
     problem = measurements(read_ranges(SAMPLE), None, PROFILE, (begin_s, begin_s + LENGTH_S))
     last = estimated(problem, ClaimRule()).epochs[-1]
     assert last.fitted is not None
-    ours, pair = last.fitted.fit, pair_of(last.fitted.used, math.inf)
-    starts = nudged(ours, pair.apart, np.random.default_rng(request.param))
+    ours, pair = last.fitted.fit, last.fitted.used
+    starts = nudged(ours, m2(pair), np.random.default_rng(request.param))
     ends = [pose_of(robot, len(path.v)) for robot, path in enumerate(pair.paths)]
     return Compared(pair, ours, optimum(graph_of(pair, ours), begun(pair, starts), ends))
 

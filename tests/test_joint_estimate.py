@@ -23,14 +23,11 @@ from agent.estimation.facts import (
 )
 from agent.estimation.fit import Fit, Start, fits
 from agent.estimation.gauss_newton import Convergence
-from agent.estimation.gaussian.hypotheses import search as search_of_pair
 from agent.estimation.gaussian.joint_claims import displaced_anchor, undetermined
 from agent.estimation.gaussian.joint_ranges import MOST_MUTUAL_RANGES, JointMeasurements, joint_measurements
-from agent.estimation.gaussian.joint_search import search
 from agent.estimation.gaussian.odometry_noise import constant_errors, track, variances
-from agent.estimation.gaussian.pair_ranges import PairRanges
-from agent.estimation.gaussian.range_model import Ranges
-from agent.estimation.posterior import Certainty, JointHypotheses, certainties
+from agent.estimation.gaussian.search import search
+from agent.estimation.posterior import Certainty, Posterior, certainties
 from tests.moving_groups import NOISE, PERIOD_S, MovingGroup, moving_group
 
 Array = NDArray[np.float64]
@@ -40,7 +37,7 @@ SURE = 0.9999
 
 
 def measured_of(group: MovingGroup) -> JointMeasurements:
-    return joint_measurements(group.facts, group.noise, PERIOD_S)
+    return joint_measurements(group.facts, group.noise, PERIOD_S, REACH)
 
 
 def at_truth(group: MovingGroup, measured: JointMeasurements) -> Start:
@@ -74,7 +71,7 @@ class Reference:
         self.v, self.omega = v, omega
         self.sigmas = np.sqrt(variances(v, omega, self.noise.odometry))
         self.patterns = constant_errors(v, omega, self.noise)
-        self.common = measured.ranges.single.common_errors(self.noise.priors)
+        self.common = measured.ranges.common_errors(self.noise.priors)
         self.n, self.k = v.shape
         self.m = self.patterns.shape[1]
 
@@ -138,42 +135,12 @@ def test_the_joint_fit_is_the_optimum_that_scipy_finds(unanchored: list[int]) ->
     assert np.max(np.abs(fit.covariance - covariance) / np.outer(sigmas, sigmas)) < 0.02
 
 
-def test_two_robots_have_the_same_poses_as_by_the_search_of_a_pair() -> None:
-    group = moving_group(2, 3)
-    measured, noise = measured_of(group), group.noise
-    ranges = measured.ranges
-    rows = [np.flatnonzero(own) for own in ranges.pairs]
-    counts = (len(rows[0]), len(rows[1]), len(rows[2]))
-    m1, m2 = ranges.place[rows[0][0]], ranges.place[rows[1][0]]
-    nothing = np.empty(0, np.intp)
-    pair = PairRanges(
-        (measured.paths[0], measured.paths[1]),
-        Ranges(ranges.rho, ranges.tick, ranges.sigma, counts),
-        (nothing, nothing, nothing),
-        (float(m2[0] - m1[0]), float(m2[1] - m1[1])),
-        REACH,
-        noise,
-    )
-    by_pair = search_of_pair(pair)[0].fit
-    fit = search(measured, REACH).scored[0].fit
-    covariance = by_pair.covariance
-    sigmas = np.sqrt(np.diagonal(covariance))
-    off = (fit.poses - by_pair.poses).ravel()
-    off[2::3] = np.remainder(off[2::3] + math.pi, math.tau) - math.pi
-    off[[0, 3]] -= m1[0]
-    off[[1, 4]] -= m1[1]
-    assert np.max(np.abs(off) / sigmas) < 0.02
-    assert np.max(np.abs(fit.covariance - covariance) / np.outer(sigmas, sigmas)) < 0.02
-
-
 # --- accuracy -----------------------------------------------------------------------------------------------
 
 
-def blocking_reason(
-    robot: int, found: JointHypotheses, certainty: Certainty, measured: JointMeasurements
-) -> str:
+def blocking_reason(robot: int, found: Posterior, certainty: Certainty, measured: JointMeasurements) -> str:
     """Return what blocks the claim of a robot, but for other profiles."""
-    judged = of_joint("recording", robot, found, certainty, measured, REACH, 0.3, SURE)
+    judged = of_joint("recording", robot, found, certainty, measured, 0.3, SURE)
     blocking = blocked(judged, BEFORE_SEARCH)
     return blocking.reason if blocking is not None else ""
 
@@ -189,9 +156,9 @@ class Scores:
         for seed in seeds:
             group = moving_group(robots, seed, noise=noise, unanchored=unanchored, outliers=outliers)
             measured = measured_of(group)
-            found = search(measured, REACH)
+            found = search(measured)
             assert len(found.located) == robots
-            fit = found.scored[0].fit
+            fit = found.hypotheses[0].fit
             errors = errors_of(fit, group, measured)
             sure = certainties(found)
             for i, nees in enumerate(nees_of(fit, errors)):
@@ -247,11 +214,11 @@ def pairwise_errors(group: MovingGroup) -> list[float]:
             if one.key.kind == "anchor"
             or {one.key.robot, one.key.other} - {f"M{each}" for each in two} <= two | {""}
         ]
-        measured = joint_measurements(Facts(frozenset(some)), group.noise, PERIOD_S)
-        of_two = search(measured, REACH)
+        measured = joint_measurements(Facts(frozenset(some)), group.noise, PERIOD_S, REACH)
+        of_two = search(measured)
         order = sorted((i, j))
         part = group._replace(ends=group.ends[order])
-        errors = errors_of(of_two.scored[0].fit, part, measured)
+        errors = errors_of(of_two.hypotheses[0].fit, part, measured)
         found.append(math.hypot(*errors[order.index(i), :2]))
     return found
 
@@ -261,7 +228,7 @@ def test_a_joint_fit_is_at_least_as_accurate_as_pairs() -> None:
     for seed in range(12):
         group = moving_group(4, seed)
         measured = measured_of(group)
-        fit = search(measured, REACH).scored[0].fit
+        fit = search(measured).hypotheses[0].fit
         joint += [math.hypot(*error[:2]) for error in errors_of(fit, group, measured)]
         pairwise += pairwise_errors(group)
     assert np.median(joint) <= np.median(pairwise)
@@ -284,7 +251,7 @@ def with_anchors(
             known.append(anchor(name, x, y, sigmas[name]))
         else:
             known.append(one)
-    return joint_measurements(Facts(frozenset(known)), group.noise, PERIOD_S), true
+    return joint_measurements(Facts(frozenset(known)), group.noise, PERIOD_S, REACH), true
 
 
 def anchor_errors(fit: Fit, used: JointMeasurements, true: dict[str, Array]) -> tuple[Array, list[float]]:
@@ -301,9 +268,9 @@ def anchor_errors(fit: Fit, used: JointMeasurements, true: dict[str, Array]) -> 
 
 def test_an_anchor_without_a_position_is_located_by_located_robots() -> None:
     measured, true = with_anchors(moving_group(3, 4), {"Mr00": math.inf})
-    found = search(measured, REACH)
+    found = search(measured)
     assert [measured.robots[one] for one in found.located] == ["r00", "r01", "r02", "Mr00"]
-    fit = found.scored[0].fit
+    fit = found.hypotheses[0].fit
     errors, nees = anchor_errors(fit, measured.some(found.located), true)
     assert float(np.hypot(*errors[0])) < 0.5
     assert nees[0] < chi2.isf(1e-3, 2)
@@ -316,8 +283,8 @@ def test_covariances_of_anchors_that_are_not_surveyed_are_right() -> None:
         group = moving_group(4, seed)
         sigmas = {"Mr00": math.inf, "Mr01": 0.5, "Mr02": 0.1, "Mr03": 0.1}
         measured, true = with_anchors(group, sigmas, seed)
-        found = search(measured, REACH)
-        part, fit = measured.some(found.located), found.scored[0].fit
+        found = search(measured)
+        part, fit = measured.some(found.located), found.hypotheses[0].fit
         assert len(part.driving) == 4
         of_anchors += anchor_errors(fit, part, true)[1]
         errors = errors_of(fit._replace(poses=fit.poses[:4]), group, measured)
@@ -339,16 +306,16 @@ def test_an_anchor_that_stands_elsewhere_than_surveyed_is_named(sigma: float) ->
         for one in group.facts.ordered
     ]
     for known, name in ((group.facts.ordered, None), (moved, "Mr02")):
-        measured = joint_measurements(Facts(frozenset(known)), group.noise, PERIOD_S)
-        found = search(measured, REACH)
-        displaced = displaced_anchor(found.scored[0].fit, measured.some(found.located))
+        measured = joint_measurements(Facts(frozenset(known)), group.noise, PERIOD_S, REACH)
+        found = search(measured)
+        displaced = displaced_anchor(found.hypotheses[0].fit, measured.some(found.located))
         assert (displaced.anchor if displaced is not None else None) == name
 
 
 # --- what is not determined ---------------------------------------------------------------------------------
 
 
-def ambiguous() -> tuple[JointMeasurements, JointHypotheses]:
+def ambiguous() -> tuple[JointMeasurements, Posterior]:
     """Return a group in which r02 drives straight, and has ranges to two anchors alone."""
     group = moving_group(2, 7)
     known = [*group.facts.known, anchor("P", 20.0, 0.0), anchor("Q", 26.0, 0.0)]
@@ -358,14 +325,14 @@ def ambiguous() -> tuple[JointMeasurements, JointHypotheses]:
         for name, at in (("P", 20.0), ("Q", 26.0)):
             if tick % 2 == 0:
                 known.append(anchor_range("r02", name, tick, math.hypot(x - at, y), 0.05))
-    measured = joint_measurements(Facts(frozenset(known)), group.noise, PERIOD_S)
-    return measured, search(measured, REACH)
+    measured = joint_measurements(Facts(frozenset(known)), group.noise, PERIOD_S, REACH)
+    return measured, search(measured)
 
 
 def test_only_the_robot_with_a_mirror_image_is_uncertain() -> None:
     measured, found = ambiguous()
     assert found.located == (0, 1, 2)
-    assert len(found.scored) == 2
+    assert len(found.hypotheses) == 2
     sure = certainties(found)
     assert [one.poses for one in sure] == [1, 1, 2]
     assert sure[0].probability == sure[1].probability == 1.0
@@ -381,8 +348,8 @@ def test_a_component_without_two_anchors_has_no_pose_and_says_why() -> None:
     for tick in range(20):
         known += [manoeuvre(name, tick, Manoeuvre(0.2, 0.2)) for name in ("u", "v", "w")]
         known += [mutual_range("u", "v", tick, 3.0, 0.05), anchor_range("u", "P", tick, 2.0, 0.05)]
-    measured = joint_measurements(Facts(frozenset(known)), group.noise, PERIOD_S)
-    found = search(measured, REACH)
+    measured = joint_measurements(Facts(frozenset(known)), group.noise, PERIOD_S, REACH)
+    found = search(measured)
     assert [measured.robots[one] for one in found.located] == ["r00", "r01"]
     u, v, w = [undetermined(measured.robots.index(name), found.located, measured) for name in "uvw"]
     ends = "ranges to one anchor; two at different places are needed"

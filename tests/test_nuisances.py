@@ -12,7 +12,7 @@ from scipy import stats  # type: ignore[import-untyped]
 
 from agent.estimation.fit import Fit, fits
 from agent.estimation.gaussian.consistency import beta_binomial_tail, f_tail, fisher, sigmas
-from agent.estimation.gaussian.hypotheses import starts_about
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.noise_level import LEAST_LEVEL, noise_level, residual_correlation
 from agent.estimation.gaussian.odometry_noise import (
     Array,
@@ -24,9 +24,10 @@ from agent.estimation.gaussian.odometry_noise import (
     track,
 )
 from agent.estimation.gaussian.own_sensors import doubt
-from agent.estimation.gaussian.pair_ranges import alone
-from agent.estimation.gaussian.range_model import Ranges, inlier_probability, mixture
+from agent.estimation.gaussian.range_model import inlier_probability
+from agent.estimation.gaussian.range_weights import Weighing, weights_by_errors
 from agent.estimation.gaussian.reachable_accuracy import reference_sigma
+from agent.estimation.gaussian.search import starts_about
 from agent.peer.peer_state import PeerState
 from agent.planning.accuracy_seeking import AccuracySeeking
 from agent.planning.plausibility import objection
@@ -38,6 +39,7 @@ from compose.scenario import scenario_file
 from protocol.messages import Observation, Report
 from protocol.motion import REST, Segment
 from protocol.noise import PROFILES, UNTOLD, Noise, with_profile
+from tests.pair_starts import alone
 from world.scenario import Scenario
 
 PLAIN = """
@@ -137,8 +139,7 @@ def test_the_profile_of_uncalibrated_radios_needs_a_coarser_accuracy_than_a_tent
 
 def fitted(path: Track, rho: Array, noise: Noise, anchor: Array) -> Fit:
     """Return the fit to a range in each tick that begins with the anchor at `anchor` (m)."""
-    ranges = Ranges.of_lists(list(enumerate(rho.tolist())), (), (), noise)
-    (found,) = fits(alone(path, ranges, noise), starts_about([anchor]))
+    (found,) = fits(alone(path, rho.tolist(), noise), starts_about([anchor]))
     return found
 
 
@@ -235,10 +236,11 @@ def test_errors_keep_their_size_under_other_priors() -> None:
 @pytest.mark.parametrize("outliers", [0.0, 0.05])
 @pytest.mark.parametrize("strays", [0.0, 1e-3])
 def test_the_probability_of_an_inlier_is_that_of_the_mixture(outliers: float, strays: float) -> None:
-    noise = Noise(0.1, 0.1, outliers=outliers, strays=strays)
+    noise = Noise(0.1, 0.1, outliers=outliers, strays=strays, sigma_degrees=0.0)
     residuals, sigma = np.linspace(-9.0, 9.0, 91), np.linspace(0.05, 3.0, 91)
-    probability = inlier_probability(residuals, sigma, noise)
-    assert probability == pytest.approx(mixture(residuals, sigma, noise)[1], abs=1e-12)
+    by = Weighing.of(noise, sigma, np.zeros(91, np.intp), np.arange(91), 1.0, free=0, noisy=False)
+    probability = weights_by_errors(residuals.tolist(), sigma.tolist(), by)
+    assert probability == pytest.approx(inlier_probability(residuals, sigma, noise), abs=1e-12)
 
 
 def test_the_tail_of_an_f_ratio_is_that_of_tables() -> None:
@@ -270,21 +272,19 @@ def test_a_p_value_as_sigmas_is_that_of_a_normal_distribution(value: float) -> N
     assert sigmas(0.9) == 0.0
 
 
-def own(bias: float) -> tuple[Track, Ranges]:
+def own(bias: float) -> JointMeasurements:
     draw = np.random.default_rng(3)
     path = track(np.full(20, 0.5), np.full(20, 0.4), 1.0)
     rho = np.hypot(path.x - 0.7, path.y - 0.4) + bias + 0.05 * draw.normal(size=21)
-    return path, Ranges.of_lists(list(enumerate(rho.tolist())), (), (), Noise(0.05, 0.05))
+    return alone(path, rho.tolist(), Noise(0.05, 0.05))
 
 
 def test_a_robot_whose_own_ranges_contradict_its_odometry_names_the_profile_to_try() -> None:
-    path, ranges = own(0.35)
-    found = doubt(path, ranges, 3.0, Noise(0.05, 0.05))
+    found = doubt(own(0.35))
     assert found is not None
     assert found.profile == "uwb"
     assert 'noise = "uwb"' in found.reason()
-    path, ranges = own(0.0)
-    assert doubt(path, ranges, 3.0, Noise(0.05, 0.05)) is None
+    assert doubt(own(0.0)) is None
 
 
 @pytest.mark.parametrize(("v", "fits"), [(1.001, True), (1.03, True), (1.5, False)])

@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 from agent.estimation import smoother
 from agent.estimation.fit import Fit, Start, deviation, fits, held_fit
 from agent.estimation.gauss_newton import LAST_STEP, Convergence, moved
-from agent.estimation.gaussian import odometry_noise, pair_ranges
+from agent.estimation.gaussian import joint_ranges, odometry_noise
 from agent.estimation.gaussian.claim_rivals import FAR_ANCHOR, _holding
 from agent.estimation.gaussian.consistency import FINISHED
-from agent.estimation.gaussian.hypotheses import starts_about
-from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.gaussian.joint_ranges import JointMeasurements, near_anchors
 from agent.estimation.gaussian.odometry_noise import (
     OdometryNoiseModel,
     Projection,
@@ -34,12 +33,12 @@ from agent.estimation.gaussian.odometry_noise import (
     track,
     wander,
 )
-from agent.estimation.gaussian.pair_ranges import PairRanges, alone
-from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges
+from agent.estimation.gaussian.range_model import SIGMA_FLOOR
+from agent.estimation.gaussian.search import starts_about
 from agent.estimation.problem import MOST_MEASURED_LENGTHS, Problem
 from protocol.motion import ORIGIN, Pose, compose, rotated, step
 from protocol.noise import Noise, VelocityNoise
-from tests.pair_starts import pair_fit, pair_start
+from tests.pair_starts import alone, kinds, m2, pair_fit, pair_start, with_ranges
 
 Array = NDArray[np.float64]
 
@@ -177,15 +176,15 @@ def test_noise_has_the_size_of_what_was_measured_and_the_course_of_what_was_driv
 class Told(NamedTuple):
     """The measurements of two robots, and their true values."""
 
-    pair: PairRanges
+    pair: JointMeasurements
     guess: Array
     """true value of `Fit.guess`"""
     poses: Array
     """true last poses, relative to M1"""
 
-    def ranging(self, ranges: Ranges) -> Told:
-        """Return the same robots with other `ranges`."""
-        return self._replace(pair=replace(self.pair, ranges=ranges))
+    def ranging(self, rho: Array) -> Told:
+        """Return the same robots with other ranges `rho` (m)."""
+        return self._replace(pair=with_ranges(self.pair, rho=rho))
 
 
 K = 10
@@ -217,9 +216,8 @@ def told(seed: int, noise: Noise) -> Told:
         list(enumerate((np.hypot(*way.T) + sigma * draw.normal(size=K + 1)).tolist()))
         for way, sigma in zip(ways, sigmas, strict=True)
     )
-    ranges = Ranges.of_lists(first, second, mutual, noise)
-    vector, nothing = (float(apart[0]), float(apart[1])), np.empty(0, np.intp)
-    pair = PairRanges((measured[0], measured[1]), ranges, (nothing, nothing, nothing), vector, REACH, noise)
+    places = [(0.0, 0.0), (float(apart[0]), float(apart[1]))]
+    pair = near_anchors(measured, (first, second), places, noise, REACH, mutual)
     return Told(pair, np.array(guess), np.concatenate((a[-1], b[-1])))
 
 
@@ -229,16 +227,16 @@ def placed(start: Pose) -> tuple[float, float]:
     return -c * start.x - s * start.y, s * start.x - c * start.y
 
 
-def distances(pair: PairRanges, guess: Array, paths: Sequence[Track] = ()) -> Array:
+def distances(pair: JointMeasurements, guess: Array, paths: Sequence[Track] = ()) -> Array:
     """Return the ranges of `pair` without noise, by its paths or by other ones."""
     at = []
     for path, (mx, my, turn), anchor in zip(
-        paths or pair.paths, guess.reshape(2, 3).tolist(), pair.anchors, strict=True
+        paths or pair.paths, guess.reshape(2, 3).tolist(), pair.pivots, strict=True
     ):
         x, y = rotated(math.cos(turn), math.sin(turn), path.x - mx, path.y - my)
         at.append(np.stack((x, y), 1) + anchor)
-    ways, ranges = (at[0], at[1] - pair.apart, at[0] - at[1]), pair.ranges
-    return np.concatenate([np.hypot(*ways[kind][ranges.tick[ranges.rows(kind)]].T) for kind in range(3)])
+    ways, ranges = (at[0], at[1] - m2(pair), at[0] - at[1]), pair.ranges
+    return np.concatenate([np.hypot(*ways[kind][ranges.tick[kinds(pair) == kind]].T) for kind in range(3)])
 
 
 def clear(told: Told) -> bool:
@@ -253,13 +251,13 @@ def clear(told: Told) -> bool:
 EXACT = Noise().as_told
 
 
-def with_other_anchors(pair: PairRanges, seed: int) -> JointMeasurements:
+def with_other_anchors(pair: JointMeasurements, seed: int) -> JointMeasurements:
     """Return `pair` with every other range of a robot to an anchor at another place."""
-    ranges = pair.measured.ranges
+    ranges = pair.ranges
     place = np.random.default_rng(seed).uniform(-3.0, 3.0, ranges.place.shape)
     place[::2] = ranges.place[::2]
     place[ranges.second >= 0] = 0.0
-    return replace(pair.measured, ranges=replace(ranges, place=place, radio=np.arange(len(place))))
+    return with_ranges(pair, place=place, radio=np.arange(len(place)))
 
 
 @few
@@ -298,8 +296,8 @@ def test_a_range_changes_with_all_unknowns_as_the_linear_model_predicts(
 ) -> None:
     one = told(seed, noise)
     assume(clear(one))
-    problem = Problem.of(with_other_anchors(one.pair, seed) if anchors == "several" else one.pair.measured)
-    of, kernel, begin = problem.measured, problem.kernel, pair_start(one.guess, one.pair.apart)
+    problem = Problem.of(with_other_anchors(one.pair, seed) if anchors == "several" else one.pair)
+    of, kernel, begin = problem.measured, problem.kernel, pair_start(one.guess, m2(one.pair))
     draw, poses, white = np.random.default_rng(seed), begin.poses.ravel(), np.zeros(of.white.shape)
     at = np.concatenate((np.zeros(6), draw.normal(size=of.size - 6)))
     parts = (6, 6 + of.common.shape[1])
@@ -322,7 +320,7 @@ def settled(told: Told) -> Fit:
     """Return the fit from the truth, continued until its linear model is that of its end."""
     found = pair_fit(told.guess, told.pair)
     for _ in range(5):
-        (found,) = fits(told.pair.measured, [found.start])
+        (found,) = fits(told.pair, [found.start])
     return found
 
 
@@ -351,7 +349,7 @@ def test_exact_ranges_and_an_exact_odometry_give_the_truth(seed: int) -> None:
 def test_one_robot_finds_its_anchor_and_holds_its_heading(seed: int) -> None:
     one = told(seed, EXACT)
     assume(clear(one))
-    (found,) = fits(one.pair.of(0), starts_about([nudged(one, seed, 0.02)[:2]]))
+    (found,) = fits(one.pair.alone(0), starts_about([nudged(one, seed, 0.02)[:2]]))
     assert found.guess == pytest.approx([*one.guess[:2], 0.0], abs=1e-9)
     assert abs(found.start.poses[0, 2]) < 1e-30
 
@@ -370,12 +368,12 @@ def patterns_of(told: Told) -> list[Array]:
 def errors_of_ranges(told: Told) -> Array:
     """Return the effect of one sigma of each bias, scale and slow error on each range; (N, unknowns)."""
     priors, ranges, count = told.pair.noise.priors, told.pair.ranges, len(told.pair.ranges.rho)
-    kinds = np.repeat(np.eye(3), ranges.counts, axis=0)
+    kind = np.eye(3)[kinds(told.pair)]
     apart = np.abs(ranges.tick[:, None] - ranges.tick) * told.pair.paths[0].period
-    together = (kinds @ kinds.T) * np.exp(-apart / priors.slow_time)
+    together = (kind @ kind.T) * np.exp(-apart / priors.slow_time)
     slow = priors.slow_sigma * np.linalg.cholesky(together + 1e-12 * np.eye(count))
     common = np.full((count, 1), priors.range_bias)
-    return np.hstack((common, priors.range_scale * ranges.rho[:, None], priors.pair_bias * kinds, slow))
+    return np.hstack((common, priors.range_scale * ranges.rho[:, None], priors.pair_bias * kind, slow))
 
 
 def information_of(told: Told, found: Fit) -> tuple[Array, Array, Array]:
@@ -490,9 +488,9 @@ def test_without_odometry_noise_the_covariance_is_the_inverse_of_the_ranges_info
 def test_a_fit_that_begins_where_one_ended_ends_there_too() -> None:
     """On a path straight to the anchor the guess is right at once, but the path is still corrected."""
     measured, driven = (track(np.full(8, v), np.zeros(8), 1.0) for v in (1.0, 1.01))
-    told = [(tick, 20.0 - x) for tick, x in enumerate(driven.x.tolist())]
+    told = (20.0 - driven.x).tolist()
     noise = Noise(0.01, odometry=VelocityNoise(v=0.05)).as_told
-    own = alone(measured, Ranges.of_lists(told, (), (), noise), noise)
+    own = alone(measured, told, noise)
     (first,) = fits(own, starts_about([np.array((20.0, 0.0))]))
     (again,) = fits(own, starts_about([first.guess[:2]]))
     assert again.guess == pytest.approx(first.guess, abs=1e-9)
@@ -533,7 +531,7 @@ def test_a_fit_begins_on_the_path_that_it_is_given(seed: int) -> None:
     assume(clear(one))
     first = pair_fit(one.guess, one.pair, Convergence(30))
     assume(first.last_step < LAST_STEP)
-    (there,) = fits(one.pair.measured, [first.start], Convergence(0))
+    (there,) = fits(one.pair, [first.start], Convergence(0))
     assert there.last_step < 0.3, (
         "the last step has been taken; among 938 draws, the next one had at most 0.073"
     )
@@ -553,19 +551,15 @@ def test_an_outlier_moves_a_fit_no_farther_than_its_absence(seed: int, which: in
     assume(clear(one))
     rho = one.pair.ranges.rho.copy()
     rho[which] += bias
-    spoilt = pair_fit(nudged(one, seed, 0.2), one.ranging(one.pair.ranges._replace(rho=rho)).pair)
-    without = pair_fit(one.guess, one.ranging(dropped(one.pair.ranges, which)).pair)
+    spoilt = pair_fit(nudged(one, seed, 0.2), one.ranging(rho).pair)
+    without = pair_fit(one.guess, dropped(one.pair, which))
     assert spoilt.weights[which] < 1e-3
     off = (spoilt.guess - without.guess) / np.sqrt(np.diagonal(without.of_start))
     assert np.max(np.abs(off)) < 0.1, "sigmas"
 
 
-def dropped(ranges: Ranges, which: int) -> Ranges:
-    counts = [K + 1, K + 1, K + 1]
-    counts[which // (K + 1)] -= 1
-    left = np.arange(len(ranges.rho)) != which
-    first, second, mutual = counts
-    return Ranges(ranges.rho[left], ranges.tick[left], ranges.sigma[left], (first, second, mutual))
+def dropped(pair: JointMeasurements, which: int) -> JointMeasurements:
+    return replace(pair, ranges=pair.ranges.rows(np.arange(len(pair.ranges.rho)) != which))
 
 
 OF_EXACT_RANGES = Noise(odometry=VelocityNoise(0.02, 0.02)).as_told
@@ -597,10 +591,10 @@ def resting(told: Told) -> Told:
     ]
     lists = []
     for kind in range(3):
-        rho = told.pair.ranges.rho[told.pair.ranges.rows(kind)].tolist()
+        rho = told.pair.ranges.rho[kinds(told.pair) == kind].tolist()
         lists.append(list(enumerate(rho + REST * rho[-1:])))
-    ranges = Ranges.of_lists(lists[0], lists[1], lists[2], told.pair.noise)
-    return told._replace(pair=replace(told.pair, paths=(paths[0], paths[1]), ranges=ranges))
+    places = ((0.0, 0.0), m2(told.pair))
+    return told._replace(pair=near_anchors(paths, lists[:2], places, told.pair.noise, REACH, lists[2]))
 
 
 @few
@@ -611,7 +605,7 @@ def test_the_distance_from_an_anchor_is_as_accurate_as_exact_ranges_at_rest(seed
     one = resting(one)
     found = settled(one)
     assume(converged(found))
-    for robot, anchor in enumerate(one.pair.anchors):
+    for robot, anchor in enumerate(one.pair.pivots):
         own, way = slice(3 * robot, 3 * robot + 2), found.poses[robot, :2] - anchor
         along = way / np.hypot(*way)
         variance = float(along @ found.covariance[own, own] @ along) / found.level
@@ -628,8 +622,7 @@ def test_exact_ranges_and_strides_of_a_kilometre_leave_a_covariance_that_can_be_
     path = track(np.array([1e3, -1e3, 1e3, 0.0, 0.0]), np.array([0.3, -0.2, 0.4, 0.0, 0.0]), 1.0)
     anchor, noise = np.array((400.0, 300.0)), Noise(odometry=VelocityNoise(0.01, 0.01)).as_told
     rho = np.hypot(path.x - anchor[0], path.y - anchor[1])
-    ranges = Ranges.of_lists(list(enumerate(rho.tolist())), (), (), EXACT)
-    (found,) = fits(alone(path, ranges, noise), starts_about([anchor + (1.0, -1.0)]))
+    (found,) = fits(alone(path, rho.tolist(), noise), starts_about([anchor + (1.0, -1.0)]))
     assert found.guess == pytest.approx([*anchor, 0.0], abs=1e-3)
     assert np.min(np.linalg.eigvalsh(found.of_start[:2, :2])) > 0.0
     assert found.last_step < LAST_STEP
@@ -645,8 +638,9 @@ def test_the_covariance_has_the_surveying_errors_of_both_anchors(seed: int, odom
 
     def placed_if(error: Array) -> Array:
         """Return the poses that the ranges tell if the anchors are off by `error`: x and y of each."""
-        (ax, ay, bx, by), (x, y) = error, one.pair.apart
-        moved = one._replace(pair=replace(one.pair, apart=(float(x + bx - ax), float(y + by - ay))))
+        (ax, ay, bx, by), (x, y) = error, m2(one.pair)
+        place = np.where(kinds(one.pair)[:, None] == 1, (x + bx - ax, y + by - ay), 0.0)
+        moved = one._replace(pair=with_ranges(one.pair, place=place))
         return np.asarray(settled(moved).poses.ravel() + (ax, ay, 0.0, ax, ay, 0.0))
 
     surveyed = one._replace(pair=replace(one.pair, noise=replace(noise, survey_error=0.02)))
@@ -677,8 +671,8 @@ def test_the_heading_of_a_robot_alone_is_held_and_its_evidence_does_not_depend_o
     one, weights, starts = told(seed, ALL_ERRORS), [], []
     for held in (1e22, 1e26):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(pair_ranges, "HELD", held)
-            (found,) = fits(one.pair.of(0), starts_about([nudged(one, seed, 0.05)[:2]]))
+            patch.setattr(joint_ranges, "HELD", held)
+            (found,) = fits(one.pair.alone(0), starts_about([nudged(one, seed, 0.05)[:2]]))
         assert abs(found.start.poses[0, 2]) < 1e-15
         weights.append(found.weight)
         starts.append(found.guess)
@@ -686,13 +680,10 @@ def test_the_heading_of_a_robot_alone_is_held_and_its_evidence_does_not_depend_o
     assert starts[1] == pytest.approx(starts[0], abs=1e-9)
 
 
-def repeated(pair: PairRanges, times: int) -> PairRanges:
+def repeated(pair: JointMeasurements, times: int) -> JointMeasurements:
     """Return `pair` with each range `times` times."""
-    ranges, (a, b, mutual) = pair.ranges, pair.ranges.counts
-    rows = np.repeat(np.arange(len(ranges.rho)), times)
-    counts = times * a, times * b, times * mutual
-    more = Ranges(ranges.rho[rows], ranges.tick[rows], ranges.sigma[rows], counts)
-    return replace(pair, ranges=more)
+    rows = np.repeat(np.arange(len(pair.ranges.rho)), times)
+    return replace(pair, ranges=pair.ranges.rows(rows))
 
 
 @pytest.mark.parametrize("times", [1, 8])
@@ -709,8 +700,8 @@ def test_a_range_that_holds_a_coordinate_is_no_outlier_and_has_no_bias(
     begun = pair_fit(one.guess, pair)
     along = np.array((math.cos(seed), math.sin(seed)))
     place, sigma = begun.poses[1, :2], 1e-4
-    away = FAR_ANCHOR * pair.sensing_range
-    measured = _holding(pair.measured, 1, place - away * along, away + offset, sigma)
+    away = FAR_ANCHOR * pair.reach
+    measured = _holding(pair, 1, place - away * along, away + offset, sigma)
     held = held_fit(measured, begun, 5)
     # a few full steps: each is bounded, and none is made shorter if it does not descend
     assert 0.0 < (held.poses[1, :2] - place) @ along / offset < 1.5
@@ -728,11 +719,11 @@ def test_a_fit_does_not_depend_on_the_origin_and_the_axes_of_the_world(
     one = told(seed, ALL_ERRORS)
     assume(clear(one))
     c, s = math.cos(turn), math.sin(turn)
-    ranges, start = one.pair.measured.ranges, pair_start(nudged(one, seed, 0.05), one.pair.apart)
+    ranges, start = one.pair.ranges, pair_start(nudged(one, seed, 0.05), m2(one.pair))
     place = np.where(ranges.second[:, None] < 0, np.stack(rotated(c, s, *ranges.place.T), 1) + (x, y), 0.0)
-    elsewhere = replace(one.pair.measured, ranges=replace(ranges, place=place))
+    elsewhere = with_ranges(one.pair, place=place)
     poses = np.column_stack((*rotated(c, s, *start.poses[:, :2].T), start.poses[:, 2])) + (x, y, turn)
-    (here,) = fits(one.pair.measured, [start])
+    (here,) = fits(one.pair, [start])
     (there,) = fits(elsewhere, [Start(poses)])
     assert there.guess - here.guess == pytest.approx(np.tile((0.0, 0.0, turn), 2), abs=1e-9)
     assert there.weight == pytest.approx(here.weight, abs=1e-9)
@@ -764,7 +755,7 @@ def test_the_information_of_the_distance_score_is_the_curvature_of_the_likelihoo
     """Ranges without errors: residuals would add to the curvature."""
     one = told(seed, noise)
     assume(clear(one))
-    one = one.ranging(one.pair.ranges._replace(rho=distances(one.pair, one.guess)))
+    one = one.ranging(distances(one.pair, one.guess))
     found = settled(one)
     _, information = distance_score(found, one.pair)
     small = 0.02 / math.sqrt(information)
@@ -772,9 +763,9 @@ def test_the_information_of_the_distance_score_is_the_curvature_of_the_likelihoo
     assert information == pytest.approx((2.0 * here - more - less) / small**2, rel=0.05)
 
 
-def distance_score(found: Fit, pair: PairRanges) -> tuple[float, float]:
+def distance_score(found: Fit, pair: JointMeasurements) -> tuple[float, float]:
     """Return the score and its information for M2 farther from M1, and b with it."""
-    along = np.array(pair.apart) / math.hypot(*pair.apart)
+    along = np.array(m2(pair)) / math.hypot(*m2(pair))
     effect = np.where(found.problem.measured.second >= 0, -found.linear.walk.direction @ along, 0.0)
     score, information = found.linear.score(effect)
     assert found.linear.score(1e-3 * effect) == pytest.approx((1e-3 * score, 1e-6 * information), rel=1e-6)
@@ -783,5 +774,5 @@ def distance_score(found: Fit, pair: PairRanges) -> tuple[float, float]:
 
 def likelihood(told: Told, farther: float) -> float:
     """Return the log-likelihood at the optimum if the anchors are `farther` (m) apart."""
-    x, y = np.array(told.pair.apart) * (1.0 + farther / math.hypot(*told.pair.apart))
-    return -0.5 * settled(told._replace(pair=replace(told.pair, apart=(float(x), float(y))))).chi2
+    place = told.pair.ranges.place * (1.0 + farther / math.hypot(*m2(told.pair)))
+    return -0.5 * settled(told._replace(pair=with_ranges(told.pair, place=place))).chi2

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 
+import numpy as np
 import pytest
 from msgspec.structs import replace
 
 import tandem
+from agent.estimation.fit import fits
 from agent.estimation.gaussian import inference
-from agent.estimation.gaussian.hypotheses import Hypothesis, ScoredHypothesis, search
-from agent.estimation.gaussian.pair_ranges import PairRanges
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.gaussian.odometry_noise import track
+from agent.estimation.gaussian.search import search, starts_about
 from agent.estimation.knowledge import Belief
+from agent.estimation.posterior import Hypothesis, Posterior
 from agent.peer.motion_log import MotionLog
 from agent.planning import pair_claim
 from agent.planning.accuracy_seeking import OFF_RADIUS, AccuracySeeking
@@ -27,6 +31,7 @@ from protocol.messages import Ranged, Undecided
 from protocol.motion import Pose, compose, inverse
 from protocol.noise import Noise
 from protocol.wire import encode
+from tests.pair_starts import alone
 from tests.series import series
 from tests.surveys import ODOMETRY, SIGMA, WHEELS, assert_localised, scenario_of, states, survey
 from world.scenario import Scenario
@@ -351,8 +356,11 @@ def test_a_robot_whose_first_range_is_impossible_localises() -> None:
 
 
 def test_a_waiting_robot_fits_its_anchor_again_when_a_quarter_more_ranges_are_in() -> None:
+    own = alone(track(np.ones(2), np.ones(2), 1.0), [1.0, 1.0, 1.0], Noise(0.1, 0.1))
+    (fit,) = fits(own, starts_about([np.ones(2)]))
+
     def due(fitted: int, ranges: int, probability: float = 1.0) -> bool:
-        belief = Belief(own=(Hypothesis(((0.0, 0.0, 0.0),), probability),), ranges_at_last_fit=fitted)
+        belief = Belief(own=(Hypothesis(probability, fit),), ranges_at_last_fit=fitted)
         log = MotionLog(ranges=tuple([Ranged(tick, 1.0) for tick in range(ranges)]))
         return inference.is_fit_due(RobotState(scenario_of(SIGMA, 1).config("b"), log=log, belief=belief))
 
@@ -409,8 +417,10 @@ def test_a_robot_that_left_its_peers_range_does_not_go_there_again() -> None:
 def test_nothing_is_claimed_by_a_fit_that_still_moves(monkeypatch: pytest.MonkeyPatch) -> None:
     ticks = len(survey(SIGMA, SHORT).ticks)
 
-    def searched(pair: PairRanges, known: Sequence[Hypothesis]) -> tuple[ScoredHypothesis, ...]:
-        return tuple([one._replace(fit=one.fit._replace(last_step=0.5)) for one in search(pair, known)])
+    def searched(pair: JointMeasurements, known: Posterior) -> Posterior:
+        found = search(pair, known)
+        still = [one._replace(fit=one.fit._replace(last_step=0.5)) for one in found.hypotheses]
+        return found._replace(hypotheses=tuple(still))
 
     monkeypatch.setattr(pair_claim, "search", searched)
     recording = run_mission(scenario_of(SIGMA, SHORT, max_ticks=ticks + 2))

@@ -25,10 +25,10 @@ from agent.estimation.gaussian.consistency import (
     consistency_test,
 )
 from agent.estimation.gaussian.evidence import mutual_evidence
-from agent.estimation.gaussian.hypotheses import ScoredHypothesis
 from agent.estimation.gaussian.inference import (
     PlanningHypothesis,
     localised,
+    m2_of,
     pair_planning_hypotheses,
     to_second_order,
 )
@@ -42,8 +42,7 @@ from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.noise_level import INLIER
 from agent.estimation.gaussian.odometry_noise import Array
 from agent.estimation.gaussian.own_sensors import contradiction
-from agent.estimation.gaussian.pair_ranges import PairRanges
-from agent.estimation.posterior import Certainty, JointHypotheses
+from agent.estimation.posterior import Certainty, Hypothesis, Posterior
 from protocol.messages import Localised, RobotConfig
 from protocol.mission import HEADING_ACCURACY
 from protocol.noise import Noise
@@ -141,8 +140,6 @@ class Judged(NamedTuple):
     """The fit of the most probable hypothesis."""
     measured: JointMeasurements
     """The measurements to which it is the fit."""
-    reach: float
-    """The longest range (m) that is expected."""
     origin: tuple[float, float]
     """The point of <W> (m) to which the poses of the fit are relative."""
     hypotheses: int
@@ -163,15 +160,13 @@ class Judged(NamedTuple):
     """The least probability of the pose."""
     rivals_of: tuple[int, ...] = ()
     """The robots of which rivals are looked for."""
-    pair: PairRanges | None = None
-    """The measurements of a pair, for the evidence of its mutual ranges."""
     displaced: Displacement | None = None
     """The anchor that seems to stand elsewhere than it was surveyed, if one does."""
 
     @property
     def rival(self) -> Rival:
         """The likeliest rival of the claim."""
-        return likeliest_rival(self.fit, self.measured, self.reach, self.stated, self.rivals_of)
+        return likeliest_rival(self.fit, self.measured, self.stated, self.rivals_of)
 
     @property
     def localised(self) -> Localised:
@@ -182,15 +177,15 @@ class Judged(NamedTuple):
 def of_pair(
     user: User,
     config: RobotConfig,
-    scored: Sequence[ScoredHypothesis],
-    pair: PairRanges,
+    scored: Sequence[Hypothesis],
+    pair: JointMeasurements,
 ) -> Judged | None:
     """Return the estimate of one robot of a pair by the most probable of the hypotheses `scored`, if any."""
     if not scored:
         return None
     mission, role = config.mission, config.role
     robot, ids = (0, (config.robot, config.peer)) if role == "a" else (1, (config.peer, config.robot))
-    places = len(pair.places)
+    places = len(pair.mutual_places)
     required = required_mutual_ranges(mission.noise) if user in FIRST_CLAIMS else 0
     own_heading = config.heading_accuracy if places < ENOUGH_FOR_HEADING else HEADING_ACCURACY
     best = scored[0]
@@ -199,29 +194,26 @@ def of_pair(
         user=user,
         robot=robot,
         fit=best.fit,
-        measured=pair.measured,
-        reach=pair.sensing_range,
+        measured=pair,
         origin=(config.m1.x, config.m1.y),
         hypotheses=len(scored),
         ranges=places,
         required=required,
-        stated=to_second_order(first, pair.apart),
+        stated=to_second_order(first, m2_of(config)),
         inconsistency=consistency_test(best.fit, pair, robot) if places >= required else None,
         accuracy=mission.accuracy,
         headings=tuple([(i, f"{ids[i]}'s", own_heading if i == robot else HEADING_ACCURACY) for i in (0, 1)]),
         confidence=mission.confidence,
         rivals_of=(robot,),
-        pair=pair,
     )
 
 
 def of_joint(
     user: User,
     robot: int,
-    found: JointHypotheses,
+    found: Posterior,
     certainty: Certainty,
     measured: JointMeasurements,
-    reach: float,
     accuracy: float,
     confidence: float,
 ) -> Judged:
@@ -229,16 +221,15 @@ def of_joint(
 
     `certainty` is that of its pose; `measured` are the measurements of all these robots.
     """
-    fit, free = found.scored[0].fit, found.scored[0].fit.freedom
+    fit, free = found.hypotheses[0].fit, found.hypotheses[0].fit.freedom
     return Judged(
         user=user,
         robot=robot,
         fit=fit,
         measured=measured,
-        reach=reach,
         origin=measured.origin,
         hypotheses=certainty.poses,
-        ranges=decisive_ranges(robot, measured, reach),
+        ranges=decisive_ranges(robot, measured),
         required=sufficient_mutual_ranges(measured.noise),
         stated=PlanningHypothesis(certainty.probability, fit.poses.ravel(), fit.covariance),
         inconsistency=Inconsistency(
@@ -337,7 +328,7 @@ def definite_covariance(judged: Judged) -> str:
 @condition("recording")
 def determined_position(judged: Judged) -> str:
     """The sigma of the position is less than half of the longest range: else, the robot has no pose."""
-    return open_position(judged.robot, judged.fit, judged.reach)
+    return open_position(judged.robot, judged.fit, judged.measured)
 
 
 @condition(*FIRST_CLAIMS)
@@ -366,8 +357,7 @@ def evidence(judged: Judged) -> str:
     """Fewer ranges than {MUTUAL_RANGES} agree by chance with a probability of 1 - `confidence` at most."""
     if judged.ranges >= sufficient_mutual_ranges(judged.measured.noise):
         return ""
-    assert judged.pair is not None
-    found, required = mutual_evidence(judged.fit, judged.pair), -math.log1p(-judged.confidence)
+    found, required = mutual_evidence(judged.fit, judged.measured), -math.log1p(-judged.confidence)
     if found >= required:
         return ""
     return (

@@ -198,9 +198,8 @@ def without_outliers(measured: JointMeasurements, starts: Sequence[Start]) -> li
     problem = Problem.of(measured)
     if not problem.weighing.robust:
         return []
-    kernel, ranges, found = problem.kernel, measured.ranges, []
-    loose = np.square(ranges.sigma) + ranges.single.loosened(measured.noise.priors, measured.speeds)
-    sigma = np.sqrt(loose)[problem.order]
+    kernel, found = problem.kernel, []
+    sigma = np.sqrt(np.square(measured.ranges.sigma) + measured.loosened)[problem.order]
     for start in starts:
         poses, constant, white, _ = _begin(problem, start)
         weights = kernel.weights_by_errors(kernel.walked(poses, constant, white).residual, sigma)

@@ -85,19 +85,15 @@ class Kernel:
         spaces = (s, s * size, s * s, s, size, size * size, max(size, n3) ** 2, *[max(q, of.radios)] * 2)
         self._work, self._spaces = _Layout(*vectors, *spaces, *[count] * 4, n3).new()
 
+    def __reduce__(self) -> tuple[type[Kernel], tuple[Measured, Weighing]]:
+        """Return how to build the kernel again from a copy, which has memory of its own."""
+        return Kernel, (self.of, self.by)
+
     def walked(self, poses: Array, constants: Array, white: Array) -> Walk:
         """Return the paths; see `smoother.walked`."""
         at, arrays = _Layout(*self._of_walk).new()
         library().walked(self._measured, *map(address, (poses, constants, white)), at)
         return Walk._make(arrays)
-
-    def loosened(self, walk: Walk, poses: Array, variance: Array) -> Array:
-        """Return the variances of the ranges before any fit; see `smoother.loosened`. Raises Singular."""
-        found = np.empty(len(self.of.rho))
-        given = (self._measured, _addresses(*walk), address(poses), address(variance))
-        if not library().loosened(*given, self._work, address(found)):
-            raise Singular("the errors of the odometry are too large for a float")
-        return found
 
     def step(self, walk: Walk, poses: Array, variance: Array, ridge: float, largest: float) -> FitStep:
         """Return a Gauss-Newton step; see `smoother.step`. Raises Singular."""

@@ -9,7 +9,7 @@ import msgspec
 from agent.estimation.closed_forms import Placement
 from agent.estimation.exact import Branch, PairObservation
 from agent.estimation.gaussian.consistency import Inconsistency
-from agent.estimation.gaussian.hypotheses import Hypothesis
+from agent.estimation.posterior import Hypothesis
 from agent.peer.motion_log import MotionLog
 from agent.peer.peer_state import PeerState
 from protocol import messages

@@ -1,71 +1,127 @@
-"""The hypotheses about the poses of n robots, with their probabilities by the evidence for their fits."""
+"""The hypotheses about the poses of robots, with their probabilities by the evidence for their fits.
+
+Ranges and ticks without a detection determine the probability of a hypothesis. It is dropped when that
+becomes small, and no single measurement excludes it.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
 from agent.estimation.elementary import eigh, product
-from agent.estimation.fit import Fit
-from agent.estimation.gaussian.hypotheses import NEGLIGIBLE_PROBABILITY, SAME_SIGMAS
+from agent.estimation.fit import TO_THE_END, Fit, fits
+from agent.estimation.gauss_newton import Convergence
+from agent.estimation.gaussian.consistency import FINISHED
+from agent.estimation.gaussian.detections import detection_log_likelihood
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.smoother import Array
 
-MOST_JOINT = 12
-"""The largest number of joint hypotheses whose poses are all in more probable ones, too.
+NEGLIGIBLE_PROBABILITY = 1e-7
+"""The probability, relative to the likeliest hypothesis, below which a hypothesis is dropped."""
 
-Robots that are each one of two mirror images have as many joint hypotheses as there are combinations. Only
-the most probable ones are fitted; see `_representative`.
+SAME_SIGMAS = 1.0
+"""The distance in sigmas below which the poses of a robot by two fits are the same."""
+
+LEAST_EVIDENCE = -math.log(100.0)
+"""The least log-likelihood of detections and of ticks without one that counts for a probability.
+
+R may not be as it was told, and detection may fade with range. So they never suffice for a claim.
+"""
+
+MOST_JOINT = 12
+"""The largest number of hypotheses whose poses are all in more probable ones, too.
+
+Robots that are each one of two mirror images have as many hypotheses as there are combinations. Only the most
+probable ones are fitted; see `_representative`.
 """
 
 MOST_POSES = 24
-"""The largest number of joint hypotheses. The time of an estimate is proportional to it."""
+"""The largest number of hypotheses. The time of an estimate is proportional to it."""
+
+WARM_STEPS = 2
+"""The Gauss-Newton steps from the fit of the previous tick.
+
+Where the best fit has not converged by then, it may be on its way to another mode, and the plane is searched.
+With one step, that is every third tick; with more, each tick takes longer."""
+
+MOST_FITS = 4
+"""The most fits in a tick: after a long way, the steps of one do not suffice to correct the path."""
+
+FOLLOWED = Convergence(WARM_STEPS)
+"""The convergence of fits that begin at those of the previous tick."""
 
 
-class JointHypothesis(NamedTuple):
-    """One possible explanation of all ranges of the located robots."""
+class Hypothesis(NamedTuple):
+    """One possible explanation of all measurements."""
 
     probability: float
+    """The probability that this hypothesis is true; the probabilities of all remaining ones sum to 1."""
     fit: Fit
+    """The fit, with the poses. The next one begins at its poses and at the odometry errors that it has found.
+
+    A fit that began on the measured path again could end in another mode.
+    """
+    detections: float = 0.0
+    """The log-likelihood of the detections and of the ticks without one, given this fit."""
 
 
-class JointHypotheses(NamedTuple):
+class Posterior(NamedTuple):
     """The hypotheses about all robots that are located."""
 
     located: tuple[int, ...]
     """The indices of the robots to which the fits belong, ascending."""
-    scored: tuple[JointHypothesis, ...] = ()
+    hypotheses: tuple[Hypothesis, ...] = ()
     """The hypotheses, the most probable first."""
 
-
-NO_HYPOTHESES = JointHypotheses(())
-
-
-def with_probability(fits: Sequence[Fit]) -> tuple[JointHypothesis, ...]:
-    """Return the hypotheses for `fits`, likeliest first, without duplicates and without improbable ones."""
-    best = max([one.weight for one in fits], default=0.0)
-    probable = [one for one in fits if one.weight >= best + math.log(NEGLIGIBLE_PROBABILITY)]
-    left = _representative(sorted(probable, key=lambda one: -one.weight))
-    total = sum([math.exp(one.weight - best) for one in left])
-    return tuple([JointHypothesis(math.exp(one.weight - best) / total, one) for one in left])
+    @property
+    def has_converged(self) -> bool:
+        """Whether the fit of the most probable hypothesis has reached its minimum, if there is one."""
+        return not self.hypotheses or self.hypotheses[0].fit.last_step <= FINISHED
 
 
-def _representative(fits: Sequence[Fit]) -> list[Fit]:
-    """Return the different ones of `fits`, the likeliest first: all in which a robot has a pose of its own.
+NO_HYPOTHESES = Posterior(())
+
+PAIR = (0, 1)
+"""The robots of a mission's pair: `Posterior.located`."""
+
+
+def hypotheses_of(found: Sequence[Fit], measured: JointMeasurements) -> tuple[Hypothesis, ...]:
+    """Return the hypotheses for fits to what was `measured`, likeliest first, without duplicates.
+
+    Improbable ones are dropped.
+    """
+    detections = [detection_log_likelihood(one, measured) for one in found]
+    weighed = [
+        (one.weight + max(seen, LEAST_EVIDENCE), one, seen)
+        for one, seen in zip(found, detections, strict=True)
+    ]
+    best = max([weight for weight, _, _ in weighed], default=0.0)
+    probable = [each for each in weighed if each[0] >= best + math.log(NEGLIGIBLE_PROBABILITY)]
+    probable.sort(key=lambda each: -each[0])
+    left = [(math.exp(probable[k][0] - best), *probable[k][1:]) for k in _representative(probable)]
+    total = sum([relative for relative, _, _ in left])
+    return tuple([Hypothesis(relative / total, one, seen) for relative, one, seen in left])
+
+
+def _representative(weighed: Sequence[tuple[float, Fit, float]]) -> list[int]:
+    """Return the indices of the different fits: all in which a robot has a pose of its own.
 
     Of the others, which combine poses of likelier fits, they are the first ones. So no ambiguity of a robot
     is lost to the number of combinations of those of others.
     """
-    left: list[Fit] = []
-    for one in fits:
-        agreed = [same(one, other) for other in left]
+    left: list[int] = []
+    for k, (_, one, _) in enumerate(weighed):
+        agreed = [same(one, weighed[other][1]) for other in left]
         if any(all(each) for each in agreed):
             continue
         novel = not all(any(own) for own in zip(*agreed, strict=True)) if agreed else True
         if len(left) < (MOST_POSES if novel else MOST_JOINT):
-            left.append(one)
+            left.append(k)
     return left
 
 
@@ -73,10 +129,12 @@ def same(one: Fit, other: Fit) -> list[bool]:
     """Return for each robot whether two fits to the same facts have the same pose, within SAME_SIGMAS."""
     change = one.poses - other.poses
     change[:, 2] = np.remainder(change[:, 2] + math.pi, math.tau) - math.pi
+    variances = np.diagonal(other.covariance).reshape(-1, 3)
+    far = ((variances > 0.0) & (np.square(change) > SAME_SIGMAS**2 * variances)).any(1)
     blocks = [slice(3 * i, 3 * i + 3) for i in range(len(change))]
     return [
-        _squared_sigmas(moved, other.covariance[own, own]) < SAME_SIGMAS**2
-        for moved, own in zip(change, blocks, strict=True)
+        not apart and _squared_sigmas(moved, other.covariance[own, own]) < SAME_SIGMAS**2
+        for moved, own, apart in zip(change, blocks, np.asarray(far), strict=True)
     ]
 
 
@@ -92,8 +150,50 @@ NO_VARIANCE = 1e-15
 """The fraction of the largest variance up to which a variance is 0 by rounding."""
 
 
+# --- from tick to tick --------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=8)
+def follow(known: Posterior, measured: JointMeasurements, until: Convergence = FOLLOWED) -> Posterior:
+    """Return the hypotheses that follow from those `known` before the latest facts."""
+    if not known.hypotheses:
+        return known
+    part = measured.some(known.located)
+    found = fits(part, [one.fit.start for one in known.hypotheses], until)
+    return Posterior(known.located, hypotheses_of(found, part))
+
+
+def settled(known: Posterior, measured: JointMeasurements) -> Posterior:
+    """Return the hypotheses that follow from those of some time ago: until the likeliest has converged."""
+    for _ in range(MOST_FITS):
+        known = follow(known, measured)
+        if known.has_converged:
+            break
+    return known
+
+
+def merged(known: Posterior, found: Posterior, measured: JointMeasurements) -> Posterior:
+    """Return the hypotheses of both, or those of `found` alone if it locates more robots.
+
+    Both are fitted to what was `measured`; the fits of those `known` are continued to the end. If `found`
+    does not locate all of their robots, they are returned alone.
+    """
+    if not known.hypotheses or set(known.located) < set(found.located):
+        return found
+    part = measured.some(known.located)
+    ended = [one.fit for one in known.hypotheses if one.fit.last_step <= TO_THE_END.shortest]
+    moving = [one.fit.start for one in known.hypotheses if one.fit.last_step > TO_THE_END.shortest]
+    both = ended + (fits(part, moving) if moving else [])
+    if known.located == found.located:
+        both += [one.fit for one in found.hypotheses]
+    return Posterior(known.located, hypotheses_of(both, part))
+
+
+# --- one robot of them --------------------------------------------------------------------------------
+
+
 class Certainty(NamedTuple):
-    """The joint hypotheses as far as they concern one robot."""
+    """The hypotheses as far as they concern one robot."""
 
     poses: int
     """The number of different poses."""
@@ -101,7 +201,7 @@ class Certainty(NamedTuple):
     """The probability of the pose in the most probable hypothesis."""
 
 
-def certainties(found: JointHypotheses) -> list[Certainty]:
+def certainties(found: Posterior) -> list[Certainty]:
     """Return the certainty of each located robot.
 
     Hypotheses that differ in others only count as one, the most probable of them. That is exact for
@@ -109,8 +209,8 @@ def certainties(found: JointHypotheses) -> list[Certainty]:
     """
     result = []
     for i in range(len(found.located)):
-        poses: list[JointHypothesis] = []
-        for one in found.scored:
+        poses: list[Hypothesis] = []
+        for one in found.hypotheses:
             if not any(same(one.fit, other.fit)[i] for other in poses):
                 poses.append(one)
         total = sum([one.probability for one in poses])

@@ -58,7 +58,7 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
         back[order] = np.arange(len(order))
         radios, holding = sorted(set(ranges.radio.tolist()) - {-1}), ranges.radio[order] < 0
         radio = np.where(holding, -1, np.searchsorted(radios, ranges.radio[order]))  # without gaps
-        common = ranges.single.common_errors(priors)[order]
+        common = ranges.common_errors(priors)[order]
         common[holding] = 0.0
         v, omega, slip = _velocities(measured.paths, ticks)
         anchor, anchors = _unsure_anchors(ranges) if priors.survey_error else (np.full(len(order), -1), 0)
@@ -88,7 +88,7 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
             decay=math.exp(-measured.period / priors.slow_time),
             mean=np.zeros(3 * n) if prior is None else prior.mean.ravel(),
             information=np.zeros((3 * n, 3 * n)) if prior is None else prior.information,
-            pivot=_pivots(n, ranges),
+            pivot=measured.pivots,
         )
         by = Weighing.of(
             noise,
@@ -128,17 +128,6 @@ def _variances(measured: JointMeasurements, v: Array, omega: Array) -> Array:
         if path.extra is not None:
             white[i, :, :known] += path.extra
     return white
-
-
-def _pivots(robots: int, ranges: JointRanges) -> Array:
-    """Return the pivot of each robot: the mean place of its anchors; NaN, without any, for its start."""
-    pivots = np.full((robots, 2), math.nan)
-    for i in range(robots):
-        own = (ranges.first == i) & (ranges.second < 0) & (ranges.radio >= 0)
-        places = dict.fromkeys([tuple(place) for place in ranges.place[own].tolist()])
-        if places:
-            pivots[i] = [math.fsum(axis) / len(places) for axis in zip(*places, strict=True)]
-    return pivots
 
 
 def _unsure_anchors(ranges: JointRanges) -> tuple[Places, int]:

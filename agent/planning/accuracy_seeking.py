@@ -11,14 +11,15 @@ import math
 from collections.abc import Callable, Sequence
 from functools import partial
 
+import numpy as np
 from msgspec.structs import replace
 
 from agent.estimation.claim import FEWEST_FOR_CLAIM, sufficient_mutual_ranges
 from agent.estimation.gaussian import inference
-from agent.estimation.gaussian.hypotheses import ScoredHypothesis
 from agent.estimation.gaussian.inference import MANY_MUTUAL_RANGES, PlanningHypothesis
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.odometry_noise import Track
-from agent.estimation.gaussian.pair_ranges import PairRanges
+from agent.estimation.posterior import Hypothesis
 from agent.planning import active_sensing, exchange, phase2_orbit, range_seeking, transitions
 from agent.planning.active_sensing import CONTINUED, STALLED, Listening, Objective, Retreating, Surveying
 from agent.planning.assured import AssuredExact
@@ -185,14 +186,14 @@ def _objective(state: RobotState, beacon: Beacon, paths: Sequence[Track]) -> tup
             return state.tick, CONTINUED
 
 
-def _are_misleading(state: RobotState, best: ScoredHypothesis) -> bool:
+def _are_misleading(state: RobotState, best: Hypothesis) -> bool:
     """Return whether the detections and the ticks without one contradict the most probable hypothesis.
 
     With CONVINCING_RANGES, ranges count more: R may not be as it was told.
     """
     if len(state.log.ranges) >= CONVINCING_RANGES:
         return False
-    return best.detection_log_likelihood < MISLEADING + _drop_out_log_likelihood(state)
+    return best.detections < MISLEADING + _drop_out_log_likelihood(state)
 
 
 def _drop_out_log_likelihood(state: RobotState) -> float:
@@ -363,14 +364,14 @@ def _decide_phase3(state: RobotState, planned: JointManoeuvres) -> RobotState:
         state = replace(state, belief=replace(state.belief, encounter_tick=state.tick))
     state = _of_this_attempt(state)
     pair = inference.pair_of(state)
-    mutual = pair.ranges.counts[2]
+    mutual = int(np.count_nonzero(pair.ranges.mutual))
     if mutual < FEWEST_FOR_CLAIM:
         return _drive_without_hypotheses(state)
     scored, hypotheses, belief, judged, searched = inferred(state, pair)
     if searched:
         belief = replace(belief, ranges_at_last_search=mutual)
     tested = replace(state, belief=belief)
-    if searched and len(pair.places) >= sufficient_mutual_ranges(mission.noise):
+    if searched and len(pair.mutual_places) >= sufficient_mutual_ranges(mission.noise):
         tested = with_consistency_test(tested)
     if tested.verdict is None and belief.blocking_reason is None:
         tested, rival = with_claim(tested, judged)
@@ -384,14 +385,14 @@ def _decide_phase3(state: RobotState, planned: JointManoeuvres) -> RobotState:
         return _drive_without_hypotheses(tested)
     since, objective = _objective(state, "peer", pair.paths)
     manoeuvres = _manoeuvres(state, objective) or planned
-    a, b = manoeuvres(hypotheses, pair.apart, state.mutual[-1].range, mission)
+    a, b = manoeuvres(hypotheses, inference.m2_of(state.config), state.mutual[-1].range, mission)
     return replace(tested, mode=Surveying("peer", a if role == "a" else b, since))
 
 
-def _measures_in_vain(state: RobotState, pair: PairRanges) -> bool:
+def _measures_in_vain(state: RobotState, pair: JointMeasurements) -> bool:
     """Return whether this meeting has so many ranges that more will hardly settle the poses."""
     many = MANY_MUTUAL_RANGES * (1 + state.belief.returns)
-    return len(pair.places) >= many and len(state.mutual) - state.belief.earlier_ranges >= many
+    return len(pair.mutual_places) >= many and len(state.mutual) - state.belief.earlier_ranges >= many
 
 
 def _manoeuvres(state: RobotState, objective: Objective) -> JointManoeuvres | None:

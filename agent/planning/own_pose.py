@@ -22,9 +22,10 @@ from agent.estimation.claim import (
     of_pair,
 )
 from agent.estimation.gaussian import inference
-from agent.estimation.gaussian.hypotheses import Hypothesis, ScoredHypothesis, follow, search, settled
-from agent.estimation.gaussian.pair_ranges import PairRanges
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.gaussian.search import search
 from agent.estimation.knowledge import Knowledge
+from agent.estimation.posterior import PAIR, Hypothesis, Posterior, follow, settled
 from agent.planning import sweep
 from agent.planning.group_state import GroupState
 from agent.planning.sweep import Looping, Sweeping
@@ -87,41 +88,35 @@ def searched(state: GroupState) -> tuple[GroupState, ReportedPose | None]:
 def beacon_place(state: GroupState) -> Place:
     """Return the most probable position of the beacon in <W>, in m; its anchor if there is no hypothesis."""
     pair, measured = state.pair, _measured(state)
-    scored = follow(pair.belief.pair, measured)
-    if not scored:
+    found = follow(Posterior(PAIR, pair.belief.pair), measured).hypotheses
+    if not found:
         return pair.config.peer_anchor.x, pair.config.peer_anchor.y
-    x, y, _ = scored[0].fit.poses[1 if pair.config.role == "a" else 0].tolist()
+    x, y, _ = found[0].fit.poses[1 if pair.config.role == "a" else 0].tolist()
     return pair.config.m1.x + x, pair.config.m1.y + y
 
 
-def _estimate(state: GroupState, *, searched: bool) -> tuple[tuple[ScoredHypothesis, ...], Judged | None]:
+def _estimate(state: GroupState, *, searched: bool) -> tuple[tuple[Hypothesis, ...], Judged | None]:
     """Return the hypotheses by all measurements of the latest meeting, and the first one as `claim` sees it.
 
     The whole plane is searched if the known hypotheses do not explain the measurements, or if `searched`.
     """
     pair, measured = state.pair, _measured(state)
-    scored = settled(pair.belief.pair, measured)
-    judged = of_pair("finder", pair.config, scored, measured)
+    found = settled(Posterior(PAIR, pair.belief.pair), measured)
+    judged = of_pair("finder", pair.config, found.hypotheses, measured)
     if searched or blocked(judged, (convergence, consistency)) is not None:
-        scored = settled(_hypotheses(search(measured, _hypotheses(scored))), measured)
-        judged = of_pair("finder", pair.config, scored, measured)
-    return scored, judged
+        found = settled(search(measured, found), measured)
+        judged = of_pair("finder", pair.config, found.hypotheses, measured)
+    return found.hypotheses, judged
 
 
-def _hypotheses(scored: Sequence[ScoredHypothesis]) -> tuple[Hypothesis, ...]:
-    return tuple([one.hypothesis for one in scored])
-
-
-def _measured(state: GroupState) -> PairRanges:
+def _measured(state: GroupState) -> JointMeasurements:
     """Return the measurements of the latest meeting: all until its claim, and some of the later ranges."""
     measured = inference.pair_of(state.pair)
     claimed = state.located.tick if state.located is not None else -1
-    return replace(measured, ranges=measured.ranges.thinned_after(claimed, MOST_WEIGHED))
+    return measured.thinned_after(claimed, MOST_WEIGHED)
 
 
-def _with_estimate(
-    state: GroupState, scored: Sequence[ScoredHypothesis], judged: Judged | None
-) -> GroupState:
+def _with_estimate(state: GroupState, scored: Sequence[Hypothesis], judged: Judged | None) -> GroupState:
     """Return `state` with an estimate. The places to which the robot drives stay where they are in <W>."""
     pair, before = state.pair, state.own_pose
     if judged is None:
@@ -134,7 +129,7 @@ def _with_estimate(
         mode = Sweeping(sweep.transformed(turn, mode.places))
     elif isinstance(mode, Looping):
         mode = replace(mode, then=sweep.transformed(turn, mode.then))
-    pair = replace(pair, belief=replace(pair.belief, pair=_hypotheses(scored)), mode=mode)
+    pair = replace(pair, belief=replace(pair.belief, pair=tuple(scored)), mode=mode)
     ranges = len(pair.log.ranges) + len(pair.mutual)
     was_lost = before.sigma > LOST_SIGMA * state.config.mission.sensing_range
     own_pose = replace(
@@ -172,6 +167,7 @@ def later_pose(met: Knowledge, now: Knowledge) -> Localised | None:
     """
     met = replace(met, tick=now.tick, odometry=now.odometry, log=now.log)
     measured = inference.pair_of(met)
-    scored = settled(_hypotheses(search(measured, met.belief.pair)), measured)
-    found = claim(of_pair("meeting", met.config, scored, measured))
-    return found if isinstance(found, Localised) else None
+    known = settled(Posterior(PAIR, met.belief.pair), measured)
+    found = settled(search(measured, known), measured)
+    claimed = claim(of_pair("meeting", met.config, found.hypotheses, measured))
+    return claimed if isinstance(claimed, Localised) else None

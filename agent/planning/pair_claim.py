@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 from msgspec.structs import replace
 
 from agent.estimation.claim import (
@@ -22,15 +23,15 @@ from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.claim_rivals import Rival
 from agent.estimation.gaussian.consistency import (
     CLAIM_P_VALUE,
-    FINISHED,
     INCONSISTENT_SEARCHES,
     rejecting_p_value,
 )
-from agent.estimation.gaussian.hypotheses import ScoredHypothesis, follow, search
 from agent.estimation.gaussian.inference import PlanningHypothesis
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.own_sensors import DOUBTFUL_CLAIMS
-from agent.estimation.gaussian.pair_ranges import PairRanges
+from agent.estimation.gaussian.search import search
 from agent.estimation.knowledge import Belief, Knowledge
+from agent.estimation.posterior import PAIR, Hypothesis, Posterior, follow
 from agent.planning.state import Done, RobotState
 from protocol.messages import Localised
 
@@ -45,7 +46,7 @@ whenever the best fit still moves. More searches cost time; with fewer, robots p
 class PairInference(NamedTuple):
     """The hypotheses about both robots in one tick."""
 
-    scored: tuple[ScoredHypothesis, ...]
+    scored: tuple[Hypothesis, ...]
     hypotheses: tuple[PlanningHypothesis, ...]
     belief: Belief
     judged: Judged | None
@@ -54,26 +55,25 @@ class PairInference(NamedTuple):
     """True if the hypotheses are from a search of the whole plane."""
 
 
-def inferred(state: Knowledge, pair: PairRanges) -> PairInference:
+def inferred(state: Knowledge, pair: JointMeasurements) -> PairInference:
     """Return the hypotheses about both robots, from those of the last tick or from a search.
 
     The whole plane is searched if nothing is known, at the counts PAIR_SEARCHES, if the best fit still moves,
     because it may be on its way to another mode, and before a claim or a suspicion.
     """
-    known, mutual = state.belief.pair, pair.ranges.counts[2]
-    if known and not any(state.belief.ranges_at_last_search < count <= mutual for count in PAIR_SEARCHES):
-        scored = follow(known, pair)
-        if scored and scored[0].fit.last_step <= FINISHED:
-            followed = weighed(state, pair, scored, searched=False)
-            blocking, test = followed.belief.blocking_reason, followed.belief.inconsistency
-            if blocking is not None and (test is None or test.p_value >= CLAIM_P_VALUE):
-                return followed
-        known = tuple([one.hypothesis for one in scored])
-    return weighed(state, pair, search(pair, known), searched=True)
+    known, mutual = Posterior(PAIR, state.belief.pair), int(np.count_nonzero(pair.ranges.mutual))
+    due = any(state.belief.ranges_at_last_search < count <= mutual for count in PAIR_SEARCHES)
+    known = follow(known, pair)
+    if known.hypotheses and known.has_converged and not due:
+        followed = weighed(state, pair, known.hypotheses, searched=False)
+        blocking, test = followed.belief.blocking_reason, followed.belief.inconsistency
+        if blocking is not None and (test is None or test.p_value >= CLAIM_P_VALUE):
+            return followed
+    return weighed(state, pair, search(pair, known).hypotheses, searched=True)
 
 
 def weighed(
-    state: Knowledge, pair: PairRanges, scored: tuple[ScoredHypothesis, ...], *, searched: bool
+    state: Knowledge, pair: JointMeasurements, scored: tuple[Hypothesis, ...], *, searched: bool
 ) -> PairInference:
     """Return the hypotheses `scored` with the belief that follows from them."""
     hypotheses = inference.pair_planning_hypotheses(scored)
@@ -82,7 +82,7 @@ def weighed(
         judged = judged._replace(rivals_of=(0, 1))
     found = blocked(judged, BEFORE_SEARCH)
     belief = inference.with_pair(
-        state, scored, hypotheses, pair, judged and judged.inconsistency, found and found.reason
+        state, scored, hypotheses, judged and judged.inconsistency, found and found.reason
     )
     return PairInference(scored, hypotheses, belief, judged, searched)
 

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from agent.estimation.gaussian.joint_ranges import MOVED
 from agent.estimation.gaussian.odometry_noise import Track
-from agent.estimation.gaussian.pair_ranges import MOVED
 from protocol.mission import Mission
 
 PLANS = 6

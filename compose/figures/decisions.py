@@ -136,7 +136,10 @@ def _places(pair: PairRecord, tick: int) -> dict[Role, Pose]:
 
 def _ties(axes: Axes, one: PairDecision) -> None:
     """Join the poses of a and b that belong to one hypothesis, if both robots have the same hypotheses."""
-    if len(one.states) < 2 or one.states["a"].belief.pair != one.states["b"].belief.pair:
+    held = [
+        [hypothesis.fit.poses.tolist() for hypothesis in state.belief.pair] for state in one.states.values()
+    ]
+    if len(held) < 2 or held[0] != held[1]:
         return
     for p, q in zip(one.states["a"].belief.poses, one.states["b"].belief.poses, strict=True):
         axes.plot([p.x, q.x], [p.y, q.y], "-", lw=0.7, color=PALER, zorder=3)

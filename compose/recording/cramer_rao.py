@@ -11,9 +11,8 @@ import math
 
 import numpy as np
 
+from agent.estimation.gaussian.joint_ranges import near_anchors
 from agent.estimation.gaussian.odometry_noise import Track, track
-from agent.estimation.gaussian.pair_ranges import PairRanges
-from agent.estimation.gaussian.range_model import Ranges
 from agent.estimation.gaussian.reachable_accuracy import position_sigmas
 from compose.recording.run import Run
 from protocol.motion import REST, Pose
@@ -49,14 +48,13 @@ def position_bounds(run: Run, pair: tuple[int, int], tick: int) -> tuple[float, 
         if contact is not None and contact.range is not None:
             mutual.append((truth.tick, _apart(truth.poses[pair[0]], truth.poses[pair[1]])))
     apart = (anchors[1].x - anchors[0].x, anchors[1].y - anchors[0].y)
-    nothing, tracks = np.empty(0, np.intp), [_driven(run, place, tick) for place in pair]
-    measured = PairRanges(
-        (tracks[0], tracks[1]),
-        Ranges.of_lists(own[0], own[1], mutual, noise),
-        (nothing, nothing, nothing),
-        apart,
-        scenario.mission.sensing_range,
+    measured = near_anchors(
+        [_driven(run, place, tick) for place in pair],
+        own,
+        ((0.0, 0.0), apart),
         noise.as_told,
+        scenario.mission.sensing_range,
+        mutual,
     )
     starts = [ticks[0].truth.poses[place] for place in pair]
     relative = [(pose.x - anchors[0].x, pose.y - anchors[0].y, pose.heading) for pose in starts]

@@ -12,17 +12,16 @@ from functools import cache
 import numpy as np
 
 from agent.estimation.elementary import hypot
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.odometry_noise import (
     Array,
     Places,
-    Track,
     constant_errors,
     is_noisy,
     variances,
     wander,
 )
-from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges, inlier_probability, mixture
-from protocol.noise import Noise
+from agent.estimation.gaussian.range_model import SIGMA_FLOOR, inlier_probability, log_likelihood
 
 SEED_RANGES = 10
 """The largest number of ranges that initial guesses are made from.
@@ -45,33 +44,27 @@ TWINS = 0.3
 UNLIKELY = 25.0
 """The difference in log-likelihood to the best guess beyond which a guess is dropped."""
 
-MOST_FOLLOWED = 6
-"""The maximum number of hypotheses that are followed at once."""
+MOST_GUESSES = 6
+"""The largest number of guesses for an anchor."""
 
 
-def anchors(
-    path: Track,
-    ranges: Ranges,
-    sensing_range: float,
-    noise: Noise,
-    known: Sequence[Sequence[float]] = (),
-) -> Array:
-    """Return initial guesses for the anchor (m) in the frame of the odometry, from the ranges; shape (n, 2).
+def anchors(own: JointMeasurements, known: Sequence[Sequence[float]] = ()) -> Array:
+    """Return initial guesses for the anchor (m) of a robot in the frame of its odometry; shape (n, 2).
 
     `known` contains earlier guesses, which are refined as well.
     """
-    points = np.concatenate((np.array(known).reshape(-1, 2), _crossings(path, ranges)))
+    points = np.concatenate((np.array(known).reshape(-1, 2), _crossings(own)))
     if not len(points):
         return points
-    variance = np.square(ranges.sigma) + _odometry_variance(path, ranges, noise)
-    variance += ranges.loosened(noise.priors, path.speeds(ranges.tick))
-    return _polished(points, path, ranges, np.sqrt(variance), noise, sensing_range)
+    variance = np.square(own.ranges.sigma) + _odometry_variance(own) + own.loosened
+    return _polished(points, own, np.sqrt(variance))
 
 
-def _odometry_variance(path: Track, ranges: Ranges, noise: Noise) -> Array:
+def _odometry_variance(own: JointMeasurements) -> Array:
     """Return the approximate variance (m^2) that odometry noise adds to each range, without correlations."""
+    path, noise = own.paths[0], own.noise
     if not is_noisy(noise):
-        return np.zeros_like(ranges.rho)
+        return np.zeros_like(own.ranges.rho)
     v, omega = path.v, path.omega
     white = variances(v, omega, noise.odometry)
     if path.extra is not None:
@@ -84,7 +77,7 @@ def _odometry_variance(path: Track, ranges: Ranges, noise: Noise) -> Array:
         position += lever**2 * (path.x**2 + path.y**2) * turn
     for turned, x, y in model.moves[:-1]:
         position = position + np.square(x - lever * path.y * turned) + np.square(y + lever * path.x * turned)
-    along: Array = 0.5 * np.maximum(position, 0.0)[np.minimum(ranges.tick, len(path.v))]
+    along: Array = 0.5 * np.maximum(position, 0.0)[np.minimum(own.ranges.tick, len(path.v))]
     return along
 
 
@@ -104,11 +97,12 @@ def _couples(count: int) -> tuple[Places, Places]:
     return chosen[i], chosen[j]
 
 
-def _crossings(path: Track, ranges: Ranges) -> Array:
+def _crossings(own: JointMeasurements) -> Array:
     """Return the intersections (m) of each two range circles, in the frame of the odometry; shape (n, 2).
 
     If noise keeps two circles apart, a point between them is used.
     """
+    path, ranges = own.paths[0], own.ranges
     if len(ranges.rho) < 2:
         return np.empty((0, 2))
     i, j = _couples(len(ranges.rho))
@@ -132,10 +126,9 @@ def _crossings(path: Track, ranges: Ranges) -> Array:
     return np.concatenate(points)
 
 
-def _polished(
-    points: Array, path: Track, ranges: Ranges, sigma: Array, noise: Noise, sensing_range: float
-) -> Array:
+def _polished(points: Array, own: JointMeasurements, sigma: Array) -> Array:
     """Return the most likely of `points` after refinement on all ranges, without duplicates; shape (n, 2)."""
+    path, ranges, noise, sensing_range = own.paths[0], own.ranges, own.noise, own.reach
     x, y, rho = path.x[ranges.tick], path.y[ranges.tick], ranges.rho
     near = SAME_POSITION * sensing_range
 
@@ -157,7 +150,7 @@ def _polished(
         change = np.stack(((yy * gx - xy * gy) / determinant, (xx * gy - xy * gx) / determinant), 1)
         longest = np.maximum(np.abs(change).max(1, keepdims=True), 1e-12)
         points = points + change * np.minimum(1.0, 0.5 * sensing_range / longest)
-    likely = mixture(residuals_at(points)[0], hypot(sigma, near * POSITION_FINER**POLISHINGS), noise)[0]
+    likely = log_likelihood(residuals_at(points)[0], hypot(sigma, near * POSITION_FINER**POLISHINGS), noise)
     return _best(points, likely, near * POSITION_FINER + TWINS * float(np.min(sigma)))
 
 
@@ -166,7 +159,7 @@ def _best(points: Array, likely: Array, near: float) -> Array:
     left = np.flatnonzero(likely >= np.max(likely) - UNLIKELY)
     left = left[np.argsort(-likely[left], kind="stable")]
     chosen: list[int] = []
-    while len(left) and len(chosen) < MOST_FOLLOWED:
+    while len(left) and len(chosen) < MOST_GUESSES:
         chosen.append(int(left[0]))
         left = left[np.abs(points[left] - points[left[0]]).sum(1) > near]
     return points[chosen]

@@ -10,11 +10,34 @@ import math
 
 import numpy as np
 
-from agent.estimation.elementary import cos, hypot, sin
-from agent.estimation.gaussian.known_anchors import COARSE, ROTATIONS, AnchoredRobot, ranges_places, refined
-from agent.estimation.gaussian.odometry_noise import Array
-from agent.estimation.gaussian.range_model import SIGMA_FLOOR, mixture
-from protocol.motion import rotated
+from agent.estimation.elementary import cos, hypot, product, sin, solve
+from agent.estimation.fit import Start
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.gaussian.odometry_noise import Array, Places
+from agent.estimation.gaussian.range_model import SIGMA_FLOOR, inlier_probability, log_likelihood
+from agent.estimation.smoother import SMALLEST_DISTANCE
+from protocol.motion import rotated, rotated_back
+
+ROTATIONS = 72
+"""The number of rotations that are tried. The refinement bridges half of the 5 degrees between them."""
+
+REFINEMENTS = 8
+"""The number of Gauss-Newton steps on all candidates."""
+
+COARSE = 0.1
+"""The expected error of a candidate's ranges at first, as a fraction of the longest range."""
+
+ERROR_FINER = 0.4
+"""The factor by which it decreases in each step."""
+
+CANDIDATES = 8
+"""The number of candidates from which fits begin."""
+
+APART, TURNED = 0.05, 0.2
+"""The distance (as a fraction of the longest range) and the angle (rad) within which candidates are one."""
+
+FEWEST_FOR_POSE = 4
+"""The least number of ranges for hypotheses: there are three unknowns, and one range checks them."""
 
 CIRCLES = 6
 """The number of ranges whose circles are intersected, spread over all of them."""
@@ -23,16 +46,13 @@ OF_HEADING = 3
 """The number of intersections of each heading that are refined."""
 
 
-def beacon_guesses(robot: AnchoredRobot) -> list[Array]:
-    """Return likely guesses in the layout of `known_anchors.predicted`, each with shape (3,).
-
-    They contain the place of the origin in the frame of the odometry, and the rotation of this frame in <W>.
-    """
-    ranges, path = robot.ranges, robot.path
+def beacon_guesses(robot: JointMeasurements) -> list[Array]:
+    """Return likely guesses for one robot whose beacons are anchors, in the layout of `predicted`."""
+    ranges, path = robot.ranges, robot.paths[0]
     turns = np.linspace(-math.pi, math.pi, ROTATIONS, endpoint=False)
     c, s = cos(turns)[:, None], sin(turns)[:, None]
     px, py = path.x[ranges.tick], path.y[ranges.tick]
-    place = ranges_places(robot)
+    place = ranges.place
     # where the robot would have started if it were at the beacon; shape (turns, N)
     dx, dy = rotated(c, s, px, py)
     x, y = place[:, 0] - dx, place[:, 1] - dy
@@ -54,8 +74,81 @@ def beacon_guesses(robot: AnchoredRobot) -> list[Array]:
     sx, sy = np.concatenate([one[0] for one in both], 1), np.concatenate([one[1] for one in both], 1)
     away = hypot(sx[..., None] - x[:, None], sy[..., None] - y[:, None])
     longest = max(float(np.max(ranges.rho)), SIGMA_FLOOR)
-    likely = mixture(ranges.rho - away, hypot(ranges.sigma, COARSE * longest), robot.noise)[0]
+    likely = log_likelihood(ranges.rho - away, hypot(ranges.sigma, COARSE * longest), robot.noise)
     best = np.argsort(-likely, 1, kind="stable")[:, :OF_HEADING]
     sx, sy = np.take_along_axis(sx, best, 1), np.take_along_axis(sy, best, 1)
     guesses = np.stack((-(c * sx + s * sy), s * sx - c * sy, np.broadcast_to(turns[:, None], sx.shape)), -1)
     return refined(guesses.reshape(-1, 3), robot)
+
+
+def start_of(guess: Array) -> Start:
+    """Return the pose of a robot at tick 0 from a guess, (3,), in the layout of `predicted`."""
+    mx, my, turn = guess.tolist()
+    x, y = rotated(math.cos(turn), math.sin(turn), mx, my)
+    return Start(np.array([[-x, -y, turn]]))
+
+
+def refined(guesses: Array, robot: JointMeasurements) -> list[Array]:
+    """Return the likeliest of `guesses` after Gauss-Newton steps on all ranges, with measured odometry."""
+    ranges, path = robot.ranges, robot.paths[0]
+    at = np.stack((path.x[ranges.tick], path.y[ranges.tick]))
+    sigma = np.sqrt(np.square(ranges.sigma) + robot.loosened)
+    longest = max(float(np.max(ranges.rho)), SIGMA_FLOOR)
+    for step in range(REFINEMENTS):
+        s = hypot(sigma, COARSE * longest * ERROR_FINER**step)
+        distance, jacobian = predicted(guesses, at, ranges.place)
+        residuals = ranges.rho - distance
+        weight = inlier_probability(residuals, s, robot.noise) / np.square(s)
+        weighted = np.swapaxes(jacobian * weight[..., None], 1, 2)
+        information = product(weighted, jacobian)
+        information.reshape(len(guesses), -1)[:, ::4] *= 1.0 + DAMPING
+        information.reshape(len(guesses), -1)[:, ::4] += DAMPING
+        change = solve(information, product(weighted, residuals[..., None]))[..., 0]
+        most = np.array((LONGEST_STEP * longest, LONGEST_STEP * longest, LARGEST_TURN))
+        guesses = guesses + change / np.maximum(np.max(np.abs(change) / most, 1, keepdims=True), 1.0)
+    distance, _ = predicted(guesses, at, ranges.place)
+    likely = log_likelihood(ranges.rho - distance, hypot(sigma, FINAL * longest), robot.noise)
+    return _distinct(guesses, likely, at[:, -1], longest)
+
+
+def predicted(guesses: Array, at: Array, place: Array) -> tuple[Array, Array]:
+    """Return the N ranges (m) that `guesses` predict, (n, N), and their derivatives, (n, N, 3).
+
+    A guess has the x and y (m) of the origin in the frame of the odometry, and the rotation (rad) of this
+    frame in <W>; shape (n, 3). `at` are the places (m) of the robot in its frame, (2, N), and `place` those
+    of the anchors, (N, 2).
+    """
+    c, s = cos(guesses[:, 2:]), sin(guesses[:, 2:])
+    x, y = at[0] - guesses[:, :1], at[1] - guesses[:, 1:2]
+    wx, wy = rotated(c, s, x, y)
+    dx, dy = wx - place[:, 0], wy - place[:, 1]
+    distance = np.maximum(hypot(dx, dy), SMALLEST_DISTANCE)
+    nx, ny = dx / distance, dy / distance
+    along, across = rotated_back(c, s, nx, ny)
+    return distance, np.stack((-along, -across, ny * wx - nx * wy), -1)
+
+
+DAMPING = 1e-6
+"""The damping of these steps, as a fraction of the information, and its least value."""
+
+LONGEST_STEP, LARGEST_TURN = 0.2, 0.3
+"""The largest step, as a fraction of the longest range, and the largest turn, in rad."""
+
+FINAL = 0.02
+"""The error of a prediction without a correction of the odometry, as a fraction of the longest range."""
+
+
+def _distinct(guesses: Array, likely: Array, last: Array, longest: float) -> list[Array]:
+    """Return the likeliest of `guesses` at different poses at the place `last` (m) of the path."""
+    c, s = cos(guesses[:, 2]), sin(guesses[:, 2])
+    x, y = last[0] - guesses[:, 0], last[1] - guesses[:, 1]
+    ends = np.stack(rotated(c, s, x, y), 1)
+    left: Places = np.argsort(-likely, kind="stable")
+    chosen: list[Array] = []
+    while len(left) and len(chosen) < CANDIDATES:
+        best = int(left[0])
+        chosen.append(guesses[best])
+        turn = np.remainder(guesses[left, 2] - guesses[best, 2] + math.pi, math.tau) - math.pi
+        far = hypot(*(ends[left] - ends[best]).T) > APART * longest
+        left = left[far | (np.abs(turn) > TURNED)]
+    return chosen

@@ -56,13 +56,12 @@ class Rival(NamedTuple):
 def likeliest_rival(
     fitted: Fit,
     measured: JointMeasurements,
-    reach: float,
     stated: PlanningHypothesis,
     robots: tuple[int, ...],
 ) -> Rival:
     """Return the likeliest rival of the claims of `robots` (indices) by the fit to what was `measured`.
 
-    `stated` has the covariance of the claims, and `reach` (m) bounds the ranges. The coordinate that is held
+    `stated` has the covariance of the claims. The coordinate that is held
     is that along the longest axis of the ellipse of a robot's position.
     """
     covariance, rivals = stated.covariance, []
@@ -70,7 +69,7 @@ def likeliest_rival(
         i = 3 * robot
         variances, axes = eigh(covariance[i : i + 2, i : i + 2])
         along, far = axes[:, 1], WRONG_SIGMAS * deviation(float(np.sum(variances)))
-        place, away, held = fitted.poses[robot, :2], FAR_ANCHOR * reach, HOLDING_SIGMA * far
+        place, away, held = fitted.poses[robot, :2], FAR_ANCHOR * measured.reach, HOLDING_SIGMA * far
         here, *there = [
             _held(_holding(measured, robot, place - away * along, away + offset, held), fitted, steps)
             for offset, steps in ((0.0, 0), (far, HELD_STEPS), (-far, HELD_STEPS))

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from agent.estimation.fit import Fit
 from agent.estimation.gaussian.evidence import own_fit
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.noise_level import INLIER
-from agent.estimation.gaussian.pair_ranges import PairRanges
 from protocol.messages import Inconsistent
 from protocol.noise import Noise
 
@@ -83,7 +83,7 @@ class Inconsistency(NamedTuple):
         return Inconsistent(self.what, self.sigmas, self.p_value)
 
 
-def consistency_test(fitted: Fit, pair: PairRanges, robot: int) -> Inconsistency:
+def consistency_test(fitted: Fit, pair: JointMeasurements, robot: int) -> Inconsistency:
     """Return the least probable of three tests: all residuals, the strays, and the distance of the anchors.
 
     Its p-value is that of the three together if that is smaller: false data may be a little improbable in
@@ -148,7 +148,7 @@ LEARNED_P_VALUE = 1e-2
 """The p-value under the told noise below which a robot asks how noisy its own ranges are."""
 
 
-def _strays_test(fitted: Fit, own: Fit, pair: PairRanges, robot: int) -> Inconsistency:
+def _strays_test(fitted: Fit, own: Fit, pair: JointMeasurements, robot: int) -> Inconsistency:
     """Return the test of the number of strays among the ranges that depend on the peer.
 
     The rate of strays follows from the ranges to the own anchor and from what was told. The peer's ranges
@@ -164,9 +164,9 @@ def _strays_test(fitted: Fit, own: Fit, pair: PairRanges, robot: int) -> Inconsi
     strays = STRAYS_BEFORE + known * told + seen
     ranges = RANGES_BEFORE + known * (1.0 - told) + own.inliers
     stray = fitted.weights <= INLIER
-    tested = [(int(np.count_nonzero(stray)) - seen, len(stray) - pair.ranges.counts[robot])]
-    for kind in (1 - robot, 2):
-        tested += _from_either_end(stray[pair.ranges.rows(kind)])
+    tested = [(int(np.count_nonzero(stray)) - seen, len(stray) - len(own.residuals))]
+    for rows in (pair.ranges.to_anchors(1 - robot), pair.ranges.mutual):
+        tested += _from_either_end(stray[rows])
     p_value, count, total = min((beta_binomial_tail(k, n, strays, ranges), k, n) for k, n in tested)
     p_value = min(p_value * max(tested[0][0], 1), 1.0)
     what = f"measurements and reports of which {count} of {total} fit no other"
@@ -271,15 +271,16 @@ def _normal(chi2: float, free: int) -> float:
     return float(((max(chi2, 0.0) / free) ** (1.0 / 3.0) - (1.0 - spread)) / math.sqrt(spread))
 
 
-def _distance_score(fitted: Fit, pair: PairRanges) -> float:
+def _distance_score(fitted: Fit, pair: JointMeasurements) -> float:
     """Return by how many sigmas the ranges favour another distance of the anchors (score test, Rao 1948)."""
     of, walk = fitted.problem.measured, fitted.linear.walk
     x, y = walk.direction.T  # of a from b, which moves with M2
-    along = (x * pair.apart[0] + y * pair.apart[1]) / math.hypot(*pair.apart)
+    apart = of.pivot[1] - of.pivot[0]
+    along = (x * apart[0] + y * apart[1]) / math.hypot(*apart)
     score, information = fitted.linear.score(np.where(of.second >= 0, -along, 0.0))
     level = max(min(fitted.level, HIGHEST_LEVEL), 1.0)
     surveyed = 2.0 * pair.noise.priors.survey_error**2  # the variance of the known distance
-    if information * (pair.apart[0] ** 2 + pair.apart[1] ** 2) <= LEAST_INFORMATION:
+    if not information * (apart[0] ** 2 + apart[1] ** 2) > LEAST_INFORMATION:
         return 0.0
     return score / math.sqrt(information * (level + surveyed * information))
 

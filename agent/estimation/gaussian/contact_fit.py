@@ -8,8 +8,6 @@ this robot.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import msgspec
@@ -18,18 +16,18 @@ from msgspec.structs import replace
 
 from agent.estimation.claim import blocked, of_joint
 from agent.estimation.elementary import inverted
-from agent.estimation.fit import Start, fits
-from agent.estimation.gaussian.beacon_guesses import beacon_guesses
+from agent.estimation.fit import TO_THE_END, Start, fits
+from agent.estimation.gaussian.beacon_guesses import FEWEST_FOR_POSE
 from agent.estimation.gaussian.consistency import chi2_p_value
 from agent.estimation.gaussian.inference import covariance_of
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges, PosePrior
-from agent.estimation.gaussian.known_anchors import FEWEST_FOR_POSE, AnchoredRobot, scored_fits, start_of
-from agent.estimation.gaussian.odometry_noise import Errors, Track
-from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges
-from agent.estimation.posterior import JointHypotheses, JointHypothesis, certainties, with_probability
+from agent.estimation.gaussian.odometry_noise import Track
+from agent.estimation.gaussian.range_model import SIGMA_FLOOR
+from agent.estimation.gaussian.search import extended
+from agent.estimation.posterior import Posterior, certainties, follow, hypotheses_of
 from protocol.messages import Ranged
 from protocol.mission import Mission
-from protocol.motion import Covariance, Pose, rotated, wrap
+from protocol.motion import Covariance, Pose, wrap
 
 FINDER, OWN = 0, 1
 """The places of the two robots in a fit."""
@@ -71,14 +69,15 @@ def estimated(contact: ContactRanges, mission: Mission) -> ContactEstimate | Non
     measured = _measured(contact, mission)
     if len(measured.ranges.rho) < FEWEST_FOR_POSE:
         return None
-    found = with_probability(fits(measured, _starts(measured, mission)))
-    if not found:
+    finder = _finder_alone(measured)
+    found = extended(finder, measured) if finder.hypotheses else finder
+    if OWN not in found.located:
         return None
-    level = found[0].fit.level
+    level = found.hypotheses[0].fit.level
     if abs(level - 1.0) > SAME_LEVEL:  # the level is that of these measurements, not of the finder's pose
         measured = _with_level(measured, level)
-        found = with_probability(fits(measured, [one.fit.start for one in found]))
-    estimate = _estimate(found, measured, mission) if found else None
+        found = follow(found, measured, TO_THE_END)
+    estimate = _estimate(found, measured, mission) if found.hypotheses else None
     return estimate if estimate is not None and _is_sendable(estimate) else None
 
 
@@ -125,23 +124,11 @@ def _measured(contact: ContactRanges, mission: Mission) -> JointMeasurements:
     return measured.thinned(mission.sensing_range)
 
 
-def _starts(measured: JointMeasurements, mission: Mission) -> list[Start]:
-    """Return the poses from which fits begin: intersections of the circles about the finder's places."""
-    ranges, path, prior = measured.ranges, measured.paths[FINDER], measured.prior
-    assert prior is not None
-    c, s = math.cos(prior.mean[FINDER, 2]), math.sin(prior.mean[FINDER, 2])
-    x, y = path.x[ranges.tick], path.y[ranges.tick]
-    place = np.stack(rotated(c, s, x, y), 1)
-    as_anchors = Ranges(
-        ranges.rho, ranges.tick, ranges.sigma, (len(ranges.rho), 0, 0), place, np.zeros(len(x), np.intp)
-    )
-    robot = AnchoredRobot(measured.paths[OWN], as_anchors, mission.sensing_range, measured.noise)
-    starts = []
-    for one in scored_fits(robot, list(map(start_of, beacon_guesses(robot)))):
-        poses = np.stack((prior.mean[FINDER], one.fit.start.poses[0]))
-        nothing = Errors(np.zeros(0), np.zeros(0), np.zeros(0))
-        starts.append(Start(poses, (nothing, *one.fit.start.errors)))
-    return starts
+def _finder_alone(measured: JointMeasurements) -> Posterior:
+    """Return the finder with the pose that it has sent."""
+    alone = measured.some((FINDER,))
+    assert alone.prior is not None
+    return Posterior((FINDER,), hypotheses_of(fits(alone, [Start(alone.prior.mean)]), alone))
 
 
 def _with_level(measured: JointMeasurements, level: float) -> JointMeasurements:
@@ -151,19 +138,16 @@ def _with_level(measured: JointMeasurements, level: float) -> JointMeasurements:
     return replace(measured, prior=prior._replace(information=level * prior.information))
 
 
-def _estimate(
-    found: Sequence[JointHypothesis], measured: JointMeasurements, mission: Mission
-) -> ContactEstimate:
-    best, joint = found[0].fit, JointHypotheses((FINDER, OWN), tuple(found))
+def _estimate(found: Posterior, measured: JointMeasurements, mission: Mission) -> ContactEstimate:
+    best, certainty = found.hypotheses[0].fit, certainties(found)[OWN]
     mine = slice(3 * OWN, 3 * OWN + 3)
-    poses = [one.fit.poses[OWN].tolist() for one in found]
-    reach, certainty = mission.sensing_range, certainties(joint)[OWN]
+    poses = [one.fit.poses[OWN].tolist() for one in found.hypotheses]
     blocking = blocked(
-        of_joint("unanchored", OWN, joint, certainty, measured, reach, mission.accuracy, mission.confidence)
+        of_joint("unanchored", OWN, found, certainty, measured, mission.accuracy, mission.confidence)
     )
     return ContactEstimate(
         tuple([Pose(measured.origin[0] + x, measured.origin[1] + y, wrap(turn)) for x, y, turn in poses]),
-        tuple([one.probability for one in found]),
+        tuple([one.probability for one in found.hypotheses]),
         covariance_of(best.covariance[mine, mine]),
         blocking.reason if blocking is not None else "",
         chi2_p_value(best.chi2, best.freedom),

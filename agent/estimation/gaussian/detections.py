@@ -8,69 +8,71 @@ import numpy as np
 
 from agent.estimation.elementary import hypot, quadratic
 from agent.estimation.fit import Fit, deviation
+from agent.estimation.gaussian.joint_ranges import JointMeasurements, Silence
 from agent.estimation.gaussian.odometry_noise import Array, Places
-from agent.estimation.gaussian.pair_ranges import PairRanges
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
 from protocol.motion import rotated_back
-from protocol.noise import Noise
 
 
-def detection_log_likelihood(one: Fit, pair: PairRanges) -> float:
-    """Return the log-likelihood of all detections and ticks without one, given the fit."""
+def detection_log_likelihood(one: Fit, measured: JointMeasurements) -> float:
+    """Return the log-likelihood of all detections and of the ticks without one, given the fit.
+
+    It is 0 if a missing range says nothing.
+    """
     weight = 0.0
-    for robot in (0, 1):
-        ranged = pair.ranges.only(robot).tick
-        weight += anchor_log_likelihood(
-            one, robot, pair.silent[robot], ranged, pair.sensing_range, pair.noise
-        )
-    return weight + _mutual_log_likelihood(one, pair)
+    for silence in measured.silent:
+        if silence.second < 0:
+            ranged = measured.ranges.tick[measured.ranges.to_anchors(silence.first)]
+            weight += _anchor_log_likelihood(one, silence, ranged, measured)
+        else:
+            weight += _mutual_log_likelihood(one, silence, measured)
+    return weight
 
 
-def _mutual_log_likelihood(one: Fit, pair: PairRanges) -> float:
-    """Return the log-likelihood of no mutual detection at the ticks without a mutual range."""
-    silent = pair.silent[2]
+def _mutual_log_likelihood(one: Fit, silence: Silence, measured: JointMeasurements) -> float:
+    """Return the log-likelihood of no detection between two robots at the ticks without one."""
+    first, second, silent = silence
     if not len(silent):
         return 0.0
-    (wx, wy), (vx, vy) = (one.places(robot, silent) for robot in (0, 1))
+    (wx, wy), (vx, vy) = (one.places(robot, silent) for robot in (first, second))
     dx, dy = wx - vx, wy - vy
     distance = hypot(dx, dy)
     k = int(np.argmin(distance))
-    beyond = distance - pair.sensing_range
-    if beyond[k] > CLEAR * pair.sensing_range:
+    beyond = distance - measured.reach
+    if beyond[k] > CLEAR * measured.reach:
         return 0.0
     nx, ny = dx[k] / max(distance[k], SIGMA_FLOOR), dy[k] / max(distance[k], SIGMA_FLOOR)
-    gradient = np.empty(6)
-    beside = (vx[k] - pair.apart[0], vy[k] - pair.apart[1])
-    for robot, (x, y), sign in ((0, (wx[k], wy[k]), 1.0), (1, beside, -1.0)):
+    gradient, pivot = np.zeros(one.start.poses.size), one.problem.measured.pivot
+    for robot, at, sign in ((first, (wx[k], wy[k]), 1.0), (second, (vx[k], vy[k]), -1.0)):
+        x, y = at - pivot[robot]
         theta = one.start.poses[robot, 2]
         c, s = math.cos(theta), math.sin(theta)
         along, across = rotated_back(c, s, nx, ny)
         gradient[3 * robot : 3 * robot + 3] = (-sign * along, -sign * across, sign * (ny * x - nx * y))
-    sigma = math.hypot(deviation(quadratic(one.of_start, gradient)), EDGE * pair.sensing_range)
-    return no_detection_log_likelihood(beyond, sigma, pair.noise.drop_outs)
+    sigma = math.hypot(deviation(quadratic(one.of_start, gradient)), EDGE * measured.reach)
+    return no_detection_log_likelihood(beyond, sigma, measured.noise.drop_outs)
 
 
-def anchor_log_likelihood(
-    one: Fit, robot: int, silent: Places, ranged: Places, sensing_range: float, noise: Noise
-) -> float:
-    """Return the log-likelihood of detections by the anchor at `ranged`, and of none at `silent` (ticks)."""
+def _anchor_log_likelihood(one: Fit, silence: Silence, ranged: Places, measured: JointMeasurements) -> float:
+    """Return the log-likelihood of detections by the anchor at `ranged`, and of none in the `silence`."""
+    robot, weight, reach = silence.first, 0.0, measured.reach
     columns = slice(3 * robot, 3 * robot + 2)
-    place, weight = one.of_start[columns, columns], 0.0
+    place = one.of_start[columns, columns]
     anchor, turn = one.problem.measured.pivot[robot], one.start.poses[robot, 2]
     c, s = math.cos(turn), math.sin(turn)
-    for ticks, sign in ((silent, 1.0), (ranged, -1.0)):
+    for ticks, sign in ((silence.ticks, 1.0), (ranged, -1.0)):
         if not len(ticks):
             continue
         x, y = one.places(robot, ticks) - anchor[:, None]
-        beyond = sign * (hypot(x, y) - sensing_range)
+        beyond = sign * (hypot(x, y) - reach)
         worst = int(np.argmin(beyond))
-        if beyond[worst] > CLEAR * sensing_range:
+        if beyond[worst] > CLEAR * reach:
             continue
         along = np.array(rotated_back(c, s, x[worst], y[worst]))
         u = along / max(math.hypot(x[worst], y[worst]), SIGMA_FLOOR)
-        sigma = math.hypot(deviation(quadratic(place, u)), EDGE * sensing_range)
+        sigma = math.hypot(deviation(quadratic(place, u)), EDGE * reach)
         if sign > 0.0:
-            weight += no_detection_log_likelihood(beyond, sigma, noise.drop_outs)
+            weight += no_detection_log_likelihood(beyond, sigma, measured.noise.drop_outs)
         else:
             weight += _log_cdf(float(beyond[worst]) / sigma)
     return weight

@@ -3,42 +3,39 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
 
 from agent.estimation.elementary import hypot, log
 from agent.estimation.fit import Fit, Start, fits
-from agent.estimation.gaussian.odometry_noise import Track
-from agent.estimation.gaussian.pair_ranges import PairRanges
-from agent.estimation.gaussian.range_model import Ranges
+from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges
 
 
-def anchor_evidence(one: Fit, path: Track, ranges: Ranges, sensing_range: float) -> float:
+def anchor_evidence(one: Fit, own: JointMeasurements) -> float:
     """Return the logarithm of the Bayes factor for the fit of one robot, against ranges by chance.
 
     It compares marginal likelihoods: that of the ranges if the anchor is anywhere within R of the start, with
     the other unknowns integrated out (Laplace), and that of ranges that have nothing to do with each other
     (see `_log_widths`).
     """
-    prior = math.log(math.pi * sensing_range**2)
-    return one.weight + math.log(2.0 * math.pi) - prior + _log_widths((path,), ranges, sensing_range)
+    prior = math.log(math.pi * own.reach**2)
+    return one.weight + math.log(2.0 * math.pi) - prior + _log_widths(own, own.ranges)
 
 
 @lru_cache(maxsize=4)
-def own_fit(joint: Fit, robot: int, pair: PairRanges) -> Fit | None:
-    """Return the fit of one robot (0 or 1) to its own anchor alone, which begins at that of both robots.
+def own_fit(joint: Fit, robot: int, measured: JointMeasurements) -> Fit | None:
+    """Return the fit of one robot to its own anchor alone, which begins at that of all robots.
 
     There is none if a number is too large for a float.
     """
-    guess, measured = joint.guess[3 * robot : 3 * robot + 2], pair.of(robot)
+    guess = joint.guess[3 * robot : 3 * robot + 2]
     start = Start(np.array([[-guess[0], -guess[1], 0.0]]), joint.start.errors[robot : robot + 1])
-    return next(iter(fits(measured, [start])), None)
+    return next(iter(fits(measured.alone(robot), [start])), None)
 
 
 @lru_cache(maxsize=2)
-def mutual_evidence(one: Fit, pair: PairRanges) -> float:
+def mutual_evidence(one: Fit, pair: JointMeasurements) -> float:
     """Return the logarithm of the Bayes factor for the mutual ranges under a fit of both robots.
 
     It is that of `anchor_evidence`, given the ranges to the anchors. All headings are equally probable.
@@ -49,17 +46,17 @@ def mutual_evidence(one: Fit, pair: PairRanges) -> float:
         return -math.inf
     weight = one.weight - math.log(2.0 * math.pi)
     weight -= sum(own)
-    return weight + _log_widths(pair.paths, pair.ranges.only(2), pair.sensing_range)
+    return weight + _log_widths(pair, pair.ranges.rows(pair.ranges.mutual))
 
 
-def _log_widths(paths: Sequence[Track], ranges: Ranges, sensing_range: float) -> float:
+def _log_widths(measured: JointMeasurements, ranges: JointRanges) -> float:
     """Return the logarithm of the volume (m^n) over which n ranges spread that fit each other by chance.
 
     The first is anywhere within R. Each of the others differs from the last by as much as the robots have
     moved since at the most, and by the noise.
     """
-    moved = np.zeros(max(len(ranges.tick) - 1, 0))
-    for path in paths:
+    moved, sensing_range = np.zeros(max(len(ranges.tick) - 1, 0)), measured.reach
+    for path in measured.paths:
         ticks = np.minimum(ranges.tick, len(path.v))
         moved += hypot(np.diff(path.x[ticks]), np.diff(path.y[ticks]))
     width = np.full(len(ranges.tick), sensing_range)

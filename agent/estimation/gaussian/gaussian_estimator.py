@@ -6,14 +6,15 @@ import math
 from typing import ClassVar
 
 import msgspec
+import numpy as np
 
 from agent.estimation.claim import Blocked, claim, of_pair
 from agent.estimation.closed_forms import Placement
 from agent.estimation.estimator import AnchorEstimate, Estimator, FittedBranch, PairEstimate
 from agent.estimation.exact import Branch
 from agent.estimation.gaussian import inference
-from agent.estimation.gaussian.hypotheses import search
 from agent.estimation.gaussian.inference import PlanningHypothesis
+from agent.estimation.gaussian.search import search
 from agent.estimation.knowledge import Knowledge
 from protocol.messages import Localised, Observation, Undecided, Verdict
 from protocol.mission import RANGE_MARGIN
@@ -75,9 +76,9 @@ class GaussianEstimator(msgspec.Struct, frozen=True):
             return None
         pair = inference.pair_of(knowledge)
         known_through = inference.known_through(knowledge)
-        if known_through < knowledge.tick or pair.ranges.counts[2] < FEWEST_MUTUAL_RANGES:
+        if known_through < knowledge.tick or np.count_nonzero(pair.ranges.mutual) < FEWEST_MUTUAL_RANGES:
             return None
-        scored = search(pair)
+        scored = search(pair, fewest=FEWEST_MUTUAL_RANGES).hypotheses
         hypotheses = inference.pair_planning_hypotheses(scored)
         judged = of_pair("paper", knowledge.config, scored, pair)
         found = claim(judged)
@@ -86,9 +87,7 @@ class GaussianEstimator(msgspec.Struct, frozen=True):
         failure = f"the paper's manoeuvres give no further ranges: {reason}"
         if not scored:
             verdict = Undecided(failure)
-        belief = inference.with_pair(
-            knowledge, scored, hypotheses, pair, judged and judged.inconsistency, reason
-        )
+        belief = inference.with_pair(knowledge, scored, hypotheses, judged and judged.inconsistency, reason)
         placements = tuple([_pose_in_b_frame(one) for one in hypotheses])
         return PairEstimate(
             belief, verdict, placements, ORIGIN, ORIGIN, checked=False, observations=(), failure=failure

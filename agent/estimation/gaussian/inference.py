@@ -18,15 +18,16 @@ from agent.estimation.exact import Branch
 from agent.estimation.fit import Fit, deviation
 from agent.estimation.gaussian.consistency import Inconsistency
 from agent.estimation.gaussian.evidence import anchor_evidence
-from agent.estimation.gaussian.hypotheses import ScoredHypothesis, missing, of_anchor
-from agent.estimation.gaussian.odometry_noise import Array, Track, track, variances
+from agent.estimation.gaussian.joint_ranges import JointMeasurements, Listed, Silence, near_anchors
+from agent.estimation.gaussian.odometry_noise import Array, Places, Track, track, variances
 from agent.estimation.gaussian.own_sensors import Doubt, doubt
-from agent.estimation.gaussian.pair_ranges import PairRanges
 from agent.estimation.gaussian.placement_guesses import STARTS
-from agent.estimation.gaussian.range_model import SIGMA_FLOOR, Ranges
+from agent.estimation.gaussian.range_model import SIGMA_FLOOR
+from agent.estimation.gaussian.search import of_anchor
 from agent.estimation.knowledge import Belief, Knowledge
+from agent.estimation.posterior import Hypothesis
 from agent.peer.motion_log import MotionLog
-from protocol.messages import Localised
+from protocol.messages import Localised, RobotConfig
 from protocol.mission import Mission
 from protocol.motion import Covariance, Pose, Segment, compose, inverse, relative, wrap
 from protocol.noise import VelocityNoise
@@ -104,27 +105,32 @@ def own_path(knowledge: Knowledge) -> Track:
     return path_of(knowledge.log, 0, knowledge.tick, knowledge.config.mission)
 
 
-def _own_measurements(knowledge: Knowledge) -> tuple[Track, Ranges]:
+def _own_measurements(knowledge: Knowledge) -> JointMeasurements:
     """Return the odometry of the robot and its ranges to its anchor, without those that do not count."""
     mission, now, first = knowledge.config.mission, knowledge.tick, _own_beginning(knowledge)
-    ranges = Ranges.of_lists(_ranges_within(knowledge.log, first, now), (), (), mission.noise)
-    return path_of(knowledge.log, first, now, mission), ranges
+    ranges = _ranges_within(knowledge.log, first, now)
+    silent = Silence(0, -1, _missing(ranges, now + 1, first))
+    own = near_anchors(
+        [path_of(knowledge.log, first, now, mission)],
+        *([ranges], [(0.0, 0.0)], mission.noise, mission.sensing_range),
+        silent=(silent,),
+    )
+    return own.alone(0)
 
 
-def _possible(ranges: Ranges, mission: Mission) -> Ranges:
-    """Return the ranges that need not be outliers; two robots change one by twice their speed at the most."""
-    return ranges.within(mission.sensing_range, mission.noise.priors, 2.0 * mission.max_speed)
-
-
-def own_anchor(knowledge: Knowledge) -> tuple[ScoredHypothesis, ...]:
+def own_anchor(knowledge: Knowledge) -> tuple[Hypothesis, ...]:
     """Return the hypotheses about the anchor in the frame of the odometry, the most probable first."""
-    mission = knowledge.config.mission
-    path, ranges = _own_measurements(knowledge)
-    possible = _possible(ranges, mission).thinned(mission.noise)
-    if not len(possible.rho):
-        return ()
-    silent = missing(ranges.tick, knowledge.tick + 1, _own_beginning(knowledge))
-    return of_anchor(knowledge.belief.own, path, possible, silent, mission.sensing_range, mission.noise)
+    own = _own_measurements(knowledge)
+    own = own.thinned(own.reach)
+    return of_anchor(knowledge.belief.own, own) if len(own.ranges.rho) else ()
+
+
+def _missing(ranges: Listed, end: int, first: int) -> Places:
+    """Return the ticks from `first` on and before `end` without one of `ranges`."""
+    silent = np.ones(end, bool)
+    silent[:first] = False
+    silent[[tick for tick, _ in ranges]] = False
+    return np.flatnonzero(silent)
 
 
 def _ranges_within(log: MotionLog, first: int, through: int) -> list[tuple[int, float]]:
@@ -138,25 +144,16 @@ def sensor_doubt(knowledge: Knowledge) -> Doubt | None:
     It explains the own measurements better than the noise that the robot was told, or all without a
     contradiction.
     """
-    mission = knowledge.config.mission
-    path, ranges = _own_measurements(knowledge)
-    return doubt(
-        path,
-        ranges.thinned(mission.noise),
-        mission.sensing_range,
-        mission.noise,
-        pair_of(knowledge),
-        0 if knowledge.config.role == "a" else 1,
-    )
+    own = _own_measurements(knowledge).thinned_after()
+    return doubt(own, pair_of(knowledge), 0 if knowledge.config.role == "a" else 1)
 
 
-def with_own(knowledge: Knowledge, scored: Sequence[ScoredHypothesis]) -> Belief:
+def with_own(knowledge: Knowledge, scored: Sequence[Hypothesis]) -> Belief:
     """Return the belief with the hypotheses `scored` about its anchor, and with the most probable branch."""
-    own = tuple([one.hypothesis for one in scored])
     branches = tuple([branch_of(knowledge, one) for one in scored])
     fitted = len(knowledge.log.ranges)
     return replace(
-        knowledge.belief, own=own, branches=branches, branch=branches[0], ranges_at_last_fit=fitted
+        knowledge.belief, own=tuple(scored), branches=branches, branch=branches[0], ranges_at_last_fit=fitted
     )
 
 
@@ -176,9 +173,9 @@ whose odometry is noisy strays from its place; with less, the fits take most of 
 """
 
 
-def branch_of(knowledge: Knowledge, scored: ScoredHypothesis) -> Branch:
+def branch_of(knowledge: Knowledge, scored: Hypothesis) -> Branch:
     """Return the trajectory of `scored` as a branch, whose start and odometry lead to the present pose."""
-    ((x, y, _),) = scored.hypothesis.poses
+    x, y, _ = scored.fit.start.poses[0].tolist()
     frame = math.atan2(y, x)
     now = relative(Pose(0.0, 0.0, frame), Pose(*scored.fit.poses[0].tolist()))
     start = compose(now, inverse(knowledge.odometry))
@@ -195,26 +192,24 @@ def anchor_planning_hypotheses(knowledge: Knowledge) -> list[PlanningHypothesis]
         pose = compose(branch.start, knowledge.odometry)
         c, s = math.cos(branch.alpha), math.sin(branch.alpha)
         turn = np.array(((c, -s), (s, c)))
-        covariance = product(product(turn, np.array(one.covariance)[:2, :2]), turn.T)
+        covariance = product(product(turn, one.fit.of_start[:2, :2]), turn.T)
         now = np.array((pose.x, pose.y, pose.heading))
         hypotheses.append(PlanningHypothesis(one.probability, now, covariance))
     return hypotheses
 
 
-def is_anchor_known(knowledge: Knowledge, scored: Sequence[ScoredHypothesis]) -> bool:
+def is_anchor_known(knowledge: Knowledge, scored: Sequence[Hypothesis]) -> bool:
     """Return whether the anchor's position is known well enough to end phase 1."""
     mission, best = knowledge.config.mission, scored[0]
     good = int(np.count_nonzero(best.fit.weights > 0.5))
-    if good < LEAST_RANGES or best.hypothesis.probability < SURE_OF_BRANCH:
+    if good < LEAST_RANGES or best.probability < SURE_OF_BRANCH:
         return False
     if _anchor_sigma(best.fit) > mission.required_anchor_sigma:
         return False
     if mission.noise.outliers or good >= ANCHOR_RANGES:
         return good >= (ANCHOR_RANGES_WITH_OUTLIERS if mission.noise.outliers else ANCHOR_RANGES)
-    path, ranges = _own_measurements(knowledge)
-    possible = _possible(ranges, mission)
-    evidence = anchor_evidence(best.fit, path, possible, mission.sensing_range)
-    return evidence >= ANCHOR_EVIDENCE
+    own = _own_measurements(knowledge)
+    return anchor_evidence(best.fit, own.thinned(own.reach)) >= ANCHOR_EVIDENCE
 
 
 def _anchor_sigma(fit: Fit) -> float:
@@ -271,8 +266,8 @@ def peer_log_suffices(knowledge: Knowledge) -> bool:
     return known_through(knowledge) >= knowledge.log.moved(knowledge.config.mission.noise.standstill_bound)
 
 
-def pair_of(knowledge: Knowledge) -> PairRanges:
-    """Return the ranges and odometry of both robots.
+def pair_of(knowledge: Knowledge) -> JointMeasurements:
+    """Return the ranges and odometry of both robots; the first is robot a, and M1 is the origin.
 
     The own data reach up to now, and the peer's up to the last tick that both logs cover.
     """
@@ -283,26 +278,30 @@ def pair_of(knowledge: Knowledge) -> PairRanges:
         logs, ends = ((peer, knowledge.log), (last, knowledge.tick, last))
     first = beginning(knowledge, last)
     firsts = (first, 0, first)
+    own = [_ranges_within(log, *within) for log, *within in zip(logs, firsts, ends, strict=False)]
     mutual = [(one.tick, one.range) for one in knowledge.mutual if first <= one.tick <= last]
-    lists = [_ranges_within(log, *within) for log, *within in zip(logs, firsts, ends, strict=False)]
-    ranges = Ranges.of_lists(lists[0], lists[1], mutual, mission.noise)
-    silent = [missing(ranges.tick[ranges.rows(kind)], ends[kind] + 1, firsts[kind]) for kind in range(3)]
-    ranges = _possible(ranges, mission).thinned(mission.noise)
-    own, other = config.anchor, config.peer_anchor
-    sign = 1.0 if config.role == "a" else -1.0
-    return PairRanges(
+    silent = [
+        Silence(*robots, _missing(ranges, end + 1, begin))
+        for robots, ranges, end, begin in zip(
+            ((0, -1), (1, -1), (0, 1)), (*own, mutual), ends, firsts, strict=True
+        )
+    ]
+    measured = near_anchors(
         (path_of(logs[0], first, ends[0], mission), path_of(logs[1], 0, ends[1], mission)),
-        ranges,
-        (silent[0], silent[1], silent[2]),
-        (sign * (other.x - own.x), sign * (other.y - own.y)),
-        mission.sensing_range,
-        mission.noise,
+        *(own, ((0.0, 0.0), m2_of(config)), mission.noise, mission.sensing_range, mutual, tuple(silent)),
     )
+    return measured.thinned(mission.sensing_range)
 
 
-def pair_planning_hypotheses(scored: Sequence[ScoredHypothesis]) -> tuple[PlanningHypothesis, ...]:
+def m2_of(config: RobotConfig) -> tuple[float, float]:
+    """Return the place (m) of M2 relative to M1."""
+    m1, m2 = config.m1, config.peer_anchor if config.role == "a" else config.anchor
+    return m2.x - m1.x, m2.y - m1.y  # the same bits for both robots
+
+
+def pair_planning_hypotheses(scored: Sequence[Hypothesis]) -> tuple[PlanningHypothesis, ...]:
     """Return the hypotheses about both poses relative to M1, in the form that planning needs."""
-    return tuple([_pair_planning_hypothesis(one.hypothesis.probability, one.fit) for one in scored])
+    return tuple([_pair_planning_hypothesis(one.probability, one.fit) for one in scored])
 
 
 @lru_cache(maxsize=STARTS)
@@ -312,9 +311,8 @@ def _pair_planning_hypothesis(probability: float, one: Fit) -> PlanningHypothesi
 
 def with_pair(
     knowledge: Knowledge,
-    scored: Sequence[ScoredHypothesis],
+    scored: Sequence[Hypothesis],
     hypotheses: Sequence[PlanningHypothesis],
-    pair: PairRanges,
     inconsistency: Inconsistency | None,
     blocking_reason: str | None,
 ) -> Belief:
@@ -325,11 +323,11 @@ def with_pair(
     """
     config = knowledge.config
     robot, m1 = 0 if config.role == "a" else 1, config.m1
-    claims = [localised(to_second_order(one, pair.apart), robot, (m1.x, m1.y)) for one in hypotheses]
+    claims = [localised(to_second_order(one, m2_of(config)), robot, (m1.x, m1.y)) for one in hypotheses]
     first, _ = knowledge.belief.candidates or (len(scored), 0)
     return replace(
         knowledge.belief,
-        pair=tuple(one.hypothesis for one in scored),
+        pair=tuple(scored),
         poses=tuple([one.pose for one in claims]),
         odometry=knowledge.odometry,
         covariance=claims[0].covariance if claims else None,

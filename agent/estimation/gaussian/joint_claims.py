@@ -7,13 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.elementary import hypot
 from agent.estimation.fit import Fit, deviation
 from agent.estimation.gaussian.consistency import LEAST_INFORMATION
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
-from agent.estimation.gaussian.joint_search import FEWEST_DECISIVE, beacons
-from agent.estimation.gaussian.odometry_noise import Places
-from agent.estimation.gaussian.pair_ranges import MOVED
+from agent.estimation.gaussian.search import FEWEST_DECISIVE, beacons
 
 OPEN = 0.5
 """The sigma of a position from which on a robot has no pose, as a fraction of the longest range."""
@@ -64,7 +61,7 @@ def displaced_anchor(fit: Fit, used: JointMeasurements) -> Displacement | None:
     return most if most.anchor else None
 
 
-def decisive_ranges(robot: int, used: JointMeasurements, reach: float) -> int:
+def decisive_ranges(robot: int, used: JointMeasurements) -> int:
     """Return the number of ranges of a robot from different places, if it has one anchor without those to it.
 
     Ranges to one anchor leave a circle. A range counts if one of the two ends has moved since the last.
@@ -74,21 +71,10 @@ def decisive_ranges(robot: int, used: JointMeasurements, reach: float) -> int:
         rows = np.flatnonzero(pair)
         ends = int(ranges.first[rows[0]]), int(ranges.second[rows[0]])
         if robot in ends:
-            count = _places(ends, ranges.tick[rows], used, reach)
+            count = len(used.from_places(ends, ranges.tick[rows]))
             total += count
             of_anchors += [count] if ends[1] < 0 or used.is_anchor(ends[1]) else []
     return total - (sum(of_anchors) if len(of_anchors) == 1 else 0)
-
-
-def _places(ends: tuple[int, int], ticks: Places, used: JointMeasurements, reach: float) -> int:
-    """Return the number of ranges at `ticks` that are the first, or follow a motion of one of both `ends`."""
-    moved = np.zeros(len(ticks), bool)
-    moved[:1] = True
-    for end in ends:
-        if end >= 0 and not used.is_anchor(end):
-            x, y = used.paths[end].x[ticks], used.paths[end].y[ticks]
-            moved[1:] |= hypot(np.diff(x), np.diff(y)) > MOVED * reach
-    return int(np.count_nonzero(moved))
 
 
 def undetermined(robot: int, located: tuple[int, ...], measured: JointMeasurements) -> str:
@@ -112,11 +98,11 @@ def undetermined(robot: int, located: tuple[int, ...], measured: JointMeasuremen
     return "too few of its ranges are from different places, or no pose explains them"
 
 
-def open_position(robot: int, fit: Fit, reach: float) -> str:
+def open_position(robot: int, fit: Fit, measured: JointMeasurements) -> str:
     """Return why a located robot has no pose: its ranges leave its position open; else an empty text."""
     own = np.diagonal(fit.covariance)[3 * robot : 3 * robot + 2]
     sigma = deviation(float(own[0] + own[1]))
-    if sigma <= OPEN * reach:
+    if sigma <= OPEN * measured.reach:
         return ""
     how = f"to a sigma of {sigma:.3g} m" if math.isfinite(sigma) else "without a bound"
     return f"its ranges leave its position open {how}"

@@ -18,8 +18,31 @@ from numpy.typing import NDArray
 from agent.estimation.elementary import hypot
 from agent.estimation.facts import AnchorPlace, Facts, Manoeuvre, MeasuredRange
 from agent.estimation.gaussian.odometry_noise import Array, Places, Track, track
-from agent.estimation.gaussian.range_model import IMPOSSIBLE, MOST_CORRELATED_RANGES, SIGMA_FLOOR, Ranges
-from protocol.noise import Noise
+from agent.estimation.gaussian.range_model import SIGMA_FLOOR
+from protocol.noise import Noise, Priors, VelocityNoise
+
+IMPOSSIBLE = 6.0
+"""The number of sigmas beyond R from which a range is an outlier under any guess."""
+
+MOVED = 0.01
+"""The fraction of R that a robot must have moved for a range to count as one from another place."""
+
+HELD = 1e24
+"""The information (1 / rad^2) of a heading that is held: more than any ranges have."""
+
+MOST_CORRELATED_RANGES = 96
+"""The most ranges of a pair of radios that a fit weighs if odometry is noisy.
+
+The cost of a fit is linear in their number. Old ranges tell little of the present pose then. Missions of the
+sweep `noise` have up to 70; with a bound of less than that, they would take longer; with more, each search.
+"""
+
+MOST_RANGES_BY_EXACT_ODOMETRY = 2048
+"""The most ranges of a pair of radios without white odometry noise. The cost is linear, and old ranges tell
+as much as new ones.
+
+With it, a tick takes 10 ms. A mission that needs more ranges than that does not reach its accuracy.
+"""
 
 MOST_MUTUAL_RANGES = 1024
 """The most ranges between robots in one fit, of all pairs together; see MOST_CORRELATED_RANGES.
@@ -52,12 +75,27 @@ class JointRanges(msgspec.Struct, frozen=True, dict=True, eq=False):
     @cached_property
     def pairs(self) -> list[NDArray[np.bool]]:
         """The ranges of each pair of radios that has some; shapes (N,)."""
-        return self.single.pairs
+        # numpy.unique would import numpy.ma in the first search of a mission
+        return [self.radio == one for one in sorted(set(self.radio.tolist()) - {-1})]
 
-    @cached_property
-    def single(self) -> Ranges:
-        """All ranges as if they were those of one robot, for models that do not ask who measured them."""
-        return Ranges(self.rho, self.tick, self.sigma, (len(self.rho), 0, 0), self.place, self.radio)
+    def common_errors(self, priors: Priors) -> Array:
+        """Return the effect (m) of one sigma of each constant error on the ranges; shape (N, m).
+
+        The errors are a bias of all ranges, a scale, a bias of each pair of radios, and a delay. The scale
+        multiplies the measured ranges: then the effects are the same under each guess. The column of the
+        delay is in s: its effect is minus the range rate (see `smoother`).
+        """
+        rho = self.rho
+        columns: list[Array] = []
+        if priors.range_bias:
+            columns.append(np.full(len(rho), priors.range_bias))
+        if priors.range_scale:
+            columns.append(priors.range_scale * rho)
+        if priors.pair_bias:
+            columns += [np.where(own, priors.pair_bias, 0.0) for own in self.pairs]
+        if priors.range_delay:
+            columns.append(np.full(len(rho), priors.range_delay))
+        return np.array(columns).T if columns else np.zeros((len(rho), 0))
 
     def rows(self, some: NDArray[np.bool] | Places) -> JointRanges:
         """Return the ranges selected by `some`."""
@@ -73,6 +111,17 @@ class JointRanges(msgspec.Struct, frozen=True, dict=True, eq=False):
         involved: NDArray[np.bool] = (self.first == robot) | (self.second == robot)
         return involved
 
+    def to_anchors(self, robot: int) -> NDArray[np.bool]:
+        """Return which ranges are those of a robot to its anchors; shape (N,)."""
+        own: NDArray[np.bool] = (self.first == robot) & (self.second < 0)
+        return own
+
+    @property
+    def mutual(self) -> NDArray[np.bool]:
+        """Which ranges are between robots; shape (N,)."""
+        between: NDArray[np.bool] = self.second >= 0
+        return between
+
 
 class PosePrior(NamedTuple):
     """A normal prior of the poses of n robots at tick 0."""
@@ -85,6 +134,25 @@ class PosePrior(NamedTuple):
     """The rank of `information`: the number of unknowns that it determines."""
     log_information: float = 0.0
     """The logarithm of its determinant for these unknowns, if evidences with other priors are compared."""
+
+    def some(self, chosen: Sequence[int]) -> PosePrior | None:
+        """Return the prior of the `chosen` robots, of which nothing is known together with others."""
+        own = np.add.outer(3 * np.array(chosen), np.arange(3)).ravel()
+        information = self.information[np.ix_(own, own)]
+        known = np.diagonal(information)[np.diagonal(information) > 0.0].tolist()
+        if not known:
+            return None
+        return PosePrior(self.mean[list(chosen)], information, len(known), sum(map(math.log, known)))
+
+
+class Silence(NamedTuple):
+    """The ticks in which a range was possible, but not measured."""
+
+    first: int
+    """The index of the robot, or of the first of two."""
+    second: int
+    """The index of the second robot; -1 if a range to the anchor of the robot was possible."""
+    ticks: Places
 
 
 class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
@@ -111,6 +179,34 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
 
     Empty if none is an anchor.
     """
+    reach: float = math.inf
+    """The longest range (m) that is expected."""
+    silent: tuple[Silence, ...] = ()
+    """The ticks without a range of each pair of radios; empty if a missing range says nothing."""
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether `other` has the same measurements, to the bit."""
+        return isinstance(other, JointMeasurements) and self._content == other._content
+
+    def __hash__(self) -> int:
+        """Return the hash of all measurements."""
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        return hash(self._content)
+
+    @cached_property
+    def _content(self) -> tuple[object, ...]:
+        """All measurements as values that can be compared."""
+        ranges = tuple([part.tobytes() for part in msgspec.structs.astuple(self.ranges)])
+        silent = tuple([(first, second, ticks.tobytes()) for first, second, ticks in self.silent])
+        prior = self.prior and (self.prior.mean.tobytes(), self.prior.information.tobytes())
+        paths = tuple([path.content for path in self.paths])
+        return (
+            *(self.robots, self.anchors, self.radios, paths, ranges, self.period, self.origin),
+            *(self.noise, prior, self.surveyed, self.reach, silent),
+        )
 
     def is_anchor(self, robot: int) -> bool:
         """Return whether one of `robots` is an anchor."""
@@ -158,24 +254,93 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
             ranges=self.ranges.rows(self.ranges.tick <= tick),
         )
 
+    @cached_property
+    def pivots(self) -> Array:
+        """The pivot of each robot: the mean place of its anchors; NaN, without any, for its start; (n, 2)."""
+        ranges, found = self.ranges, np.full((len(self.robots), 2), math.nan)
+        for i in range(len(found)):
+            own = ranges.to_anchors(i) & (ranges.radio >= 0)
+            places = dict.fromkeys([tuple(place) for place in ranges.place[own].tolist()])
+            if places:
+                found[i] = [math.fsum(axis) / len(places) for axis in zip(*places, strict=True)]
+        return found
+
+    @property
+    def loosened(self) -> Array:
+        """The variance (m^2) that constant and slow errors add to each range; shape (N,)."""
+        priors, ranges = self.noise.priors, self.ranges
+        of_biases = priors.range_bias**2 + priors.pair_bias**2 + priors.slow_sigma**2
+        variance: Array = np.square(priors.range_scale * ranges.rho) + of_biases
+        return variance + np.square(priors.range_delay * self.speeds) if priors.range_delay else variance
+
     def thinned(self, reach: float) -> JointMeasurements:
         """Return the measurements with as many ranges as a fit weighs, and none that must be an outlier.
 
-        Of each pair of radios they are all recent ones and some older ones (see `Ranges.thinned`). `reach` is
-        the longest range (m) that is expected.
+        Of each pair of radios they are all recent ones and some older ones, so that the cost of a tick is
+        bounded. `reach` is the longest range (m) that is expected.
         """
-        ranges, priors = self.ranges, self.noise.priors
-        loose = np.sqrt(np.square(ranges.sigma) + ranges.single.loosened(priors, self.speeds))
-        ranges = ranges.rows(ranges.rho <= reach + IMPOSSIBLE * loose)
-        pairs = ranges.pairs
+        possible = self.ranges.rho <= reach + IMPOSSIBLE * np.sqrt(
+            np.square(self.ranges.sigma) + self.loosened
+        )
+        ranges = self.ranges if possible.all() else self.ranges.rows(possible)
+        return msgspec.structs.replace(self, ranges=ranges, reach=reach).thinned_after()
+
+    def thinned_after(self, tick: int = -1, most: int | None = None) -> JointMeasurements:
+        """Return all ranges up to `tick`, and at most `most` of each pair of radios after it.
+
+        Which of the older ones are left changes only when their number doubles. Of many pairs of robots,
+        fewer are left (see MOST_MUTUAL_RANGES).
+        """
+        ranges, pairs = self.ranges, self.ranges.pairs
+        if most is None:
+            correlated = self.noise.odometry != VelocityNoise() or self.noise.priors.slow_sigma > 0.0
+            most = MOST_CORRELATED_RANGES if correlated else MOST_RANGES_BY_EXACT_ODOMETRY
         mutual = sum(1 for own in pairs if ranges.second[np.argmax(own)] >= 0)
-        most = min(MOST_CORRELATED_RANGES, max(MOST_MUTUAL_RANGES // max(mutual, 1), WEIGHED_OF_PAIR))
+        of_pair = min(most, max(MOST_MUTUAL_RANGES // max(mutual, 1), WEIGHED_OF_PAIR))
         left = np.zeros(len(ranges.rho), bool)
         for own in pairs:
             rows = np.flatnonzero(own)
-            bound = most if ranges.second[rows[0]] >= 0 else MOST_CORRELATED_RANGES
-            left[rows[_recent(len(rows), bound)]] = True
-        return msgspec.structs.replace(self, ranges=ranges if left.all() else ranges.rows(left))
+            before = int(np.count_nonzero(ranges.tick[rows] <= tick))
+            bound = of_pair if ranges.second[rows[0]] >= 0 else most
+            left[rows[:before]] = True
+            left[rows[before + _recent(len(rows) - before, bound)]] = True
+        return self if left.all() else msgspec.structs.replace(self, ranges=ranges.rows(left))
+
+    def from_places(self, ends: tuple[int, int], ticks: Places) -> Places:
+        """Return the indices of `ticks` that are the first, or follow a motion of one of both `ends`."""
+        moved = np.zeros(len(ticks), bool)
+        moved[:1] = True
+        for end in ends:
+            if end >= 0 and not self.is_anchor(end):
+                x, y = self.paths[end].x[ticks], self.paths[end].y[ticks]
+                moved[1:] |= hypot(np.diff(x), np.diff(y)) > MOVED * self.reach
+        return np.flatnonzero(moved)
+
+    @cached_property
+    def mutual_places(self) -> Places:
+        """The indices of the mutual ranges of a pair that are the first, or follow a motion of a robot."""
+        return self.from_places((0, 1), self.ranges.tick[self.ranges.mutual])
+
+    def alone(self, robot: int) -> JointMeasurements:
+        """Return the measurements of one robot near its anchor, which is the origin.
+
+        One anchor does not tell the heading at tick 0: it is held at 0, so the axes are those of the
+        odometry. Where the anchor should be does not matter, so there is no surveying error.
+        """
+        own = self.ranges.rows(self.ranges.to_anchors(robot))
+        nothing = np.zeros(len(own.rho), np.intp)
+        ranges = msgspec.structs.replace(own, first=nothing, place=np.zeros((len(nothing), 2)), radio=nothing)
+        silent = [one._replace(first=0) for one in self.silent if (one.first, one.second) == (robot, -1)]
+        return msgspec.structs.replace(
+            self,
+            robots=("",),
+            paths=(self.paths[robot],),
+            ranges=ranges,
+            origin=(0.0, 0.0),
+            noise=msgspec.structs.replace(self.noise, survey_error=0.0),
+            prior=PosePrior(np.zeros((1, 3)), np.diag((0.0, 0.0, HELD)), 1, math.log(HELD)),
+            silent=tuple(silent),
+        )
 
     def some(self, chosen: Sequence[int]) -> JointMeasurements:
         """Return the measurements of the `chosen` robots alone, in ascending order.
@@ -183,6 +348,8 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
         All anchors with a sigma are chosen, too: they are the last ones.
         """
         chosen = (*[one for one in chosen if one not in self.placed], *self.placed)
+        if chosen == tuple(range(len(self.robots))):
+            return self
         surveyed = tuple([self.surveyed[one] for one in chosen]) if self.surveyed else ()
         index = np.full(len(self.robots) + 1, -2)  # the last entry is that of second == -1
         index[list(chosen)] = np.arange(len(chosen))
@@ -196,7 +363,14 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
             paths=tuple([self.paths[one] for one in chosen]),
             ranges=moved.rows((first >= 0) & (second >= -1)),
             surveyed=surveyed,
-            prior=_prior(surveyed),
+            prior=self.prior and self.prior.some(chosen),
+            silent=tuple(
+                [
+                    Silence(int(index[one.first]), int(index[one.second]), one.ticks)
+                    for one in self.silent
+                    if index[one.first] >= 0 and index[one.second] >= -1
+                ]
+            ),
         )
 
 
@@ -214,6 +388,44 @@ def _recent(count: int, most: int) -> Places:
     return np.concatenate((np.arange(0, older, step), np.arange(older, count)))
 
 
+Listed = Sequence[tuple[int, float]]
+"""Ticks and ranges in m, as the robots log them."""
+
+
+def near_anchors(
+    paths: Sequence[Track],
+    own: Sequence[Listed],
+    places: Sequence[tuple[float, float]],
+    noise: Noise,
+    reach: float,
+    mutual: Listed = (),
+    silent: tuple[Silence, ...] = (),
+) -> JointMeasurements:
+    """Return the measurements of robots with one anchor each, the first of which is the origin.
+
+    `own` contains the ranges of each to its anchor, whose place (m) is in `places`. `mutual` contains those
+    between the first two.
+    """
+    lists, robots = [*own, mutual], len(paths)
+    counts = [len(one) for one in lists]
+    kind = np.repeat(np.arange(robots + 1), counts)
+    sigmas = [noise.anchor_sigma] * robots + [noise.mutual_sigma]
+    ranges = JointRanges(
+        np.array([rho for ranges in lists for _, rho in ranges], np.float64),
+        np.array([tick for ranges in lists for tick, _ in ranges], np.intp),
+        np.repeat([max(sigma, SIGMA_FLOOR) for sigma in sigmas], counts),
+        kind % robots,
+        np.where(kind == robots, 1, -1),
+        np.repeat(np.array([*places, (0.0, 0.0)]), counts, 0),
+        kind,
+    )
+    return JointMeasurements(
+        *(("a", "b")[:robots], (), (), tuple(paths), ranges, paths[0].period, (0.0, 0.0), noise),
+        reach=reach,
+        silent=silent,
+    )
+
+
 class _Row(NamedTuple):
     """A range with the names of its radios, in the order of the ranges of a fit."""
 
@@ -224,8 +436,10 @@ class _Row(NamedTuple):
     measured: MeasuredRange
 
 
-def joint_measurements(facts: Facts, noise: Noise, period: float) -> JointMeasurements:
-    """Return the measurements in `facts`, with ticks of `period` s.
+def joint_measurements(
+    facts: Facts, noise: Noise, period: float, reach: float = math.inf
+) -> JointMeasurements:
+    """Return the measurements in `facts`, with ticks of `period` s. No range above `reach` m is expected.
 
     The path of a robot reaches to its first unknown manoeuvre; ranges after it are not used, nor those to
     anchors of which no position is known.
@@ -277,6 +491,7 @@ def joint_measurements(facts: Facts, noise: Noise, period: float) -> JointMeasur
         noise,
         _prior(anchors),
         anchors,
+        reach,
     )
 
 

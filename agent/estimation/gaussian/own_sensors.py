@@ -16,11 +16,9 @@ from agent.estimation.fit import Fit, Start, fits
 from agent.estimation.gauss_newton import FIT_STEPS, Convergence
 from agent.estimation.gaussian.anchor_guesses import anchors
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, consistency_test
-from agent.estimation.gaussian.hypotheses import search, starts_about
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
-from agent.estimation.gaussian.odometry_noise import Track, rescaled
-from agent.estimation.gaussian.pair_ranges import PairRanges, alone
-from agent.estimation.gaussian.range_model import Ranges
+from agent.estimation.gaussian.odometry_noise import rescaled
+from agent.estimation.gaussian.search import search, starts_about
 from protocol.noise import PROFILES, UNTOLD_SIGMA, Noise, ProfileName
 
 DOUBTED_EVIDENCE = 3.0
@@ -86,26 +84,17 @@ ALL = "the ranges and the odometry"
 """All measurements."""
 
 
-def doubt(
-    path: Track,
-    ranges: Ranges,
-    sensing_range: float,
-    noise: Noise,
-    pair: PairRanges | None = None,
-    robot: int = 0,
-) -> Doubt | None:
+def doubt(own: JointMeasurements, pair: JointMeasurements | None = None, robot: int = 0) -> Doubt | None:
     """Return the profile that explains a contradiction between the reports of the peer and the own ranges.
 
-    It explains the own `ranges` along `path` much better than `noise`; or about as well, and those of the
-    `pair` without a contradiction, as `robot` (0 or 1) tests it.
+    It explains the `own` ranges to the anchor much better than the told noise; or about as well, and those of
+    the `pair` without a contradiction, as `robot` (0 or 1) tests it.
     """
-    if len(ranges.rho) < FEWEST_RANGES:
+    noise = own.noise
+    if len(own.ranges.rho) < FEWEST_RANGES:
         return None
-    told = _log_evidence(path, ranges, sensing_range, noise)
-    others = {
-        name: _log_evidence(path, ranges, sensing_range, _profile(name, noise)) - told
-        for name in _others(noise)
-    }
+    told = _log_evidence(own)
+    others = {name: _log_evidence(_near_anchor(own, _profile(name, noise))) - told for name in _others(noise)}
     found = _best(OWN_SENSORS, others, DOUBTED_EVIDENCE)
     if found is not None or pair is None:
         return found
@@ -137,14 +126,14 @@ def contradiction(fitted: Fit, measured: JointMeasurements) -> Doubt | None:
     return _best(ALL, others, DOUBTFUL_CLAIM)
 
 
-def _explains(name: ProfileName, pair: PairRanges, robot: int) -> bool:
+def _explains(name: ProfileName, pair: JointMeasurements, robot: int) -> bool:
     """Return whether the ranges and reports that `robot` (0 or 1) has are consistent under a profile.
 
     The priors of the profile are smaller for accurate ranges, as the default ones are.
     """
     under = replace(pair, noise=_profile(name, pair.noise, _share(pair.noise)))
-    scored = search(under)
-    return bool(scored) and consistency_test(scored[0].fit, under, robot).p_value >= CLAIM_P_VALUE
+    found = search(under).hypotheses
+    return bool(found) and consistency_test(found[0].fit, under, robot).p_value >= CLAIM_P_VALUE
 
 
 def _others(noise: Noise) -> list[ProfileName]:
@@ -196,8 +185,12 @@ def _profile(name: ProfileName, noise: Noise, share: float = 1.0) -> Noise:
     )
 
 
-def _log_evidence(path: Track, ranges: Ranges, sensing_range: float, noise: Noise) -> float:
-    """Return the log evidence of the ranges under `noise`, with the anchor's position integrated out."""
-    points = anchors(path, ranges, sensing_range, noise)
-    found = fits(alone(path, ranges, noise), starts_about(points))
+def _near_anchor(own: JointMeasurements, noise: Noise) -> JointMeasurements:
+    """Return the measurements of one robot near its anchor under other `noise`."""
+    return replace(own, noise=noise).alone(0)
+
+
+def _log_evidence(own: JointMeasurements) -> float:
+    """Return the log evidence of the ranges to the anchor, with its position integrated out."""
+    found = fits(own, starts_about(anchors(own)))
     return max([one.weight for one in found], default=-math.inf)

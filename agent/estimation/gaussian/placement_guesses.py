@@ -23,6 +23,7 @@ from agent.estimation.gaussian.anchor_guesses import (
     UNLIKELY,
     spread_out,
 )
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.odometry_noise import (
     Array,
     Errors,
@@ -36,8 +37,7 @@ from agent.estimation.gaussian.odometry_noise import (
     symmetric,
     wander,
 )
-from agent.estimation.gaussian.pair_ranges import PairRanges
-from agent.estimation.gaussian.range_model import SIGMA_FLOOR, inlier_probability, mixture
+from agent.estimation.gaussian.range_model import SIGMA_FLOOR, inlier_probability, log_likelihood
 from protocol.motion import rotated, rotated_back
 
 SCAN = 72
@@ -164,7 +164,7 @@ def _encounter(own: Fit, base: int, ticks: Places) -> Encounter:
     return Encounter(x, y, axes * sigmas, inverse, of_anchor, odometry, since)
 
 
-def placements(own: tuple[Fit, Fit], pair: PairRanges) -> list[Placed]:
+def placements(own: tuple[Fit, Fit], pair: JointMeasurements) -> list[Placed]:
     """Return the most likely starts of a fit of both robots, given the mutual ranges, the likeliest first.
 
     `own` contains a fit of each robot to the ranges to its anchor. Their odometry noise before the encounter
@@ -176,34 +176,33 @@ def placements(own: tuple[Fit, Fit], pair: PairRanges) -> list[Placed]:
     (Section III.C with one circle rotated). The circle about its anchor is also tried with other radii,
     within its uncertainty. The other mutual ranges determine which candidates are likely.
     """
-    mutual = pair.ranges.rows(2)
-    ticks, rho, sigma = pair.ranges.tick[mutual], pair.ranges.rho[mutual], pair.ranges.sigma[mutual]
-    places = pair.places if len(pair.places) >= SEED_RANGES else np.arange(len(ticks))
-    some = places[spread_out(len(places))]
-    loose = pair.ranges.loosened(pair.noise.priors, pair.measured.speeds)
-    sigma = np.sqrt(np.square(sigma) + loose[mutual])
-    ticks, rho, sigma = ticks[some], rho[some], sigma[some]
+    mutual = np.flatnonzero(pair.ranges.mutual)
+    places = pair.mutual_places if len(pair.mutual_places) >= SEED_RANGES else np.arange(len(mutual))
+    some = mutual[places[spread_out(len(places))]]
+    ticks, rho = pair.ranges.tick[some], pair.ranges.rho[some]
+    sigma = np.sqrt(np.square(pair.ranges.sigma[some]) + pair.loosened[some])
     middle = len(ticks) // 2
     robots = [_encounter(one, int(ticks[middle]), ticks) for one in own]
     radii = [float(np.mean(hypot(one.x, one.y))) for one in robots]
     near, far = (0, 1) if radii[0] < radii[1] else (1, 0)
     sign = 1.0 if far == 0 else -1.0
-    apart = (sign * pair.apart[0], sign * pair.apart[1])  # from the far robot's anchor to the near one's
-    lever = np.array([max(radii[robot], SHORTEST_LEVER * pair.sensing_range) for robot in (near, far)])
+    between = (pair.pivots[1] - pair.pivots[0]).tolist()
+    apart = (sign * between[0], sign * between[1])  # from the far robot's anchor to the near one's
+    lever = np.array([max(radii[robot], SHORTEST_LEVER * pair.reach) for robot in (near, far)])
     ends = sorted({0, len(ticks) - 1})
     z = np.concatenate([_scanned(robots[near], robots[far], i, float(rho[i]), apart, lever) for i in ends])
     z, likely = _turned(z, (robots[near], robots[far]), middle, rho, sigma, apart, lever, pair)
     found = []
-    for one, log_likelihood in zip(z, likely.tolist(), strict=True):
+    for one, likelihood in zip(z, likely.tolist(), strict=True):
         poses, errors = np.empty((2, 3)), []
         for i, robot in enumerate((near, far)):
             (mx, my), more = robots[robot].begun(own[robot], one[2 + 3 * i : 5 + 3 * i])
-            turn, (at_x, at_y) = float(one[i]), pair.anchors[robot]
+            turn, (at_x, at_y) = float(one[i]), pair.pivots[robot]
             dx, dy = rotated(math.cos(turn), math.sin(turn), mx, my)
             poses[robot] = at_x - dx, at_y - dy, turn
             errors.append(more)
         in_order = errors if near == 0 else errors[::-1]
-        found.append(Placed(Start(poses, tuple([one for more in in_order for one in more])), log_likelihood))
+        found.append(Placed(Start(poses, tuple([one for more in in_order for one in more])), likelihood))
     return found
 
 
@@ -245,7 +244,7 @@ def _turned(
     sigma: Array,
     apart: tuple[float, float],
     lever: Array,
-    pair: PairRanges,
+    pair: JointMeasurements,
 ) -> tuple[Array, Array]:
     """Return the most likely of `z` after refinement by Gauss-Newton, with their log-likelihoods.
 
@@ -275,7 +274,7 @@ def _turned(
         z[:, :unknowns] += change * np.minimum(1.0, TURN / longest)
         if len(z) > CROWD:
             likely, gap = _likelihood(z, hypot(sigma, coarse * FINER_TURN ** (step + 1)), residuals_at, pair)
-            z = z[_thinned(z, likely, gap, lever, SAME_POSITION * pair.sensing_range)]
+            z = z[_thinned(z, likely, gap, lever, SAME_POSITION * pair.reach)]
     return _likeliest(z, hypot(sigma, coarse * FINER_TURN**steps), residuals_at, lever, pair)
 
 
@@ -292,11 +291,11 @@ def _thinned(z: Array, likely: Array, gap: Array, lever: Array, near: float) -> 
 
 
 def _likelihood(
-    z: Array, sigma: Array, residuals_at: Callable[..., Residuals], pair: PairRanges
+    z: Array, sigma: Array, residuals_at: Callable[..., Residuals], pair: JointMeasurements
 ) -> tuple[Array, Array]:
     """Return the log-likelihood of `z`, (n,), and the vector between the robots, (n, 2), in m."""
     residuals, _, gap = residuals_at(z)
-    return mixture(residuals, sigma, pair.noise)[0] - 0.5 * np.sum(np.square(z[:, 2:]), 1), gap
+    return log_likelihood(residuals, sigma, pair.noise) - 0.5 * np.sum(np.square(z[:, 2:]), 1), gap
 
 
 def _residuals_at(
@@ -342,7 +341,7 @@ def _likeliest(
     sigma: Array,
     residuals_at: Callable[..., Residuals],
     lever: Array,
-    pair: PairRanges,
+    pair: JointMeasurements,
 ) -> tuple[Array, Array]:
     """Return the most likely of `z`, at most STARTS, and their log-likelihoods, the likeliest first.
 
@@ -350,7 +349,7 @@ def _likeliest(
     likelihood falls between them.
     """
     likely, gap = _likelihood(z, sigma, residuals_at, pair)
-    near = MERGED_WITHIN * pair.sensing_range + TWINS * float(np.min(sigma))
+    near = MERGED_WITHIN * pair.reach + TWINS * float(np.min(sigma))
     left = np.flatnonzero(likely >= np.max(likely) - UNLIKELY)
     left = left[np.argsort(-likely[left], kind="stable")]
     chosen: list[int] = []

@@ -18,6 +18,7 @@ from msgspec.structs import replace
 from agent.estimation.elementary import hypot
 from agent.estimation.fit import Start, deviation, fits
 from agent.estimation.gauss_newton import Convergence
+from agent.estimation.gaussian.joint_ranges import JointMeasurements, near_anchors
 from agent.estimation.gaussian.odometry_noise import (
     Array,
     Projection,
@@ -27,8 +28,6 @@ from agent.estimation.gaussian.odometry_noise import (
     variances,
     wander,
 )
-from agent.estimation.gaussian.pair_ranges import PairRanges
-from agent.estimation.gaussian.range_model import Ranges
 from protocol.mission import Mission
 from protocol.motion import rotated
 from protocol.noise import Noise, VelocityNoise
@@ -148,18 +147,17 @@ def reference_sigma(mission: Mission, distance: float, noise: Noise) -> float:
     gap = hypot(ax - bx, ay - by)
     together = range(AROUND_ANCHOR + 1, AROUND_ANCHOR + TOGETHER + 2)
     white = replace(noise, odometry=VelocityNoise(), outliers=0.0, strays=0.0, sigma_degrees=0.0)
-    ranges = Ranges.of_lists(lists[0], lists[1], [(tick, float(gap[tick])) for tick in together], white)
-    nothing = np.empty(0, np.intp)
-    pair = PairRanges((paths[0], paths[1]), ranges, (nothing, nothing, nothing), apart, reach, white)
+    mutual = [(tick, float(gap[tick])) for tick in together]
+    pair = near_anchors(paths, lists, ((0.0, 0.0), apart), white, reach, mutual)
     return max(position_sigmas(pair, np.array(starts)))
 
 
-def position_sigmas(pair: PairRanges, poses: Array) -> list[float]:
+def position_sigmas(pair: JointMeasurements, poses: Array) -> list[float]:
     """Return the sigma (m) of each robot's last position if their `poses` at tick 0, (2, 3), are the truth.
 
     It is infinite if the ranges do not determine the poses.
     """
-    for fit in fits(pair.measured, [Start(poses)], Convergence(0)):
+    for fit in fits(pair, [Start(poses)], Convergence(0)):
         return [deviation(float(fit.covariance[i, i] + fit.covariance[i + 1, i + 1])) for i in (0, 3)]
     return [math.inf, math.inf]
 

@@ -126,11 +126,11 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
         """Return the path of the antenna of a robot, in the frame of its first pose."""
         return self.joint.paths[self.joint.robots.index(robot)]
 
-    def until(self, epoch: int) -> tuple[JointMeasurements, float]:
-        """Return what was measured up to the end of `epoch`, from 0 on, and the assumed sensing range (m)."""
+    def until(self, epoch: int) -> JointMeasurements:
+        """Return what was measured up to the end of `epoch`, from 0 on; see HORIZON."""
         known = self.joint.until((epoch + 1) * self.ticks_per_epoch)
         reach = HORIZON * max(float(np.max(known.ranges.rho, initial=0.0)), SHORTEST_RANGE_M)
-        return known.thinned(reach), reach
+        return known.thinned(reach)
 
 
 @contextmanager

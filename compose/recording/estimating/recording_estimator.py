@@ -10,8 +10,6 @@ import numpy as np
 
 from agent.estimation.claim import BEFORE_SEARCH, blocked, of_joint
 from agent.estimation.fit import Fit
-from agent.estimation.gauss_newton import FIT_STEPS
-from agent.estimation.gaussian.consistency import FINISHED
 from agent.estimation.gaussian.joint_claims import (
     Displacement,
     displaced_anchor,
@@ -19,8 +17,8 @@ from agent.estimation.gaussian.joint_claims import (
     undetermined,
 )
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
-from agent.estimation.gaussian.joint_search import candidates, extended, follow, merged, search
-from agent.estimation.posterior import NO_HYPOTHESES, Certainty, JointHypotheses, JointHypothesis, certainties
+from agent.estimation.gaussian.search import candidates, extended, search
+from agent.estimation.posterior import NO_HYPOTHESES, Certainty, Hypothesis, Posterior, certainties, settled
 from compose.recording.estimating.recorded_measurements import Measurements, numerics
 from compose.recording.ranging.range_recording import Numbers
 from protocol.motion import wrap
@@ -108,7 +106,7 @@ class RecordingEstimator:
     def __init__(self, rule: ClaimRule) -> None:
         self._rule = rule
         self._next = 0
-        self._known: JointHypotheses = NO_HYPOTHESES
+        self._known: Posterior = NO_HYPOTHESES
         self._searched = self._searches = 0
         self._failed: dict[tuple[int, ...], int] = {}
         self._claimed: set[str] = set()
@@ -135,48 +133,44 @@ class RecordingEstimator:
 
     def _epoch(self, measured: Measurements, number: int) -> EstimateEpoch:
         """Return the estimate at the end of the epoch with this `number`, from 0 on, in their order."""
-        used, reach = measured.until(number)
-        found = self._extended(self._followed(used), used, reach)
+        used = measured.until(number)
+        found = self._extended(self._followed(used), used)
         count = len(used.ranges.rho)
-        due = found.scored and any(self._searched < at <= count for at in GROUP_SEARCHES)
-        reasons = self._reasons(found, used, reach)
+        due = found.hypotheses and any(self._searched < at <= count for at in GROUP_SEARCHES)
+        reasons = self._reasons(found, used)
         claiming = {name for name, reason in reasons.items() if not reason} - self._claimed
         if claiming and not due and self._searches >= MOST_SEARCHES:
             reasons |= dict.fromkeys(sorted(claiming), GIVEN_UP)
         elif due or claiming:
-            found, self._searched = merged(found, search(used, reach)), count
+            found, self._searched = search(used, found), count
             self._searches += 1
-            reasons = self._reasons(found, used, reach)
+            reasons = self._reasons(found, used)
         self._known = found
         self._claimed |= {name for name, reason in reasons.items() if not reason}
-        return _result(measured, number, used, found, reasons, reach)
+        return _result(measured, number, used, found, reasons)
 
-    def _followed(self, used: JointMeasurements) -> JointHypotheses:
+    def _followed(self, used: JointMeasurements) -> Posterior:
         """Return the known hypotheses with the latest ranges; a fit that still moves takes more steps."""
-        if not self._known.scored:
-            return NO_HYPOTHESES
-        found = follow(self._known, used)
-        if found.scored and found.scored[0].fit.last_step > FINISHED:
-            found = follow(found, used, FIT_STEPS)
-        return found if found.scored else NO_HYPOTHESES
+        found = settled(self._known, used)
+        return found if found.hypotheses else NO_HYPOTHESES
 
-    def _extended(self, found: JointHypotheses, used: JointMeasurements, reach: float) -> JointHypotheses:
+    def _extended(self, found: Posterior, used: JointMeasurements) -> Posterior:
         """Return `found` with further robots; those that failed are tried again with more ranges."""
         possible = candidates(found.located, used)
         failed = [one for one in possible if one.decisive < MORE_RANGES * self._failed.get(one.robots, 0)]
         if len(failed) == len(possible):
             return found
-        more = extended(found, used, reach, failed)
+        more = extended(found, used, failed)
         for one in candidates(more.located, used):
             if one not in failed:
                 self._failed[one.robots] = one.decisive
         return more
 
-    def _reasons(self, found: JointHypotheses, used: JointMeasurements, reach: float) -> dict[str, str]:
+    def _reasons(self, found: Posterior, used: JointMeasurements) -> dict[str, str]:
         """Return what blocks the claim of each located robot; an empty text if nothing does."""
         part = used.some(found.located)
         judged = {
-            part.robots[i]: of_joint("recording", i, found, certainty, part, reach, *self._rule)
+            part.robots[i]: of_joint("recording", i, found, certainty, part, *self._rule)
             for i, certainty in enumerate(certainties(found))
             if not part.is_anchor(i)
         }
@@ -184,7 +178,7 @@ class RecordingEstimator:
         if claiming:
             count = len(part.ranges.rho)
             if count >= RETESTED * self._tested or not claiming <= self._claimed:
-                self._tested, self._displaced = count, displaced_anchor(found.scored[0].fit, part)
+                self._tested, self._displaced = count, displaced_anchor(found.hypotheses[0].fit, part)
             judged = {name: one._replace(displaced=self._displaced) for name, one in judged.items()}
         reasons = {name: blocked(one) for name, one in judged.items()}
         return {name: one.reason if one is not None else "" for name, one in reasons.items()}
@@ -194,15 +188,14 @@ def _result(
     measured: Measurements,
     number: int,
     used: JointMeasurements,
-    found: JointHypotheses,
+    found: Posterior,
     reasons: dict[str, str],
-    reach: float,
 ) -> EstimateEpoch:
     """Return the estimate at the end of an epoch, by what was `found` with what is `used`."""
     names, part = [one.id for one in measured.robots], used.some(found.located)
     place = {used.robots[robot]: i for i, robot in enumerate(found.located)}
     without = {
-        name: open_position(place[name], found.scored[0].fit, reach)
+        name: open_position(place[name], found.hypotheses[0].fit, used)
         if name in place
         else undetermined(used.robots.index(name), found.located, used)
         for name in names
@@ -215,18 +208,16 @@ def _result(
     return EstimateEpoch(
         float(measured.ends[number]),
         tuple(np.bincount(part.ranges.radio, minlength=len(measured.joint.radios)).tolist()),
-        tuple([_of_centres(one, places, measured) for one in found.scored]),
+        tuple([_of_centres(one, places, measured) for one in found.hypotheses]),
         tuple([reasons.get(name) == "" for name in names]),
         reason[0] + more if reason else "",
-        EpochFit(found.scored[0].fit, part) if found.scored else None,
+        EpochFit(found.hypotheses[0].fit, part) if found.hypotheses else None,
         tuple([sure[place[name]] if name in place else Certainty(0, 0.0) for name in names]),
         without,
     )
 
 
-def _of_centres(
-    one: JointHypothesis, places: Sequence[int | None], measured: Measurements
-) -> PosesHypothesis:
+def _of_centres(one: Hypothesis, places: Sequence[int | None], measured: Measurements) -> PosesHypothesis:
     """Return a hypothesis about the centres of robots; their antennas are at `places` in the fit."""
     poses, covariance = np.full((len(places), 3), np.nan), np.full((len(places), 3, 3), np.nan)
     for i, k in enumerate(places):
