@@ -152,13 +152,16 @@ TO_THE_END = Convergence()
 """The convergence of fits from which a claim may follow."""
 
 
-def fits(measured: JointMeasurements, starts: Iterable[Start], until: Convergence = TO_THE_END) -> list[Fit]:
+def fits(
+    measured: JointMeasurements, starts: Iterable[Start], until: Convergence = TO_THE_END, doubted: int = 0
+) -> list[Fit]:
     """Return the fits to all ranges in `measured` that begin at `starts`.
 
-    A start from which there is none, because a number is too large for a float, is left out.
+    Fits also begin at the first `doubted` ones without their outliers. A start from which there is no fit,
+    because a number is too large for a float, is left out.
     """
-    problem, found = Problem.of(measured), []
-    for start in starts:
+    problem, found, starts = Problem.of(measured), [], list(starts)
+    for start in (*starts, *_without_outliers(problem, measured, starts[:doubted])):
         try:
             found.append(_fit(problem, problem.kernel.fitted(*_begin(problem, start), until)))
         except Singular:
@@ -188,14 +191,13 @@ def held_fit(measured: JointMeasurements, begun: Fit, steps: int) -> HeldFit:
     return HeldFit(_evidence(problem, found) - volume, found.final.walk.place[:, -1])
 
 
-def without_outliers(measured: JointMeasurements, starts: Sequence[Start]) -> list[Start]:
+def _without_outliers(problem: Problem, measured: JointMeasurements, starts: Sequence[Start]) -> list[Start]:
     """Return the `starts` under which some range is an outlier, with weights that leave these ranges out.
 
     The weights follow from the residuals and the sigmas of the ranges alone, as if the start were exact.
     Without them, a fit first allows for the uncertainty of the odometry too, which can explain an outlier
     and draw the fit away from the start.
     """
-    problem = Problem.of(measured)
     if not problem.weighing.robust:
         return []
     kernel, found = problem.kernel, []

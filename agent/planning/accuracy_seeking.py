@@ -367,10 +367,10 @@ def _decide_phase3(state: RobotState, planned: JointManoeuvres) -> RobotState:
     mutual = int(np.count_nonzero(pair.ranges.mutual))
     if mutual < FEWEST_FOR_CLAIM:
         return _drive_without_hypotheses(state)
-    scored, hypotheses, belief, judged, searched = inferred(state, pair)
+    belief, judged, searched = inferred(state, pair)
     if searched:
         belief = replace(belief, ranges_at_last_search=mutual)
-    tested = replace(state, belief=belief)
+    tested, hypotheses = replace(state, belief=belief), inference.pair_planning_hypotheses(belief.pair)
     if searched and len(pair.mutual_places) >= sufficient_mutual_ranges(mission.noise):
         tested = with_consistency_test(tested)
     if tested.verdict is None and belief.blocking_reason is None:
@@ -381,7 +381,7 @@ def _decide_phase3(state: RobotState, planned: JointManoeuvres) -> RobotState:
         return tested
     if role == "a" and _measures_in_vain(state, pair):
         return _leave(tested)
-    if not scored:
+    if not hypotheses:
         return _drive_without_hypotheses(tested)
     since, objective = _objective(state, "peer", pair.paths)
     manoeuvres = _manoeuvres(state, objective) or planned

@@ -26,12 +26,11 @@ from agent.estimation.gaussian.consistency import (
     INCONSISTENT_SEARCHES,
     rejecting_p_value,
 )
-from agent.estimation.gaussian.inference import PlanningHypothesis
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.own_sensors import DOUBTFUL_CLAIMS
 from agent.estimation.gaussian.search import search
 from agent.estimation.knowledge import Belief, Knowledge
-from agent.estimation.posterior import PAIR, Hypothesis, Posterior, follow
+from agent.estimation.posterior import PAIR, Posterior, follow
 from agent.planning.state import Done, RobotState
 from protocol.messages import Localised
 
@@ -46,8 +45,6 @@ whenever the best fit still moves. More searches cost time; with fewer, robots p
 class PairInference(NamedTuple):
     """The hypotheses about both robots in one tick."""
 
-    scored: tuple[Hypothesis, ...]
-    hypotheses: tuple[PlanningHypothesis, ...]
     belief: Belief
     judged: Judged | None
     """The first hypothesis, as the conditions for a claim see it; None if there is none."""
@@ -61,30 +58,30 @@ def inferred(state: Knowledge, pair: JointMeasurements) -> PairInference:
     The whole plane is searched if nothing is known, at the counts PAIR_SEARCHES, if the best fit still moves,
     because it may be on its way to another mode, and before a claim or a suspicion.
     """
-    known, mutual = Posterior(PAIR, state.belief.pair), int(np.count_nonzero(pair.ranges.mutual))
+    known, mutual = (
+        follow(Posterior(PAIR, state.belief.pair), pair),
+        int(np.count_nonzero(pair.ranges.mutual)),
+    )
     due = any(state.belief.ranges_at_last_search < count <= mutual for count in PAIR_SEARCHES)
-    known = follow(known, pair)
     if known.hypotheses and known.has_converged and not due:
-        followed = weighed(state, pair, known.hypotheses, searched=False)
+        followed = _inference(state, pair, known, searched=False)
         blocking, test = followed.belief.blocking_reason, followed.belief.inconsistency
         if blocking is not None and (test is None or test.p_value >= CLAIM_P_VALUE):
             return followed
-    return weighed(state, pair, search(pair, known).hypotheses, searched=True)
+    return _inference(state, pair, search(pair, known), searched=True)
 
 
-def weighed(
-    state: Knowledge, pair: JointMeasurements, scored: tuple[Hypothesis, ...], *, searched: bool
+def _inference(
+    state: Knowledge, pair: JointMeasurements, found: Posterior, *, searched: bool
 ) -> PairInference:
-    """Return the hypotheses `scored` with the belief that follows from them."""
-    hypotheses = inference.pair_planning_hypotheses(scored)
-    judged = of_pair("assured", state.config, scored, pair)
+    """Return the hypotheses that were `found`, with the belief that follows from them."""
+    judged = of_pair("assured", state.config, found.hypotheses, pair)
     if judged is not None and not isinstance(state.peer_state.verdict, Localised):
         judged = judged._replace(rivals_of=(0, 1))
-    found = blocked(judged, BEFORE_SEARCH)
-    belief = inference.with_pair(
-        state, scored, hypotheses, judged and judged.inconsistency, found and found.reason
-    )
-    return PairInference(scored, hypotheses, belief, judged, searched)
+    blocking = blocked(judged, BEFORE_SEARCH)
+    reason = blocking.reason if blocking is not None else None
+    belief = inference.with_pair(state, found.hypotheses, judged and judged.inconsistency, reason)
+    return PairInference(belief, judged, searched)
 
 
 def with_claim(state: RobotState, judged: Judged | None) -> tuple[RobotState, Rival | None]:

@@ -87,7 +87,7 @@ class GaussianEstimator(msgspec.Struct, frozen=True):
         failure = f"the paper's manoeuvres give no further ranges: {reason}"
         if not scored:
             verdict = Undecided(failure)
-        belief = inference.with_pair(knowledge, scored, hypotheses, judged and judged.inconsistency, reason)
+        belief = inference.with_pair(knowledge, scored, judged and judged.inconsistency, reason)
         placements = tuple([_pose_in_b_frame(one) for one in hypotheses])
         return PairEstimate(
             belief, verdict, placements, ORIGIN, ORIGIN, checked=False, observations=(), failure=failure

@@ -312,18 +312,20 @@ def _pair_planning_hypothesis(probability: float, one: Fit) -> PlanningHypothesi
 def with_pair(
     knowledge: Knowledge,
     scored: Sequence[Hypothesis],
-    hypotheses: Sequence[PlanningHypothesis],
     inconsistency: Inconsistency | None,
     blocking_reason: str | None,
 ) -> Belief:
     """Return the belief with the hypotheses `scored` about both robots' poses in <W>.
 
-    `hypotheses` contains the same in the form that planning needs. The others are what follows from the
-    first one for a claim: the result of its consistency test, and what blocks the claim.
+    The others are what follows from the first one for a claim: the result of its consistency test, and what
+    blocks the claim.
     """
     config = knowledge.config
     robot, m1 = 0 if config.role == "a" else 1, config.m1
-    claims = [localised(to_second_order(one, m2_of(config)), robot, (m1.x, m1.y)) for one in hypotheses]
+    claims = [
+        localised(to_second_order(one, m2_of(config)), robot, (m1.x, m1.y))
+        for one in pair_planning_hypotheses(scored)
+    ]
     first, _ = knowledge.belief.candidates or (len(scored), 0)
     return replace(
         knowledge.belief,

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
-from agent.estimation.fit import Start, fits, without_outliers
+from agent.estimation.fit import Start, fits
 from agent.estimation.gauss_newton import Convergence
 from agent.estimation.gaussian.anchor_guesses import SEED_RANGES, UNLIKELY, anchors
 from agent.estimation.gaussian.beacon_guesses import beacon_guesses, start_of
@@ -285,8 +285,7 @@ def _of_pair(pair: JointMeasurements) -> tuple[Hypothesis, ...]:
     ]
     found.sort(key=lambda one: -one[0])
     starts = [start for weight, start in found[:STARTS] if weight > found[0][0] - UNLIKELY]
-    starts += without_outliers(pair, starts[:STARTS_WITHOUT_OUTLIERS])
-    return hypotheses_of(fits(pair, starts), pair)
+    return hypotheses_of(fits(pair, starts, doubted=STARTS_WITHOUT_OUTLIERS), pair)
 
 
 def _until_now(pair: JointMeasurements, robot: int) -> list[Hypothesis]:
