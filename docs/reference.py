@@ -19,7 +19,7 @@ import msgspec
 from msgspec import NODEFAULT
 from msgspec import inspect as types
 
-from agent.estimation import claim
+from agent.estimation import claim, judged
 from compose.cli.commands import COMMANDS
 from compose.cli.main import command_parser
 from compose.cli.removed import REMOVED
@@ -261,11 +261,11 @@ def _participant(name: str) -> str:
 
 def claim_conditions() -> str:
     """Return the table of the conditions for a claim, in their order, and of those whom each concerns."""
-    users = get_args(claim.User)
+    users = get_args(judged.User)
     rows = [
         [
             f"`{one.name}`",
-            " ".join((one.blocks.__doc__ or "").format_map(vars(claim)).split()),
+            " ".join((one.blocks.__doc__ or "").format_map(vars(judged) | vars(claim)).split()),
             *["yes" if user in one.users else "-" for user in users],
         ]
         for one in claim.CONDITIONS

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from agent.estimation import claim, posterior
+from agent.estimation import judged, posterior
 from agent.estimation.gaussian import inference, search
 from agent.estimation.gaussian.range_weights import Weighing
 from agent.planning import phase3_last_manoeuvre
@@ -123,7 +123,7 @@ def bias() -> None:
 def consistency() -> None:
     """The test of consistency never alarms."""
     wrapped(
-        claim, "consistency_test", lambda before, *given: before(*given)._replace(sigmas=0.0, p_value=1.0)
+        judged, "consistency_test", lambda before, *given: before(*given)._replace(sigmas=0.0, p_value=1.0)
     )
 
 

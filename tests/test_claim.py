@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from agent.estimation.claim import CONDITIONS, Blocked, Judged, User, blocked, claim
+from agent.estimation.claim import CONDITIONS, Blocked, blocked, claim
+from agent.estimation.judged import Judged, User
 from agent.planning import pair_claim
 from compose.launch.in_process import run_mission
 from protocol.messages import Localised

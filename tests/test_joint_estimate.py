@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares  # type: ignore[import-untyped]
 from scipy.stats import binom, chi2  # type: ignore[import-untyped]
 
-from agent.estimation.claim import BEFORE_SEARCH, blocked, of_joint
+from agent.estimation.claim import BEFORE_SEARCH, blocked
 from agent.estimation.facts import (
     AnchorPlace,
     Facts,
@@ -27,6 +27,7 @@ from agent.estimation.gaussian.joint_claims import displaced_anchor, undetermine
 from agent.estimation.gaussian.joint_ranges import MOST_MUTUAL_RANGES, JointMeasurements, joint_measurements
 from agent.estimation.gaussian.odometry_noise import constant_errors, track, variances
 from agent.estimation.gaussian.search import search
+from agent.estimation.judged import of_joint
 from agent.estimation.posterior import Certainty, Posterior, certainties
 from tests.moving_groups import NOISE, PERIOD_S, MovingGroup, moving_group
 

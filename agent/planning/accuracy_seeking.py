@@ -14,11 +14,11 @@ from functools import partial
 import numpy as np
 from msgspec.structs import replace
 
-from agent.estimation.claim import FEWEST_FOR_CLAIM, sufficient_mutual_ranges
 from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.inference import MANY_MUTUAL_RANGES, PlanningHypothesis
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.odometry_noise import Track
+from agent.estimation.judged import FEWEST_FOR_CLAIM, sufficient_mutual_ranges
 from agent.estimation.posterior import Hypothesis
 from agent.planning import active_sensing, exchange, phase2_orbit, range_seeking, transitions
 from agent.planning.active_sensing import CONTINUED, STALLED, Listening, Objective, Retreating, Surveying

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import msgspec
 
-from agent.estimation.claim import required_mutual_ranges
+from agent.estimation.judged import required_mutual_ranges
 from agent.peer import peer_state
 from agent.planning import exchange, phase3_last_manoeuvre, transitions
 from agent.planning.manoeuvres import Manoeuvres

@@ -14,12 +14,13 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from agent.estimation.claim import is_definite, sufficient_mutual_ranges
+from agent.estimation.claim import is_definite
 from agent.estimation.compiled import library
 from agent.estimation.gaussian.beacon_guesses import FEWEST_FOR_POSE
 from agent.estimation.gaussian.contact_fit import ContactEstimate, ContactRanges, estimated
 from agent.estimation.gaussian.gaussian_estimator import GAUSSIAN
 from agent.estimation.gaussian.inference import path_of
+from agent.estimation.judged import sufficient_mutual_ranges
 from agent.peer import peer_state
 from agent.peer.motion_log import MotionLog
 from agent.planning import sweep

@@ -11,19 +11,11 @@ from collections.abc import Sequence
 
 from msgspec.structs import astuple, replace
 
-from agent.estimation.claim import (
-    NORMAL_RATIO,
-    Blocked,
-    Judged,
-    blocked,
-    claim,
-    consistency,
-    convergence,
-    of_pair,
-)
+from agent.estimation.claim import NORMAL_RATIO, Blocked, blocked, claim, consistency, convergence
 from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.search import search
+from agent.estimation.judged import Judged, of_pair
 from agent.estimation.knowledge import Knowledge
 from agent.estimation.posterior import PAIR, Hypothesis, Posterior, follow, settled
 from agent.planning import sweep

@@ -7,18 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
-from agent.estimation.claim import (
-    BEFORE_SEARCH,
-    FEWEST_FOR_CLAIM,
-    Blocked,
-    Judged,
-    blocked,
-    claim,
-    early_consistency,
-    of_pair,
-    profiles,
-    rivals,
-)
+from agent.estimation.claim import BEFORE_SEARCH, Blocked, blocked, claim, early_consistency, profiles, rivals
 from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.claim_rivals import Rival
 from agent.estimation.gaussian.consistency import (
@@ -29,6 +18,7 @@ from agent.estimation.gaussian.consistency import (
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.own_sensors import DOUBTFUL_CLAIMS
 from agent.estimation.gaussian.search import search
+from agent.estimation.judged import FEWEST_FOR_CLAIM, Judged, of_pair
 from agent.estimation.knowledge import Belief, Knowledge
 from agent.estimation.posterior import PAIR, Posterior, follow
 from agent.planning.state import Done, RobotState

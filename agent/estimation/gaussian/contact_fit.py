@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from agent.estimation.claim import blocked, of_joint
+from agent.estimation.claim import blocked
 from agent.estimation.elementary import inverted
 from agent.estimation.fit import TO_THE_END, Start, fits
 from agent.estimation.gaussian.beacon_guesses import FEWEST_FOR_POSE
@@ -24,6 +24,7 @@ from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRange
 from agent.estimation.gaussian.odometry_noise import Track
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
 from agent.estimation.gaussian.search import extended
+from agent.estimation.judged import of_joint
 from agent.estimation.posterior import Posterior, certainties, follow, hypotheses_of
 from protocol.messages import Ranged
 from protocol.mission import Mission

@@ -8,13 +8,14 @@ from typing import ClassVar
 import msgspec
 import numpy as np
 
-from agent.estimation.claim import Blocked, claim, of_pair
+from agent.estimation.claim import Blocked, claim
 from agent.estimation.closed_forms import Placement
 from agent.estimation.estimator import AnchorEstimate, Estimator, FittedBranch, PairEstimate
 from agent.estimation.exact import Branch
 from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.inference import PlanningHypothesis
 from agent.estimation.gaussian.search import search
+from agent.estimation.judged import of_pair
 from agent.estimation.knowledge import Knowledge
 from protocol.messages import Localised, Observation, Undecided, Verdict
 from protocol.mission import RANGE_MARGIN

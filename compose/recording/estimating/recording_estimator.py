@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.claim import BEFORE_SEARCH, blocked, of_joint
+from agent.estimation.claim import BEFORE_SEARCH, blocked
 from agent.estimation.fit import Fit
 from agent.estimation.gaussian.joint_claims import (
     Displacement,
@@ -18,6 +18,7 @@ from agent.estimation.gaussian.joint_claims import (
 )
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.search import candidates, extended, search
+from agent.estimation.judged import of_joint
 from agent.estimation.posterior import NO_HYPOTHESES, Certainty, Hypothesis, Posterior, certainties, settled
 from compose.recording.estimating.recorded_measurements import Measurements, numerics
 from compose.recording.ranging.range_recording import Numbers

@@ -1,0 +1,193 @@
+"""The estimate of a pose as the conditions for its claim see it: of a pair, or of any number of robots."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple, get_args
+
+from agent.estimation.fit import Fit
+from agent.estimation.gaussian.claim_rivals import Rival, likeliest_rival
+from agent.estimation.gaussian.consistency import (
+    HIGHEST_LEVEL,
+    Inconsistency,
+    chi2_p_value,
+    consistency_test,
+)
+from agent.estimation.gaussian.inference import (
+    PlanningHypothesis,
+    localised,
+    m2_of,
+    pair_planning_hypotheses,
+    to_second_order,
+)
+from agent.estimation.gaussian.joint_claims import (
+    Displacement,
+    decisive_ranges,
+)
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.posterior import Certainty, Hypothesis, Posterior
+from protocol.messages import Localised, RobotConfig
+from protocol.mission import HEADING_ACCURACY
+from protocol.noise import Noise
+
+User = Literal["paper", "assured", "meeting", "finder", "unanchored", "recording"]
+"""The kinds of robots that state a pose.
+
+They are a robot of a pair with the planner `paper`, or `assured`, also in a group; one that confirms the pose
+of an earlier meeting; a finder that passes its pose on; a robot without an anchor by its finder; a robot of a
+recording.
+"""
+
+EVERYBODY = frozenset(get_args(User))
+FIRST_CLAIMS = EVERYBODY - {"meeting", "finder"}
+"""The users that state a pose for the first time; the others have claimed one in a meeting before."""
+
+FEWEST_FOR_CLAIM = 3
+"""The number of mutual ranges for hypotheses, and before a claim of a pair.
+
+With fewer, there are too many hypotheses, and no range checks them. How many more a claim needs depends on
+their evidence.
+"""
+
+MUTUAL_RANGES, MUTUAL_RANGES_WITH_OUTLIERS = 8, 12
+"""The numbers of mutual ranges from different places with which a claim needs no evidence against chance.
+
+Set on the sweep `noise`, in which 1 of 30 000 missions was wrong. With sigmas of R / 30 and more, evidence
+would need 11. With fewer ranges, claims are too often wrong; with more, each mission takes longer.
+"""
+
+ENOUGH_FOR_HEADING = 20
+"""The number of mutual ranges from different places after which HEADING_ACCURACY suffices for a claim.
+
+More ranges may not make the heading more accurate: then the robot searches longer at the end of its way.
+"""
+
+
+def required_mutual_ranges(noise: Noise) -> int:
+    """Return the minimum number of mutual ranges from different places before a claim of a pair.
+
+    With outliers, that a few ranges agree, one of which is an outlier, is not chance.
+    """
+    return MUTUAL_RANGES_WITH_OUTLIERS if noise.outliers else FEWEST_FOR_CLAIM
+
+
+def sufficient_mutual_ranges(noise: Noise) -> int:
+    """Return the number of mutual ranges from different places from which on evidence is not required.
+
+    With fewer, no suspicion of the peer counts either: the tests of a few ranges repeat each other.
+    """
+    return MUTUAL_RANGES_WITH_OUTLIERS if noise.outliers else MUTUAL_RANGES
+
+
+class Judged(NamedTuple):
+    """The estimate of a robot's pose, as the conditions for its claim see it."""
+
+    user: User
+    robot: int
+    """The index in the fit of the robot that claims its pose."""
+    fit: Fit
+    """The fit of the most probable hypothesis."""
+    measured: JointMeasurements
+    """The measurements to which it is the fit."""
+    origin: tuple[float, float]
+    """The point of <W> (m) to which the poses of the fit are relative."""
+    hypotheses: int
+    """The number of hypotheses that differ in this robot's pose."""
+    ranges: int
+    """The number of ranges from different places."""
+    required: int
+    """The number of them that the claim needs."""
+    stated: PlanningHypothesis
+    """The poses of all robots, with the covariance of the claim and the probability of the robot's pose."""
+    inconsistency: Inconsistency | None
+    """The consistency test of the fit; None if there are too few ranges."""
+    accuracy: float
+    """The largest sigma (m) of a position."""
+    headings: tuple[tuple[int, str, float], ...]
+    """The poses that have to be accurate: index, whose, and the largest sigma (rad) of the heading."""
+    confidence: float
+    """The least probability of the pose."""
+    rivals_of: tuple[int, ...] = ()
+    """The robots of which rivals are looked for."""
+    displaced: Displacement | None = None
+    """The anchor that seems to stand elsewhere than it was surveyed, if one does."""
+
+    @property
+    def rival(self) -> Rival:
+        """The likeliest rival of the claim."""
+        return likeliest_rival(self.fit, self.measured, self.stated, self.rivals_of)
+
+    @property
+    def localised(self) -> Localised:
+        """The pose and its covariance in <W>."""
+        return localised(self.stated, self.robot, self.origin)
+
+
+def of_pair(
+    user: User,
+    config: RobotConfig,
+    scored: Sequence[Hypothesis],
+    pair: JointMeasurements,
+) -> Judged | None:
+    """Return the estimate of one robot of a pair by the most probable of the hypotheses `scored`, if any."""
+    if not scored:
+        return None
+    mission, role = config.mission, config.role
+    robot, ids = (0, (config.robot, config.peer)) if role == "a" else (1, (config.peer, config.robot))
+    places = len(pair.mutual_places)
+    required = required_mutual_ranges(mission.noise) if user in FIRST_CLAIMS else 0
+    own_heading = config.heading_accuracy if places < ENOUGH_FOR_HEADING else HEADING_ACCURACY
+    best = scored[0]
+    (first,) = pair_planning_hypotheses(scored[:1])
+    return Judged(
+        user=user,
+        robot=robot,
+        fit=best.fit,
+        measured=pair,
+        origin=(config.m1.x, config.m1.y),
+        hypotheses=len(scored),
+        ranges=places,
+        required=required,
+        stated=to_second_order(first, m2_of(config)),
+        inconsistency=consistency_test(best.fit, pair, robot) if places >= required else None,
+        accuracy=mission.accuracy,
+        headings=tuple([(i, f"{ids[i]}'s", own_heading if i == robot else HEADING_ACCURACY) for i in (0, 1)]),
+        confidence=mission.confidence,
+        rivals_of=(robot,),
+    )
+
+
+def of_joint(
+    user: User,
+    robot: int,
+    found: Posterior,
+    certainty: Certainty,
+    measured: JointMeasurements,
+    accuracy: float,
+    confidence: float,
+) -> Judged:
+    """Return the estimate of the robot with the index `robot` among those that the fits `found` have.
+
+    `certainty` is that of its pose; `measured` are the measurements of all these robots.
+    """
+    fit, free = found.hypotheses[0].fit, found.hypotheses[0].fit.freedom
+    return Judged(
+        user=user,
+        robot=robot,
+        fit=fit,
+        measured=measured,
+        origin=measured.origin,
+        hypotheses=certainty.poses,
+        ranges=decisive_ranges(robot, measured),
+        required=sufficient_mutual_ranges(measured.noise),
+        stated=PlanningHypothesis(certainty.probability, fit.poses.ravel(), fit.covariance),
+        inconsistency=Inconsistency(
+            f"chi-square {fit.chi2:.3g} for {free} degrees of freedom",
+            0.0,
+            chi2_p_value(fit.chi2 / min(max(fit.level, 1.0), HIGHEST_LEVEL), free),
+        ),
+        accuracy=accuracy,
+        headings=((robot, "the", HEADING_ACCURACY),),
+        confidence=confidence,
+        rivals_of=(robot,),
+    )
