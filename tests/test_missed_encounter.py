@@ -52,11 +52,11 @@ odometry = {v = 0.05, omega = 0.05}
 actuation = {v = 0.05, omega = 0.05}"""
 """Noise with which one of twelve robots a meets b, and cannot claim after 60 mutual ranges."""
 UNSETTLED = (
-    2010375696666685743,
     2386190808387697108,
-    1077452619412565400,
+    1503482729963585065,
+    2225360763666612774,
 )
-"""Seeds of WHEELS, from a sweep of 300, which ended undecided when a did not begin again after a meeting."""
+"""Seeds of WHEELS, three of the first that were drawn, in which a leaves b after a meeting."""
 PASSED = 49
 """The number of ticks of T_max in these missions."""
 
