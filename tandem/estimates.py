@@ -13,6 +13,7 @@ import msgspec
 
 from compose.errors import CannotWrite, UserError
 from compose.extras import need
+from compose.launch.solver_loader import GuardedSolver
 from compose.recording.estimating.estimate_rows import EstimateSummary, PoseEstimateRow
 from compose.recording.estimating.estimate_run import RecordingEstimate, estimated
 from compose.recording.estimating.estimate_summary import write_estimate
@@ -26,6 +27,8 @@ from tandem.results import Run
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from agent.estimation.solver import Solver
 
 DEFAULTS = ClaimRule()
 """The accuracy in m and the probability that a claim needs by default."""
@@ -106,6 +109,7 @@ def estimate(
     anchors: str | Path | None = None,
     accuracy: float = DEFAULTS.accuracy,
     confidence: float = DEFAULTS.confidence,
+    solver: Solver | None = None,
 ) -> PoseEstimates:
     """Return the poses of recorded robots over time, estimated from their odometry and ranges.
 
@@ -114,7 +118,8 @@ def estimate(
     estimated in one fit. `noise` is the assumed noise: the name of a profile or the path of a TOML file, by
     default what the recording states. `window` is the part that is used, in s from the first odometry on.
     `anchors` is a CSV file of further anchors; all anchors are used. A claim needs the standard deviation
-    `accuracy` in m and the probability `confidence`.
+    `accuracy` in m and the probability `confidence`. A `solver` of your own fits the poses, see
+    `tandem.estimation`.
 
     Raises UserError for invalid arguments, and if the recording cannot be read.
 
@@ -129,6 +134,7 @@ def estimate(
         raise UserError(f"accuracy: {accuracy} is not a positive number")
     if not 0.5 <= confidence < 1.0:
         raise UserError(f"confidence: {confidence} is not a probability from 0.5 to below 1")
+    guarded = GuardedSolver(solver) if solver is not None else None
     if isinstance(recording, Run):
         if anchors is not None:
             raise UserError("anchors: a run has its own anchors")
@@ -138,4 +144,4 @@ def estimate(
         ranges = read_ranges(Path(recording), Path(anchors) if anchors is not None else None)
     name = str(noise) if noise is not None else None
     problem = measurements(ranges, robots, name, window)
-    return PoseEstimates(problem, estimated(problem, ClaimRule(accuracy, confidence)))
+    return PoseEstimates(problem, estimated(problem, ClaimRule(accuracy, confidence), solver=guarded))

@@ -20,6 +20,7 @@ from agent.estimation.gaussian.odometry_noise import Array, Errors, Places
 from agent.estimation.kernel import Kernel
 from agent.estimation.problem import Problem
 from agent.estimation.smoother import FitStep, Singular, Walk
+from agent.estimation.solver import Solution, UnusableSolution
 
 
 def deviation(variance: float) -> float:
@@ -158,15 +159,46 @@ def fits(
     """Return the fits to all ranges in `measured` that begin at `starts`.
 
     Fits also begin at the first `doubted` ones without their outliers. A start from which there is no fit,
-    because a number is too large for a float, is left out.
+    because a number is too large for a float, is left out. The
+    solver of the user, if there is one, converges `until` its own end.
     """
     problem, found, starts = Problem.of(measured), [], list(starts)
     for start in (*starts, *_without_outliers(problem, measured, starts[:doubted])):
         try:
-            found.append(_fit(problem, problem.kernel.fitted(*_begin(problem, start), until)))
+            if measured.solver is not None:
+                found += _solved(problem, measured.solver.solve(measured, start))
+            else:
+                found.append(_fit(problem, problem.kernel.fitted(*_begin(problem, start), until)))
         except Singular:
             continue
     return found
+
+
+def _solved(problem: Problem, solution: Solution | None) -> list[Fit]:
+    """Return the fit at the solution of a user's solver, with the smoother's linear model there.
+
+    It is empty if there is no solution. Raises UnusableSolution.
+    """
+    if solution is None:
+        return []
+    start, covariance, log_evidence = solution
+    size, of = 3 * len(problem.lengths), "a solution of the solver has"
+    if np.shape(start.poses) != (len(problem.lengths), 3) or not np.isfinite(start.poses).all():
+        raise UnusableSolution(f"{of} no finite poses of shape {(len(problem.lengths), 3)}")
+    fit = _fit(problem, problem.kernel.fitted(*_begin(problem, start), AS_IT_IS))._replace(last_step=0.0)
+    if covariance is not None:
+        if np.shape(covariance) != (size, size) or not np.isfinite(covariance).all():
+            raise UnusableSolution(f"{of} no finite covariance of shape {(size, size)}")
+        fit = fit._replace(covariance=np.array(covariance, np.float64))
+    if log_evidence is not None:
+        if not math.isfinite(log_evidence):
+            raise UnusableSolution(f"{of} the log evidence {log_evidence}")
+        fit = fit._replace(weight=float(log_evidence))
+    return [fit]
+
+
+AS_IT_IS = Convergence(0)
+"""The convergence of a fit that stays where it begins."""
 
 
 class HeldFit(NamedTuple):

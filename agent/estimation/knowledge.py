@@ -10,6 +10,7 @@ from agent.estimation.closed_forms import Placement
 from agent.estimation.exact import Branch, PairObservation
 from agent.estimation.gaussian.consistency import Inconsistency
 from agent.estimation.posterior import Hypothesis
+from agent.estimation.solver import Solver
 from agent.peer.motion_log import MotionLog
 from agent.peer.peer_state import PeerState
 from protocol import messages
@@ -92,6 +93,8 @@ class Knowledge(msgspec.Struct, frozen=True):
     mutual: tuple[Ranged, ...] = ()
     belief: Belief = Belief()
     peer_state: PeerState = PeerState()
+    solver: Solver | None = None
+    """Noisy sensors: the solver that the planner has chosen; None for the smoother."""
 
     @property
     def start(self) -> Pose:

@@ -80,7 +80,7 @@ class Posterior(NamedTuple):
 
     @property
     def has_converged(self) -> bool:
-        """Whether the fit of the most probable hypothesis has reached its minimum, if there is one."""
+        """True if the fit of the most probable hypothesis has reached its minimum, or if there is none."""
         return not self.hypotheses or self.hypotheses[0].fit.last_step <= FINISHED
 
 

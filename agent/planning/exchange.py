@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
+from agent.estimation.solver import Solver
 from agent.peer import false_reports, peer_state
 from agent.peer.motion_log import MotionLog
 from agent.planning import phase1_anchor, plausibility, separation
@@ -27,9 +28,9 @@ from protocol.messages import (
 from protocol.motion import REST, Controls, Pose, compose, inverse, step
 
 
-def start(config: RobotConfig) -> RobotState:
-    """Return the state of a robot that has measured nothing yet."""
-    return RobotState(config)
+def start(config: RobotConfig, solver: Solver | None = None) -> RobotState:
+    """Return the state of a robot that has measured nothing yet; `solver` fits its poses under noise."""
+    return RobotState(config, solver=solver)
 
 
 def dead_reckoned(

@@ -367,6 +367,7 @@ def _in_meeting(state: GroupState, peer: str, role: Role, orbits: Rendezvous | N
     belief = pair.belief
     fresh = RobotState(
         state.config.in_meeting(peer, role, orbits),
+        solver=pair.solver,
         tick=pair.tick,
         odometry=pair.odometry,
         log=pair.log,

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import msgspec
 
 from agent.estimation.judged import required_mutual_ranges
+from agent.estimation.solver import Solver
 from agent.peer import peer_state
 from agent.planning import exchange, phase3_last_manoeuvre, transitions
 from agent.planning.manoeuvres import Manoeuvres
@@ -26,11 +27,13 @@ class LogPlanner(Planner[RobotState, Report]):
 
     BODY = Report
     MANOEUVRES: Manoeuvres
+    SOLVER: Solver | None = None
+    """The solver that fits the poses under noise; None for the smoother. A subclass may choose its own."""
     REQUIRED_PLACES = KEPT_PLACES
 
     def start(self, config: RobotConfig) -> RobotState:
         """Return the state of a robot that has measured nothing yet."""
-        return exchange.start(config)
+        return exchange.start(config, self.SOLVER)
 
     def observe(self, state: RobotState, observation: Observation) -> RobotState:
         """Return `state` with the sensor data of one tick, and with the mode that follows from them."""

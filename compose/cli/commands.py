@@ -321,6 +321,7 @@ COMMANDS = (
         {PART_OF_RECORDING}
         --accuracy M = 0.3: sigma of the position in m that a claim needs [default: %(default)g]
         --confidence P = 0.9999: probability that a claim needs [default: %(default)g]
+        --solver MODULE:CLASS: solver of your own, which fits the poses [default: the smoother]
         --out DIR: folder for estimate.csv, estimate.json and figures [default: none are written]
         """,
     ),

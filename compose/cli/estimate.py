@@ -13,12 +13,14 @@ from typing import TYPE_CHECKING
 from compose.errors import BROKEN_PIPE, ENDED, NOT_LOCALISED, STOPPED_STATUS, CannotWrite, UserError
 from compose.extras import need
 from compose.launch.signals import until_signal
+from compose.launch.solver_loader import solver_named
 from compose.recording.recording_files import make_folder
 from compose.terminal.outcome import counting
 from compose.terminal.text_width import tell
 from protocol.output import discard, say
 
 if TYPE_CHECKING:
+    from agent.estimation.solver import Solver
     from compose.recording.estimating.estimate_rows import PoseEstimateRow, RobotEstimate
     from compose.recording.estimating.estimate_run import RecordingEstimate
     from compose.recording.estimating.recorded_measurements import Measurements
@@ -39,13 +41,14 @@ def main(options: argparse.Namespace) -> int:
 
     stopped = None
     rule = ClaimRule(options.accuracy, options.confidence)
+    solver = solver_named(options.solver) if options.solver is not None else None
     if options.follow:
-        problem, estimate, stopped = _followed(options, rule)
+        problem, estimate, stopped = _followed(options, rule, solver)
     else:
         recording = read_ranges(options.recording, options.anchors)
         problem = measurements(recording, options.robots, options.noise, options.window)
         with counting("tandem estimate", len(problem.ends)) as done:
-            estimate = estimated(problem, rule, done)
+            estimate = estimated(problem, rule, done, solver)
     if options.out is not None:
         written = _written(options.out, problem, estimate)
         say(*map(str, written), error=options.follow)
@@ -59,7 +62,7 @@ def main(options: argparse.Namespace) -> int:
 
 
 def _followed(
-    options: argparse.Namespace, rule: ClaimRule
+    options: argparse.Namespace, rule: ClaimRule, solver: Solver | None
 ) -> tuple[Measurements, RecordingEstimate, int | None]:
     """Print the estimates of a stream until it ends; return all of them, and the status if it did not end."""
     need("mcap")
@@ -72,7 +75,7 @@ def _followed(
         raise UserError("--follow: a stream has its own anchors, and no window")
     name = "standard input" if str(options.recording) == "-" else str(options.recording)
     noise = told_noise(options.noise) if options.noise is not None else None
-    estimate = StreamEstimate(name, options.robots, noise, rule, partial(_doubted, name))
+    estimate = StreamEstimate(name, options.robots, noise, rule, partial(_doubted, name), solver)
     try:
         stream = sys.stdin.buffer if str(options.recording) == "-" else options.recording.open("rb")
     except OSError as error:

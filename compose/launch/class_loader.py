@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from compose.errors import UserError
 
-Kind = Literal["planner", "model", "driver"]
+Kind = Literal["planner", "model", "driver", "solver"]
 """The kind of a class, and the flag without -- that names it."""
 
 _trusted: set[str] = set()

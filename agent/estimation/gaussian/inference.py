@@ -115,7 +115,7 @@ def _own_measurements(knowledge: Knowledge) -> JointMeasurements:
         *([ranges], [(0.0, 0.0)], mission.noise, mission.sensing_range),
         silent=(silent,),
     )
-    return own.alone(0)
+    return replace(own.alone(0), solver=knowledge.solver)
 
 
 def own_anchor(knowledge: Knowledge) -> tuple[Hypothesis, ...]:
@@ -290,7 +290,7 @@ def pair_of(knowledge: Knowledge) -> JointMeasurements:
         (path_of(logs[0], first, ends[0], mission), path_of(logs[1], 0, ends[1], mission)),
         *(own, ((0.0, 0.0), m2_of(config)), mission.noise, mission.sensing_range, mutual, tuple(silent)),
     )
-    return measured.thinned(mission.sensing_range)
+    return replace(measured.thinned(mission.sensing_range), solver=knowledge.solver)
 
 
 def m2_of(config: RobotConfig) -> tuple[float, float]:

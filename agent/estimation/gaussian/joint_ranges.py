@@ -19,6 +19,7 @@ from agent.estimation.elementary import hypot
 from agent.estimation.facts import AnchorPlace, Facts, Manoeuvre, MeasuredRange
 from agent.estimation.gaussian.odometry_noise import Array, Places, Track, track
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
+from agent.estimation.solver import Solver
 from protocol.noise import Noise, Priors, VelocityNoise
 
 IMPOSSIBLE = 6.0
@@ -118,7 +119,7 @@ class JointRanges(msgspec.Struct, frozen=True, dict=True, eq=False):
 
     @property
     def mutual(self) -> NDArray[np.bool]:
-        """Which ranges are between robots; shape (N,)."""
+        """True for each range between robots; shape (N,)."""
         between: NDArray[np.bool] = self.second >= 0
         return between
 
@@ -183,6 +184,8 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
     """The longest range (m) that is expected."""
     silent: tuple[Silence, ...] = ()
     """The ticks without a range of each pair of radios; empty if a missing range says nothing."""
+    solver: Solver | None = None
+    """The solver that the user has chosen; None for the smoother."""
 
     def __eq__(self, other: object) -> bool:
         """Return whether `other` has the same measurements, to the bit."""
@@ -205,7 +208,7 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
         paths = tuple([path.content for path in self.paths])
         return (
             *(self.robots, self.anchors, self.radios, paths, ranges, self.period, self.origin),
-            *(self.noise, prior, self.surveyed, self.reach, silent),
+            *(self.noise, prior, self.surveyed, self.reach, silent, self.solver),
         )
 
     def is_anchor(self, robot: int) -> bool:

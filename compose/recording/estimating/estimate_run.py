@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
+from agent.estimation.solver import Solver, UnusableSolution
 from compose.errors import UserError
 from compose.recording.estimating.estimate_rows import EstimateSummary, PoseEstimateRow, rows_of
 from compose.recording.estimating.estimate_summary import summary_of
@@ -47,13 +48,17 @@ class RecordingEstimate(NamedTuple):
 class _Estimate:
     """An estimate that grows with its measurements."""
 
-    def __init__(self, rule: ClaimRule) -> None:
-        self.rule = rule
-        self.estimator = RecordingEstimator(rule)
+    def __init__(self, rule: ClaimRule, solver: Solver | None) -> None:
+        self.rule, self._solver = rule, solver
+        self.begin()
         self.measured: Measurements | None = None
         """The measurements of the last epoch."""
         self.rows: list[PoseEstimateRow] = []
         self.epochs: list[EstimateEpoch] = []
+
+    def begin(self) -> None:
+        """Begin the estimate of all further measurements again."""
+        self.estimator = RecordingEstimator(self.rule, self._solver)
 
     def advanced(
         self, measured: Measurements, done: Callable[[], None] = lambda: None
@@ -62,7 +67,7 @@ class _Estimate:
         if self.measured is None or not self.epochs:
             self.measured = measured
         self.measured = replace(self.measured, doubt=measured.doubt)
-        for epoch in self.estimator.epochs(measured, done, self.epochs[-1].t if self.epochs else -math.inf):
+        for epoch in self._epochs(measured, done):
             with numerics(measured.source):
                 rows = rows_of(epoch, measured.robots)
             self.measured = measured
@@ -70,6 +75,13 @@ class _Estimate:
             self.epochs[-1:] = [one._replace(fitted=None) for one in self.epochs[-1:]]  # fits are large
             self.epochs.append(epoch)
             yield from rows
+
+    def _epochs(self, measured: Measurements, done: Callable[[], None]) -> Iterator[EstimateEpoch]:
+        """Yield all further epochs. Raises UserError if a solution of the user's solver cannot be used."""
+        try:
+            yield from self.estimator.epochs(measured, done, self.epochs[-1].t if self.epochs else -math.inf)
+        except UnusableSolution as error:
+            raise UserError(str(error)) from None
 
     def result(self, measured: Measurements) -> RecordingEstimate:
         """Return all estimates, the last of which follow from what was `measured`."""
@@ -79,10 +91,16 @@ class _Estimate:
 
 
 def estimated(
-    measured: Measurements, rule: ClaimRule, done: Callable[[], None] = lambda: None
+    measured: Measurements,
+    rule: ClaimRule,
+    done: Callable[[], None] = lambda: None,
+    solver: Solver | None = None,
 ) -> RecordingEstimate:
-    """Return all estimates; `done` is called after each epoch. There are none if the units are doubtful."""
-    estimate = _Estimate(rule)
+    """Return all estimates; `done` is called after each epoch. There are none if the units are doubtful.
+
+    `solver` fits the poses; by default, the smoother does.
+    """
+    estimate = _Estimate(rule, solver)
     for _ in estimate.advanced(measured, done):
         pass
     return estimate.result(measured)
@@ -98,16 +116,17 @@ class StreamEstimate:
         noise: AssumedNoise | None,
         rule: ClaimRule,
         doubted: Callable[[str], None] = lambda _: None,
+        solver: Solver | None = None,
     ) -> None:
         """Begin the estimate of `robots`, with the `noise` that is told.
 
         None: all robots of the stream. With each further one, the estimate begins again.
         `doubted` is called with the suspicion that parts of the stream are in different units; as long as it
-        lasts, nothing is estimated.
+        lasts, nothing is estimated. `solver` fits the poses in place of the smoother.
         """
         self._builder = RecordingBuilder(source)
         self._robots, self._noise, self._doubted = robots, noise, doubted
-        self._estimate = _Estimate(rule)
+        self._estimate = _Estimate(rule, solver)
         self._doubt = ""
         self._spans: dict[str, tuple[float, float]] = {}
         """The first and the last time in s of the odometry of each robot."""
@@ -131,7 +150,7 @@ class StreamEstimate:
             return
         if len(names) > self._count:  # the estimates so far are kept, and are of other robots
             self._count = len(names)
-            self._estimate.estimator = RecordingEstimator(self._estimate.rule)
+            self._estimate.begin()
             self._due_after_s, self._examined_after_s = EPOCH_S, EXAMINED_AFTER_S
         lasts = min(self._spans[name][1] for name in names) - max(self._spans[name][0] for name in names)
         if lasts < self._due_after_s - SAME_TIME_S * EPOCH_S:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from agent.estimation.claim import BEFORE_SEARCH, blocked
@@ -20,6 +21,7 @@ from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.search import candidates, extended, search
 from agent.estimation.judged import of_joint
 from agent.estimation.posterior import NO_HYPOTHESES, Certainty, Hypothesis, Posterior, certainties, settled
+from agent.estimation.solver import Solver
 from compose.recording.estimating.recorded_measurements import Measurements, numerics
 from compose.recording.ranging.range_recording import Numbers
 from protocol.motion import wrap
@@ -104,8 +106,8 @@ class RecordingEstimator:
     and before the first claim of each robot.
     """
 
-    def __init__(self, rule: ClaimRule) -> None:
-        self._rule = rule
+    def __init__(self, rule: ClaimRule, solver: Solver | None = None) -> None:
+        self._rule, self._solver = rule, solver
         self._next = 0
         self._known: Posterior = NO_HYPOTHESES
         self._searched = self._searches = 0
@@ -134,7 +136,7 @@ class RecordingEstimator:
 
     def _epoch(self, measured: Measurements, number: int) -> EstimateEpoch:
         """Return the estimate at the end of the epoch with this `number`, from 0 on, in their order."""
-        used = measured.until(number)
+        used = msgspec.structs.replace(measured.until(number), solver=self._solver)
         found = self._extended(self._followed(used), used)
         count = len(used.ranges.rho)
         due = found.hypotheses and any(self._searched < at <= count for at in GROUP_SEARCHES)

@@ -1,0 +1,74 @@
+"""Solvers of a user, and planners that have one."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from msgspec.structs import replace
+
+from agent.estimation.fit import fits
+from tandem.estimation import JointMeasurements, Solution, Start
+from tandem.planning import AccuracySeeking
+
+
+class Smoother:
+    """The smoother of Tandem behind the contract of a user's solver."""
+
+    def solve(self, measured: JointMeasurements, start: Start) -> Solution | None:
+        """Return the fit from `start`."""
+        for fit in fits(replace(measured, solver=None), [start]):
+            return Solution(fit.start._replace(weights=fit.weights), fit.covariance, fit.weight)
+        return None
+
+
+class Nothing:
+    """A solver that finds no poses."""
+
+    def solve(self, measured: JointMeasurements, start: Start) -> Solution | None:
+        """Return None."""
+        del measured, start
+        return None
+
+
+class Broken:
+    """A solver whose `solution` cannot be used."""
+
+    def __init__(self, solution: str) -> None:
+        self._solution = solution
+
+    def solve(self, measured: JointMeasurements, start: Start) -> Solution | None:
+        """Return the solution, or raise."""
+        del measured
+        match self._solution:
+            case "poses":
+                return Solution(start._replace(poses=start.poses * math.nan))
+            case "shape":
+                return Solution(start._replace(poses=np.zeros((5, 3))))
+            case "covariance":
+                return Solution(start, np.zeros((2, 2)))
+            case "evidence":
+                return Solution(start, None, math.inf)
+            case "something":
+                return "poses"  # type: ignore[return-value]
+            case _:
+                raise ZeroDivisionError("by the solver")
+
+
+class WithSmoother(AccuracySeeking):
+    """The planner `assured` with the smoother as the user's solver."""
+
+    SOLVER = Smoother()
+
+
+class WithNothing(AccuracySeeking):
+    """A planner whose solver finds nothing."""
+
+    SOLVER = Nothing()
+
+
+class WithBroken(AccuracySeeking):
+    """A planner whose solver is broken."""
+
+    def __init__(self, solution: str) -> None:
+        self.SOLVER = Broken(solution)
