@@ -70,3 +70,9 @@ def test_the_parser_of_a_command_imports_no_module_of_commands(command: CommandE
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.split() == []
+
+
+def test_a_missing_argument_is_named_without_hidden_ones() -> None:
+    ended = tandem("run")
+    assert ended.status == 2
+    assert ended.err == "tandem run: the following arguments are required: SCENARIO\n"

@@ -49,7 +49,7 @@ VALUES: Mapping[str, Callable[[str], Any] | tuple[str, ...]] = {
 MARKS: Mapping[str, Mapping[str, Any]] = {
     "!": {"required": True},
     "+": {"action": "append", "default": []},
-    "*": {"nargs": "*"},
+    "*": {"nargs": "*", "default": []},
     "?": {"nargs": "?", "const": "scenario"},
 }
 """The settings of arguments that are required, may be repeated, may be several, or need no value."""
