@@ -8,8 +8,10 @@ import numpy as np
 from msgspec.structs import replace
 
 from agent.estimation.fit import fits
-from tandem.estimation import JointMeasurements, Solution, Start
+from tandem.estimation import JointMeasurements, OdometryErrors, Solution, Start
 from tandem.planning import AccuracySeeking
+
+NO_ERRORS = OdometryErrors(np.zeros(0), np.zeros(0), np.zeros(0))
 
 
 class Smoother:
@@ -37,9 +39,10 @@ class Broken:
     def __init__(self, solution: str) -> None:
         self._solution = solution
 
-    def solve(self, measured: JointMeasurements, start: Start) -> Solution | None:
+    def solve(  # noqa: C901, PLR0912  # one case each
+        self, measured: JointMeasurements, start: Start
+    ) -> Solution | None:
         """Return the solution, or raise."""
-        del measured
         match self._solution:
             case "poses":
                 return Solution(start._replace(poses=start.poses * math.nan))
@@ -49,6 +52,28 @@ class Broken:
                 return Solution(start, np.zeros((2, 2)))
             case "evidence":
                 return Solution(start, None, math.inf)
+            case "texts":
+                return Solution(start._replace(poses=start.poses.astype(str)))
+            case "complex":
+                return Solution(start._replace(poses=start.poses.astype(complex)))
+            case "no-errors":
+                return Solution(start._replace(errors=None))  # type: ignore[arg-type]
+            case "more-robots":
+                return Solution(start._replace(errors=(NO_ERRORS,) * 9))
+            case "errors":
+                return Solution(
+                    start._replace(errors=(NO_ERRORS._replace(v=np.zeros(2)),) * len(start.poses))
+                )
+            case "weights":
+                return Solution(start._replace(weights=np.ones(0)))
+            case "negative-weights":
+                return Solution(start._replace(weights=-np.ones(len(measured.ranges.rho))))
+            case "variance":
+                return Solution(start, np.zeros((start.poses.size, start.poses.size)))
+            case "poses-alone":
+                return start  # type: ignore[return-value]
+            case "nothing-else":
+                return Solution(None)  # type: ignore[arg-type]
             case "something":
                 return "poses"  # type: ignore[return-value]
             case _:

@@ -68,7 +68,17 @@ def test_a_robot_whose_solver_finds_nothing_claims_nothing() -> None:
         ("poses", "no finite poses of shape (1, 3)"),
         ("shape", "no finite poses of shape (1, 3)"),
         ("covariance", "no finite covariance of shape (3, 3)"),
-        ("evidence", "the log evidence inf"),
+        ("evidence", "no finite log evidence"),
+        ("texts", "no finite poses of shape (1, 3)"),
+        ("complex", "no finite poses of shape (1, 3)"),
+        ("no-errors", "errors that are no tuple of OdometryErrors"),
+        ("more-robots", "odometry errors of 9 of 1 robots"),
+        ("errors", "no finite errors omega of shape (2,)"),
+        ("weights", "no finite weights of shape"),
+        ("negative-weights", "weights that are not all from 0 to 1"),
+        ("variance", "a covariance whose variances are not all positive"),
+        ("poses-alone", "returned Start, not a Solution or None"),
+        ("nothing-else", "a Solution of NoneType, not of a Start"),
         ("raises", "ZeroDivisionError: by the solver"),
     ],
 )
@@ -121,10 +131,11 @@ def claims(found: tandem.PoseEstimates) -> dict[str, object]:
 @pytest.mark.parametrize(
     ("solver", "why"),
     [
-        (Broken("shape"), "a solution of the solver has no finite poses"),
+        (Broken("shape"), "tests.own_solvers:Broken: solve() returned no finite poses"),
         (Broken("raises"), "tests.own_solvers:Broken: solve() raised ZeroDivisionError: by the solver"),
         (Broken("something"), "solve() returned str, not a Solution or None"),
-        (Smoother, "is no solver: an object with the method solve"),
+        (Smoother, "the class tests.own_solvers:Smoother is no solver: an object with the method solve"),
+        (object(), "builtins:object is no solver: an object with the method solve"),
     ],
 )
 def test_a_recording_with_a_broken_solver_is_refused_in_one_line(solver: Any, why: str) -> None:

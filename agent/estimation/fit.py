@@ -181,20 +181,53 @@ def _solved(problem: Problem, solution: Solution | None) -> list[Fit]:
     """
     if solution is None:
         return []
-    start, covariance, log_evidence = solution
-    size, of = 3 * len(problem.lengths), "a solution of the solver has"
-    if np.shape(start.poses) != (len(problem.lengths), 3) or not np.isfinite(start.poses).all():
-        raise UnusableSolution(f"{of} no finite poses of shape {(len(problem.lengths), 3)}")
-    fit = _fit(problem, problem.kernel.fitted(*_begin(problem, start), AS_IT_IS))._replace(last_step=0.0)
+    if not isinstance(solution, Solution):
+        raise UnusableSolution(f"solve() returned {type(solution).__name__}, not a Solution or None")
+    size, (start, covariance, log_evidence) = 3 * len(problem.lengths), solution
+    begun = _begin(problem, _usable(problem, start))
+    fit = _fit(problem, problem.kernel.fitted(*begun, AS_IT_IS))._replace(last_step=0.0)
     if covariance is not None:
-        if np.shape(covariance) != (size, size) or not np.isfinite(covariance).all():
-            raise UnusableSolution(f"{of} no finite covariance of shape {(size, size)}")
-        fit = fit._replace(covariance=np.array(covariance, np.float64))
+        covariance = _floats("covariance", covariance, size, size)
+        if not np.all(np.diagonal(covariance) > 0.0):
+            raise UnusableSolution("solve() returned a covariance whose variances are not all positive")
+        fit = fit._replace(covariance=covariance)
     if log_evidence is not None:
-        if not math.isfinite(log_evidence):
-            raise UnusableSolution(f"{of} the log evidence {log_evidence}")
-        fit = fit._replace(weight=float(log_evidence))
+        fit = fit._replace(weight=float(_floats("log evidence", log_evidence)))
     return [fit]
+
+
+def _usable(problem: Problem, start: Start) -> Start:
+    """Return the start of a user's solution with its numbers as floats. Raises UnusableSolution."""
+    if not isinstance(start, Start):
+        raise UnusableSolution(f"solve() returned a Solution of {type(start).__name__}, not of a Start")
+    (robots, constants), errors, weights = problem.measured.patterns.shape[:2], start.errors, start.weights
+    if not isinstance(errors, tuple) or not all(isinstance(one, Errors) for one in errors):
+        raise UnusableSolution("solve() returned errors that are no tuple of OdometryErrors")
+    if len(errors) not in (0, robots):
+        raise UnusableSolution(f"solve() returned odometry errors of {len(errors)} of {robots} robots")
+    usable = []
+    for v, omega, constant in errors:
+        of_v = _floats("errors v", v, np.size(v))
+        of_omega = _floats("errors omega", omega, len(of_v))
+        usable.append(
+            Errors(of_v, of_omega, _floats("errors constant", constant, constants * (np.size(constant) > 0)))
+        )
+    if weights is not None:
+        weights = _floats("weights", weights, len(problem.ticks))
+        if np.any((weights < 0.0) | (weights > 1.0)):
+            raise UnusableSolution("solve() returned weights that are not all from 0 to 1")
+    return Start(_floats("poses", start.poses, robots, 3), tuple(usable), weights)
+
+
+def _floats(what: str, numbers: object, *shape: int) -> Array:
+    """Return `numbers` of a user's solution as an array of finite floats. Raises UnusableSolution."""
+    try:
+        found = np.array(numbers).astype(np.float64, casting="same_kind")
+    except (TypeError, ValueError):  # texts, objects, complex numbers, or rows of several lengths
+        found = np.array(np.nan)
+    if found.shape != shape or not np.isfinite(found).all():
+        raise UnusableSolution(f"solve() returned no finite {what}" + (f" of shape {shape}" if shape else ""))
+    return found
 
 
 AS_IT_IS = Convergence(0)

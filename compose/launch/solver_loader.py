@@ -18,22 +18,23 @@ class GuardedSolver:
 
     def __init__(self, solver: Any) -> None:
         """Raises UserError if `solver` is no solver."""
-        self._name = f"{type(solver).__module__}:{type(solver).__qualname__}"
-        if isinstance(solver, type) or not callable(getattr(solver, "solve", None)):
-            raise UserError(f"solver: {solver!r} is no solver: an object with the method solve")
+        own = solver if isinstance(solver, type) else type(solver)
+        self._name = f"{own.__module__}:{own.__qualname__}"
+        if solver is own or not callable(getattr(solver, "solve", None)):
+            what = "the class " if solver is own else ""
+            raise UserError(f"{what}{self._name} is no solver: an object with the method solve")
         self._solver = solver
+
+    def __str__(self) -> str:
+        """Return the name of the solver, MODULE:CLASS."""
+        return self._name
 
     def solve(self, measured: JointMeasurements, start: Start) -> Solution | None:
         """Return the solution of the user's solver."""
-        from agent.estimation.solver import Solution  # noqa: PLC0415  # it imports numpy
-
         try:
-            found = self._solver.solve(measured, start)
+            return self._solver.solve(measured, start)  # type: ignore[no-any-return]
         except Exception as error:  # noqa: BLE001  # the user's code may raise anything
             raise UserError(f"{self._name}: solve() raised {type(error).__name__}: {error}") from None
-        if found is not None and not isinstance(found, Solution):
-            raise UserError(f"{self._name}: solve() returned {type(found).__name__}, not a Solution or None")
-        return found
 
 
 def solver_named(name: str) -> GuardedSolver:

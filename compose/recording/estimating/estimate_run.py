@@ -81,7 +81,7 @@ class _Estimate:
         try:
             yield from self.estimator.epochs(measured, done, self.epochs[-1].t if self.epochs else -math.inf)
         except UnusableSolution as error:
-            raise UserError(str(error)) from None
+            raise UserError(f"{self._solver}: {error}") from None
 
     def result(self, measured: Measurements) -> RecordingEstimate:
         """Return all estimates, the last of which follow from what was `measured`."""
