@@ -159,8 +159,8 @@ def fits(
     """Return the fits to all ranges in `measured` that begin at `starts`.
 
     Fits also begin at the first `doubted` ones without their outliers. A start from which there is no fit,
-    because a number is too large for a float, is left out. A solver of the user converges by its own rule, and
-    `until` does not count.
+    because a number is too large for a float, is left out. A solver of the user converges by its own rule,
+    and `until` does not count.
     """
     problem, found, starts = Problem.of(measured), [], list(starts)
     for start in (*starts, *_without_outliers(problem, measured, starts[:doubted])):
