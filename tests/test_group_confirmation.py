@@ -251,7 +251,7 @@ def test_a_visitor_does_not_drive_home_because_of_ranges_of_earlier_meetings() -
 @pytest.mark.long
 def test_a_second_meeting_of_two_robots_has_file_names_of_its_own() -> None:
     """Figures of two meetings of the same robots; those of the second replaced those of the first."""
-    run = of_frames(kept(scenario_with(2, SHIFTED)))
+    run = of_frames(kept(scenario_with(3, SHIFTED)))
     assert honest(run) == (3, 0, 0)
     pairs = list(pairs_of(run, {robot: agent_replay(run, robot) for robot in run.robots}))
     names = [pair.name for pair in pairs]
