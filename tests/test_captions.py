@@ -112,7 +112,7 @@ def test_the_story_of_paper_1_has_a_caption_for_each_of_its_beats(paper_1: Run) 
 
 @pytest.mark.long
 def test_under_noise_captions_speak_of_estimates_and_probabilities(recorded: Record) -> None:
-    run = recorded(load("noisy"))
+    run = recorded(load("noisy", seed=1))
     text = " ".join(text for _, text in told(run))
     assert "After a short drive, each robot has an estimate of its path" in text
     assert "a drives on a circle around its anchor to find b, which waits near its own." in text

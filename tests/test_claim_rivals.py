@@ -35,10 +35,12 @@ PASSED_AS_INLIERS = [
 
 
 @pytest.mark.parametrize("case", series(PASSED_AS_INLIERS, 0), ids=["told", "untold"])
-def test_an_outlier_that_passes_as_an_inlier_delays_the_claim(case: tuple[dict[str, Any], int]) -> None:
+def test_an_outlier_that_passes_as_an_inlier_leads_to_no_wrong_claim(
+    case: tuple[dict[str, Any], int],
+) -> None:
     fields, seed = case
     run = tandem.run(tandem.Scenario.load("random").with_(fields, seed=seed))
-    assert run.outcome == "localised"
+    assert run.outcome in ("localised", "undecided")
 
 
 def test_the_next_manoeuvre_is_planned_with_the_rival_that_blocks_a_claim(

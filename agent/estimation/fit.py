@@ -73,13 +73,27 @@ class Fit(NamedTuple):
     linear: Linear
     """The last linear model. Covariances are those of the point where it was computed."""
 
+    def __repr__(self) -> str:
+        return f"<Fit of {self.poses.tolist()}, log evidence {self.weight!r}>"
+
     def __hash__(self) -> int:
-        """Return the hash of this object."""
-        return id(self)
+        """Return the hash of its numbers."""
+        return hash((self.weight, self.chi2, self.level, self.last_step))
 
     def __eq__(self, other: object) -> bool:
-        """Return whether `other` is this fit itself: what follows from one fit is computed once."""
-        return self is other
+        """Return whether `other` is a fit to the same measurements with the same result, to the bit."""
+        if self is other or not isinstance(other, Fit):
+            return self is other
+        return hash(self) == hash(other) and all(
+            np.array_equal(one, another)
+            for one, another in (
+                (self.start.poses, other.start.poses),
+                (self.paths, other.paths),
+                (self.covariance, other.covariance),
+                (self.residuals, other.residuals),
+                (self.weights, other.weights),
+            )
+        )
 
     @property
     def guess(self) -> Array:

@@ -26,7 +26,7 @@ class Solution(NamedTuple):
 
 
 class Solver(Protocol):
-    """A fit of n robots to their odometry and ranges. Tandem finds the starts, and judges the claims.
+    """A fit of n robots to their odometry and ranges. Tandem finds the starts, and decides about claims.
 
     It is pure: equal measurements and starts give equal solutions, to the bit.
     """
