@@ -303,9 +303,10 @@ def test_what_follows_from_a_hypothesis_is_computed_once_for_both_robots() -> No
     ours, theirs = (inference.pair_planning_hypotheses(search(one).hypotheses) for one in (pair, again))
     assert all(one is other for one, other in zip(ours, theirs, strict=True))
     fitted = search(pair).hypotheses[0].fit
-    assert hash(fitted) != hash(fitted._replace(level=fitted.level)), (
-        "another fit, though it has the same values"
-    )
+    same = fitted._replace(poses=fitted.poses.copy())
+    assert (same, hash(same)) == (fitted, hash(fitted)), "a fit with the same numbers"
+    assert fitted != fitted._replace(level=2.0 * fitted.level)
+    assert fitted != fitted._replace(paths=fitted.paths + 1e-9)
 
 
 def test_a_followed_anchor_ends_after_one_linear_model_near_the_fit_of_all_steps() -> None:
