@@ -95,6 +95,10 @@ class Fit(NamedTuple):
             )
         )
 
+    def __ne__(self, other: object) -> bool:
+        """Return whether `other` is another fit; that of tuples would compare arrays."""
+        return not self == other
+
     @property
     def guess(self) -> Array:
         """The pivots in the robots' frames (m) and the headings (rad) at tick 0 (see `smoother`); (3 n,)."""
