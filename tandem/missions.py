@@ -78,10 +78,6 @@ def run(
         raise UserError(f"{where}: a run in one process has no processes to kill; set processes=True")
     if rate is not None:
         raise UserError("rate: a run in one process cannot run in real time; set processes=True")
-    return _in_process(chosen)
-
-
-def _in_process(chosen: Scenario) -> Run:
     began = time.perf_counter()
     model = in_process.recorded(chosen.template.scenario, chosen.source)
     return Run(model, "in-process", round(time.perf_counter() - began, 6))

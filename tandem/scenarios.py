@@ -82,7 +82,8 @@ class Scenario(msgspec.Struct, frozen=True):
         Raises BadScenario and Unworkable.
         """
         table, changed = self.table, {**(fields or {}), **top}
-        if [*changed] == ["seed"] and _is_seed(seed := plain(changed["seed"])):
+        seed = plain(changed.get("seed"))
+        if [*changed] == ["seed"] and type(seed) is int and 0 <= seed < 2**63:
             # all else stays valid, and its validation would take as long as a mission
             return Scenario({**table, "seed": seed}, self.source, self.template.reseeded(seed))
         for path, value in changed.items():
@@ -141,10 +142,6 @@ class Scenario(msgspec.Struct, frozen=True):
 
     def __repr__(self) -> str:
         return f"<Scenario {self.name}, seed {self.seed}: {', '.join(self.robots)}>"
-
-
-def _is_seed(value: object) -> bool:
-    return type(value) is int and 0 <= value < 2**63
 
 
 def scenario_of(given: Scenario | str | Path | Mapping[str, Any]) -> Scenario:

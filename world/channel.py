@@ -80,12 +80,10 @@ def idle_link_state(links: LinkFaults, tick: int, radio: Any = None) -> LinkStat
 
     Only the room under the bandwidths of its faults may have changed. `radio` is that in the radio model.
     """
-    room = [1.0 + (_idle_rate(fault) if _has_begun(fault, tick) else 0.0) for _, fault in links.faults]
+    room = [
+        1.0 + (fault.reports_per_tick or 0.0 if _has_begun(fault, tick) else 0.0) for _, fault in links.faults
+    ]
     return LinkState(room=tuple(room), radio=radio)
-
-
-def _idle_rate(fault: Fault) -> float:
-    return fault.reports_per_tick or 0.0
 
 
 def _has_begun(fault: Fault, tick: int) -> bool:

@@ -185,7 +185,7 @@ class WorldProcess:
         self._show_truth()
         commands: dict[str, Command] = {}
         now = time.monotonic()
-        self._set_repeat(now)
+        self._repeat, self._repeat_to_all = now + REPEAT_S, now + REPEAT_TO_ALL_S
         while due is not None or len(commands) < len(self._robots):
             arrival = self._next((self._repeat if due is None else due) - now)
             now = time.monotonic()
@@ -214,10 +214,6 @@ class WorldProcess:
         named = {*robots} & self._peers.keys()
         named |= {self._peers[robot] for robot in named}
         self._put({robot: frame for robot, frame in frames.items() if robot in named})
-
-    def _set_repeat(self, now: float) -> None:
-        """Set the times of the next repetitions, after new messages have been sent."""
-        self._repeat, self._repeat_to_all = now + REPEAT_S, now + REPEAT_TO_ALL_S
 
     def _put_all_again(self, frames: Mapping[str, bytes], missing: Iterable[str], now: float) -> None:
         """Repeat the `frames` of the robots that are `missing`, or of all robots if that is due."""

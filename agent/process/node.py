@@ -117,7 +117,9 @@ class AgentProcess:
             match arrival.topic:
                 case "observation":
                     message = self._decoded(arrival)
-                    if isinstance(message, MissionEnd) and self._is_accepted(message):
+                    if isinstance(message, MissionEnd) and (
+                        message.tick == self._latest_tick or self._out_of_step.persists(message, ENDED_S)
+                    ):
                         self._conclude(message)
                     elif isinstance(message, TickStart) or (
                         isinstance(message, Observation) and self._on_observation(message, arrival.frame)
@@ -197,9 +199,6 @@ class AgentProcess:
             return None
         decoded: Observation | MissionEnd | TickStart = message
         return decoded
-
-    def _is_accepted(self, end: MissionEnd) -> bool:
-        return end.tick == self._latest_tick or self._out_of_step.persists(end, ENDED_S)
 
     def _on_observation(self, observation: Observation, frame: bytes) -> bool:
         """Process an Observation and return whether it is in step. Raises NoWorld."""

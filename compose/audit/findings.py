@@ -118,15 +118,13 @@ def findings_of(
     rounding: list[Violation] = []
     violations: list[Violation] = []
     for one in found:
-        (rounding if versions is not None and _by_rounding(one) else violations).append(one)
+        by_rounding = one.difference is not None and one.difference.by_rounding
+        known = versions is not None and one.rule in RECOMPUTED and by_rounding
+        (rounding if known else violations).append(one)
     counts = [
         Count(rule, len(some), sum([one.rule == rule for one in violations])) for rule, some in checks.items()
     ]
     return Findings(scenario, ticks, tuple(counts), tuple(violations), links, tuple(rounding), versions)
-
-
-def _by_rounding(one: Violation) -> bool:
-    return one.rule in RECOMPUTED and one.difference is not None and one.difference.by_rounding
 
 
 def difference(found: msgspec.Struct, expected: msgspec.Struct) -> str:

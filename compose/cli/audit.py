@@ -31,7 +31,9 @@ def main(options: argparse.Namespace) -> int:
 
 
 def _show(findings: Findings) -> None:
-    tell(f"{findings.scenario}: {_count(len(findings.violations))} over {findings.ticks} ticks", "")
+    found = len(findings.violations)
+    violations = "one violation" if found == 1 else f"{found or 'no'} violations"
+    tell(f"{findings.scenario}: {violations} over {findings.ticks} ticks", "")
     say(f"{'rule':10}{'checks':>8}{'violations':>12}")
     for one in findings.counts:
         say(f"{one.rule:10}{one.checks:>8}{one.violations:>12}")
@@ -51,7 +53,3 @@ def _show(findings: Findings) -> None:
         tell(violation.line)
     if len(findings.violations) > SHOWN_VIOLATIONS:
         say(f"and {len(findings.violations) - SHOWN_VIOLATIONS} more")
-
-
-def _count(violations: int) -> str:
-    return "one violation" if violations == 1 else f"{violations or 'no'} violations"

@@ -145,7 +145,10 @@ def _path(drawn: Drawn, medium: Medium) -> Figure:
         points += [(row.x, row.y) for row in rows]
         for row in rows[:: math.ceil(len(rows) / OUTLINES_PER_PATH)]:
             if math.sqrt(row.xx + row.yy) <= TOO_WIDE:
-                around_it = outline(Pose(row.x, row.y, row.heading), _covariance(row))
+                around_it = outline(
+                    Pose(row.x, row.y, row.heading),
+                    Covariance(row.xx, row.xy, row.xh, row.yy, row.yh, row.hh),
+                )
                 axes.add_patch(Polygon(around_it, facecolor=colour, edgecolor=colour, alpha=0.18, lw=0.8))
                 points += around_it
         axes.plot(rows[0].x, rows[0].y, ls="", ms=5, **marks)
@@ -159,10 +162,6 @@ def _path(drawn: Drawn, medium: Medium) -> Figure:
     sheet.plane("plane", around(points, PATH_MARGIN), TALLEST)
     sheet.key(axes)
     return sheet.finished()
-
-
-def _covariance(row: PoseEstimateRow) -> Covariance:
-    return Covariance(row.xx, row.xy, row.xh, row.yy, row.yh, row.hh)
 
 
 def _over_time(drawn: Drawn, medium: Medium) -> Figure:

@@ -150,7 +150,7 @@ def _candidates(axes: Axes, pair: PairRecord, one: Planned, seen: ManoeuvreView,
             axes, (x, y), rho, ls=(0, (5, 3)), lw=1.0, color="k", gid="rho", label=f"last range, {rho:.4f} m"
         )
     after = _after(pair, one)
-    end = _end(seen, one.plan, pair.mission)
+    end = step(seen.mover, one.plan.command.v, one.plan.command.omega, pair.mission.period)
     for i, place in enumerate(seen.others, start=1):
         away = math.hypot(place.x - x, place.y - y) or 1.0
         axes.plot(
@@ -185,10 +185,6 @@ def _bisector(axes: Axes, one: Pose, other: Pose, length: float, gid: str) -> No
         [x - length * ux, x + length * ux], [y - length * uy, y + length * uy], "-", lw=0.7, color=PALE,
         zorder=1, gid=gid,
     )  # fmt: skip
-
-
-def _end(seen: ManoeuvreView, plan: Plan, mission: Mission) -> Pose:
-    return step(seen.mover, plan.command.v, plan.command.omega, mission.period)
 
 
 def _reach(axes: Axes, pair: PairRecord, plan: Plan, seen: ManoeuvreView, ways: Compared) -> None:

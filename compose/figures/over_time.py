@@ -165,7 +165,7 @@ def draw_errors(axes: Axes, pair: PairRecord, quantity: Quantity, *roles: Role) 
     Before the encounter, draw those of the pose relative to the anchor. Of one robot, the claimed sigma is
     drawn too, and the errors within 3 sigma are shaded.
     """
-    off = error if quantity == "position" else _heading_error
+    off = error if quantity == "position" else lambda pose, truth: abs(wrap(pose.heading - truth.heading))
     sigmas: Points = ()
     for role in roles:
         sigmas = _errors(axes, pair, role, quantity, off)
@@ -187,10 +187,6 @@ def draw_errors(axes: Axes, pair: PairRecord, quantity: Quantity, *roles: Role) 
             zorder=0, gid="envelope",
         )  # fmt: skip
     axes.set_ylabel(f"{quantity} error [{'m' if quantity == 'position' else 'rad'}]")
-
-
-def _heading_error(pose: Pose, truth: Pose) -> float:
-    return abs(wrap(pose.heading - truth.heading))
 
 
 def _errors(

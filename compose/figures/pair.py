@@ -206,10 +206,10 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
     @cached_property
     def encounter_tick(self) -> int | None:
         """The first tick in which one of the robots is in phase 3; None if there is none."""
-        return next((tick for tick in range(self.first, len(self.mutual)) if self._meet(tick)), None)
-
-    def _meet(self, tick: int) -> bool:
-        return any(tick < len(side.phases) and side.phases[tick] == 3 for side in (self.a, self.b))
+        for tick in range(self.first, len(self.mutual)):
+            if any(tick < len(side.phases) and side.phases[tick] == 3 for side in (self.a, self.b)):
+                return tick
+        return None
 
     @property
     def first(self) -> int:

@@ -105,7 +105,8 @@ class Sheet:
         cell, edge = self.panels[name], self.width < PAGE
         cell.set_axis_off()
         handles, labels = panel.get_legend_handles_labels()
-        share = [width for width, one in zip(self._widths, self._row(name), strict=True) if one == name]
+        row = next(row for row in self._mosaic if name in row)
+        share = [width for width, one in zip(self._widths, row, strict=True) if one == name]
         room = self.width - 2 * PAD if edge else KEY_WIDTH * self.width * sum(share) / sum(self._widths)
         places = self.figure.transFigure if edge else cell.transAxes
         columns = 1
@@ -121,10 +122,6 @@ class Sheet:
             columns = max(1, min(len(labels), int(room * self.figure.dpi / max(extent.width, 1.0))))
         height = extent.height / self.figure.dpi if labels else 0.0
         self._heights[name] = lambda: height
-
-    def _row(self, name: str) -> Sequence[str]:
-        """Return the row of the mosaic with the cell `name`."""
-        return next(row for row in self._mosaic if name in row)
 
     def finished(self) -> Figure:
         """Return the figure, as high as its rows of panels need."""

@@ -185,12 +185,8 @@ class Run(msgspec.Struct, frozen=True, dict=True):
 
     def truth(self, robot: str) -> tuple[Pose, ...]:
         """Return the true pose of `robot` at each tick; empty in hardware mode."""
-        return tuple([poses[self._place[robot]] for poses in self._poses])
-
-    @cached_property
-    def _poses(self) -> list[tuple[Pose, ...]]:
-        """The true poses at each tick, in the order of the scenario."""
-        return [tick.truth.poses for tick in self.world.ticks] if self.world is not None else []
+        ticks = self.world.ticks if self.world is not None else ()
+        return tuple([tick.truth.poses[self._place[robot]] for tick in ticks])
 
     @cached_property
     def _place(self) -> dict[str, int]:

@@ -149,9 +149,10 @@ def over_axis(sweep: Sweep, place: int, statistic: Statistic, points: Sequence[F
     for (i, line), (rank, quantity) in product(enumerate(lines), enumerate(quantities)):
         colour, style, marker = STYLES[i]
         shown = [point for point in points if (point.line, point.quantity) == (line, quantity)]
+        aside = 0.0 if joined else POINTS_SPREAD / len(lines) * (i - 0.5 * (len(lines) - 1))
         values = np.array([point[3:] for point in shown]).T.reshape(3, -1)
         axes.errorbar(
-            [at[point.value] + (0.0 if joined else _aside(i, len(lines))) for point in shown],
+            [at[point.value] + aside for point in shown],
             values[0],
             yerr=np.maximum(0.0, [values[0] - values[1], values[2] - values[0]]),
             color=colour,
@@ -241,11 +242,6 @@ def _numbers(axis: Axis) -> list[float] | None:
     if any(isinstance(value, bool) or not isinstance(value, int | float) for value in values):
         return None
     return [float(value) for value in values]
-
-
-def _aside(i: int, lines: int) -> float:
-    """Return the horizontal offset of the points of line `i`."""
-    return POINTS_SPREAD / lines * (i - 0.5 * (lines - 1))
 
 
 def _unpaired(sweep: Sweep, place: int) -> str | None:

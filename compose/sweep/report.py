@@ -111,7 +111,8 @@ def show(results: Results, out: Path, *, quiet: bool) -> None:
     total = {name: sum([getattr(one, name) for one in results.figures.values()]) for name in OUTCOME_COLUMNS}
     total["refused"] = sum([one.refused_trials for one in results.figures.values()])
     counts = ", ".join([f"{count} {name}" for name, count in total.items() if count])
-    tell(f"{results.sweep.name}: {counts} of {len(results.table)} trials in {_cells(len(results.cells))}")
+    cells = "one cell" if len(results.cells) == 1 else f"{len(results.cells)} cells"
+    tell(f"{results.sweep.name}: {counts} of {len(results.table)} trials in {cells}")
     if any(one.audited for one in results.figures.values()):
         tell(_audited(results))
     if quiet:
@@ -267,17 +268,12 @@ def _well(figures: CellSummary) -> bool:
     )
 
 
-def _noisy(results: Results) -> bool:
-    """Return true if robots claimed covariances in any cell."""
-    return any(one.nees_mean is not None for one in results.figures.values())
-
-
 def _choices(results: Results) -> tuple[tuple[str, ...], ...]:
     """Return the possible choices of columns, the widest first."""
     more = (
         *(SHOWN_GROUP_COLUMNS if results.sweep.of_group else ()),
         *(OF_ATTACKED_GROUP if any(one.attacker_met for one in results.figures.values()) else ()),
-        *(OF_NOISE if _noisy(results) else ()),
+        *(OF_NOISE if any(one.nees_mean is not None for one in results.figures.values()) else ()),
     )
     if not more:
         return COLUMN_CHOICES
@@ -312,7 +308,3 @@ def _figures(figures: CellSummary) -> dict[str, str]:
         "honest": "-" if None in honest else "/".join(map(str, honest)),
         "found": f"{figures.attacker_found}/{figures.attacker_met}" if figures.attacker_met else "-",
     }
-
-
-def _cells(count: int) -> str:
-    return "one cell" if count == 1 else f"{count} cells"

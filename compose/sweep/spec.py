@@ -246,13 +246,10 @@ def _axis(table: AxisTable, where: str, base: dict[str, Any]) -> Axis:
         return _axis_of_rows(table, table.rows, where, base)
     assert table.values is not None
     fields = _fields(table, where)
-    ways = []
+    ways: list[Steps] = []
     for i, field in enumerate(fields):
         named = f"{where}.fields[{i}]" if table.fields is not None else f"{where}.field"
-        try:
-            ways.append(steps(field, base))
-        except NoSuchField as error:
-            raise BadSpec(f"{named}: '{field}': {error}") from None
+        ways += _ways([field], base, named)
     seen: dict[str, int] = {}
     values = []
     for i, value in enumerate(table.values):

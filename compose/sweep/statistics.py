@@ -126,15 +126,6 @@ def _within(trials: CellTrials) -> float | None:
     return float(trials.known("claims_within").sum() / claims) if claims else None
 
 
-def _clean(trials: CellTrials) -> int:
-    return int((trials.known("violations") == 0.0).sum())
-
-
-def _nees(trials: CellTrials) -> float | None:
-    known = trials.known("nees")
-    return float(known.mean()) if len(known) else None
-
-
 Number = float | None
 
 
@@ -194,7 +185,12 @@ class CellSummary(msgspec.Struct, frozen=True):
         Number, SummaryColumn(lambda trials: _fraction(trials.table["truth_held"].to_pylist()))
     ]
     """fraction of the trials with claims under noise in which every such robot held the true hypothesis"""
-    nees_mean: Annotated[Number, SummaryColumn(_nees, "nees", ".3g")]
+    nees_mean: Annotated[
+        Number,
+        SummaryColumn(
+            lambda one: float(known.mean()) if len(known := one.known("nees")) else None, "nees", ".3g"
+        ),
+    ]
     """mean over trials of the mean NEES of their robots' claims, wrong ones included; 3 is expected if the
     claimed covariances are consistent. The errors of a pair are correlated, so a trial counts once"""
     nees_low: Annotated[
@@ -211,7 +207,9 @@ class CellSummary(msgspec.Struct, frozen=True):
     """median number of reports that all robots of a trial sent"""
     audited: Annotated[int, SummaryColumn(lambda trials: len(trials.known("violations")))]
     """number of audited trials"""
-    clean: Annotated[int, SummaryColumn(_clean, "clean", rank=3)]
+    clean: Annotated[
+        int, SummaryColumn(lambda trials: int((trials.known("violations") == 0.0).sum()), "clean", rank=3)
+    ]
     """number of audited trials without a violation"""
     violations: Annotated[int, _total("violations")]
     """number of violations in all trials"""

@@ -238,7 +238,10 @@ def row(trial: Trial, run: Run, wall_s: float, findings: Findings | None = None)
     group = group_columns(run)
     errors = [robot.position_error_m for robot in robots.values() if robot.position_error_m is not None]
     largest: dict[str, Any] = {
-        name: _most([getattr(one, name) for one in robots.values()]) for name in LARGEST
+        name: max(
+            [one for robot in robots.values() if (one := getattr(robot, name)) is not None], default=None
+        )
+        for name in LARGEST
     }
     nees = [robot.nees for robot in robots.values() if robot.nees is not None]
     held = [robot.truth_held for robot in robots.values() if robot.truth_held is not None]
@@ -328,8 +331,3 @@ def _last(ticks: list[int | None]) -> int | None:
     """Return the largest of `ticks`; None if any is None."""
     known = [tick for tick in ticks if tick is not None]
     return max(known) if len(known) == len(ticks) else None
-
-
-def _most(values: list[N | None]) -> N | None:
-    """Return the largest of the known values; None if there is none."""
-    return max([value for value in values if value is not None], default=None)

@@ -108,7 +108,9 @@ class Journals:
                 if path.name == WORLD_JOURNAL:
                     self._fold_world(frames, path)
                 else:
-                    self._fold_agent(frames, path)
+                    for frame in frames:
+                        message = decode(frame, OfRobot, MAX_FRAME_BYTES)
+                        self.known.add(message, len(frame), robot_of(path.name))
             except OtherVersion as error:
                 self._note(f"{self.folder}: {error.versions}; {error.remedy}")  # the same in all journals
             except CorruptJournal as error:
@@ -143,11 +145,6 @@ class Journals:
     def _note(self, text: str) -> None:
         if text not in self.notes:
             self.notes.append(text)
-
-    def _fold_agent(self, frames: list[bytes], path: Path) -> None:
-        robot = robot_of(path.name)
-        for frame in frames:
-            self.known.add(decode(frame, OfRobot, MAX_FRAME_BYTES), len(frame), robot)
 
     def _fold_world(self, frames: list[bytes], path: Path) -> None:
         reading = self._world

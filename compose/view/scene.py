@@ -127,12 +127,7 @@ class Player(msgspec.Struct, frozen=True, omit_defaults=True):
         """Return the role whose colour the robot has: in a group, a once it is localised, and b before."""
         if self.peer is None:
             return robot_setup.role
-        return "a" if self.is_localised else "b"
-
-    @property
-    def is_localised(self) -> bool:
-        """True if the robot claims to know its pose."""
-        return self.command is not None and isinstance(self.command.verdict, Localised)
+        return "a" if self.command is not None and isinstance(self.command.verdict, Localised) else "b"
 
 
 class PairLink(NamedTuple):

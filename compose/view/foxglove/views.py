@@ -118,7 +118,9 @@ class Views:
             robot_setup = self.setup.robot_setup(player.robot)
             frames = {}
             if robot_setup.given_anchor is not None:
-                frames[f"{player.robot}/anchor"] = _frame(robot_setup)
+                frames[f"{player.robot}/anchor"] = robot_setup.frame or Pose(
+                    robot_setup.anchor.x, robot_setup.anchor.y, 0.0
+                )
             if player.pose is not None:
                 frames[player.robot] = player.pose
             for child, pose in frames.items():
@@ -235,11 +237,6 @@ class Views:
         return fox.SceneEntity(
             timestamp=at, frame_id=frame, id=robot, arrows=arrows, lines=lines, texts=texts
         )
-
-
-def _frame(robot_setup: RobotSetup) -> Pose:
-    """Return the robot's anchor frame in the world frame, unrotated if its heading is unknown."""
-    return robot_setup.frame or Pose(robot_setup.anchor.x, robot_setup.anchor.y, 0.0)
 
 
 def _line(event: Event, at: fox.Timestamp) -> fox.Log:

@@ -235,10 +235,14 @@ class Listener:
             if robot is not None and appeared.qsize() < MOST_APPEARING:
                 appeared.put(robot)
 
+        def hand_over(sample: zenoh.Sample) -> None:
+            received.set()
+            session.deliver(sample, self._inbox, "command")
+
         received = threading.Event()
         session.watch_liveliness(link, keys.world_alive("*"), self._inbox)
         for key in LISTENED:
-            link.declare_subscriber(key, self._hand_over(received))
+            link.declare_subscriber(key, hand_over)
         session.watch_liveliness(link, keys.robot_alive("*", "*"), self._inbox)
         liveliness: Any = link.liveliness()
         liveliness.declare_subscriber(keys.robot_alive("*", "*"), appears, history=True)
@@ -253,13 +257,6 @@ class Listener:
                     return
                 continue
             self._ask(link, robot.run, robot.robot)
-
-    def _hand_over(self, received: threading.Event) -> Callable[[zenoh.Sample], None]:
-        def hand_over(sample: zenoh.Sample) -> None:
-            received.set()
-            session.deliver(sample, self._inbox, "command")
-
-        return hand_over
 
     def _ask(self, link: zenoh.Session, run: str, robot: str) -> None:
         known = self.shows.get(run)
