@@ -32,7 +32,7 @@ BELOW = {
 }
 """The packages of the project that each package may import."""
 
-BUDGETS = {"protocol": 4_340, "agent": 16_605, "world": 4_285, "compose": 29_150, "tandem": 1_555}
+BUDGETS = {"protocol": 4_336, "agent": 16_598, "world": 4_277, "compose": 29_093, "tandem": 1_544}
 """The largest number of lines of Python and C of each package. Raising one needs a reason in the commit."""
 
 SHELL = {
