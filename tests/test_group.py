@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from agent.planning import group_transitions
-from agent.planning.group import TRAVELLING_MODE
-from agent.planning.group_state import Fix
-from agent.planning.group_transitions import PEER_LOST_AFTER
+from agent.planning.group_knowledge import Fix
+from agent.planning.group_transitions import PEER_LOST_AFTER, TRAVELLING_MODE
 from agent.planning.phase2_orbit import Travelling, next_leg, travel_controls
 from agent.planning.state import Done
 from agent.planning.visit import MOST_SIDES
@@ -170,7 +169,7 @@ def test_a_robot_in_phase_1_goes_on_with_it_when_its_peer_ends_their_meeting(sig
     state = planner.observe(planner.start(config), Observation(0, "r0", None, 1.0, near))
     refusal = Report(0, config.peer, 1, "straight", None, 0, 0, (), 0, (), 0, 0, Undecided("a false log"))
     after = planner.decide(state, [refusal])
-    assert after.verdict is None
+    assert after.robot_verdict is None
     assert after.other(config.peer).failed
     command = planner.command(after)
     assert (command.phase, command.task) == (1, "straight")
@@ -189,9 +188,8 @@ def test_a_localised_robot_waits_for_its_peer_beside_it_for_a_bounded_time(
     config = scenario.config(scenario.meetings[-1].visitor)
     planner = planner_of(config)
     state, claim = planner.start(config), Localised(Pose(0.0, 0.0, 0.0))
-    pair = replace(state.pair, mode=Done(3, claim), in_contact=True)
-    assert pair.verdict == claim
-    state = replace(state, pair=pair, verdict=claim, fix=Fix(0, claim, (config.peer,)), silence=silence)
+    state = replace(state, mode=Done(3, claim), in_contact=True, fix=Fix(0, claim, (config.peer,)))
+    state = replace(state, robot_verdict=claim, silence=silence)
     assert group_transitions.onward(state, peer_has_left=refused).visiting == leaves
 
 

@@ -17,10 +17,10 @@ from msgspec.structs import astuple, replace
 from agent.estimation.gaussian.claim_agreement import agreement, covariance_union, difference, minus
 from agent.peer.motion_log import MotionLog
 from agent.planning.active_sensing import Listening, Surveying
-from agent.planning.confirmation import ConfirmingPlanner
-from agent.planning.group_state import GroupState
+from agent.planning.group import GroupPlanner
 from agent.planning.own_pose import later_pose
 from agent.planning.range_seeking import Homing
+from agent.planning.state import RobotState
 from compose.audit.replay import replayed
 from compose.errors import Unworkable
 from compose.figures.agent_replay import agent_replay
@@ -70,11 +70,11 @@ def without_attacker() -> dict[str, list[bytes]]:
     return kept(scenario_with(3))
 
 
-def states(run: Run, robot: str) -> list[GroupState]:
+def states(run: Run, robot: str) -> list[RobotState]:
     """Return the states of a robot after each tick of its recording."""
     agent = run.agents[robot]
     planner = planner_of(agent.config)
-    assert isinstance(planner, ConfirmingPlanner)
+    assert isinstance(planner, GroupPlanner)
     state, found = planner.start(agent.config), []
     for one in agent.steps:
         state = planner.observe(state, one.observation)
@@ -106,11 +106,11 @@ def test_a_robot_claims_a_pose_later_than_it_knows_one_and_by_two_peers_that_agr
     run = of_frames(without_attacker())
     for robot in run.robots:
         before, after = next(
-            (one, other) for one, other in pairwise(states(run, robot)) if other.verdict is not None
+            (one, other) for one, other in pairwise(states(run, robot)) if other.robot_verdict is not None
         )
-        assert before.verdict is None
+        assert before.robot_verdict is None
         assert before.fix is not None
-        assert isinstance(after.verdict, Localised)
+        assert isinstance(after.robot_verdict, Localised)
         peers = {one.config.peer for one in after.confirming.meetings}
         assert len(peers) == len(after.confirming.meetings) >= 2
 
@@ -181,9 +181,9 @@ def test_a_robot_leaves_for_its_anchor_though_the_one_that_it_has_met_is_in_rang
         steps = run.agents[robot].steps[1:]
         for (before, state), step in zip(pairwise(states(run, robot)), steps, strict=True):
             in_range = [one.peer for one in step.observation.contacts]
-            if before.alone and state.alone and state.pair.config.peer in in_range:
+            if before.alone and state.alone and state.config.peer in in_range:
                 left += 1
-                assert not state.pair.in_contact
+                assert not state.in_contact
     assert left > 4
 
 
@@ -195,8 +195,8 @@ def test_the_pose_after_a_long_way_does_not_depend_on_the_hypotheses_of_its_meet
     for robot in run.robots:
         state = states(run, robot)[-1]
         for met in state.confirming.meetings:
-            expected = later_pose(met, state.pair)
-            again = later_pose(replace(met, belief=replace(met.belief, pair=())), state.pair)
+            expected = later_pose(met, state)
+            again = later_pose(replace(met, belief=replace(met.belief, pair=())), state)
             if expected is None:
                 continue
             found += 1
@@ -209,23 +209,23 @@ def test_a_robot_compares_its_meetings_once_more_before_it_gives_up() -> None:
     """Without it, the agreement of a late meeting was not found."""
     run = of_frames(without_attacker())
     found = states(run, "r1")
-    tick = next(tick for tick, one in enumerate(found) if one.verdict is not None)
+    tick = next(tick for tick, one in enumerate(found) if one.robot_verdict is not None)
     before, after, step = found[tick - 1], found[tick], run.agents["r1"].steps[tick]
     config = before.config
     assert config.confirms
-    assert isinstance(after.verdict, Localised)
+    assert isinstance(after.robot_verdict, Localised)
     assert after.fix is not None
-    assert after.fix.tick < after.pair.tick  # no meeting has just ended
+    assert after.fix.tick < after.tick  # no meeting has just ended
     planner = planner_of(config)
 
-    def decided(gives_up: float) -> GroupState:
-        pair = replace(before.pair, config=replace(config, gives_up=gives_up))
-        state = replace(before, pair=pair, confirming=replace(before.confirming, ranges=10**6))
+    def decided(gives_up: float) -> RobotState:
+        confirming = replace(before.confirming, ranges=10**6)
+        state = replace(before, config=replace(config, gives_up=gives_up), confirming=confirming)
         state = planner.observe(state, step.observation)
         return planner.decide(state, [framed.report for framed in step.received])  # type: ignore[no-any-return]
 
-    assert decided(math.inf).verdict is None
-    assert decided(0.0).verdict == after.verdict
+    assert decided(math.inf).robot_verdict is None
+    assert decided(0.0).robot_verdict == after.robot_verdict
 
 
 @pytest.mark.long
@@ -240,7 +240,7 @@ def test_a_visitor_does_not_drive_home_because_of_ranges_of_earlier_meetings() -
     assert honest(run) == (3, 0, 0)
     met_again = 0
     for robot in run.agents:
-        for before, after in pairwise([state.pair for state in states(run, robot)]):
+        for before, after in pairwise(states(run, robot)):
             meets = before.config.role == "a" and isinstance(before.mode, Surveying | Listening)
             if meets and len(before.mutual) > 60:
                 met_again += 1

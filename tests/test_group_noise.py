@@ -13,7 +13,8 @@ from agent.estimation.gaussian.claim_agreement import difference
 from agent.peer.motion_log import MotionLog
 from agent.planning import group_transitions
 from agent.planning.group import GroupPlanner
-from agent.planning.group_state import Fix, GroupState, Other
+from agent.planning.group_knowledge import Fix, Other
+from agent.planning.state import RobotState
 from compose.audit.rules import audit_run
 from compose.errors import Unworkable
 from compose.launch.in_process import run_mission
@@ -100,27 +101,28 @@ SMALL = Covariance(0.01, 0.0, 0.0, 0.01, 0.0, 0.01)
 """The covariance of a claim: sigmas of 0.1 m and 0.1 rad."""
 
 
-def after_meetings(agreeing: tuple[str, ...]) -> GroupState:
+def after_meetings(agreeing: tuple[str, ...]) -> RobotState:
     """Return the state of r0 in a meeting with r1, if those with `agreeing` have given the same pose."""
     config = group_of(5, 1, sigma=SIGMA).config("r0")
     planner = planner_of(config)
     assert isinstance(planner, GroupPlanner)
     state = planner.start(config.in_meeting("r1", "a"))
     claim = Localised(ORIGIN, SMALL)
-    return replace(state, verdict=claim, fix=Fix(0, claim, agreeing))
+    return replace(state, robot_verdict=claim, fix=Fix(0, claim, agreeing))
 
 
 def test_a_pose_on_which_two_meetings_agree_stays_and_the_third_peer_is_not_met_again() -> None:
     state = after_meetings(("r2", "r3"))
-    after = group_transitions.with_claim(state, Localised(Pose(0.0, 0.0, 2.0), SMALL))
-    assert (after.verdict, after.fix, after.frame) == (state.verdict, state.fix, state.frame)
+    after = group_transitions.with_pose(state, Localised(Pose(0.0, 0.0, 2.0), SMALL))
+    assert (after.robot_verdict, after.fix) == (state.robot_verdict, state.fix)
+    assert after.frame == state.frame
     assert after.other("r1").failed
 
 
 def test_a_pose_from_one_meeting_is_withdrawn_with_both_peers_if_the_next_contradicts_it() -> None:
     state = after_meetings(("r2",))
-    after = group_transitions.with_claim(state, Localised(Pose(0.0, 0.0, 2.0), SMALL))
-    assert (after.verdict, after.fix) == (None, None)
+    after = group_transitions.with_pose(state, Localised(Pose(0.0, 0.0, 2.0), SMALL))
+    assert (after.robot_verdict, after.fix) == (None, None)
     assert isinstance(after.failure, Undecided)
     assert after.failure.reason.startswith("r2 and r1 contradict each other")
     assert after.other("r2") == Other(failed=True)
@@ -128,8 +130,8 @@ def test_a_pose_from_one_meeting_is_withdrawn_with_both_peers_if_the_next_contra
 
 def test_a_meeting_that_agrees_changes_no_claim() -> None:
     state = after_meetings(("r2",))
-    after = group_transitions.with_claim(state, Localised(Pose(0.1, -0.1, 0.1), SMALL))
-    assert after.verdict == state.verdict
+    after = group_transitions.with_pose(state, Localised(Pose(0.1, -0.1, 0.1), SMALL))
+    assert after.robot_verdict == state.robot_verdict
     assert after.fix is not None
     assert after.fix.peers == ("r2", "r1")
 

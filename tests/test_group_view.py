@@ -144,7 +144,7 @@ def test_the_meetings_that_viewers_find_are_those_of_the_planners(faults: str, t
         again = PlannerReplay(agent, planner_of(agent.config))
         for step in again:
             if step.command is not None:
-                played[robot].append(again.robot.state.pair.config.peer)
+                played[robot].append(again.robot.state.config.peer)
     for scene in scenes_of(run):
         for player in scene.players:
             compared += 1

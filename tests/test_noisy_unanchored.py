@@ -21,9 +21,9 @@ from agent.estimation.claim import is_definite
 from agent.estimation.gaussian.contact_fit import ContactRanges, estimated
 from agent.estimation.gaussian.odometry_noise import Track, track
 from agent.planning.accuracy_seeking import AccuracySeeking
-from agent.planning.group_state import GroupState
-from agent.planning.noisy_search import NoisyGroupPlanner
+from agent.planning.group import GroupPlanner
 from agent.planning.noisy_unanchored import NoisyUnanchoredPlanner
+from agent.planning.state import RobotState
 from agent.process.agent_journal import Step
 from compose.audit.replay import replayed
 from compose.audit.rules import audit_run
@@ -253,18 +253,18 @@ def three_and_one() -> dict[str, Any]:
     return table
 
 
-def in_search(run: Run, peers: tuple[str, ...], shift: float) -> GroupState | None:
+def in_search(run: Run, peers: tuple[str, ...], shift: float) -> RobotState | None:
     """Return the state of a when it begins to sweep; None if it does not, because its claim is withdrawn.
 
     Before it claims its pose with c, the pose that it knows is from its meetings with `peers`, and `shift` m
     beside the one that it has computed.
     """
-    agent, planner = run.agents["a"], NoisyGroupPlanner(AccuracySeeking())
+    agent, planner = run.agents["a"], GroupPlanner(AccuracySeeking())
     state, changed = planner.start(agent.config), False
     for one in agent.steps:
         state = planner.observe(state, one.observation)
         fix = state.fix
-        if not changed and fix is not None and state.config.peer == "c" and state.pair.in_contact:
+        if not changed and fix is not None and state.config.peer == "c" and state.in_contact:
             pose = replace(fix.claim.pose, x=fix.claim.pose.x + shift)
             fix = replace(fix, peers=peers, claim=replace(fix.claim, pose=pose))
             state, changed = replace(state, fix=fix), True
@@ -278,11 +278,11 @@ def test_the_search_begins_with_the_pose_that_the_robot_knows_after_a_meeting_th
     run = of_frames(kept(noisy(three_and_one())))
     agreeing = in_search(run, ("b",), 0.0)
     assert agreeing is not None
-    assert agreeing.pair.config.peer == "c"
+    assert agreeing.config.peer == "c"
     kept_claim = in_search(run, ("b", "d"), 2.0)
     assert kept_claim is not None
     assert kept_claim.other("c").failed
-    assert kept_claim.pair.config.peer == "b"
+    assert kept_claim.config.peer == "b"
     assert in_search(run, ("b",), 2.0) is None
 
 
@@ -293,7 +293,7 @@ def test_a_claim_that_later_ranges_contradict_is_withdrawn_in_the_search_and_no_
     run = of_frames(journals())
     (finder,) = {report.robot for _, report, _ in references(run)}
     first = min(prior.tick for _, _, prior in references(run))
-    agent, planner = run.agents[finder], NoisyGroupPlanner(AccuracySeeking())
+    agent, planner = run.agents[finder], GroupPlanner(AccuracySeeking())
     state = planner.start(agent.config)
     for one in agent.steps[: first + 1]:
         if one.observation.tick == first:
@@ -319,7 +319,7 @@ def test_a_claim_that_later_ranges_contradict_is_withdrawn_in_the_search_and_no_
 def test_a_robot_that_takes_a_finder_anew_receives_the_manoeuvres_since_the_reference_again() -> None:
     run = of_frames(journals())
     receiver, report, first = references(run)[0]
-    agent, planner = run.agents[report.robot], NoisyGroupPlanner(AccuracySeeking())
+    agent, planner = run.agents[report.robot], GroupPlanner(AccuracySeeking())
     state, since = planner.start(agent.config), []
     for one in agent.steps[: first.tick + 9]:
         state = planner.decide(planner.observe(state, one.observation), of_robots(one))

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from agent.planning.group import TRAVELLING_MODE
+from agent.planning.group_transitions import TRAVELLING_MODE
 from agent.planning.unanchored import UnanchoredPlanner, UnanchoredState
 from compose.audit.replay import replayed
 from compose.errors import UserError

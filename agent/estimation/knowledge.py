@@ -97,6 +97,11 @@ class Knowledge(msgspec.Struct, frozen=True):
     """Noisy sensors: the solver that the planner has chosen; None for the smoother."""
 
     @property
+    def knowledge(self) -> Knowledge:
+        """Return this knowledge alone, without what a subclass adds to it."""
+        return Knowledge(**{name: getattr(self, name) for name in Knowledge.__struct_fields__})
+
+    @property
     def start(self) -> Pose:
         """Return the pose of tick 0 in the frame of the robot's anchor; known from phase 2 on."""
         assert self.belief.branch is not None

@@ -12,21 +12,26 @@ from msgspec.structs import replace
 
 from agent.estimation.gaussian.claim_agreement import difference
 from agent.estimation.knowledge import Belief
+from agent.peer.peer_state import PeerState
 from agent.planning import passing, phase2_orbit, sweep_transitions, transitions, visit
-from agent.planning.group_state import Fix, GroupState
+from agent.planning.group_knowledge import Fix
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Travelling
-from agent.planning.state import Done, RobotState
+from agent.planning.state import MODE_NAMES, UNCONFIRMED, Asleep, Done, RobotState
 from protocol.messages import (
     Appointment,
     Contact,
     Localised,
     Member,
+    Report,
     Undecided,
     Verdict,
 )
 from protocol.mission import Role
 from protocol.motion import compose
 from protocol.orbits import Rendezvous
+
+TRAVELLING_MODE = MODE_NAMES[Travelling]
+"""The mode of a robot that is localised, and drives to another one."""
 
 PARTED_AFTER = 8
 """The ticks out of range of a peer after which a robot whose meeting has ended goes on.
@@ -45,14 +50,31 @@ LINGERING = 6
 # --- meetings -----------------------------------------------------------------------------------------
 
 
-def answering(state: GroupState, visitors: Sequence[str]) -> GroupState:
-    """Return `state` in a meeting with one of `visitors`, which have come to it, if it waits for one."""
-    pair = state.pair
-    if not state.waits or pair.belief.phase1_done_tick is None:
+def with_sender(state: RobotState, report: Report) -> RobotState:
+    """Return `state` with what `report` says about its sender: whether it travels, is localised or served.
+
+    If poses have to be confirmed, a robot that travels need not have claimed its own.
+    """
+    known, travels, confirms = (
+        state.other(report.robot),
+        report.state == TRAVELLING_MODE,
+        state.config.confirms,
+    )
+    claims = not report.has_log and isinstance(report.verdict, Localised)
+    localised = known.localised or claims or (travels and not confirms)
+    served = known.served or (report.state == UNCONFIRMED and not confirms)
+    if (travels, localised, served) == (known.travels, known.localised, known.served):
         return state
-    if pair.config.peer in visitors and not (state.alone or refused(state, pair.config.peer)):
+    return state.with_other(report.robot, replace(known, travels=travels, localised=localised, served=served))
+
+
+def answering(state: RobotState, visitors: Sequence[str]) -> RobotState:
+    """Return `state` in a meeting with one of `visitors`, which have come to it, if it waits for one."""
+    if not state.waits or state.belief.phase1_done_tick is None:
+        return state
+    if state.config.peer in visitors and not (state.alone or refused(state, state.config.peer)):
         # a robot that searches for its peer must not wait for that one's manoeuvre while it waits for its own
-        return _waiting(state, pair.config.peer) if state.config.role == "a" else state
+        return _waiting(state, state.config.peer) if state.config.role == "a" else state
     if _is_met(state):
         return state
     for visitor in visitors:
@@ -61,58 +83,66 @@ def answering(state: GroupState, visitors: Sequence[str]) -> GroupState:
     return state
 
 
-def _is_met(state: GroupState) -> bool:
+def _is_met(state: RobotState) -> bool:
     """Return whether this robot is in contact with its peer, in a meeting that may still localise it.
 
     With noise, one that has not done so by its bound may never do so. Of exact ranges, a few suffice.
     """
-    pair, config = state.pair, state.config
-    if not pair.in_contact or _is_silent(state) or refused(state, config.peer):
+    config = state.config
+    if not state.in_contact or _is_silent(state) or refused(state, config.peer):
         return False
     until = state.until if state.until is not None else 0.0
-    is_noisy, ends = pair.estimator.corrects_poses, config.member(config.robot).ends
-    return not is_noisy or pair.tick <= ends or _now(pair) < until
+    is_noisy, ends = state.estimator.corrects_poses, config.member(config.robot).ends
+    return not is_noisy or state.tick <= ends or state.elapsed < until
 
 
-def _is_silent(state: GroupState) -> bool:
+def _is_silent(state: RobotState) -> bool:
     """Return whether this robot takes its peer, which is in range, for lost."""
     return state.silence > PEER_LOST_AFTER
 
 
-def refused(state: GroupState, robot: str) -> bool:
+def refused(state: RobotState, robot: str) -> bool:
     """Return whether this robot, which waits for others, has had a meeting with `robot` that failed."""
     return state.waits and state.other(robot).failed
 
 
-def with_claim(state: GroupState, claim: Localised) -> GroupState:
+def with_pose(state: RobotState, claim: Localised) -> RobotState:
     """Return `state` of a robot that has determined its pose in the present meeting, and knows it now.
 
-    If this contradicts the pose that it knows, one of two peers has reported false data. A pose on which
-    several meetings agree stays. One that follows from a single meeting is withdrawn, because nothing tells
-    which of the two it was, and the robot waits for a third one.
+    It claims the pose, unless others have to confirm it. If this contradicts the pose that it knows, one of
+    two peers has reported false data. A pose on which several meetings agree stays. One that follows from a
+    single meeting is withdrawn, because nothing tells which of the two it was, and the robot waits for a
+    third one.
     """
-    pair, peer, fix = state.pair, state.config.peer, state.fix
+    peer, fix, known = state.config.peer, state.fix, state.knowledge
+    if state.config.confirms:
+        earlier = [one for one in state.confirming.meetings if one.config.peer != peer]
+        confirming = replace(state.confirming, meetings=(*earlier, known))
+        fix = Fix(state.tick, claim, (peer,))
+        return replace(state, fix=fix, located=known, confirming=confirming).with_frame(claim.pose)
+    state = state.with_other(peer, replace(state.other(peer), localised=True))
     contradiction = _contradiction(state, claim)
     if contradiction is None:
-        fix = Fix(pair.tick, claim, (*(fix.peers if fix is not None else ()), peer))
-        return replace(state, fix=fix, located=pair).with_frame(claim.pose)
+        fix = Fix(state.tick, claim, (*(fix.peers if fix is not None else ()), peer))
+        state = replace(state, fix=fix, located=known).with_frame(claim.pose)
+        return state if state.robot_verdict is not None else replace(state, robot_verdict=claim)
     assert fix is not None
     if len(fix.peers) > 1:
         return _after_meeting(state)
     (other,) = fix.peers
     state = state.with_other(other, replace(state.other(other), failed=True))
-    return replace(state, verdict=None, fix=None, located=None, failure=contradiction)
+    return replace(state, robot_verdict=None, fix=None, located=None, failure=contradiction)
 
 
-def _contradiction(state: GroupState, claim: Localised) -> Undecided | None:
+def _contradiction(state: RobotState, claim: Localised) -> Undecided | None:
     """Return how `claim`, of the present meeting, contradicts the known pose; None if it does not.
 
     The claims of robots with exact sensors have no covariance, and are never wrong.
     """
-    pair, fix, mission = state.pair, state.fix, state.config.mission
+    fix, mission = state.fix, state.config.mission
     if fix is None or claim.covariance is None:
         return None
-    off = difference(fix.claim, fix.tick, claim, pair.tick, pair.log, mission)
+    off = difference(fix.claim, fix.tick, claim, state.tick, state.log, mission)
     if off.p_value >= 1.0 - mission.confidence:
         return None
     return Undecided(
@@ -121,144 +151,144 @@ def _contradiction(state: GroupState, claim: Localised) -> Undecided | None:
     )
 
 
-def withdrawn(state: GroupState, failure: Undecided) -> GroupState:
+def withdrawn(state: RobotState, failure: Undecided) -> RobotState:
     """Return `state` without a claim, because of `failure`: the robot waits for another one than its peer."""
     peer = state.config.peer
-    state = replace(state, verdict=None, fix=None, located=None, failure=failure, visiting=False)
+    state = replace(state, robot_verdict=None, fix=None, located=None, failure=failure, visiting=False)
     return _waiting(_after_meeting(state), peer)
 
 
-def _is_withdrawn(state: GroupState) -> bool:
+def _is_withdrawn(state: RobotState) -> bool:
     """Return whether the present meeting contradicts an earlier one, so that the robot knows no pose."""
-    return state.fix is None and state.verdict is None and isinstance(state.pair.verdict, Localised)
+    return state.fix is None and state.robot_verdict is None and isinstance(state.verdict, Localised)
 
 
-def after_refusal(state: GroupState) -> GroupState:
+def after_refusal(state: RobotState) -> RobotState:
     """Return `state` of a robot whose peer has ended their meeting, because it contradicts what it knows."""
     if state.visiting:
         return next_visit(_after_meeting(state))
     failure = Undecided(f"{state.config.peer} does not go on with the meeting")
-    if state.pair.belief.phase1_done_tick is None:
+    if state.belief.phase1_done_tick is None:
         return without_peer(state, failure)
     return _resumed(_after_meeting(replace(state, failure=failure)))
 
 
-def without_peer(state: GroupState, failure: Verdict) -> GroupState:
+def without_peer(state: RobotState, failure: Verdict) -> RobotState:
     """Return `state` of a robot in phase 1 that goes on with it, without its peer, because of `failure`."""
     return _after_meeting(replace(state, failure=failure))
 
 
-def onward(state: GroupState, *, peer_has_left: bool = False) -> GroupState:
+def onward(state: RobotState, *, peer_has_left: bool = False) -> RobotState:
     """Return `state` in the next meeting if the present one is over.
 
     `peer_has_left` says that the peer has a result, and has reported it from outside the meeting.
     """
-    pair, peer = state.pair, state.pair.config.peer
+    peer = state.config.peer
     over = peer_has_left or _is_over(state)
     if _is_withdrawn(state):
         return _waiting(replace(_after_meeting(state), visiting=False), peer) if over else state
     if state.fix is None:
         return _after_failure(state)
     if state.sweeps:
-        assert state.verdict is not None
+        assert state.robot_verdict is not None
         swept = sweep_transitions.onward(state)
-        done = Done(pair.phase, state.verdict)
-        return swept or next_visit(replace(state, pair=replace(pair, mode=done)))
-    if state.visiting and pair.verdict is None:
-        if state.other(peer).localised and state.verdict is not None:  # by another robot
+        done = Done(state.phase, state.robot_verdict)
+        return swept or next_visit(replace(state, mode=done))
+    if state.visiting and state.verdict is None:
+        if state.other(peer).localised and state.robot_verdict is not None:  # by another robot
             return next_visit(state)
         if visit.has_searched(state):
-            other = replace(state.other(peer), missed=pair.tick)
+            other = replace(state.other(peer), missed=state.tick)
             return next_visit(state.with_other(peer, other))
         if _is_silent(state):
             return next_visit(_after_meeting(state))
         return state
-    if not isinstance(pair.mode, Done) or _must_linger(state):
+    if not isinstance(state.mode, Done) or _must_linger(state):
         return state
-    if not isinstance(pair.verdict, Localised):
-        reported = state.lingering > 0 or not pair.in_contact  # to the peer, before this robot leaves
+    if not isinstance(state.verdict, Localised):
+        reported = state.lingering > 0 or not state.in_contact  # to the peer, before this robot leaves
         return next_visit(_after_meeting(state)) if reported else state
     return next_visit(state) if over else state
 
 
-def _is_over(state: GroupState) -> bool:
+def _is_over(state: RobotState) -> bool:
     """Return whether the peer has a result in the present meeting, or is not there any more."""
     has_left = state.unmet >= PARTED_AFTER or _is_silent(state)
-    return has_left or state.pair.peer_state.verdict is not None
+    return has_left or state.peer_state.verdict is not None
 
 
-def rests(state: GroupState) -> bool:
+def rests(state: RobotState) -> bool:
     """Return whether the robot has its result, its meeting is over, and it has no robot to drive to."""
-    if state.verdict is None or not isinstance(state.pair.mode, Done) or _must_linger(state):
+    if state.robot_verdict is None or not isinstance(state.mode, Done) or _must_linger(state):
         return False
     return _is_over(state)
 
 
-def _after_failure(state: GroupState) -> GroupState:
+def _after_failure(state: RobotState) -> RobotState:
     """Return `state`, of a robot that is not localised: if its meeting has failed, it waits for another one.
 
     It gives up in the end, with the verdict of its latest meeting; at once if its own phase 1 has failed, or
     if its meetings with all others have.
     """
-    pair, config = state.pair, state.config
-    if pair.belief.phase1_done_tick is None:
-        return replace(state, verdict=pair.verdict)
-    now = _now(pair)
-    if now >= config.gives_up or (pair.verdict is None and _has_nobody(state)):
+    config = state.config
+    if state.belief.phase1_done_tick is None:
+        return replace(state, robot_verdict=state.verdict)
+    now = state.elapsed
+    if now >= config.gives_up or (state.verdict is None and _has_nobody(state)):
         late = Undecided(f"not localised after {now:g} s")
-        return replace(state, verdict=pair.verdict or state.failure or late)
-    if pair.verdict is not None:
-        state = _resumed(_after_meeting(replace(state, failure=pair.verdict)))
-    elif _has_orbited(state) and (not pair.in_contact or _is_silent(state)):
+        return replace(state, robot_verdict=state.verdict or state.failure or late)
+    if state.verdict is not None:
+        state = _resumed(_after_meeting(replace(state, failure=state.verdict)))
+    elif _has_orbited(state) and (not state.in_contact or _is_silent(state)):
         state = _waiting(replace(state, until=None), config.peer)
     return _trying_again(state)
 
 
-def _has_nobody(state: GroupState) -> bool:
+def _has_nobody(state: RobotState) -> bool:
     """Return whether the meetings of this robot with all others have failed."""
     own = state.config.robot
     return all(state.other(one.robot).failed for one in state.config.members if one.robot != own)
 
 
-def _resumed(state: GroupState) -> GroupState:
+def _resumed(state: RobotState) -> RobotState:
     """Return `state` of a robot whose meeting has failed: in the retry that it has left, or waiting."""
     config = state.config
     if state.retries and state.fix is None:
         retry = config.retries[state.retries - 1]
-        if not refused(state, retry.peer_of(config.robot)) and _now(state.pair) < retry.begins + retry.lasts:
+        if not refused(state, retry.peer_of(config.robot)) and state.elapsed < retry.begins + retry.lasts:
             return _in_retry(state, retry)
     return _waiting(state, config.peer)
 
 
-def _has_orbited(state: GroupState) -> bool:
+def _has_orbited(state: RobotState) -> bool:
     """Return whether this robot of role a searches for its peer in vain: the bound of their meeting is over.
 
     Beside its anchor, where it waits from then on, others find it.
     """
-    pair, config = state.pair, state.config
+    config = state.config
     if config.role != "a":
         return False
     if state.until is not None:
-        return _now(pair) >= state.until
-    return pair.tick > config.member(config.robot).ends
+        return state.elapsed >= state.until
+    return state.tick > config.member(config.robot).ends
 
 
-def _trying_again(state: GroupState) -> GroupState:
+def _trying_again(state: RobotState) -> RobotState:
     """Return `state` of a robot that is not localised, in the retry whose time has come."""
-    pair, config = state.pair, state.config
-    if state.retries >= len(config.retries) or _now(pair) < config.retries[state.retries].begins:
+    config = state.config
+    if state.retries >= len(config.retries) or state.elapsed < config.retries[state.retries].begins:
         return state
     retry = config.retries[state.retries]
     state = replace(state, retries=state.retries + 1)
     # with its peer, which it has only been near so far, the robot meets in the roles of the retry
     peer = retry.peer_of(config.robot)
-    begun = peer != config.peer or pair.peer_state.latest >= 0
+    begun = peer != config.peer or state.peer_state.latest >= 0
     if (begun and _is_met(state)) or refused(state, peer):
         return state
     return _in_retry(state, retry)
 
 
-def _in_retry(state: GroupState, retry: Appointment) -> GroupState:
+def _in_retry(state: RobotState, retry: Appointment) -> RobotState:
     """Return `state` in the meeting of `retry`, which has begun."""
     if retry.visited == state.config.robot:
         return _waiting(state, retry.visitor, retry.rendezvous)
@@ -266,35 +296,28 @@ def _in_retry(state: GroupState, retry: Appointment) -> GroupState:
     return replace(_aligned(_in_meeting(state, retry.visited, "a", retry.rendezvous)), until=until)
 
 
-def _now(pair: RobotState) -> float:
-    """Return the time since tick 0 in s."""
-    return pair.tick * pair.config.mission.period
-
-
-def _after_meeting(state: GroupState) -> GroupState:
+def _after_meeting(state: RobotState) -> RobotState:
     """Return `state` of a robot whose meeting has failed, and which does not meet its peer again."""
     peer = state.config.peer
     return state.with_other(peer, replace(state.other(peer), failed=True))
 
 
-def _waiting(state: GroupState, peer: str, orbits: Rendezvous | None = None) -> GroupState:
+def _waiting(state: RobotState, peer: str, orbits: Rendezvous | None = None) -> RobotState:
     """Return `state` of a robot that waits beside its anchor, in a meeting with `peer`."""
-    before, waits = state.pair.mode, state.config.role == "b"
+    before, waits = state.mode, state.config.role == "b"
     state = _in_meeting(state, peer, "b", orbits)
-    pair = state.pair
     if waits and isinstance(before, Orbiting | Aligning | Radial):
-        return replace(state, pair=replace(pair, mode=before))
+        return replace(state, mode=before)
     return _aligned(state)
 
 
-def _aligned(state: GroupState) -> GroupState:
+def _aligned(state: RobotState) -> RobotState:
     """Return `state` on the way to its orbit or its waiting place."""
-    pair = state.pair
-    mu = phase2_orbit.orientation(pair.local_pose)
-    return replace(state, pair=transitions.continue_phase2(pair, Aligning(pair.odometry.heading - mu)))
+    mu = phase2_orbit.orientation(state.local_pose)
+    return transitions.continue_phase2(state, Aligning(state.odometry.heading - mu))
 
 
-def next_visit(state: GroupState) -> GroupState:
+def next_visit(state: RobotState) -> RobotState:
     """Return `state` on the way to the next robot; as it is if there is none.
 
     After the planned visits, and after its part of a sweep, it is the nearest one that should be localised by
@@ -313,7 +336,7 @@ def next_visit(state: GroupState) -> GroupState:
     seeks = sweep_transitions.wanted(state)
     if seeks and state.parts == 0:
         return sweep_transitions.next_part(state)
-    here, tick = compose(state.frame, state.pair.odometry), state.pair.tick
+    here, tick = compose(state.frame, state.odometry), state.tick
     late = [
         (_missed(state, one), math.hypot(one.anchor.x - here.x, one.anchor.y - here.y), one.robot)
         for one in config.members
@@ -325,13 +348,13 @@ def next_visit(state: GroupState) -> GroupState:
     return sweep_transitions.next_part(state) if seeks else state
 
 
-def _missed(state: GroupState, member: Member) -> int:
+def _missed(state: RobotState, member: Member) -> int:
     """Return the latest tick in which this robot has not found `member`; -1 if there is none."""
     missed = state.other(member.robot).missed
     return -1 if missed is None else missed
 
 
-def _is_late(state: GroupState, member: Member) -> bool:
+def _is_late(state: RobotState, member: Member) -> bool:
     """Return whether `member`, which should be localised by now, may still wait for a visitor.
 
     A robot that was not there is visited again after the time of the longest way: it may have been on its way
@@ -344,36 +367,29 @@ def _is_late(state: GroupState, member: Member) -> bool:
     if other.missed is None:
         return True
     mission = config.mission
-    return (state.pair.tick - other.missed) * mission.period * mission.max_speed > config.widest_distance
+    return (state.tick - other.missed) * mission.period * mission.max_speed > config.widest_distance
 
 
-def at_anchor(state: GroupState) -> GroupState:
+def at_anchor(state: RobotState) -> RobotState:
     """Return `state` of a robot that returns to its anchor, and waits for any visitor."""
     return replace(_waiting(state, state.config.peer), alone=True)
 
 
-def on_visit(state: GroupState, peer: str) -> GroupState:
+def on_visit(state: RobotState, peer: str) -> RobotState:
     """Return `state` of a localised robot that drives to `peer`."""
     state = _in_meeting(state, peer, "a")
-    pair = replace(state.pair, mode=Travelling(visit.stop(state.frame, state.pair)))
-    return replace(state, pair=pair, visiting=True)
+    return replace(state, mode=Travelling(visit.stop(state)), visiting=True)
 
 
-def _in_meeting(state: GroupState, peer: str, role: Role, orbits: Rendezvous | None = None) -> GroupState:
+def _in_meeting(state: RobotState, peer: str, role: Role, orbits: Rendezvous | None = None) -> RobotState:
     """Return `state` in a new meeting with `peer`, of which the robot knows only its ranges to it."""
-    pair = state.pair
-    before = state.other(pair.config.peer)
-    state = state.with_other(pair.config.peer, replace(before, mutual=pair.mutual))
-    belief = pair.belief
-    fresh = RobotState(
-        state.config.in_meeting(peer, role, orbits),
-        solver=pair.solver,
-        tick=pair.tick,
-        odometry=pair.odometry,
-        log=pair.log,
-        leg=pair.leg,
-        mutual=state.other(peer).mutual,
-        in_contact=bool(state.other(peer).mutual) and state.other(peer).mutual[-1].tick == pair.tick,
+    state = state.with_other(state.config.peer, replace(state.other(state.config.peer), mutual=state.mutual))
+    belief, mutual = state.belief, state.other(peer).mutual
+    return replace(
+        state,
+        config=state.config.in_meeting(peer, role, orbits),
+        mutual=mutual,
+        in_contact=bool(mutual) and mutual[-1].tick == state.tick,
         belief=Belief(
             possible=belief.possible,
             branch=belief.branch,
@@ -383,45 +399,50 @@ def _in_meeting(state: GroupState, peer: str, role: Role, orbits: Rendezvous | N
             own=belief.own,
             branches=belief.branches,
             ranges_at_last_fit=belief.ranges_at_last_fit,
-            earlier_ranges=len(state.other(peer).mutual),
+            earlier_ranges=len(mutual),
         ),
+        peer_state=PeerState(),
+        mode=Asleep(),
+        plan=None,
+        alone=False,
+        visiting=False,
+        unmet=0,
+        silence=0,
     )
-    return replace(state, pair=fresh, alone=False, visiting=False, unmet=0, silence=0)
 
 
-def passing_others(state: GroupState, contacts: Sequence[Contact]) -> GroupState:
+def passing_others(state: RobotState, contacts: Sequence[Contact]) -> RobotState:
     """Return `state` on its way past the robots in contact that it does not meet, after a tick."""
-    pair, mission = state.pair, state.config.mission
+    mission = state.config.mission
     if not mission.safety_distance:
         return state
-    free = passing.leeway(contacts, pair.config.peer if pair.in_contact else None, mission)
-    mode = pair.mode
+    free = passing.leeway(contacts, state.config.peer if state.in_contact else None, mission)
+    mode = state.mode
     if isinstance(mode, Travelling) and passing.yielding(state.passing, _leading(state, contacts), mission):
         passed = replace(state.passing, leeway=0.0, blocked=0, yielded=state.passing.yielded + 1)
         return replace(state, passing=passed)
-    passed = passing.passed(state.passing, mode, pair.odometry, free, mission)
+    passed = passing.passed(state.passing, mode, state.odometry, free, mission)
     if isinstance(mode, Travelling) and (passed.places or state.passing.places):
-        places, tolerance = passed.places, pair.estimator.pose_tolerance
-        if places and phase2_orbit.arrived(Travelling(places[0]), pair.odometry, mission, tolerance):
+        places, tolerance = passed.places, state.estimator.pose_tolerance
+        if places and phase2_orbit.arrived(Travelling(places[0]), state.odometry, mission, tolerance):
             places = places[1:]
         passed = replace(passed, places=places)
-        mode = Travelling(places[0] if places else visit.stop(state.frame, pair))
-    return replace(state, pair=replace(pair, mode=mode), passing=passed)
+        mode = Travelling(places[0] if places else visit.stop(state))
+    return replace(state, mode=mode, passing=passed)
 
 
-def _leading(state: GroupState, contacts: Sequence[Contact]) -> list[Contact]:
+def _leading(state: RobotState, contacts: Sequence[Contact]) -> list[Contact]:
     """Return those of `contacts` that travel, too, and go first: those with smaller ids."""
     own = state.config.robot
     return [one for one in contacts if one.peer < own and state.other(one.peer).travels]
 
 
-def _must_linger(state: GroupState) -> bool:
+def _must_linger(state: RobotState) -> bool:
     """Return whether a robot whose meeting is over lets its peer leave first, as the visited one does.
 
     If both left at once, they could be in each other's way.
     """
-    pair = state.pair
-    if not state.config.mission.safety_distance or state.config.role == "a" or not pair.in_contact:
+    if not state.config.mission.safety_distance or state.config.role == "a" or not state.in_contact:
         return False
     if state.other(state.config.peer).travels:
         return state.lingering < PEER_LOST_AFTER

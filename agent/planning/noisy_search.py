@@ -14,9 +14,8 @@ from msgspec.structs import replace
 
 from agent.estimation.gaussian.claim_agreement import difference
 from agent.planning import exchange, group_transitions, own_pose, sweep, sweep_transitions
-from agent.planning.group import GroupPlanner, with_sender
-from agent.planning.group_state import GroupState, Other
-from agent.planning.state import Done
+from agent.planning.group_knowledge import Other
+from agent.planning.state import Done, RobotState
 from agent.planning.sweep import Sweeping
 from protocol.messages import Localised, Report, ReportedPose, Undecided
 from protocol.motion import inverse
@@ -33,63 +32,73 @@ The ranges between them add to it: with a larger one, the other robot can make n
 """
 
 
-class NoisyGroupPlanner(GroupPlanner):
-    """The planner of a robot in a group with noisy sensors, in which some robots have no anchor."""
-
-    def report_to(self, state: GroupState, peer: str) -> Report:
-        """Return the report to `peer`: the log, the verdict, or a reference with the log since then."""
-        if state.sweeps and peer == state.pair.config.peer:
-            return exchange.report(state.pair)
-        if not sweep_transitions.is_helped(state, peer):
-            return super().report_to(state, peer)
-        without_log = exchange.report_without_log(state.pair, state.verdict)
-        reference = state.own_pose.reference
-        if reference is None:
-            return without_log
-        since = max(reference.tick, min(state.other(peer).acknowledged, state.pair.log.through))
-        part = state.pair.log.after(since, len(state.pair.log.ranges))
-        return replace(without_log, since=since, through=part.through, runs=part.runs, prior=reference)
-
-    def decide(self, state: GroupState, reports: Sequence[Report] = ()) -> GroupState:
-        """Return `state` with the `reports` of others, and in the next meeting if this one has ended."""
-        if not (state.sweeps or _is_beacon(state)):
-            state = super().decide(state, reports)
-            return _begun(state) if state.sweeps else state
-        for report in reports:
-            sender = with_sender(state, report).other(report.robot)
-            sender = replace(sender, acknowledged=report.heard)  # if it is overtaken, more is sent again
-            state = state.with_other(report.robot, sender)
-        of_peer = [report for report in reports if report.has_log and report.robot == state.pair.config.peer]
-        heard = exchange.with_reports(state.pair, of_peer)
-        if heard.verdict == state.pair.verdict:
-            state = replace(state, pair=heard)
-        return _onward(own_pose.updated(state)) if state.sweeps else state
+def applies(state: RobotState) -> bool:
+    """Return whether robots without an anchor need the covariance of the pose that this one reports."""
+    return bool(state.config.unanchored) and state.estimator.corrects_poses
 
 
-def _is_beacon(state: GroupState) -> bool:
-    """Return whether this robot stays where it is: it sweeps no part, and its planned meetings are over."""
+def is_sweeping(state: RobotState) -> bool:
+    """Return whether the robot looks for others with noisy sensors, or has stopped for one."""
+    return state.sweeps and applies(state)
+
+
+def is_apart(state: RobotState) -> bool:
+    """Return whether the robot is in no meeting any more: it sweeps, or is the beacon of one that does.
+
+    A beacon stays where it is: it sweeps no part, and its planned meetings are over.
+    """
     config = state.config
+    if not applies(state) or state.sweeps:
+        return is_sweeping(state)
     assert config.sweep is not None
     if config.part < config.sweep.parts or state.visits < len(config.visits):
         return False
-    return isinstance(state.pair.verdict, Localised) and isinstance(state.verdict, Localised)
+    return isinstance(state.verdict, Localised) and isinstance(state.robot_verdict, Localised)
 
 
-def _begun(state: GroupState) -> GroupState:
+def report(state: RobotState, peer: str) -> Report:
+    """Return the report to `peer` without an anchor: the verdict, and the reference with the log since."""
+    without_log = exchange.report_without_log(state, state.robot_verdict)
+    reference = state.own_pose.reference
+    if reference is None:
+        return without_log
+    since = max(reference.tick, min(state.other(peer).acknowledged, state.log.through))
+    part = state.log.after(since, len(state.log.ranges))
+    return replace(without_log, since=since, through=part.through, runs=part.runs, prior=reference)
+
+
+def decided(state: RobotState, reports: Sequence[Report]) -> RobotState:
+    """Return `state` of a robot that is in no meeting, with the `reports` of others, and one tick on."""
+    for one in reports:
+        state = group_transitions.with_sender(state, one)
+        sender = state.other(one.robot)  # if it is overtaken, more is sent again
+        state = state.with_other(one.robot, replace(sender, acknowledged=one.heard))
+    of_peer = [one for one in reports if one.has_log and one.robot == state.config.peer]
+    heard = exchange.with_reports(state, of_peer)
+    if heard.verdict == state.verdict:
+        state = heard
+    return _onward(own_pose.updated(state)) if state.sweeps else state
+
+
+def begun(state: RobotState) -> RobotState:
     """Return `state`, which begins a part of the sweep, on its way; or still, if it sweeps none."""
-    config, pair = state.config, state.pair
+    config, located = state.config, state.located
     assert config.sweep is not None
-    assert isinstance(state.verdict, Localised)
+    assert isinstance(state.robot_verdict, Localised)
     if config.part >= config.sweep.parts:
-        return replace(state, pair=replace(pair, mode=Done(3, state.verdict)))
-    located = state.located
+        return replace(state, mode=Done(3, state.robot_verdict))
     assert located is not None
     # after a visit in vain, or one that contradicts what this robot knows
-    if not pair.belief.pair or pair.config.peer != located.config.peer:
-        same = {"tick": pair.tick, "odometry": pair.odometry, "log": pair.log, "leg": pair.leg}
-        pair = replace(located, **same, mode=pair.mode)
+    if not state.belief.pair or state.config.peer != located.config.peer:
+        state = replace(
+            state,
+            config=located.config,
+            mutual=located.mutual,
+            belief=located.belief,
+            peer_state=located.peer_state,
+        )
     due = replace(state.own_pose, estimated_tick=None, reference=None)
-    state = own_pose.updated(replace(state, pair=pair, own_pose=due))
+    state = own_pose.updated(replace(state, own_pose=due))
     part, anchor = (config.part + state.parts - 1) % config.sweep.parts, config.anchor
     path = surveyed_path(
         config.sweep,
@@ -98,19 +107,18 @@ def _begun(state: GroupState) -> GroupState:
         (anchor.x, anchor.y),
         own_pose.beacon_place(state),
     )
-    mode = Sweeping(sweep.transformed(inverse(state.frame), path))
-    return replace(state, pair=replace(state.pair, mode=mode))
+    return replace(state, mode=Sweeping(sweep.transformed(inverse(state.frame), path)))
 
 
 # --- contacts -----------------------------------------------------------------------------------------
 
 
-def _onward(state: GroupState) -> GroupState:
+def _onward(state: RobotState) -> RobotState:
     """Return `state` after a tick of a sweep, or of a contact with robots without an anchor."""
     state = _with_contact(state)
     if not state.sweeps:  # it has withdrawn its claim
         return state
-    mission, odometry, phase = state.config.mission, state.pair.odometry, state.pair.phase
+    mission, odometry, phase = state.config.mission, state.odometry, state.phase
     along, aside = ALONG * mission.sensing_range, ASIDE * mission.sensing_range
     helped = [one for one in _helped(state) if _ticks_since(state, one) <= LINGER]
     state = sweep_transitions.moved_on(
@@ -122,38 +130,38 @@ def _onward(state: GroupState) -> GroupState:
     )
     if not sweep_transitions.is_over(state):
         return state
-    assert state.verdict is not None
-    pair = replace(state.pair, mode=Done(phase, state.verdict))
-    following = group_transitions.next_visit(replace(_with_reference(state, None), pair=pair))
-    return _begun(following) if following.sweeps else following
+    assert state.robot_verdict is not None
+    state = replace(_with_reference(state, None), mode=Done(phase, state.robot_verdict))
+    following = group_transitions.next_visit(state)
+    return begun(following) if following.sweeps else following
 
 
-def _with_contact(state: GroupState) -> GroupState:
+def _with_contact(state: RobotState) -> RobotState:
     """Return `state` with a reference if a contact has begun in this tick, and without one at its end."""
     ticks = [_ticks_since(state, one) for one in _helped(state)]
     searched = state.own_pose.searched_tick
     if state.own_pose.reference is not None:
         return _with_reference(state, None) if all(since > LINGER for since in ticks) else state
-    if 0 not in ticks or (searched is not None and state.pair.tick - searched <= LINGER):
+    if 0 not in ticks or (searched is not None and state.tick - searched <= LINGER):
         return state
     state, reference = own_pose.searched(state)
     return _agreed(state, reference) if reference is not None else state
 
 
-def _with_reference(state: GroupState, reference: ReportedPose | None) -> GroupState:
+def _with_reference(state: RobotState, reference: ReportedPose | None) -> RobotState:
     return replace(state, own_pose=replace(state.own_pose, reference=reference))
 
 
-def _agreed(state: GroupState, reference: ReportedPose) -> GroupState:
+def _agreed(state: RobotState, reference: ReportedPose) -> RobotState:
     """Return `state` with `reference`, if the claim of this robot does not contradict it.
 
     The ranges since the claim may have ruled out the hypothesis on which it rests. A claim from a single
     meeting is then withdrawn. If several meetings agree on the claim, there is no reference.
     """
-    fix, pair, mission = state.fix, state.pair, state.config.mission
+    fix, mission = state.fix, state.config.mission
     assert fix is not None
     now = Localised(reference.pose, reference.covariance)
-    off = difference(fix.claim, fix.tick, now, reference.tick, pair.log, mission)
+    off = difference(fix.claim, fix.tick, now, reference.tick, state.log, mission)
     if off.p_value >= 1.0 - mission.confidence:
         return _with_reference(state, reference)
     if len(fix.peers) > 1:
@@ -162,7 +170,7 @@ def _agreed(state: GroupState, reference: ReportedPose) -> GroupState:
     return group_transitions.withdrawn(state, Undecided(f"{why} (p = {off.p_value:.2g})"))
 
 
-def _helped(state: GroupState) -> list[str]:
+def _helped(state: RobotState) -> list[str]:
     """Return the robots without an anchor that are not localised, and with which no contact has failed."""
     return [
         one
@@ -171,19 +179,19 @@ def _helped(state: GroupState) -> list[str]:
     ]
 
 
-def _ticks_since(state: GroupState, robot: str) -> int:
+def _ticks_since(state: RobotState, robot: str) -> int:
     """Return the number of ticks since the latest range to `robot`; many if there is none."""
     mutual = state.other(robot).mutual
-    return state.pair.tick - mutual[-1].tick if mutual else LINGER + 1
+    return state.tick - mutual[-1].tick if mutual else LINGER + 1
 
 
-def _stops_for(state: GroupState, robot: str) -> bool:
+def _stops_for(state: RobotState, robot: str) -> bool:
     """Return whether this robot stops for `robot`: it has just passed it, and knows its own pose well."""
     reference, mission = state.own_pose.reference, state.config.mission
     covariance = reference.covariance if reference is not None else None
     if covariance is None or covariance.position_sigma > WORTH * mission.accuracy:
         return False
-    return _has_passed(state.other(robot), state.pair.tick, STRIP_REACH * mission.sensing_range)
+    return _has_passed(state.other(robot), state.tick, STRIP_REACH * mission.sensing_range)
 
 
 def _has_passed(other: Other, tick: int, near: float) -> bool:

@@ -19,7 +19,7 @@ from agent.estimation.judged import Judged, of_pair
 from agent.estimation.knowledge import Knowledge
 from agent.estimation.posterior import PAIR, Hypothesis, Posterior, follow, settled
 from agent.planning import sweep
-from agent.planning.group_state import GroupState
+from agent.planning.state import RobotState
 from agent.planning.sweep import Looping, Sweeping
 from protocol.messages import Localised, ReportedPose
 from protocol.motion import Covariance, compose, inverse
@@ -54,17 +54,17 @@ SMALLEST_LOSS = 1e-6
 """The smallest difference of log-likelihoods by which another one is divided."""
 
 
-def updated(state: GroupState) -> GroupState:
+def updated(state: RobotState) -> RobotState:
     """Return `state` with a new estimate of the pose, if one is due."""
-    pair, before = state.pair, state.own_pose.estimated_tick
-    ranged = bool(pair.log.ranges) and pair.log.ranges[-1].tick == pair.tick
-    ranged |= bool(pair.mutual) and pair.mutual[-1].tick == pair.tick
-    if before is not None and pair.tick - before < (REFIT_WITH_RANGES if ranged else REFIT):
+    before = state.own_pose.estimated_tick
+    ranged = bool(state.log.ranges) and state.log.ranges[-1].tick == state.tick
+    ranged |= bool(state.mutual) and state.mutual[-1].tick == state.tick
+    if before is not None and state.tick - before < (REFIT_WITH_RANGES if ranged else REFIT):
         return state
     return _with_estimate(state, *_estimate(state, searched=False))
 
 
-def searched(state: GroupState) -> tuple[GroupState, ReportedPose | None]:
+def searched(state: RobotState) -> tuple[RobotState, ReportedPose | None]:
     """Return `state` with an estimate from a search of the whole plane, and its pose if it may be reported.
 
     The conditions are those of `claim`. After a large sigma, the first few ranges leave more than an ellipse
@@ -74,67 +74,67 @@ def searched(state: GroupState) -> tuple[GroupState, ReportedPose | None]:
     scored, judged = _estimate(state, searched=True)
     state = _with_estimate(state, scored, judged)
     reference = _reference(state, judged)
-    return replace(state, own_pose=replace(state.own_pose, searched_tick=state.pair.tick)), reference
+    return replace(state, own_pose=replace(state.own_pose, searched_tick=state.tick)), reference
 
 
-def beacon_place(state: GroupState) -> Place:
+def beacon_place(state: RobotState) -> Place:
     """Return the most probable position of the beacon in <W>, in m; its anchor if there is no hypothesis."""
-    pair, measured = state.pair, _measured(state)
-    found = follow(Posterior(PAIR, pair.belief.pair), measured).hypotheses
+    measured = _measured(state)
+    found = follow(Posterior(PAIR, state.belief.pair), measured).hypotheses
     if not found:
-        return pair.config.peer_anchor.x, pair.config.peer_anchor.y
-    x, y, _ = found[0].fit.poses[1 if pair.config.role == "a" else 0].tolist()
-    return pair.config.m1.x + x, pair.config.m1.y + y
+        return state.config.peer_anchor.x, state.config.peer_anchor.y
+    x, y, _ = found[0].fit.poses[1 if state.config.role == "a" else 0].tolist()
+    return state.config.m1.x + x, state.config.m1.y + y
 
 
-def _estimate(state: GroupState, *, searched: bool) -> tuple[tuple[Hypothesis, ...], Judged | None]:
+def _estimate(state: RobotState, *, searched: bool) -> tuple[tuple[Hypothesis, ...], Judged | None]:
     """Return the hypotheses by all measurements of the latest meeting, and the first one as `claim` sees it.
 
     The whole plane is searched if the known hypotheses do not explain the measurements, or if `searched`.
     """
-    pair, measured = state.pair, _measured(state)
-    found = settled(Posterior(PAIR, pair.belief.pair), measured)
-    judged = of_pair("finder", pair.config, found.hypotheses, measured)
+    measured = _measured(state)
+    found = settled(Posterior(PAIR, state.belief.pair), measured)
+    judged = of_pair("finder", state.config, found.hypotheses, measured)
     if searched or blocked(judged, (convergence, consistency)) is not None:
         found = settled(search(measured, found), measured)
-        judged = of_pair("finder", pair.config, found.hypotheses, measured)
+        judged = of_pair("finder", state.config, found.hypotheses, measured)
     return found.hypotheses, judged
 
 
-def _measured(state: GroupState) -> JointMeasurements:
+def _measured(state: RobotState) -> JointMeasurements:
     """Return the measurements of the latest meeting: all until its claim, and some of the later ranges."""
-    measured = inference.pair_of(state.pair)
+    measured = inference.pair_of(state)
     claimed = state.located.tick if state.located is not None else -1
     return measured.thinned_after(claimed, MOST_WEIGHED)
 
 
-def _with_estimate(state: GroupState, scored: Sequence[Hypothesis], judged: Judged | None) -> GroupState:
+def _with_estimate(state: RobotState, scored: Sequence[Hypothesis], judged: Judged | None) -> RobotState:
     """Return `state` with an estimate. The places to which the robot drives stay where they are in <W>."""
-    pair, before = state.pair, state.own_pose
+    before = state.own_pose
     if judged is None:
-        return replace(state, own_pose=replace(before, estimated_tick=pair.tick))
+        return replace(state, own_pose=replace(before, estimated_tick=state.tick))
     now = judged.localised
     assert now.covariance is not None
     framed = state.with_frame(now.pose)
-    turn, mode = compose(inverse(framed.frame), state.frame), pair.mode
+    turn, mode = compose(inverse(framed.frame), state.frame), state.mode
     if isinstance(mode, Sweeping):
         mode = Sweeping(sweep.transformed(turn, mode.places))
     elif isinstance(mode, Looping):
         mode = replace(mode, then=sweep.transformed(turn, mode.then))
-    pair = replace(pair, belief=replace(pair.belief, pair=tuple(scored)), mode=mode)
-    ranges = len(pair.log.ranges) + len(pair.mutual)
+    belief = replace(state.belief, pair=tuple(scored))
+    ranges = len(state.log.ranges) + len(state.mutual)
     was_lost = before.sigma > LOST_SIGMA * state.config.mission.sensing_range
     own_pose = replace(
         before,
-        estimated_tick=pair.tick,
+        estimated_tick=state.tick,
         ranges=ranges,
         sigma=now.covariance.position_sigma,
         ranges_when_lost=before.ranges if was_lost and ranges > before.ranges else before.ranges_when_lost,
     )
-    return replace(framed, pair=pair, own_pose=own_pose)
+    return replace(framed, belief=belief, mode=mode, own_pose=own_pose)
 
 
-def _reference(state: GroupState, judged: Judged | None) -> ReportedPose | None:
+def _reference(state: RobotState, judged: Judged | None) -> ReportedPose | None:
     """Return the pose that was `judged` if the robot may report it (see `searched`); None if not."""
     own_pose = state.own_pose
     if judged is not None and own_pose.ranges_when_lost is not None:
@@ -146,7 +146,7 @@ def _reference(state: GroupState, judged: Judged | None) -> ReportedPose | None:
     assert found.covariance is not None
     factor = max(NORMAL_RATIO / min(judged.rival.log_likelihood_ratio, -SMALLEST_LOSS), 1.0)
     covariance = Covariance(*[factor * one for one in astuple(found.covariance)])
-    return ReportedPose(state.pair.tick, found.pose, covariance)
+    return ReportedPose(state.tick, found.pose, covariance)
 
 
 def later_pose(met: Knowledge, now: Knowledge) -> Localised | None:

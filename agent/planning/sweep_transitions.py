@@ -10,24 +10,24 @@ from collections.abc import Callable, Sequence
 from msgspec.structs import replace
 
 from agent.planning import sweep
-from agent.planning.group_state import GroupState
+from agent.planning.state import RobotState
 from agent.planning.sweep import LOOPS_FOR, Looping, Sweeping
 from protocol.motion import inverse
 from protocol.sweep_strips import STRIP_REACH, Place
 
 
-def wanted(state: GroupState) -> bool:
+def wanted(state: RobotState) -> bool:
     """Return whether there are robots without an anchor that this robot can still help."""
     return any(is_helped(state, robot) for robot in state.config.unanchored)
 
 
-def is_helped(state: GroupState, robot: str) -> bool:
+def is_helped(state: RobotState, robot: str) -> bool:
     """Return whether `robot` has no anchor, and still needs the poses of this robot, as far as it knows."""
     other = state.other(robot)
     return robot in state.config.unanchored and not (other.localised or other.served)
 
 
-def next_part(state: GroupState) -> GroupState:
+def next_part(state: RobotState) -> RobotState:
     """Return `state` of a localised robot that sweeps the next part of the area, its own one first.
 
     It stops again for robots that it has left before.
@@ -41,21 +41,21 @@ def next_part(state: GroupState) -> GroupState:
     mode = Sweeping(sweep.transformed(inverse(state.frame), path))
     return replace(
         state,
-        pair=replace(state.pair, mode=mode),
+        mode=mode,
         parts=state.parts + 1,
-        part_tick=state.pair.tick,
+        part_tick=state.tick,
         visiting=False,
         unmet=0,
         silence=0,
     )
 
 
-def onward(state: GroupState) -> GroupState | None:
+def onward(state: RobotState) -> RobotState | None:
     """Return `state` after a tick of a sweep with exact sensors; None at its end.
 
     Near robots without an anchor, it drives squares until they are localised or LOOPS_FOR ticks are over.
     """
-    mission, odometry = state.config.mission, state.pair.odometry
+    mission, odometry = state.config.mission, state.odometry
     helped = [one for one in state.config.unanchored if is_helped(state, one) and _is_near(state, one)]
     moved = moved_on(
         state,
@@ -68,47 +68,47 @@ def onward(state: GroupState) -> GroupState | None:
 
 
 def moved_on(
-    state: GroupState,
+    state: RobotState,
     helped: Sequence[str],
     loop: Callable[[int, tuple[Place, ...]], Looping],
     *,
     stops: bool,
     longest: int,
-) -> GroupState:
+) -> RobotState:
     """Return `state` after a tick of a sweep, in which the robots `helped` without an anchor are in contact.
 
     If it `stops` for them, it leaves its strip and drives a `loop`, of which it gives the first tick and the
     places that are left of the sweep. It repeats the loop until nobody is in contact any more, or for
     `longest` ticks, and then returns to where it has left its strip.
     """
-    pair, mission, tolerance = state.pair, state.config.mission, state.pair.estimator.pose_tolerance
-    assert isinstance(pair.mode, Sweeping | Looping)
-    mode = sweep.onward(pair.mode, pair.odometry, mission, tolerance)
-    if isinstance(mode, Looping) and pair.tick - mode.since > longest:
+    mission, tolerance = state.config.mission, state.estimator.pose_tolerance
+    assert isinstance(state.mode, Sweeping | Looping)
+    mode = sweep.onward(state.mode, state.odometry, mission, tolerance)
+    if isinstance(mode, Looping) and state.tick - mode.since > longest:
         for robot in helped:
             state = state.with_other(robot, replace(state.other(robot), failed=True))
         helped = []
     match mode:
         case Sweeping(places) if stops:
-            mode = loop(pair.tick, ((pair.odometry.x, pair.odometry.y), *places))
+            mode = loop(state.tick, ((state.odometry.x, state.odometry.y), *places))
         case Looping((), then, since) if helped:
             mode = loop(since, then)
         case Looping(_, then) if not helped:
-            mode = sweep.onward(Sweeping(then), pair.odometry, mission, tolerance)
-    return replace(state, pair=replace(pair, mode=mode))
+            mode = sweep.onward(Sweeping(then), state.odometry, mission, tolerance)
+    return replace(state, mode=mode)
 
 
-def is_over(state: GroupState) -> bool:
+def is_over(state: RobotState) -> bool:
     """Return whether the robot has driven along all strips of its part."""
-    return isinstance(state.pair.mode, Sweeping) and not state.pair.mode.places
+    return isinstance(state.mode, Sweeping) and not state.mode.places
 
 
-def _is_near(state: GroupState, robot: str) -> bool:
+def _is_near(state: RobotState, robot: str) -> bool:
     """Return whether this robot is near enough to `robot` to drive a square, or drives one already."""
-    other, pair = state.other(robot), state.pair
-    if other.failed or not other.mutual or other.mutual[-1].tick != pair.tick:
+    other = state.other(robot)
+    if other.failed or not other.mutual or other.mutual[-1].tick != state.tick:
         return False
     return (
-        isinstance(pair.mode, Looping)
+        isinstance(state.mode, Looping)
         or other.mutual[-1].range <= STRIP_REACH * state.config.mission.sensing_range
     )

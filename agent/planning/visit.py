@@ -10,7 +10,6 @@ import math
 from msgspec.structs import replace
 
 from agent.planning import phase2_orbit
-from agent.planning.group_state import GroupState
 from agent.planning.phase2_orbit import Travelling
 from agent.planning.state import RobotState
 from protocol.motion import Pose, compose, inverse
@@ -23,25 +22,24 @@ MOST_SIDES = 8
 """The most sides of a search. They reach 14 R to either side, and are 128 R long."""
 
 
-def searching(state: GroupState) -> GroupState:
+def searching(state: RobotState) -> RobotState:
     """Return `state` of a visitor out of range; if it has arrived, on the next leg of its search."""
-    pair = state.pair
-    assert isinstance(pair.mode, Travelling)
-    mission, tolerance = pair.config.mission, pair.estimator.pose_tolerance
-    if not phase2_orbit.arrived(pair.mode, pair.odometry, mission, tolerance):
+    assert isinstance(state.mode, Travelling)
+    mission, tolerance = state.config.mission, state.estimator.pose_tolerance
+    if not phase2_orbit.arrived(state.mode, state.odometry, mission, tolerance):
         return state
-    begin, anchor = state.framed_at, _peer_anchor(state.frame, pair)
-    leg = phase2_orbit.next_leg(pair.mode, (begin.x, begin.y), (anchor.x, anchor.y), mission)
-    return replace(state, pair=replace(pair, mode=leg))
+    begin, anchor = state.framed_at, _peer_anchor(state)
+    leg = phase2_orbit.next_leg(state.mode, (begin.x, begin.y), (anchor.x, anchor.y), mission)
+    return replace(state, mode=leg)
 
 
-def has_searched(state: GroupState) -> bool:
+def has_searched(state: RobotState) -> bool:
     """Return whether the robot has searched for its peer in vain."""
-    mode = state.pair.mode
+    mode = state.mode
     return isinstance(mode, Travelling) and mode.leg > 0 and mode.leg > search_legs(_search_sides(state))
 
 
-def _search_sides(state: GroupState) -> int:
+def _search_sides(state: RobotState) -> int:
     """Return the number of sides of the search for the peer: with an inaccurate heading, more are necessary.
 
     They reach SEARCHED_SIGMAS of the error that the heading at the claim has led to, to either side.
@@ -49,24 +47,24 @@ def _search_sides(state: GroupState) -> int:
     assert state.fix is not None
     if state.fix.claim.covariance is None:
         return 0
-    begin, anchor = state.framed_at, _peer_anchor(state.frame, state.pair)
+    begin, anchor = state.framed_at, _peer_anchor(state)
     sigma = state.fix.claim.covariance.heading_sigma
     aside = SEARCHED_SIGMAS * sigma * math.hypot(anchor.x - begin.x, anchor.y - begin.y)
     needed = 1 + math.ceil(0.5 * aside / state.config.mission.sensing_range)
     return min(max(SEARCH_SIDES, needed), MOST_SIDES)
 
 
-def _peer_anchor(frame: Pose, pair: RobotState) -> Pose:
+def _peer_anchor(state: RobotState) -> Pose:
     """Return the place of the peer's anchor, in m in the odometry's frame."""
-    peer_anchor = pair.config.peer_anchor
-    return compose(inverse(frame), Pose(peer_anchor.x, peer_anchor.y, 0.0))
+    peer_anchor = state.config.peer_anchor
+    return compose(inverse(state.frame), Pose(peer_anchor.x, peer_anchor.y, 0.0))
 
 
-def stop(frame: Pose, pair: RobotState) -> tuple[float, float]:
+def stop(state: RobotState) -> tuple[float, float]:
     """Return the place of a visit, in m in the odometry's frame: on the way to the anchor, short of it."""
-    anchor = _peer_anchor(frame, pair)
-    dx, dy = anchor.x - pair.odometry.x, anchor.y - pair.odometry.y
+    anchor = _peer_anchor(state)
+    dx, dy = anchor.x - state.odometry.x, anchor.y - state.odometry.y
     distance = math.hypot(dx, dy)
-    short = SHORT_OF_ANCHOR * pair.config.mission.sensing_range
+    short = SHORT_OF_ANCHOR * state.config.mission.sensing_range
     share = 1.0 - short / distance if distance > short else 0.0
-    return pair.odometry.x + share * dx, pair.odometry.y + share * dy
+    return state.odometry.x + share * dx, state.odometry.y + share * dy

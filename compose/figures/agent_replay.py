@@ -7,7 +7,6 @@ from typing import Any
 import msgspec
 
 from agent.planning.group import GroupPlanner
-from agent.planning.group_state import GroupState
 from agent.planning.planner import Planner
 from agent.planning.state import RobotState
 from agent.process.agent_journal import AgentHistory
@@ -24,7 +23,7 @@ class AgentReplay(msgspec.Struct, frozen=True):
     history: AgentHistory | None
     """The journal's content; None if the robot was killed before it received its configuration."""
     states: tuple[RobotState, ...] = ()
-    """The state after each tick in which the robot decided, from tick 0; in a group, that in its meeting."""
+    """The state after each tick in which the robot decided, from tick 0."""
     broken: str | None = None
     """The reason why `states` ends before the recording does; None if it does not."""
     planner: Planner[Any, Any] | None = None
@@ -67,8 +66,7 @@ def _recomputed(history: AgentHistory, planner: Planner[Any, Any], drawn: Planne
             if again.robot.command_frame != step.command_frame:
                 why = f"the recorded decision at tick {again.tick} differs: another version wrote the journal"
                 return AgentReplay(history, tuple(states), why, drawn)
-            state = again.robot.state
-            states.append(state.pair if isinstance(state, GroupState) else state)
+            states.append(again.robot.state)
     except Exception as error:  # noqa: BLE001  # recorded inputs may raise any error in the planner
         why = f"the planner fails on its inputs of tick {again.tick}: {type(error).__name__}: {error}"
         return AgentReplay(history, tuple(states), why, drawn)

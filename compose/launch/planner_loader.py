@@ -68,21 +68,15 @@ def unguarded_planner_of(config: RobotConfig) -> Planner[Any, Any]:
     if not config.members:
         return found
     from agent.planning.assured import AssuredExact  # noqa: PLC0415  # it imports numpy
-    from agent.planning.confirmation import ConfirmingPlanner  # noqa: PLC0415  # likewise
     from agent.planning.group import GroupPlanner  # noqa: PLC0415  # likewise
-    from agent.planning.noisy_search import NoisyGroupPlanner  # noqa: PLC0415  # likewise
     from agent.planning.noisy_unanchored import NoisyUnanchoredPlanner  # noqa: PLC0415  # likewise
     from agent.planning.unanchored import UnanchoredPlanner  # noqa: PLC0415  # likewise
 
-    exact = config.mission.noise.exact
     if config.given_anchor is None:
-        return UnanchoredPlanner() if exact else NoisyUnanchoredPlanner()
+        return UnanchoredPlanner() if config.mission.noise.exact else NoisyUnanchoredPlanner()
     if not isinstance(found, AssuredExact):
         raise UserError(f"robots with the planner {name} meet in pairs, not in a group")
-    if config.confirms:
-        return ConfirmingPlanner(found)
-    searches = config.unanchored and not exact
-    return NoisyGroupPlanner(found) if searches else GroupPlanner(found)
+    return GroupPlanner(found)
 
 
 def is_for_groups(name: str) -> bool:
