@@ -8,9 +8,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from agent.estimation.gaussian.inference import PlanningHypothesis
-from agent.planning.accuracy_seeking import AccuracySeeking
-from agent.planning.assured import AssuredExact
+from agent.planning.assured import Assured
 from agent.planning.log_exchange import LogPlanner
 from agent.planning.paper import Paper
 from agent.planning.phase3_last_manoeuvre import Plan, Question
@@ -35,9 +36,8 @@ from protocol.orbits import Orbit, Rendezvous
 __all__ = [
     "MAX_BODY_BYTES",
     "REST",
-    "AccuracySeeking",
     "Anchor",
-    "AssuredExact",
+    "Assured",
     "Command",
     "Contact",
     "Controls",
@@ -66,3 +66,10 @@ __all__ = [
     "step",
     "wrap",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Raise ImportError for a name that was removed, and AttributeError for others."""
+    if name in ("AssuredExact", "AccuracySeeking"):
+        raise ImportError(f"tandem.planning.{name} was removed in version 0.3: subclass Assured")
+    raise AttributeError(f"module 'tandem.planning' has no attribute '{name}'")

@@ -13,7 +13,7 @@ import msgspec
 from msgspec.structs import replace
 
 from tandem.planning import (
-    AssuredExact,
+    Assured,
     Command,
     Estimate,
     Localised,
@@ -46,7 +46,7 @@ class Wrapping(Planner[RobotState, Parcel]):
         if weight < 0:
             raise ValueError(f"weight {weight} is negative")
         self.note, self.weight = note, weight
-        self.inner = AssuredExact()
+        self.inner = Assured()
 
     def start(self, config: RobotConfig) -> RobotState:
         return self.inner.start(config)
@@ -102,7 +102,16 @@ class Incomplete(Planner[int, None]):
     """It defines nothing."""
 
 
-class Drawing(AssuredExact):
+class Suited(Assured):
+    """It has a method that no version calls any more."""
+
+    def suited(self, mission: Mission) -> Assured:
+        """Return another planner."""
+        del mission
+        return Assured()
+
+
+class Drawing(Assured):
     """It draws random numbers."""
 
     def command(self, state: RobotState) -> Command:
@@ -110,11 +119,11 @@ class Drawing(AssuredExact):
         return replace(one, omega=one.omega * (1.0 - 1e-9 * Random().random()))
 
 
-class Sound(AssuredExact):
+class Sound(Assured):
     """The planner `assured` with exact sensors, under another name."""
 
 
-class Clock(AssuredExact):
+class Clock(Assured):
     """It asks for the time."""
 
     def command(self, state: RobotState) -> Command:
@@ -122,7 +131,7 @@ class Clock(AssuredExact):
         return replace(one, v=one.v * (1.0 - 1e-12 * (time.time_ns() % 1000)))
 
 
-class Remembers(AssuredExact):
+class Remembers(Assured):
     """It counts its calls outside of the state."""
 
     def __init__(self) -> None:
@@ -154,7 +163,7 @@ class Mutable(Planner[dict[str, Any], None]):
         return Estimate(state["tick"], state["robot"], (), (), localised=False)
 
 
-class Unpicklable(AssuredExact):
+class Unpicklable(Assured):
     """A planner whose state holds a function of itself."""
 
     def start(self, config: RobotConfig) -> Any:
@@ -186,7 +195,7 @@ class Local:
         self.inner, self.extra = inner, extra
 
 
-class Fast(AssuredExact):
+class Fast(Assured):
     """It drives faster than v_max."""
 
     def command(self, state: RobotState) -> Command:
@@ -194,7 +203,7 @@ class Fast(AssuredExact):
         return replace(one, v=1.5 * one.v)
 
 
-class NotANumber(AssuredExact):
+class NotANumber(Assured):
     """It commands NaN at tick 5."""
 
     def command(self, state: RobotState) -> Command:
@@ -226,7 +235,7 @@ class Gullible(Wrapping):
         return super().decide(state, reports)
 
 
-class Bragging(AssuredExact):
+class Bragging(Assured):
     """It claims at once that it is at the origin."""
 
     def command(self, state: RobotState) -> Command:
@@ -234,7 +243,7 @@ class Bragging(AssuredExact):
         return replace(one, verdict=Localised(Pose(0.0, 0.0, 0.0))) if state.tick > 2 else one
 
 
-class Fickle(AssuredExact):
+class Fickle(Assured):
     """Robot a takes its claim back."""
 
     def command(self, state: RobotState) -> Command:
@@ -244,7 +253,7 @@ class Fickle(AssuredExact):
         return one
 
 
-class Failing(AssuredExact):
+class Failing(Assured):
     """It raises an error at tick 7."""
 
     def observe(self, state: RobotState, observation: Observation) -> RobotState:
@@ -259,7 +268,7 @@ class Undecodable(Wrapping):
     BODY = int  # type: ignore[assignment]
 
 
-class Rendezvousless(AssuredExact):
+class Rendezvousless(Assured):
     """A planner whose orbits are none."""
 
     def rendezvous(self, mission: Mission, distance: float) -> Any:

@@ -9,7 +9,7 @@ from msgspec.structs import replace
 
 from agent.estimation.fit import fits
 from tandem.estimation import JointMeasurements, OdometryErrors, Solution, Start
-from tandem.planning import AccuracySeeking
+from tandem.planning import Assured
 
 NO_ERRORS = OdometryErrors(np.zeros(0), np.zeros(0), np.zeros(0))
 
@@ -80,19 +80,19 @@ class Broken:
                 raise ZeroDivisionError("by the solver")
 
 
-class WithSmoother(AccuracySeeking):
+class WithSmoother(Assured):
     """The planner `assured` with the smoother as the user's solver."""
 
     SOLVER = Smoother()
 
 
-class WithNothing(AccuracySeeking):
+class WithNothing(Assured):
     """A planner whose solver finds nothing."""
 
     SOLVER = Nothing()
 
 
-class WithBroken(AccuracySeeking):
+class WithBroken(Assured):
     """A planner whose solver is broken."""
 
     def __init__(self, solution: str) -> None:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from msgspec.structs import replace
 
 from agent.planning.planner import Planner
-from agent.planning.registry import planner
+from agent.planning.registry import PLANNER_CLASSES
 from agent.planning.state import RobotState
 from compose.scenario.scenario_file import load
 from protocol.messages import Command, Observation, Report
@@ -28,7 +28,7 @@ class Step(NamedTuple):
 
 def planner_of(state: RobotState) -> Planner[RobotState, Report]:
     """Return the planner of the robot with this state."""
-    return planner(state.config.planner_name, state.config.mission)
+    return PLANNER_CLASSES[state.config.planner_name]()
 
 
 def steps(name: str, *, at_rest: int = 0) -> Iterator[Step]:
@@ -37,7 +37,7 @@ def steps(name: str, *, at_rest: int = 0) -> Iterator[Step]:
     In the first `at_rest` ticks, all robots miss the deadline.
     """
     world = release(load(name))
-    play = planner(world.scenario.planner_name, world.scenario.mission)
+    play = PLANNER_CLASSES[world.scenario.planner_name]()
     states = {robot.id: play.start(world.scenario.config(robot.id)) for robot in world.scenario.robots}
     while True:
         sensed = observations(world)

@@ -23,7 +23,7 @@ from matplotlib.patches import Circle
 from matplotlib.text import Annotation
 from msgspec.structs import replace
 
-from agent.planning.assured import AssuredExact
+from agent.planning.assured import Assured
 from agent.planning.phase3_last_manoeuvre import compared
 from agent.planning.strides import stride
 from compose.cli.figures import draw
@@ -172,7 +172,7 @@ def test_a_plan_shows_each_candidate_and_the_axis_of_each_two_and_the_choice(
 def test_what_is_compared_is_what_was_chosen_from(recordings: Path) -> None:
     told = pair(recorded("assured", recordings))
     (one,) = [one for role in ("b", "a") for one in manoeuvre.planned(told, role)][:1]
-    ways = compared(one.plan.question, told.mission, AssuredExact.MANOEUVRES)
+    ways = compared(one.plan.question, told.mission, Assured.MANOEUVRES)
     row, column = np.unravel_index(np.argmax(ways.value), ways.value.shape)
     assert (ways.reach.v[row, 0], ways.reach.omega[column]) == (one.plan.command.v, one.plan.command.omega)
     command = told.command(one.plan.question.mover, one.tick)

@@ -19,7 +19,7 @@ from agent.estimation.closed_forms import Placement, same_placement
 from agent.estimation.exact import PairObservation, turn_error, weigh_placements
 from agent.estimation.mutual_ranges import base, solve
 from agent.estimation.precision import combined_error, odometry_rounding
-from agent.planning.assured import AssuredExact
+from agent.planning.assured import Assured
 from agent.planning.phase3_last_manoeuvre import LAST_SPEEDS, TURN_RATES, LastManoeuvre
 from agent.planning.state import RobotState
 from compose.launch.in_process import run_mission
@@ -285,7 +285,7 @@ def test_observations_before_phase_3_rule_out_further_placements(tmp_path: Path)
     more = 0
     for seed in range(60):
         claim = next(step for step in steps_of(tmp_path, CLOSE, seed) if step.commands["b"].verdict)
-        state = AssuredExact().decide(claim.observed["b"], claim.heard["b"])
+        state = Assured().decide(claim.observed["b"], claim.heard["b"])
         assert state.belief.encounter_tick is not None
         late = state.pair_observations(state.belief.encounter_tick)
         rounding_error = odometry_rounding(state, min(state.tick, state.peer_state.peer.through))
@@ -402,7 +402,7 @@ def test_the_last_manoeuvre_leaves_no_more_placements_out_of_range_than_it_must(
     counts = set()
     for seed in (*range(20), 64, 78, 83, 86):
         for moment in steps_of(tmp_path, SLOW, seed):
-            state = AssuredExact().decide(moment.observed["b"], moment.heard["b"])
+            state = Assured().decide(moment.observed["b"], moment.heard["b"])
             if isinstance(state.mode, LastManoeuvre) and not isinstance(
                 moment.before["b"].mode, LastManoeuvre
             ):
@@ -429,9 +429,9 @@ def test_no_detection_selects_the_placement_out_of_range_and_b_drives_back_to_re
     assert (returning.v, returning.omega) == (-command.v, -command.omega)
     assert math.dist(places_of(back)[1], places_of(setting_out)[1]) < 1e-9
     assert back.heard["b"]
-    state = AssuredExact().decide(setting_out.observed["b"], setting_out.heard["b"])
+    state = Assured().decide(setting_out.observed["b"], setting_out.heard["b"])
     for robot in "ab":
-        named = AssuredExact().decide(back.observed[robot], back.heard[robot]).belief.placements
+        named = Assured().decide(back.observed[robot], back.heard[robot]).belief.placements
         (only,) = left_out(state, command.v, command.omega, state.belief.placements)
         assert len(named) == 1
         assert same_placement(named[0], only, 1e-6)

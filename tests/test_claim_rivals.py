@@ -10,7 +10,7 @@ import pytest
 import tandem
 from agent.estimation.gaussian import claim_rivals
 from agent.planning import accuracy_seeking, active_sensing, pair_claim
-from agent.planning.accuracy_seeking import AccuracySeeking
+from agent.planning.assured import Assured
 from agent.planning.state import RobotState
 from compose.launch.in_process import run_mission
 from compose.recording.summary_json import summary
@@ -59,7 +59,7 @@ def test_the_next_manoeuvre_is_planned_with_the_rival_that_blocks_a_claim(
         return active_sensing.plan_together(hypotheses, *args)
 
     monkeypatch.setattr(accuracy_seeking, "with_claim", with_claim)
-    monkeypatch.setattr(AccuracySeeking, "joint_manoeuvres", lambda _, *args: plan_together(*args))
+    monkeypatch.setattr(Assured, "joint_manoeuvres", lambda _, *args: plan_together(*args))
     assert_localised(run_mission(scenario_of(SIGMA, 384, reach=1.5)))
     assert rivals
     for rival in rivals:

@@ -20,7 +20,7 @@ from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.search import search
 from agent.estimation.posterior import Hypothesis
-from agent.planning.accuracy_seeking import AccuracySeeking
+from agent.planning.assured import Assured
 from agent.planning.state import Done, RobotState
 from compose.launch.in_process import run_mission
 from compose.scenario.scenario_file import parse
@@ -160,11 +160,11 @@ def remembered(folder: Path, robot: str) -> tuple[RobotState, Localised]:
     for message in said(folder, robot):
         match message:
             case Observation():
-                state, heard = AccuracySeeking().observe(state, message), []
+                state, heard = Assured().observe(state, message), []
             case Report() if message.robot != robot:
                 heard.append(message)
             case Command(verdict=verdict):
-                state = AccuracySeeking().decide(state, heard)
+                state = Assured().decide(state, heard)
                 if isinstance(verdict, Localised):
                     return state, verdict
             case _:

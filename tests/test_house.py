@@ -32,7 +32,7 @@ BELOW = {
 }
 """The packages of the project that each package may import."""
 
-BUDGETS = {"protocol": 4_336, "agent": 16_598, "world": 4_277, "compose": 29_093, "tandem": 1_544}
+BUDGETS = {"protocol": 4_340, "agent": 16_545, "world": 4_285, "compose": 29_125, "tandem": 1_560}
 """The largest number of lines of Python and C of each package. Raising one needs a reason in the commit."""
 
 SHELL = {
@@ -296,7 +296,7 @@ def test_robot_states_and_worlds_are_immutable() -> None:
 
 ASKED_IN = {
     "planner_name": set(),
-    "exact": {"agent.planning.registry", "agent.planning.state"},
+    "exact": {"agent.planning.state"},
 }
 """The modules of the agent that read these fields: they select a planner and an estimator."""
 

@@ -20,7 +20,7 @@ from agent.estimation.gaussian.odometry_noise import variances
 from agent.estimation.knowledge import Belief, Knowledge
 from agent.peer.motion_log import MotionLog
 from agent.peer.peer_state import PeerState
-from agent.planning.accuracy_seeking import AccuracySeeking
+from agent.planning.assured import Assured
 from agent.planning.range_seeking import next_on_spiral
 from agent.planning.state import RobotState
 from compose.launch.in_process import played, run_mission
@@ -115,7 +115,7 @@ def test_a_recording_in_which_a_left_b_is_audited_replayed_and_told(tmp_path: Pa
 def test_neither_robot_keeps_hypotheses_of_the_meeting_that_a_left() -> None:
     known: dict[str, list[Belief]] = {"a": [], "b": []}
 
-    class Watched(AccuracySeeking):
+    class Watched(Assured):
         def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
             decided = super().decide(state, reports)
             known[state.config.robot].append(decided.belief)

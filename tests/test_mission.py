@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from agent.estimation.closed_forms import Placement
-from agent.planning.assured import AssuredExact
+from agent.planning.assured import Assured
 from agent.planning.paper import Paper
 from agent.planning.phase1_anchor import third_point
 from agent.planning.phase3_last_manoeuvre import LAST_SPEEDS, TURN_RATES, last_manoeuvre
@@ -30,7 +30,7 @@ from world.world_journal import Tick
 
 SECTION_IV = Mission(3.0, 1.0, 1.0, math.pi)
 D = 10.0
-MANOEUVRES = {"paper": Paper.MANOEUVRES, "assured": AssuredExact.MANOEUVRES}
+MANOEUVRES = {"paper": Paper.MANOEUVRES, "assured": Assured.MANOEUVRES}
 VARIANTS: tuple[PlannerName, ...] = ("paper", "assured")
 
 missions = st.builds(
@@ -316,7 +316,7 @@ def test_the_assured_last_manoeuvre_keeps_as_many_candidates_in_range_as_it_can(
     """Among manoeuvres with as many candidates in range, it is the optimum of eq. (8)."""
     b, a, found = case
     rim = SECTION_IV.sensing_range - 1e-6
-    plan = last_manoeuvre("b", a, b, found, SECTION_IV, AssuredExact.MANOEUVRES)
+    plan = last_manoeuvre("b", a, b, found, SECTION_IV, Assured.MANOEUVRES)
     assert plan is not None
 
     def value(v: float, omega: float) -> tuple[int, float]:
@@ -333,7 +333,7 @@ def test_the_assured_last_manoeuvre_keeps_as_many_candidates_in_range_as_it_can(
 def test_a_single_candidate_is_checked_from_where_its_range_changes_most() -> None:
     b, a = Pose(0.0, 0.0, 0.0), Pose(6.5, 0.0, 0.0)
     ahead = Placement(0.0, -4.5, 0.0)
-    plan = last_manoeuvre("b", a, b, [ahead], SECTION_IV, AssuredExact.MANOEUVRES)
+    plan = last_manoeuvre("b", a, b, [ahead], SECTION_IV, Assured.MANOEUVRES)
     assert plan is not None
     assert plan.command.v == 1.0
     assert plan.command.omega == pytest.approx(0.0, abs=1e-9)

@@ -20,7 +20,7 @@ from msgspec.structs import replace
 from agent.estimation.claim import is_definite
 from agent.estimation.gaussian.contact_fit import ContactRanges, estimated
 from agent.estimation.gaussian.odometry_noise import Track, track
-from agent.planning.accuracy_seeking import AccuracySeeking
+from agent.planning.assured import Assured
 from agent.planning.group import GroupPlanner
 from agent.planning.noisy_unanchored import NoisyUnanchoredPlanner
 from agent.planning.state import RobotState
@@ -259,7 +259,7 @@ def in_search(run: Run, peers: tuple[str, ...], shift: float) -> RobotState | No
     Before it claims its pose with c, the pose that it knows is from its meetings with `peers`, and `shift` m
     beside the one that it has computed.
     """
-    agent, planner = run.agents["a"], GroupPlanner(AccuracySeeking())
+    agent, planner = run.agents["a"], GroupPlanner(Assured())
     state, changed = planner.start(agent.config), False
     for one in agent.steps:
         state = planner.observe(state, one.observation)
@@ -293,7 +293,7 @@ def test_a_claim_that_later_ranges_contradict_is_withdrawn_in_the_search_and_no_
     run = of_frames(journals())
     (finder,) = {report.robot for _, report, _ in references(run)}
     first = min(prior.tick for _, _, prior in references(run))
-    agent, planner = run.agents[finder], GroupPlanner(AccuracySeeking())
+    agent, planner = run.agents[finder], GroupPlanner(Assured())
     state = planner.start(agent.config)
     for one in agent.steps[: first + 1]:
         if one.observation.tick == first:
@@ -319,7 +319,7 @@ def test_a_claim_that_later_ranges_contradict_is_withdrawn_in_the_search_and_no_
 def test_a_robot_that_takes_a_finder_anew_receives_the_manoeuvres_since_the_reference_again() -> None:
     run = of_frames(journals())
     receiver, report, first = references(run)[0]
-    agent, planner = run.agents[report.robot], GroupPlanner(AccuracySeeking())
+    agent, planner = run.agents[report.robot], GroupPlanner(Assured())
     state, since = planner.start(agent.config), []
     for one in agent.steps[: first.tick + 9]:
         state = planner.decide(planner.observe(state, one.observation), of_robots(one))

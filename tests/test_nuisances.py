@@ -29,7 +29,7 @@ from agent.estimation.gaussian.range_weights import Weighing, weights_by_errors
 from agent.estimation.gaussian.reachable_accuracy import reference_sigma
 from agent.estimation.gaussian.search import starts_about
 from agent.peer.peer_state import PeerState
-from agent.planning.accuracy_seeking import AccuracySeeking
+from agent.planning.assured import Assured
 from agent.planning.plausibility import objection
 from agent.planning.state import MODE_NAMES
 from compose.errors import BadScenario, Unworkable
@@ -355,10 +355,10 @@ def test_a_robot_searches_when_drop_outs_hardly_explain_that_it_has_no_range(
     drop_outs: float, ticks: int
 ) -> None:
     told = f"{{anchor_sigma = 0.05, mutual_sigma = 0.05, drop_outs = {drop_outs}}}"
-    start = AccuracySeeking().start(parsed(told, 0.3).config("a"))
+    start = Assured().start(parsed(told, 0.3).config("a"))
     modes = []
     for tick in range(ticks + 1):
-        start = AccuracySeeking().observe(start, Observation(tick, "a", REST if tick else None, None))
+        start = Assured().observe(start, Observation(tick, "a", REST if tick else None, None))
         modes.append(MODE_NAMES[type(start.mode)])
     assert modes == ["asleep"] * ticks + ["straight"]
 

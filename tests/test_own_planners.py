@@ -42,7 +42,7 @@ from protocol.motion import REST, Covariance, Pose
 from protocol.network import keys
 from protocol.network.inbox import Arrival
 from protocol.wire import MAX_REPORT_BYTES, encode
-from tandem.planning import AssuredExact, Paper, RobotState
+from tandem.planning import Assured, Paper, RobotState
 from tests import own_planners
 from tests.commands import PAPER_1, TandemProcess
 from tests.commands import tandem as command
@@ -62,9 +62,7 @@ def own(name: str, scenario: str = "paper-1", **options: Any) -> ScenarioTemplat
 
 def first_state() -> RobotState:
     """Return the state of a robot that has been observed once."""
-    return AssuredExact().observe(
-        AssuredExact().start(load("paper-1").config("a")), Observation(0, "a", None, 1.0)
-    )
+    return Assured().observe(Assured().start(load("paper-1").config("a")), Observation(0, "a", None, 1.0))
 
 
 def journals(folder: Path) -> dict[str, bytes]:
@@ -219,13 +217,25 @@ def test_a_planner_of_an_installed_package_has_a_name(tmp_path: Path) -> None:
         ("tests.own_planners:Nobody", "there is no 'Nobody' in tests.own_planners"),
         ("tests.own_planners:Local", "is not a planner: not a subclass of tandem.planning.Planner"),
         ("tests.own_planners:Incomplete", "is not a planner: it does not define start, observe, decide"),
+        (
+            "tests.own_planners:Suited",
+            "suited() was removed in version 0.3: a planner asks config.mission.noise",
+        ),
         ("own planner", "invalid name"),
         ("asured", "there is no 'asured'; there are assured, paper"),
     ],
 )
 def test_a_name_that_is_no_planner_is_one_line(name: str, says: str) -> None:
-    with pytest.raises(BadScenario, match=says.replace("(", "\\(")):
+    with pytest.raises(BadScenario, match=re.escape(says)):
         setting("paper-1", (), name)
+
+
+@pytest.mark.parametrize("name", ["AssuredExact", "AccuracySeeking"])
+def test_a_removed_class_names_the_one_that_replaces_it(name: str) -> None:
+    says = f"tandem.planning.{name} was removed in version 0.3: subclass Assured"
+    with pytest.raises(ImportError, match=says):
+        getattr(tandem.planning, name)
+    assert not hasattr(tandem.planning, "AssuredNothing")
 
 
 def test_options_are_checked_before_the_mission() -> None:
@@ -327,9 +337,9 @@ def test_a_report_that_its_decoder_refuses_is_refused_on_arrival() -> None:
     good = report_of(Wrapping().report(state), 0, "a")
     assert malformed(good, planner) is None
     assert malformed(replace(good, body=b"\x93"), planner) == "its body: Input data was truncated"
-    parcel = msgspec.msgpack.encode(Parcel(AssuredExact().report(state), 3))
+    parcel = msgspec.msgpack.encode(Parcel(Assured().report(state), 3))
     assert malformed(replace(good, body=parcel), planner) == "3 is not twice 0"
-    assert malformed(AssuredExact().report(state), planner) == (
+    assert malformed(Assured().report(state), planner) == (
         "a report without a body, and this robot's planner has reports of its own"
     )
     shipped = planner_of(load("paper-1").config("a"))
@@ -339,7 +349,7 @@ def test_a_report_that_its_decoder_refuses_is_refused_on_arrival() -> None:
 def test_the_agent_counts_and_drops_a_report_that_the_decoder_refuses() -> None:
     planner, inbox = planner_of(own("Wrapping").scenario.config("a")), QuietInbox("test")
     buffer = ReportBuffer(inbox, (), partial(malformed, planner=planner), real_time=False)
-    log = AssuredExact().report(first_state())
+    log = Assured().report(first_state())
     for tick, double in ((0, 0), (1, 3)):
         parcel = Parcel(replace(log, tick=tick, robot="b"), double)
         frame = encode(report_of(parcel, tick, "b"))
@@ -406,7 +416,7 @@ def test_shipped_planners_send_the_same_reports_as_before() -> None:
 def test_every_mistake_of_this_module_has_a_test() -> None:
     classes = {name for name, value in vars(own_planners).items() if isinstance(value, type)}
     mistakes = {name for name in classes if getattr(own_planners, name).__module__ == own_planners.__name__}
-    assert mistakes - {*BROKEN} == {"Parcel", "Wrapping", "Sound", "Incomplete", "Local", "Rendezvousless"}
+    assert mistakes - {*BROKEN} == {"Parcel", "Wrapping", "Sound", "Incomplete", "Local", "Rendezvousless", "Suited"}
 
 
 def test_orbits_that_are_none_are_one_line() -> None:

@@ -21,7 +21,8 @@ from agent.estimation.knowledge import Belief
 from agent.estimation.posterior import Hypothesis, Posterior
 from agent.peer.motion_log import MotionLog
 from agent.planning import pair_claim
-from agent.planning.accuracy_seeking import OFF_RADIUS, AccuracySeeking
+from agent.planning.accuracy_seeking import OFF_RADIUS
+from agent.planning.assured import Assured
 from agent.planning.phase2_orbit import Aligning, Radial, orientation
 from agent.planning.state import RobotState
 from compose.launch.in_process import run_mission
@@ -50,7 +51,7 @@ by_noise = pytest.mark.parametrize("noise", series(NOISES.values(), 2), ids=NOIS
 SEEDS = range(4, 7)
 HALF_SIGMA = "anchor_sigma = 0.05\nmutual_sigma = 0.05"
 
-PLANNER = AccuracySeeking()
+PLANNER = Assured()
 
 
 def first_ranges(scenario: Scenario, robot: int, ticks: int) -> list[float | None]:

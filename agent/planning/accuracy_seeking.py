@@ -1,4 +1,4 @@
-"""The `assured` planner with noisy sensors: it measures until the poses are as accurate as the mission asks.
+"""The transitions of `assured` with noisy sensors: it measures until poses are as accurate as it is asked.
 
 The phases are those of the paper. In phase 1, a robot collects ranges to its anchor until a better estimate
 is not worth the time. In phase 3, both robots move, each to where its next ranges are expected to tell
@@ -22,9 +22,10 @@ from agent.estimation.judged import FEWEST_FOR_CLAIM, sufficient_mutual_ranges
 from agent.estimation.posterior import Hypothesis
 from agent.planning import active_sensing, exchange, phase2_orbit, range_seeking, transitions
 from agent.planning.active_sensing import CONTINUED, STALLED, Listening, Objective, Retreating, Surveying
-from agent.planning.assured import AssuredExact
+from agent.planning.manoeuvres import Manoeuvres
 from agent.planning.pair_claim import inferred, with_claim, with_consistency_test
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent
+from agent.planning.phase3_last_manoeuvre import LAST_SPEEDS
 from agent.planning.range_seeking import Backing, Beacon, Circling, Homing, Straight, Turning
 from agent.planning.stalls import is_stalled
 from agent.planning.state import Asleep, Done, RobotState
@@ -33,8 +34,10 @@ from protocol.messages import BranchKind, Localised, Observation, Report
 from protocol.mission import Mission, Role
 from protocol.motion import ORIGIN, REST, Controls, Pose, compose, inverse
 
-MANOEUVRES = AssuredExact.MANOEUVRES
-"""The manoeuvres of the searches for ranges."""
+MANOEUVRES = Manoeuvres(
+    directions=(1.0, -1.0), sides=(1.0, -1.0), last_speeds=LAST_SPEEDS, fewest_out_of_range=True
+)
+"""Both ways, to both sides in phase 1, and at several speeds."""
 
 LOST_AFTER = 3
 """The number of strides without an expected anchor detection after which the robot returns to its anchor."""
@@ -65,41 +68,10 @@ DROP_OUT_SIGMAS = 3.0
 JointManoeuvres = Callable[
     [Sequence[PlanningHypothesis], tuple[float, float], float, Mission], tuple[Controls, Controls]
 ]
-"""The type of `AccuracySeeking.joint_manoeuvres`."""
+"""The type of `Assured.joint_manoeuvres`."""
 
 
-class AccuracySeeking(AssuredExact):
-    """The planner `assured` with noisy sensors."""
-
-    ACTIVE_SENSING = True
-    """Each hypothesis has a covariance, from which the value of further ranges follows."""
-
-    def observe(self, state: RobotState, observation: Observation) -> RobotState:
-        """Return `state` with the sensor data of one tick, and with the mode that follows from them."""
-        return _observe(state, observation)
-
-    def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
-        """Return `state` with the peer's `reports` and with the mode that follows from them."""
-        return _decide(state, reports, self.joint_manoeuvres)
-
-    def joint_manoeuvres(
-        self,
-        hypotheses: Sequence[PlanningHypothesis],
-        m2: tuple[float, float],
-        rho: float,
-        mission: Mission,
-    ) -> tuple[Controls, Controls]:
-        """Return the manoeuvres of a and b in phase 3, for `stride` ticks.
-
-        `hypotheses` are about the poses of both robots relative to M1, the most probable first. M2 is at
-        `m2` in m, and `rho` is the latest range between the robots in m. A subclass may plan others; both
-        robots compute both from the same measurements. It is not asked while they are stalled (see `stalls`),
-        nor when one of them has claimed its pose.
-        """
-        return active_sensing.plan_together(hypotheses, m2, rho, mission)
-
-
-def _observe(state: RobotState, observation: Observation) -> RobotState:
+def observed(state: RobotState, observation: Observation) -> RobotState:
     """Return `state` with the sensor data of one tick, and with the mode that follows from them."""
     state, anchor_range = exchange.observed(state, observation), observation.anchor_range
     match state.mode:
@@ -331,7 +303,7 @@ def _continue_phase3(state: RobotState) -> RobotState:
             return state
 
 
-def _decide(state: RobotState, reports: Sequence[Report], planned: JointManoeuvres) -> RobotState:
+def decided(state: RobotState, reports: Sequence[Report], planned: JointManoeuvres) -> RobotState:
     """Return `state` with the peer's `reports` and with the mode that follows from them."""
     if reports:
         state = exchange.with_reports(state, reports)

@@ -1,7 +1,8 @@
-"""The `assured` planner with exact sensors: it handles the failure cases of the paper.
+"""The `assured` planner: it handles the failure cases of the paper, with exact and with noisy sensors.
 
-It follows the paper's phases with more manoeuvres to choose from, until one placement is left and a redundant
-range has confirmed it. With noisy sensors, `accuracy_seeking` is the `assured` planner.
+With exact sensors, it follows the paper's phases with more manoeuvres to choose from, until one placement is
+left and a redundant range has confirmed it. With noisy sensors, it measures until the poses are as accurate
+as the mission asks (`accuracy_seeking`).
 """
 
 from __future__ import annotations
@@ -10,14 +11,15 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from agent.planning import exchange, phase3_last_manoeuvre, transitions
+from agent.estimation.gaussian.inference import PlanningHypothesis
+from agent.planning import accuracy_seeking, active_sensing, exchange, phase3_last_manoeuvre, transitions
 from agent.planning.log_exchange import LogPlanner
-from agent.planning.manoeuvres import Manoeuvres
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent, Travelling
-from agent.planning.phase3_last_manoeuvre import LAST_SPEEDS, Standing, Waiting
+from agent.planning.phase3_last_manoeuvre import Standing, Waiting
 from agent.planning.state import MODE_NAMES, Done, RobotState
-from protocol.messages import Command, Localised, Report
-from protocol.motion import REST
+from protocol.messages import Command, Localised, Observation, Report
+from protocol.mission import Mission
+from protocol.motion import REST, Controls
 
 PEER_RESTS = (MODE_NAMES[Standing], MODE_NAMES[Waiting])
 """The modes of the peer in which this robot may plan a manoeuvre.
@@ -26,19 +28,26 @@ If both moved at once, they might do so in mirror image, and the new range would
 """
 
 
-class AssuredExact(LogPlanner):
-    """The planner `assured` with exact sensors. Subclasses may plan another last manoeuvre."""
+class Assured(LogPlanner):
+    """The planner `assured`. Subclasses may plan other manoeuvres of phase 3, and choose a `SOLVER`."""
 
-    MANOEUVRES = Manoeuvres(
-        directions=(1.0, -1.0), sides=(1.0, -1.0), last_speeds=LAST_SPEEDS, fewest_out_of_range=True
-    )
-    """Both ways, to both sides in phase 1, and at several speeds."""
+    MANOEUVRES = accuracy_seeking.MANOEUVRES
+    ACTIVE_SENSING = True
+
+    def observe(self, state: RobotState, observation: Observation) -> RobotState:
+        """Return `state` with the sensor data of one tick, and with the mode that follows from them."""
+        if state.estimator.corrects_poses:
+            return accuracy_seeking.observed(state, observation)
+        return super().observe(state, observation)
 
     def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
         """Return `state` with the peer's `reports` and with the mode that follows from them.
 
-        Phase 3 begins as soon as the peer's phase 1 has ended and b is far enough from its anchor.
+        With exact sensors, phase 3 begins as soon as the peer's phase 1 has ended and b is far enough from
+        its anchor.
         """
+        if state.estimator.corrects_poses:
+            return accuracy_seeking.decided(state, reports, self.joint_manoeuvres)
         if reports:
             state = exchange.with_reports(state, reports)
         if not state.in_contact or isinstance(state.mode, Done):
@@ -56,6 +65,22 @@ class AssuredExact(LogPlanner):
     def command(self, state: RobotState) -> Command:
         """Return the command for the next tick, with the phase, the task and the verdict."""
         return exchange.command(state, REST if self._must_wait(state) else transitions.controls(state))
+
+    def joint_manoeuvres(
+        self,
+        hypotheses: Sequence[PlanningHypothesis],
+        m2: tuple[float, float],
+        rho: float,
+        mission: Mission,
+    ) -> tuple[Controls, Controls]:
+        """Return the manoeuvres of a and b in phase 3 with noisy sensors, for `stride` ticks.
+
+        `hypotheses` are about the poses of both robots relative to M1, the most probable first. M2 is at
+        `m2` in m, and `rho` is the latest range between the robots in m. A subclass may plan others; both
+        robots compute both from the same measurements. It is not asked while they are stalled (see `stalls`),
+        nor when one of them has claimed its pose.
+        """
+        return active_sensing.plan_together(hypotheses, m2, rho, mission)
 
     def _must_wait(self, state: RobotState) -> bool:
         """Return whether the robot stands still, in range of a peer with which phase 3 cannot begin yet.

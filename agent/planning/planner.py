@@ -79,7 +79,7 @@ class Planner(Generic[S, B]):
     figures show nothing of them."""
 
     ACTIVE_SENSING: bool = False
-    """True if robots choose each manoeuvre by the information of its next ranges, for figures."""
+    """True if robots choose noisy ranges by their information, for figures of a `RobotState`."""
 
     REQUIRED_PLACES: int = 0
     """The number of different relative placements with a mutual range that a claim from exact ranges needs.
@@ -131,11 +131,6 @@ class Planner(Generic[S, B]):
         """
         del peer
         return self.report(state)
-
-    def suited(self, mission: Mission) -> Planner[Any, Any]:
-        """Return the planner that is used with the noise of `mission`: by default, this one."""
-        del mission
-        return self
 
     def rendezvous(self, mission: Mission, distance: float) -> Rendezvous:
         """Return the orbits of a pair whose anchors are `distance` m apart, and the bound of their duration.

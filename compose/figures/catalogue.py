@@ -37,7 +37,7 @@ def pictures(pair: PairRecord, kind: str, medium: Medium = SCREEN) -> Iterator[P
             known = kind == "robot" or pair.planner is not None
             for role in pair.newcomers:
                 yield f"{kind}-{pair.robot(role).id}", draw(pair, role, medium) if known else foreign
-        case "plan" if pair.planner is not None and pair.planner.ACTIVE_SENSING:
+        case "plan" if pair.senses_actively:
             yield f"{kind}-{pair.name}", decisions.draw(pair, medium)
         case "plan" if pair.readable:
             plans = manoeuvre.draw(pair, medium) if pair.planner is not None else {pair.name: foreign}

@@ -134,6 +134,11 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
         return self.run.setup is not None and any(one.own_planner for one in self.run.setup.robots)
 
     @property
+    def senses_actively(self) -> bool:
+        """True if the robots choose their ranges by information, with states that can be drawn."""
+        return self.planner is not None and self.planner.ACTIVE_SENSING and not self.exact
+
+    @property
     def true(self) -> bool:
         """True if the paths are the ground truth, and not implied by claims."""
         return self.run.world is not None

@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from compose.errors import BadOptions, UserError
 from compose.launch.class_loader import entry_points, named
-from protocol.messages import (
-    RobotConfig,
-)
+from protocol.messages import RobotConfig
 from protocol.mission import Mission
 from protocol.orbits import RENDEZVOUS, Rendezvous, rendezvous
 from protocol.spelling import did_you_mean
@@ -48,33 +46,29 @@ def check(name: str, options: Mapping[str, Any]) -> None:
     _created(name, options)
 
 
-def planner(name: str, options: Mapping[str, Any], mission: Mission) -> Planner[Any, Any]:
-    """Return a new planner for the noise of `mission`.
+def planner_of(config: RobotConfig) -> Planner[Any, Any]:
+    """Return the planner of the robot with this configuration, in a guard unless it is shipped with Tandem.
 
     Raises UserError if it cannot be loaded or created, and Untrusted if the user has not named it.
     """
-    return _guarded(name, _suited(name, options, mission))
-
-
-def planner_of(config: RobotConfig) -> Planner[Any, Any]:
-    """Return the planner of the robot with this configuration. Raises like `planner`."""
-    return _guarded(config.planner_name, unguarded_planner_of(config))
+    found = unguarded_planner_of(config)
+    return found if is_shipped(config.planner_name) else _guarded(config.planner_name, found)
 
 
 def unguarded_planner_of(config: RobotConfig) -> Planner[Any, Any]:
     """Return a new planner of the robot with this configuration, without a guard. Raises UserError."""
     name = config.planner_name
-    found = _suited(name, config.planner_options, config.mission)
+    found = _created(name, config.planner_options)
     if not config.members:
         return found
-    from agent.planning.assured import AssuredExact  # noqa: PLC0415  # it imports numpy
+    from agent.planning.assured import Assured  # noqa: PLC0415  # it imports numpy
     from agent.planning.group import GroupPlanner  # noqa: PLC0415  # likewise
     from agent.planning.noisy_unanchored import NoisyUnanchoredPlanner  # noqa: PLC0415  # likewise
     from agent.planning.unanchored import UnanchoredPlanner  # noqa: PLC0415  # likewise
 
     if config.given_anchor is None:
         return UnanchoredPlanner() if config.mission.noise.exact else NoisyUnanchoredPlanner()
-    if not isinstance(found, AssuredExact):
+    if not isinstance(found, Assured):
         raise UserError(f"robots with the planner {name} meet in pairs, not in a group")
     return GroupPlanner(found)
 
@@ -83,27 +77,12 @@ def is_for_groups(name: str) -> bool:
     """Return whether robots with the planner `name` can form a group. Raises like `planner`."""
     if is_shipped(name):
         return name == GROUP_PLANNER
-    from agent.planning.assured import AssuredExact  # noqa: PLC0415  # it imports numpy
+    from agent.planning.assured import Assured  # noqa: PLC0415  # it imports numpy
 
-    return issubclass(planner_class(name), AssuredExact)
-
-
-def _suited(name: str, options: Mapping[str, Any], mission: Mission) -> Planner[Any, Any]:
-    if is_shipped(name):
-        from agent.planning import registry  # noqa: PLC0415  # it imports numpy
-
-        return registry.planner(name, mission)
-    created = _created(name, options)
-    try:
-        return created.suited(mission)
-    except Exception as error:  # noqa: BLE001  # the user's code may raise anything
-        raise UserError(f"{name}: suited() raised {type(error).__name__}: {error}") from None
+    return issubclass(planner_class(name), Assured)
 
 
 def _guarded(name: str, found: Planner[Any, Any]) -> Planner[Any, Any]:
-    """Return `found` in a guard, unless it is shipped with Tandem."""
-    if is_shipped(name):
-        return found
     from compose.launch.planner_guard import GuardedPlanner  # noqa: PLC0415  # it imports numpy
 
     return GuardedPlanner(name, found)
@@ -113,7 +92,7 @@ def orbits(name: str, options: Mapping[str, Any], mission: Mission, distance: fl
     """Return the orbits of a planner for anchors `distance` m (D) apart. Raises like `planner`."""
     if is_shipped(name):
         return rendezvous(mission, distance, name)
-    return planner(name, options, mission).rendezvous(mission, distance)
+    return _guarded(name, _created(name, options)).rendezvous(mission, distance)
 
 
 def planner_class(name: str) -> type[Planner[Any, Any]]:
@@ -132,6 +111,8 @@ def planner_class(name: str) -> type[Planner[Any, Any]]:
         raise UserError(f"there is no '{name}'; there are {', '.join(names)}{near}") from None
     if not isinstance(found, type) or not issubclass(found, Planner):
         raise UserError(f"{name}: is not a planner: not a subclass of tandem.planning.Planner")
+    if hasattr(found, "suited"):
+        raise UserError(f"{name}: suited() was removed in version 0.3: a planner asks config.mission.noise")
     missing = [method for method in PLANNER_METHODS if getattr(found, method) is getattr(Planner, method)]
     if missing:
         raise UserError(f"{name}: is not a planner: it does not define {', '.join(missing)}")

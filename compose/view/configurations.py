@@ -132,7 +132,7 @@ def _compared(
     from agent.planning.registry import PLANNER_CLASSES  # noqa: PLC0415
 
     planner = PLANNER_CLASSES.get(setup.planner_name)
-    manoeuvres = planner().suited(setup.mission).MANOEUVRES if planner is not None else None
+    manoeuvres = planner.MANOEUVRES if planner is not None else None
     if manoeuvres is None:
         return None
     relative = [compose(inverse(b), a) for a, b in poses]

@@ -14,10 +14,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import tandem
-from tandem.planning import AccuracySeeking, Controls, Mission, PlanningHypothesis, Pose, step
+from tandem.planning import Assured, Controls, Mission, PlanningHypothesis, Pose, step
 
 
-class Greedy(AccuracySeeking):
+class Greedy(Assured):
     """The phases of `assured` with noisy sensors, and greedy manoeuvres in contact with the peer."""
 
     def __init__(self, turns: int = 9) -> None:

@@ -12,7 +12,7 @@ from gtsam.noiseModel import Diagonal, Isotropic
 
 import tandem
 from tandem.estimation import Array, JointMeasurements, OdometryErrors, Solution, Start
-from tandem.planning import AccuracySeeking
+from tandem.planning import Assured
 
 EXACT = 1e-4
 """The least standard deviation (m, rad) of an increment of odometry; gtsam divides by it."""
@@ -48,7 +48,7 @@ class GtsamSolver:
         return Solution(Start(poses, errors), turn @ local @ turn.T)
 
 
-class WithGtsam(AccuracySeeking):
+class WithGtsam(Assured):
     """The planner `assured` with noisy sensors, whose poses gtsam fits."""
 
     SOLVER = GtsamSolver()

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import tandem
-from tandem.planning import AssuredExact, Controls, Mission, Plan, Question
+from tandem.planning import Assured, Controls, Mission, Plan, Question
 
 
-class Hasty(AssuredExact):
+class Hasty(Assured):
     """The planner `assured` with exact sensors, without eq. (8)."""
 
     def last_manoeuvre(self, question: Question, mission: Mission) -> Plan | None:
