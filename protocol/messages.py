@@ -560,8 +560,9 @@ class Report(Message, frozen=True):
 
     @property
     def has_log(self) -> bool:
-        """True if this contains the log of the sender; False to a robot that it is not in a meeting with."""
-        return self.prior is None and (self.start is not None or self.through > 0)
+        """True if this contains the log of the sender, or a body; False to a robot that it does not meet."""
+        logs = self.start is not None or self.through > 0 or self.body is not None
+        return logs and self.prior is None
 
 
 class Command(Message, frozen=True):

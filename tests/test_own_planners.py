@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
@@ -21,6 +22,7 @@ from agent.process.report_bodies import malformed, report_of
 from agent.process.report_buffer import ReportBuffer
 from agent.process.robot import REPORTS_KEPT, Robot
 from compose.audit.planner_checks import QuietInbox, check_planner
+from compose.audit.rules import audit_run
 from compose.errors import BadScenario, PlannerFailed, UserError
 from compose.launch import class_loader
 from compose.launch.in_process import run_mission
@@ -38,7 +40,7 @@ from protocol.messages import (
     Report,
     Undecided,
 )
-from protocol.motion import REST, Covariance, Pose
+from protocol.motion import ORIGIN, REST, Covariance, Pose
 from protocol.network import keys
 from protocol.network.inbox import Arrival
 from protocol.wire import MAX_REPORT_BYTES, encode
@@ -49,6 +51,7 @@ from tests.commands import tandem as command
 from tests.groups import group_of, table_of
 from tests.own_planners import Parcel, Wrapping
 from tests.series import series
+from world.scenario import Scenario
 
 OWN = "tests.own_planners:Wrapping"
 FAULTS = "loss=0.2, delay=0..2, duplicate=0.1, reorder=0.1, corrupt=0.05"
@@ -328,6 +331,68 @@ def test_robots_with_another_planner_cannot_form_a_group() -> None:
         validate(table, "group.toml")
 
 
+BELIEVING = "docs.examples.group_planner:Believing"
+"""A planner that is no subclass of a shipped one, and defines `meet`."""
+
+
+def believing(robots: int, seed: int, **fields: Any) -> Scenario:
+    """Return a group with the planner BELIEVING."""
+    table = table_of(robots, seed) | fields
+    table["planner"] = {"name": BELIEVING}
+    class_loader.trust(BELIEVING)
+    return validate(table, "group.toml").seeded(None)
+
+
+@pytest.mark.parametrize("seed", series((1, 2, 3, 4)))
+def test_robots_with_any_planner_that_begins_another_meeting_form_a_group(seed: int, tmp_path: Path) -> None:
+    run_mission(believing(5, seed), tmp_path)
+    run = read(tmp_path)
+    assert all(run.claim(robot) is not None for robot in run.robots)
+    assert audit_run(run).violations == ()
+
+
+def test_such_a_group_is_localised_though_reports_are_lost_and_late() -> None:
+    fault = {"loss": 0.3, "delay": 5, "duplicate": 0.1}
+    run = run_mission(believing(4, 1, fault=[fault]))
+    assert all(run.claim(robot) is not None for robot in run.robots)
+
+
+@pytest.mark.long
+def test_such_a_group_of_processes_that_are_killed_decides_the_same() -> None:
+    checks = list(check_planner(believing(4, 1), QuietInbox("test")))
+    assert [one for one in checks if one.wrong is not None] == []
+
+
+@pytest.mark.parametrize(
+    ("sigma", "change", "says"),
+    [
+        (0.05, lambda table: table["mission"].update(tolerates=1), "confirm no poses"),
+        (0.0, lambda table: table["robot"].append({"id": "u"}), "do not search for others"),
+    ],
+    ids=["poses that others confirm", "a robot without an anchor"],
+)
+def test_such_a_planner_helps_nobody_and_that_is_one_line(
+    sigma: float, change: Callable[[dict[str, Any]], None], says: str
+) -> None:
+    table = table_of(5, 1, sigma=sigma)
+    table["mission"]["area"] = [0.0, 0.0, 60.0, 60.0]
+    table["planner"] = {"name": BELIEVING}
+    class_loader.trust(BELIEVING)
+    change(table)
+    with pytest.raises(UserError, match=says):
+        validate(table, "group.toml")
+
+
+def test_a_group_refuses_a_body_that_its_planner_does_not_take_and_a_log_in_its_place() -> None:
+    planner = planner_of(believing(3, 1).config("r0"))
+    state = planner.observe(planner.start(believing(3, 1).config("r0")), Observation(0, "r0", None, 1.0))
+    good = planner.report(state)
+    assert planner.malformed(good) is None
+    assert planner.malformed(replace(good, body=b"\x83")) == "its body: Input data was truncated"
+    log = Report(5, "r1", start=ORIGIN)
+    assert planner.malformed(log) == "a log, and this robot's planner has reports of its own"
+
+
 # --- reports ------------------------------------------------------------------------------------------
 
 
@@ -343,7 +408,7 @@ def test_a_report_that_its_decoder_refuses_is_refused_on_arrival() -> None:
         "a report without a body, and this robot's planner has reports of its own"
     )
     shipped = planner_of(load("paper-1").config("a"))
-    assert malformed(good, shipped) == "a report with a body, and this robot's planner has none"
+    assert malformed(good, shipped) == "a body, and this robot's planner has none"
 
 
 def test_the_agent_counts_and_drops_a_report_that_the_decoder_refuses() -> None:
@@ -416,7 +481,15 @@ def test_shipped_planners_send_the_same_reports_as_before() -> None:
 def test_every_mistake_of_this_module_has_a_test() -> None:
     classes = {name for name, value in vars(own_planners).items() if isinstance(value, type)}
     mistakes = {name for name in classes if getattr(own_planners, name).__module__ == own_planners.__name__}
-    assert mistakes - {*BROKEN} == {"Parcel", "Wrapping", "Sound", "Incomplete", "Local", "Rendezvousless", "Suited"}
+    assert mistakes - {*BROKEN} == {
+        "Parcel",
+        "Wrapping",
+        "Sound",
+        "Incomplete",
+        "Local",
+        "Rendezvousless",
+        "Suited",
+    }
 
 
 def test_orbits_that_are_none_are_one_line() -> None:

@@ -37,6 +37,8 @@ def contradiction(report: Report) -> str | None:
 
     The checks concern the report alone, and do not depend on earlier reports.
     """
+    if report.body is not None:
+        return "a body, and this robot's planner has none"
     if report.heard > report.tick:
         return f"tick {report.heard} acknowledged at tick {report.tick}"
     if report.ranges_heard > report.tick + 1:

@@ -19,11 +19,12 @@ from msgspec.structs import replace
 from agent.planning import confirmation, exchange, group_transitions, noisy_search, sweep_transitions, visit
 from agent.planning.active_sensing import Retreating
 from agent.planning.log_exchange import LogPlanner
+from agent.planning.meeting_planner import MeetingPlanner
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Travelling
 from agent.planning.planner import Planner, Summary
 from agent.planning.range_seeking import Homing
 from agent.planning.separation import slowed
-from agent.planning.state import UNCONFIRMED, Done, RobotState
+from agent.planning.state import UNCONFIRMED, Deciding, Done, RobotState
 from protocol.messages import (
     Command,
     Estimate,
@@ -45,7 +46,7 @@ class GroupPlanner(Planner[RobotState, Report]):
 
     BODY = Report
 
-    def __init__(self, pair_planner: LogPlanner) -> None:
+    def __init__(self, pair_planner: LogPlanner | MeetingPlanner) -> None:
         """`pair_planner` decides in each meeting."""
         self.pair_planner = pair_planner
         self.REQUIRED_PLACES = pair_planner.REQUIRED_PLACES
@@ -80,7 +81,7 @@ class GroupPlanner(Planner[RobotState, Report]):
 
     def report(self, state: RobotState) -> Report:
         """Return the report to the peer of the present meeting."""
-        return exchange.report(state)
+        return self.pair_planner.report(state)
 
     def report_to(self, state: RobotState, peer: str) -> Report:
         """Return the report to `peer`: the log, or outside a meeting only this robot's verdict.
@@ -91,11 +92,11 @@ class GroupPlanner(Planner[RobotState, Report]):
         if sweep_transitions.is_helped(state, peer) and noisy_search.applies(state):
             return noisy_search.report(state, peer)
         if peer == state.config.peer and noisy_search.is_sweeping(state):
-            return exchange.report(state)
+            return self.report(state)
         if group_transitions.refused(state, peer):
             report = exchange.report_without_log(state, state.failure)
         elif peer == state.config.peer and state.meets:
-            return exchange.report(state)
+            return self.report(state)
         else:
             report = exchange.report_without_log(state, state.robot_verdict)
             if sweep_transitions.is_helped(state, peer) and isinstance(state.robot_verdict, Localised):
@@ -167,7 +168,7 @@ class GroupPlanner(Planner[RobotState, Report]):
         Once it is localised, there is one. On the way to another robot, it has no covariance, because the
         planner does not compute how the noise of the odometry adds up.
         """
-        estimate, latest = exchange.estimate(state), state.verdict
+        estimate, latest = self.pair_planner.estimate(state), state.verdict
         if state.fix is None:
             return estimate
         return replace(
@@ -203,4 +204,5 @@ def _is_out_of_range_again(before: RobotState, after: RobotState) -> bool:
     That planner sends a robot to its orbit, or back to its own anchor, which may be far from here.
     """
     back = isinstance(before.mode, Retreating) and isinstance(after.mode, Homing)
-    return back or isinstance(after.mode, Aligning | Radial | Orbiting)
+    left = isinstance(after.mode, Deciding) and not after.in_contact
+    return back or left or isinstance(after.mode, Aligning | Radial | Orbiting)

@@ -112,8 +112,10 @@ def with_pose(state: RobotState, claim: Localised) -> RobotState:
     It claims the pose, unless others have to confirm it. If this contradicts the pose that it knows, one of
     two peers has reported false data. A pose on which several meetings agree stays. One that follows from a
     single meeting is withdrawn, because nothing tells which of the two it was, and the robot waits for a
-    third one.
+    third one. A planner of the user claims its pose once.
     """
+    if state.own is not None and state.fix is not None:
+        return state
     peer, fix, known = state.config.peer, state.fix, state.knowledge
     if state.config.confirms:
         earlier = [one for one in state.confirming.meetings if one.config.peer != peer]
@@ -312,7 +314,9 @@ def _waiting(state: RobotState, peer: str, orbits: Rendezvous | None = None) -> 
 
 
 def _aligned(state: RobotState) -> RobotState:
-    """Return `state` on the way to its orbit or its waiting place."""
+    """Return `state` on the way to its orbit or waiting place; a planner of the user drives there itself."""
+    if state.own is not None:
+        return state
     mu = phase2_orbit.orientation(state.local_pose)
     return transitions.continue_phase2(state, Aligning(state.odometry.heading - mu))
 
@@ -404,6 +408,7 @@ def _in_meeting(state: RobotState, peer: str, role: Role, orbits: Rendezvous | N
         peer_state=PeerState(),
         mode=Asleep(),
         plan=None,
+        meeting=state.meeting + 1,
         alone=False,
         visiting=False,
         unmet=0,

@@ -132,6 +132,15 @@ class Planner(Generic[S, B]):
         del peer
         return self.report(state)
 
+    def meet(self, state: S, config: RobotConfig) -> S:
+        """Return the state in a new meeting of a group, with the peer and the role of `config`.
+
+        What the robot knows of itself stays, and what it knew of the earlier peer goes. It may have its
+        verdict already: then it visits the peer, which has none. Robots form groups with a planner that
+        defines this, and with subclasses of `Assured`.
+        """
+        raise NotImplementedError
+
     def rendezvous(self, mission: Mission, distance: float) -> Rendezvous:
         """Return the orbits of a pair whose anchors are `distance` m apart, and the bound of their duration.
 

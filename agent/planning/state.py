@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import msgspec
 from msgspec.structs import replace
@@ -42,11 +43,18 @@ class Done(msgspec.Struct, frozen=True):
     verdict: messages.Verdict
 
 
+class Deciding(msgspec.Struct, frozen=True):
+    """A planner of the user decides in a meeting of a group."""
+
+    phase: int
+    task: str
+
+
 Phase1 = Straight | Backing | Turning | Circling | ThirdPoint | Surveying | Homing
 Phase2 = Aligning | Radial | Tangent | Orbiting | Travelling | Sweeping
 Phase3 = Straight | Backing | Turning | Circling | Standing | Waiting | LastManoeuvre | Returning | Looping
 Noisy3 = Surveying | Listening | Retreating
-Mode = Asleep | Phase1 | Phase2 | Phase3 | Noisy3 | Done
+Mode = Asleep | Phase1 | Phase2 | Phase3 | Noisy3 | Deciding | Done
 
 UNCONFIRMED = "unconfirmed"
 """The mode that a robot without an anchor reports to one by which it knows its pose, until others agree."""
@@ -110,6 +118,10 @@ class RobotState(Knowledge, frozen=True):
 
     # --- beyond the present meeting: only a robot of a group has more than one ---
 
+    meeting: int = 0
+    """The number of the present meeting; that of the first is 0."""
+    own: Any = None
+    """The number of the meeting, and the state in it, of a planner of the user; None with `assured`."""
     robot_verdict: messages.Verdict | None = None
     """The verdict over all meetings: the pose that the robot claims, or why it claims none.
 
@@ -171,7 +183,7 @@ class RobotState(Knowledge, frozen=True):
         phase = PHASE_OF_TASK.get(type(mode))
         if phase is not None:
             return phase
-        if isinstance(mode, Done):
+        if isinstance(mode, Done | Deciding):
             return mode.phase
         assert isinstance(mode, Seeking | Surveying)
         return 1 if mode.beacon == "anchor" else 3
@@ -180,6 +192,8 @@ class RobotState(Knowledge, frozen=True):
     def mode_name(self) -> str:
         """Return the name of the mode that reports, commands and recordings use."""
         mode = self.mode
+        if isinstance(mode, Deciding):
+            return mode.task
         if not isinstance(mode, Done):
             return MODE_NAMES[type(mode)]
         match mode.verdict:

@@ -42,12 +42,10 @@ def body_of(report: Report, planner: Planner[Any, Any]) -> Any:
 
     Raises MalformedFrame if it is not of the planner's type.
     """
-    if report.body is None:
-        if planner.BODY is not Report:
-            raise MalformedFrame("a report without a body, and this robot's planner has reports of its own")
-        return report
     if planner.BODY is Report:
-        raise MalformedFrame("a report with a body, and this robot's planner has none")
+        return report
+    if report.body is None:
+        raise MalformedFrame("a report without a body, and this robot's planner has reports of its own")
     decoder = _decoders.get(planner.BODY)
     if decoder is None:
         decoder = _decoders[planner.BODY] = msgspec.msgpack.Decoder(planner.BODY)

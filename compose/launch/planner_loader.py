@@ -63,23 +63,37 @@ def unguarded_planner_of(config: RobotConfig) -> Planner[Any, Any]:
         return found
     from agent.planning.assured import Assured  # noqa: PLC0415  # it imports numpy
     from agent.planning.group import GroupPlanner  # noqa: PLC0415  # likewise
+    from agent.planning.meeting_planner import MeetingPlanner  # noqa: PLC0415  # likewise
     from agent.planning.noisy_unanchored import NoisyUnanchoredPlanner  # noqa: PLC0415  # likewise
     from agent.planning.unanchored import UnanchoredPlanner  # noqa: PLC0415  # likewise
 
     if config.given_anchor is None:
         return UnanchoredPlanner() if config.mission.noise.exact else NoisyUnanchoredPlanner()
-    if not isinstance(found, Assured):
+    if isinstance(found, Assured):
+        return GroupPlanner(found)
+    if not meets(type(found)):
         raise UserError(f"robots with the planner {name} meet in pairs, not in a group")
-    return GroupPlanner(found)
+    return GroupPlanner(MeetingPlanner(found))
 
 
-def is_for_groups(name: str) -> bool:
-    """Return whether robots with the planner `name` can form a group. Raises like `planner`."""
+def is_for_groups(name: str, *, helps: bool = False) -> bool:
+    """Return whether robots with the planner `name` can form a group. Raises like `planner_class`.
+
+    If it `helps` robots without an anchor, or those that have met attackers, only `assured` can.
+    """
     if is_shipped(name):
         return name == GROUP_PLANNER
     from agent.planning.assured import Assured  # noqa: PLC0415  # it imports numpy
 
-    return issubclass(planner_class(name), Assured)
+    found = planner_class(name)
+    return issubclass(found, Assured) or (not helps and meets(found))
+
+
+def meets(planner: type[Planner[Any, Any]]) -> bool:
+    """Return whether `planner` can begin another meeting."""
+    from agent.planning.planner import Planner  # noqa: PLC0415  # it imports numpy
+
+    return planner.meet is not Planner.meet
 
 
 def _guarded(name: str, found: Planner[Any, Any]) -> Planner[Any, Any]:

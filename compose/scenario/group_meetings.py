@@ -88,10 +88,9 @@ def group_meetings(
     Who meets whom does not depend on the `faults` of the radio, but the bounds do. Raises Unworkable if the
     planner is not made for groups, and UserError if it cannot be loaded.
     """
-    if not planner_loader.is_for_groups(planner.name):
-        raise Unworkable(
-            f"planner.name: robots with the planner {planner.name} meet in pairs: set robot.peer"
-        )
+    if not planner_loader.is_for_groups(planner.name, helps=tolerates > 0):
+        instead = "confirm no poses" if tolerates else "meet in pairs: set robot.peer"
+        raise Unworkable(f"planner.name: robots with the planner {planner.name} {instead}")
     anchors = [robot.anchor for robot in robots if robot.anchor is not None]
     ids = [robot.id for robot in robots]
     nearest = mission.orienting_distance

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import msgspec
 
 from compose.errors import BadScenario, Unworkable
+from compose.launch import planner_loader
 from compose.scenario.group_meetings import MOST_TURNED, FirstMeeting, GroupMeetings, rounded_down
 from compose.scenario.scenario_tables import Area, RobotTable, ScenarioFile
 from protocol.mission import Mission, infeasibility
@@ -48,6 +49,8 @@ def check_unanchored(file: ScenarioFile, source: str) -> None:
         where = f"{source}: group.without_anchor"
     if len(file.robot) - len(missing) < 2:
         raise BadScenario(f"{where}: at least two robots of a group need one")
+    if not planner_loader.is_for_groups(file.planner.name, helps=True):
+        raise Unworkable(f"{where}: robots with the planner {file.planner.name} do not search for others")
     if file.mission.safety_distance:
         raise Unworkable(
             f"{source}: mission.safety_distance: there is a robot without an anchor, and until it is "

@@ -1,0 +1,128 @@
+"""A planner of the user in the meetings of a group: the group brings robots into contact, it decides there.
+
+It has a state of its own, and reports of its own. To each report, the group adds what it has to know: whether
+the robot travels, and its verdict. On the way to another robot, the planner's commands are not used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import msgspec
+from msgspec.structs import replace
+
+from agent.peer import peer_state
+from agent.planning import exchange, transitions
+from agent.planning.phase2_orbit import Travelling
+from agent.planning.planner import Planner, Summary
+from agent.planning.state import Asleep, Deciding, Done, RobotState
+from protocol.messages import Command, Estimate, Observation, Report, RobotConfig
+from protocol.mission import Mission
+from protocol.motion import Controls
+
+_encoder = msgspec.msgpack.Encoder()
+
+
+class MeetingPlanner(Planner[RobotState, Report]):
+    """The planner `planner` of the user, as the planner of a pair that `GroupPlanner` calls."""
+
+    BODY = Report
+
+    def __init__(self, planner: Planner[Any, Any]) -> None:
+        """`planner` defines `meet`."""
+        self._planner = planner
+        self._decoder = msgspec.msgpack.Decoder(planner.BODY)
+        self.REQUIRED_PLACES = planner.REQUIRED_PLACES
+
+    # --- decisions ---
+
+    def start(self, config: RobotConfig) -> RobotState:
+        """Return the state of a robot that has measured nothing yet."""
+        return RobotState(config, own=(0, self._planner.start(config)))
+
+    def observe(self, state: RobotState, observation: Observation) -> RobotState:
+        """Return `state` with the sensor data of one tick; the planner of the user gets those of its peer."""
+        state = exchange.observed(state, observation)
+        contacts = tuple([one for one in observation.contacts if one.peer == state.config.peer])
+        own = self._planner.observe(self._own(state), replace(observation, contacts=contacts))
+        return replace(state, own=(state.meeting, own))
+
+    def report(self, state: RobotState) -> Report:
+        """Return the report to the peer: that of the user's planner, and what the group has to know."""
+        body = self._planner.report_to(self._own(state), state.config.peer)
+        return Report(
+            state.tick,
+            state.config.robot,
+            phase=state.phase,
+            state=state.mode_name,
+            heard=max(state.peer_state.latest, 0),
+            verdict=state.verdict,
+            body=_encoder.encode(body),
+        )
+
+    def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
+        """Return `state` with the peer's `reports`, and with the phase and verdict of the user's planner."""
+        peer, bodies = state.peer_state, []
+        for one in reports:
+            peer = peer_state.with_report(peer, one)
+            bodies.append(self._decoder.decode(one.body or b""))
+        own = self._planner.decide(self._own(state), bodies)
+        state = replace(state, own=(state.meeting, own), peer_state=peer)
+        met = state.in_contact or not isinstance(state.mode, Travelling)
+        if not met or state.sweeps or isinstance(state.mode, Done):
+            return state
+        command, belief = self._planner.command(own), state.belief
+        if belief.phase1_done_tick is None and (command.phase > 1 or command.verdict is not None):
+            state = replace(state, belief=replace(belief, phase1_done_tick=state.tick))
+        if command.verdict is not None:
+            return replace(state, mode=Done(command.phase, command.verdict))
+        return replace(state, mode=Deciding(command.phase, command.task))
+
+    def command(self, state: RobotState) -> Command:
+        """Return the command of the user's planner; on the way to another robot, that of the group."""
+        match state.mode:
+            case Asleep() | Deciding():
+                decides = True
+            case Done():
+                decides = state.in_contact  # the peer may need further ranges
+            case _:
+                decides = False
+        if not decides:
+            return exchange.command(state, transitions.controls(state))
+        command = self._planner.command(self._own(state))
+        return exchange.command(state, Controls(command.v, command.omega))
+
+    def estimate(self, state: RobotState) -> Estimate:
+        """Return the estimate of the user's planner."""
+        return self._planner.estimate(self._own(state))
+
+    def _own(self, state: RobotState) -> Any:
+        """Return the state of the user's planner in the present meeting."""
+        number, own = state.own
+        return own if number == state.meeting else self._planner.meet(own, state.config)
+
+    # --- optional ---
+
+    def malformed(self, body: Report) -> str | None:
+        """Return why a received report is refused: the group's part, or the body."""
+        if body.body is None:
+            return None if not body.has_log else "a log, and this robot's planner has reports of its own"
+        try:
+            return self._planner.malformed(self._decoder.decode(body.body))
+        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+            return f"its body: {error}"
+
+    def summary(self, state: RobotState) -> Summary:
+        """Return the numbers of the user's planner."""
+        return self._planner.summary(self._own(state))
+
+    def misreport(self, body: Report, observations: Sequence[Observation]) -> str | None:
+        """Return how a report contradicts the robot's own measurements; None if it does not."""
+        if body.body is None:
+            return None
+        return self._planner.misreport(self._decoder.decode(body.body), observations)
+
+    def required_mutual_ranges(self, mission: Mission) -> int:
+        """Return the minimum number of noisy mutual ranges before a claim."""
+        return self._planner.required_mutual_ranges(mission)
