@@ -22,8 +22,9 @@ from agent.estimation.gaussian.contact_fit import ContactRanges, estimated
 from agent.estimation.gaussian.odometry_noise import Track, track
 from agent.planning.assured import Assured
 from agent.planning.group import GroupPlanner
-from agent.planning.noisy_unanchored import NoisyUnanchoredPlanner
+from agent.planning.group_knowledge import Contacted
 from agent.planning.state import RobotState
+from agent.planning.unanchored import UnanchoredPlanner
 from agent.process.agent_journal import Step
 from compose.audit.replay import replayed
 from compose.audit.rules import audit_run
@@ -520,7 +521,7 @@ def config() -> RobotConfig:
 
 def met(sigma: float, ticks: int = 40) -> Any:
     """Return the state of a robot after a contact with a finder whose position has this sigma, in m."""
-    planner, pose = NoisyUnanchoredPlanner(), Pose(5.0, 4.0, 0.7)
+    planner, pose = UnanchoredPlanner(), Pose(5.0, 4.0, 0.7)
     finder, driven = Pose(6.5, 5.0, 0.2), [(v, omega) for v, omega in FINDER * 8]
     state, executed = planner.start(config()), None
     runs: list[Segment] = []
@@ -549,11 +550,11 @@ def test_a_robot_claims_its_pose_in_a_contact() -> None:
     assert isinstance(state.verdict, Localised)
     assert state.verdict.covariance is not None
     assert nees(state.verdict.pose, pose, state.verdict.covariance) < 16.3
-    assert NoisyUnanchoredPlanner().report_to(state, "b").heard > 0
+    assert UnanchoredPlanner().report_to(state, "b").heard > 0
 
 
 def test_a_robot_stands_still_for_a_finder_that_is_too_inaccurate_and_ends_undecided() -> None:
-    planner = NoisyUnanchoredPlanner()
+    planner = UnanchoredPlanner()
     state, _ = met(0.4)
     assert state.odometry == Pose(0.0, 0.0, 0.0)
     late = math.ceil(state.config.gives_up / state.config.mission.period)
@@ -563,7 +564,7 @@ def test_a_robot_stands_still_for_a_finder_that_is_too_inaccurate_and_ends_undec
 
 
 def test_a_robot_that_reports_another_reference_in_each_tick_costs_an_estimate_in_three_ticks() -> None:
-    planner = NoisyUnanchoredPlanner()
+    planner = UnanchoredPlanner()
     state = planner.start(config())
     covariance = Covariance(0.01, 0.0, 0.0, 0.01, 0.0, 1e-4)
     estimates = set()
@@ -576,19 +577,20 @@ def test_a_robot_that_reports_another_reference_in_each_tick_costs_an_estimate_i
         report = Report(tick, "b", 2, "looping", since=here, through=tick, runs=runs, prior=prior)
         assert planner.malformed(report) is None
         state = planner.decide(state, [report])
-        estimates.add(state.estimated_tick)
+        assert isinstance(state.found, Contacted)
+        estimates.add(state.found.estimated_tick)
     assert 5 <= len(estimates) <= 20
 
 
 def test_malformed_references_are_refused() -> None:
-    planner = NoisyUnanchoredPlanner()
+    planner = UnanchoredPlanner()
     good = decode(encode(references(of_frames(journals()))[0][1]), Report)
     assert good.prior is not None
     assert planner.malformed(good) is None
     flat = Covariance(1.0, 2.0, 0.0, 1.0, 0.0, 1.0)
     assert not is_definite(np.array(flat.matrix))
     tiny = Covariance(1e-300, 0.0, 0.0, 1e-300, 0.0, 1e-300)
-    for wrong in ({"covariance": flat}, {"covariance": tiny}, {"covariance": None}, {"tick": good.since + 1}):
+    for wrong in ({"covariance": flat}, {"covariance": tiny}, {"tick": good.since + 1}):
         assert planner.malformed(replace(good, prior=replace(good.prior, **wrong))) is not None
 
 

@@ -11,7 +11,8 @@ import pytest
 from msgspec.structs import replace
 
 from agent.planning.group_transitions import TRAVELLING_MODE
-from agent.planning.unanchored import UnanchoredPlanner, UnanchoredState
+from agent.planning.state import RobotState
+from agent.planning.unanchored import UnanchoredPlanner
 from compose.audit.replay import replayed
 from compose.errors import UserError
 from compose.launch.in_process import run_mission
@@ -247,7 +248,7 @@ def test_a_robot_without_an_anchor_that_claims_to_visit_is_not_met() -> None:
 # --- the robot without an anchor ----------------------------------------------------------------------
 
 
-def met(state: UnanchoredState, pose: Pose, finder: str, offset: Pose) -> tuple[UnanchoredState, Pose]:
+def met(state: RobotState, pose: Pose, finder: str, offset: Pose) -> tuple[RobotState, Pose]:
     """Return the state and the true pose after `finder` has driven squares until `state` needs no more.
 
     The finder reports its poses as they are after the motion `offset` of the plane.

@@ -13,7 +13,7 @@ from agent.estimation.exact_estimator import EXACT_ESTIMATOR
 from agent.estimation.gaussian.gaussian_estimator import GAUSSIAN
 from agent.estimation.knowledge import Knowledge
 from agent.planning.active_sensing import Listening, Retreating, Surveying
-from agent.planning.group_knowledge import Confirming, Fix, Other, OwnPose
+from agent.planning.group_knowledge import Confirming, Contacted, Fix, Other, OwnPose, Resected
 from agent.planning.passing import Bypass
 from agent.planning.phase1_anchor import ThirdPoint
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent, Travelling
@@ -43,6 +43,10 @@ class Done(msgspec.Struct, frozen=True):
     verdict: messages.Verdict
 
 
+class Awaiting(msgspec.Struct, frozen=True):
+    """A robot without an anchor stands, until a localised one finds it."""
+
+
 class Deciding(msgspec.Struct, frozen=True):
     """A planner of the user decides in a meeting of a group."""
 
@@ -54,7 +58,7 @@ Phase1 = Straight | Backing | Turning | Circling | ThirdPoint | Surveying | Homi
 Phase2 = Aligning | Radial | Tangent | Orbiting | Travelling | Sweeping
 Phase3 = Straight | Backing | Turning | Circling | Standing | Waiting | LastManoeuvre | Returning | Looping
 Noisy3 = Surveying | Listening | Retreating
-Mode = Asleep | Phase1 | Phase2 | Phase3 | Noisy3 | Deciding | Done
+Mode = Asleep | Awaiting | Phase1 | Phase2 | Phase3 | Noisy3 | Deciding | Done
 
 UNCONFIRMED = "unconfirmed"
 """The mode that a robot without an anchor reports to one by which it knows its pose, until others agree."""
@@ -77,6 +81,7 @@ MODE_NAMES: dict[type, str] = {
     Sweeping: "sweeping",
     Looping: "looping",
     Standing: "standing",
+    Awaiting: "standing",
     Waiting: "waiting",
     LastManoeuvre: "last-manoeuvre",
     Returning: "returning",
@@ -94,6 +99,7 @@ PHASE_OF_TASK: dict[type, int] = {
     Orbiting: 2,
     Travelling: 2,
     Sweeping: 2,
+    Awaiting: 2,
     Looping: 3,
     Standing: 3,
     Waiting: 3,
@@ -133,6 +139,8 @@ class RobotState(Knowledge, frozen=True):
     """Its knowledge at its claim in the latest meeting in which it was localised."""
     confirming: Confirming = Confirming()
     """The meetings that confirm that pose, if a claim of it needs several peers."""
+    found: Resected | Contacted | None = None
+    """What a robot without an anchor knows by those that are localised; None with an anchor."""
     failure: messages.Verdict | None = None
     """The verdict of the latest meeting that has failed before the robot was localised."""
     frame: Pose = ORIGIN

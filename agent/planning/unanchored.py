@@ -1,8 +1,9 @@
 """A robot of a group without an anchor: it waits until a localised robot finds it, and believes its pose.
 
-The other robot drives a square while this one stands still; that determines this robot's position. Then this
-one drives a square, too; that determines its heading. The pose rests on the ranges to one other robot, in the
-order of their ticks, so it does not depend on the order in which reports arrive.
+With exact sensors, the other robot drives a square while this one stands still; that determines this robot's
+position. Then this one drives a square, too; that determines its heading. The pose rests on the ranges to one
+other robot, in the order of their ticks, so it does not depend on the order in which reports arrive. With
+noisy sensors, both drive loops (`noisy_unanchored`).
 
 If f robots may report false data, it claims a pose on which f + 1 of them agree, at least one of which is
 honest. Until then, it waits for the next one.
@@ -11,20 +12,22 @@ honest. Until then, it waits for the next one.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Self
+from collections.abc import Sequence
 
-import msgspec
+import numpy as np
 from msgspec.structs import replace
 
 from agent.estimation import resection
-from agent.estimation.exact_estimator import EXACT_ESTIMATOR
+from agent.estimation.claim import is_definite
+from agent.estimation.compiled import library
+from agent.estimation.judged import sufficient_mutual_ranges
 from agent.estimation.resection import RangedPlace
-from agent.peer.motion_log import MotionLog
-from agent.planning import exchange, sweep
+from agent.peer import peer_state
+from agent.planning import exchange, noisy_unanchored, sweep, transitions
+from agent.planning.group_knowledge import Contacted, Resected
 from agent.planning.phase3_last_manoeuvre import Standing
 from agent.planning.planner import Planner, Summary
-from agent.planning.state import MODE_NAMES, UNCONFIRMED
+from agent.planning.state import UNCONFIRMED, Awaiting, Done, RobotState, estimator_for
 from agent.planning.sweep import LOOPS_FOR, Looping
 from protocol.messages import (
     Command,
@@ -33,10 +36,9 @@ from protocol.messages import (
     Observation,
     Report,
     RobotConfig,
-    Undecided,
 )
 from protocol.mission import Mission
-from protocol.motion import ORIGIN, REST, Pose, compose, inverse, wrap
+from protocol.motion import ORIGIN, Pose, compose, inverse, wrap
 from protocol.rounding import SURE
 
 LARGEST_MISFIT = 0.1 * SURE
@@ -58,203 +60,194 @@ FEWEST_PLACES = 5
 """The number of relative placements that a claim needs: three for a position, two for a heading."""
 
 
-class WaitingState(msgspec.Struct, frozen=True):
-    """The state of a robot without an anchor, with exact and with noisy sensors."""
-
-    config: RobotConfig
-    tick: int = -1
-    odometry: Pose = ORIGIN
-    """The pose by dead reckoning, in the frame of the pose at tick 0."""
-    leg: Pose = ORIGIN
-    """The odometry at the beginning of the last segment of `log`."""
-    log: MotionLog = MotionLog()
-    mode: Standing | Looping = Standing()
-    verdict: Localised | Undecided | None = None
-
-    @property
-    def phase(self) -> int:
-        """Return 2 until a localised robot has found it, then 3."""
-        raise NotImplementedError
-
-    @property
-    def mode_name(self) -> str:
-        """Return the name of the mode that reports, commands and recordings use."""
-        match self.verdict:
-            case Localised():
-                return "localised"
-            case Undecided():
-                return "undecided"
-        return MODE_NAMES[type(self.mode)]
-
-    def after_odometry(self, observation: Observation) -> Self:
-        """Return this state in the tick of `observation`, with its odometry."""
-        log, odometry, leg = exchange.dead_reckoned(
-            self.log, self.odometry, self.leg, observation.executed, self.config.mission.period
-        )
-        return replace(self, tick=observation.tick, odometry=odometry, leg=leg, log=log)
-
-    def report(self) -> Report:
-        """Return a report without a log: a robot without an anchor is in no meeting."""
-        return Report(self.tick, self.config.robot, self.phase, self.mode_name, verdict=self.verdict)
-
-    def command(self, tolerance: float) -> Command:
-        """Return the command for the next tick; a place counts as reached within `tolerance` m."""
-        controls = None
-        if isinstance(self.mode, Looping) and self.verdict is None:
-            controls = sweep.controls(self.mode, self.odometry, self.config.mission, tolerance)
-        driven = controls or REST
-        return Command(
-            self.tick,
-            self.config.robot,
-            driven.v,
-            driven.omega,
-            self.phase,
-            self.mode_name,
-            self.verdict,
-            rests=self.verdict is not None,
-        )
-
-
-class UnanchoredState(WaitingState, frozen=True):
-    """The state of a robot without an anchor, with exact sensors."""
-
-    base: Pose = ORIGIN
-    """The odometry at the place where it stands, or stood before its square."""
-    ranges: Mapping[tuple[str, int], tuple[float, Pose]] = {}
-    """The ranges without a reported pose yet, with the own pose relative to `base`, by robot and tick."""
-    places: Mapping[tuple[str, int], RangedPlace] = {}
-    """The ranges to robots that have reported their poses in those ticks, by robot and tick."""
-    possible: tuple[Pose, ...] = ()
-    """The poses of `base` in <W> that agree with the ranges; empty before the heading can be determined."""
-    candidates: Mapping[str, Pose] = {}
-    """The pose in <W> of the frame of the odometry, by the robot from whose reports it follows."""
-
-    @property
-    def phase(self) -> int:
-        """Return 2 until the first range to a localised robot, then 3."""
-        return 3 if self.places or self.candidates else 2
-
-
-class UnanchoredPlanner(Planner[UnanchoredState, Report]):
-    """The planner of a robot without an anchor, with exact sensors."""
+class UnanchoredPlanner(Planner[RobotState, Report]):
+    """The planner of a robot without an anchor."""
 
     BODY = Report
     REQUIRED_PLACES = FEWEST_PLACES
 
-    def start(self, config: RobotConfig) -> UnanchoredState:
-        """Return the state of a robot that has measured nothing yet."""
-        return UnanchoredState(config)
+    def start(self, config: RobotConfig) -> RobotState:
+        """Return the state of a robot that has measured nothing yet. Raises NoKernel."""
+        noisy = estimator_for(config.mission).corrects_poses
+        if noisy:
+            library()  # it is needed when the robot is found, and would end the mission then
+        return RobotState(config, mode=Awaiting(), found=Contacted() if noisy else Resected())
 
-    def observe(self, state: UnanchoredState, observation: Observation) -> UnanchoredState:
+    def observe(self, state: RobotState, observation: Observation) -> RobotState:
         """Return `state` with the odometry and the ranges of one tick."""
-        state = state.after_odometry(observation)
+        state = exchange.observed(state, observation)
         if state.verdict is not None:
             return state
-        # where it stands, rounding must not look like a motion
-        moved = ORIGIN
-        if state.odometry != state.base:
-            moved = compose(inverse(state.base), state.odometry)
-        new = {
-            (contact.peer, observation.tick): (contact.range, moved)
-            for contact in observation.contacts
-            if contact.range is not None
-        }
-        if not new:
-            return state
-        recent = {key: contact for key, contact in state.ranges.items() if key[1] > observation.tick - KEPT}
-        return replace(state, ranges={**recent, **new})
+        match state.found:
+            case Contacted():
+                return noisy_unanchored.ranged(state, observation)
+            case Resected(base=base) as found:
+                # where it stands, rounding must not look like a motion
+                moved = compose(inverse(base), state.odometry) if state.odometry != base else ORIGIN
+                new = {
+                    (contact.peer, observation.tick): (contact.range, moved)
+                    for contact in observation.contacts
+                    if contact.range is not None
+                }
+                first = observation.tick - KEPT
+                recent = {key: contact for key, contact in found.ranges.items() if key[1] > first}
+                return replace(state, found=replace(found, ranges={**recent, **new})) if new else state
+        raise AssertionError
 
-    def report(self, state: UnanchoredState) -> Report:
-        """Return the report to a robot that has not found it."""
-        return state.report()
+    def report(self, state: RobotState) -> Report:
+        """Return the report to a robot that has not found it: without a log, as it is in no meeting."""
+        return exchange.report_without_log(state, state.verdict)
 
-    def report_to(self, state: UnanchoredState, peer: str) -> Report:
-        """Return the report to `peer`, which does not stop any longer once this robot knows a pose by it."""
-        unconfirmed = state.verdict is None and peer in state.candidates
-        return replace(state.report(), state=UNCONFIRMED) if unconfirmed else state.report()
+    def report_to(self, state: RobotState, peer: str) -> Report:
+        """Return the report to `peer`: with noisy sensors, it acknowledges the manoeuvres of its finder.
 
-    def decide(self, state: UnanchoredState, reports: Sequence[Report] = ()) -> UnanchoredState:
-        """Return `state` with the poses in `reports`, and with a verdict if they determine the own pose."""
+        With exact sensors, a robot by which it knows a pose does not stop any longer.
+        """
+        report = self.report(state)
+        match state.found:
+            case Contacted(finder) if finder is not None and finder.robot == peer:
+                return replace(report, heard=finder.log.through)
+            case Resected(candidates=candidates) if state.verdict is None and peer in candidates:
+                return replace(report, state=UNCONFIRMED)
+        return report
+
+    def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
+        """Return `state` with the data in `reports`, and with a verdict if they determine the own pose."""
         if state.verdict is not None:
             return state
-        if state.tick * state.config.mission.period >= state.config.gives_up:
-            return replace(state, verdict=Undecided(_why_undecided(state)))
-        ranges, places = dict(state.ranges), dict(state.places)
-        if isinstance(state.mode, Standing):  # a robot that comes back may have corrected its pose
-            places = {key: report for key, report in places.items() if key[1] > state.tick - LOOPS_FOR}
-        for report in reports:
-            if (prior := report.prior) is None or report.robot in state.candidates:
-                continue
-            if (ranged := ranges.pop((report.robot, prior.tick), None)) is not None:
-                distance, odometry = ranged
-                places[report.robot, prior.tick] = RangedPlace(
-                    (prior.pose.x, prior.pose.y), odometry, distance
-                )
-        if places.keys() != state.places.keys():
-            state = _resected(replace(state, ranges=ranges, places=places))
-        return _moved_on(state) if isinstance(state.mode, Looping) and state.verdict is None else state
+        match state.found:
+            case Contacted() as found:
+                if state.elapsed >= state.config.gives_up:
+                    return state.undecided(found.failure)
+                return noisy_unanchored.decided(state, reports)
+            case Resected() as found:
+                if state.elapsed >= state.config.gives_up:
+                    return state.undecided(_why_undecided(state, found))
+                return _decided(state, found, reports)
+        raise AssertionError
 
-    def command(self, state: UnanchoredState) -> Command:
+    def command(self, state: RobotState) -> Command:
         """Return the command for the next tick, with the phase, the task and the verdict."""
-        return state.command(EXACT_ESTIMATOR.pose_tolerance)
+        return replace(exchange.command(state, transitions.controls(state)), peer=None, role=None)
 
-    def estimate(self, state: UnanchoredState) -> Estimate:
-        """Return the poses in <W> that agree with all ranges, or those that robots have not confirmed yet."""
-        world = [_now(state, one) for one in state.possible]
-        if not world:
-            world = [compose(state.candidates[robot], state.odometry) for robot in sorted(state.candidates)]
-        return Estimate(
+    def estimate(self, state: RobotState) -> Estimate:
+        """Return the possible poses in <W>.
+
+        With noisy sensors, they are those of the latest estimate; with exact ones, those that agree with all
+        ranges, or that robots have not confirmed yet.
+        """
+        estimate = Estimate(
             tick=state.tick,
             robot=state.config.robot,
             local=(),
-            world=tuple(world),
+            world=(),
             localised=isinstance(state.verdict, Localised),
         )
+        match state.found:
+            case Contacted(estimate=latest) as found:
+                if latest is None or (found.estimated_tick != state.tick and state.verdict is None):
+                    return estimate
+                return replace(
+                    estimate,
+                    world=latest.poses,
+                    probabilities=latest.probabilities,
+                    covariance=latest.covariance,
+                )
+            case Resected(possible=possible, candidates=candidates) as found:
+                world = [_now(state, found, one) for one in possible]
+                if not world:
+                    world = [compose(candidates[robot], state.odometry) for robot in sorted(candidates)]
+                return replace(estimate, world=tuple(world))
+        raise AssertionError
+
+    # --- optional ---
+
+    def malformed(self, body: Report) -> str | None:
+        """Return the reason why the log or the pose in a report is malformed, or None."""
+        if (prior := body.prior) is not None and prior.covariance is not None:
+            if prior.tick > body.since:
+                return f"a log from tick {body.since} on, before its pose at tick {prior.tick}"
+            if not is_definite(np.array(prior.covariance.matrix)):
+                return "a covariance of a pose that is not positive definite"
+        return peer_state.contradiction(body)
 
     def required_mutual_ranges(self, mission: Mission) -> int:
-        """Return 0: not the number of exact ranges counts, but redundant ones."""
-        del mission
-        return 0
+        """Return the minimum number of noisy mutual ranges before a claim."""
+        return sufficient_mutual_ranges(mission.noise)
 
-    def summary(self, state: UnanchoredState) -> Summary:
-        """Return the number of possible poses."""
-        return Summary(hypotheses=len(state.possible) or len(state.candidates) or None)
+    def summary(self, state: RobotState) -> Summary:
+        """Return the number of possible poses; with noisy sensors also what prevents a claim."""
+        match state.found:
+            case Resected() as found:
+                return Summary(hypotheses=len(found.possible) or len(found.candidates) or None)
+            case Contacted(estimate=estimate) as found:
+                if estimate is None:
+                    return Summary(blocking_reason=None if state.verdict is not None else found.failure)
+                return Summary(
+                    hypotheses=len(estimate.poses),
+                    probability=estimate.probabilities[0],
+                    blocking_reason=None if isinstance(state.verdict, Localised) else found.failure,
+                    p_value=estimate.p_value,
+                )
+        raise AssertionError
 
 
-def _now(state: UnanchoredState, base: Pose) -> Pose:
-    """Return the present pose in <W> if that of `state.base` is `base`."""
-    return compose(base, compose(inverse(state.base), state.odometry))
+# --- exact sensors --------------------------------------------------------------------------------------
 
 
-def _resected(state: UnanchoredState) -> UnanchoredState:
-    """Return `state` with what follows from its ranges to each robot: a square to drive, or a verdict."""
-    for robot in sorted({robot for robot, _ in state.places} - state.candidates.keys()):
-        ranged = [state.places[key] for key in sorted(state.places) if key[0] == robot]
+def _decided(state: RobotState, found: Resected, reports: Sequence[Report]) -> RobotState:
+    """Return `state` with the poses in `reports`, and with what follows from them."""
+    ranges, places = dict(found.ranges), dict(found.places)
+    if not isinstance(state.mode, Looping):  # a robot that comes back may have corrected its pose
+        places = {key: report for key, report in places.items() if key[1] > state.tick - LOOPS_FOR}
+    for report in reports:
+        if (prior := report.prior) is None or report.robot in found.candidates:
+            continue
+        if (ranged := ranges.pop((report.robot, prior.tick), None)) is not None:
+            distance, odometry = ranged
+            places[report.robot, prior.tick] = RangedPlace((prior.pose.x, prior.pose.y), odometry, distance)
+    if places.keys() != found.places.keys():
+        state = _resected(state, replace(found, ranges=ranges, places=places))
+    assert isinstance(state.found, Resected)
+    return _moved_on(state, state.found) if state.verdict is None else state
+
+
+def _now(state: RobotState, found: Resected, base: Pose) -> Pose:
+    """Return the present pose in <W> if that of `found.base` is `base`."""
+    return compose(base, compose(inverse(found.base), state.odometry))
+
+
+def _resected(state: RobotState, found: Resected) -> RobotState:
+    """Return `state` with what follows from the ranges to each robot: a square to drive, or a verdict."""
+    for robot in sorted({robot for robot, _ in found.places} - found.candidates.keys()):
+        ranged = [found.places[key] for key in sorted(found.places) if key[0] == robot]
         standing = [one for one in ranged if one.odometry == ORIGIN]
         moved = [one for one in ranged if one.odometry != ORIGIN]
-        if isinstance(state.mode, Standing):
+        if not isinstance(state.mode, Looping):
             positions = resection.positions(standing, LARGEST_MISFIT)
             if len(positions) == 1 and resection.is_fixed(standing, positions[0]):
-                return replace(state, mode=sweep.looping(state.odometry, state.config.mission, state.tick))
+                mode = sweep.looping(state.odometry, state.config.mission, state.tick)
+                return replace(state, mode=mode, found=found)
         elif moved and (possible := resection.poses(standing, moved, LARGEST_MISFIT)):
-            state = replace(state, possible=possible)
+            found = replace(found, possible=possible)
             if resection.is_certain(standing, moved, possible):
-                state = _with_candidate(state, robot, _now(state, possible[0]))
+                state, found = _with_candidate(state, found, robot)
                 if state.verdict is not None:
-                    return state
-    return state
+                    break
+    return replace(state, found=found)
 
 
-def _with_candidate(state: UnanchoredState, robot: str, pose: Pose) -> UnanchoredState:
-    """Return `state` with the present `pose`, which follows from the reports of `robot`.
+def _with_candidate(state: RobotState, found: Resected, robot: str) -> tuple[RobotState, Resected]:
+    """Return both with the first possible pose, which follows from the reports of `robot`.
 
     It is claimed if as many robots agree on it as are needed for one of them to be honest.
     """
-    candidates = {**state.candidates, robot: compose(pose, inverse(state.odometry))}
-    others = [compose(one, state.odometry) for by, one in state.candidates.items() if by != robot]
-    agreeing = 1 + sum([_agree(pose, other) for other in others])
-    verdict = Localised(pose) if agreeing > state.config.tolerates else None
-    return replace(state, candidates=candidates, verdict=verdict)
+    pose = _now(state, found, found.possible[0])
+    others = [compose(one, state.odometry) for by, one in found.candidates.items() if by != robot]
+    found = replace(found, candidates={**found.candidates, robot: compose(pose, inverse(state.odometry))})
+    if 1 + sum([_agree(pose, other) for other in others]) > state.config.tolerates:
+        state = replace(state, mode=Done(3, Localised(pose)))
+    return state, found
 
 
 def _agree(one: Pose, other: Pose) -> bool:
@@ -263,26 +256,28 @@ def _agree(one: Pose, other: Pose) -> bool:
     return max(apart, abs(wrap(one.heading - other.heading))) <= AGREE
 
 
-def _why_undecided(state: UnanchoredState) -> str:
+def _why_undecided(state: RobotState, found: Resected) -> str:
     """Return why the robot has not claimed a pose, for a user."""
-    if not state.candidates:
+    if not found.candidates:
         return "no localised robot has found it"
-    finders = ", ".join(sorted(state.candidates))
+    finders = ", ".join(sorted(found.candidates))
     return f"{state.config.tolerates + 1} robots must agree on its pose; it is found by: {finders}"
 
 
-def _moved_on(state: UnanchoredState) -> UnanchoredState:
+def _moved_on(state: RobotState, found: Resected) -> RobotState:
     """Return `state` after a tick of a square. The square is repeated until the pose is known.
 
     If nobody has reported a pose for KEPT ticks, except robots by which it knows a pose, the robot stands
     still again, and forgets all ranges: those to the next robot that comes begin where it is then.
     """
-    assert isinstance(state.mode, Looping)
-    mission, since = state.config.mission, state.mode.since
-    mode = sweep.onward(state.mode, state.odometry, mission, EXACT_ESTIMATOR.pose_tolerance)
+    if not isinstance(state.mode, Looping):
+        return replace(state, mode=Standing() if found.places or found.candidates else Awaiting())
+    mission, since, tolerance = state.config.mission, state.mode.since, state.estimator.pose_tolerance
+    mode = sweep.onward(state.mode, state.odometry, mission, tolerance)
     if mode.places:
         return replace(state, mode=mode)
-    latest = max([tick for robot, tick in state.places if robot not in state.candidates], default=-KEPT)
+    latest = max([tick for robot, tick in found.places if robot not in found.candidates], default=-KEPT)
     if latest > state.tick - KEPT and since > state.tick - LOOPS_FOR:
         return replace(state, mode=sweep.looping(state.odometry, mission, since))
-    return replace(state, mode=Standing(), base=state.odometry, ranges={}, places={}, possible=())
+    found = Resected(state.odometry, candidates=found.candidates)
+    return replace(state, mode=Standing() if found.candidates else Awaiting(), found=found)

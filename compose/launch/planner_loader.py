@@ -64,11 +64,10 @@ def unguarded_planner_of(config: RobotConfig) -> Planner[Any, Any]:
     from agent.planning.assured import Assured  # noqa: PLC0415  # it imports numpy
     from agent.planning.group import GroupPlanner  # noqa: PLC0415  # likewise
     from agent.planning.meeting_planner import MeetingPlanner  # noqa: PLC0415  # likewise
-    from agent.planning.noisy_unanchored import NoisyUnanchoredPlanner  # noqa: PLC0415  # likewise
     from agent.planning.unanchored import UnanchoredPlanner  # noqa: PLC0415  # likewise
 
     if config.given_anchor is None:
-        return UnanchoredPlanner() if config.mission.noise.exact else NoisyUnanchoredPlanner()
+        return UnanchoredPlanner()
     if isinstance(found, Assured):
         return GroupPlanner(found)
     if not meets(type(found)):
