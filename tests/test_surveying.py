@@ -10,12 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from agent.estimation.exact_estimator import EXACT_ESTIMATOR
+from agent.estimation.gaussian.gaussian_estimator import GAUSSIAN
 from agent.estimation.gaussian.inference import PlanningHypothesis
 from agent.estimation.gaussian.odometry_noise import Array
 from agent.planning.active_sensing import plan_alone, plan_together
 from agent.planning.phase2_orbit import pursuit
 from agent.planning.range_seeking import Homing, homing_controls
-from agent.planning.state import estimator_for
 from agent.planning.strides import STRIDES_AHEAD, choice, stride
 from protocol.mission import Mission
 from protocol.motion import REST, Controls, Pose, step
@@ -163,7 +164,7 @@ def test_from_anywhere_a_robot_finds_home(
 ) -> None:
     if exact:
         mission = replace(mission, noise=Noise())
-    tolerance = estimator_for(mission).pose_tolerance
+    tolerance = (EXACT_ESTIMATOR if mission.noise.exact else GAUSSIAN).pose_tolerance
     pose, home = Pose(x, y, heading), Homing(Pose(1.0, -2.0, 0.5))
     far = math.hypot(x - 1.0, y + 2.0)
     legs = far / (mission.max_speed * mission.period) + math.pi / (mission.max_turn_rate * mission.period)

@@ -28,9 +28,9 @@ from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent
 from agent.planning.phase3_last_manoeuvre import LAST_SPEEDS
 from agent.planning.range_seeking import Backing, Beacon, Circling, Homing, Straight, Turning
 from agent.planning.stalls import is_stalled
-from agent.planning.state import Asleep, Done, RobotState
+from agent.planning.state import Asleep, RobotState
 from agent.planning.strides import stride
-from protocol.messages import BranchKind, Localised, Observation, Report
+from protocol.messages import BranchKind, Localised, Observation
 from protocol.mission import Mission, Role
 from protocol.motion import ORIGIN, REST, Controls, Pose, compose, inverse
 
@@ -303,14 +303,10 @@ def _continue_phase3(state: RobotState) -> RobotState:
             return state
 
 
-def decided(state: RobotState, reports: Sequence[Report], planned: JointManoeuvres) -> RobotState:
-    """Return `state` with the peer's `reports` and with the mode that follows from them."""
-    if reports:
-        state = exchange.with_reports(state, reports)
-    if not state.in_contact:
-        return state
+def decided(state: RobotState, planned: JointManoeuvres) -> RobotState:
+    """Return `state`, in contact with the peer and without a verdict, with the mode that follows."""
     match state.mode:
-        case Done() | Asleep():
+        case Asleep():
             return state
         case Surveying("anchor") | Straight() | Backing() | Turning() | Circling() | Homing():
             return state

@@ -46,12 +46,12 @@ class Assured(LogPlanner):
         With exact sensors, phase 3 begins as soon as the peer's phase 1 has ended and b is far enough from
         its anchor.
         """
-        if state.estimator.corrects_poses:
-            return accuracy_seeking.decided(state, reports, self.joint_manoeuvres)
         if reports:
             state = exchange.with_reports(state, reports)
         if not state.in_contact or isinstance(state.mode, Done):
             return state
+        if state.estimator.corrects_poses:
+            return accuracy_seeking.decided(state, self.joint_manoeuvres)
         match state.mode:
             case Aligning() | Radial() | Tangent() | Orbiting() | Travelling():
                 peer = state.peer_state

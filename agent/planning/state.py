@@ -22,14 +22,8 @@ from agent.planning.range_seeking import Backing, Circling, Homing, Seeking, Str
 from agent.planning.sweep import Looping, Sweeping
 from protocol import messages
 from protocol.messages import Inconsistent, Localised, Undecided
-from protocol.mission import Mission
 from protocol.motion import ORIGIN, Pose, compose, inverse
 from protocol.orbits import Orbit
-
-
-def estimator_for(mission: Mission) -> Estimator:
-    """Return the estimator for the noise of `mission`."""
-    return EXACT_ESTIMATOR if mission.noise.exact else GAUSSIAN
 
 
 class Asleep(msgspec.Struct, frozen=True):
@@ -177,7 +171,7 @@ class RobotState(Knowledge, frozen=True):
     @property
     def estimator(self) -> Estimator:
         """Return the estimator for the noise of the mission."""
-        return estimator_for(self.config.mission)
+        return EXACT_ESTIMATOR if self.config.mission.noise.exact else GAUSSIAN
 
     @property
     def orbit(self) -> Orbit:

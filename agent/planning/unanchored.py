@@ -27,7 +27,7 @@ from agent.planning import exchange, noisy_unanchored, sweep, transitions
 from agent.planning.group_knowledge import Contacted, Resected
 from agent.planning.phase3_last_manoeuvre import Standing
 from agent.planning.planner import Planner, Summary
-from agent.planning.state import UNCONFIRMED, Awaiting, Done, RobotState, estimator_for
+from agent.planning.state import UNCONFIRMED, Awaiting, Done, RobotState
 from agent.planning.sweep import LOOPS_FOR, Looping
 from protocol.messages import (
     Command,
@@ -68,10 +68,11 @@ class UnanchoredPlanner(Planner[RobotState, Report]):
 
     def start(self, config: RobotConfig) -> RobotState:
         """Return the state of a robot that has measured nothing yet. Raises NoKernel."""
-        noisy = estimator_for(config.mission).corrects_poses
-        if noisy:
-            library()  # it is needed when the robot is found, and would end the mission then
-        return RobotState(config, mode=Awaiting(), found=Contacted() if noisy else Resected())
+        state = RobotState(config, mode=Awaiting())
+        if not state.estimator.corrects_poses:
+            return replace(state, found=Resected())
+        library()  # it is needed when the robot is found, and would end the mission then
+        return replace(state, found=Contacted())
 
     def observe(self, state: RobotState, observation: Observation) -> RobotState:
         """Return `state` with the odometry and the ranges of one tick."""
