@@ -63,14 +63,13 @@ class MeetingPlanner(Planner[RobotState, Report]):
 
     def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
         """Return `state` with the peer's `reports`, and with the phase and verdict of the user's planner."""
-        peer, bodies = state.peer_state, []
+        peer = state.peer_state
         for one in reports:
             peer = peer_state.with_report(peer, one)
-            bodies.append(self._decoder.decode(one.body or b""))
+        bodies = [self._decoder.decode(one.body) for one in reports if one.body is not None]
         own = self._planner.decide(self._own(state), bodies)
         state = replace(state, own=(state.meeting, own), peer_state=peer)
-        met = state.in_contact or not isinstance(state.mode, Travelling)
-        if not met or state.sweeps or isinstance(state.mode, Done):
+        if isinstance(state.mode, Done) or (isinstance(state.mode, Travelling) and not state.in_contact):
             return state
         command, belief = self._planner.command(own), state.belief
         if belief.phase1_done_tick is None and (command.phase > 1 or command.verdict is not None):
@@ -81,13 +80,9 @@ class MeetingPlanner(Planner[RobotState, Report]):
 
     def command(self, state: RobotState) -> Command:
         """Return the command of the user's planner; on the way to another robot, that of the group."""
-        match state.mode:
-            case Asleep() | Deciding():
-                decides = True
-            case Done():
-                decides = state.in_contact  # the peer may need further ranges
-            case _:
-                decides = False
+        decides = isinstance(state.mode, Asleep | Deciding)
+        if isinstance(state.mode, Done):
+            decides = state.in_contact  # the peer may need further ranges
         if not decides:
             return exchange.command(state, transitions.controls(state))
         command = self._planner.command(self._own(state))
