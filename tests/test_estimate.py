@@ -21,7 +21,11 @@ from msgspec.structs import replace
 from agent.estimation.gaussian.joint_ranges import near_anchors
 from agent.estimation.gaussian.odometry_noise import track
 from agent.estimation.problem import Problem
-from compose.errors import NOT_LOCALISED, USER_ERROR, UserError
+from compose.cli import estimate as estimate_command
+from compose.cli.commands import COMMANDS
+from compose.cli.main import command_parser
+from compose.errors import NOT_LOCALISED, USER_ERROR, CannotWrite, UserError
+from compose.recording.estimating import estimate_run
 from compose.recording.estimating.estimate_rows import ESTIMATE_COLUMNS, PoseEstimate, estimate_csv
 from compose.recording.estimating.estimate_run import RecordingEstimate, estimated
 from compose.recording.estimating.noise_files import RangeCorrection, told_noise
@@ -511,9 +515,22 @@ def test_both_orders_of_the_robots_of_the_sample_claim_and_none_is_wrong(
 # --- the command ----------------------------------------------------------------------------------------
 
 
+def test_a_folder_that_cannot_be_written_is_refused_before_the_estimate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(estimate_run, "estimated", None)
+    parser = command_parser(next(one for one in COMMANDS if one.name == "estimate"))
+    words = [str(SAMPLE), "--window", "0..8", "--out", str(tmp_path / "file")]
+    with pytest.raises(CannotWrite, match="file cannot be written: File exists"):
+        estimate_command.main(parser.parse_all(words))
+
+
 def test_the_command_writes_a_table_a_summary_and_figures(tmp_path: Path) -> None:
     ended = tandem("estimate", str(SAMPLE), "--noise", "uwb-calibrated", "--out", "found", cwd=tmp_path)
     assert (ended.status, ended.err) == (0, "")
+    page = (Path(__file__).parents[1] / "docs" / "howto-estimate.md").read_text("utf-8")
+    assert page.split("```text\n")[1].split("```")[0] in ended.out, "the page shows this table"
     names = {"estimate.csv", "estimate.json", "estimate-path.svg", "estimate-over-time.svg"}
     assert names <= {path.name for path in (tmp_path / "found").iterdir()}
     with (tmp_path / "found" / "estimate.csv").open() as file:

@@ -202,6 +202,8 @@ def test_a_stream_is_ended_by_ctrl_c_and_by_the_end_of_its_reader_and_the_files_
     ("words", "says"),
     [
         (("bad.mcap", "--follow"), "bad.mcap, /ranges, message 1: range: expected a number, got 'str'"),
+        (("bad.txt", "--follow"), "bad.txt: it is not a complete MCAP file"),
+        (("empty.mcap", "--follow", "--out", "bad.txt"), "bad.txt cannot be written: File exists"),
         (("empty.mcap", "--follow"), "empty.mcap: there is no second with odometry of all robots"),
         (("no.mcap", "--follow"), "no.mcap cannot be read: No such file or directory"),
         (
@@ -214,7 +216,9 @@ def test_a_wrong_stream_is_one_line(words: tuple[str, ...], says: str, tmp_path:
     wrong: Messages = [(0.0, "/ranges", {"t": 0.0, "from": "A", "to": "B", "range": "x"})]
     (tmp_path / "bad.mcap").write_bytes(written(wrong))
     (tmp_path / "empty.mcap").write_bytes(b"")
+    (tmp_path / "bad.txt").write_text("this is no MCAP")
     ended = tandem("estimate", *words, cwd=tmp_path)
     assert ended.status == USER_ERROR
     assert ended.err.count("\n") == 1
     assert says in ended.err
+    assert ended.out == "", "no heading"

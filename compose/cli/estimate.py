@@ -47,6 +47,8 @@ def main(options: argparse.Namespace) -> int:
     else:
         recording = read_ranges(options.recording, options.anchors)
         problem = measurements(recording, options.robots, options.noise, options.window)
+        if options.out is not None:
+            make_folder(options.out)
         with counting("tandem estimate", len(problem.ends)) as done:
             estimate = estimated(problem, rule, done, solver)
     if options.out is not None:
@@ -80,11 +82,14 @@ def _followed(
         stream = sys.stdin.buffer if str(options.recording) == "-" else options.recording.open("rb")
     except OSError as error:
         raise UserError(f"{name} cannot be read: {error.strerror or error}") from None
+    if options.out is not None:
+        make_folder(options.out)
+    heading = [",".join(ESTIMATE_COLUMNS)]
     with stream, until_signal() as stopped:
-        say(",".join(ESTIMATE_COLUMNS))
         try:
             for row in estimate.rows(rows_as_they_arrive(stream, name)):
-                say(csv_line(row))
+                say(*heading, csv_line(row))
+                heading = []
         except BrokenPipeError:  # the files are of the estimates so far
             discard(sys.stdout)
             return *estimate.result(), BROKEN_PIPE
@@ -99,7 +104,6 @@ def _written(out: Path, problem: Measurements, estimate: RecordingEstimate) -> l
     """Write all files into `out`, and return their paths. Raises UserError."""
     from compose.recording.estimating.estimate_summary import write_estimate  # noqa: PLC0415  # they need numpy
 
-    make_folder(out)
     try:
         return [*write_estimate(out, estimate.rows, estimate.summary), *_drawn(out, problem, estimate)]
     except OSError as error:
