@@ -395,6 +395,12 @@ def test_an_unknown_scenario_is_refused(
             (["agent", "a", *CONNECT, "--connect-timeout", v], "--connect-timeout: ")
             for v in ("0", "-1", "nan", "inf", "soon")
         ),
+        (["sweep", "noise", "--workers", "x"], "--workers: 'x' is not a whole number from 1 to 1000"),
+        (["sweep", "noise", "--workers", "0"], "--workers: '0' is not a whole number from 1 to 1000"),
+        (["sweep", "noise", "--print-trial", ":"], "--print-trial: ':' is not a trial such as 17, or 3:17"),
+        (["sweep", "noise", "--print-trial", "x:1"], "--print-trial: 'x:1' is not a trial such as 17, or"),
+        (["estimate", "run", "--confidence", "nan"], "'nan' is not a probability from 0.5 to below 1"),
+        (["estimate", "run", "--confidence", "x"], "'x' is not a probability from 0.5 to below 1"),
         *((["agent", v, *CONNECT], "ID: ") for v in ("", "a/b", "*", "a\n", "x" * 65)),
         *((["agent", "a", *CONNECT, "--run", v], "--run: ") for v in ("", "a/b", "**", "a b")),
         *((["world", "paper-1", *LISTEN, "--run", v], "--run: ") for v in ("", "a/b", "@x", "x" * 65)),

@@ -116,7 +116,7 @@ def test_a_folder_that_is_removed_is_made_anew_by_the_same_authority(tmp_path: P
             ("--robots", "a", "--host", "not a host"),
             "--host: 'not a host' is neither a host name nor an IP address",
         ),
-        (("--robots", "a", "--days", "0"), "0 is not from 1 to 36500"),
+        (("--robots", "a", "--days", "0"), "'0' is not a whole number from 1 to 36500"),
         ((), "--robots"),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import math
 import re
 from argparse import ArgumentTypeError
 from pathlib import Path
@@ -58,12 +59,17 @@ def model(text: str) -> str:
     return text
 
 
+def _number(text: str) -> float:
+    """Return the number that `text` is; NaN if it is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
 def positive(text: str) -> float:
     """Return a number above 0 and below 1e9. Raises ArgumentTypeError."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
+    value = _number(text)
     if not 0.0 < value < 1e9:
         raise ArgumentTypeError(f"'{text}' is not a positive number")
     return value
@@ -81,16 +87,17 @@ def cell_and_trial(text: str) -> tuple[int, int]:
 
     Raises ArgumentTypeError.
     """
-    cell, _, trial = text.rpartition(":")
-    return natural(cell) if cell else 0, natural(trial)
+    found = re.fullmatch("(?:([0-9]{1,18}):)?([0-9]{1,18})", text)
+    if found is None:
+        raise ArgumentTypeError(f"'{text}' is not a trial such as 17, or 3:17 in cell 3")
+    return int(found[1] or 0), int(found[2])
 
 
 def up_to(most: int, text: str) -> int:
     """Return an integer from 1 to `most`. Raises ArgumentTypeError."""
-    value = natural(text)
-    if not 0 < value <= most:
-        raise ArgumentTypeError(f"{value} is not from 1 to {most}")
-    return value
+    if not re.fullmatch(r"[0-9]{1,19}", text) or not 0 < int(text) <= most:
+        raise ArgumentTypeError(f"'{text}' is not a whole number from 1 to {most}")
+    return int(text)
 
 
 def port(text: str) -> int:
@@ -129,10 +136,7 @@ def names(text: str) -> tuple[str, ...]:
 def window(text: str) -> tuple[float, float]:
     """Return the first and the last second of a text such as 10..40. Raises ArgumentTypeError."""
     first, dots, last = text.partition("..")
-    try:
-        begin, end = float(first), float(last)
-    except ValueError:
-        begin, end = 0.0, 0.0
+    begin, end = _number(first), _number(last)
     if not dots or not 0.0 <= begin < end < 1e13:
         raise ArgumentTypeError(f"'{text}' is not a window in seconds such as 10..40")
     return begin, end
@@ -140,7 +144,7 @@ def window(text: str) -> tuple[float, float]:
 
 def confidence(text: str) -> float:
     """Return a probability from 0.5 to below 1. Raises ArgumentTypeError."""
-    value = positive(text)
+    value = _number(text)
     if not 0.5 <= value < 1.0:
         raise ArgumentTypeError(f"'{text}' is not a probability from 0.5 to below 1")
     return value
