@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+import sys
+from collections.abc import Sequence
 
 import numpy as np
 from msgspec.structs import replace
 
 from agent.estimation.fit import fits
 from tandem.estimation import JointMeasurements, OdometryErrors, Solution, Start
-from tandem.planning import Assured
+from tandem.planning import Assured, Report, RobotState
 
 NO_ERRORS = OdometryErrors(np.zeros(0), np.zeros(0), np.zeros(0))
 
@@ -74,10 +76,19 @@ class Broken:
                 return start  # type: ignore[return-value]
             case "nothing-else":
                 return Solution(None)  # type: ignore[arg-type]
+            case "exits":
+                sys.exit(3)
+            case "changes":
+                measured.ranges.rho[:] = 1.0
+            case "changes-path":
+                measured.paths[0].x[0] = 1.0
+            case "changes-start":
+                np.add(start.poses, 1.0, out=start.poses)
             case "something":
                 return "poses"  # type: ignore[return-value]
             case _:
                 raise ZeroDivisionError("by the solver")
+        return None
 
 
 class WithSmoother(Assured):
@@ -90,6 +101,25 @@ class WithNothing(Assured):
     """A planner whose solver finds nothing."""
 
     SOLVER = Nothing()
+
+
+class Exiting(Assured):
+    """A planner that ends its process, in `decide` or as soon as it is created."""
+
+    def __init__(self, *, at_once: bool = False) -> None:
+        if at_once:
+            sys.exit(7)
+
+    def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
+        """End the process."""
+        del state, reports
+        sys.exit("no more")
+
+
+class WithNoSolver(Assured):
+    """A planner with a class in place of a solver."""
+
+    SOLVER = Smoother  # type: ignore[assignment]
 
 
 class WithBroken(Assured):

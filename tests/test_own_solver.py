@@ -20,7 +20,7 @@ from tests.commands import tandem as command
 from tests.expected.playing import decisions
 from tests.groups import table_of
 from tests.moving_groups import NOISE, PERIOD_S, moving_group
-from tests.own_solvers import Broken, Smoother, WithBroken, WithNothing, WithSmoother
+from tests.own_solvers import Broken, Exiting, Smoother, WithBroken, WithNoSolver, WithNothing, WithSmoother
 
 SHIPPED = Path(scenario.__file__).parent / "shipped" / "noisy.toml"
 SAMPLE = Path(__file__).parent / "data" / "uwb" / "tiers-a-b-30-s.pyfg"
@@ -80,11 +80,32 @@ def test_a_robot_whose_solver_finds_nothing_claims_nothing() -> None:
         ("poses-alone", "returned Start, not a Solution or None"),
         ("nothing-else", "a Solution of NoneType, not of a Start"),
         ("raises", "ZeroDivisionError: by the solver"),
+        ("exits", "observe() at tick 1 raises SystemExit: 3 (own_solvers.py:"),
+        ("changes", "ValueError: assignment destination is read-only (own_solvers.py:"),
+        ("changes-path", "ValueError: assignment destination is read-only (own_solvers.py:"),
+        ("changes-start", "ValueError: output array is read-only (own_solvers.py:"),
     ],
 )
 def test_a_solution_that_cannot_be_used_ends_the_run_in_one_line(solution: str, why: str) -> None:
     with pytest.raises(PlannerFailed) as failed:
         tandem.run("noisy", planner=WithBroken, planner_options={"solution": solution})
+    assert why in str(failed.value)
+    assert "\n" not in str(failed.value)
+
+
+@pytest.mark.parametrize(
+    ("planner", "options", "why"),
+    [
+        (Exiting, {}, "decide() at tick 0 raises SystemExit: no more (own_solvers.py:"),
+        (Exiting, {"at_once": True}, "tests.own_solvers:Exiting cannot be created: SystemExit: 7"),
+        (WithNoSolver, {}, "SOLVER: the class tests.own_solvers:Smoother is no solver: an object with the"),
+    ],
+)
+def test_a_planner_that_exits_or_has_no_solver_is_one_line(
+    planner: type[tandem.planning.Planner[Any, Any]], options: dict[str, Any], why: str
+) -> None:
+    with pytest.raises(UserError) as failed:
+        tandem.run("noisy", planner=planner, planner_options=options)
     assert why in str(failed.value)
     assert "\n" not in str(failed.value)
 
@@ -133,6 +154,8 @@ def claims(found: tandem.PoseEstimates) -> dict[str, object]:
     [
         (Broken("shape"), "tests.own_solvers:Broken: solve() returned no finite poses"),
         (Broken("raises"), "tests.own_solvers:Broken: solve() raised ZeroDivisionError: by the solver"),
+        (Broken("exits"), "tests.own_solvers:Broken: solve() raised SystemExit: 3"),
+        (Broken("changes"), "solve() raised ValueError: assignment destination is read-only"),
         (Broken("something"), "solve() returned str, not a Solution or None"),
         (Smoother, "the class tests.own_solvers:Smoother is no solver: an object with the method solve"),
         (object(), "builtins:object is no solver: an object with the method solve"),
@@ -149,7 +172,10 @@ def test_a_recording_with_a_broken_solver_is_refused_in_one_line(solver: Any, wh
     [
         ("tests.own_solvers:Smother", "there is no 'Smother' in tests.own_solvers"),
         ("tests.own_solvers:Broken", "tests.own_solvers:Broken cannot be created: TypeError"),
-        ("nowhere", "'nowhere' is not a solver; expected MODULE:CLASS"),
+        ("nowhere", "'nowhere' is not a solver; expected MODULE:CLASS, such as mine:Own"),
+        ("./own.py:Own", "'./own.py:Own' is not a solver; expected MODULE:CLASS, such as mine:Own"),
+        ("own.py:Own", "'own.py:Own' is not a solver; expected MODULE:CLASS, such as mine:Own"),
+        ("tests.own_solvers:math", "tests.own_solvers:math cannot be created: TypeError"),
     ],
 )
 def test_a_solver_that_cannot_be_loaded_ends_the_command_with_2(name: str, why: str) -> None:

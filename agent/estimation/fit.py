@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from agent.estimation.elementary import dot
@@ -184,12 +185,22 @@ def fits(
     for start in (*starts, *_without_outliers(problem, measured, starts[:doubted])):
         try:
             if measured.solver is not None:
+                _lock((measured, start))
                 found += _solved(problem, measured.solver.solve(measured, start))
             else:
                 found.append(_fit(problem, problem.kernel.fitted(*_begin(problem, start), until)))
         except Singular:
             continue
     return found
+
+
+def _lock(value: object) -> None:
+    """Make all arrays in `value` read-only: a user's solver gets those that other fits use, too."""
+    if isinstance(value, np.ndarray):
+        value.flags.writeable = False
+    elif isinstance(value, tuple | msgspec.Struct):
+        for part in value if isinstance(value, tuple) else msgspec.structs.astuple(value):
+            _lock(part)
 
 
 def _solved(problem: Problem, solution: Solution | None) -> list[Fit]:
@@ -227,9 +238,8 @@ def _usable(problem: Problem, start: Start) -> Start:
     for v, omega, constant in errors:
         of_v = _floats("errors v", v, np.size(v))
         of_omega = _floats("errors omega", omega, len(of_v))
-        usable.append(
-            Errors(of_v, of_omega, _floats("errors constant", constant, constants * (np.size(constant) > 0)))
-        )
+        size = constants * (np.size(constant) > 0)
+        usable.append(Errors(of_v, of_omega, _floats("errors constant", constant, size)))
     if weights is not None:
         weights = _floats("weights", weights, len(problem.ticks))
         if np.any((weights < 0.0) | (weights > 1.0)):

@@ -104,7 +104,7 @@ class PurityProbe(Watched):
     def _pickled(self, value: Any) -> bytes:
         try:
             return pickle.dumps(value)
-        except Exception as error:  # noqa: BLE001  # the user's classes may raise anything
+        except (Exception, SystemExit) as error:  # noqa: BLE001  # the user's classes may raise anything
             raise self.broken(f"its state cannot be pickled: {type(error).__name__}: {error}") from None
 
     def _unchanged(self, method: str, call: Callable[..., Any], *arguments: Any) -> Any:
@@ -118,7 +118,7 @@ class PurityProbe(Watched):
         """Return the result of `method` of a new planner."""
         try:
             return getattr(self.fresh(), method)(*arguments)
-        except Exception as error:  # noqa: BLE001  # the user's code may raise anything
+        except (Exception, SystemExit) as error:  # noqa: BLE001  # the user's code may raise anything
             raise self.broken(
                 f"{method}() of a new object of the class raises {type(error).__name__}: {error}"
             ) from None

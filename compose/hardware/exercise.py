@@ -86,7 +86,7 @@ class ExerciseRun:
                 self._try("away from the anchor", Controls(v, 0.0))
         except Broken:
             raise
-        except Exception as error:  # the user's code may raise anything
+        except (Exception, SystemExit) as error:  # the user's code may raise anything
             raise Broken(f"{type(error).__name__}: {error}") from error
         finally:
             self._driver.stop()

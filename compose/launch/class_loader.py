@@ -81,13 +81,13 @@ def named(name: str, kind: Kind, group: str | None = None) -> Any:
     if point is not None:
         try:
             return point.load()
-        except Exception as error:  # noqa: BLE001  # the code of the package may raise anything
+        except (Exception, SystemExit) as error:  # noqa: BLE001  # the code of the package may raise anything
             raise UserError(
                 f"{name}: {point.value} cannot be loaded: {type(error).__name__}: {error}"
             ) from None
     module, _, cls = name.partition(":")
-    if not module or not cls.isidentifier():
-        raise UserError(f"'{name}' is not a {kind}; expected MODULE:CLASS")
+    if module.endswith(".py") or not all(map(str.isidentifier, (*module.split("."), cls))):
+        raise UserError(f"'{name}' is not a {kind}; expected MODULE:CLASS, such as mine:Own")
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # last, because it may contain a folder named world
     try:
@@ -96,5 +96,5 @@ def named(name: str, kind: Kind, group: str | None = None) -> Any:
         raise UserError(f"{name}: there is no module '{error.name}'") from None
     except AttributeError:
         raise UserError(f"{name}: there is no '{cls}' in {module}") from None
-    except Exception as error:  # noqa: BLE001  # the user's code may raise anything
+    except (Exception, SystemExit) as error:  # noqa: BLE001  # the user's code may raise anything
         raise UserError(f"{name}: {module} cannot be imported: {type(error).__name__}: {error}") from None

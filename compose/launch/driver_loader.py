@@ -40,7 +40,7 @@ def made(
     """
     try:
         return maker(config, manoeuvre_s, **options)
-    except Exception as error:  # noqa: BLE001  # as above
+    except (Exception, SystemExit) as error:  # noqa: BLE001  # as above
         raise UserError(f"{name}: cannot be created: {type(error).__name__}: {error}") from None
 
 
@@ -54,7 +54,7 @@ def resume_driver(driver: Driver, name: str, history: DriverHistory) -> None:
     try:
         driver.stop()
         resume(history.tick, history.mark)
-    except Exception as error:  # noqa: BLE001  # as above
+    except (Exception, SystemExit) as error:  # noqa: BLE001  # as above
         raise UserError(f"{name}: cannot resume: {type(error).__name__}: {error}") from None
 
 

@@ -40,7 +40,7 @@ def check(kind: str, spec: ModelSpec) -> None:
             raise UserError(f"model: {spec.model} is not a subclass of tandem.models.{contract.__name__}")
     try:
         maker(**spec.options)
-    except Exception as error:  # noqa: BLE001  # the user's code may raise anything
+    except (Exception, SystemExit) as error:  # noqa: BLE001  # the user's code may raise anything
         raise UserError(f"options: {spec.model} cannot be created: {type(error).__name__}: {error}") from None
 
 

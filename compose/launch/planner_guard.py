@@ -91,7 +91,7 @@ class GuardedPlanner(Planner[Any, Any]):
         """Return why the planner's decoder refuses a body, or what it raises."""
         try:
             return self._planner.malformed(body)
-        except Exception as error:  # noqa: BLE001  # an unknown process may have sent the body
+        except (Exception, SystemExit) as error:  # noqa: BLE001  # an unknown process may have sent the body
             self.decoder_error = f"the decoder of {self._name} raises {type(error).__name__}: {error}"
             return self.decoder_error
 
@@ -140,7 +140,7 @@ class GuardedPlanner(Planner[Any, Any]):
     def _called(self, method: Callable[..., Any], *arguments: Any) -> Any:
         try:
             return method(*arguments)
-        except Exception as error:  # the user's code may raise anything
+        except (Exception, SystemExit) as error:  # the user's code may raise anything
             place = traceback.extract_tb(error.__traceback__)[-1]
             where = f"{Path(place.filename).name}:{place.lineno}"
             raise self._failed(

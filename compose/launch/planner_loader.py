@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from compose.errors import BadOptions, UserError
 from compose.launch.class_loader import entry_points, named
+from compose.launch.solver_loader import GuardedSolver
 from protocol.messages import RobotConfig
 from protocol.mission import Mission
 from protocol.orbits import RENDEZVOUS, Rendezvous, rendezvous
@@ -135,6 +136,9 @@ def planner_class(name: str) -> type[Planner[Any, Any]]:
 def _created(name: str, options: Mapping[str, Any]) -> Planner[Any, Any]:
     maker = planner_class(name)
     try:
-        return maker(**options)
-    except Exception as error:  # noqa: BLE001  # as above
+        created = maker(**options)
+    except (Exception, SystemExit) as error:  # noqa: BLE001  # as above
         raise BadOptions(f"options: {name} cannot be created: {type(error).__name__}: {error}") from None
+    if (solver := getattr(created, "SOLVER", None)) is not None:
+        GuardedSolver(solver, f"{name}: SOLVER: ")
+    return created

@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 class GuardedSolver:
     """A solver of a user whose errors are UserErrors."""
 
-    def __init__(self, solver: Any) -> None:
-        """Raises UserError if `solver` is no solver."""
+    def __init__(self, solver: Any, where: str = "") -> None:
+        """Raises UserError, which begins with `where`, if `solver` is no solver."""
         own = solver if isinstance(solver, type) else type(solver)
         self._name = f"{own.__module__}:{own.__qualname__}"
         if solver is own or not callable(getattr(solver, "solve", None)):
             what = "the class " if solver is own else ""
-            raise UserError(f"{what}{self._name} is no solver: an object with the method solve")
+            raise UserError(f"{where}{what}{self._name} is no solver: an object with the method solve")
         self._solver = solver
 
     def __str__(self) -> str:
@@ -33,7 +33,7 @@ class GuardedSolver:
         """Return the solution of the user's solver."""
         try:
             return self._solver.solve(measured, start)  # type: ignore[no-any-return]
-        except Exception as error:  # noqa: BLE001  # the user's code may raise anything
+        except (Exception, SystemExit) as error:  # noqa: BLE001  # the user's code may raise anything
             raise UserError(f"{self._name}: solve() raised {type(error).__name__}: {error}") from None
 
 
@@ -45,8 +45,7 @@ def solver_named(name: str) -> GuardedSolver:
     trust(name)
     maker = named(name, "solver")
     try:
-        return GuardedSolver(maker())
-    except UserError:
-        raise
-    except Exception as error:  # noqa: BLE001  # as above
+        solver = maker()
+    except (Exception, SystemExit) as error:  # noqa: BLE001  # as above
         raise UserError(f"{name} cannot be created: {type(error).__name__}: {error}") from None
+    return GuardedSolver(solver)

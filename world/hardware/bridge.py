@@ -276,7 +276,7 @@ class Field:
         """
         try:
             reading = self._driver.sense(tick)
-        except Exception as error:  # a driver of the user may raise anything
+        except (Exception, SystemExit) as error:  # a driver of the user may raise anything
             raise DriverFailed(f"sense({tick}): {type(error).__name__}: {error}") from error
         try:
             observation = observation_frame(reading, tick, self._config)
@@ -287,7 +287,7 @@ class Field:
     def _stop(self) -> None:
         try:
             self._driver.stop()
-        except Exception as error:  # noqa: BLE001  # as above; the MissionEnd still has to be sent
+        except (Exception, SystemExit) as error:  # noqa: BLE001  # as above; the MissionEnd still has to be sent
             self._inbox.say(f"the driver does not stop: {type(error).__name__}: {error}")
 
     def _drive(self, command: Command) -> None:
@@ -297,7 +297,7 @@ class Field:
         omega = min(max(command.omega, -mission.max_turn_rate), mission.max_turn_rate)
         try:
             self._driver.drive(v, omega)
-        except Exception as error:  # as above
+        except (Exception, SystemExit) as error:  # as above
             raise DriverFailed(f"drive({v:g}, {omega:g}): {type(error).__name__}: {error}") from error
 
     def _wait_for_command(self, tick: int) -> Command | None:
