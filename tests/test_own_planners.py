@@ -10,6 +10,7 @@ from collections.abc import Callable
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -24,18 +25,22 @@ from agent.process.robot import REPORTS_KEPT, Robot
 from compose.audit.planner_checks import QuietInbox, check_planner
 from compose.audit.rules import audit_run
 from compose.errors import BadScenario, PlannerFailed, UserError
-from compose.launch import class_loader
+from compose.launch import class_loader, in_process, processes
 from compose.launch.in_process import run_mission
 from compose.launch.planner_guard import GuardedPlanner
 from compose.launch.planner_loader import planner_of
 from compose.launch.processes import free_endpoint
+from compose.recording import run as recorded
 from compose.recording.run import read
+from compose.scenario.kills import Kill
 from compose.scenario.scenario_file import ScenarioTemplate, load, setting, validate
 from protocol.messages import (
     MAX_BODY_BYTES,
+    Cause,
     Contact,
     Inconsistent,
     Localised,
+    MissionEnd,
     Observation,
     Report,
     Undecided,
@@ -287,6 +292,24 @@ def test_check_planner_finds_each_mistake_for_its_own_reason(name: str) -> None:
     wrong = next(one for one in checks if one.wrong is not None)
     assert wrong.what.startswith(check)
     assert why in str(wrong.wrong)
+
+
+def test_check_planner_says_why_processes_did_not_complete_the_mission(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    end = MissionEnd(17, "failed", (Cause("failed", text="no answer from b at tick 17 for 30 s"),))
+
+    def without_answer(scenario: Scenario, folder: Path, *_: Any, **__: Any) -> list[Kill]:
+        for name in in_process.journals(scenario):
+            (folder / name).touch()
+        return []
+
+    monkeypatch.setattr(processes, "run_mission", without_answer)
+    monkeypatch.setattr(recorded, "read", lambda _: SimpleNamespace(end=end))
+    checks = check_planner(own("Sound").scenario, QuietInbox("test"))
+    wrong = next(one for one in checks if one.wrong is not None)
+    assert wrong.what == "it decides the same as processes over the network"
+    assert str(wrong.wrong) == "the mission failed: no answer from b at tick 17 for 30 s"
 
 
 @pytest.mark.parametrize("name", [OWN, "assured", "paper"])

@@ -15,6 +15,7 @@ from compose.launch import in_process, planner_loader, processes
 from compose.launch.supervisor import ChildFailed
 from compose.recording import run as recorded
 from compose.recording.comparison import comparison
+from compose.recording.reasons import reason_for
 from compose.recording.recording_files import WORLD_JOURNAL
 from compose.recording.run import Run
 from compose.scenario.kills import Kill, parse
@@ -167,5 +168,8 @@ def _as_processes(scenario: Scenario, first: Journals, kills: tuple[Kill, ...], 
             return "no kill took place"
         for name, frames in first.items():
             if (Path(folder) / name).read_bytes() != packed(frames):
+                end = recorded.read(Path(folder)).end
+                if end is not None and end.outcome == "failed":
+                    return f"the mission failed: {reason_for(end)}"
                 return f"{name} has other bytes"
     return None
