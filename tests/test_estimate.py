@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -489,27 +490,46 @@ def test_robots_with_ranges_to_one_anchor_only_are_refused(sample: RangeRecordin
 # --- the table of claims -------------------------------------------------------------------------------
 
 
+class LeastRow(NamedTuple):
+    """The worst numbers that a row of the table of claims may have."""
+
+    claims: int
+    median_s: float
+    p90_m: float
+    region_percent: float
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("change", "noise", "accuracy", "claims"),
+    ("change", "noise", "accuracy", "starts_s", "least"),
     [
-        (recorded_claims.unchanged, "uwb-calibrated", 0.3, 4),
-        (partial(recorded_claims.longer, bias=0.35), "uwb", 0.5, 2),
-        (partial(recorded_claims.longer, scale=1.07), "uwb", 0.5, 2),
-        (recorded_claims.with_outliers, "uwb", 0.5, 2),
+        (recorded_claims.unchanged, "uwb-calibrated", 0.3, range(9), LeastRow(18, 14.5, 0.25, 98.0)),
+        (recorded_claims.with_outliers, "uwb", 0.3, range(9), LeastRow(8, 17.0, 0.35, 93.0)),
+        (partial(recorded_claims.longer, bias=0.35), "uwb", 0.5, (0, 2), LeastRow(2, 30.0, 0.5, 85.0)),
+        (partial(recorded_claims.longer, scale=1.07), "uwb", 0.5, (0, 2), LeastRow(2, 30.0, 0.5, 85.0)),
     ],
-    ids=["as recorded", "bias", "scale", "outliers"],
+    ids=["as recorded", "outliers", "bias", "scale"],
 )
-def test_both_orders_of_the_robots_of_the_sample_claim_and_none_is_wrong(
-    change: recorded_claims.Change, noise: str, accuracy: float, claims: int
+def test_the_rows_of_the_table_of_claims_get_no_worse_and_no_claim_is_wrong(
+    change: recorded_claims.Change,
+    noise: str,
+    accuracy: float,
+    starts_s: Sequence[float],
+    least: LeastRow,
 ) -> None:
-    trials = recorded_claims.trials_of(SAMPLE, change, noise, accuracy, (0.0, 2.0))
+    """The part of the table in docs/howto-estimate.md that the sample allows: two robots, and 30 s.
+
+    The bounds are those of the commit that wrote them. With fits that begin again after every two steps, the
+    pairs with outliers claim after 26 s in place of 16 s, and fewer do.
+    """
+    trials = recorded_claims.trials_of(SAMPLE, change, noise, accuracy, starts_s)
     row = recorded_claims.row_of("", trials, [recorded_claims.claimed(one) for one in trials])
     cells = dict(zip(recorded_claims.HEAD, [cell.strip() for cell in row.split("|")[1:-1]], strict=True))
-    assert int(cells["claims"].removesuffix(" of 4")) >= claims
+    assert int(cells["claims"].split()[0]) >= least.claims
+    assert float(cells["median s"]) <= least.median_s
+    assert float(cells["p90 m"]) <= least.p90_m
+    assert float(cells["truth in 99 % region %"]) >= least.region_percent
     assert cells["wrong"] == "0"
-    assert float(cells["truth in 99 % region %"]) >= 85.0
-    assert float(cells["p90 m"]) <= accuracy
 
 
 # --- the command ----------------------------------------------------------------------------------------
