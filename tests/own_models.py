@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import sys
+
 from tandem.models import RadioModel, Radios, RangeModel, Transmission
 
 
@@ -27,3 +29,17 @@ class Long(RangeModel):
 
     def measured(self, radios: Radios, rho: float) -> float | None:
         return None if radios.uniform("missing") < 0.1 else 1.001 * rho
+
+
+class Failing(RadioModel[int]):
+    """It raises an error with the first report."""
+
+    def sent(self, state: int | None, transmission: Transmission) -> tuple[int, int | None]:
+        raise KeyError("first")
+
+
+class Exiting(RangeModel):
+    """It ends the process with the first range."""
+
+    def measured(self, radios: Radios, rho: float) -> float | None:
+        sys.exit(4)

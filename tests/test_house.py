@@ -32,7 +32,7 @@ BELOW = {
 }
 """The packages of the project that each package may import."""
 
-BUDGETS = {"protocol": 4_337, "agent": 16_633, "world": 4_277, "compose": 29_101, "tandem": 1_551}
+BUDGETS = {"protocol": 4_337, "agent": 16_633, "world": 4_277, "compose": 29_121, "tandem": 1_551}
 """The largest number of lines of Python and C of each package. Raising one needs a reason in the commit."""
 
 SHELL = {

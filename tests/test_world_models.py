@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import tomli_w
 from msgspec.structs import replace
 
 import tandem
@@ -230,6 +231,25 @@ def test_a_wrong_model_is_one_line(world: dict[str, Any], says: str) -> None:
         scenario_of("noisy", **world)
     assert says in str(bad.value)
     assert "\n" not in str(bad.value)
+
+
+@pytest.mark.parametrize("mode", [("--in-process",), ()])
+@pytest.mark.parametrize(
+    ("world", "says"),
+    [
+        ({"radio": {"model": f"{OWN}:Failing"}}, f"the model {OWN}:Failing: sent() raises KeyError: 'first'"),
+        ({"range": {"model": f"{OWN}:Exiting"}}, f"the model {OWN}:Exiting: measured() raises SystemExit: 4"),
+    ],
+)
+def test_a_model_that_raises_an_error_is_one_line(
+    world: dict[str, Any], says: str, mode: tuple[str, ...], tmp_path: Path
+) -> None:
+    path = tmp_path / "own.toml"
+    path.write_text(tomli_w.dumps({**scenario_table("noisy"), "world": world}))
+    ended = command("run", path, "-q", *mode)
+    assert ended.status == 3
+    assert says in ended.err
+    assert ended.err.count("\n") == 1
 
 
 def test_a_range_model_needs_noise_that_the_robots_are_told() -> None:

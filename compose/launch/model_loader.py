@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
-from compose.errors import UserError
+from compose.errors import FAILED, UserError
 from compose.launch import class_loader
 from protocol.spelling import did_you_mean
 from world.radio_models import RADIO_MODELS
@@ -54,8 +55,27 @@ def _loaded(name: str) -> type:
     found = class_loader.named(name, "model")
     if not isinstance(found, type) or not issubclass(found, RangeModel | RadioModel):
         raise UserError(f"{name} is not a range model or a radio model")
-    OWN_MODELS[name] = found
+    OWN_MODELS[name] = _guarded(name, found)
     return found
+
+
+def _guarded(name: str, model: type) -> type:
+    """Return a subclass of `model` whose methods raise UserError, in one line, for whatever they raise."""
+
+    def guarded(method: str) -> Callable[..., Any]:
+        def called(self: Any, *arguments: Any) -> Any:
+            try:
+                return getattr(super(subclass, self), method)(*arguments)
+            except (Exception, SystemExit) as error:
+                failed = UserError(f"the model {name}: {method}() raises {type(error).__name__}: {error}")
+                failed.exit_status = FAILED
+                raise failed from error
+
+        return called
+
+    methods = [one for one in ("detects", "measured", "start", "sent") if hasattr(model, one)]
+    subclass = type(model.__name__, (model,), {one: guarded(one) for one in methods})
+    return subclass
 
 
 def trust_all(scenario: Scenario) -> None:
