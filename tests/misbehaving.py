@@ -14,6 +14,7 @@ from msgspec.structs import replace
 
 from agent.process.robot import Robot
 from compose.launch import in_process
+from compose.launch.forked import launcher
 from compose.launch.signals import stop_by_signal
 from compose.sweep import execution, spec, trial, worker_pool
 from protocol.network.inbox import Inbox
@@ -27,7 +28,7 @@ class Owned(worker_pool.WorkerProcess):
     """A process for trials whose timeout applies only to trials that hang, however slow the machine is."""
 
     def answer(self, timeout: float) -> bytes:
-        """Return the next frame. Raises Hung if the trial hangs, and Died if the process ends."""
+        """Return the next message. Raises Hung if the trial hangs, and Died if the process ends."""
         while True:
             try:
                 return super().answer(timeout)
@@ -76,9 +77,9 @@ def endless(one: trial.Trial) -> trial.TrialRow:
 
 
 def stubborn() -> None:
-    """Ignore SIGTERM, say so on standard output, and never end."""
+    """Ignore SIGTERM, say so to the launcher, and never end."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    os.write(1, b"ready")
+    launcher().send_bytes(b"ready")
     signal.pause()
 
 

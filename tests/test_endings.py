@@ -314,7 +314,7 @@ def test_a_page_that_stays_is_not_ended_by_another_process_that_ends_late() -> N
     inbox = Watched("test")
     inbox.put("ended", "agent a")
     children = Supervisor(inbox)
-    child = children.start("the page", main="signal:pause", answers=True)
+    child = children.start("the page", main="signal:pause")
     assert PageProcess(child, "here").stay(inbox) is False
     children.stop()
     assert taken == [True, True]

@@ -55,7 +55,7 @@ def test_a_mission_that_takes_too_long_is_ended(tmp_path: Path, monkeypatch: pyt
     with pytest.raises(UserError, match="the mission has not ended after 0 s: save it"):
         missions.run(show, change)
     missions.close()
-    work.close()
+    work.stop()
 
 
 def values(**changed: object) -> dict[str, Any]:

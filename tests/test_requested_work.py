@@ -192,7 +192,7 @@ def test_work_beyond_its_deadline_is_ended_with_one_line(
     with pytest.raises(UserError, match=r"^the trial has not ended after 0.2 s: print its scenario with"):
         (slow := trials.Trials(results(tmp_path, ENDLESS), work)).worst(0)
     slow.close()
-    work.close()
+    work.stop()
     with pytest.raises(UserError, match="the server has been stopped"):
         work.result(trials.run_worst, within=1.0, late="")
 

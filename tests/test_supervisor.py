@@ -7,7 +7,7 @@ from signal import SIGKILL, SIGTERM
 
 import pytest
 
-from compose.launch import child, supervisor
+from compose.launch import forked, supervisor
 from compose.launch.supervisor import Supervisor
 from protocol.network.inbox import Inbox
 from tests.commands import BOUND_S
@@ -28,7 +28,7 @@ def test_children_end_by_one_sigterm_and_one_that_ignores_it_is_killed(
     children: Supervisor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(supervisor, "STOP_S", 0.2)
-    stubborn = children.start("stubborn", main="tests.misbehaving:stubborn", answers=True)
+    stubborn = children.start("stubborn", main="tests.misbehaving:stubborn")
     assert stubborn.receive(BOUND_S) == b"ready"
     obedient = children.start("obedient", main=SLEEPS)
     children.stop()
@@ -38,9 +38,9 @@ def test_children_end_by_one_sigterm_and_one_that_ignores_it_is_killed(
 def test_a_child_that_does_not_read_what_it_is_sent_is_killed(
     children: Supervisor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(child, "SEND_S", 0.2)
+    monkeypatch.setattr(forked, "SEND_S", 0.2)
     deaf = children.start("deaf", main=SLEEPS)
-    deaf.send(bytes(1 << 20))  # more than a pipe holds
+    deaf.send(bytes(1 << 20))  # more than a socket holds
     assert deaf.wait(BOUND_S)
     assert deaf.status == -SIGKILL
 

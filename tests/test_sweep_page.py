@@ -83,7 +83,7 @@ def test_a_cell_that_cannot_be_run_is_one_line(folder: Path) -> None:
     with pytest.raises(UserError, match=r"^cell 0 cannot be run: "):
         trials.worst(0)
     trials.close()
-    work.close()
+    work.stop()
 
 
 @pytest.mark.long

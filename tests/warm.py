@@ -73,7 +73,6 @@ def run_command() -> None:
     """Run the command whose file sys.argv names, in this forked process."""
     with open(sys.argv[1], "rb") as file:
         command = msgspec.msgpack.decode(file.read(), type=Request)
-    os.dup(0)  # keep it open: the fork server treats a process that closes it as ended
     for path, stream, flags in ((sys.argv[2], 1, os.O_WRONLY), (os.devnull, 0, os.O_RDONLY)):
         opened = os.open(path, flags)
         os.dup2(opened, stream)

@@ -8,6 +8,7 @@ import ipaddress
 import os
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +16,7 @@ from compose.cli.recording import note
 from compose.errors import ENDED, STOPPED_STATUS, UserError
 from compose.extras import need
 from compose.launch.class_loader import trust
-from compose.launch.page_process import OVER
+from compose.launch.forked import launcher
 from protocol.output import say
 
 if TYPE_CHECKING:
@@ -57,7 +58,9 @@ def main(options: argparse.Namespace) -> int:
     def ready(stop: Callable[[], None]) -> None:
         if options.launched:
             threading.Thread(target=_follow_launcher, args=(shown, stop), daemon=True).start()
-        say(server.address(taken) if options.launched else f"{server.address(taken)} until Ctrl-C")
+            launcher().send_bytes(server.address(taken).encode())
+        else:
+            say(f"{server.address(taken)} until Ctrl-C")
 
     shown.start()
     try:
@@ -80,8 +83,9 @@ def _recorded(folders: Sequence[Path], launched: bool) -> Site:
 
 
 def _follow_launcher(shown: Site, stop: Callable[[], None]) -> None:
-    """Follow the launcher, which writes OVER when the mission is over, and closes the stream at the end."""
-    while received := os.read(0, 64):
-        if OVER in received:
+    """Follow the launcher, which sends a message when the mission is over, and hangs up at the end."""
+    with suppress(EOFError):
+        while True:
+            launcher().recv_bytes()
             shown.concluded()
     stop()

@@ -1,7 +1,7 @@
 """The process that a launcher's processes are forked from.
 
-Its first argument is WARM_UP, a module:function. It calls WARM_UP, which imports what the processes need. It
-opens no session and starts no thread. Its standard input is a socket to the launcher
+Its first argument is WARM_UP, a module, or a module:function that it calls, which imports what the processes
+need. It opens no session and starts no thread. Its standard input is a socket to the launcher
 (`compose/launch/forked.py`). The launcher sends requests for processes and signals on it, and receives the
 exit status of each process. The server ends when the launcher does, and no process outlasts the server.
 """
@@ -82,7 +82,7 @@ class _RequestLoop:
         return found
 
     def _request(self) -> tuple[ForkRequest | Signal, list[int]] | None:
-        request, streams, _, _ = socket.recv_fds(self._launcher, REQUEST_BYTES, STREAMS)
+        request, streams, _, _ = socket.recv_fds(self._launcher, REQUEST_BYTES, len(STREAMS))
         return (self._decoder.decode(request), streams) if request else None
 
     def _fork(self, start: ForkRequest, streams: list[int]) -> bool:
@@ -91,7 +91,7 @@ class _RequestLoop:
         try:
             pid = os.fork()
         except OSError as error:
-            os.write(streams[2], f"cannot start a process: {error.strerror}\n".encode())
+            os.write(streams[1], f"cannot start a process: {error.strerror}\n".encode())
             self._report(Ended(start.number, NOT_FORKED))
         else:
             if not pid:
@@ -126,13 +126,13 @@ class _RequestLoop:
 
 
 def _become(start: ForkRequest, streams: list[int], parent: int) -> None:
-    """Give this forked process its own session, default signals, standard streams, arguments and title."""
+    """Give this forked process its own session, default signals, `streams`, arguments and title."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     os.setsid()
     _signal_when_parent_ends(signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(128 + signal.SIGKILL)
-    for number, stream in enumerate(streams):
+    for number, stream in zip(STREAMS, streams, strict=True):
         os.dup2(stream, number)
         os.close(stream)
     sys.argv = [start.title, *start.arguments]
@@ -140,18 +140,19 @@ def _become(start: ForkRequest, streams: list[int], parent: int) -> None:
 
 
 def _signal_when_parent_ends(number: signal.Signals) -> None:
-    """Send `number` to this process when its parent ends; without effect on systems other than Linux."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, number)
+    """Send `number` to this process when its parent ends."""
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, number)
 
 
 def _call(name: str) -> None:
     module, _, function = name.partition(":")
-    getattr(import_module(module), function)()
+    imported = import_module(module)
+    if function:
+        getattr(imported, function)()
 
 
 def main() -> None:
-    """Call WARM_UP, and fork processes until the launcher has ended."""
+    """Import or call WARM_UP, and fork processes until the launcher has ended."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
     _signal_when_parent_ends(signal.SIGCONT)  # a suspended server must notice the end, too

@@ -1,18 +1,18 @@
-"""The launcher's side of a fork server, and of the processes forked from it.
+"""Processes that are forked from a fork server, and the server, as their launcher sees them.
 
 A fork server (`compose/launch/fork_server.py`) imports what its processes need once, so that each of them
-starts in milliseconds. Each process has its own session, process group, standard streams, signals and exit
+starts in milliseconds. Each process has its own session, process group, standard error, signals and exit
 status. It inherits the environment, working directory and limits that the launcher had when it started the
-server.
+server. Its standard input is a connection to the launcher, for messages in both directions.
 """
 
 from __future__ import annotations
 
 import errno
 import os
-import select
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import tempfile
@@ -20,17 +20,31 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from functools import partial
+from functools import cache
 from itertools import count
+from multiprocessing.connection import Connection
+from typing import IO
 
 import msgspec
 
-from compose.launch.child import KILL_S, ChildProcess, ending
-
 REQUEST_BYTES = 1 << 18
 """The largest size of a request, which is more than a socket takes by default."""
-STREAMS = 3
-"""The number of descriptors sent with a request for a process: its standard input, output and error."""
+STREAMS = (0, 2)
+"""The descriptors sent with a request for a process: its standard input and error."""
+KILL_S = 5.0
+"""Time in s that a killed process has to end; then its fork server is considered hung, and is killed."""
+SEND_S = 60.0
+"""Time in s that a process has to read what is sent to it; then it is considered hung, and is killed."""
+ERROR_BYTES = 1 << 20
+"""The number of bytes of standard error, counted from its end, that are kept."""
+TAKE_S = 60.0
+"""Time in s for retries of a request to fork: the fork server may still import."""
+FORKS_CHECK_S = 1.0
+"""The interval in s at which a fork server that reports nothing is continued, in case it is suspended."""
+TRY_AGAIN_S = 0.001
+"""The interval in s between retries of a request."""
+LETHAL = (signal.SIGTERM, signal.SIGKILL)
+"""The signals that end a process that has not begun yet."""
 
 
 class ForkRequest(msgspec.Struct, frozen=True, tag=True):
@@ -52,18 +66,6 @@ class Signal(msgspec.Struct, frozen=True, tag=True):
     signal: int
 
 
-TAKE_S = 60.0
-"""Time in s for retries of a request to fork: the fork server may still import."""
-FORKS_CHECK_S = 1.0
-"""The interval in s at which processes are checked while the fork server reports nothing."""
-TRY_AGAIN_S = 0.001
-"""The interval in s between these retries."""
-
-
-LETHAL = (signal.SIGTERM, signal.SIGKILL)
-"""The signals that end a process that has not begun yet."""
-
-
 class Imported(msgspec.Struct, frozen=True, tag=True):
     """The report to the launcher that the fork server has imported its modules, and forks from now on."""
 
@@ -76,12 +78,145 @@ class Ended(msgspec.Struct, frozen=True, tag=True):
     """Exit status; negative is the signal that killed it."""
 
 
+@cache  # closed with the process
+def launcher() -> Connection:
+    """Return the connection of this forked process to its launcher."""
+    return Connection(0)
+
+
+class ChildProcess:
+    """A forked process. It ends when its connection is closed, which its launcher holds open.
+
+    It has its own session, so Ctrl-C reaches only the launcher.
+    """
+
+    def __init__(
+        self,
+        server: ForkServer,
+        number: int,
+        link: socket.socket,
+        errors: IO[bytes] | None,
+        on_end: Callable[[], None],
+    ) -> None:
+        """`link` is the launcher's end of its connection, `errors` its standard error.
+
+        `on_end` is called in another thread when it has ended.
+        """
+        self.started = time.monotonic()
+        """Monotonic time of its start in s."""
+        self.status: int | None = None
+        """Exit status; negative is the signal that killed the process, and None that it has not ended."""
+        self._server, self._number, self._on_end = server, number, on_end
+        limit = struct.pack("ll", int(SEND_S), int(SEND_S % 1.0 * 1e6))
+        for bounded in (socket.SO_SNDTIMEO, socket.SO_RCVTIMEO):
+            link.setsockopt(socket.SOL_SOCKET, bounded, limit)
+        self._link = Connection(link.detach())
+        self._errors = errors
+        self._stderr_text = ""
+        """The text of standard error; set once the file is closed."""
+        self._why = ""
+        self._over = threading.Event()
+
+    @property
+    def running(self) -> bool:
+        """True if the process has not ended yet."""
+        return not self._over.is_set()
+
+    def wait(self, timeout: float) -> bool:
+        """Wait at most `timeout` seconds, and return whether the process has ended."""
+        return self._over.wait(max(timeout, 0.0))
+
+    def signal(self, number: int) -> None:
+        """Send a signal to the process and its group, unless it has ended."""
+        if self.running:
+            self._server.signal(self._number, number)
+
+    def terminate(self) -> None:
+        """Send SIGTERM, and SIGCONT in case the process is suspended."""
+        self.signal(signal.SIGTERM)
+        self.signal(signal.SIGCONT)
+
+    def kill(self) -> None:
+        """Kill the process and its group."""
+        self.signal(signal.SIGKILL)
+
+    def end(self, timeout: float = 0.0) -> int:
+        """Wait `timeout` seconds, then kill the process; free its streams, and return its exit status."""
+        if not self.wait(timeout):
+            self.kill()
+            if not self.wait(KILL_S):
+                self._server.kill()
+                self.wait(KILL_S)
+        self.hang_up()
+        if self._errors is not None:
+            self._stderr_text = self.stderr_text()
+            self._errors.close()
+            self._errors = None
+        return -signal.SIGKILL if self.status is None else self.status
+
+    def hang_up(self) -> None:
+        """Close the connection, which ends the process."""
+        self._link.close()
+
+    def send(self, message: bytes) -> None:
+        """Send a message to the process, unless it has ended; kill it if it does not read it for SEND_S."""
+        try:
+            self._link.send_bytes(message)
+        except BlockingIOError:
+            self.kill()
+        except ConnectionError:
+            pass
+
+    def receive(self, timeout: float) -> bytes:
+        """Return the next message of the process. Raises TimeoutError, and EOFError if there is none."""
+        try:
+            if self._link.poll(max(timeout, 0.0)):
+                return self._link.recv_bytes()
+        except BlockingIOError:  # the rest of a message
+            pass
+        except OSError:
+            raise EOFError from None
+        raise TimeoutError
+
+    def stderr_text(self) -> str:
+        """Return what the process has written to its standard error, at most its last ERROR_BYTES."""
+        if self._errors is None:
+            return self._stderr_text
+        file = self._errors.fileno()
+        begin = max(0, os.fstat(file).st_size - ERROR_BYTES)
+        return os.pread(file, ERROR_BYTES, begin).decode(errors="replace").strip()
+
+    def how_ended(self) -> str:
+        """Return how the process ended, as part of an error message."""
+        assert self.status is not None
+        how = self._why or ending(self.status)
+        lines = [] if self._why else self.stderr_text().splitlines()
+        return f"{how}: {'; '.join(lines)}" if lines else how
+
+    def ended(self, status: int, why: str = "") -> None:
+        """Store the exit status, and why the process was killed if its fork server has ended."""
+        self.status, self._why = status, why
+        with (
+            suppress(OSError),
+            socket.fromfd(self._link.fileno(), socket.AF_UNIX, socket.SOCK_STREAM) as link,
+        ):
+            link.shutdown(socket.SHUT_RDWR)  # if it has not begun, the fork server still has the other end
+        self._over.set()
+        self._on_end()
+
+
+def ending(status: int) -> str:
+    """Return how a process with the exit status `status` ended; negative is the signal that killed it."""
+    return f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
+
+
 class ForkServer:
     """A fork server whose launcher is this process."""
 
     def __init__(self, warm_up: str) -> None:
-        """Start the server; it first calls `warm_up`, a module:function."""
+        """Start the server; it first imports `warm_up`, a module, or calls it, a module:function."""
         self._socket, its = socket.socketpair(type=socket.SOCK_SEQPACKET)
+        self._socket.settimeout(FORKS_CHECK_S)
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the server
         # like `multiprocessing`, so that its modules are the launcher's: another folder may have a `world`
         path = [folder or os.getcwd() for folder in sys.path]
@@ -111,29 +246,22 @@ class ForkServer:
         title: str,
         *arguments: str,
         errors: int | None = None,
-        answers: bool = False,
         on_end: Callable[[], None] = lambda: None,
     ) -> ChildProcess:
         """Fork a process that calls `main`, a module:function, with `arguments` in sys.argv.
 
-        Its standard error goes to the descriptor `errors`, otherwise to a file that the result reads. Its
-        standard output goes to a pipe if `answers` is set, otherwise to /dev/null. `on_end` is called in
-        another thread when the process has ended.
+        Its standard error goes to the descriptor `errors`, otherwise to a file that the result reads, and its
+        standard output to /dev/null. `on_end` is called in another thread when the process has ended.
         """
-        its_input, our_input = os.pipe()
-        our_output, its_output = os.pipe() if answers else (None, os.open(os.devnull, os.O_WRONLY))
+        ours, its = socket.socketpair()
         file = None
         if errors is None:
             file = tempfile.TemporaryFile()  # noqa: SIM115  # closed by the process
             errors = file.fileno()
-        with self._lock:
+        with its, self._lock:
             number = next(self._numbers)
-            process = self._running[number] = ChildProcess(
-                (our_input, our_output), file, partial(self.signal, number), self.kill, on_end
-            )
-            self._ask(ForkRequest(number, main, title, arguments), [its_input, its_output, errors])
-        os.close(its_input)
-        os.close(its_output)
+            process = self._running[number] = ChildProcess(self, number, ours, file, on_end)
+            self._ask(ForkRequest(number, main, title, arguments), [its.fileno(), errors])
         if self.gone:
             self._end_all()
         return process
@@ -186,7 +314,7 @@ class ForkServer:
     def _send(self, frame: bytes, streams: list[int]) -> None:
         """Send `frame` with `streams`.
 
-        A server that is suspended, or still imports, takes few requests (EAGAIN), and the kernel limits the
+        A server that is suspended, or still imports, takes few requests, and the kernel limits the
         descriptors in flight of all processes of a user to the number that one process may have open
         (ETOOMANYREFS). Sending is therefore retried, for TAKE_S, and without `streams` for KILL_S.
 
@@ -195,46 +323,37 @@ class ForkServer:
         give_up = time.monotonic() + (TAKE_S if streams else KILL_S)
         while True:
             try:
-                socket.send_fds(self._socket, [frame], streams, socket.MSG_DONTWAIT)
+                socket.send_fds(self._socket, [frame], streams)
             except OSError as error:
-                if error.errno not in (errno.EAGAIN, errno.ETOOMANYREFS) or time.monotonic() >= give_up:
+                late = time.monotonic() >= give_up
+                if late or not (isinstance(error, TimeoutError) or error.errno == errno.ETOOMANYREFS):
                     raise
             else:
                 return
             time.sleep(TRY_AGAIN_S)
 
     def _listen(self) -> None:
+        """Note the ends of processes until the server has ended. A suspended server would not report them."""
         decoder = msgspec.msgpack.Decoder(Ended | Imported)
-        with suppress(OSError):
-            while received := self._received():
-                match decoder.decode(received):
-                    case Imported():
-                        self._imports = False
-                    case Ended(number, status) if (process := self._running.pop(number, None)) is not None:
-                        process.ended(status)
-                    case Ended():  # it was ended before it began
-                        pass
+        while True:
+            try:
+                received = self._socket.recv(4096)
+            except TimeoutError:
+                self._process.send_signal(signal.SIGCONT)
+                continue
+            except OSError:
+                break
+            if not received:
+                break
+            match decoder.decode(received):
+                case Imported():
+                    self._imports = False
+                case Ended(number, status) if (process := self._running.pop(number, None)) is not None:
+                    process.ended(status)
+                case Ended():  # it was ended before it began
+                    pass
         self.gone = True
         self._end_all()
-
-    def _received(self) -> bytes:
-        """Return the next bytes from the server; none once it has ended.
-
-        A suspended server would not report ended processes. It is continued, then killed.
-        """
-        overdue: float | None = None
-        news = select.poll()
-        news.register(self._socket, select.POLLIN)
-        while not news.poll(1e3 * FORKS_CHECK_S):
-            if not any(process.hung_up for process in tuple(self._running.values())):
-                overdue = None
-            elif overdue is None:
-                overdue = time.monotonic()
-            else:
-                self._process.send_signal(signal.SIGCONT)
-                if time.monotonic() > overdue + KILL_S:
-                    self._process.kill()
-        return self._socket.recv(4096)
 
     def _end_all(self) -> None:
         """Mark all processes as ended, because none outlasts the server."""
@@ -249,7 +368,7 @@ _lock = threading.Lock()
 
 
 def fork_server(warm_up: str) -> ForkServer:
-    """Return this process's fork server that has called `warm_up`; start it if none runs."""
+    """Return this process's fork server that has begun with `warm_up`; start it if none runs."""
     with _lock:
         if warm_up in _servers and _servers[warm_up].gone:
             _servers.pop(warm_up).close()

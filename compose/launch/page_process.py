@@ -1,31 +1,26 @@
 """The process that serves the page of a mission from its growing journals, and its launcher's side.
 
-It writes its address to standard output when it is ready. It ends on SIGTERM, and with its launcher.
+It sends its address when it is ready. It ends on SIGTERM, and with its launcher.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from compose.errors import UserError
-from compose.launch.child import ChildProcess
-from compose.launch.supervisor import COMMAND, Supervisor
+from compose.launch.forked import ChildProcess
+from compose.launch.supervisor import Supervisor
 from protocol.network.inbox import Inbox, Interrupted
 from protocol.output import say
 
 WHAT = "the page"
 """The name of the process in messages."""
-OVER = b"."
+OVER = b""
 """The message to it that the mission has ended."""
 READY_S = 30.0
 """Time in s that it has to be ready."""
-
-
-def warm_up() -> None:
-    """Prepare a fork server for the page, which shares few modules. Importing this module does all of it."""
 
 
 class PageProcess:
@@ -62,10 +57,10 @@ def serving(folder: Path, port: int, inbox: Inbox) -> Iterator[PageProcess]:
 
     Raises UserError, with the last line of its standard error, if it is not ready within READY_S.
     """
-    children = Supervisor(inbox, "compose.launch.page_process:warm_up")
+    children = Supervisor(inbox, __name__)  # its modules are few
     arguments = ("watch", str(folder), "--launched", "--port", str(port))
     try:
-        child = children.start(WHAT, *arguments, main=COMMAND, answers=True)
+        child = children.start(WHAT, *arguments)
         address = _address(child)
         if address is None:
             child.end()
@@ -78,11 +73,7 @@ def serving(folder: Path, port: int, inbox: Inbox) -> Iterator[PageProcess]:
 
 
 def _address(child: ChildProcess) -> str | None:
-    """Return the address that the page writes when it is ready; None if it is not ready within READY_S."""
-    line, give_up = b"", time.monotonic() + READY_S
-    with suppress(TimeoutError):
-        while not line.endswith(b"\n") and (news := child.receive(give_up - time.monotonic())):
-            line += news
-    if not line.endswith(b"\n"):
-        return None
-    return line.decode().strip() or None
+    """Return the address that the page sends when it is ready; None if it is not ready within READY_S."""
+    with suppress(TimeoutError, EOFError):
+        return child.receive(READY_S).decode()
+    return None

@@ -5,12 +5,12 @@ from __future__ import annotations
 import random
 import signal
 import socket
-import sys
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from compose.errors import ENDED
+from compose.launch.forked import launcher
 from compose.launch.model_loader import trust_all
 from compose.launch.planner_loader import is_shipped
 from compose.launch.supervisor import ChildFailed, Supervisor
@@ -41,8 +41,8 @@ _reservations: deque[socket.socket] = deque()
 def free_endpoint(protocol: str = "tcp") -> str:
     """Return a loopback endpoint on which no process listens, and that no other call returns meanwhile.
 
-    On Linux, the port stays reserved also while nothing listens there, as after a crash of its process. A
-    process that connects again would otherwise reach another run.
+    The port stays reserved also while nothing listens there, as after a crash of its process. A process that
+    connects again would otherwise reach another run.
     """
     ports = random.SystemRandom()
     while True:
@@ -53,20 +53,16 @@ def free_endpoint(protocol: str = "tcp") -> str:
         except OSError:
             reservation.close()
             continue
-        if sys.platform == "linux":  # elsewhere, nobody could listen
-            reservation.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            _reservations.append(reservation)
-            if len(_reservations) > RESERVED:
-                _reservations.popleft().close()
-        else:
-            reservation.close()
+        reservation.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        _reservations.append(reservation)
+        if len(_reservations) > RESERVED:
+            _reservations.popleft().close()
         return f"{protocol}/127.0.0.1:{port}"
 
 
 def scenario_from_launcher() -> Scenario:
-    """Return the scenario that the launcher sent to the standard input of this child process."""
-    size = int.from_bytes(sys.stdin.buffer.read(4), "big")
-    scenario: Scenario = decode(sys.stdin.buffer.read(size), Scenario, MAX_FRAME_BYTES)
+    """Return the scenario that the launcher has sent to this child process."""
+    scenario: Scenario = decode(launcher().recv_bytes(), Scenario, MAX_FRAME_BYTES)
     trust_all(scenario)
     return scenario
 
@@ -191,7 +187,7 @@ class _Mission:
         kills = [word for kill in self.kills[name] for word in ("--kill", kill.text)]
         child = self.children.start(name, *self._arguments[name], *kills)
         if name == WORLD:
-            child.send(len(self._scenario).to_bytes(4, "big") + self._scenario)
+            child.send(self._scenario)
 
     def _restart(self, name: str) -> None:
         """Restart a child that was killed.

@@ -7,8 +7,7 @@ from collections.abc import Callable
 
 from compose.errors import ENDED
 from compose.launch import forked
-from compose.launch.child import ChildProcess
-from compose.launch.forked import ForkServer
+from compose.launch.forked import ChildProcess, ForkServer
 from protocol.network.inbox import Inbox
 from protocol.output import say
 
@@ -38,7 +37,7 @@ class Supervisor:
     def __init__(self, inbox: Inbox, warm_up: str = PREPARE_MISSIONS) -> None:
         """Put "ended", with the name of the child, into `inbox` whenever a child ends.
 
-        `warm_up` is the function that prepares the fork server of the children.
+        `warm_up` is the module or function that prepares the fork server of the children.
         """
         self._inbox = inbox
         self._warm_up = warm_up
@@ -49,15 +48,15 @@ class Supervisor:
     def __getitem__(self, name: str) -> ChildProcess:
         return self._children[name]
 
-    def start(self, name: str, *arguments: str, main: str = COMMAND, answers: bool = False) -> ChildProcess:
+    def start(self, name: str, *arguments: str, main: str = COMMAND) -> ChildProcess:
         """Start the child `name` with `arguments` in sys.argv; end an earlier child of that name.
 
-        It calls `main`, a module:function. With `answers`, its standard output can be received.
+        It calls `main`, a module:function.
         """
         if name in self._children:
             self._children[name].end()
         child = forked.fork_server(self._warm_up).start(
-            main, "tandem", *arguments, answers=answers, on_end=lambda: self._inbox.put("ended", name)
+            main, "tandem", *arguments, on_end=lambda: self._inbox.put("ended", name)
         )
         self._children[name] = child
         return child

@@ -1,8 +1,7 @@
 """The process in which trials run, forked from a fork server that has imported this module.
 
-It reads chunks from its standard input and writes one row per trial to its standard output. Each is a frame:
-its length in four bytes (big endian), then msgpack. The process ends when its standard input is closed, even
-during a trial that hangs.
+It receives chunks from its launcher, and sends one row per trial, both as msgpack. The process ends when the
+connection is closed, even during a trial that hangs.
 """
 
 from __future__ import annotations
@@ -17,13 +16,14 @@ from collections.abc import Callable
 from functools import cache
 from importlib import import_module
 from queue import Empty, SimpleQueue
-from typing import Any, BinaryIO
+from typing import Any
 
 import msgspec
 from msgspec.structs import replace
 
 from compose.errors import Unworkable
 from compose.launch.class_loader import trust
+from compose.launch.forked import launcher
 from compose.launch.model_loader import trust_all
 from compose.scenario.scenario_file import ScenarioTemplate, validate
 from compose.sweep import trial
@@ -33,8 +33,7 @@ from protocol.output import one_line
 PLAY = "compose.sweep.trial:run_trial"
 """The default function that runs a trial."""
 READY = b""
-"""The first frame, sent when all modules are imported."""
-LENGTH_BYTES = 4
+"""The first message, sent when all modules are imported."""
 MAX_ERROR = 300
 """The largest length of an error text, in characters."""
 WORKER_IDLE_S = 300.0
@@ -71,27 +70,21 @@ class Chunk(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(self, trials=self.trials[done:], seeds=self.seeds[done:])
 
 
-def warm_up() -> None:
-    """Prepare a fork server for such processes. Importing this module does all of it."""
-
-
 def main() -> None:
-    """Run trials until standard input is closed, or until there has been no work for WORKER_IDLE_S."""
+    """Run trials until the connection is closed, or until there has been no work for WORKER_IDLE_S."""
     folder = sys.argv[1]
     tempfile.tempdir = folder  # removed by the owner, with all files that trials leave in it
-    answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # the output of a trial must not mix with the rows
     chunks: SimpleQueue[Chunk] = SimpleQueue()
     threading.Thread(target=_listen, args=(chunks, folder), daemon=True).start()
     try:
-        _play(chunks, answers)
+        _play(chunks)
     finally:  # the reader of the rows is gone, or there was no work for WORKER_IDLE_S
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _play(chunks: SimpleQueue[Chunk], answers: BinaryIO) -> None:
-    """Run the trials of `chunks`, and write their rows to `answers`."""
-    _answer(answers, READY)
+def _play(chunks: SimpleQueue[Chunk]) -> None:
+    """Run the trials of `chunks`, and send their rows."""
+    launcher().send_bytes(READY)
     encoder = msgspec.msgpack.Encoder()
     while True:
         try:
@@ -99,28 +92,18 @@ def _play(chunks: SimpleQueue[Chunk], answers: BinaryIO) -> None:
         except Empty:
             return
         for number, seed in zip(chunk.trials, chunk.seeds, strict=True):
-            _answer(answers, encoder.encode(played(chunk, number, seed)))
+            launcher().send_bytes(encoder.encode(played(chunk, number, seed)))
 
 
 def _listen(chunks: SimpleQueue[Chunk], folder: str) -> None:
-    """Read chunks from standard input. End the process when it is closed, and remove `folder`."""
+    """Receive chunks. End the process when the connection is closed, and remove `folder`."""
     decoder = msgspec.msgpack.Decoder(Chunk)
     try:
-        while (head := sys.stdin.buffer.read(LENGTH_BYTES)) != b"":
-            chunks.put(decoder.decode(sys.stdin.buffer.read(int.from_bytes(head, "big"))))
-    finally:  # the owner has closed standard input, or has ended
+        while True:
+            chunks.put(decoder.decode(launcher().recv_bytes()))
+    finally:  # the owner has closed the connection, or has ended
         shutil.rmtree(folder, ignore_errors=True)
         os._exit(0)
-
-
-def _answer(answers: BinaryIO, body: bytes) -> None:
-    answers.write(framed(body))
-    answers.flush()
-
-
-def framed(body: bytes) -> bytes:
-    """Return `body` as a frame, with its length in front."""
-    return len(body).to_bytes(LENGTH_BYTES, "big") + body
 
 
 def played(chunk: Chunk, number: int, seed: int) -> trial.TrialRow:

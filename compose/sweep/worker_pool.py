@@ -15,7 +15,7 @@ import msgspec
 
 from compose.launch.forked import fork_server
 from compose.sweep.trial import lost
-from compose.sweep.worker import LENGTH_BYTES, MAX_ERROR, READY, Chunk, framed
+from compose.sweep.worker import MAX_ERROR, READY, Chunk
 from protocol.output import one_line
 
 _DECODER = msgspec.msgpack.Decoder(Chunk)
@@ -38,41 +38,28 @@ class WorkerProcess:
 
     def __init__(self) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="tandem-trials-", ignore_cleanup_errors=True)
-        self._child = fork_server("compose.sweep.worker:warm_up").start(
-            "compose.sweep.worker:main", "tandem sweep worker", self._folder.name, answers=True
+        self._child = fork_server("compose.sweep.worker").start(
+            "compose.sweep.worker:main", "tandem sweep worker", self._folder.name
         )
-        self._read = b""
 
     def ask(self, chunk: Chunk) -> None:
         """Send the trials of `chunk` to the process, which runs them."""
-        self._child.send(framed(msgspec.msgpack.encode(chunk)))
+        self._child.send(msgspec.msgpack.encode(chunk))
 
     def answer(self, timeout: float) -> bytes:
-        """Return the next frame. Raises Hung after `timeout` seconds, and Died if the process has ended."""
-        give_up = time.monotonic() + timeout
-        while (body := self._frame()) is None:
-            try:
-                news = self._child.receive(give_up - time.monotonic())
-            except TimeoutError:
-                raise Hung from None
-            if not news:
-                raise Died(self._how())
-            self._read += news
-        return body
-
-    def _frame(self) -> bytes | None:
-        """Remove and return the first frame that has been read; None if it is incomplete."""
-        end = LENGTH_BYTES + int.from_bytes(self._read[:LENGTH_BYTES], "big")
-        if len(self._read) < max(end, LENGTH_BYTES):
-            return None
-        body, self._read = self._read[LENGTH_BYTES:end], self._read[end:]
-        return body
+        """Return the next message. Raises Hung after `timeout` seconds, and Died if the process has ended."""
+        try:
+            return self._child.receive(timeout)
+        except TimeoutError:
+            raise Hung from None
+        except EOFError:
+            raise Died(self._how()) from None
 
     def _how(self) -> str:
         """Return how the process ended, with the last line of its standard error."""
-        if not self._child.wait(1.0):  # its standard output is closed, but it still runs
+        if not self._child.wait(1.0):  # its connection is closed, but it still runs
             self.kill()
-            return "it closed its standard output"
+            return "it closed its connection"
         status = self._child.status or 0
         errors = self._child.stderr_text()[-MAX_ERROR:].splitlines()
         how = f"killed by {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"

@@ -7,11 +7,8 @@ from __future__ import annotations
 
 import os
 import resource
-import sys
 import threading
-import time
 from collections.abc import Callable
-from contextlib import suppress
 from importlib import import_module
 from typing import Any
 
@@ -19,13 +16,10 @@ import msgspec
 
 from compose.errors import UserError
 from compose.launch import class_loader, model_loader
-from compose.launch.child import END_CHECK_S, ChildProcess
-from compose.launch.forked import ForkServer
+from compose.launch.forked import KILL_S, ChildProcess, fork_server, launcher
 from protocol.output import one_line
 from world.world_models import OWN_MODELS
 
-REQUEST_LENGTH_BYTES = 4
-"""The number of bytes of the length before a request."""
 MOST_MEMORY_BYTES = 4 << 30
 """The largest size in bytes of the data of a process."""
 MOST_FILE_BYTES = 1 << 30
@@ -62,7 +56,7 @@ class RequestedWork:
     def __init__(self) -> None:
         self.over = False
         """True once the server is stopping."""
-        self._server: ForkServer | None = None
+        self._children: set[ChildProcess] = set()
         self._lock = threading.Lock()
 
     def result(self, function: Callable[..., Any], *arguments: Any, within: float, late: str) -> Any:
@@ -74,57 +68,35 @@ class RequestedWork:
         request = _Request(
             f"{function.__module__}:{function.__name__}", arguments, class_loader.trusted(), tuple(OWN_MODELS)
         )
-        body = msgspec.msgpack.encode(request)
-        child = self._forked()
+        with self._lock:
+            self._check()
+            child = fork_server(f"{__name__}:warm_up").start(
+                f"{__name__}:main", f"tandem watch: requested work of {os.getpid()}"
+            )
+            self._children.add(child)
         try:
-            child.send(len(body).to_bytes(REQUEST_LENGTH_BYTES, "big") + body)
-            answer = self._received(child, within, late)
+            child.send(msgspec.msgpack.encode(request))
+            answer = msgspec.msgpack.decode(child.receive(within), type=_Answer)
+        except TimeoutError:
+            self._check()
+            raise UserError(late) from None
+        except EOFError:
+            child.end(KILL_S)
+            self._check()
+            raise UserError(f"it cannot be computed: its process {child.how_ended()}") from None
         finally:
             child.end()
-        if not answer:
-            raise UserError(f"it cannot be computed: its process {child.how_ended()}")
-        found = msgspec.msgpack.decode(answer, type=_Answer)
-        if found.error is not None:
-            raise UserError(found.error)
-        return found.result
+            self._children.discard(child)
+        if answer.error is not None:
+            raise UserError(answer.error)
+        return answer.result
 
     def stop(self) -> None:
         """Kill all processes; requests that wait for them, and later ones, end with a UserError."""
-        self.over = True
         with self._lock:
-            if self._server is not None:
-                self._server.kill()
-
-    def close(self) -> None:
-        """Free what is left of the processes, once no request waits any more."""
-        self.stop()
-        if self._server is not None:
-            self._server.close()
-
-    def _forked(self) -> ChildProcess:
-        with self._lock:
-            self._check()
-            if self._server is not None and self._server.gone:
-                self._server.close()
-                self._server = None
-            if self._server is None:
-                self._server = ForkServer(f"{__name__}:warm_up")
-            return self._server.start(
-                f"{__name__}:main", f"tandem watch: requested work of {os.getpid()}", answers=True
-            )
-
-    def _received(self, child: ChildProcess, within: float, late: str) -> bytes:
-        """Return all that `child` writes. `stop` ends it by killing it."""
-        give_up, answer = time.monotonic() + within, b""
-        while (left := give_up - time.monotonic()) > 0.0:
-            with suppress(TimeoutError):
-                if not (part := child.receive(left)):
-                    child.wait(END_CHECK_S)
-                    self._check()
-                    return answer
-                answer += part
-        self._check()
-        raise UserError(late)
+            self.over = True
+            for child in tuple(self._children):
+                child.kill()
 
     def _check(self) -> None:
         if self.over:
@@ -140,15 +112,11 @@ def warm_up() -> None:
 
 
 def main() -> None:
-    """Call the function of the request on standard input, and write its result to standard output."""
-    answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # whatever else is printed must not mix with the answer
+    """Call the function of the request that the launcher sends, and send its result."""
     resource.setrlimit(resource.RLIMIT_DATA, (MOST_MEMORY_BYTES, MOST_MEMORY_BYTES))
     resource.setrlimit(resource.RLIMIT_FSIZE, (MOST_FILE_BYTES, MOST_FILE_BYTES))
-    size = int.from_bytes(sys.stdin.buffer.read(REQUEST_LENGTH_BYTES), "big")
-    request = msgspec.msgpack.decode(sys.stdin.buffer.read(size), type=_Request)
-    answers.write(msgspec.msgpack.encode(_answer(request)))
-    answers.close()
+    request = msgspec.msgpack.decode(launcher().recv_bytes(), type=_Request)
+    launcher().send_bytes(msgspec.msgpack.encode(_answer(request)))
 
 
 def _answer(request: _Request) -> _Answer:

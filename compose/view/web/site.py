@@ -105,7 +105,7 @@ class Site:
 
     def stop(self) -> None:
         """Stop listening on the network, and delete the recordings of trials and of changed missions."""
-        self.work.close()
+        self.work.stop()
         for listener in self.listeners:
             listener.stop()
         if self.trials is not None:
