@@ -8,7 +8,7 @@ import sys
 import msgspec
 
 from compose.scenario.scenario_file import setting
-from compose.sweep.worker import Chunk
+from compose.sweep.worker import Chunk, TrialOptions
 
 AT_ONCE = """
 import sys, threading
@@ -63,6 +63,6 @@ def test_several_threads_can_be_the_first_that_decode_messages() -> None:
 
 
 def test_several_threads_can_be_the_first_that_decode_chunks_of_a_sweep() -> None:
-    chunk = Chunk(0, (0,), (1,), setting("paper-1"), processes=False, timeout=1.0)
+    chunk = Chunk(0, (0,), (1,), setting("paper-1"), TrialOptions(1, processes=False, timeout=1.0))
     for _ in range(3):
         assert of_four_threads(CHUNKS, msgspec.msgpack.encode(chunk)) == (0, "4")

@@ -38,7 +38,7 @@ runpy.run_module("tandem", run_name="__main__", alter_sys=True)
 """The program `tandem`, which receives a signal when it exits."""
 LOST = """
 import signal
-from compose.launch.interruption import INTERRUPTION
+from compose.launch.signals import INTERRUPTION
 
 class Finalized:
     def __del__(self):

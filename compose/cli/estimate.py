@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 from compose.errors import BROKEN_PIPE, ENDED, NOT_LOCALISED, STOPPED_STATUS, CannotWrite, UserError
 from compose.extras import need
-from compose.launch.signals import until_signal
 from compose.launch.solver_loader import solver_named
 from compose.recording.recording_files import make_folder
 from compose.terminal.outcome import counting
@@ -85,7 +84,7 @@ def _followed(
     if options.out is not None:
         make_folder(options.out)
     heading = [",".join(ESTIMATE_COLUMNS)]
-    with stream, until_signal() as stopped:
+    with stream:
         try:
             for row in estimate.rows(rows_as_they_arrive(stream, name)):
                 say(*heading, csv_line(row))
@@ -93,7 +92,9 @@ def _followed(
         except BrokenPipeError:  # the files are of the estimates so far
             discard(sys.stdout)
             return *estimate.result(), BROKEN_PIPE
-    return *estimate.result(), STOPPED_STATUS if stopped else None
+        except KeyboardInterrupt:
+            return *estimate.result(), STOPPED_STATUS
+    return *estimate.result(), None
 
 
 def _doubted(name: str, doubt: str) -> None:

@@ -19,7 +19,7 @@ from typing import NoReturn
 from compose.cli.commands import COMMANDS, CommandEntry
 from compose.cli.removed import refuse_removed
 from compose.errors import BROKEN_PIPE, BUG, FAILED, STOPPED_STATUS, USER_ERROR, UserError
-from compose.launch.interruption import INTERRUPTION
+from compose.launch.signals import INTERRUPTION
 from compose.terminal import text_width
 from compose.terminal.invocation import program
 from protocol import limits

@@ -13,9 +13,8 @@ from compose.cli import export_files
 from compose.errors import FAILED, STOPPED_STATUS, UserError
 from compose.extras import need
 from compose.launch import processes, supervisor
-from compose.launch.interruption import INTERRUPTION
 from compose.launch.page_process import PageProcess, serving
-from compose.launch.signals import stop_by_signal
+from compose.launch.signals import INTERRUPTION, stop_by_signal
 from compose.recording.kills_file import KILLS
 from compose.recording.recording_files import folder_for, not_recorded
 from compose.recording.run import Run, read

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 
 from compose.errors import FAILED, LOCALISED, NOT_LOCALISED, STOPPED_STATUS, UserError
 from compose.extras import need
-from compose.launch.interruption import INTERRUPTION
-from compose.launch.signals import stop_by_signal
+from compose.launch.signals import INTERRUPTION, stop_by_signal
 from compose.sweep import spec
 from compose.sweep.cells import cell_at, trial_table
 from compose.sweep.spec import Sweep

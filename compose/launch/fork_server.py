@@ -25,6 +25,7 @@ from setproctitle import setproctitle
 from compose.launch.forked import REQUEST_BYTES, STREAMS, Ended, ForkRequest, Imported, Signal
 from protocol.output import one_line
 
+PRCTL = ctypes.CDLL(None).prctl
 PR_SET_PDEATHSIG = 1
 """The option of prctl(2) for a signal on the end of the parent, from <sys/prctl.h>."""
 NOT_FORKED = 71
@@ -57,14 +58,14 @@ class _RequestLoop:
         self._report(Imported())
         while True:
             if self._launcher.fileno() in self._wait(None):
-                received = self._request()
-                if received is None:
+                frame, streams, _, _ = socket.recv_fds(self._launcher, REQUEST_BYTES, len(STREAMS))
+                if not frame:
                     return None
-                request, streams = received
-                if isinstance(request, Signal):
-                    self._send(request)
-                elif self._fork(request, streams):
-                    return request
+                match self._decoder.decode(frame):
+                    case Signal() as request:
+                        self._send(request)
+                    case ForkRequest() as request if self._fork(request, streams):
+                        return request
 
     def linger(self) -> None:
         """Wait at most LINGER_S until all children have ended."""
@@ -78,12 +79,11 @@ class _RequestLoop:
         found = {source for source, _ in self._news.poll(None if within is None else 1e3 * within)}
         if self._ends in found:
             os.read(self._ends, select.PIPE_BUF)
-            self._reap()
+            with suppress(ChildProcessError):
+                while (ended := os.waitpid(-1, os.WNOHANG))[0]:
+                    pid, status = ended
+                    self._report(Ended(self._numbers.pop(pid), os.waitstatus_to_exitcode(status)))
         return found
-
-    def _request(self) -> tuple[ForkRequest | Signal, list[int]] | None:
-        request, streams, _, _ = socket.recv_fds(self._launcher, REQUEST_BYTES, len(STREAMS))
-        return (self._decoder.decode(request), streams) if request else None
 
     def _fork(self, start: ForkRequest, streams: list[int]) -> bool:
         """Fork a process, and return whether this is the child."""
@@ -114,12 +114,6 @@ class _RequestLoop:
                 except ProcessLookupError:  # it has not created its process group yet
                     os.kill(pid, request.signal)
 
-    def _reap(self) -> None:
-        with suppress(ChildProcessError):
-            while (found := os.waitpid(-1, os.WNOHANG))[0]:
-                pid, status = found
-                self._report(Ended(self._numbers.pop(pid), os.waitstatus_to_exitcode(status)))
-
     def _report(self, event: Ended | Imported) -> None:
         with suppress(OSError):  # the launcher has ended
             self._launcher.send(msgspec.msgpack.encode(event))
@@ -129,7 +123,7 @@ def _become(start: ForkRequest, streams: list[int], parent: int) -> None:
     """Give this forked process its own session, default signals, `streams`, arguments and title."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     os.setsid()
-    _signal_when_parent_ends(signal.SIGKILL)
+    PRCTL(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(128 + signal.SIGKILL)
     for number, stream in zip(STREAMS, streams, strict=True):
@@ -137,11 +131,6 @@ def _become(start: ForkRequest, streams: list[int], parent: int) -> None:
         os.close(stream)
     sys.argv = [start.title, *start.arguments]
     setproctitle(one_line(" ".join(sys.argv)))
-
-
-def _signal_when_parent_ends(number: signal.Signals) -> None:
-    """Send `number` to this process when its parent ends."""
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, number)
 
 
 def _call(name: str) -> None:
@@ -155,7 +144,7 @@ def main() -> None:
     """Import or call WARM_UP, and fork processes until the launcher has ended."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
-    _signal_when_parent_ends(signal.SIGCONT)  # a suspended server must notice the end, too
+    PRCTL(PR_SET_PDEATHSIG, signal.SIGCONT)  # a suspended server must notice the end, too
     _call(sys.argv[1])
     setproctitle(f"tandem fork-server of {os.getppid()}")
     gc.collect()

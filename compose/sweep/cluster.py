@@ -21,9 +21,9 @@ from distributed.security import Security
 
 from compose.errors import UserError
 from compose.sweep import worker_pool
-from compose.sweep.remaining_work import EngineFailed, TrialOptions, Work, chunks_of
+from compose.sweep.remaining_work import EngineFailed, Work, chunks_of
 from compose.sweep.trial import TrialRow, lost
-from compose.sweep.worker import MAX_ERROR, Chunk
+from compose.sweep.worker import MAX_ERROR, Chunk, TrialOptions
 from protocol.network.inbox import Inbox
 from protocol.output import one_line
 

@@ -16,12 +16,12 @@ from compose.scenario.scenario_file import trust_classes
 from compose.sweep import SUMMARY_CSV
 from compose.sweep.cells import Cell, RefusedCell, setting_of
 from compose.sweep.paired_differences import PairedDifference, differences_csv, paired_differences
-from compose.sweep.remaining_work import EngineFailed, TrialOptions, Work
+from compose.sweep.remaining_work import EngineFailed, Work
 from compose.sweep.results_folder import Folder, opened
 from compose.sweep.spec import Sweep
 from compose.sweep.statistics import CellSummary, counted, header, summary_csv
 from compose.sweep.trial import TrialRow
-from compose.sweep.worker import PLAY
+from compose.sweep.worker import PLAY, TrialOptions
 from protocol import files
 from protocol.network.inbox import Inbox, Interrupted
 

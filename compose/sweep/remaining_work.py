@@ -13,9 +13,8 @@ import msgspec
 
 from compose.scenario.scenario_file import ScenarioTemplate
 from compose.sweep.cells import trial_seed
-from compose.sweep.draws import Draws
 from compose.sweep.trial import TrialRow
-from compose.sweep.worker import Chunk
+from compose.sweep.worker import Chunk, TrialOptions
 
 CHUNK_S = 1.0
 """The wall time in s that a chunk should take: long compared to its overhead, short enough to lose."""
@@ -74,23 +73,6 @@ class Work(msgspec.Struct):
         return max(1, min(round(fitting), share, MAX_CHUNK))
 
 
-class TrialOptions(msgspec.Struct, frozen=True):
-    """The options that all trials of a sweep have in common."""
-
-    seed: int
-    """seed of the sweep"""
-    processes: bool
-    """true to run trials as processes over Zenoh"""
-    timeout: float
-    """wall time in s that a trial may take"""
-    play: str
-    """function that runs a trial, as module:function"""
-    audit: bool
-    """true to audit the journals of every trial"""
-    draws: Draws = Draws()
-    """values drawn for each trial"""
-
-
 def chunks_of(
     work: Sequence[Work], orders: TrialOptions, threads: Callable[[], int]
 ) -> Iterator[tuple[Chunk, Work]]:
@@ -105,18 +87,5 @@ def chunks_of(
             trials = tuple(source.trials[source.given : source.given + size])
             source.given += size
             seeds = tuple([trial_seed(orders.seed, source.key, trial) for trial in trials])
-            yield (
-                Chunk(
-                    source.cell,
-                    trials,
-                    seeds,
-                    source.setting,
-                    orders.processes,
-                    orders.timeout,
-                    orders.play,
-                    orders.audit,
-                    orders.draws,
-                    source.table if orders.draws else {},
-                ),
-                source,
-            )
+            table = source.table if orders.draws else {}
+            yield Chunk(source.cell, trials, seeds, source.setting, orders, table), source

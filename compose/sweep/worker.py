@@ -43,15 +43,11 @@ The command that started the sweep may have been killed while the Dask worker th
 """
 
 
-class Chunk(msgspec.Struct, frozen=True):
-    """Trials of one cell that a process runs in sequence."""
+class TrialOptions(msgspec.Struct, frozen=True):
+    """The options that all trials of a sweep have in common."""
 
-    cell: int
-    trials: tuple[int, ...]
-    """indices of the trials within the cell"""
-    seeds: tuple[int, ...]
-    """seed of each trial"""
-    setting: ScenarioTemplate
+    seed: int
+    """seed of the sweep"""
     processes: bool
     """true to run trials as processes over Zenoh"""
     timeout: float
@@ -62,12 +58,24 @@ class Chunk(msgspec.Struct, frozen=True):
     """true to audit the journals of every trial"""
     draws: Draws = Draws()
     """values drawn for each trial"""
+
+
+class Chunk(msgspec.Struct, frozen=True):
+    """Trials of one cell that a process runs in sequence."""
+
+    cell: int
+    trials: tuple[int, ...]
+    """indices of the trials within the cell"""
+    seeds: tuple[int, ...]
+    """seed of each trial"""
+    setting: ScenarioTemplate
+    options: TrialOptions
     table: dict[str, Any] = {}
     """parsed table of the cell's scenario file; empty without draws"""
 
     def after(self, done: int) -> Chunk:
         """Return the chunk without its first `done` trials."""
-        return msgspec.structs.replace(self, trials=self.trials[done:], seeds=self.seeds[done:])
+        return replace(self, trials=self.trials[done:], seeds=self.seeds[done:])
 
 
 def main() -> None:
@@ -108,23 +116,23 @@ def _listen(chunks: SimpleQueue[Chunk], folder: str) -> None:
 
 def played(chunk: Chunk, number: int, seed: int) -> trial.TrialRow:
     """Run one trial, and return its row. An exception gives the row of a lost trial."""
-    began = time.perf_counter()
+    began, options = time.perf_counter(), chunk.options
     try:
-        player = _function(chunk.play)
+        player = _function(options.play)
         setting, drawn = chunk.setting, {}
         trust(setting.scenario.planner_name)  # the user has named it in the scenario or in the sweep
         trust_all(setting.scenario)
         try:
-            if chunk.draws:
-                table = chunk.draws.table(chunk.table, seed)
-                drawn = chunk.draws.values(table)
+            if options.draws:
+                table = options.draws.table(chunk.table, seed)
+                drawn = options.draws.values(table)
                 setting = validate(table, "its draws")
             scenario = setting.seeded(seed)
         except Unworkable as error:
             why = str(error).removeprefix("its draws: ").removeprefix(f"{setting.source}: ")
             return trial.refused(chunk.cell, number, seed, why, drawn)
         kills = setting.kills(seed) if setting.file.kill else None
-        row = player(trial.Trial(chunk.cell, number, scenario, chunk.processes, chunk.audit, kills))
+        row = player(trial.Trial(chunk.cell, number, scenario, options.processes, options.audit, kills))
         return replace(row, drawn=drawn) if drawn else row
     except BaseException as error:  # noqa: BLE001  # SystemExit from a trial must not end the process
         error_text = one_line(f"{type(error).__name__}: {error}")[:MAX_ERROR]

@@ -149,6 +149,7 @@ def run(sweep: str, encoded: bytes) -> list[bytes]:
     chunk = _DECODER.decode(encoded)
     children = _children.setdefault(sweep, _Children())
     rows: list[bytes] = []
+    timeout = chunk.options.timeout
     while len(rows) < len(chunk.trials) and (taken := children.take()) is not None:
         child, reused = taken
         asked = len(rows)
@@ -156,10 +157,10 @@ def run(sweep: str, encoded: bytes) -> list[bytes]:
         try:
             child.ask(chunk.after(asked))
             for _ in chunk.trials[asked:]:
-                rows.append(child.answer(chunk.timeout))
+                rows.append(child.answer(timeout))
                 began = time.perf_counter()
         except Hung:
-            error = f"hung: no answer within {chunk.timeout:g} s"
+            error = f"hung: no answer within {timeout:g} s"
         except Died as death:
             if reused and len(rows) == asked:  # a reused process may have ended earlier: try a new one
                 children.drop(child)

@@ -22,7 +22,7 @@ from compose.sweep.spec import Sweep
 from compose.sweep.table import of_rows, schema_of
 from compose.sweep.trial import Trial, TrialRow
 from compose.sweep.trial_mission import run_in_process
-from compose.sweep.worker import Chunk, played
+from compose.sweep.worker import Chunk, TrialOptions, played
 from tests.expected.results import SAMPLE, STRIDE
 
 CHUNK = 4
@@ -55,6 +55,9 @@ def play(sweep: Sweep, jobs: int) -> tuple[pa.Table, list[str], float]:
 
 def _chunks(sweep: Sweep, every: list[Cell]) -> Iterator[Chunk]:
     """Yield the trials of all cells; those of the last cells, which may be the longest, first."""
+    options = TrialOptions(
+        sweep.seed, False, sweep.trial_timeout, play=f"{__name__}:run_trial", draws=sweep.draws
+    )
     for cell in reversed(every):
         setting = setting_of(sweep, cell)
         assert not isinstance(setting, RefusedCell)
@@ -63,17 +66,7 @@ def _chunks(sweep: Sweep, every: list[Cell]) -> Iterator[Chunk]:
             trials = tuple(range(first, min(first + CHUNK, begin + sweep.trials)))
             seeds = tuple([trial_seed(sweep.seed, cell.key, trial) for trial in trials])
             table = cell.table if sweep.draws else {}
-            yield Chunk(
-                cell.index,
-                trials,
-                seeds,
-                setting,
-                False,
-                sweep.trial_timeout,
-                play=f"{__name__}:run_trial",
-                draws=sweep.draws,
-                table=table,
-            )
+            yield Chunk(cell.index, trials, seeds, setting, options, table)
 
 
 def run_trial(trial: Trial) -> TrialRow:
@@ -104,7 +97,7 @@ def _rows(chunk: Chunk) -> tuple[list[TrialRow], dict[tuple[int, int], str], flo
     DECISIONS.clear()
     began, rows = time.process_time(), []
     for trial, seed in zip(chunk.trials, chunk.seeds, strict=True):
-        signal.setitimer(signal.ITIMER_REAL, chunk.timeout)
+        signal.setitimer(signal.ITIMER_REAL, chunk.options.timeout)
         row = played(chunk, trial, seed)  # it catches the exception
         rows.append(replace(row, trial=trial - chunk.cell * STRIDE))
         signal.setitimer(signal.ITIMER_REAL, 0.0)
