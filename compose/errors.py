@@ -1,6 +1,8 @@
 """The exit statuses of all commands, and the exceptions that stand for a user's mistake."""
 
 import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from protocol.messages import Outcome
 
@@ -49,6 +51,24 @@ class CannotWrite(UserError):
         super().__init__(f"{place} cannot be written: {error.strerror or error}")
         if error.errno in FULL_DISK:
             self.exit_status = FAILED
+
+
+@contextmanager
+def writing(place: object) -> Iterator[None]:
+    """Raise an OSError in this context as CannotWrite, for `place`."""
+    try:
+        yield
+    except OSError as error:
+        raise CannotWrite(place, error) from None
+
+
+@contextmanager
+def user_code(what: str, kind: type[UserError] = UserError) -> Iterator[None]:
+    """Raise whatever code of the user raises in this context as a `kind` of error that begins with `what`."""
+    try:
+        yield
+    except (Exception, SystemExit) as error:  # noqa: BLE001  # it may raise anything
+        raise kind(f"{what} {type(error).__name__}: {error}") from None
 
 
 # --- scenarios --------------------------------------------------------------------------------------

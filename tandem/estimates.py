@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from compose.errors import CannotWrite, UserError
+from compose.errors import UserError, writing
 from compose.extras import need
 from compose.launch.solver_loader import GuardedSolver
 from compose.recording.estimating.estimate_rows import EstimateSummary, PoseEstimateRow
@@ -73,10 +73,8 @@ class PoseEstimates(msgspec.Struct, frozen=True, dict=True, eq=False):
         """Write `estimate.csv` and `estimate.json` to `folder`, and return its path. Raises UserError."""
         out = Path(folder)
         make_folder(out)
-        try:
+        with writing(out):
             write_estimate(out, self.result.rows, self.summary)
-        except OSError as error:
-            raise CannotWrite(out, error) from None
         return out
 
     def __repr__(self) -> str:

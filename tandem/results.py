@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from compose.errors import CannotWrite, UserError
+from compose.errors import UserError, writing
 from compose.extras import need
 from compose.figures import PICTURES
 from compose.launch import model_loader
@@ -196,13 +196,11 @@ class Run(msgspec.Struct, frozen=True, dict=True, eq=False):
         with user_errors(Path(str(self.model.source))):
             self.model.readable(*self.model.journals)
         make_folder(out)
-        try:
+        with writing(out):
             for name, journal in self.model.journals.items():
                 files.write(out / name, packed(journal.frames))
             if self.model.world is not None:
                 leave(self.model, self.summary, out)
-        except OSError as error:
-            raise CannotWrite(out, error) from None
         return out
 
     # --- display ---

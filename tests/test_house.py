@@ -35,8 +35,8 @@ BELOW = {
 <<<<<<< HEAD
 BUDGETS = {"protocol": 4_337, "agent": 16_633, "world": 4_277, "compose": 29_121, "tandem": 1_551}
 =======
-BUDGETS = {"protocol": 4_337, "agent": 16_623, "world": 4_277, "compose": 28_910, "tandem": 1_551}
->>>>>>> fceb93b5 (Handle signals in one module, and give trials one set of options)
+BUDGETS = {"protocol": 4_337, "agent": 16_623, "world": 4_277, "compose": 28_895, "tandem": 1_547}
+>>>>>>> d1c91e58 (Turn errors of files and of users' code into lines in one place each)
 """The largest number of lines of Python and C of each package. Raising one needs a reason in the commit."""
 
 SHELL = {

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
-from compose.errors import ENDED, CannotWrite, UserError
+from compose.errors import ENDED, UserError, writing
 from compose.terminal.outcome import counting
 from compose.terminal.text_width import tell
 from protocol import files
@@ -31,10 +31,8 @@ def main(options: argparse.Namespace) -> int:
     anchors = frozenset([one.id for one in recording.anchors])
     text = profile_toml(found, anchors, f"{found.source} of {recording.source}")
     if options.out is not None:
-        try:
+        with writing(f"--out: {options.out}"):
             files.write(options.out, text)
-        except OSError as error:
-            raise CannotWrite(f"--out: {options.out}", error) from None
     tell(*_lines(found))
     say(*(["", *text.splitlines()] if options.out is None else [str(options.out)]))
     return ENDED

@@ -7,7 +7,7 @@ import os
 import shlex
 from pathlib import Path
 
-from compose.errors import ENDED, CannotWrite, UserError
+from compose.errors import ENDED, UserError, writing
 from compose.hardware.compose_file import compose_file
 from compose.launch.planner_loader import is_shipped
 from compose.scenario.scenario_file import setting
@@ -27,10 +27,8 @@ def main(options: argparse.Namespace) -> int:
     place: Path = options.file
     if os.path.lexists(place):  # a link that leads nowhere is a file, too
         raise UserError(f"{place} already exists; choose another file")
-    try:
+    with writing(place):
         files.write(place, compose_file(options.scenario, scenario, place))
-    except OSError as error:
-        raise CannotWrite(place, error) from None
     robots = ", ".join([robot.id for robot in scenario.robots])
     tell(f"{place}: a world, the agents of {robots}, and a page", "to go on:")
     say(f"  docker compose -f {shlex.quote(str(place))} up --build")

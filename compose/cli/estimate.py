@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from compose.errors import BROKEN_PIPE, ENDED, NOT_LOCALISED, STOPPED_STATUS, CannotWrite, UserError
+from compose.errors import BROKEN_PIPE, ENDED, NOT_LOCALISED, STOPPED_STATUS, UserError, writing
 from compose.extras import need
 from compose.launch.solver_loader import solver_named
 from compose.recording.recording_files import make_folder
@@ -105,10 +105,8 @@ def _written(out: Path, problem: Measurements, estimate: RecordingEstimate) -> l
     """Write all files into `out`, and return their paths. Raises UserError."""
     from compose.recording.estimating.estimate_summary import write_estimate  # noqa: PLC0415  # they need numpy
 
-    try:
+    with writing(out):
         return [*write_estimate(out, estimate.rows, estimate.summary), *_drawn(out, problem, estimate)]
-    except OSError as error:
-        raise CannotWrite(out, error) from None
 
 
 def _drawn(out: Path, problem: Measurements, estimate: RecordingEstimate) -> list[Path]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from compose.cli.export_files import EXPORT_MODULES, exported
 from compose.cli.recording import note, read_noted
-from compose.errors import ENDED, FAILED, CannotWrite
+from compose.errors import ENDED, FAILED, writing
 from compose.extras import need
 from compose.recording.recording_files import make_folder, user_errors
 from compose.terminal.text_width import tell
@@ -69,8 +69,6 @@ def _rerun(recording: Path, out: Path) -> None:
 def _write(out: Path, name: str, text: str | bytes) -> None:
     """Write a file to the folder `out`, and print its path. Raises UserError."""
     make_folder(out)
-    try:
+    with writing(out):
         files.write(out / name, text)
-    except OSError as error:
-        raise CannotWrite(out, error) from None
     say(str(out / name))

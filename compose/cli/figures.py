@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from compose.cli.recording import read_noted
-from compose.errors import ENDED, FAILED, CannotWrite
+from compose.errors import ENDED, FAILED, writing
 from compose.extras import need
 from compose.figures import FIGURE_FORMATS, PICTURES
 from compose.launch.class_loader import trust
@@ -60,12 +60,10 @@ def main(options: argparse.Namespace) -> int:
                 _say(f"no figure of {' and '.join(robots)}: the recording has no data")
                 status = FAILED
                 continue
-            try:
+            with writing(folder):
                 for kind in kinds:
                     drawn += draw(pair, kind, formats, folder, torn=bool(torn), paper=options.paper)
                     done()
-            except OSError as error:
-                raise CannotWrite(folder, error) from None
     return status
 
 

@@ -9,7 +9,7 @@ import shlex
 from importlib import resources
 from pathlib import Path
 
-from compose.errors import ENDED, CannotWrite, UserError
+from compose.errors import ENDED, UserError, writing
 from compose.scenario.json_schema import json_schema
 from compose.scenario.scenario_tables import ScenarioFile
 from compose.sweep.spec import SpecFile
@@ -28,12 +28,10 @@ def main(options: argparse.Namespace) -> int:
     for name in content:
         if os.path.lexists(out / name):  # a link that leads nowhere is a file, too
             raise UserError(f"{out / name} already exists; choose another folder")
-    try:
+    with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         for name, text in content.items():
             files.write(out / name, text)
-    except OSError as error:
-        raise CannotWrite(out, error) from None
     say(*[str(out / name) for name in content], "", "to go on:")
     say(*[f"  {command}" for command in commands(out)])
     return ENDED

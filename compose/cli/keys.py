@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from compose.errors import ENDED, CannotWrite, UserError
+from compose.errors import ENDED, UserError, writing
 from compose.extras import need
 from compose.terminal.text_width import tell
 
@@ -17,10 +17,8 @@ def main(options: argparse.Namespace) -> int:
     for host in options.host:
         if not certificates.is_host(host):
             raise UserError(f"--host: '{host}' is neither a host name nor an IP address")
-    try:
+    with writing(options.folder):
         made, kept = certificates.make(options.folder, options.robots, options.host, options.days)
-    except OSError as error:
-        raise CannotWrite(options.folder, error) from None
     if made:
         tell(f"created, valid for {options.days} days: {', '.join(made)}")
     if kept:

@@ -13,7 +13,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
-from compose.errors import UserError
+from compose.errors import UserError, user_code
 
 Kind = Literal["planner", "model", "driver", "solver"]
 """The kind of a class, and the flag without -- that names it."""
@@ -79,12 +79,8 @@ def named(name: str, kind: Kind, group: str | None = None) -> Any:
     if name not in _trusted:
         raise Untrusted(f"the {kind} is {name}; to run its code, add --{kind} {name}")
     if point is not None:
-        try:
+        with user_code(f"{name}: {point.value} cannot be loaded:"):
             return point.load()
-        except (Exception, SystemExit) as error:  # noqa: BLE001  # the code of the package may raise anything
-            raise UserError(
-                f"{name}: {point.value} cannot be loaded: {type(error).__name__}: {error}"
-            ) from None
     module, _, cls = name.partition(":")
     if module.endswith(".py") or not all(map(str.isidentifier, (*module.split("."), cls))):
         raise UserError(f"'{name}' is not a {kind}; expected MODULE:CLASS, such as mine:Own")

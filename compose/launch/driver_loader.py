@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from compose.errors import UserError
+from compose.errors import UserError, user_code
 from compose.launch.class_loader import named, trust
 from compose.scenario.scenario_file import setting
 from protocol.messages import RobotConfig
@@ -38,10 +38,8 @@ def made(
 
     `manoeuvre_s` is the wall time of a manoeuvre in s.
     """
-    try:
+    with user_code(f"{name}: cannot be created:"):
         return maker(config, manoeuvre_s, **options)
-    except (Exception, SystemExit) as error:  # noqa: BLE001  # as above
-        raise UserError(f"{name}: cannot be created: {type(error).__name__}: {error}") from None
 
 
 def resume_driver(driver: Driver, name: str, history: DriverHistory) -> None:
@@ -51,11 +49,9 @@ def resume_driver(driver: Driver, name: str, history: DriverHistory) -> None:
         raise UserError(
             f"--out: contains a recording, and {name} has no resume() method; choose another folder"
         )
-    try:
+    with user_code(f"{name}: cannot resume:"):
         driver.stop()
         resume(history.tick, history.mark)
-    except (Exception, SystemExit) as error:  # noqa: BLE001  # as above
-        raise UserError(f"{name}: cannot resume: {type(error).__name__}: {error}") from None
 
 
 def options_of(words: list[str]) -> dict[str, str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from compose.errors import FAILED, UserError
+from compose.errors import FAILED, UserError, user_code
 from compose.launch import class_loader
 from protocol.spelling import did_you_mean
 from world.radio_models import RADIO_MODELS
@@ -39,10 +39,8 @@ def check(kind: str, spec: ModelSpec) -> None:
             raise UserError(f"model: {error}") from None
         if not issubclass(maker, contract):
             raise UserError(f"model: {spec.model} is not a subclass of tandem.models.{contract.__name__}")
-    try:
+    with user_code(f"options: {spec.model} cannot be created:"):
         maker(**spec.options)
-    except (Exception, SystemExit) as error:  # noqa: BLE001  # the user's code may raise anything
-        raise UserError(f"options: {spec.model} cannot be created: {type(error).__name__}: {error}") from None
 
 
 def trust(name: str) -> type:

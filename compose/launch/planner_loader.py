@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from compose.errors import BadOptions, UserError
+from compose.errors import BadOptions, UserError, user_code
 from compose.launch.class_loader import entry_points, named
 from compose.launch.solver_loader import GuardedSolver
 from protocol.messages import RobotConfig
@@ -135,10 +135,8 @@ def planner_class(name: str) -> type[Planner[Any, Any]]:
 
 def _created(name: str, options: Mapping[str, Any]) -> Planner[Any, Any]:
     maker = planner_class(name)
-    try:
+    with user_code(f"options: {name} cannot be created:", BadOptions):
         created = maker(**options)
-    except (Exception, SystemExit) as error:  # noqa: BLE001  # as above
-        raise BadOptions(f"options: {name} cannot be created: {type(error).__name__}: {error}") from None
     if (solver := getattr(created, "SOLVER", None)) is not None:
         GuardedSolver(solver, f"{name}: SOLVER: ")
     return created

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from compose.errors import UserError
+from compose.errors import UserError, user_code
 from compose.launch.class_loader import named, trust
 
 if TYPE_CHECKING:
@@ -31,10 +31,8 @@ class GuardedSolver:
 
     def solve(self, measured: JointMeasurements, start: Start) -> Solution | None:
         """Return the solution of the user's solver."""
-        try:
+        with user_code(f"{self._name}: solve() raised"):
             return self._solver.solve(measured, start)  # type: ignore[no-any-return]
-        except (Exception, SystemExit) as error:  # noqa: BLE001  # the user's code may raise anything
-            raise UserError(f"{self._name}: solve() raised {type(error).__name__}: {error}") from None
 
 
 def solver_named(name: str) -> GuardedSolver:
@@ -44,8 +42,6 @@ def solver_named(name: str) -> GuardedSolver:
     """
     trust(name)
     maker = named(name, "solver")
-    try:
+    with user_code(f"{name} cannot be created:"):
         solver = maker()
-    except (Exception, SystemExit) as error:  # noqa: BLE001  # as above
-        raise UserError(f"{name} cannot be created: {type(error).__name__}: {error}") from None
     return GuardedSolver(solver)

@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from compose.errors import FAILED, FULL_DISK, CannotWrite, UserError
+from compose.errors import FAILED, FULL_DISK, UserError, writing
 from protocol.journal import journal_file
 from protocol.journal.journal_file import CannotRecord, CorruptJournal
 from protocol.messages import OfRobot
@@ -51,12 +51,10 @@ def folder_for(out: Path | None) -> Iterator[Path]:
 
 def make_folder(out: Path) -> None:
     """Create the folder `out` and check that it is writable. Raises UserError if it is not."""
-    try:
+    with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=out):
             pass
-    except OSError as error:
-        raise CannotWrite(out, error) from None
 
 
 def not_recorded(error: CannotRecord) -> UserError:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from compose.errors import CannotWrite, status_of
+from compose.errors import status_of, writing
 from compose.recording import run
 from compose.recording.summary_json import Mode, leave, outcome_line, summary
 from protocol.journal.journal_file import Journal
@@ -68,10 +68,8 @@ def concluded(
     result = summary(recording, mode, round(time.perf_counter() - began, 6))
     try:
         if folder is not None and options.out is not None:
-            try:
+            with writing(folder):
                 leave(recording, result, folder)
-            except OSError as error:
-                raise CannotWrite(folder, error) from None
         yield status_of(result["outcome"])
     finally:
         if options.quiet:
