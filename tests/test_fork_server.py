@@ -124,48 +124,30 @@ def test_each_has_its_own_session_and_group_and_is_named_in_ps(endless: Path, tm
     assert not processes_of(out)
 
 
-def test_each_forked_process_has_its_own_status_and_output(tmp_path: Path) -> None:
+def test_each_forked_process_has_its_own_status_and_output() -> None:
     server = ForkServer("compose.cli.warm_up:missions")
     try:
-        ended = []
-        with (tmp_path / "first").open("wb+") as first, (tmp_path / "second").open("wb+") as second:
-            wrong = server.start(
-                "compose.cli.main:main",
-                "tandem",
-                "agent",
-                "?",
-                errors=first.fileno(),
-                on_end=lambda: ended.append(1),
-            )
-            mute = server.start(
-                *(
-                    "compose.cli.main:main",
-                    "tandem",
-                    "agent",
-                    "a",
-                    "--connect",
-                    free_endpoint(),
-                    "--launched",
-                ),
-                errors=second.fileno(),
-            )
-            assert wrong.wait(BOUND_S)
-            until(lambda: ended, "its end is told")
-            mute.signal(SIGKILL)
-            assert mute.wait(BOUND_S)
-            assert not mute.running
-            assert (tmp_path / "first").read_text().startswith("tandem agent: argument ID: '?'")
-            assert (tmp_path / "second").read_text() == ""
-            assert (wrong.end(), mute.end()) == (2, -SIGKILL)
+        ended: list[int] = []
+        wrong = server.start("compose.cli.main:main", "tandem", "agent", "?", on_end=lambda: ended.append(1))
+        mute = server.start(
+            "compose.cli.main:main", "tandem", "agent", "a", "--connect", free_endpoint(), "--launched"
+        )
+        assert wrong.wait(BOUND_S)
+        until(lambda: ended, "its end is told")
+        mute.signal(SIGKILL)
+        assert mute.wait(BOUND_S)
+        assert not mute.running
+        assert wrong.stderr_text.startswith("tandem agent: argument ID: '?'")
+        assert mute.stderr_text == ""
+        assert (wrong.end(), mute.end()) == (2, -SIGKILL)
     finally:
         server.close()
 
 
 def test_it_ends_with_its_standard_input() -> None:
     server = ForkServer("compose.cli.warm_up:missions")
-    with open(os.devnull, "wb") as nowhere:
-        words = ("tandem", "agent", "a", "--connect", free_endpoint(), "--launched")
-        agent = server.start("compose.cli.main:main", *words, errors=nowhere.fileno())
+    words = ("tandem", "agent", "a", "--connect", free_endpoint(), "--launched")
+    agent = server.start("compose.cli.main:main", *words)
     agent.hang_up()
     assert agent.wait(BOUND_S)
     assert agent.status == 130
@@ -344,10 +326,9 @@ def test_a_fork_server_that_takes_the_place_of_another_leaves_nothing_open() -> 
 
 def test_a_fork_server_that_cannot_start_prints_the_reason_in_one_line() -> None:
     server = ForkServer("nowhere:nothing")
-    with open(os.devnull, "wb") as nowhere:
-        process = server.start("compose.cli.main:main", "tandem", errors=nowhere.fileno())
-        assert process.wait(BOUND_S)
-        assert process.status == -SIGKILL
+    process = server.start("compose.cli.main:main", "tandem")
+    assert process.wait(BOUND_S)
+    assert process.status == -SIGKILL
     assert server.gone
     assert server.why_gone() == (
         "the fork server ended with status 1: ModuleNotFoundError: No module named 'nowhere'"
@@ -356,16 +337,16 @@ def test_a_fork_server_that_cannot_start_prints_the_reason_in_one_line() -> None
 
 
 CROWD = """
-import os, resource, signal, threading
-from compose.launch import forked
+import os, resource, signal, socket, threading
 from compose.launch.forked import ForkServer
 
 server = ForkServer("os:getpid")
-nowhere = os.open(os.devnull, os.O_RDWR)
 resource.setrlimit(resource.RLIMIT_NOFILE, (70, 70))
 os.kill(server.pid, signal.SIGSTOP)
-threading.Timer(0.5, os.kill, (server.pid, signal.SIGCONT)).start()
-crowd = [server.start("os:getpid", "one of a crowd", errors=nowhere) for _ in range(40)]
+ours, its = socket.socketpair()
+socket.send_fds(ours, [b"others"], [0] * 60)
+threading.Timer(0.5, its.close).start()
+crowd = [server.start("os:getpid", "one of a crowd") for _ in range(15)]
 print({process.end(30.0) for process in crowd})
 server.close()
 """

@@ -58,14 +58,13 @@ def run(words: list[str], folder: Path | None, out: IO[bytes], err: IO[bytes], w
         file.write(msgspec.msgpack.encode(command))
         file.flush()
         server = forked.fork_server(WARM_UP)
-        process = server.start(
-            MAIN, "tandem", file.name, f"/proc/{os.getpid()}/fd/{out.fileno()}", errors=err.fileno()
-        )
+        streams = [f"/proc/{os.getpid()}/fd/{stream.fileno()}" for stream in (out, err)]
+        process = server.start(MAIN, "tandem", file.name, *streams)
         if not process.wait(within):
             process.end()
             raise AssertionError(f"still running after {within:g} s: {words}")
         if server.gone:
-            raise AssertionError(f"{process.how_ended()}: {words}")
+            raise AssertionError(f"{process.how_ended}: {words}")
     return process.end()
 
 
@@ -73,8 +72,8 @@ def run_command() -> None:
     """Run the command whose file sys.argv names, in this forked process."""
     with open(sys.argv[1], "rb") as file:
         command = msgspec.msgpack.decode(file.read(), type=Request)
-    for path, stream, flags in ((sys.argv[2], 1, os.O_WRONLY), (os.devnull, 0, os.O_RDONLY)):
-        opened = os.open(path, flags)
+    for stream, path in enumerate((os.devnull, *sys.argv[2:])):
+        opened = os.open(path, os.O_WRONLY if stream else os.O_RDONLY)
         os.dup2(opened, stream)
         os.close(opened)
     os.chdir(command.folder)

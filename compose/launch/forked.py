@@ -18,7 +18,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cache
 from itertools import count
@@ -95,7 +95,7 @@ class ChildProcess:
         server: ForkServer,
         number: int,
         link: socket.socket,
-        errors: IO[bytes] | None,
+        errors: IO[bytes],
         on_end: Callable[[], None],
     ) -> None:
         """`link` is the launcher's end of its connection, `errors` its standard error.
@@ -112,9 +112,10 @@ class ChildProcess:
             link.setsockopt(socket.SOL_SOCKET, bounded, limit)
         self._link = Connection(link.detach())
         self._errors = errors
-        self._stderr_text = ""
-        """The text of standard error; set once the file is closed."""
-        self._why = ""
+        self.stderr_text = ""
+        """What it has written to its standard error, at most its last ERROR_BYTES, once it has ended."""
+        self.how_ended = ""
+        """How it has ended, as part of an error message."""
         self._over = threading.Event()
 
     @property
@@ -148,10 +149,6 @@ class ChildProcess:
                 self._server.kill()
                 self.wait(KILL_S)
         self.hang_up()
-        if self._errors is not None:
-            self._stderr_text = self.stderr_text()
-            self._errors.close()
-            self._errors = None
         return -signal.SIGKILL if self.status is None else self.status
 
     def hang_up(self) -> None:
@@ -178,24 +175,12 @@ class ChildProcess:
             raise EOFError from None
         raise TimeoutError
 
-    def stderr_text(self) -> str:
-        """Return what the process has written to its standard error, at most its last ERROR_BYTES."""
-        if self._errors is None:
-            return self._stderr_text
-        file = self._errors.fileno()
-        begin = max(0, os.fstat(file).st_size - ERROR_BYTES)
-        return os.pread(file, ERROR_BYTES, begin).decode(errors="replace").strip()
-
-    def how_ended(self) -> str:
-        """Return how the process ended, as part of an error message."""
-        assert self.status is not None
-        how = self._why or ending(self.status)
-        lines = [] if self._why else self.stderr_text().splitlines()
-        return f"{how}: {'; '.join(lines)}" if lines else how
-
     def ended(self, status: int, why: str = "") -> None:
-        """Store the exit status, and why the process was killed if its fork server has ended."""
-        self.status, self._why = status, why
+        """Note that the process has ended, and why it was killed if its fork server has ended."""
+        with self._errors as file:
+            begin = max(0, os.fstat(file.fileno()).st_size - ERROR_BYTES)
+            self.stderr_text = os.pread(file.fileno(), ERROR_BYTES, begin).decode(errors="replace").strip()
+        self.status, self.how_ended = status, why or ending(status, self.stderr_text.splitlines())
         with (
             suppress(OSError),
             socket.fromfd(self._link.fileno(), socket.AF_UNIX, socket.SOCK_STREAM) as link,
@@ -205,9 +190,10 @@ class ChildProcess:
         self._on_end()
 
 
-def ending(status: int) -> str:
-    """Return how a process with the exit status `status` ended; negative is the signal that killed it."""
-    return f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
+def ending(status: int, errors: Sequence[str]) -> str:
+    """Return how a process ended; a negative `status` is the signal that killed it."""
+    how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
+    return f"{how}: {'; '.join(errors)}" if errors else how
 
 
 class ForkServer:
@@ -245,23 +231,19 @@ class ForkServer:
         main: str,
         title: str,
         *arguments: str,
-        errors: int | None = None,
         on_end: Callable[[], None] = lambda: None,
     ) -> ChildProcess:
         """Fork a process that calls `main`, a module:function, with `arguments` in sys.argv.
 
-        Its standard error goes to the descriptor `errors`, otherwise to a file that the result reads, and its
-        standard output to /dev/null. `on_end` is called in another thread when the process has ended.
+        Its standard error goes to a file that the result reads, its standard output to /dev/null. `on_end` is
+        called in another thread when the process has ended.
         """
         ours, its = socket.socketpair()
-        file = None
-        if errors is None:
-            file = tempfile.TemporaryFile()  # noqa: SIM115  # closed by the process
-            errors = file.fileno()
+        errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed by the process
         with its, self._lock:
             number = next(self._numbers)
-            process = self._running[number] = ChildProcess(self, number, ours, file, on_end)
-            self._ask(ForkRequest(number, main, title, arguments), [its.fileno(), errors])
+            process = self._running[number] = ChildProcess(self, number, ours, errors, on_end)
+            self._ask(ForkRequest(number, main, title, arguments), [its.fileno(), errors.fileno()])
         if self.gone:
             self._end_all()
         return process
@@ -288,7 +270,7 @@ class ForkServer:
         status = self.kill()
         self._errors.seek(0)
         errors = self._errors.read().decode(errors="replace").strip().splitlines()
-        return f"the fork server {ending(status)}{f': {errors[-1]}' if errors else ''}"
+        return f"the fork server {ending(status, errors[-1:])}"
 
     def kill(self) -> int:
         """Kill the server and all its processes, and return the server's exit status."""
@@ -306,28 +288,22 @@ class ForkServer:
         self._errors.close()
 
     def _ask(self, request: ForkRequest | Signal, streams: list[int]) -> None:
-        try:
-            self._send(msgspec.msgpack.encode(request), streams)
-        except OSError:  # a request must not be lost unnoticed: `_listen` sees that the server has ended
-            self._process.kill()
-
-    def _send(self, frame: bytes, streams: list[int]) -> None:
-        """Send `frame` with `streams`.
+        """Send a request with `streams`, or kill the server: a request must not be lost unnoticed.
 
         A server that is suspended, or still imports, takes few requests, and the kernel limits the
         descriptors in flight of all processes of a user to the number that one process may have open
         (ETOOMANYREFS). Sending is therefore retried, for TAKE_S, and without `streams` for KILL_S.
-
-        Raises OSError.
         """
+        frame = msgspec.msgpack.encode(request)
         give_up = time.monotonic() + (TAKE_S if streams else KILL_S)
         while True:
             try:
                 socket.send_fds(self._socket, [frame], streams)
             except OSError as error:
-                late = time.monotonic() >= give_up
-                if late or not (isinstance(error, TimeoutError) or error.errno == errno.ETOOMANYREFS):
-                    raise
+                again = isinstance(error, TimeoutError) or error.errno == errno.ETOOMANYREFS
+                if not again or time.monotonic() >= give_up:
+                    self._process.kill()
+                    return
             else:
                 return
             time.sleep(TRY_AGAIN_S)

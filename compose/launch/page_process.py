@@ -47,7 +47,7 @@ class PageProcess:
                 inbox.next(None)
         if self._child.running or self._child.status == 0:
             return True
-        inbox.say(f"{WHAT} {self._child.how_ended().splitlines()[-1]}")
+        inbox.say(f"{WHAT} {self._child.how_ended.splitlines()[-1]}")
         return False
 
 
@@ -64,7 +64,7 @@ def serving(folder: Path, port: int, inbox: Inbox) -> Iterator[PageProcess]:
         address = _address(child)
         if address is None:
             child.end()
-            errors = child.stderr_text().splitlines()
+            errors = child.stderr_text.splitlines()
             late = f"{WHAT}: not ready within {READY_S:g} s"
             raise UserError(errors[-1].removeprefix("tandem watch: ") if errors else late)
         yield PageProcess(child, address)

@@ -195,11 +195,11 @@ class _Mission:
         Raises ChildFailed if the child did not end by one of its kills, or by a kill without a restart.
         """
         child = self.children[name]
-        kill = taken(self.kills[name], child.stderr_text()) if child.status == -signal.SIGKILL else None
+        kill = taken(self.kills[name], child.stderr_text) if child.status == -signal.SIGKILL else None
         if kill is None:
             raise self.children.failure(name)
         self._note(kill)
-        if said := child.stderr_text().splitlines()[:-1]:  # since it was restarted itself
+        if said := child.stderr_text.splitlines()[:-1]:  # since it was restarted itself
             say(*said, error=True)
         if kill.after is None:
             raise ChildFailed(f"{name} was killed at tick {kill.tick} (--kill {kill.text})")

@@ -88,7 +88,7 @@ class Supervisor:
 
     def failure(self, name: str) -> ChildFailed:
         """Return the error that the child `name` has ended, and how."""
-        return ChildFailed(f"{name} {self[name].how_ended()}")
+        return ChildFailed(f"{name} {self[name].how_ended}")
 
     def wait(self, timeout: float) -> None:
         """Wait at most `timeout` seconds until all children have ended."""
@@ -107,5 +107,5 @@ class Supervisor:
     def say_errors(self) -> None:
         """Print what the children that ended well wrote to standard error."""
         for child in self._children.values():
-            if child.status == ENDED and (errors := child.stderr_text()):
+            if child.status == ENDED and (errors := child.stderr_text):
                 say(*errors.splitlines(), error=True)

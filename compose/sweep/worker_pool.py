@@ -37,6 +37,8 @@ class WorkerProcess:
     """A process in which trials run. It has its own session, so Ctrl-C reaches only its owner."""
 
     def __init__(self) -> None:
+        self.reused = False
+        """True once it has run a chunk."""
         self._folder = tempfile.TemporaryDirectory(prefix="tandem-trials-", ignore_cleanup_errors=True)
         self._child = fork_server("compose.sweep.worker").start(
             "compose.sweep.worker:main", "tandem sweep worker", self._folder.name
@@ -61,7 +63,7 @@ class WorkerProcess:
             self.kill()
             return "it closed its connection"
         status = self._child.status or 0
-        errors = self._child.stderr_text()[-MAX_ERROR:].splitlines()
+        errors = self._child.stderr_text[-MAX_ERROR:].splitlines()
         how = f"killed by {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
         return f"{how}: {one_line(errors[-1])}" if errors else how
 
@@ -80,34 +82,34 @@ class _Children:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._working: set[WorkerProcess] = set()
+        self._all: set[WorkerProcess] = set()
         self._resting: list[WorkerProcess] = []
         self._over = False
 
-    def take(self) -> tuple[WorkerProcess, bool] | None:
-        """Return a process for this thread, and whether it is reused; None if the sweep is over.
+    def take(self) -> WorkerProcess | None:
+        """Return a process for this thread, a new one if none rests; None if the sweep is over.
 
         Raises Died or Hung if a new process does not become ready.
         """
         with self._lock:
             if self._over:
                 return None
-            reused = bool(self._resting)
-            child = self._resting.pop() if reused else WorkerProcess()
-            self._working.add(child)
-        if not reused:
-            try:
-                ready = child.answer(START_S)
-                assert ready == READY
-            except (Died, Hung):
-                self.drop(child)
-                raise
-        return child, reused
+            if self._resting:
+                return self._resting.pop()
+            child = WorkerProcess()
+            self._all.add(child)
+        try:
+            ready = child.answer(START_S)
+            assert ready == READY
+        except (Died, Hung):
+            self.drop(child)
+            raise
+        return child
 
     def keep(self, child: WorkerProcess) -> None:
         """Store the process for another chunk; close it if the sweep is over."""
+        child.reused = True
         with self._lock:
-            self._working.remove(child)
             if not self._over:
                 self._resting.append(child)
                 return
@@ -116,19 +118,17 @@ class _Children:
     def drop(self, child: WorkerProcess) -> bool:
         """Close the process, and return whether the sweep is still running."""
         with self._lock:
-            self._working.remove(child)
-            running = not self._over
+            self._all.remove(child)
         child.close()
-        return running
+        return not self._over
 
     def dismiss(self) -> None:
         """End all processes, and start no more of them."""
         with self._lock:
             self._over = True
-            for child in self._working:
-                child.kill()  # its thread sees that it has ended, and closes it
-            idle, self._resting = self._resting, []
-        for child in idle:
+            for child in self._all:
+                child.kill()  # its thread, if it works for one, sees that it has ended, and closes it
+        for child in self._resting:
             child.close()
 
 
@@ -150,8 +150,7 @@ def run(sweep: str, encoded: bytes) -> list[bytes]:
     children = _children.setdefault(sweep, _Children())
     rows: list[bytes] = []
     timeout = chunk.options.timeout
-    while len(rows) < len(chunk.trials) and (taken := children.take()) is not None:
-        child, reused = taken
+    while len(rows) < len(chunk.trials) and (child := children.take()) is not None:
         asked = len(rows)
         began = time.perf_counter()
         try:
@@ -162,7 +161,7 @@ def run(sweep: str, encoded: bytes) -> list[bytes]:
         except Hung:
             error = f"hung: no answer within {timeout:g} s"
         except Died as death:
-            if reused and len(rows) == asked:  # a reused process may have ended earlier: try a new one
+            if child.reused and len(rows) == asked:  # a reused process may have ended earlier: try a new one
                 children.drop(child)
                 continue
             error = f"died: {death}"

@@ -83,7 +83,7 @@ class RequestedWork:
         except EOFError:
             child.end(KILL_S)
             self._check()
-            raise UserError(f"it cannot be computed: its process {child.how_ended()}") from None
+            raise UserError(f"it cannot be computed: its process {child.how_ended}") from None
         finally:
             child.end()
             self._children.discard(child)
