@@ -8,7 +8,8 @@ estimates, which are published only for subscribers. It ends as soon as each pro
 from __future__ import annotations
 
 import time
-from collections import Counter
+from collections import defaultdict, deque
+from collections.abc import Mapping
 from typing import Any
 
 import msgspec
@@ -35,6 +36,8 @@ MISSIONS_POLL_S = 0.02
 """The polling interval in s."""
 COMMAND_AHEAD = 4
 """The number of ticks by which a Command may be ahead of the latest received Observation."""
+Frames = Mapping[Key, tuple[bytes, ...]]
+"""The latest two frames of each key."""
 
 
 class Participant(msgspec.Struct, frozen=True):
@@ -79,9 +82,8 @@ def look(link: zenoh.Session, wait: float) -> tuple[RunningMission, ...]:
     alive = _alive(link)
     if not alive:
         return ()
-    latest = _LatestFrames(link, alive)
-    latest.listen(wait)
-    return tuple(_mission(link, latest, run, robots) for run, robots in alive.items())
+    frames = _received(link, alive, wait)
+    return tuple(_mission(link, frames, run, robots) for run, robots in alive.items())
 
 
 def _alive(link: zenoh.Session) -> dict[str, frozenset[str]]:
@@ -107,90 +109,83 @@ def _decoded(frame: bytes | None, kind: Any) -> Any:
         return None
 
 
-class _LatestFrames:
-    """The latest frame of each key, and the number of frames. Samples under other keys are ignored."""
+def _received(link: zenoh.Session, alive: dict[str, frozenset[str]], wait: float) -> Frames:
+    """Return the frames received until each process that is alive has sent a message, or for `wait` s.
 
-    def __init__(self, link: zenoh.Session, alive: dict[str, frozenset[str]]) -> None:
-        self._link = link
-        self._alive = alive
-        self.latest: dict[Key, bytes] = {}
-        self._count = Counter[Key]()
-        self._over = False
+    Samples under other keys are ignored.
+    """
+    latest: defaultdict[Key, deque[bytes]] = defaultdict(lambda: deque(maxlen=2))
 
-    def listen(self, wait: float) -> None:
-        """Listen until each process that is alive has sent a message, at most `wait` s."""
-        declared: list[Any] = [
-            self._link.declare_subscriber(key(run, "*"), self._hand_over)
-            for run in self._alive
-            for key in (keys.observation, keys.command)
-        ]
-        until = time.monotonic() + wait
-        while not all(map(self._is_complete, self._alive)) and time.monotonic() < until:
-            time.sleep(MISSIONS_POLL_S)
-        self._over = True
-        for one in declared:
-            one.undeclare()
-
-    def _hand_over(self, sample: zenoh.Sample) -> None:
-        if self._over:  # frames received between the undeclarations would be of several ticks
-            return
+    def hand_over(sample: zenoh.Sample) -> None:
         key = keys.parse(str(sample.key_expr))
         if key is not None:
-            self.latest[key] = sample.payload.to_bytes()
-            self._count[key] += 1
+            latest[key].append(sample.payload.to_bytes())
 
-    def _is_complete(self, run: str) -> bool:
-        """Return whether all robots of `run` have sent a Command, and its world Observations to all of them.
-
-        The world sends to its robots in turn: once one has received two, all have received one.
-        """
-        robots = self._alive[run] - {""}
-        if "" not in self._alive[run]:
-            return True
-        again = any(
-            self._count[Key(keys.observation, run, one)] > 1 for one in self.named(run, keys.observation)
-        )
-        return again and robots <= self.named(run, keys.command)
-
-    def named(self, run: str, kind: Any) -> set[str]:
-        """Return the robots for whose key of this kind a frame was received."""
-        return {one.robot for one in tuple(self.latest) if (one.kind, one.run) == (kind, run)}
-
-    def message(self, key: Key, messages: Any) -> Any:
-        """Return the latest message under `key`, if it is one of `messages` and of the robot in the key."""
-        message = _decoded(self.latest.get(key), messages)
-        return message if getattr(message, "robot", key.robot) == key.robot else None
-
-
-def _mission(link: zenoh.Session, latest: _LatestFrames, run: str, alive: frozenset[str]) -> RunningMission:
-    frames = [
-        latest.latest[Key(kind, run, robot)]
-        for kind in (keys.observation, keys.command)
-        for robot in latest.named(run, kind)
+    declared: list[Any] = [
+        link.declare_subscriber(key(run, "*"), hand_over)
+        for run in alive
+        for key in (keys.observation, keys.command)
     ]
-    answers = _configs(link, run, latest.named(run, keys.observation) | alive - {""}) if "" in alive else {}
-    frames += answers.values()
+    until = time.monotonic() + wait
+    while True:
+        frames = {key: tuple(some) for key, some in tuple(latest.items())}
+        if all(_is_complete(frames, *one) for one in alive.items()) or time.monotonic() >= until:
+            break
+        time.sleep(MISSIONS_POLL_S)
+    for one in declared:  # frames received meanwhile would be of several ticks
+        one.undeclare()
+    return frames
+
+
+def _is_complete(frames: Frames, run: str, alive: frozenset[str]) -> bool:
+    """Return whether all robots of `run` have sent a Command, and its world Observations to all of them.
+
+    The world sends to its robots in turn: once one has received two, all have received one.
+    """
+    if "" not in alive:
+        return True
+    again = any(
+        len(frames[Key(keys.observation, run, one)]) > 1 for one in _named(frames, run, keys.observation)
+    )
+    return again and alive - {""} <= _named(frames, run, keys.command)
+
+
+def _named(frames: Frames, run: str, kind: Any) -> set[str]:
+    """Return the robots for whose key of this kind a frame was received."""
+    return {one.robot for one in frames if (one.kind, one.run) == (kind, run)}
+
+
+def _message(frames: Frames, key: Key, messages: Any) -> Any:
+    """Return the latest message under `key`, if it is one of `messages` and of the robot in the key."""
+    message = _decoded(frames.get(key, (None,))[-1], messages)
+    return message if getattr(message, "robot", key.robot) == key.robot else None
+
+
+def _mission(link: zenoh.Session, frames: Frames, run: str, alive: frozenset[str]) -> RunningMission:
+    observed, there = _named(frames, run, keys.observation), alive - {""}
+    answers = _configs(link, run, observed | there) if "" in alive else {}
     configs = [one for frame in answers.values() if (one := _decoded(frame, RobotConfig)) is not None]
-    named = alive - {""} | latest.named(run, keys.observation) | latest.named(run, keys.command)
+    named = there | observed | _named(frames, run, keys.command)
     named |= {robot for one in configs for robot in one.others}
     messages = [
-        latest.message(Key(keys.observation, run, robot), Observation | MissionEnd | FinalReport)
+        _message(frames, Key(keys.observation, run, robot), Observation | MissionEnd | FinalReport)
         for robot in named
     ]
     ends = [one for one in messages if isinstance(one, MissionEnd)]
     tick = max((one.tick for one in messages if isinstance(one, Observation | MissionEnd)), default=None)
+    seen = [*[some[-1] for key, some in frames.items() if key.run == run], *answers.values()]
     return RunningMission(
         run,
         "" in alive,
         tick,
         ends[0].outcome if ends else None,
-        tuple(sorted({version for frame in frames if (version := version_of(frame)) is not None})),
+        tuple(sorted({version for frame in seen if (version := version_of(frame)) is not None})),
         tuple(
             _participant(
                 robot,
                 robot in alive,
                 tick,
-                latest.message(Key(keys.command, run, robot), Command | FinalReport),
+                _message(frames, Key(keys.command, run, robot), Command | FinalReport),
             )
             for robot in sorted(named)
         ),
