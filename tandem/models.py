@@ -2,13 +2,7 @@
 
 from __future__ import annotations
 
-from world.radio_models import (
-    ByteRateRadio,
-    CollidingRadio,
-    FadingRadio,
-    LogDistanceRadio,
-    WalledRadio,
-)
+from world.radio_models import ByteRateRadio, CollidingRadio, FadingRadio, LogDistanceRadio, WalledRadio
 from world.range_models import FadingRange, WalledRange
 from world.world_models import Point, RadioModel, Radios, RangeModel, Transmission
 

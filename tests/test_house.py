@@ -35,8 +35,8 @@ BELOW = {
 <<<<<<< HEAD
 BUDGETS = {"protocol": 4_337, "agent": 16_633, "world": 4_277, "compose": 29_121, "tandem": 1_551}
 =======
-BUDGETS = {"protocol": 4_337, "agent": 16_623, "world": 4_277, "compose": 28_895, "tandem": 1_547}
->>>>>>> d1c91e58 (Turn errors of files and of users' code into lines in one place each)
+BUDGETS = {"protocol": 4_337, "agent": 16_623, "world": 4_262, "compose": 28_795, "tandem": 1_541}
+>>>>>>> 19715786 (Write imports that fit one line on one)
 """The largest number of lines of Python and C of each package. Raising one needs a reason in the commit."""
 
 SHELL = {

@@ -14,13 +14,7 @@ from compose.scenario.group_meetings import FirstMeeting, GroupMeetings
 from compose.scenario.scenario_tables import PlannerTable, RobotTable
 from protocol.attack import OF_THE_START
 from protocol.messages import RobotConfig
-from protocol.mission import (
-    Anchor,
-    Mission,
-    infeasibility,
-    noise_infeasibility,
-    safety_infeasibility,
-)
+from protocol.mission import Anchor, Mission, infeasibility, noise_infeasibility, safety_infeasibility
 from protocol.orbits import Orbit, Rendezvous, visiting
 from world.scenario import RobotSpec, Scenario
 from world.world_noise import world_noise_infeasibility, world_noise_mistake

@@ -8,13 +8,7 @@ from agent.process.discovery import NoWorld, Search, Unwelcome
 from agent.process.node import AgentProcess, run_agent
 from agent.process.recovery import Memory, remember
 from agent.process.robot import Robot
-from compose.cli.participant import (
-    endpoints_of,
-    old_journal,
-    participate,
-    replayed,
-    warn_beyond,
-)
+from compose.cli.participant import endpoints_of, old_journal, participate, replayed, warn_beyond
 from compose.errors import ENDED, UserError, status_of
 from compose.launch import planner_loader
 from compose.launch.class_loader import trust

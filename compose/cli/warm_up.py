@@ -10,14 +10,7 @@ from compose.launch import in_process
 from compose.scenario.scenario_file import load
 from protocol import wire
 from protocol.journal import environment
-from protocol.messages import (
-    Command,
-    FinalReport,
-    MissionEnd,
-    Observation,
-    Report,
-    RobotConfig,
-)
+from protocol.messages import Command, FinalReport, MissionEnd, Observation, Report, RobotConfig
 from world.scenario import Scenario
 
 WARM_UP_MISSION = "paper-1"

@@ -7,14 +7,7 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 
-from compose.cli.participant import (
-    RELISTEN_S,
-    endpoints_of,
-    old_journal,
-    participate,
-    replayed,
-    warn_beyond,
-)
+from compose.cli.participant import RELISTEN_S, endpoints_of, old_journal, participate, replayed, warn_beyond
 from compose.errors import ENDED, UserError
 from compose.launch.processes import scenario_from_launcher
 from compose.launch.signals import stop_by_signal

@@ -15,15 +15,7 @@ from typing import Any
 import msgspec
 import zenoh
 
-from protocol.messages import (
-    Command,
-    FinalReport,
-    MissionEnd,
-    Observation,
-    Outcome,
-    Phase,
-    RobotConfig,
-)
+from protocol.messages import Command, FinalReport, MissionEnd, Observation, Outcome, Phase, RobotConfig
 from protocol.network import keys, session
 from protocol.network.keys import Key
 from protocol.wire import MalformedFrame, decode, version_of

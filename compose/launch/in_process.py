@@ -18,14 +18,7 @@ from compose.recording.recording_files import WORLD_JOURNAL, JournalFile, agent_
 from compose.recording.run import Run, of_frames
 from protocol.journal import environment
 from protocol.journal.journal_file import Journal, MemoryJournal, Sink
-from protocol.messages import (
-    Command,
-    Estimate,
-    FinalReport,
-    Localised,
-    MissionEnd,
-    RobotConfig,
-)
+from protocol.messages import Command, Estimate, FinalReport, Localised, MissionEnd, RobotConfig
 from protocol.wire import EncodedMessages, encode
 from world.faults import LATEST
 from world.scenario import Scenario

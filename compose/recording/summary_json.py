@@ -14,12 +14,7 @@ import msgspec
 
 from compose.extras import version
 from compose.recording.corrected_bounds import corrected_bounds
-from compose.recording.group_localisation import (
-    MeetingResult,
-    SearchResult,
-    meeting_results,
-    search_results,
-)
+from compose.recording.group_localisation import MeetingResult, SearchResult, meeting_results, search_results
 from compose.recording.reasons import of_it, outcome_after, reason_for
 from compose.recording.rows import ticks_csv
 from compose.recording.run import Run

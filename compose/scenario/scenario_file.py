@@ -21,24 +21,14 @@ from compose.scenario.shipped_files import misplaced, shipped, unknown
 from compose.scenario.toml_file import field_first, read_text, table_in
 from protocol.attack import OF_THE_START
 from protocol.messages import RobotConfig
-from protocol.mission import (
-    Anchor,
-    Mission,
-    noise_infeasibility,
-    safety_infeasibility,
-    too_small,
-)
+from protocol.mission import Anchor, Mission, noise_infeasibility, safety_infeasibility, too_small
 from protocol.motion import TAU, Pose, wrap
 from protocol.noise import with_profile
 from protocol.orbits import tick_budget
 from protocol.spelling import did_you_mean
 from protocol.wire import MalformedFrame, decode, encode
 from world.faults import Fault, delivery_time_bound
-from world.scenario import (
-    Death,
-    RobotSpec,
-    Scenario,
-)
+from world.scenario import Death, RobotSpec, Scenario
 from world.world_noise import world_noise_infeasibility, world_noise_mistake
 
 EXCHANGES = 20

@@ -16,16 +16,7 @@ from compose.view.run_data import TickData
 from compose.view.story.caption import Caption
 from compose.view.story.captions import captions
 from compose.view.words import doing
-from protocol.messages import (
-    Contact,
-    Localised,
-    MissionEnd,
-    Phase,
-    Probability,
-    Report,
-    Verdict,
-    Word,
-)
+from protocol.messages import Contact, Localised, MissionEnd, Phase, Probability, Report, Verdict, Word
 from protocol.mission import Mission, Role
 from protocol.motion import Controls, Covariance, Pose, travelled, wrap
 

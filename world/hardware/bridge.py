@@ -20,15 +20,7 @@ from collections.abc import Callable
 import zenoh
 
 from protocol.journal.journal_file import Sink
-from protocol.messages import (
-    Cause,
-    Command,
-    FinalReport,
-    MissionEnd,
-    RobotConfig,
-    TickStart,
-    Verdict,
-)
+from protocol.messages import Cause, Command, FinalReport, MissionEnd, RobotConfig, TickStart, Verdict
 from protocol.network import keys, session
 from protocol.network.inbox import NO_ARRIVAL, Arrival, Inbox
 from protocol.wire import MAX_REPORT_BYTES, encode

@@ -15,14 +15,7 @@ from typing import Annotated
 import msgspec
 
 from protocol.journal.journal_file import CorruptJournal, message_in
-from protocol.messages import (
-    Command,
-    Message,
-    MissionEnd,
-    Observation,
-    RobotConfig,
-    TickStart,
-)
+from protocol.messages import Command, Message, MissionEnd, Observation, RobotConfig, TickStart
 from protocol.units import Finite, RobotId, Tick
 
 MAX_MARK = 64

@@ -11,12 +11,7 @@ import numpy as np
 
 from agent.estimation.claim import BEFORE_SEARCH, blocked
 from agent.estimation.fit import TO_THE_END, Fit
-from agent.estimation.gaussian.joint_claims import (
-    Displacement,
-    displaced_anchor,
-    open_position,
-    undetermined,
-)
+from agent.estimation.gaussian.joint_claims import Displacement, displaced_anchor, open_position, undetermined
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.search import candidates, extended, search
 from agent.estimation.judged import of_joint
