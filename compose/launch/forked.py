@@ -78,10 +78,10 @@ class Ended(msgspec.Struct, frozen=True, tag=True):
     """Exit status; negative is the signal that killed it."""
 
 
-@cache  # closed with the process
+@cache
 def launcher() -> Connection:
     """Return the connection of this forked process to its launcher."""
-    return Connection(0)
+    return Connection(os.dup(0))  # a duplicate, since two threads that call this at once make two
 
 
 class ChildProcess:
