@@ -32,11 +32,7 @@ BELOW = {
 }
 """The packages of the project that each package may import."""
 
-<<<<<<< HEAD
-BUDGETS = {"protocol": 4_337, "agent": 16_633, "world": 4_277, "compose": 29_121, "tandem": 1_551}
-=======
-BUDGETS = {"protocol": 4_337, "agent": 16_623, "world": 4_262, "compose": 28_795, "tandem": 1_541}
->>>>>>> 19715786 (Write imports that fit one line on one)
+BUDGETS = {"protocol": 4_337, "agent": 16_633, "world": 4_262, "compose": 28_831, "tandem": 1_541}
 """The largest number of lines of Python and C of each package. Raising one needs a reason in the commit."""
 
 SHELL = {
