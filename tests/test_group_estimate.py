@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -113,6 +114,16 @@ def test_two_robots_of_a_group_are_estimated_as_a_pair() -> None:
     begin, end = recording.span
     alone = recording.part(("r00", "r01"), begin, end)
     assert estimate_csv(two.rows) == estimate_csv(estimate_of(alone).rows)
+
+
+def test_an_anchor_without_a_position_is_estimated_once_a_robot_is_located() -> None:
+    recording = recorded(3, 4)
+    first, *others = recording.anchors
+    unknown = first._replace(x=math.nan, y=math.nan, sigma=math.inf)
+    found = estimate_of(recording._replace(anchors=(unknown, *others)))
+    assert all(robot.first_claim is not None for robot in found.summary.robots.values())
+    x, y = found.summary.anchors[first.id].position
+    assert math.hypot(x - first.x, y - first.y) < 0.5
 
 
 GROUP = """

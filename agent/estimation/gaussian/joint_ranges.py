@@ -138,7 +138,7 @@ class PosePrior(NamedTuple):
 
     def some(self, chosen: Sequence[int]) -> PosePrior | None:
         """Return the prior of the `chosen` robots, of which nothing is known together with others."""
-        own = np.add.outer(3 * np.array(chosen), np.arange(3)).ravel()
+        own = np.add.outer(3 * np.array(chosen, np.intp), np.arange(3)).ravel()
         information = self.information[np.ix_(own, own)]
         known = np.diagonal(information)[np.diagonal(information) > 0.0].tolist()
         if not known:
