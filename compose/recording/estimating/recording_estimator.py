@@ -10,12 +10,12 @@ import msgspec
 import numpy as np
 
 from agent.estimation.claim import BEFORE_SEARCH, blocked
-from agent.estimation.fit import TO_THE_END, Fit
+from agent.estimation.fit import Fit
 from agent.estimation.gaussian.joint_claims import Displacement, displaced_anchor, open_position, undetermined
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.search import candidates, extended, search
 from agent.estimation.judged import of_joint
-from agent.estimation.posterior import NO_HYPOTHESES, Certainty, Hypothesis, Posterior, certainties, follow
+from agent.estimation.posterior import NO_HYPOTHESES, Certainty, Hypothesis, Posterior, certainties, settled
 from agent.estimation.solver import Solver
 from compose.recording.estimating.recorded_measurements import Measurements, numerics
 from compose.recording.ranging.range_recording import Numbers
@@ -132,7 +132,8 @@ class RecordingEstimator:
     def _epoch(self, measured: Measurements, number: int) -> EstimateEpoch:
         """Return the estimate at the end of the epoch with this `number`, from 0 on, in their order."""
         used = msgspec.structs.replace(measured.until(number), solver=self._solver)
-        found = self._extended(self._followed(used), used)
+        known = settled(self._known, used)
+        found = self._extended(known if known.hypotheses else NO_HYPOTHESES, used)
         count = len(used.ranges.rho)
         due = found.hypotheses and any(self._searched < at <= count for at in GROUP_SEARCHES)
         reasons = self._reasons(found, used)
@@ -146,17 +147,6 @@ class RecordingEstimator:
         self._known = found
         self._claimed |= {name for name, reason in reasons.items() if not reason}
         return _result(measured, number, used, found, reasons)
-
-    def _followed(self, used: JointMeasurements) -> Posterior:
-        """Return the known hypotheses with the latest ranges; a fit that still moves goes on to its end.
-
-        It does so in one loop, in which the weights of the ranges go on: begun again after every two steps,
-        34 of 48 pairs with outliers made a claim, and not 46 (docs/howto-estimate.md).
-        """
-        found = follow(self._known, used)
-        if found.hypotheses and not found.has_converged:
-            found = follow(found, used, TO_THE_END)
-        return found if found.hypotheses else NO_HYPOTHESES
 
     def _extended(self, found: Posterior, used: JointMeasurements) -> Posterior:
         """Return `found` with further robots; those that failed are tried again with more ranges."""
