@@ -29,7 +29,7 @@ from compose.errors import NOT_LOCALISED, USER_ERROR, CannotWrite, UserError
 from compose.recording.estimating import estimate_run
 from compose.recording.estimating.estimate_rows import ESTIMATE_COLUMNS, PoseEstimate, estimate_csv
 from compose.recording.estimating.estimate_run import RecordingEstimate, estimated
-from compose.recording.estimating.noise_files import RangeCorrection, told_noise
+from compose.recording.estimating.noise_files import AssumedNoise, RangeCorrection, told_noise
 from compose.recording.estimating.recorded_measurements import EPOCH_S, MOST_USED_ANCHORS, measurements
 from compose.recording.estimating.recording_estimator import ClaimRule
 from compose.recording.estimating.sound_odometry import GAP_MOTION_S, sound
@@ -47,7 +47,7 @@ from compose.recording.ranging.range_recording import (
 from compose.recording.ranging.range_steps import dead_reckoned, relative
 from docs import recorded_claims
 from protocol.motion import Pose, step
-from protocol.noise import Noise, VelocityNoise
+from protocol.noise import Noise, ProfileName, VelocityNoise
 from tests.commands import tandem
 
 SAMPLE = Path(__file__).parent / "data" / "uwb" / "tiers-a-b-30-s.pyfg"
@@ -636,3 +636,66 @@ def test_bad_input_is_one_line_with_its_place(words: tuple[str, ...], says: str,
     assert ended.out == ""
     assert ended.err.count("\n") == 1
     assert says in ended.err
+
+
+# --- lengths ------------------------------------------------------------------------------------------------
+
+
+def times(recording: RangeRecording, factor: float) -> RangeRecording:
+    """Return `recording` with all lengths multiplied by `factor`, the sigmas of ranges among them."""
+    pose, ranges = np.array((factor, factor, 1.0)), recording.ranges
+    robots = [
+        one._replace(
+            odometry=one.odometry._replace(
+                increments=one.odometry.increments * pose,
+                covariance=one.odometry.covariance * np.outer(pose, pose),
+            ),
+            truth=one.truth and one.truth._replace(poses=one.truth.poses * pose),
+            antenna=(factor * one.antenna[0], factor * one.antenna[1], factor * one.antenna[2]),
+        )
+        for one in recording.robots
+    ]
+    anchors = [FixedAnchor(one.id, *[factor * each for each in one[1:]]) for one in recording.anchors]
+    series = ranges._replace(range=factor * ranges.range, sigma=factor * ranges.sigma)
+    return RangeRecording(recording.source, tuple(robots), tuple(anchors), series)
+
+
+def assumed(profile: ProfileName | None, factor: float) -> AssumedNoise | None:
+    """Return the noise of a profile with all lengths multiplied by `factor`; None: what is recorded."""
+    if profile is None:
+        return None
+    told = told_noise(profile)
+    lengths = ("anchor_sigma", "mutual_sigma", "range_bias", "pair_bias", "slow_sigma")
+    return told._replace(
+        noise=replace(told.noise, **{one: factor * getattr(told.noise, one) for one in lengths})
+    )
+
+
+@pytest.mark.parametrize("factor", [0.01, 100.0])
+@pytest.mark.parametrize(
+    ("profile", "bias", "own", "reason"),
+    [
+        (None, 0.0, False, ""),
+        ("uwb", 0.35, False, ""),
+        ("uwb-calibrated", 0.25, True, "the profile 'uwb' explains them better"),
+        (None, 0.0, True, ""),
+    ],
+    ids=["stated", "uwb", "another profile is better", "odometry without a noise, and heights"],
+)
+def test_the_unit_of_length_changes_no_claim(
+    sample: RangeRecording, profile: ProfileName | None, bias: float, own: bool, reason: str, factor: float
+) -> None:
+    recording = simulated((0.2, 0.1, 0.9), 1.1) if own else sample
+    recording = with_ranges(recording, recording.ranges.range + bias)
+    first, other = (
+        estimated(measurements(times(recording, size), None, assumed(profile, size)), ClaimRule(0.3 * size))
+        for size in (1.0, factor)
+    )
+    assert [row.claim for row in first.rows] == [row.claim for row in other.rows]
+    assert any(row.claim for row in first.rows)
+    assert reason in first.summary.blocking_reason
+    assert reason in other.summary.blocking_reason
+    for one, another in zip(first.rows, other.rows, strict=True):
+        if one.claim:
+            assert another.nees == pytest.approx(one.nees, rel=0.01, abs=0.01)
+            assert (another.x / factor, another.y / factor) == pytest.approx((one.x, one.y), abs=1e-3)

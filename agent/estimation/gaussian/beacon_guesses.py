@@ -94,6 +94,7 @@ def refined(guesses: Array, robot: JointMeasurements) -> list[Array]:
     at = np.stack((path.x[ranges.tick], path.y[ranges.tick]))
     sigma = np.sqrt(np.square(ranges.sigma) + robot.loosened)
     longest = max(float(np.max(ranges.rho)), SIGMA_FLOOR)
+    most = np.array((LONGEST_STEP * longest, LONGEST_STEP * longest, LARGEST_TURN))
     for step in range(REFINEMENTS):
         s = hypot(sigma, COARSE * longest * ERROR_FINER**step)
         distance, jacobian = predicted(guesses, at, ranges.place)
@@ -102,9 +103,8 @@ def refined(guesses: Array, robot: JointMeasurements) -> list[Array]:
         weighted = np.swapaxes(jacobian * weight[..., None], 1, 2)
         information = product(weighted, jacobian)
         information.reshape(len(guesses), -1)[:, ::4] *= 1.0 + DAMPING
-        information.reshape(len(guesses), -1)[:, ::4] += DAMPING
+        information.reshape(len(guesses), -1)[:, ::4] += DAMPING / np.square(most)
         change = solve(information, product(weighted, residuals[..., None]))[..., 0]
-        most = np.array((LONGEST_STEP * longest, LONGEST_STEP * longest, LARGEST_TURN))
         guesses = guesses + change / np.maximum(np.max(np.abs(change) / most, 1, keepdims=True), 1.0)
     distance, _ = predicted(guesses, at, ranges.place)
     likely = log_likelihood(ranges.rho - distance, hypot(sigma, FINAL * longest), robot.noise)
@@ -129,7 +129,7 @@ def predicted(guesses: Array, at: Array, place: Array) -> tuple[Array, Array]:
 
 
 DAMPING = 1e-6
-"""The damping of these steps, as a fraction of the information, and its least value."""
+"""The damping of these steps, as a fraction of the information, and of that of the largest step."""
 
 LONGEST_STEP, LARGEST_TURN = 0.2, 0.3
 """The largest step, as a fraction of the longest range, and the largest turn, in rad."""

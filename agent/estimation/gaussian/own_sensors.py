@@ -110,12 +110,14 @@ def contradiction(fitted: Fit, measured: JointMeasurements) -> Doubt | None:
     """Return the profile that explains what was `measured` much better than the told noise.
 
     `fitted` is the fit to it that would be claimed. Only constant errors are compared: slow ones and strays
-    do not move a pose by more than the noise level that robots learn.
+    do not move a pose by more than the noise level that robots learn. Biases are in proportion to the sigma.
     """
     noise = measured.noise
-    others = {}
+    others, size = {}, max(noise.anchor_sigma, noise.mutual_sigma) / UNTOLD_SIGMA
     for name in _others(noise):
-        other = replace(_profile(name, noise), slow_sigma=noise.slow_sigma, strays=noise.strays)
+        other = _profile(name, noise)
+        biases = {one: size * getattr(other.priors, one) for one in ("range_bias", "pair_bias")}
+        other = replace(other, slow_sigma=noise.slow_sigma, strays=noise.strays, **biases)
         errors = tuple([rescaled(one, noise, other) for one in fitted.start.errors])
         start, again = Start(fitted.start.poses, errors), replace(measured, noise=other)
         for steps in (0, FIT_STEPS):

@@ -59,9 +59,9 @@ MOST_BIAS = 10.0
 
 It is thirty times that of UWB radios. If ranges are all alike, a factor may explain a larger one."""
 
-LEAST_GAP, SAME_PLACE_S = 1.0, 1.0
-"""The length in m by which ranges between robots must be off: below it, motion and biases count; and the time
-in s between two ranges in which a robot hardly moves."""
+LEAST_GAP, SAME_PLACE_S = 0.1, 1.0
+"""The part of the longest other side by which ranges between robots must be off: below it, motion and biases
+count; and the time in s between two ranges in which a robot hardly moves."""
 
 BEARINGS, STEPS = 8, 25
 """The number of bearings from which a fit begins, and that of its steps."""
@@ -371,9 +371,9 @@ def _between_robots(recording: RangeRecording) -> tuple[str, float]:
             bounds.append(excess / apart)
         between, others = lengths[0], np.stack((*lengths[1:], np.full(lengths.shape[1], apart)))
         most, usual = np.sum(others, 0), np.sqrt(np.sum(np.square(others), 0))
-        least = 2.0 * np.max(others, 0) - most
+        least = 2.0 * (longest := np.max(others, 0)) - most
         off = np.median(between - LEAST_FACTOR * most), np.median(least - LEAST_FACTOR * between)
-        if max(off) > LEAST_GAP:
+        if max(off) > LEAST_GAP * np.median(longest):
             factor = float(np.median(np.maximum(between, TINY) / np.maximum(usual, TINY)))
             who = f"ranges of {' and '.join(pair)}"
             doubts.append(_sentence(who, factor, "ranges to anchors", NEAR_UNIT_OF_USUAL))

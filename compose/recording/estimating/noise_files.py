@@ -18,11 +18,11 @@ from compose.errors import UserError
 from compose.recording.estimating.radio_errors import absurd_error
 from compose.recording.ranging.range_recording import RangeRecording, locked
 from compose.scenario.toml_file import field_first, read_text, table_in
-from protocol.noise import PROFILES, Noise, ProfileName, VelocityNoise, with_profile
+from protocol.noise import PROFILES, UNTOLD, UNTOLD_SIGMA, Noise, ProfileName, VelocityNoise, with_profile
 from protocol.spelling import did_you_mean
 
-RESIDUAL = VelocityNoise(v_floor=1e-3, omega_floor=1e-4)
-"""The noise of odometry in addition to that of each increment, in m/s and rad/s.
+RESIDUAL_S, RESIDUAL_TURN = 50.0, 1e-4
+"""The noise of odometry besides that of increments: the sigma of a range in so many s, and rad/s.
 
 It sets the bound below which a robot counts as standing, with which a gyro has no bias.
 """
@@ -34,6 +34,9 @@ Of ranges that are 0.3 s late at 1 m/s, 5 claims of 107 were wrong without it
 (by 5 of their sigmas along an axis), 2 of 113 with it, and the median error of a claim is 0.10 m, not 0.3 m.
 Where stamps are right, as many poses are claimed.
 """
+
+ACCURATE = 0.002
+"""The sigma of ranges, as a fraction of their median, below which UNTOLD becomes narrower."""
 
 FALLBACK: ProfileName = "uwb"
 """The profile for recordings that do not state the sigma of each range."""
@@ -81,6 +84,11 @@ class AssumedNoise(NamedTuple):
     """True if the sigmas of ranges are those that the recording states."""
 
     @property
+    def sigma(self) -> float:
+        """The larger sigma (m) of ranges to anchors and between robots: the unit of lengths of odometry."""
+        return max(self.noise.anchor_sigma, self.noise.mutual_sigma)
+
+    @property
     def odometry(self) -> VelocityNoise | None:
         """The noise of odometry over one second; None: what the recording states."""
         return None if self.noise.odometry == VelocityNoise() else self.noise.odometry
@@ -88,7 +96,7 @@ class AssumedNoise(NamedTuple):
     @property
     def of_fit(self) -> Noise:
         """The noise in a fit, whose increments have the variances of what was recorded."""
-        return replace(self.noise, odometry=RESIDUAL)
+        return replace(self.noise, odometry=VelocityNoise(0.0, 0.0, self.sigma / RESIDUAL_S, RESIDUAL_TURN))
 
 
 def stated_noise(recording: RangeRecording) -> AssumedNoise:
@@ -97,7 +105,10 @@ def stated_noise(recording: RangeRecording) -> AssumedNoise:
     if not len(sigmas) or not np.all(np.isfinite(sigmas)):
         return told_noise(FALLBACK)
     usual = float(np.median(sigmas))
-    noise = Noise(anchor_sigma=usual, mutual_sigma=usual, range_delay=UNTOLD_DELAY_S)
+    share = usual / max(ACCURATE * float(np.median(recording.ranges.range)), usual)
+    priors = {one: share * usual / UNTOLD_SIGMA * getattr(UNTOLD, one) for one in ("range_bias", "pair_bias")}
+    priors |= {one: share**2 * getattr(UNTOLD, one) for one in ("range_scale", "wheel_scale", "gyro_bias")}
+    noise = Noise(anchor_sigma=usual, mutual_sigma=usual, range_delay=UNTOLD_DELAY_S, **priors)
     return AssumedNoise("stated in the recording", noise, stated=True)
 
 

@@ -67,9 +67,6 @@ A missing range of a recording says nothing, so that this only scales the tolera
 the estimator would take it for information that no range is longer.
 """
 
-SHORTEST_RANGE_M = 1e-3
-"""The least length in m of the longest range. A recording whose ranges are all 0 says nothing."""
-
 MOST_USED_ANCHORS = 32
 """The largest number of anchors of a robot that are used. Each has a bias of its own, which a fit learns."""
 
@@ -129,7 +126,7 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     def until(self, epoch: int) -> JointMeasurements:
         """Return what was measured up to the end of `epoch`, from 0 on; see HORIZON."""
         known = self.joint.until((epoch + 1) * self.ticks_per_epoch)
-        reach = HORIZON * max(float(np.max(known.ranges.rho, initial=0.0)), SHORTEST_RANGE_M)
+        reach = HORIZON * max(float(np.max(known.ranges.rho, initial=0.0)), SIGMA_FLOOR)
         return known.thinned(reach)
 
 
@@ -201,7 +198,7 @@ def _measurements(part: RangeRecording, assumed: AssumedNoise, ticks: int | None
         if robot.jumps:
             raise BadRecording(robot.jumps[0].why)
     arrivals = np.sort(np.concatenate([[-np.inf], part.ranges.t, *[one.odometry.t1 for one in part.robots]]))
-    prepared = [sound(robot.odometry, assumed.odometry) for robot in whole.robots]
+    prepared = [sound(robot.odometry, assumed.odometry, assumed.sigma) for robot in whole.robots]
     moved = [
         robot._replace(odometry=at_antenna(one.odometry, *robot.antenna[:2]))
         for robot, one in zip(part.robots, prepared, strict=True)
@@ -242,9 +239,9 @@ def _measurements(part: RangeRecording, assumed: AssumedNoise, ticks: int | None
 
 def ticks_per_epoch(recording: RangeRecording, noise: Noise) -> int:
     """Return the number of ticks in an epoch, by the speed of the fastest robot (see SHARE)."""
-    least = min(noise.anchor_sigma, noise.mutual_sigma)
+    least = max(min(noise.anchor_sigma, noise.mutual_sigma), SIGMA_FLOOR)
     fastest = max(float(np.percentile(speeds(one.odometry)[0], NEARLY_ALL)) for one in recording.robots)
-    return min(max(math.ceil(0.5 * EPOCH_S * fastest / (SHARE * max(least, 1e-3))), 1), MOST_TICKS_APART)
+    return min(max(math.ceil(0.5 * EPOCH_S * fastest / (SHARE * least)), 1), MOST_TICKS_APART)
 
 
 def _ranges(

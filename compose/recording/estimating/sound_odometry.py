@@ -11,13 +11,15 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from msgspec.structs import replace
 
 from compose.recording.ranging.range_recording import SAME_TIME_S, Numbers, Places, RobotOdometry, locked
 from compose.recording.ranging.range_steps import GROSS_FACTOR, gross, speed_bound
 from protocol.noise import VelocityNoise
 
-UNSTATED_NOISE = VelocityNoise(v=0.05, omega=0.05, v_floor=0.01, omega_floor=0.01)
-"""The noise of odometry whose recording states none, over one second.
+UNSTATED_NOISE, FLOOR_S = VelocityNoise(v=0.05, omega=0.05, omega_floor=0.01), 5.0
+"""The noise of odometry whose recording states none, over one second, and the time in s in which its floor of
+v is the sigma of a range: 0.01 m/s with 0.05 m.
 
 It is that of wheels without calibration and of a cheap gyro, and white: a scale or a bias has a prior of its
 own. With less, real slip contradicts the ranges; with more, a claim takes more of them.
@@ -33,8 +35,8 @@ After it, nothing is known of a robot's heading, and hardly anything of its posi
 fits lose all digits.
 """
 
-FREE = 1.0
-"""The speed (m/s) and turn rate (rad/s) that a robot is assumed to have if its odometry never moves."""
+FREE, FREE_TURN = 20.0, 1.0
+"""The speed (sigmas of a range in a second) and turn rate (rad/s) of a robot whose odometry never moves."""
 
 
 class SoundOdometry(NamedTuple):
@@ -50,15 +52,15 @@ class SoundOdometry(NamedTuple):
     """The indices of the recorded increments whose turn was off by a whole turn, which was removed."""
 
 
-def sound(odometry: RobotOdometry, told: VelocityNoise | None = None) -> SoundOdometry:
+def sound(odometry: RobotOdometry, told: VelocityNoise | None = None, sigma: float = 0.0) -> SoundOdometry:
     """Return `odometry` with gross increments replaced and gaps filled.
 
-    `told` is its noise over one second; None for the stated covariances.
+    `told` is its noise over one second; None for the stated covariances. `sigma` (m) is that of ranges.
     """
     odometry, whole_turns = _without_whole_turns(odometry)
     bound, gaps = speed_bound(odometry), odometry.gaps
     flagged = gross(odometry, bound)
-    usual = [one / GROSS_FACTOR if math.isfinite(one) else FREE for one in bound]
+    usual = np.where(np.isfinite(bound), np.divide(bound, GROSS_FACTOR), (FREE * sigma, FREE_TURN))
     t0, t1 = np.concatenate((odometry.t0, gaps[:, 0])), np.concatenate((odometry.t1, gaps[:, 1]))
     order, lasts = np.lexsort((t1, t0)), t1 - t0
     t0, t1, lasts = t0[order], t1[order], lasts[order]
@@ -69,7 +71,7 @@ def sound(odometry: RobotOdometry, told: VelocityNoise | None = None) -> SoundOd
     rates = np.where(last[:, None] >= 0, rates[np.maximum(last, 0)], 0.0)
     moving = np.where(order < len(flagged), lasts, np.minimum(lasts, GAP_MOTION_S))
     increments[unknown] = moving[unknown, None] * rates[unknown]
-    covariance = np.concatenate((_covariance(odometry, told), np.zeros((len(gaps), 3, 3))))[order]
+    covariance = np.concatenate((_covariance(odometry, told, sigma), np.zeros((len(gaps), 3, 3))))[order]
     lost = np.minimum(lasts[unknown], LOST_S)
     variances = np.square(lost[:, None] * (usual[0], usual[0], usual[1]))
     covariance[unknown] = variances[:, :, None] * np.eye(3)
@@ -98,9 +100,9 @@ def _without_whole_turns(odometry: RobotOdometry) -> tuple[RobotOdometry, Places
     return odometry._replace(increments=locked(increments)), np.flatnonzero(removed)
 
 
-def _covariance(odometry: RobotOdometry, told: VelocityNoise | None) -> Numbers:
+def _covariance(odometry: RobotOdometry, told: VelocityNoise | None, sigma: float) -> Numbers:
     """Return the covariance of each increment: `told`, else stated, else UNSTATED_NOISE; shape (N, 3, 3)."""
-    noise, lasts = told or UNSTATED_NOISE, odometry.t1 - odometry.t0
+    noise, lasts = told or replace(UNSTATED_NOISE, v_floor=sigma / FLOOR_S), odometry.t1 - odometry.t0
     silent = ~np.all(np.isfinite(odometry.covariance), axis=(1, 2)) | (told is not None)
     dx, dy, turn = odometry.increments.T
     rates = np.where(lasts > 0.0, 1.0 / np.maximum(lasts, SAME_TIME_S), 0.0)
@@ -129,8 +131,8 @@ def at_antenna(odometry: RobotOdometry, forward: float, left: float) -> RobotOdo
 def levelled(measured: Numbers, higher: Numbers) -> tuple[Numbers, Numbers]:
     """Return the ranges (m) in the plane of antennas that differ in height, and the factors of the sigmas."""
     level = np.sqrt(np.maximum(np.square(measured) - np.square(higher), 0.0))
-    steep = np.where(higher == 0.0, 1.0, measured / np.maximum(level, LEVEL * np.maximum(measured, 1e-3)))
-    return level, steep
+    length = np.where(measured > 0.0, measured, 1.0)
+    return level, np.where(higher == 0.0, 1.0, length / np.maximum(level, LEVEL * length))
 
 
 LEVEL = 0.1
