@@ -12,6 +12,8 @@ SEED_VISITED = -1
 SEED_VISITOR = -2
 RELEASED = -3
 """Values in place of the robot above."""
+BLINKS = 0.1
+"""The share of possible meetings that a step does not consider, so that steps differ."""
 
 
 class OpenForest:
@@ -20,6 +22,8 @@ class OpenForest:
     def __init__(self, times: MeetingTimes) -> None:
         robots = len(times.robots)
         self._times = times
+        self._ways = tuple(zip(*times.hop, strict=True))
+        """The times of the hops, indexed [to][from]."""
         self._above = [RELEASED] * robots
         """The robot at whose anchor the hop to this one starts, or one of the constants above."""
         self._below: list[tuple[int, ...]] = [()] * robots
@@ -34,7 +38,7 @@ class OpenForest:
     def copy(self) -> OpenForest:
         """Return a copy that changes on its own."""
         copy = object.__new__(OpenForest)
-        copy._times = self._times
+        copy._times, copy._ways = self._times, self._ways
         copy._above, copy._below, copy._partner = self._above[:], self._below[:], self._partner[:]
         copy._end, copy._tail = self._end[:], self._tail[:]
         return copy
@@ -78,17 +82,17 @@ class OpenForest:
             )
         return sorted(parts)
 
-    def insert(self, parts: list[int], skip: Callable[[], bool]) -> None:
+    def insert(self, parts: list[int], draw: Callable[[], float]) -> None:
         """Insert `parts`, the last one first, each where the meetings that it changes end earliest.
 
-        A place or a seed pair for which `skip` returns True is not considered.
+        A place or a seed pair for which `draw` returns less than BLINKS is not considered.
         """
         places = [robot for root in self._roots() for robot in self._part(root)]
         waiting = parts[:]
         while waiting:
             part = waiting.pop()
-            end, place, under = self._best_hop(part, (place for place in places if not skip()))
-            seed_pairs = (pair for pair in self._seed_pairs_of(part, waiting) if not skip())
+            end, place, under = self._best_hop(part, [place for place in places if draw() >= BLINKS])
+            seed_pairs = [pair for pair in self._seed_pairs_of(part, waiting) if draw() >= BLINKS]
             end_of_pair, visitor, root = min(seed_pairs, key=itemgetter(0), default=(inf, -1, -1))
             if end == end_of_pair == inf:
                 waiting.insert(0, part)
@@ -102,16 +106,16 @@ class OpenForest:
 
     def _best_hop(self, part: int, places: Iterable[int]) -> tuple[float, int, int]:
         """Return the last end, the place of departure, and the robot above which `part` is put, or -1."""
-        hop, tail = self._times.hop, self._tail
-        best = (inf, -1, -1)
+        hop, tail, after = self._times.hop, self._tail, self._tail[part]
+        best, way, ends = (inf, -1, -1), self._ways[part], self._end
         for place in places:
-            end = self._end[place] + hop[place][part]
-            if end + tail[part] < best[0]:
+            end = ends[place] + way[place]
+            if end + after < best[0]:
                 if len(self._below[place]) < 2:
-                    best = (end + tail[part], place, -1)
+                    best = (end + after, place, -1)
                 if len(self._below[part]) < 2:
                     for under in self._below[place]:
-                        last = end + max(tail[part], hop[part][under] + tail[under])
+                        last = end + max(after, hop[part][under] + tail[under])
                         if last < best[0]:
                             best = (last, place, under)
         return best

@@ -14,8 +14,6 @@ MOST_RELEASED = 10
 """The most robots that a change takes out of the forest, without their partners."""
 STEP_SLACK = 0.05
 """The share by which a step may exceed the shortest forest at the start of the search; it falls to zero."""
-BLINKS = 0.1
-"""The share of possible meetings that a step does not consider, so that steps differ."""
 SEARCH_SEED = 21
 
 
@@ -31,13 +29,9 @@ def short_forest(times: MeetingTimes, steps: int = SEARCH_STEPS) -> WakeUpForest
     (arXiv 2507.16269); this search does not guarantee the former.
     """
     draw = random.Random(SEARCH_SEED).random
-
-    def skip() -> bool:
-        return draw() < BLINKS
-
     near = [sorted(times.robots, key=row.__getitem__) for row in times.hop]
     forest = OpenForest(times)
-    forest.insert(_shuffled(list(times.robots), draw), skip)
+    forest.insert(_shuffled(list(times.robots), draw), draw)
     best = forest
     lower_bound = times.earliest_end()
     for step in range(steps):
@@ -48,7 +42,7 @@ def short_forest(times: MeetingTimes, steps: int = SEARCH_STEPS) -> WakeUpForest
         centre = latest[int(draw() * len(latest))]
         count = 2 + int(draw() * (MOST_RELEASED - 1))
         parts = changed.release([centre, *(robot for robot in near[centre][: 2 * count] if draw() < 0.5)])
-        changed.insert(_shuffled(parts, draw), skip)
+        changed.insert(_shuffled(parts, draw), draw)
         slack = 1.0 + STEP_SLACK * (1.0 - step / steps)
         if changed.length() <= max(forest.length(), best.length() * slack):
             forest = changed
