@@ -169,6 +169,8 @@ def test_a_bound_that_is_not_the_planned_one_is_found(group: Journals) -> None:
     later = replace(scenario.meetings[-1], ends=scenario.meetings[-1].ends + 1.0)
     changed = replace(scenario, meetings=(*scenario.meetings[:-1], later))
     assert (None, None, "scenario") in audited(with_scenario(group, changed))
+    least = replace(scenario, least_bound=scenario.least_bound + 1.0)
+    assert audited(with_scenario(group, least)) == [(None, None, "scenario")]
 
 
 def test_another_visitor_than_the_planned_one_is_found(group: Journals) -> None:
@@ -240,6 +242,7 @@ def test_the_summary_has_the_meetings_their_bounds_and_the_truth_at_each_claim()
         (one.visitor, one.visited) for one in run.scenario.meetings
     ]
     assert group["bound_s"] == run.scenario.meetings[-1].ends
+    assert group["least_bound_s"] == pytest.approx(group["bound_s"])
     claims = {robot: run.claim(robot) for robot in run.robots}
     for one in group["meetings"]:
         both = [claims[one[name]] for name in ("visitor", "visited")]

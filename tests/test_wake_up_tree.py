@@ -13,7 +13,12 @@ from hypothesis import strategies as st
 
 from compose.scenario.group_plan import GroupPlan, PlannedVisit, group_plan, least_makespan, planned_meetings
 from compose.scenario.wake_up_search import short_forest
+from compose.scenario.wake_up_sectors import MOST_TRAVEL, lateral, sector_forest
 from compose.scenario.wake_up_tree import MeetingTimes, WakeUpForest, optimal_forest
+from protocol.mission import Mission
+from protocol.noise import Noise
+from protocol.orbits import meeting_ticks, pair_ticks, searching
+from tests import plans
 
 MEETING_S = 10.0
 Anchors = list[tuple[float, float]]
@@ -45,14 +50,10 @@ def meeting_times(anchors: Anchors, meeting: float = MEETING_S) -> MeetingTimes:
     )
 
 
-def last_end(forest: WakeUpForest, times: MeetingTimes) -> float:
-    return max(forest.ends(times).values())
-
-
 def ratio_of_search(anchors: Anchors) -> float:
     """Return how many times longer than the optimum the forest of the search is."""
     times = meeting_times(anchors)
-    return last_end(short_forest(times), times) / last_end(optimal_forest(times), times)
+    return short_forest(times).last_end(times) / optimal_forest(times).last_end(times)
 
 
 def simulated_ends(
@@ -118,6 +119,7 @@ def test_a_plan_is_possible_and_ends_at_its_bound(anchors: Anchors, speed: float
     assert plan.bound == pytest.approx(max(ends))
     assert ends == pytest.approx(sorted(ends))
     assert plan.bound >= least_makespan(plan.travel) * (1 - 1e-12)
+    assert plan.bound >= plan.least_bound * (1 - 1e-12)
 
 
 @given(groups(2, 5), st.lists(st.floats(1.0, 400.0), min_size=25, max_size=25), st.floats(0.0, 60.0))
@@ -143,10 +145,10 @@ def test_a_plan_of_six_robots_is_the_best_of_all_plans(seed: int) -> None:
 def test_the_optimum_is_between_the_lower_bound_and_any_search(anchors: Anchors, draw: random.Random) -> None:
     seed = tuple(tuple(draw.uniform(1.0, 400.0) for _ in anchors) for _ in anchors)
     times = MeetingTimes(seed, meeting_times(anchors).hop)
-    optimum = last_end(optimal_forest(times), times)
+    optimum = optimal_forest(times).last_end(times)
     assert times.earliest_end() <= optimum * (1 + 1e-12)
     for steps in (0, 20):
-        assert optimum <= last_end(short_forest(times, steps), times) * (1 + 1e-12)
+        assert optimum <= short_forest(times, steps).last_end(times) * (1 + 1e-12)
 
 
 @given(groups(3, 12), st.integers(-1000, 1000), st.integers(-1000, 1000), st.randoms(use_true_random=False))
@@ -182,6 +184,110 @@ def test_a_large_plan_is_possible_and_near_its_lower_bound(robots: int) -> None:
     ends = simulated_ends(plan.meetings, anchors, orbit_time(anchors), 1.0, MEETING_S)
     assert plan.bound == pytest.approx(max(ends))
     assert least_makespan(plan.travel) <= plan.bound <= 1.4 * least_makespan(plan.travel)
+
+
+FACTOR = 1.0 + MOST_TRAVEL
+"""The proved factor of docs/groups.md for at most 490 robots."""
+SHAPES = (plans.square, plans.clusters, plans.line, plans.circle, plans.disc, plans.far_cluster, plans.spiral)
+POSSIBLE = ("any two", "three nearest", "one pair")
+
+
+class Group:
+    """A group whose first meetings take as little time as docs/groups.md assumes, with a drawn shape."""
+
+    def __init__(self, robots: int, meeting: float, seed: int) -> None:
+        draw = random.Random(seed)
+        self.meeting = meeting
+        self.anchors = sorted(draw.choice(SHAPES)(robots, draw))
+        if draw.random() < 0.2:
+            self.anchors = sorted(draw.choices(self.anchors[: 2 + robots // 3], k=robots))
+        numbers = range(robots)
+        self.near = [
+            sorted(numbers, key=lambda other: math.dist(one, self.anchors[other]))[:4] for one in self.anchors
+        ]
+        self.possible = draw.choice(POSSIBLE)
+        rows = tuple(tuple(self.seed_time(a, b) for b in numbers) for a in numbers)
+        ways = tuple(tuple(math.dist(p, q) + meeting for q in self.anchors) for p in self.anchors)
+        self.times = MeetingTimes(rows, ways)
+
+    def seed_time(self, a: int, b: int) -> float:
+        possible = {"any two": True, "three nearest": b in self.near[a], "one pair": {a, b} == {0, 1}}
+        if a == b or not (possible[self.possible] or (a, b) == (0, 1)):
+            return math.inf
+        return 1.5 * self.meeting + 2.0 * math.dist(self.anchors[a], self.anchors[b]) + 0.01
+
+
+drawn_groups = st.builds(
+    Group, st.integers(2, 200), st.sampled_from([0.0, 1.0, 38.0, 1000.0]), st.integers(0, 1 << 32)
+)
+
+
+@given(drawn_groups)
+@settings(max_examples=60, deadline=None)
+def test_a_forest_of_sectors_ends_within_the_proved_factor_of_the_lower_bound(group: Group) -> None:
+    forest = sector_forest(group.times, group.anchors, group.meeting)
+    meetings = tuple(planned_meetings(forest, group.times))
+    simulated_ends(meetings, group.anchors, group.seed_time, 1.0, group.meeting)
+    assert forest.last_end(group.times) <= FACTOR * group.times.earliest_end() * (1 + 1e-12)
+
+
+@given(drawn_groups)
+@settings(max_examples=60, deadline=None)
+def test_each_cell_is_localised_within_the_proved_time_after_its_first_meeting(group: Group) -> None:
+    forest = sector_forest(group.times, group.anchors, group.meeting)
+    ends, root = forest.ends(group.times), {b: b for _, b in forest.seeds}
+    for place, robot in forest.hops:
+        root[robot] = root[place]
+    for _, b in forest.seeds:
+        cell = [robot for robot in root if root[robot] == b and robot != b]
+        radius = max([math.dist(group.anchors[b], group.anchors[robot]) for robot in cell], default=0.0)
+        most = MOST_TRAVEL * radius + group.meeting * math.log2(len(cell) + 1)
+        assert max(ends[robot] for robot in (b, *cell)) <= (ends[b] + most) * (1 + 1e-12)
+
+
+@given(st.floats(0.0, math.tau), st.floats(0.0, math.tau))
+def test_the_way_across_a_sector_is_as_the_proof_needs_it(angle: float, other: float) -> None:
+    chord = 2.0 * math.sin(min(angle, math.pi) / 2.0)
+    assert lateral(angle) >= chord + lateral(angle / 2.0) - 1e-12
+    assert lateral((angle + other) / 2.0) >= (lateral(angle) + lateral(other)) / 2.0 - 1e-12
+
+
+@given(
+    st.floats(1 / 25, 2.0), st.floats(-3.0, 2.5), st.floats(0.3, 3.0), st.sampled_from([0.0, 0.02, 0.05, 0.2])
+)
+def test_first_meetings_take_the_time_that_the_proof_assumes(
+    step: float, scale: float, turn: float, sigma: float
+) -> None:
+    noise = Noise(anchor_sigma=sigma, mutual_sigma=sigma)
+    mission = Mission(sensing_range=3.0, period=1.0, max_speed=3.0 * step, max_turn_rate=turn, noise=noise)
+    distance = 3.0 * 10.0**scale
+    ticks = pair_ticks(mission, searching(mission, distance))
+    assert ticks >= 1.5 * meeting_ticks(mission) + 2.0 * distance / mission.max_speed
+
+
+@given(st.builds(Group, st.integers(9, 24), st.sampled_from([0.0, 38.0]), st.integers(0, 1 << 32)))
+@settings(max_examples=10, deadline=None)
+def test_a_plan_is_no_worse_than_the_search_nor_than_the_factor(group: Group) -> None:
+    plan = group_plan(group.anchors, group.seed_time, 1.0, group.meeting)
+    simulated_ends(plan.meetings, group.anchors, group.seed_time, 1.0, group.meeting)
+    assert plan.bound <= short_forest(group.times).last_end(group.times)
+    assert plan.least_bound == group.times.earliest_end()
+    assert plan.least_bound * (1 - 1e-12) <= plan.bound <= FACTOR * plan.least_bound
+
+
+def test_sectors_are_the_plan_where_the_search_finds_a_longer_one() -> None:
+    anchors = sorted(plans.disc(90, random.Random(1)))
+    pair = [i for i, anchor in enumerate(anchors) if anchor == (0.0, 0.0)]
+
+    def seed_time(a: int, b: int) -> float:
+        return 151.0 if [a, b] == pair else math.inf
+
+    plan = group_plan(anchors, seed_time, speed=1.0, meeting=100.0)
+    numbers = range(len(anchors))
+    seed = tuple(tuple(seed_time(a, b) for b in numbers) for a in numbers)
+    times = MeetingTimes(seed, meeting_times(anchors, 100.0).hop)
+    assert plan.bound == pytest.approx(sector_forest(times, anchors, 100.0).last_end(times))
+    assert plan.bound < 0.95 * short_forest(times).last_end(times)
 
 
 def test_the_same_group_has_the_same_plan() -> None:

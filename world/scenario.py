@@ -152,6 +152,8 @@ class Scenario(
     """The search for robots without an anchor; None if all robots have one."""
     confirmation: PlannedConfirmation | None = None
     """The meetings that confirm poses; None if robots claim the pose that they know."""
+    least_bound: Time = 0.0
+    """A lower bound in s of the time that any plan of the meetings allows; 0 if the robots form pairs."""
 
     @cached_property
     def ranging(self) -> RangeModel | None:

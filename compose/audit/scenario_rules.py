@@ -61,6 +61,8 @@ def _group(found: Scenario) -> Checks:
     for name in ("planned_sweep", "confirmation"):
         given, expected = getattr(found, name), getattr(planned, name)
         yield _violation(None, None if given == expected else f"{name}.{difference(given, expected)}")
+    if found.least_bound != planned.least_bound:
+        yield _violation(None, f"least_bound is {found.least_bound}, expected {planned.least_bound}")
     for robot in found.robots:
         first = planned.first[robot.id]
         for why in (

@@ -75,6 +75,7 @@ def _group(run: Run) -> dict[str, Any]:
     return {
         "bound_s": max(one.bound_s for one in results),
         "bound_ticks": max(one.bound_ticks for one in results),
+        "least_bound_s": run.scenario.least_bound,
         "localised_tick": max(tick for tick in ticks if tick is not None) if None not in ticks else None,
         "corrected_bounds": msgspec.to_builtins(list(corrected_bounds(run))),
         "not_localised": {robot: of_it(cause) for robot, cause in left.items()},

@@ -67,6 +67,8 @@ class GroupMeetings(NamedTuple):
     """The meetings with which the group tries again if a first meeting has failed."""
     latest: float
     """The bound in s of the time at which the last of these has localised all robots that can be."""
+    least_bound: float
+    """A lower bound in s of the `bound` of any plan."""
     planned_sweep: PlannedSweep | None = None
     """The search for robots without an anchor; None if all have one."""
     confirmation: PlannedConfirmation | None = None
@@ -141,7 +143,7 @@ def group_meetings(
         lasts = pair_time(i, j) + extra[0] * mission.period
         retries.append(Appointment(ids[i], ids[j], rendezvous(i, j), begins, lasts))
         begins += lasts + VISITS_SLOWER * spread
-    return GroupMeetings(planned, first, bound, tuple(retries), begins)
+    return GroupMeetings(planned, first, bound, tuple(retries), begins, plan.least_bound)
 
 
 def _delayed(

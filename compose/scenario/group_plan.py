@@ -9,6 +9,7 @@ from math import inf, sqrt
 import msgspec
 
 from compose.scenario.wake_up_search import short_forest
+from compose.scenario.wake_up_sectors import sector_forest
 from compose.scenario.wake_up_tree import MeetingTimes, WakeUpForest, optimal_forest
 
 MOST_OPTIMAL = 8
@@ -33,6 +34,8 @@ class GroupPlan(msgspec.Struct, frozen=True):
     """The meetings in the order of their ends."""
     bound: float
     """The bound in s of the time at which all are localised."""
+    least_bound: float
+    """A lower bound in s of the `bound` of any plan. docs/groups.md proves a factor of the two."""
     travel: MeetingTimes
     """The bounds of seed pairs, and of travel alone."""
 
@@ -43,7 +46,7 @@ def least_makespan(times: MeetingTimes) -> float:
     It is the optimum up to MOST_OPTIMAL robots; beyond, the earliest end for the robot reached last.
     """
     if len(times.robots) <= MOST_OPTIMAL:
-        return max(optimal_forest(times).ends(times).values())
+        return optimal_forest(times).last_end(times)
     return times.earliest_end()
 
 
@@ -61,9 +64,9 @@ def group_plan(
     `speed` in m/s to the anchor of one that waits, where their meeting lasts at most `meeting` in s. Robots
     whose anchors are less than `nearest` m apart visit each other only if no other robot can.
 
-    The plan is optimal up to MOST_OPTIMAL robots; beyond, `short_forest` says what is known. Numbering and
-    translation change the bound by rounding only, unless two anchors are at one place. Raises ValueError for
-    fewer than two robots, or if no two can meet first.
+    The plan is optimal up to MOST_OPTIMAL robots; beyond, it is the better one of `short_forest` and
+    `sector_forest`. Numbering and translation change the bound by rounding only, unless two anchors are at
+    one place. Raises ValueError for fewer than two robots, or if no two can meet first.
     """
     if len(anchors) < 2:
         raise ValueError(f"a group has at least two robots, not {len(anchors)}")
@@ -74,12 +77,18 @@ def group_plan(
         raise ValueError("no two robots of the group can meet first")
     travel = tuple(tuple(_distance(anchors[a], anchors[b]) / speed for b in order) for a in order)
     times = MeetingTimes(seed, tuple(tuple(time + meeting for time in row) for row in travel))
-    forest = optimal_forest(times) if len(order) <= MOST_OPTIMAL else short_forest(times)
+    if len(order) <= MOST_OPTIMAL:
+        forest = optimal_forest(times)
+    else:
+        forests = short_forest(times), sector_forest(times, [anchors[robot] for robot in order], meeting)
+        forest = min(forests, key=lambda forest: forest.last_end(times))
     meetings = tuple(
         msgspec.structs.replace(each, visitor=order[each.visitor], visited=order[each.visited])
         for each in planned_meetings(forest, times, {(order.index(a), order.index(b)) for a, b in near})
     )
-    return GroupPlan(meetings, meetings[-1].ends, MeetingTimes(seed, travel))
+    bound = meetings[-1].ends
+    least_bound = bound if len(order) <= MOST_OPTIMAL else times.earliest_end()
+    return GroupPlan(meetings, bound, least_bound, MeetingTimes(seed, travel))
 
 
 def planned_meetings(

@@ -74,12 +74,8 @@ class OpenForest:
             for each in self._below[robot]:
                 self._above[each] = RELEASED
                 parts.add(each)
-            self._above[robot], self._below[robot], self._partner[robot], self._tail[robot] = (
-                RELEASED,
-                (),
-                -1,
-                0.0,
-            )
+            self._above[robot], self._below[robot] = RELEASED, ()
+            self._partner[robot], self._tail[robot] = -1, 0.0
         return sorted(parts)
 
     def insert(self, parts: list[int], draw: Callable[[], float]) -> None:
@@ -158,7 +154,7 @@ class OpenForest:
         while robot >= 0:
             hop = self._times.hop[robot]
             self._tail[robot] = max(
-                (hop[each] + self._tail[each] for each in self._below[robot]), default=0.0
+                [hop[each] + self._tail[each] for each in self._below[robot]], default=0.0
             )
             robot = self._above[robot]
 

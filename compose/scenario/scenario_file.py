@@ -283,6 +283,7 @@ def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scena
         tolerates=file.mission.tolerates,
         planned_sweep=meetings.planned_sweep if meetings is not None else None,
         confirmation=meetings.confirmation if meetings is not None else None,
+        least_bound=meetings.least_bound if meetings is not None else 0.0,
     )
     try:
         for one in scenario.robots:

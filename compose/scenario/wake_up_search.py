@@ -22,11 +22,8 @@ def short_forest(times: MeetingTimes, steps: int = SEARCH_STEPS) -> WakeUpForest
 
     A step releases robots near one of those on which the last end depends, and inserts them again in another
     order: ruin and recreate (Schrimpf et al., J. Comput. Phys. 159, 2000) with blinks (Christiaens and
-    Vanden Berghe, Transp. Sci. 54, 2020). The search ends early at a lower bound. Its seed is a constant.
-
-    No bound of its ratio to the optimum is proved. In the plane, with no time for meetings, one robot can
-    have all within a distance r localised within 4.31 r / v, and for some positions no sooner than 3.82 r / v
-    (arXiv 2507.16269); this search does not guarantee the former.
+    Vanden Berghe, Transp. Sci. 54, 2020). The search ends early at a lower bound. Its seed is a constant. No
+    ratio to the optimum is proved, as one is for `sector_forest`.
     """
     draw = random.Random(SEARCH_SEED).random
     near = [sorted(times.robots, key=row.__getitem__) for row in times.hop]

@@ -62,6 +62,10 @@ class WakeUpForest(msgspec.Struct, frozen=True):
             ends[robot] = ends[place] + times.hop[place][robot]
         return ends
 
+    def last_end(self, times: MeetingTimes) -> float:
+        """Return the time in s at which the last robot is localised."""
+        return max(self.ends(times).values())
+
 
 def optimal_forest(times: MeetingTimes) -> WakeUpForest:
     """Return a forest whose last meeting ends as early as possible.
