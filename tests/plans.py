@@ -25,6 +25,7 @@ from protocol.mission import Mission
 MISSION = Mission(sensing_range=3.0, period=1.0, max_speed=1.0, max_turn_rate=math.pi)
 SIZES = (8, 50, 200)
 Anchors = list[tuple[float, float]]
+Shape = Callable[[int, random.Random], Anchors]
 
 
 def square(robots: int, draw: random.Random) -> Anchors:
@@ -65,6 +66,12 @@ def far_cluster(robots: int, draw: random.Random) -> Anchors:
     return [(0.0, 0.0)] * 2 + [(100.0 + x / 100, y / 100) for x, y in disc(robots, draw)[2:]]
 
 
+def fan(robots: int, draw: random.Random) -> Anchors:
+    """Return two anchors, and the others 100 m away, of which half of the angle contains nearly all."""
+    angles = [math.pi * 2.0 ** (-i / 8) for i in range(robots - 2)]
+    return [(0.0, 0.0)] * 2 + [_polar(draw.uniform(100.0, 100.001), angle) for angle in angles]
+
+
 def spiral(robots: int, draw: random.Random) -> Anchors:
     """Return two anchors at the centre of a spiral, which each way to the next one crosses."""
     shift = draw.uniform(0.0, 7.0)
@@ -76,7 +83,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(row) + " |" for row in [head, ["---"] * len(head), *rows])
 
 
-def of_missions(shape: Callable[[int, random.Random], Anchors], robots: int, groups: int) -> list[str]:
+def of_missions(shape: Shape, robots: int, groups: int) -> list[str]:
     """Return the row of the first table for groups of so many robots."""
     bounds, ratios, seconds = [], [], []
     for seed in range(groups):
@@ -93,9 +100,7 @@ def of_missions(shape: Callable[[int, random.Random], Anchors], robots: int, gro
     ]
 
 
-def of_one_pair(
-    shape: Callable[[int, random.Random], Anchors], robots: int, meeting: float, groups: int
-) -> list[str]:
+def of_one_pair(shape: Shape, robots: int, meeting: float, groups: int) -> list[str]:
     """Return the row of the second table for groups in which only the first two robots can meet first."""
     found = []
     for seed in range(groups):
@@ -116,7 +121,7 @@ def of_one_pair(
 def main(groups: int) -> None:
     """Print both tables."""
     head = ["anchors", "robots", "bound in s, median / largest", "bound over lower bound", "CPU-s"]
-    rows = [of_missions(shape, robots, groups) for shape in (square, clusters, line) for robots in SIZES]
+    rows = [of_missions(shape, robots, groups) for shape in (square, clusters) for robots in SIZES]
     print(table(head, rows), end="\n\n", flush=True)
     head = [
         "anchors",
@@ -127,7 +132,7 @@ def main(groups: int) -> None:
         "the better one, largest",
         "sectors better",
     ]
-    shapes = (circle, disc, far_cluster, spiral)
+    shapes = (circle, disc, far_cluster, fan, spiral)
     few = max(groups // 20, 1)
     cases = [
         (shape, robots, meeting)
