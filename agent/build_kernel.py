@@ -18,7 +18,7 @@ from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
-SOURCES = ("agent/estimation/smoother.c", "agent/estimation/elementary.c")
+SOURCES = tuple([f"agent/estimation/{name}.c" for name in ("smoother", "elementary", "hypotheses")])
 LIBRARY = "agent/estimation/libsmoother.so"
 FLAGS = ("-O3", "-ffp-contract=off", "-fPIC", "-shared")
 """The options: without contraction and fast math, results follow from the source and the C library alone."""

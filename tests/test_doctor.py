@@ -104,7 +104,7 @@ def test_an_estimator_that_is_compiled_from_another_source_is_to_be_installed_an
         only_fix(
             doctor.ended(),
             f"versions: {other_kernel}: the estimator ",
-            "another smoother.c or elementary.c; install Tandem",
+            "one of smoother.c, elementary.c, hypotheses.c is another; install Tandem",
         )
 
 

@@ -11,15 +11,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from agent.estimation import closed_forms, posterior
 from agent.estimation.closed_forms import Placement, same_placement
 from agent.estimation.fit import Fit, HeldFit, fits
 from agent.estimation.gauss_newton import Convergence
-from agent.estimation.gaussian import claim_rivals, evidence, inference
+from agent.estimation.gaussian import claim_rivals, evidence, inference, placement_guesses
 from agent.estimation.gaussian import search as searching
+from agent.estimation.gaussian.anchor_guesses import anchors
 from agent.estimation.gaussian.consistency import FINISHED, consistency_test
-from agent.estimation.gaussian.detections import no_detection_log_likelihood
+from agent.estimation.gaussian.detections import detection_log_likelihoods, no_detection_log_likelihood
 from agent.estimation.gaussian.evidence import anchor_evidence
 from agent.estimation.gaussian.joint_ranges import (
     MOST_CORRELATED_RANGES,
@@ -30,12 +32,19 @@ from agent.estimation.gaussian.joint_ranges import (
     near_anchors,
 )
 from agent.estimation.gaussian.odometry_noise import Array, constant_errors, track
-from agent.estimation.gaussian.placement_guesses import Residuals, _encounter, _likeliest
+from agent.estimation.gaussian.placement_guesses import _encounter, placements
 from agent.estimation.gaussian.search import COARSE_STILL, _until_now, of_anchor, search, starts_about
 from agent.estimation.posterior import NO_HYPOTHESES, Hypothesis, Posterior, follow
 from agent.estimation.smoother import Singular
 from protocol.motion import Pose, step, wrap
 from protocol.noise import Noise, VelocityNoise
+from tests.hypotheses_by_numpy import (
+    Residuals,
+    anchors_by_numpy,
+    detections_by_numpy,
+    likeliest,
+    turned_by_numpy,
+)
 from tests.pair_starts import alone, kinds, pair_fit, with_ranges
 
 REACH = 3.0
@@ -323,6 +332,57 @@ def test_a_followed_anchor_ends_after_one_linear_model_near_the_fit_of_all_steps
     assert np.max(np.abs(followed.fit.guess - whole.guess)[:2] / sigmas) < 0.01
 
 
+MIXTURES = {
+    "exact odometry": RANGES,
+    "outliers": Noise(0.05, 0.1, outliers=0.1, outlier_bias=(0.5, 2.0)),
+    "strays": Noise(0.05, 0.1, strays=0.01, odometry=VelocityNoise(0.02, 0.02)),
+    "both": Noise(0.05, 0.05, outliers=0.1, strays=0.01, odometry=VelocityNoise(omega_floor=0.03)),
+}
+
+
+@pytest.mark.parametrize("noise", MIXTURES.values(), ids=MIXTURES)
+def test_compiled_guesses_are_those_of_their_text_to_the_bit(
+    noise: Noise, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The positions of anchors, also from earlier ones, and the placements of pairs."""
+    tried = 0
+    for seed in range(12):
+        pair, _ = after_a_long_way(seed, noise) if seed % 2 else drawn(seed, noise)
+        alone = [pair.alone(robot) for robot in (0, 1)]
+        for own in alone:
+            guesses = anchors(own)
+            assert np.array_equal(guesses, anchors_by_numpy(own))
+            again = anchors(own, guesses.tolist())
+            assert np.array_equal(again, anchors_by_numpy(own, guesses.tolist()))
+        found = [fits(own, starts_about(anchors(own)[:1])) for own in alone]
+        if not all(found) or not pair.ranges.mutual.any():
+            continue
+        tried += 1
+        both = (found[0][0], found[1][0])
+        compiled = placements(both, pair)
+        with monkeypatch.context() as patch:
+            patch.setattr(placement_guesses, "_turned", turned_by_numpy)
+            text = placements(both, pair)
+        assert [(one.log_likelihood, one.start.poses.tolist()) for one in compiled] == [
+            (one.log_likelihood, one.start.poses.tolist()) for one in text
+        ]
+    assert tried > 8
+
+
+@pytest.mark.parametrize("drop_outs", [0.0, 0.1])
+def test_compiled_detections_are_those_of_their_text(drop_outs: float) -> None:
+    """Up to the last bits of a hypotenuse, for both anchors and between the robots, in range or not."""
+    told = 0
+    for seed in range(12):
+        pair, truth = drawn(seed, replace(RANGES, drop_outs=drop_outs))
+        pair = replace(pair, reach=0.9 * REACH)
+        found = [pair_fit(truth, pair)]
+        by_text = [detections_by_numpy(one, pair) for one in found]
+        assert detection_log_likelihoods(found, pair) == pytest.approx(by_text, rel=1e-12, abs=1e-12)
+        told += sum(one < -0.1 for one in by_text)
+    assert told > 4
+
+
 @pytest.mark.parametrize(("sigma", "left"), [(1e-9, 2), (1e-3, 1)])
 def test_two_placements_between_which_the_likelihood_falls_are_not_merged(sigma: float, left: int) -> None:
     """In the limit of exact ranges, two placements may be a hundredth of a rad apart."""
@@ -333,7 +393,7 @@ def test_two_placements_between_which_the_likelihood_falls_are_not_merged(sigma:
     def residuals_at(z: Array) -> Residuals:
         return Residuals(z[:, :1] ** 2 - 0.005**2, np.empty(0), np.zeros((len(z), 2)))
 
-    found, _ = _likeliest(z, np.array([sigma]), residuals_at, np.ones(2), pair)
+    found, _ = likeliest(z, np.array([sigma]), residuals_at, np.ones(2), pair)
     assert len(found) == left
 
 
@@ -344,7 +404,7 @@ def test_a_fit_begins_on_a_path_that_is_off_by_what_its_placement_assumes(seed: 
     pair, truth = after_a_long_way(seed)
     base = 20
     (own,) = fits(pair.alone(0), starts_about([truth[:2]]))
-    robot = _encounter(own, base, np.array([base]))
+    robot = _encounter(own, base, (base,))
     anchor, (errors,) = robot.begun(own, np.array(z))
     driven = pair.paths[0]
     patterns = constant_errors(driven.v, driven.omega, pair.noise)

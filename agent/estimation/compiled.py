@@ -7,11 +7,11 @@ import errno
 import hashlib
 from functools import cache
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-SOURCE_FILES = tuple([Path(__file__).with_name(name) for name in ("smoother.c", "elementary.c")])
+SOURCE_FILES = tuple(
+    [Path(__file__).with_name(f"{name}.c") for name in ("smoother", "elementary", "hypotheses")]
+)
 LIBRARY_FILE = Path(__file__).with_name("libsmoother.so")
 REINSTALL = "install Tandem again (in a clone: uv sync --reinstall-package tandem-ranging)"
 Pointer = ctypes.c_void_p
@@ -32,24 +32,29 @@ def library() -> ctypes.CDLL:
     if all(source.exists() for source in SOURCE_FILES):
         text = b"".join([source.read_bytes() for source in SOURCE_FILES])
         if found.source() != hashlib.sha256(text).hexdigest().encode():
-            raise _no_kernel(f"it is of another {' or '.join([source.name for source in SOURCE_FILES])}")
+            raise _no_kernel(f"one of {', '.join([source.name for source in SOURCE_FILES])} is another")
     for name in ("walked", "guess", "weights_by_errors"):
         getattr(found, name).restype = None
-    for name, numbers_and_arrays in ELEMENTARY.items():
-        getattr(found, name).argtypes = [NUMBER if one == "n" else Pointer for one in numbers_and_arrays]
-        getattr(found, name).restype = ctypes.c_int if name == "solutions" else None
+    for name, (result, arguments) in SIGNATURES.items():
+        getattr(found, name).argtypes = [TYPES[one] for one in arguments]
+        getattr(found, name).restype = result
     return found
 
 
-NUMBER = ctypes.c_longlong
-ELEMENTARY = {
-    **dict.fromkeys([f"each_{name}" for name in ("exp", "log", "cos", "sin", "tan", "arccos")], "naa"),
-    **dict.fromkeys(["each_arctan2", "each_logaddexp"], "naaa"),
-    "products": "nnnnanana",
-    "solutions": "nnnaa",
-    "eigen": "naa",
+TYPES = {"n": ctypes.c_longlong, "d": ctypes.c_double, "a": Pointer}
+SIGNATURES = {
+    **{f"each_{name}": (None, "naa") for name in ("exp", "log", "cos", "sin", "tan")},
+    "each_logaddexp": (None, "naaa"),
+    "products": (None, "nnnnanana"),
+    "solutions": (ctypes.c_int, "nnnaa"),
+    "eigen": (None, "naa"),
+    "anchor_guesses": (TYPES["n"], "naaaaanaannadddna"),
+    "no_detection": (TYPES["d"], "naddn"),
+    "detections": (TYPES["d"], "anndnannaaadan"),
+    "same_poses": (None, "naaadda"),
+    "placements": (TYPES["n"], "nnaaaaaaaaaaanannaaddndddna"),
 }
-"""The arguments of the functions of elementary.c: numbers (n) and addresses of arrays (a)."""
+"""The results and the arguments of the functions of C: numbers (n), floats (d), addresses of arrays (a)."""
 
 
 def _no_kernel(why: str) -> NoKernel:
@@ -61,6 +66,12 @@ def compiler() -> str:
     return str(library().compiler().decode()).strip()
 
 
-def address(array: NDArray[np.float64]) -> Pointer:
-    """Return the address of a contiguous array."""
-    return Pointer(array.ctypes.data)
+_MEMORY = ctypes.c_char * 0
+
+
+def address(array: Any) -> ctypes.Array[ctypes.c_char]:
+    """Return the memory of a contiguous array as an argument, or of a copy: `array.ctypes` is slow."""
+    try:
+        return _MEMORY.from_buffer(array)
+    except TypeError:  # it is read-only, or not contiguous
+        return _MEMORY.from_buffer(array.copy())

@@ -18,12 +18,6 @@ OF_EACH(each_log, log)
 OF_EACH(each_cos, cos)
 OF_EACH(each_sin, sin)
 OF_EACH(each_tan, tan)
-OF_EACH(each_arccos, acos)
-
-void each_arctan2(Index count, const double *y, const double *x, double *to)
-{
-    for (Index e = 0; e < count; e++) to[e] = atan2(y[e], x[e]);
-}
 
 /* log(exp(one) + exp(other)) */
 void each_logaddexp(Index count, const double *one, const double *other, double *to)

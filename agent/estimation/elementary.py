@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from agent.estimation.compiled import library
+from agent.estimation.compiled import address, library
 from agent.estimation.smoother import Array, Singular
 
 
@@ -40,19 +40,12 @@ def tan(x: Array) -> Array:
     return _of_each("each_tan", x)
 
 
-def arccos(x: Array) -> Array:
-    """Return the angle (rad) in [0, pi] with this cosine, for each element."""
-    return _of_each("each_arccos", x)
-
-
-def arctan2(y: Array, x: Array) -> Array:
-    """Return the direction (rad) of each vector (x, y)."""
-    return _of_both("each_arctan2", y, x)
-
-
 def logaddexp(one: Array, other: Array) -> Array:
-    """Return log(exp(one) + exp(other)) for each element."""
-    return _of_both("each_logaddexp", one, other)
+    """Return log(exp(one) + exp(other)) for each element of two arrays of one shape."""
+    one, other = np.ascontiguousarray(one, np.float64), np.ascontiguousarray(other, np.float64)
+    to = np.empty(one.shape)
+    library().each_logaddexp(one.size, address(one), address(other), address(to))
+    return to
 
 
 def hypot(x: Array | float, y: Array | float) -> Array:
@@ -69,8 +62,8 @@ def product(left: Array, right: Array) -> Array:
     assert right.shape[-2] == q
     steps = [one.shape[-2] * one.shape[-1] * (one.ndim > 2) for one in (left, right)]
     to = np.empty((*leading, p, r))
-    with_steps = (left.ctypes.data, steps[0], right.ctypes.data, steps[1])
-    library().products(math.prod(leading), p, q, r, *with_steps, to.ctypes.data)
+    with_steps = (address(left), steps[0], address(right), steps[1])
+    library().products(math.prod(leading), p, q, r, *with_steps, address(to))
     return to
 
 
@@ -95,7 +88,7 @@ def solve(matrix: Array, right: Array) -> Array:
     matrix, found = np.array(matrix, np.float64, order="C"), np.array(right, np.float64, order="C")
     count, size, columns = math.prod(matrix.shape[:-2]), matrix.shape[-1], found.shape[-1]
     assert found.shape[:-1] == matrix.shape[:-1]
-    if not library().solutions(count, size, columns, matrix.ctypes.data, found.ctypes.data):
+    if not library().solutions(count, size, columns, address(matrix), address(found)):
         raise Singular("a matrix is singular")
     return found
 
@@ -108,7 +101,7 @@ def inverted(matrix: Array) -> Array:
 def eigh(matrix: Array) -> tuple[Array, Array]:
     """Return the eigenvalues of a symmetric matrix, ascending, and its eigenvectors as columns."""
     diagonal, vectors = np.array(matrix, np.float64, order="C"), np.empty(matrix.shape)
-    library().eigen(len(diagonal), diagonal.ctypes.data, vectors.ctypes.data)
+    library().eigen(len(diagonal), address(diagonal), address(vectors))
     values = np.diagonal(diagonal)
     order = np.argsort(values, kind="stable")
     return values[order], vectors[:, order]
@@ -118,15 +111,5 @@ def _of_each(name: str, x: Array) -> Array:
     """Return the C function `name` of each element."""
     x = np.ascontiguousarray(x, np.float64)
     to = np.empty(x.shape)
-    getattr(library(), name)(x.size, x.ctypes.data, to.ctypes.data)
-    return to
-
-
-def _of_both(name: str, one: Array, other: Array) -> Array:
-    """Return the C function `name` of each two elements."""
-    if one.shape != other.shape:
-        one, other = np.broadcast_arrays(one, other)
-    one, other = np.ascontiguousarray(one, np.float64), np.ascontiguousarray(other, np.float64)
-    to = np.empty(one.shape)
-    getattr(library(), name)(one.size, one.ctypes.data, other.ctypes.data, to.ctypes.data)
+    getattr(library(), name)(x.size, address(x), address(to))
     return to

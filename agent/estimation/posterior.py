@@ -13,13 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.elementary import eigh, product
+from agent.estimation.compiled import address, library
 from agent.estimation.fit import TO_THE_END, Fit, fits
 from agent.estimation.gauss_newton import Convergence
 from agent.estimation.gaussian.consistency import FINISHED
-from agent.estimation.gaussian.detections import detection_log_likelihood
+from agent.estimation.gaussian.detections import detection_log_likelihoods
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
-from agent.estimation.smoother import Array
 
 NEGLIGIBLE_PROBABILITY = 1e-7
 """The probability, relative to the likeliest hypothesis, below which a hypothesis is dropped."""
@@ -92,7 +91,7 @@ def hypotheses_of(found: Sequence[Fit], measured: JointMeasurements) -> tuple[Hy
 
     Improbable ones are dropped.
     """
-    detections = [detection_log_likelihood(one, measured) for one in found]
+    detections = detection_log_likelihoods(found, measured)
     weighed = [
         (one.weight + max(seen, LEAST_EVIDENCE), one, seen)
         for one, seen in zip(found, detections, strict=True)
@@ -123,24 +122,14 @@ def _representative(weighed: Sequence[tuple[float, Fit, float]]) -> list[int]:
 
 
 def same(one: Fit, other: Fit) -> list[bool]:
-    """Return for each robot whether two fits to the same facts have the same pose, within SAME_SIGMAS."""
-    change = one.poses - other.poses
-    change[:, 2] = np.remainder(change[:, 2] + math.pi, math.tau) - math.pi
-    variances = np.diagonal(other.covariance).reshape(-1, 3)
-    far = ((variances > 0.0) & (np.square(change) > SAME_SIGMAS**2 * variances)).any(1)
-    blocks = [slice(3 * i, 3 * i + 3) for i in range(len(change))]
-    return [
-        not apart and _squared_sigmas(moved, other.covariance[own, own]) < SAME_SIGMAS**2
-        for moved, own, apart in zip(change, blocks, np.asarray(far), strict=True)
-    ]
+    """Return for each robot whether two fits to the same facts have the same pose, within SAME_SIGMAS.
 
-
-def _squared_sigmas(change: Array, covariance: Array) -> float:
-    """Return change' covariance^+ change: directions without variance are left out."""
-    variances, axes = eigh(covariance)
-    some = variances > NO_VARIANCE * max(float(np.max(np.abs(variances))), 0.0)
-    along = product(change[None], axes[:, some])[0]
-    return float(np.add.reduce(np.square(along) / variances[some]))
+    Directions without variance are left out.
+    """
+    found = np.empty(len(one.poses), np.intp)
+    arrays = [np.ascontiguousarray(part) for part in (one.poses, other.poses, other.covariance)]
+    library().same_poses(len(found), *map(address, arrays), SAME_SIGMAS**2, NO_VARIANCE, address(found))
+    return [bool(each) for each in found.tolist()]
 
 
 NO_VARIANCE = 1e-15

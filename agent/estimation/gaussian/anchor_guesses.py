@@ -6,12 +6,13 @@ without a detection are ignored.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
 
-from agent.estimation.elementary import hypot
+from agent.estimation.compiled import address, library
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.odometry_noise import (
     Array,
@@ -21,7 +22,7 @@ from agent.estimation.gaussian.odometry_noise import (
     variances,
     wander,
 )
-from agent.estimation.gaussian.range_model import SIGMA_FLOOR, inlier_probability, log_likelihood
+from agent.estimation.gaussian.range_model import mixture
 
 SEED_RANGES = 10
 """The largest number of ranges that initial guesses are made from.
@@ -51,13 +52,22 @@ MOST_GUESSES = 6
 def anchors(own: JointMeasurements, known: Sequence[Sequence[float]] = ()) -> Array:
     """Return initial guesses for the anchor (m) of a robot in the frame of its odometry; shape (n, 2).
 
-    `known` contains earlier guesses, which are refined as well.
+    They are the intersections of each two range circles, or points between circles that noise keeps apart,
+    and the earlier guesses `known`. All are refined on all ranges (see `hypotheses.c`), the likeliest first.
     """
-    points = np.concatenate((np.array(known).reshape(-1, 2), _crossings(own)))
-    if not len(points):
-        return points
-    variance = np.square(own.ranges.sigma) + _odometry_variance(own) + own.loosened
-    return _polished(points, own, np.sqrt(variance))
+    path, ranges, near = own.paths[0], own.ranges, SAME_POSITION * own.reach
+    sigma = np.sqrt(np.square(ranges.sigma) + _odometry_variance(own) + own.loosened)
+    circles = (path.x[ranges.tick], path.y[ranges.tick], ranges.rho, sigma, mixture(own.noise))
+    couples = _couples(len(sigma))
+    finer = np.array([near * POSITION_FINER**step for step in range(POLISHINGS + 1)])
+    same = near * POSITION_FINER + TWINS * float(np.min(sigma, initial=math.inf))
+    points = np.empty((len(known) + 2 * len(couples[0]), 2))
+    points[: len(known)] = np.array(known).reshape(-1, 2)
+    found = library().anchor_guesses(
+        *(len(sigma), *map(address, circles), len(couples[0]), *map(address, couples), len(known)),
+        *(POLISHINGS, address(finer), 0.5 * own.reach, UNLIKELY, same, MOST_GUESSES, address(points)),
+    )
+    return points[:found]
 
 
 def _odometry_variance(own: JointMeasurements) -> Array:
@@ -95,71 +105,3 @@ def _couples(count: int) -> tuple[Places, Places]:
     chosen = spread_out(count)
     i, j = np.triu_indices(len(chosen), 1)
     return chosen[i], chosen[j]
-
-
-def _crossings(own: JointMeasurements) -> Array:
-    """Return the intersections (m) of each two range circles, in the frame of the odometry; shape (n, 2).
-
-    If noise keeps two circles apart, a point between them is used.
-    """
-    path, ranges = own.paths[0], own.ranges
-    if len(ranges.rho) < 2:
-        return np.empty((0, 2))
-    i, j = _couples(len(ranges.rho))
-    x, y, rho = path.x[ranges.tick], path.y[ranges.tick], ranges.rho
-    dx, dy = x[j] - x[i], y[j] - y[i]
-    apart = hypot(dx, dy)
-    some = apart > SIGMA_FLOOR
-    i, j, dx, dy, apart = i[some], j[some], dx[some], dy[some], apart[some]
-    along = (apart**2 + rho[i] ** 2 - rho[j] ** 2) / (2.0 * apart)
-    across = np.sqrt(np.maximum(rho[i] ** 2 - along**2, 0.0))
-    points = [
-        np.stack(
-            (
-                (x[i] + (along * dx - s * across * dy) / apart),
-                (y[i] + (along * dy + s * across * dx) / apart),
-            ),
-            1,
-        )
-        for s in (1.0, -1.0)
-    ]
-    return np.concatenate(points)
-
-
-def _polished(points: Array, own: JointMeasurements, sigma: Array) -> Array:
-    """Return the most likely of `points` after refinement on all ranges, without duplicates; shape (n, 2)."""
-    path, ranges, noise, sensing_range = own.paths[0], own.ranges, own.noise, own.reach
-    x, y, rho = path.x[ranges.tick], path.y[ranges.tick], ranges.rho
-    near = SAME_POSITION * sensing_range
-
-    def residuals_at(points: Array) -> tuple[Array, Array, Array, Array]:
-        dx, dy = x - points[:, :1], y - points[:, 1:]
-        distance = np.maximum(hypot(dx, dy), SIGMA_FLOOR)
-        return rho - distance, dx / distance, dy / distance, distance
-
-    for step in range(POLISHINGS):
-        s = hypot(sigma, near * POSITION_FINER**step)
-        residual, ux, uy, _ = residuals_at(points)
-        weight = inlier_probability(residual, s, noise) / np.square(s)
-        wx, wy = weight * ux, weight * uy
-        xx, xy, yy = np.add.reduce(wx * ux, 1), np.add.reduce(wx * uy, 1), np.add.reduce(wy * uy, 1)
-        gx, gy = -np.add.reduce(wx * residual, 1), -np.add.reduce(wy * residual, 1)
-        damping = 1e-6 * (xx + yy) + 1e-12
-        xx, yy = xx + damping, yy + damping
-        determinant = xx * yy - xy * xy
-        change = np.stack(((yy * gx - xy * gy) / determinant, (xx * gy - xy * gx) / determinant), 1)
-        longest = np.maximum(np.abs(change).max(1, keepdims=True), 1e-12)
-        points = points + change * np.minimum(1.0, 0.5 * sensing_range / longest)
-    likely = log_likelihood(residuals_at(points)[0], hypot(sigma, near * POSITION_FINER**POLISHINGS), noise)
-    return _best(points, likely, near * POSITION_FINER + TWINS * float(np.min(sigma)))
-
-
-def _best(points: Array, likely: Array, near: float) -> Array:
-    """Return the most likely points, with more than `near` m between any two."""
-    left = np.flatnonzero(likely >= np.max(likely) - UNLIKELY)
-    left = left[np.argsort(-likely[left], kind="stable")]
-    chosen: list[int] = []
-    while len(left) and len(chosen) < MOST_GUESSES:
-        chosen.append(int(left[0]))
-        left = left[np.abs(points[left] - points[left[0]]).sum(1) > near]
-    return points[chosen]

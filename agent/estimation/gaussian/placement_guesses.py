@@ -7,13 +7,13 @@ refined by Gauss-Newton on all mutual ranges. Ticks without a detection are igno
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import partial
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.elementary import arccos, arctan2, cos, dot, eigh, hypot, product, sin, solve, summed
+from agent.estimation.compiled import address, library
+from agent.estimation.elementary import dot, eigh, hypot, product, summed
 from agent.estimation.fit import Fit, Start
 from agent.estimation.gaussian.anchor_guesses import (
     POLISHINGS,
@@ -28,7 +28,6 @@ from agent.estimation.gaussian.odometry_noise import (
     Array,
     Errors,
     OdometryNoiseModel,
-    Places,
     Projection,
     attributed,
     constant_effects,
@@ -37,8 +36,9 @@ from agent.estimation.gaussian.odometry_noise import (
     symmetric,
     wander,
 )
-from agent.estimation.gaussian.range_model import SIGMA_FLOOR, inlier_probability, log_likelihood
-from protocol.motion import rotated, rotated_back
+from agent.estimation.gaussian.range_model import SIGMA_FLOOR, mixture
+from agent.estimation.smoother import Singular
+from protocol.motion import rotated
 
 SCAN = 72
 """The number of headings that are tried for the robot nearer to its anchor.
@@ -94,17 +94,6 @@ class Placed(NamedTuple):
     """The log-likelihood of the mutual ranges used, and of the offsets, up to a constant."""
 
 
-class Residuals(NamedTuple):
-    """The residuals of n candidates for a placement, with N mutual ranges."""
-
-    residuals: Array
-    """The measured minus the predicted ranges (m); shape (n, N)."""
-    jacobian: Array
-    """The derivatives of the predicted ranges by the first unknowns; shape (n, N, unknowns)."""
-    gap: Array
-    """The vector (m) between the robots at the middle range; shape (n, 2)."""
-
-
 class Encounter(NamedTuple):
     """One robot at the encounter, from the ranges to its own anchor alone.
 
@@ -121,10 +110,9 @@ class Encounter(NamedTuple):
     """The transposed pseudo-inverse of `root`; shape (3, 3)."""
     of_anchor: Array
     """The part of that covariance that is due to the anchor; shape (3, 3)."""
-    odometry: tuple[OdometryNoiseModel, Projection] | None
-    """The odometry noise since the last range to the anchor, and the offset as rows; None if it is exact."""
-    since: int
-    """The tick of that range."""
+    odometry: tuple[OdometryNoiseModel, Projection, Array, Array] | None
+    """The odometry noise since the last range to the anchor, the offset as rows, the effects of constant
+    errors on it, and these errors since then, shape (m, 2, k); None if it is exact."""
 
     def begun(self, own: Fit, z: Array) -> tuple[Array, tuple[Errors, ...]]:
         """Return the anchor (m) and the odometry errors for the whitened offset `z`, shape (3,)."""
@@ -132,21 +120,23 @@ class Encounter(NamedTuple):
         anchor = own.guess[:2] - product(self.of_anchor[:2], weights[:, None])[:, 0]
         if self.odometry is None:
             return anchor, own.start.errors
-        model, rows = self.odometry
-        patterns = own.problem.measured.patterns[0].copy()
-        patterns[:, :, : self.since] = 0.0
-        constant = product(constant_effects(model, rows)[:-1], weights[:, None])[:, 0]
+        model, rows, effects, patterns = self.odometry
+        constant = product(effects, weights[:, None])[:, 0]
         more = attributed(model, rows, weights) + summed(constant, patterns)
         (begun,) = own.start.errors
         return anchor, (Errors(begun.v + more[0], begun.omega + more[1], begun.constant),)
 
 
-def _encounter(own: Fit, base: int, ticks: Places) -> Encounter:
-    """Return the robot of the fit `own` at `ticks`, with its offset at the tick `base`."""
-    x, y = own.places(0, ticks)
+@lru_cache(maxsize=16)
+def _encounter(own: Fit, base: int, ticks: tuple[int, ...]) -> Encounter:
+    """Return the robot of the fit `own` at `ticks`, with its offset at the tick `base`.
+
+    Each fit of one robot is placed with each of the other.
+    """
+    x, y = np.ascontiguousarray(own.places(0, np.array(ticks)))
     of_anchor = np.zeros((3, 3))
     of_anchor[:2, :2] = own.of_start[:2, :2]
-    covariance, odometry, since = of_anchor, None, 0
+    covariance, odometry = of_anchor, None
     if own.problem.weighing.noisy:
         earlier = own.ticks[own.ticks <= base]
         since = int(earlier[-1]) if len(earlier) else 0
@@ -155,13 +145,14 @@ def _encounter(own: Fit, base: int, ticks: Places) -> Encounter:
         path = corrected(np.stack((of.v[0], of.omega[0])), correction, of.period, of.slip[0])
         model = wander(path, correction, of.patterns[0], of.white[0]).since(since)
         rows = Projection.pose(path, base)
-        odometry = (model, rows)
-        constant = constant_effects(model, rows)[:-1]
-        covariance = of_anchor + symmetric(*spread(model, rows), rows.ticks) + product(constant.T, constant)
+        effects, patterns = constant_effects(model, rows)[:-1], of.patterns[0].copy()
+        patterns[:, :, :since] = 0.0
+        odometry = (model, rows, effects, patterns)
+        covariance = of_anchor + symmetric(*spread(model, rows), rows.ticks) + product(effects.T, effects)
     variances, axes = eigh(covariance)
     sigmas = np.sqrt(np.maximum(variances, 0.0))
     inverse = axes * np.where(sigmas > LEAST_OFFSET, 1.0 / np.maximum(sigmas, LEAST_OFFSET), 0.0)
-    return Encounter(x, y, axes * sigmas, inverse, of_anchor, odometry, since)
+    return Encounter(x, y, np.ascontiguousarray(axes * sigmas), inverse, of_anchor, odometry)
 
 
 def placements(own: tuple[Fit, Fit], pair: JointMeasurements) -> list[Placed]:
@@ -182,18 +173,15 @@ def placements(own: tuple[Fit, Fit], pair: JointMeasurements) -> list[Placed]:
     ticks, rho = pair.ranges.tick[some], pair.ranges.rho[some]
     sigma = np.sqrt(np.square(pair.ranges.sigma[some]) + pair.loosened[some])
     middle = len(ticks) // 2
-    robots = [_encounter(one, int(ticks[middle]), ticks) for one in own]
+    robots = [_encounter(one, int(ticks[middle]), tuple(ticks.tolist())) for one in own]
     radii = [float(np.mean(hypot(one.x, one.y))) for one in robots]
     near, far = (0, 1) if radii[0] < radii[1] else (1, 0)
     sign = 1.0 if far == 0 else -1.0
     between = (pair.pivots[1] - pair.pivots[0]).tolist()
     apart = (sign * between[0], sign * between[1])  # from the far robot's anchor to the near one's
     lever = np.array([max(radii[robot], SHORTEST_LEVER * pair.reach) for robot in (near, far)])
-    ends = sorted({0, len(ticks) - 1})
-    z = np.concatenate([_scanned(robots[near], robots[far], i, float(rho[i]), apart, lever) for i in ends])
-    z, likely = _turned(z, (robots[near], robots[far]), middle, rho, sigma, apart, lever, pair)
     found = []
-    for one, likelihood in zip(z, likely.tolist(), strict=True):
+    for one in _turned((robots[near], robots[far]), middle, rho, sigma, apart, lever, pair):
         poses, errors = np.empty((2, 3)), []
         for i, robot in enumerate((near, far)):
             (mx, my), more = robots[robot].begun(own[robot], one[2 + 3 * i : 5 + 3 * i])
@@ -202,42 +190,29 @@ def placements(own: tuple[Fit, Fit], pair: JointMeasurements) -> list[Placed]:
             poses[robot] = at_x - dx, at_y - dy, turn
             errors.append(more)
         in_order = errors if near == 0 else errors[::-1]
-        found.append(Placed(Start(poses, tuple([one for more in in_order for one in more])), likelihood))
+        found.append(Placed(Start(poses, tuple([each for more in in_order for each in more])), float(one[8])))
     return found
 
 
-def _scanned(
-    near: Encounter, far: Encounter, i: int, rho: float, apart: tuple[float, float], lever: Array
-) -> Array:
-    """Return the candidates from the mutual range `rho` (m) with index `i`; shape (n, 8).
+def _circles(far: Encounter, i: int, rho: float, lever: float) -> Array:
+    """Return the circles of the far robot at the mutual range `rho` (m) with index `i`, as in hypotheses.c.
 
-    The columns are the rotations of the near and of the far robot, and the whitened offset of each.
+    `lever` is the distance (m) of the near robot to its anchor; shape (n, 8).
     """
     own = max(math.hypot(far.x[i], far.y[i]), SIGMA_FLOOR)
     outwards = product(np.array(((far.x[i], far.y[i], 0.0),)) / own, far.root)[0]
     uncertainty = math.sqrt(dot(outwards, outwards))
-    offsets = OFFSETS if uncertainty > WIDE * math.tau / SCAN * lever[0] else OFFSETS[:1]
-    turn = np.linspace(-math.pi, math.pi, SCAN if len(offsets) == 1 else SCAN // 2, endpoint=False)
-    c, s = cos(turn), sin(turn)
-    x = apart[0] + c * near.x[i] - s * near.y[i]
-    y = apart[1] + s * near.x[i] + c * near.y[i]
-    gap = np.maximum(hypot(x, y), SIGMA_FLOOR)
-    bearing = arctan2(y, x) - math.atan2(far.y[i], far.x[i])
-    candidates = []
+    offsets = OFFSETS if uncertainty > WIDE * math.tau / SCAN * lever else OFFSETS[:1]
+    circles = []
     for offset in offsets:
         radius = max(own + offset * uncertainty, SIGMA_FLOOR)
-        opening = arccos(np.clip((gap**2 + radius**2 - rho**2) / (2.0 * gap * radius), -1.0, 1.0))
-        for way in (1.0, -1.0):
-            z = np.zeros((len(turn), 8))
-            z[:, 0], z[:, 1] = turn, bearing + way * opening
-            if offset:
-                z[:, 5:8] = offset * outwards / uncertainty
-            candidates.append(z)
-    return np.concatenate(candidates)
+        z = offset * outwards / uncertainty if offset else np.zeros(3)
+        turns = SCAN if len(offsets) == 1 else SCAN // 2
+        circles.append((i, turns, radius, radius**2, *z.tolist(), rho**2))
+    return np.array(circles, np.float64)
 
 
 def _turned(
-    z: Array,
     robots: tuple[Encounter, Encounter],
     middle: int,
     rho: Array,
@@ -245,125 +220,40 @@ def _turned(
     apart: tuple[float, float],
     lever: Array,
     pair: JointMeasurements,
-) -> tuple[Array, Array]:
-    """Return the most likely of `z` after refinement by Gauss-Newton, with their log-likelihoods.
+) -> Array:
+    """Return the likeliest rotations and offsets, with their log-likelihoods as a last column; shape (n, 9).
 
-    The noise of the search decreases from the resolution of the scan to that of the ranges, because
-    candidates between which the ranges distinguish would otherwise be merged.
+    The candidates of the scan are refined by Gauss-Newton. The noise of the search decreases from the
+    resolution of the scan to that of the ranges, because candidates between which the ranges distinguish
+    would otherwise be merged. At last, two candidates are merged if the robots' positions differ by less than
+    MERGED_WITHIN R, unless the likelihood falls between them. See `hypotheses.c`. Raises Singular.
     """
-    residuals_at = partial(_residuals_at, robots=robots, middle=middle, rho=rho, apart=apart)
+    ends = sorted({0, len(rho) - 1})
+    circles = np.concatenate([_circles(robots[1], i, float(rho[i]), float(lever[0])) for i in ends])
     coarse = 3.0 * math.tau / SCAN * float(lever[0])
     finest = float(np.min(sigma))
     steps = max(POLISHINGS + 1, 1 + math.ceil(math.log(finest / coarse) / math.log(FINER_TURN)))
-    for step in range(steps):
-        s = hypot(sigma, coarse * FINER_TURN**step)
-        unknowns = 8 if len(z) <= CROWD else 2  # of the many candidates of the scan, only the rotations
-        residuals, jacobian, _ = residuals_at(z, unknowns)
-        weight = inlier_probability(residuals, s, pair.noise) / np.square(s)
-        weighted = np.swapaxes(jacobian * weight[..., None], 1, 2)
-        information = product(weighted, jacobian)
-        gradient = product(weighted, residuals[..., None])[..., 0]
-        gradient[:, 2:] -= z[:, 2:unknowns]
-        each = np.arange(unknowns)
-        diagonal = information[:, each, each]
-        diagonal[:, 2:] += 1.0
-        diagonal[:, :2] += HEADING_DAMPING * FINER_TURN**step * diagonal[:, :2].sum(1, keepdims=True) + 1e-12
-        information[:, each, each] = diagonal
-        change = solve(information, gradient[..., None])[..., 0]
-        longest = np.maximum(np.abs(change[:, :2]).max(1, keepdims=True), 1e-12)
-        z[:, :unknowns] += change * np.minimum(1.0, TURN / longest)
-        if len(z) > CROWD:
-            likely, gap = _likelihood(z, hypot(sigma, coarse * FINER_TURN ** (step + 1)), residuals_at, pair)
-            z = z[_thinned(z, likely, gap, lever, SAME_POSITION * pair.reach)]
-    return _likeliest(z, hypot(sigma, coarse * FINER_TURN**steps), residuals_at, lever, pair)
-
-
-def _thinned(z: Array, likely: Array, gap: Array, lever: Array, near: float) -> list[int]:
-    """Return the indices of the likeliest of `z` in each cell of `near` m, at most CROWD."""
-    cells = np.concatenate((np.remainder(z[:, :2], math.tau) * lever, gap), 1) / near
-    taken: dict[tuple[int, ...], int] = {}
-    order = np.argsort(-likely, kind="stable")
-    some = order[likely[order] >= likely[order[0]] - UNLIKELY]
-    for i, cell in zip(some.tolist(), np.round(cells[some]).astype(np.intp).tolist(), strict=True):
-        if taken.setdefault(tuple(cell), i) == i and len(taken) == CROWD:
-            break
-    return list(taken.values())
-
-
-def _likelihood(
-    z: Array, sigma: Array, residuals_at: Callable[..., Residuals], pair: JointMeasurements
-) -> tuple[Array, Array]:
-    """Return the log-likelihood of `z`, (n,), and the vector between the robots, (n, 2), in m."""
-    residuals, _, gap = residuals_at(z)
-    return log_likelihood(residuals, sigma, pair.noise) - 0.5 * np.sum(np.square(z[:, 2:]), 1), gap
-
-
-def _residuals_at(
-    z: Array,
-    unknowns: int = 0,
-    *,
-    robots: tuple[Encounter, Encounter],
-    middle: int,
-    rho: Array,
-    apart: tuple[float, float],
-) -> Residuals:
-    """Return the residuals of `z`, and their derivatives by the first `unknowns`: 0, 2 (rotations) or 8."""
-    moved = []
-    for i, one in enumerate(robots):
-        offset = product(z[:, 2 + 3 * i : 5 + 3 * i], one.root.T)
-        qx, qy = one.x - one.x[middle], one.y - one.y[middle]
-        x = one.x + offset[:, :1] - offset[:, 2:] * qy
-        y = one.y + offset[:, 1:2] + offset[:, 2:] * qx
-        c, s = cos(z[:, i : i + 1]), sin(z[:, i : i + 1])
-        moved.append((*rotated(c, s, x, y), c, s, qx, qy))
-    (nx, ny, *_), (fx, fy, *_) = moved
-    dx, dy = fx - nx - apart[0], fy - ny - apart[1]
-    distance = np.maximum(hypot(dx, dy), SIGMA_FLOOR)
-    gap = np.stack((dx[:, middle], dy[:, middle]), 1)
-    jacobian = np.empty((*distance.shape, unknowns))
-    if not unknowns:
-        return Residuals(rho - distance, jacobian, gap)
-    ux, uy = dx / distance, dy / distance
-    jacobian[..., 0] = ux * ny - uy * nx
-    jacobian[..., 1] = uy * fx - ux * fy
-    if unknowns == 2:
-        return Residuals(rho - distance, jacobian, gap)
-    for i, (_, _, c, s, qx, qy) in enumerate(moved):
-        sign = 1.0 if i else -1.0
-        along, across = (sign * part for part in rotated_back(c, s, ux, uy))
-        by_offset = np.stack((along, across, across * qx - along * qy), -1)
-        jacobian[..., 2 + 3 * i : 5 + 3 * i] = product(by_offset, robots[i].root)
-    return Residuals(rho - distance, jacobian, gap)
-
-
-def _likeliest(
-    z: Array,
-    sigma: Array,
-    residuals_at: Callable[..., Residuals],
-    lever: Array,
-    pair: JointMeasurements,
-) -> tuple[Array, Array]:
-    """Return the most likely of `z`, at most STARTS, and their log-likelihoods, the likeliest first.
-
-    Two candidates are merged if the robots' positions differ by less than MERGED_WITHIN R, unless the
-    likelihood falls between them.
-    """
-    likely, gap = _likelihood(z, sigma, residuals_at, pair)
-    near = MERGED_WITHIN * pair.reach + TWINS * float(np.min(sigma))
-    left = np.flatnonzero(likely >= np.max(likely) - UNLIKELY)
-    left = left[np.argsort(-likely[left], kind="stable")]
-    chosen: list[int] = []
-    while len(left) and len(chosen) < STARTS:
-        best = int(left[0])
-        chosen.append(best)
-        way = z[left] - z[best]
-        way[:, :2] = np.remainder(way[:, :2] + math.pi, math.tau) - math.pi
-        distance = np.abs(way[:, 0]) * lever[0] + np.abs(way[:, 1]) * lever[1]
-        distance += np.abs(gap[left] - gap[best]).sum(1)
-        other = distance > near
-        close = np.flatnonzero(~other[1:]) + 1
-        if len(close):
-            between, _ = _likelihood(z[best] + 0.5 * way[close], sigma, residuals_at, pair)
-            other[close] = between < likely[left[close]] - RIDGE_BETWEEN
-        left = left[other]
-    return z[chosen], likely[chosen]
+    finer = np.array([coarse * FINER_TURN**step for step in range(steps + 1)])
+    damping = np.array([HEADING_DAMPING * FINER_TURN**step for step in range(steps)])
+    near = MERGED_WITHIN * pair.reach + TWINS * float(np.min(hypot(sigma, finer[-1])))
+    meeting = [part for one in robots for part in (one.x, one.y, one.root)]
+    found = np.empty((STARTS, 9))
+    count = library().placements(
+        *(
+            len(rho),
+            middle,
+            *map(address, (*meeting, rho, sigma, mixture(pair.noise), np.array(apart), lever)),
+        ),
+        *(
+            len(circles),
+            address(circles),
+            int(2 * circles[:, 1].sum()),
+            steps,
+            address(finer),
+            address(damping),
+        ),
+        *(TURN, SAME_POSITION * pair.reach, CROWD, UNLIKELY, near, RIDGE_BETWEEN, STARTS, address(found)),
+    )
+    if count < 0:
+        raise Singular("the mutual ranges do not determine a placement")
+    return found[:count]

@@ -6,6 +6,7 @@ Outliers follow a mixture: a range is an inlier, or too long by a uniformly dist
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
@@ -46,6 +47,14 @@ def inliers(residuals: Array, sigma: Array, noise: Noise) -> Array:
 def _log_inlier(noise: Noise) -> float:
     """Return the joint log-density of being an inlier and of a residual of 0, in units of sigma."""
     return math.log1p(-noise.outliers - noise.strays) - 0.5 * math.log(2.0 * math.pi)
+
+
+@lru_cache(maxsize=8)
+def mixture(noise: Noise) -> Array:
+    """Return the densities of ranges as `Mixture` of hypotheses.c; shape (5,)."""
+    outlier = math.log(noise.outliers) if noise.outliers else -math.inf
+    stray = math.log(noise.strays / STRAY_WIDTH) if noise.strays else -math.inf
+    return np.array((_log_inlier(noise), outlier, stray, *noise.outlier_bias))
 
 
 def outliers(residuals: Array, sigma: Array, noise: Noise) -> Array:
