@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import ctypes
 import math
+from functools import cached_property
 from itertools import accumulate, pairwise
 
 import numpy as np
 
 from agent.estimation.compiled import Pointer, address, library
 from agent.estimation.gauss_newton import Convergence, Fitted, Point
+from agent.estimation.gaussian.odometry_noise import Places
 from agent.estimation.gaussian.range_weights import Weighing
 from agent.estimation.smoother import Array, FitStep, Measured, Singular, Walk
 
@@ -63,18 +65,20 @@ class Kernel:
             *(of.v, of.omega, of.slip, of.white, of.patterns, of.place, of.rho, of.common, of.mean),
             *(of.information, of.pivot, of.begin, of.first, of.second, of.anchor, of.radio),
         )
+        self._memory = [address(one) for one in (*arrays, by.sigma, by.holding, by.by_radio)]
+        at = [ctypes.addressof(one) for one in self._memory]
         self._measured = ctypes.byref(
             _Measured(
                 *(n, k, count, c, m, of.anchors, of.radios, of.scaled, of.delayed),
                 *(of.period, of.survey, of.slow, of.decay, of.scale),
-                *[one.ctypes.data for one in arrays],
+                *at[: len(arrays)],
             )
         )
         self._weighing = ctypes.byref(
             _Weighing(
                 *(by.longest, by.inlier, by.outlier, by.stray, by.least, by.most, by.degrees),
                 *(by.free, by.robust, by.noisy),
-                *[one.ctypes.data for one in (by.sigma, by.holding, by.by_radio)],
+                *at[len(arrays) :],
             )
         )
         self._of_walk = ((n, k + 1, 3), (n, k, 8), (count, 2), (count,), (count,))
@@ -83,7 +87,7 @@ class Kernel:
         self._fitted = _Layout(*of_point, *of_point, *self._of_step, (count,), (count,), (6,))
         vectors = (count, count, count * q, count * s, s, s * q, s * s, q * q, q)
         spaces = (s, s * size, s * s, s, size, size * size, max(size, n3) ** 2, *[max(q, of.radios)] * 2)
-        self._work, self._spaces = _Layout(*vectors, *spaces, *[count] * 4, n3).new()
+        self._work, self._space = _Layout(*vectors, *spaces, *[count] * 4, n3).space()
 
     def __reduce__(self) -> tuple[type[Kernel], tuple[Measured, Weighing]]:
         """Return how to build the kernel again from a copy, which has memory of its own."""
@@ -92,15 +96,17 @@ class Kernel:
     def walked(self, poses: Array, constants: Array, white: Array) -> Walk:
         """Return the paths; see `smoother.walked`."""
         at, arrays = _Layout(*self._of_walk).new()
-        library().walked(self._measured, *map(address, (poses, constants, white)), at)
+        library().walked(self._measured, *map(address, (poses, constants, white, at)))
         return Walk._make(arrays)
 
     def step(self, walk: Walk, poses: Array, variance: Array, ridge: float, largest: float) -> FitStep:
         """Return a Gauss-Newton step; see `smoother.step`. Raises Singular."""
         at, arrays = _Layout(*self._of_step).new()
+        memory = [address(one) for one in walk]
+        of_walk = address(np.array([ctypes.addressof(one) for one in memory]))
         if not library().gauss_newton_step(
-            *(self._measured, _addresses(*walk), address(poses), address(variance)),
-            *(ctypes.c_double(ridge), ctypes.c_double(largest), self._work, at),
+            *(self._measured, of_walk, address(poses), address(variance)),
+            *(ctypes.c_double(ridge), ctypes.c_double(largest), address(self._work), address(at)),
         ):
             raise Singular("the ranges do not determine all unknowns")
         return _step_of(arrays)
@@ -133,7 +139,9 @@ class Kernel:
         """
         at, arrays = self._begun(poses, constant, white, weights)
         end, weighed = ctypes.byref(_Convergence(*until)), ctypes.c_int(weights is not None)
-        if not library().fitted(self._measured, self._weighing, end, weighed, self._work, at):
+        if not library().fitted(
+            self._measured, self._weighing, end, weighed, address(self._work), address(at)
+        ):
             raise Singular("the ranges do not determine all unknowns, or an error is too large for a float")
         return _fitted_of(arrays)
 
@@ -141,13 +149,13 @@ class Kernel:
         """Return the fit in which a range holds a coordinate; see `gauss_newton.held`. Raises Singular."""
         at, arrays = self._begun(poses, constant, white, weights)
         number = ctypes.c_longlong(steps)
-        if not library().held(self._measured, self._weighing, number, self._work, at):
+        if not library().held(self._measured, self._weighing, number, address(self._work), address(at)):
             raise Singular("the ranges do not determine all unknowns, or an error is too large for a float")
         return _fitted_of(arrays)
 
     def _begun(
         self, poses: Array, constant: Array, white: Array, weights: Array | None
-    ) -> tuple[ctypes.Array[Pointer], list[Array]]:
+    ) -> tuple[Places, list[Array]]:
         """Return the memory of a fit that begins at these start poses and errors."""
         at, arrays = self._fitted.new()
         of_poses, common, of_constant, of_white, slow, of_slow = arrays[:6]
@@ -183,23 +191,24 @@ def _fitted_of(arrays: list[Array]) -> Fitted:
     return Fitted(at, after, step, weights, variance, last_step, level, int(inliers), outliers)
 
 
-def _addresses(*arrays: Array) -> ctypes.Array[Pointer]:
-    return (Pointer * len(arrays))(*[one.ctypes.data for one in arrays])
-
-
 class _Layout:
     """Consecutive arrays in one piece of memory."""
 
     def __init__(self, *shapes: tuple[int, ...] | int) -> None:
         self._shapes = shapes
-        ends = [0, *accumulate([math.prod(one) if isinstance(one, tuple) else one for one in shapes])]
-        self._parts = [slice(*each) for each in pairwise(ends)]
-        self._bytes = [np.dtype(np.float64).itemsize * begin for begin in ends[:-1]]
-        self._pointers, self._size = Pointer * len(shapes), ends[-1]
+        self._ends = [0, *accumulate([one if isinstance(one, int) else math.prod(one) for one in shapes])]
+        self._bytes = np.array(self._ends[:-1]) * np.dtype(np.float64).itemsize
 
-    def new(self) -> tuple[ctypes.Array[Pointer], list[Array]]:
+    @cached_property
+    def _parts(self) -> list[tuple[slice, tuple[int, ...] | int]]:
+        return [(slice(*each), one) for each, one in zip(pairwise(self._ends), self._shapes, strict=True)]
+
+    def new(self) -> tuple[Places, list[Array]]:
         """Return the addresses of new arrays, and the arrays."""
-        memory = np.empty(self._size)
-        begin = memory.ctypes.data
-        arrays = [memory[part].reshape(shape) for part, shape in zip(self._parts, self._shapes, strict=True)]
-        return self._pointers(*[begin + one for one in self._bytes]), arrays
+        at, memory = self.space()
+        return at, [memory[part].reshape(shape) for part, shape in self._parts]
+
+    def space(self) -> tuple[Places, Array]:
+        """Return the addresses of new arrays, and their memory."""
+        memory = np.empty(self._ends[-1])
+        return self._bytes + ctypes.addressof(address(memory)), memory

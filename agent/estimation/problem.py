@@ -48,7 +48,14 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
 
     @staticmethod
     def of(measured: JointMeasurements) -> Problem:
-        """Return the problem of all robots in `measured`."""
+        """Return the problem of all robots in `measured`, which keep it."""
+        known: dict[str, Problem] = measured.__dict__
+        if "problem" not in known:
+            known["problem"] = Problem._built(measured)
+        return known["problem"]
+
+    @staticmethod
+    def _built(measured: JointMeasurements) -> Problem:
         noise, priors, ranges = measured.noise, measured.noise.priors, measured.ranges
         n, lengths = len(measured.paths), tuple([len(path.v) for path in measured.paths])
         ticks = max(lengths, default=0)

@@ -65,6 +65,11 @@ def has_failed(knowledge: Knowledge, before: int, tick: int) -> bool:
     met b if there are LEAST_RANGES mutual ranges.
     """
     config, at = knowledge.config, attrgetter("tick")
+    if (
+        tick - before < MANY_MUTUAL_RANGES
+        and (tick - before) * config.mission.period <= config.rendezvous.bound
+    ):
+        return False  # a tick has at most one range between the robots
     count = bisect_left(knowledge.mutual, tick, key=at) - bisect_left(knowledge.mutual, before, key=at)
     if count < LEAST_RANGES:
         return (tick - before) * config.mission.period > config.rendezvous.bound
@@ -350,7 +355,11 @@ def localised(hypothesis: PlanningHypothesis, robot: int, origin: tuple[float, f
 
 def covariance_of(matrix: Array) -> Covariance:
     """Return a covariance of x, y (m) and heading (rad), (3, 3), as messages have it."""
-    return Covariance(*matrix[np.triu_indices(3)].tolist())
+    return Covariance(*matrix[TRIANGLE].tolist())
+
+
+TRIANGLE = np.triu_indices(3)
+"""The places of the elements of a covariance, (3, 3), that messages have."""
 
 
 @lru_cache(maxsize=STARTS)

@@ -298,6 +298,8 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
         if most is None:
             correlated = self.noise.odometry != VelocityNoise() or self.noise.priors.slow_sigma > 0.0
             most = MOST_CORRELATED_RANGES if correlated else MOST_RANGES_BY_EXACT_ODOMETRY
+        if len(ranges.rho) <= min(most, MOST_MUTUAL_RANGES // max(len(pairs), 1)):
+            return self
         mutual = sum(1 for own in pairs if ranges.second[np.argmax(own)] >= 0)
         of_pair = min(most, max(MOST_MUTUAL_RANGES // max(mutual, 1), WEIGHED_OF_PAIR))
         left = np.zeros(len(ranges.rho), bool)

@@ -181,8 +181,10 @@ def _with(known: Posterior, candidate: Candidate, measured: JointMeasurements, f
     found = []
     for i, one in enumerate(before):
         alone = _alone(candidate, one, known.located, measured, fewest)
+        if whole := alone == part:
+            alone = part  # which has its problem
         new = _of_pair(alone) if len(candidate.robots) == 2 else _of_robot(alone)
-        if alone == part:
+        if whole:
             return Posterior(located, new)
         log_weight = math.log(one.probability) if one is not None else 0.0
         found += [
