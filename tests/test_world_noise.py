@@ -100,6 +100,7 @@ EFFECTS = {
     "gyro biases": "odometry.gyro_bias_sigma = 0.01",
     "gyro walk": "odometry.gyro_walk = 0.01",
     "late odometry": "odometry.delay = 0.3",
+    "odometry strays": "odometry.strays = 0.1",
 }
 by_effect = pytest.mark.parametrize("world", EFFECTS.values(), ids=EFFECTS)
 
@@ -317,6 +318,17 @@ def test_a_gyro_has_its_bias_while_the_robot_moves() -> None:
     assert is_gaussian(np.array([one.omega for one in drawn]), 0.02)
 
 
+def test_strays_of_the_odometry_have_the_stated_share_and_size() -> None:
+    driven = Controls(0.5, 0.1)
+    table = "odometry.strays = 0.2\nodometry.stray_turn = 0.3\nodometry.stray_distance = 0.4"
+    found = np.array([(one.v - driven.v, one.omega - driven.omega) for one in measured(table, *[driven] * N)])
+    strays = found[found[:, 1] != 0.0]
+    assert has_share(len(strays), N, 0.2)
+    assert is_gaussian(strays[:, 1], 0.3)
+    assert is_gaussian(strays[:, 0], 0.4 * 0.5)
+    assert measured(table, REST) == [REST], "a robot at rest does not slip"
+
+
 def test_the_bias_of_a_gyro_walks() -> None:
     found = measured("odometry.gyro_walk = 0.01", *[Controls(1.0, 0.0)] * N)
     steps = np.diff([0.0, *[one.omega for one in found]])
@@ -390,6 +402,7 @@ STREAMS = {
     "wheel scales": {"wheel-scale"},
     "gyro biases": {"gyro-bias"},
     "gyro walk": {"gyro-walk", "gyro-walk-middle"},
+    "odometry strays": {"odometry-stray", "odometry-stray-v", "odometry-stray-omega"},
 }
 """The random streams of each effect that has any of its own."""
 

@@ -177,7 +177,12 @@ class SensorModel(msgspec.Struct, frozen=True):
         if table.gyro_walk:
             walked = random_walk(self.seed, "gyro-walk", robot, tick)
             bias += table.gyro_walk * math.sqrt(self.period) * walked
-        return Controls(v + scale * v, omega + bias)
+        v, omega = v + scale * v, omega + bias
+        if table.strays and uniform(self.seed, "odometry-stray", robot, tick) < table.strays:
+            v += table.stray_distance * gaussian(self.seed, "odometry-stray-v", robot, tick) * v
+            turn = table.stray_turn * gaussian(self.seed, "odometry-stray-omega", robot, tick)
+            omega += turn / self.period
+        return Controls(v, omega)
 
 
 def sensor_model(

@@ -65,6 +65,12 @@ class WorldOdometryNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     """The standard deviation of the change of the bias of omega in one second, in rad/s: a random walk."""
     delay: Unit = 0.0
     """The fraction of a tick by which the odometry is late: it measures that part of the tick before."""
+    strays: Probability = 0.0
+    """The probability of a stray in a tick in which the robot moves."""
+    stray_turn: Floor = 0.1
+    """The standard deviation of the heading error of a stray in rad."""
+    stray_distance: Floor = 0.2
+    """The standard deviation of the error of its distance, as a fraction of the distance."""
 
 
 class WorldNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
