@@ -129,6 +129,8 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
     """The prior of the delay in s of all ranges: of their stamps after the time of the measurement."""
     strays: Probability = 1e-3
     """The probability that a range has an error of any size and sign; without noise, there are none."""
+    odometry_strays: Probability = 0.0
+    """The probability that the odometry of a tick in motion is a stray: off by far more than its noise."""
 
     @cached_property
     def exact(self) -> bool:
@@ -137,7 +139,12 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
         told = self.range_bias or self.pair_bias or self.range_scale or self.slow_sigma
         if ranges or told or self.wheel_scale or self.gyro_bias or self.survey_error or self.range_delay:
             return False
-        return self.actuation == self.odometry == VelocityNoise()
+        return self.actuation == VelocityNoise() and not self.wanders
+
+    @property
+    def wanders(self) -> bool:
+        """True if the errors of odometry differ from tick to tick: white noise, or strays."""
+        return self.odometry != VelocityNoise() or self.odometry_strays > 0.0
 
     @cached_property
     def untold_share(self) -> float:
@@ -175,6 +182,7 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
             range_delay=0.0,
             sigma_degrees=0.0,
             strays=0.0,
+            odometry_strays=0.0,
         )
 
     @cached_property

@@ -18,7 +18,7 @@ from agent.estimation.facts import (
     manoeuvre,
     mutual_range,
 )
-from agent.estimation.gaussian.odometry_noise import track
+from agent.estimation.gaussian.odometry_noise import STRAY_DISTANCE, STRAY_TURN, track
 from protocol.motion import Pose, step
 from protocol.noise import Noise, VelocityNoise
 
@@ -94,6 +94,10 @@ def moving_group(
         sigmas = np.sqrt([noise.odometry.variances(a, b) for a, b in zip(v, omega, strict=True)])
         measured_v = v / (1.0 + of_v) + sigmas[:, 0] * draw.normal(size=ticks)
         measured_omega = (omega - of_gyro) / (1.0 + of_omega) + sigmas[:, 1] * draw.normal(size=ticks)
+        strays = np.random.default_rng((robots, seed, i))
+        stray = strays.uniform(size=ticks) < noise.odometry_strays
+        measured_v *= 1.0 + STRAY_DISTANCE * stray * strays.normal(size=ticks)
+        measured_omega += STRAY_TURN / PERIOD_S * stray * strays.normal(size=ticks)
         known += [
             manoeuvre(name, tick, Manoeuvre(a, b))
             for tick, (a, b) in enumerate(zip(measured_v.tolist(), measured_omega.tolist(), strict=True))

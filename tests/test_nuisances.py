@@ -239,7 +239,7 @@ def test_the_probability_of_an_inlier_is_that_of_the_mixture(outliers: float, st
     noise = Noise(0.1, 0.1, outliers=outliers, strays=strays, sigma_degrees=0.0)
     residuals, sigma = np.linspace(-9.0, 9.0, 91), np.linspace(0.05, 3.0, 91)
     by = Weighing.of(noise, sigma, np.zeros(91, np.intp), np.arange(91), 1.0, free=0, noisy=False)
-    probability = weights_by_errors(residuals.tolist(), sigma.tolist(), by)
+    probability, _ = weights_by_errors(residuals.tolist(), sigma.tolist(), by)
     assert probability == pytest.approx(inlier_probability(residuals, sigma, noise), abs=1e-12)
 
 
@@ -287,9 +287,15 @@ def test_a_robot_whose_own_ranges_contradict_its_odometry_names_the_profile_to_t
     assert doubt(own(0.0)) is None
 
 
-@pytest.mark.parametrize(("v", "fits"), [(1.001, True), (1.03, True), (1.5, False)])
-def test_the_limit_of_a_reported_speed_knows_the_scale_of_wheels(v: float, fits: bool) -> None:
-    config = parsed("{anchor_sigma = 0.05, mutual_sigma = 0.05}", 0.1).config("a")
+@pytest.mark.parametrize(
+    ("v", "strays", "fits"),
+    [(1.001, 0.0, True), (1.03, 0.0, True), (1.5, 0.0, False), (1.5, 0.01, True), (3.0, 0.01, False)],
+)
+def test_the_limit_of_a_reported_speed_knows_the_scale_of_wheels_and_strays(
+    v: float, strays: float, fits: bool
+) -> None:
+    told_noise = f"{{anchor_sigma = 0.05, mutual_sigma = 0.05, odometry_strays = {strays}}}"
+    config = parsed(told_noise, 0.1).config("a")
     told = Report(
         tick=1,
         robot="b",

@@ -49,6 +49,7 @@ OTHER: dict[str, Any] = {
     "mission.noise.survey_error": 0.01,
     "mission.noise.range_delay": 0.01,
     "mission.noise.strays": 0.01,
+    "mission.noise.odometry_strays": 0.01,
     "mission.noise.anchor_sigma": 0.2,
     "mission.noise.mutual_sigma": 0.2,
     "mission.noise.outliers": 0.2,

@@ -112,6 +112,7 @@ def test_summary_has_every_documented_value_of_a_run(played: tuple[str, Path]) -
             "slow_time": 2.0,
             "sigma_degrees": 4.0,
             "strays": 0.001,
+            "odometry_strays": 0.0,
         },
         "planner": "paper",
         "planner_options": {},

@@ -24,10 +24,18 @@ Array = smoother.Array
 
 
 def problem_of(
-    seed: int, robots: int, ticks: int, *, slow: float, survey: float, prior: bool, delay: float = 0.0
+    seed: int,
+    robots: int,
+    ticks: int,
+    *,
+    slow: float,
+    survey: float,
+    prior: bool,
+    delay: float = 0.0,
+    strays: float = 0.0,
 ) -> Problem:
-    """Return the problem of a random group: with slow errors, surveying errors, a prior and a delay."""
-    noise = replace(NOISE, slow_sigma=slow, survey_error=survey, range_delay=delay)
+    """Return the problem of a random group: with slow and surveying errors, a prior, a delay and strays."""
+    noise = replace(NOISE, slow_sigma=slow, survey_error=survey, range_delay=delay, odometry_strays=strays)
     measured = joint_measurements(moving_group(robots, seed, ticks=ticks, noise=noise).facts, noise, PERIOD_S)
     if prior:
         root = np.random.default_rng(seed).normal(size=(3 * robots, 3 * robots))
@@ -54,6 +62,7 @@ def point_of(of: Measured, seed: int) -> tuple[Array, Array, Array]:
     st.sampled_from([1e-3, 1.0, 1e9]),
     st.sampled_from([-1, 1]),
     st.sampled_from([0.0, 0.2]),
+    st.sampled_from([0.0, 0.1]),
 )
 def test_the_kernel_equals_its_text_to_the_bit(
     seed: int,
@@ -65,8 +74,10 @@ def test_the_kernel_equals_its_text_to_the_bit(
     largest: float,
     scaled: int,
     delay: float,
+    strays: float,
 ) -> None:
-    problem = problem_of(seed, robots, ticks, slow=slow, survey=survey, prior=prior, delay=delay)
+    given_errors = {"slow": slow, "survey": survey, "delay": delay, "strays": strays}
+    problem = problem_of(seed, robots, ticks, prior=prior, **given_errors)
     of, variance = problem.measured._replace(scaled=scaled), np.square(problem.weighing.sigma)
     of.radio[::3] = -1
     of.common[::4] = 0.0
@@ -96,6 +107,7 @@ def bits(of: Fitted | Point | tuple[object, ...]) -> list[bytes]:
     st.sampled_from([0.0, 4.0]),
     st.sampled_from([Convergence(), Convergence(2, 0.05, 0.1), Convergence(0)]),
     st.booleans(),
+    st.sampled_from([0.0, 0.2]),
 )
 def test_the_loop_of_a_fit_equals_its_text_to_the_bit(
     seed: int,
@@ -106,6 +118,7 @@ def test_the_loop_of_a_fit_equals_its_text_to_the_bit(
     degrees: float,
     until: Convergence,
     weighed: bool,
+    odometry_strays: float,
 ) -> None:
     noise = replace(
         NOISE,
@@ -114,8 +127,9 @@ def test_the_loop_of_a_fit_equals_its_text_to_the_bit(
         outliers=shares[0],
         strays=shares[1],
         sigma_degrees=degrees,
+        odometry_strays=odometry_strays,
     )
-    group = moving_group(robots, seed, ticks=5, noise=noise)
+    group = moving_group(robots, seed, ticks=7, noise=noise)
     measured = joint_measurements(group.facts, noise, PERIOD_S)
     problem = Problem.of(measured)
     of, by, kernel, rng = problem.measured, problem.weighing, problem.kernel, np.random.default_rng(seed)
@@ -124,6 +138,7 @@ def test_the_loop_of_a_fit_equals_its_text_to_the_bit(
     poses = (group.starts - (*measured.origin, 0.0)).ravel() + rng.normal(size=3 * robots)
     _, constant, white = point_of(of, seed)
     nothing, zero = np.zeros(len(of.rho)), np.zeros(of.common.shape[1])
+    white[:, 1, 1::3] += 0.4 * (rng.uniform(size=of.v[:, 1::3].shape) < odometry_strays)
     begun = point_at(of, poses, zero, constant, white, nothing, nothing)
     weights = rng.uniform(size=len(of.rho))
     given = weights if weighed else None

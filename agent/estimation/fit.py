@@ -18,6 +18,7 @@ from agent.estimation.gauss_newton import RIDGE, Convergence, Fitted
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.noise_level import INLIER, misfit_log_likelihood
 from agent.estimation.gaussian.odometry_noise import Array, Errors, Places
+from agent.estimation.gaussian.range_weights import weighted_noise
 from agent.estimation.kernel import Kernel
 from agent.estimation.problem import Problem
 from agent.estimation.smoother import FitStep, Singular, Walk
@@ -321,7 +322,10 @@ def _begin(problem: Problem, start: Start) -> tuple[Array, Array, Array, Array |
 def _fit(problem: Problem, found: Fitted) -> Fit:
     """Return the fit that the loop has `found`, with the linear model of its last step."""
     n3, back, step, model = 3 * problem.measured.robots, problem.back, found.step, found.model
-    final, level = found.final, found.level
+    final, level, kernel = found.final, found.level, problem.kernel
+    if problem.measured.strays:
+        white = weighted_noise(problem.measured, found.sound)
+        kernel = Kernel(problem.measured._replace(white=white), problem.weighing)
     return Fit(
         _start_of(problem, final.poses, final.constant, final.white),
         final.walk.place[:, -1],
@@ -336,7 +340,7 @@ def _fit(problem: Problem, found: Fitted) -> Fit:
         np.sqrt(np.maximum(np.diagonal(step.inverse)[n3:], 0.0)),
         final.walk.place,
         problem,
-        Linear(problem.kernel, model.walk, model.poses, found.variance, step),
+        Linear(kernel, model.walk, model.poses, found.variance, step),
     )
 
 
@@ -355,4 +359,5 @@ def _evidence(problem: Problem, found: Fitted) -> float:
     noise, count = problem.noise, found.inliers
     weight = -0.5 * (found.step.volume - problem.log_information + math.log(2.0 * math.pi) * count)
     weight += misfit_log_likelihood(found.step.chi2, count - problem.weighing.free, noise.sigma_degrees)
+    weight += float(np.count_nonzero(found.sound <= INLIER)) * problem.weighing.astray_odds
     return weight + count * math.log1p(-noise.outliers - noise.strays) + found.outliers

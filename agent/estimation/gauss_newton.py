@@ -1,7 +1,8 @@
-"""The loop of a fit: Gauss-Newton steps and weights of the ranges, until both have converged.
+"""The loop of a fit: Gauss-Newton steps and weights of ranges and odometry, until both have converged.
 
-The weight of a range is the probability that it is an inlier, given the prediction from all others. Each
-step descends: where the full step does not, a shorter one is tried.
+The weight of a range is the probability that it is an inlier, and that of a tick that its odometry is no
+stray, given the prediction from all other data. Each step descends: where the full step does not, a shorter
+one is tried.
 
 Like `smoother`, this is the text of `smoother.c`, to which the kernel is equal to the bit.
 """
@@ -18,6 +19,9 @@ from agent.estimation.gaussian.range_weights import (
     Weighing,
     inlier_probabilities,
     outlier_log_density,
+    sound_by_errors,
+    sound_probabilities,
+    weighted_noise,
     weighted_variance,
     weights_by_errors,
 )
@@ -131,6 +135,8 @@ class Fitted(NamedTuple):
     """the probability that each range is an inlier; (N,)"""
     variance: Array
     """own variance of each range in m^2; (N,)"""
+    sound: Array
+    """the probability that the odometry of each tick is no stray; (n, K), or (n, 0) if there are none"""
     last_step: float
     """expected length of the next step in sigmas"""
     level: float
@@ -208,19 +214,21 @@ def fitted(of: Measured, by: Weighing, begun: Point, weights: Array | None, unti
 
     Raises Singular.
     """
-    at, before = begun, 0.0
+    told, sound, before = of, sound_by_errors(of, by, begun.white), 0.0
+    of, at = _weighed(told, sound, begun)
     loose = loosened(of, at.walk, at.poses, np.square(by.sigma)).tolist()
     least = GRAIN * max(loose, default=0.0) if by.noisy else 0.0
     if weights is None:
-        weight = weights_by_errors(at.walk.residual.tolist(), [math.sqrt(one) for one in loose], by)
+        weight, _ = weights_by_errors(at.walk.residual.tolist(), [math.sqrt(one) for one in loose], by)
     else:
         weight = weights.tolist()
     for number in range(until.steps + 1):
         variance = [one + least for one in weighted_variance(by, weight)]
         taken = _step(of, by, at, variance)
-        updated = inlier_probabilities(
+        updated, scale = inlier_probabilities(
             taken.multipliers.tolist(), taken.alone.tolist(), taken.explained.tolist(), variance, by
         )
+        sounder = sound_probabilities(told, by, sound, taken.shocks, of.white, scale)
         level = noise_level(taken.chi2, _inliers(weight) - by.free, by.degrees)
         length = taken.length / math.sqrt(level)
         if number == 0:
@@ -228,14 +236,16 @@ def fitted(of: Measured, by: Weighing, begun: Point, weights: Array | None, unti
         expected = length * length / max(length, before, LAST_STEP)
         if number == until.steps:
             off = _off_model(at, taken, variance, level)
-            return _ended(of, by, at, at, taken, weight, variance, off if off > 1.0 else length)
+            return _ended(of, by, at, at, taken, weight, variance, sound, off if off > 1.0 else length)
         after = _stepped(of, at, taken, variance)
         still = all(abs(new - old) < SETTLED_WEIGHT for new, old in zip(updated, weight, strict=True))
+        still = still and bool(np.all(np.abs(sounder - sound) < SETTLED_WEIGHT))
         # the path is corrected at least once
         still = still and (number > 0 or until.decrease < 1.0 or not by.noisy)
         if still and expected < until.shortest and _off_model(after, taken, variance, level) <= 1.0:
-            return _ended(of, by, at, after, taken, weight, variance, expected)
-        weight, before, at = updated, length, after
+            return _ended(of, by, at, after, taken, weight, variance, sound, expected)
+        weight, sound, before = updated, sounder, length
+        of, at = _weighed(told, sound, after)
     raise AssertionError("the last step returns")
 
 
@@ -245,12 +255,13 @@ def held(of: Measured, by: Weighing, begun: Point, weights: Array, steps: int) -
     A range holds a coordinate, and the first step leads to where it holds it. All others are weighed by
     their residuals there. Raises Singular.
     """
-    at, weight = begun, weights.tolist()
+    sound, weight = sound_by_errors(of, by, begun.white), weights.tolist()
+    of, at = _weighed(of, sound, begun)
     for number in range(steps + 1):
         variance = weighted_variance(by, weight)
         taken = _step(of, by, at, variance)
         if number == steps:
-            return _ended(of, by, at, at, taken, weight, variance, taken.length)
+            return _ended(of, by, at, at, taken, weight, variance, sound, taken.length)
         at = _after(of, at, taken, 1.0)
         if number == 0:
             loose = []
@@ -260,12 +271,20 @@ def held(of: Measured, by: Weighing, begun: Point, weights: Array, steps: int) -
                     effect = effect_of(of, at.walk, j, e)
                     spread += effect * effect
                 loose.append(math.sqrt(spread))
-            weight = weights_by_errors(at.walk.residual.tolist(), loose, by)
+            weight, _ = weights_by_errors(at.walk.residual.tolist(), loose, by)
         else:
-            weight = inlier_probabilities(
+            weight, _ = inlier_probabilities(
                 taken.multipliers.tolist(), taken.alone.tolist(), taken.explained.tolist(), variance, by
             )
     raise AssertionError("the last step returns")
+
+
+def _weighed(told: Measured, sound: Array, at: Point) -> tuple[Measured, Point]:
+    """Return the measurements with the noise of the odometry by its weights, and the point under it."""
+    if not told.strays:
+        return told, at
+    of = told._replace(white=weighted_noise(told, sound))
+    return of, point_at(of, *at[:6])
 
 
 def _inliers(weight: Vector) -> int:
@@ -317,6 +336,7 @@ def _ended(
     taken: FitStep,
     weight: Vector,
     variance: Vector,
+    sound: Array,
     last_step: float,
 ) -> Fitted:
     """Return the fit that has ended at `final`, with its noise level and the part of outliers in it."""
@@ -328,6 +348,5 @@ def _ended(
         correlation = residual_correlation(residuals, [weight[j] for j in rows], sigmas, radios, level)
         level = noise_level(taken.chi2, inliers - by.free, by.degrees, correlation)
     outliers = outlier_log_density(final.walk.residual.tolist(), weight, by)
-    return Fitted(
-        model, final, taken, np.array(weight), np.array(variance), last_step, level, inliers, outliers
-    )
+    weights = np.array(weight), np.array(variance), sound
+    return Fitted(model, final, taken, *weights, last_step, level, inliers, outliers)

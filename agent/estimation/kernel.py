@@ -24,10 +24,10 @@ class _Measured(ctypes.Structure):
 
     _fields_ = [
         *[(name, ctypes.c_longlong) for name in ("robots", "ticks", "ranges", "common", "constant")],
-        *[(name, ctypes.c_longlong) for name in ("anchors", "radios", "scaled", "delayed")],
+        *[(name, ctypes.c_longlong) for name in ("anchors", "radios", "scaled", "delayed", "strays")],
         *[(name, ctypes.c_double) for name in ("period", "survey", "slow", "decay", "scale")],
-        *[(name, Pointer) for name in ("v", "omega", "slip", "white", "patterns", "place", "rho", "effects")],
-        *[(name, Pointer) for name in ("mean", "information", "pivot")],
+        *[(name, Pointer) for name in ("v", "omega", "slip", "white", "stray", "patterns", "place", "rho")],
+        *[(name, Pointer) for name in ("effects", "mean", "information", "pivot")],
         *[(name, Pointer) for name in ("begin", "first", "second", "anchor", "radio")],
     ]
 
@@ -37,7 +37,7 @@ class _Weighing(ctypes.Structure):
 
     _fields_ = [
         *[(name, ctypes.c_double) for name in ("longest", "inlier", "outlier", "stray", "least", "most")],
-        ("degrees", ctypes.c_double),
+        *[(name, ctypes.c_double) for name in ("degrees", "astray", "astray_odds")],
         *[(name, ctypes.c_longlong) for name in ("free", "robust", "noisy")],
         *[(name, Pointer) for name in ("sigma", "holding", "by_radio")],
     ]
@@ -62,14 +62,14 @@ class Kernel:
         size, s, n3 = of.size, 3 * n + of.radios, 3 * n
         q = size + 2 * of.anchors
         arrays = (
-            *(of.v, of.omega, of.slip, of.white, of.patterns, of.place, of.rho, of.common, of.mean),
-            *(of.information, of.pivot, of.begin, of.first, of.second, of.anchor, of.radio),
+            *(of.v, of.omega, of.slip, of.white, of.stray, of.patterns, of.place, of.rho, of.common),
+            *(of.mean, of.information, of.pivot, of.begin, of.first, of.second, of.anchor, of.radio),
         )
         self._memory = [address(one) for one in (*arrays, by.sigma, by.holding, by.by_radio)]
         at = [ctypes.addressof(one) for one in self._memory]
         self._measured = ctypes.byref(
             _Measured(
-                *(n, k, count, c, m, of.anchors, of.radios, of.scaled, of.delayed),
+                *(n, k, count, c, m, of.anchors, of.radios, of.scaled, of.delayed, of.strays),
                 *(of.period, of.survey, of.slow, of.decay, of.scale),
                 *at[: len(arrays)],
             )
@@ -77,17 +77,19 @@ class Kernel:
         self._weighing = ctypes.byref(
             _Weighing(
                 *(by.longest, by.inlier, by.outlier, by.stray, by.least, by.most, by.degrees),
-                *(by.free, by.robust, by.noisy),
+                *(by.astray, by.astray_odds, by.free, by.robust, by.noisy),
                 *at[len(arrays) :],
             )
         )
         self._of_walk = ((n, k + 1, 3), (n, k, 8), (count, 2), (count,), (count,))
-        self._of_step = ((size,), (size,), (size, size), (n, 2, k), *[(count,)] * 5, (n3, n3), (4,))
+        of_errors, ticks = ((n, 2, k), *[(count,)] * 5), k * of.strays
+        self._of_step = ((size,), (size,), (size, size), *of_errors, (n3, n3), (n, ticks, 5), (4,))
         of_point = ((n3,), (c,), (n, m), (n, 2, k), (count,), (count,), *self._of_walk, (count,), (1,))
-        self._fitted = _Layout(*of_point, *of_point, *self._of_step, (count,), (count,), (6,))
+        self._fitted = _Layout(*of_point, *of_point, *self._of_step, (count,), (count,), (n, ticks), (6,))
         vectors = (count, count, count * q, count * s, s, s * q, s * s, q * q, q)
         spaces = (s, s * size, s * s, s, size, size * size, max(size, n3) ** 2, *[max(q, of.radios)] * 2)
-        self._work, self._space = _Layout(*vectors, *spaces, *[count] * 4, n3).space()
+        weights = (*[count] * 4, n3, n * ticks, 2 * n * ticks)
+        self._work, self._space = _Layout(*vectors, *spaces, *weights).space()
 
     def __reduce__(self) -> tuple[type[Kernel], tuple[Measured, Weighing]]:
         """Return how to build the kernel again from a copy, which has memory of its own."""
@@ -162,7 +164,7 @@ class Kernel:
         of_poses[...], of_constant[...], of_white[...] = poses, constant, white
         common[...] = slow[...] = of_slow[...] = 0.0
         if weights is not None:
-            arrays[-3][...] = weights
+            arrays[-4][...] = weights
         return at, arrays
 
 
@@ -185,10 +187,10 @@ def _fitted_of(arrays: list[Array]) -> Fitted:
     """Return the fit with these arrays."""
     last_step, level, inliers, outliers, model, final = arrays[-1].tolist()
     points = arrays[:POINT], arrays[POINT : 2 * POINT]
-    step, (weights, variance, _) = _step_of(arrays[2 * POINT : -3]), arrays[-3:]
+    step, (weights, variance, sound, _) = _step_of(arrays[2 * POINT : -4]), arrays[-4:]
     at = _point_of(points[int(model)])
     after = at if final == model else _point_of(points[int(final)])
-    return Fitted(at, after, step, weights, variance, last_step, level, int(inliers), outliers)
+    return Fitted(at, after, step, weights, variance, sound, last_step, level, int(inliers), outliers)
 
 
 class _Layout:

@@ -8,7 +8,14 @@ import msgspec
 import numpy as np
 
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges
-from agent.estimation.gaussian.odometry_noise import Array, Places, Track, constant_errors, variances
+from agent.estimation.gaussian.odometry_noise import (
+    Array,
+    Places,
+    Track,
+    constant_errors,
+    stray_variances,
+    variances,
+)
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
 from agent.estimation.gaussian.range_weights import Weighing
 from agent.estimation.kernel import Kernel
@@ -69,13 +76,18 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
         common[holding] = 0.0
         v, omega, slip = _velocities(measured.paths, ticks)
         anchor, anchors = _unsure_anchors(ranges) if priors.survey_error else (np.full(len(order), -1), 0)
+        white = _variances(measured, v, omega)
+        stray = np.empty((n, 2, 0))
+        if noise.odometry_strays:
+            stray = white + stray_variances(v, omega, noise, measured.period)
         prior, few = measured.prior, len(order) <= MOST_MEASURED_LENGTHS
         of = Measured(
             period=measured.period,
             v=v,
             omega=omega,
             slip=slip,
-            white=_variances(measured, v, omega),
+            white=white,
+            stray=stray,
             patterns=constant_errors(v, omega, noise),
             begin=np.searchsorted(tick[order], np.arange(ticks + 2)),
             first=ranges.first[order],
@@ -104,7 +116,7 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
             np.argsort(radio, kind="stable"),
             max(float(np.max(ranges.rho[order[~holding]], initial=0.0)), SIGMA_FLOOR),
             free=3 * n - (0 if prior is None else prior.rank),
-            noisy=bool(of.patterns.shape[1]) or bool(of.white.any()),
+            noisy=bool(of.patterns.shape[1]) or bool(of.white.any()) or bool(of.stray.any()),
         )
         log_information = 0.0 if prior is None else prior.log_information
         return Problem(of, by, Kernel(of, by), noise, order, back, lengths, log_information, ranges.tick)

@@ -50,9 +50,10 @@ typedef long long Index;
 
 /* smoother.Measured: first the numbers, then the arrays. */
 typedef struct {
-    Index robots, ticks, ranges, common, constant, anchors, radios, scaled, delayed;
+    Index robots, ticks, ranges, common, constant, anchors, radios, scaled, delayed, strays;
     double period, survey, slow, decay, scale;
-    const double *v, *omega, *slip, *white, *patterns, *place, *rho, *effects, *mean, *information, *pivot;
+    const double *v, *omega, *slip, *white, *stray, *patterns, *place, *rho, *effects, *mean, *information;
+    const double *pivot;
     const Index *begin, *first, *second, *anchor, *radio;
 } Measured;
 
@@ -61,22 +62,24 @@ typedef struct {
     double *place, *moves, *direction, *residual, *rate;
 } Walk;
 
-/* smoother.Passed and smoother.Told; `row_of` has the places and derivatives of a range. The last four are
-   vectors of a fit, with an element for each range, and the limited step with one for each unknown. */
+/* smoother.Passed and smoother.Told; `row_of` has the places and derivatives of a range. Those from
+   `updated` on are vectors of a fit: with an element for each range, the limited step with one for each unknown,
+   and then the weights and the noise of the ticks. */
 typedef struct {
     double *innovation, *variance, *effects, *gain, *state, *u, *p, *information, *gradient;
     double *told, *by_unknowns, *weight, *weighted, *effect, *lower, *inner, *vector, *other;
-    double *updated, *errors, *spread, *ratios, *shorter;
+    double *updated, *errors, *spread, *ratios, *shorter, *sound, *noise;
 } Work;
 
 /* smoother.Step */
 typedef struct {
-    double *change, *limited, *inverse, *white, *own, *slow, *multipliers, *alone, *explained, *ends, *numbers;
+    double *change, *limited, *inverse, *white, *own, *slow, *multipliers, *alone, *explained, *ends, *shocks;
+    double *numbers;
 } Step;
 
 /* range_weights.Weighing: first the numbers, then the arrays. */
 typedef struct {
-    double longest, inlier, outlier, stray, least, most, degrees;
+    double longest, inlier, outlier, stray, least, most, degrees, astray, astray_odds;
     Index free, robust, noisy;
     const double *sigma;
     const Index *holding, *by_radio;
@@ -100,7 +103,7 @@ typedef struct {
 typedef struct {
     Point points[2];
     Step step;
-    double *weights, *variance, *numbers;
+    double *weights, *variance, *sound, *numbers;
 } Fitted;
 
 typedef struct {
@@ -501,6 +504,33 @@ static double told_by(const Measured *of, const Walk *walk, Index j, Work *w, do
     return here;
 }
 
+static void shock_of(const Measured *of, const Walk *walk, Index i, Index k, Work *w, Step *to)
+{
+    const Index s = states(of), size = estimated(of), x = 3 * i;
+    const double *move = walk->moves + 8 * (i * of->ticks + k);
+    const double effects[2][3] = {{move[0], move[1], 0.0}, {move[4], move[5], of->period}};
+    double *by[2] = {w->vector, w->other}, *shock = to->shocks + 5 * (i * of->ticks + k);
+    for (Index e = 0; e < 2; e++) {
+        double slope = 0.0;
+        memset(by[e], 0, sizeof(double) * size);
+        for (Index a = 0; a < 2 + e; a++) {
+            slope += effects[e][a] * w->told[x + a];
+            add(by[e], effects[e][a], w->by_unknowns + (x + a) * size, size);
+        }
+        shock[e] = slope - dot(by[e], to->change, size);
+    }
+    for (Index t = 0; t < 3; t++) {
+        const Index e = t / 2, f = (t + 1) / 2;
+        double information = 0.0;
+        for (Index a = 0; a < 2 + e; a++)
+            for (Index b = 0; b < 2 + f; b++)
+                information += effects[e][a] * effects[f][b] * w->weight[(x + a) * s + x + b];
+        for (Index a = 0; a < size; a++)
+            information -= by[e][a] * dot(to->inverse + a * size, by[f], size);
+        shock[2 + t] = information;
+    }
+}
+
 static void attributed(const Measured *of, const Walk *walk, Index i, Index k, Work *w, Step *to)
 {
     const Index s = states(of), size = estimated(of), K = of->ticks, x = 3 * i, y = 3 * i + 1, h = 3 * i + 2;
@@ -540,7 +570,10 @@ static void backward(const Measured *of, const Walk *walk, Work *w, Step *to)
                 to->explained[j] += w->effect[a] * dot(to->inverse + a * size, w->effect, size);
         }
         if (k == 0) break;
-        for (Index i = 0; i < of->robots; i++) attributed(of, walk, i, k - 1, w, to);
+        for (Index i = 0; i < of->robots; i++) {
+            if (of->strays) shock_of(of, walk, i, k - 1, w, to);
+            attributed(of, walk, i, k - 1, w, to);
+        }
         for (Index a = 3 * of->robots; a < s; a++) {
             w->told[a] *= of->decay;
             scale(w->by_unknowns + a * size, of->decay, size);
@@ -673,7 +706,7 @@ static double inlier_probability(double error, double sigma, const Weighing *by)
     return 1.0 / (1.0 + exp(smaller(ratio, LARGEST_RATIO)));
 }
 
-void weights_by_errors(
+double weights_by_errors(
     const Weighing *by, Index count, const double *errors, const double *sigma, double *ratios, double *to)
 {
     double scale = 1.0;
@@ -681,13 +714,14 @@ void weights_by_errors(
         to[j] = 1.0;
         ratios[j] = fabs(errors[j] / sigma[j]);
     }
-    if (!by->robust || count == 0) return;
+    if (!by->robust || count == 0) return scale;
     if (by->degrees != 0.0) scale = larger(1.0, selected(ratios, count, count / 2) / MEDIAN);
     for (Index j = 0; j < count; j++)
         if (!by->holding[j]) to[j] = inlier_probability(errors[j], scale * sigma[j], by);
+    return scale;
 }
 
-static void inlier_probabilities(
+static double inlier_probabilities(
     const Measured *of, const Weighing *by, const Step *step, const double *variance, Work *w, double *to)
 {
     for (Index j = 0; j < of->ranges; j++) {
@@ -695,7 +729,7 @@ static void inlier_probabilities(
         w->errors[j] = step->multipliers[j] / precision;
         w->spread[j] = sqrt(larger(1.0 / precision - variance[j], 0.0) + by->sigma[j] * by->sigma[j]);
     }
-    weights_by_errors(by, of->ranges, w->errors, w->spread, w->ratios, to);
+    return weights_by_errors(by, of->ranges, w->errors, w->spread, w->ratios, to);
 }
 
 static double outlier_log_density(
@@ -720,6 +754,81 @@ static Index inliers(const Measured *of, const double *weights)
     Index count = 0;
     for (Index j = 0; j < of->ranges; j++) count += weights[j] > INLIER;
     return count;
+}
+
+/* --- strays of the odometry ------------------------------------------------------------------------- */
+
+static void weighted_noise(const Measured *of, const double *sound, double *to)
+{
+    const Index K = of->ticks;
+    for (Index e = 0; e < 2 * of->robots * K; e++) {
+        const double share = sound[e / (2 * K) * K + e % K], least = of->white[e], most = of->stray[e];
+        to[e] = share * least + (1.0 - share) * most;
+    }
+}
+
+static void sound_by_errors(const Measured *of, const Weighing *by, const double *white, double *to)
+{
+    const Index K = of->ticks;
+    for (Index tick = 0; tick < of->robots * K; tick++) {
+        const Index begin = tick / K * 2 * K + tick % K;
+        double ratio = by->astray_odds;
+        for (Index e = begin; e <= begin + K; e += K) {
+            const double least = of->white[e], most = of->stray[e];
+            const double usual = (1.0 - by->astray) * least + by->astray * most;
+            if (most > least) ratio += 0.5 * white[e] * white[e] * (1.0 / usual - 1.0 / most);
+        }
+        to[tick] = 1.0 / (1.0 + exp(smaller(ratio, LARGEST_RATIO)));
+    }
+}
+
+static void others_of(const double *shock, double v, double omega, double to[5])
+{
+    const double by_v = shock[0], by_omega = shock[1], vv = shock[2], mixed = shock[3], both = shock[4];
+    const double left_v = 1.0 - vv * v, left_omega = 1.0 - both * omega;
+    const double determinant = left_v * left_omega - mixed * omega * mixed * v;
+    memset(to, 0, 5 * sizeof(double));
+    if (!(determinant > 0.0)) return;
+    to[0] = (left_omega * by_v + mixed * omega * by_omega) / determinant;
+    to[1] = (mixed * v * by_v + left_v * by_omega) / determinant;
+    to[2] = (left_omega * vv + mixed * omega * mixed) / determinant;
+    to[3] = mixed / determinant;
+    to[4] = (mixed * v * mixed + left_v * both) / determinant;
+}
+
+static double evidence_of(const double others[5], double v, double omega, double scale)
+{
+    const double by_v = others[0], by_omega = others[1], mixed = others[3];
+    const double a = 1.0 + v * others[2], b = v * mixed, c = omega * mixed, d = 1.0 + omega * others[4];
+    const double determinant = a * d - b * c;
+    const double of_v = d * v * by_v - b * omega * by_omega, of_omega = a * omega * by_omega - c * v * by_v;
+    return 0.5 * (by_v * of_v + by_omega * of_omega) / determinant / (scale * scale) - 0.5 * log(determinant);
+}
+
+static void sound_probabilities(
+    const Measured *of, const Weighing *by, const double *before, const double *shocks, const double *white,
+    double scale, double *to)
+{
+    const Index K = of->ticks;
+    double others[5];
+    for (Index tick = 0; tick < of->robots * K; tick++) {
+        const Index v = tick / K * 2 * K + tick % K, omega = v + K;
+        to[tick] = 1.0;
+        if (!(of->stray[v] > of->white[v] || of->stray[omega] > of->white[omega])) continue;
+        others_of(shocks + 5 * tick, white[v], white[omega], others);
+        const double ratio = by->astray_odds + evidence_of(others, of->stray[v], of->stray[omega], scale)
+            - evidence_of(others, of->white[v], of->white[omega], scale);
+        to[tick] = 0.5 * (before[tick] + 1.0 / (1.0 + exp(smaller(ratio, LARGEST_RATIO))));
+    }
+}
+
+/* Let the noise of the odometry of `of` be that by the weights of the ticks of a fit. */
+static void weigh(const Measured *told, Work *w, const Fitted *by, Measured *of)
+{
+    *of = *told;
+    if (!told->strays) return;
+    weighted_noise(told, by->sound, w->noise);
+    of->white = w->noise;
 }
 
 /* --- the noise level -------------------------------------------------------------------------------- */
@@ -874,10 +983,15 @@ static void ended(
 
 /* The fit that begins at the poses and errors of the first of `points`; unless `weighed`, its weights follow
    from the residuals there. Returns 0 if it is singular. */
-int fitted(const Measured *of, const Weighing *by, const Convergence *until, int weighed, Work *w, Fitted *to)
+int fitted(const Measured *told, const Weighing *by, const Convergence *until, int weighed, Work *w, Fitted *to)
 {
+    const Index ticks = told->strays * told->robots * told->ticks;
+    Measured by_sound;
+    const Measured *of = &by_sound;
     Index at = 0;
     double before = 0.0, least = 0.0;
+    if (told->strays) sound_by_errors(told, by, to->points->white, to->sound);
+    weigh(told, w, to, &by_sound);
     predicted(of, to->points);
     for (Index j = 0; j < of->ranges; j++) w->updated[j] = by->sigma[j] * by->sigma[j];
     if (!loosened(of, &to->points->walk, to->points->poses, w->updated, w, w->spread)) return 0;
@@ -893,7 +1007,8 @@ int fitted(const Measured *of, const Weighing *by, const Convergence *until, int
         weighted_variance(of, by, to->weights, to->variance);
         for (Index j = 0; j < of->ranges; j++) to->variance[j] += least;
         if (!step_of(of, by, here, w, to)) return 0;
-        inlier_probabilities(of, by, &to->step, to->variance, w, w->updated);
+        const double scale = inlier_probabilities(of, by, &to->step, to->variance, w, w->updated);
+        if (told->strays) sound_probabilities(told, by, to->sound, to->step.shocks, of->white, scale, w->sound);
         const Index freedom = inliers(of, to->weights) - by->free;
         const double level = noise_level(to->step.numbers[0], freedom, by->degrees, 0.0);
         const double length = to->step.numbers[1] / sqrt(level);
@@ -908,6 +1023,7 @@ int fitted(const Measured *of, const Weighing *by, const Convergence *until, int
         int still = number > 0 || until->decrease < 1.0 || !by->noisy;
         for (Index j = 0; j < of->ranges; j++)
             still = still && fabs(w->updated[j] - to->weights[j]) < SETTLED_WEIGHT;
+        for (Index e = 0; e < ticks; e++) still = still && fabs(w->sound[e] - to->sound[e]) < SETTLED_WEIGHT;
         if (still && expected < until->shortest
             && off_model(of, to->points + after, &to->step, to->variance, level) <= 1.0) {
             ended(of, by, at, after, expected, w, to);
@@ -916,14 +1032,22 @@ int fitted(const Measured *of, const Weighing *by, const Convergence *until, int
         memcpy(to->weights, w->updated, sizeof(double) * of->ranges);
         before = length;
         at = after;
+        if (!told->strays) continue;
+        memcpy(to->sound, w->sound, sizeof(double) * ticks);
+        weigh(told, w, to, &by_sound);
+        predicted(of, to->points + at);
     }
     return 0;
 }
 
 /* The fit after full steps from the first of `points`, with the weights there. Returns 0 if it is singular. */
-int held(const Measured *of, const Weighing *by, Index steps, Work *w, Fitted *to)
+int held(const Measured *told, const Weighing *by, Index steps, Work *w, Fitted *to)
 {
+    Measured by_sound;
+    const Measured *of = &by_sound;
     Index at = 0;
+    if (told->strays) sound_by_errors(told, by, to->points->white, to->sound);
+    weigh(told, w, to, &by_sound);
     predicted(of, to->points);
     for (Index number = 0;; number++, at = 1 - at) {
         Point *here = to->points + at, *next = to->points + 1 - at;

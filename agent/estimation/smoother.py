@@ -54,6 +54,8 @@ class Measured(NamedTuple):
     """angles in rad from the chord of eq. (1a) to the displacements; (n, K)"""
     white: Array
     """variances of v and omega; (n, 2, K)"""
+    stray: Array
+    """the variances in a tick whose odometry is a stray; (n, 2, K), or (n, 2, 0) if there are none"""
     patterns: Array
     """effects of one sigma of each constant error on v and omega; (n, m, 2, K)"""
     begin: Places
@@ -106,6 +108,11 @@ class Measured(NamedTuple):
         return int(self.v.shape[1])
 
     @property
+    def strays(self) -> int:
+        """1 if the odometry of a tick may be a stray, else 0."""
+        return int(self.stray.size > 0)
+
+    @property
     def size(self) -> int:
         """The number of unknowns that are estimated."""
         return int(3 * self.robots + self.common.shape[1] + self.robots * self.patterns.shape[1])
@@ -150,6 +157,10 @@ class FitStep(NamedTuple):
     """the part of it that the unknowns explain; (N,)"""
     ends: Array
     """covariance of the poses at the last tick; (3 n, 3 n)"""
+    shocks: Array
+    """what all data tell of the errors of v and omega in each tick, which have the variances `white`: the
+    derivatives of the log-likelihood, and the information vv, v omega and omega omega; (n, K, 5), or
+    (n, 0, 5) if there are no strays"""
     chi2: float
     """least sum of squares of all errors in their sigmas"""
     length: float
@@ -427,7 +438,7 @@ def step(of: Measured, walk: Walk, poses: Array, variance: Array, ridge: float, 
     inner = cholesky(inverse, 0, n3)
     whitened = substituted(inner, change[:n3])
     limited = _limited(passed, change, n3, largest)
-    white, own, multipliers, alone, explained = _backward(of, walk, passed, inverse, change, limited)
+    white, own, multipliers, alone, explained, shocks = _backward(of, walk, passed, inverse, change, limited)
     volume = 0.0
     for one in passed.variance:
         volume += math.log(one)
@@ -447,6 +458,7 @@ def step(of: Measured, walk: Walk, poses: Array, variance: Array, ridge: float, 
         np.array(alone),
         np.array(explained),
         np.array(_ends(of, passed, lower, inverse)),
+        np.array(shocks).reshape(of.robots, of.ticks * of.strays, 5),
         _chi2(of, passed, poses, change),
         math.sqrt(dot(whitened, whitened)),
         volume,
@@ -484,12 +496,13 @@ def _chi2(of: Measured, passed: Passed, poses: Array, change: Vector) -> float:
 
 def _backward(
     of: Measured, walk: Walk, passed: Passed, inverse: Matrix, change: Vector, limited: Vector
-) -> tuple[list[Matrix], Vector, Vector, Vector, Vector]:
-    """Return the white errors, and the vectors own, multipliers, alone and explained of a step."""
+) -> tuple[list[Matrix], Vector, Vector, Vector, Vector, list[Matrix]]:
+    """Return the white errors, the vectors own, multipliers, alone and explained, and shocks of a step."""
     s, size, count = len(passed.p), of.size, len(of.rho)
     told = Told([0.0] * s, zeros(s, size), zeros(s, s))
     white = [zeros(2, of.ticks) for _ in range(of.robots)]
     own, multipliers, alone, explained = ([0.0] * count for _ in range(4))
+    shocks = [zeros(of.ticks * of.strays, 5) for _ in range(of.robots)]
     for k in range(of.ticks, -1, -1):
         for j in range(of.begin[k + 1] - 1, of.begin[k] - 1, -1):
             here, effect, alone[j] = _told_by(of, walk, passed, j, told)
@@ -499,6 +512,8 @@ def _backward(
                 explained[j] += effect[a] * dot(inverse[a], effect)
         if k > 0:
             for i in range(of.robots):
+                if of.strays:
+                    shocks[i][k - 1] = _shock(of, walk, i, k - 1, told, inverse, change)
                 _attributed(of, walk, i, k - 1, told, limited, white[i])
             for a in range(3 * of.robots, s):
                 told.vector[a] *= of.decay
@@ -506,7 +521,7 @@ def _backward(
                 scale(told.weight[a], of.decay)
                 for row in told.weight:
                     row[a] *= of.decay
-    return white, own, multipliers, alone, explained
+    return white, own, multipliers, alone, explained, shocks
 
 
 class Told(NamedTuple):
@@ -541,6 +556,29 @@ def _told_by(of: Measured, walk: Walk, passed: Passed, j: int, told: Told) -> tu
         for e, other in row:
             told.weight[a][e] += h * other * precision
     return here, effect, precision
+
+
+def _shock(of: Measured, walk: Walk, i: int, k: int, told: Told, inverse: Matrix, change: Vector) -> Vector:
+    """Return the row of `shocks` of robot `i` in tick `k`, by what is told of the state after it."""
+    sx, sy, _, _, gx, gy, _, _ = walk.moves[i, k]
+    effects = ((sx, sy), (gx, gy, of.period))
+    shock: Vector = []
+    by_unknowns = zeros(2, of.size)
+    for e in range(2):
+        slope = 0.0
+        for a, h in enumerate(effects[e], 3 * i):
+            slope += h * told.vector[a]
+            add(by_unknowns[e], h, told.by_unknowns[a])
+        shock.append(slope - dot(by_unknowns[e], change))
+    for e, f in ((0, 0), (0, 1), (1, 1)):
+        information = 0.0
+        for a, h in enumerate(effects[e], 3 * i):
+            for b, g in enumerate(effects[f], 3 * i):
+                information += h * g * told.weight[a][b]
+        for a in range(of.size):
+            information -= by_unknowns[e][a] * dot(inverse[a], by_unknowns[f])
+        shock.append(information)
+    return shock
 
 
 def _attributed(of: Measured, walk: Walk, i: int, k: int, told: Told, limited: Vector, white: Matrix) -> None:

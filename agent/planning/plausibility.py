@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 
+from agent.estimation.gaussian.odometry_noise import STRAY_DISTANCE, STRAY_TURN
 from agent.peer.motion_log import MotionLog
 from agent.peer.peer_state import PeerState
 from agent.planning.phase2_orbit import Orbiting
@@ -64,13 +65,14 @@ def _exceeded_limit(report: Report, mission: Mission) -> Inconsistent | None:
     """Return a contradiction if a speed exceeds v_max or a turn rate exceeds omega_max."""
     noise = mission.noise
     scale = noise.priors.wheel_scale
+    of_v, of_omega = (STRAY_DISTANCE, STRAY_TURN / mission.period) if noise.odometry_strays else (0.0, 0.0)
     speed = _largest_measurement(
-        mission.max_speed, (noise.actuation.v, noise.odometry.v, scale), noise.standstill_bound[0]
+        mission.max_speed, (noise.actuation.v, noise.odometry.v, scale, of_v), noise.standstill_bound[0]
     )
     rate = _largest_measurement(
         mission.max_turn_rate,
         (noise.actuation.omega, noise.odometry.omega, scale),
-        math.hypot(noise.standstill_bound[1], NOISY * noise.priors.gyro_bias),
+        math.hypot(noise.standstill_bound[1], NOISY * noise.priors.gyro_bias, NOISY * of_omega),
     )
     for run in report.runs:
         v, omega = abs(run.v), abs(run.omega)
@@ -84,7 +86,8 @@ def _exceeded_limit(report: Report, mission: Mission) -> Inconsistent | None:
 def _largest_measurement(limit: float, relative: tuple[float, ...], floor: float) -> float:
     """Return the largest plausible measurement of a speed of at most `limit`.
 
-    `relative` are the sigmas of the actuation, of the odometry and of its scale, as fractions of the speed.
+    `relative` are the sigmas of the actuation, of the odometry, of its scale and of strays, as fractions of
+    the speed.
     """
     return limit * (1.0 + SPEED_SLACK + NOISY * math.hypot(*relative)) + floor
 

@@ -18,8 +18,8 @@ from agent.estimation.gaussian.odometry_noise import (
     Array,
     Places,
     constant_errors,
+    expected_variances,
     is_noisy,
-    variances,
     wander,
 )
 from agent.estimation.gaussian.range_model import mixture
@@ -76,7 +76,7 @@ def _odometry_variance(own: JointMeasurements) -> Array:
     if not is_noisy(noise):
         return np.zeros_like(own.ranges.rho)
     v, omega = path.v, path.omega
-    white = variances(v, omega, noise.odometry)
+    white = expected_variances(v, omega, noise, path.period)
     if path.extra is not None:
         white += path.extra
     model = wander(path, np.zeros(path.shift.shape), constant_errors(v, omega, noise), white)

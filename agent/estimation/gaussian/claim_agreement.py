@@ -17,9 +17,9 @@ from agent.estimation.gaussian.odometry_noise import (
     Track,
     constant_effects,
     constant_errors,
+    expected_variances,
     is_noisy,
     spread,
-    variances,
     wander,
 )
 from agent.estimation.smoother import Singular
@@ -144,7 +144,7 @@ def _drift(path: Track, since: int, turn: float, noise: Noise) -> Array:
     if not is_noisy(noise):
         return np.zeros((3, 3))
     patterns = constant_errors(path.v, path.omega, noise)
-    white = variances(path.v, path.omega, noise.odometry)
+    white = expected_variances(path.v, path.omega, noise, path.period)
     model = wander(path, np.zeros((2, len(path.v))), patterns, white).since(since)
     rows = Projection.pose(path, len(path.v), turn)
     constant = constant_effects(model, rows)[:-1]

@@ -20,7 +20,7 @@ from agent.estimation.facts import AnchorPlace, Facts, Manoeuvre, MeasuredRange
 from agent.estimation.gaussian.odometry_noise import Array, Places, Track, track
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
 from agent.estimation.solver import Solver
-from protocol.noise import Noise, Priors, VelocityNoise
+from protocol.noise import Noise, Priors
 
 IMPOSSIBLE = 6.0
 """The number of sigmas beyond R from which a range is an outlier under any guess."""
@@ -296,7 +296,7 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
         """
         ranges, pairs = self.ranges, self.ranges.pairs
         if most is None:
-            correlated = self.noise.odometry != VelocityNoise() or self.noise.priors.slow_sigma > 0.0
+            correlated = self.noise.wanders or self.noise.priors.slow_sigma > 0.0
             most = MOST_CORRELATED_RANGES if correlated else MOST_RANGES_BY_EXACT_ODOMETRY
         if len(ranges.rho) <= min(most, MOST_MUTUAL_RANGES // max(len(pairs), 1)):
             return self

@@ -158,8 +158,7 @@ class OdometryNoiseModel(NamedTuple):
 def constant_errors(v: Array, omega: Array, noise: Noise) -> Array:
     """Return the `patterns` of a robot that measured v and omega: two scale errors, and the bias of omega."""
     priors = noise.priors
-    at_rest = noise.standstill_bound
-    moving = (np.abs(v) > at_rest[0]) | (np.abs(omega) > at_rest[1])
+    moving = _moving(v, omega, noise)
     patterns = np.zeros((*v.shape[:-1], 3 * priors.of_odometry, 2, v.shape[-1]))
     if priors.of_odometry:
         np.multiply(v, priors.wheel_scale, out=patterns[..., 0, 0, :])
@@ -168,15 +167,44 @@ def constant_errors(v: Array, omega: Array, noise: Noise) -> Array:
     return patterns
 
 
+def _moving(v: Array, omega: Array, noise: Noise) -> NDArray[np.bool]:
+    at_rest = noise.standstill_bound
+    return np.asarray((np.abs(v) > at_rest[0]) | (np.abs(omega) > at_rest[1]), np.bool)
+
+
+STRAY_TURN = 0.1
+"""The standard deviation (rad) of the heading error of a tick whose odometry is a stray.
+
+Increments of real wheels are off by 0.1 to 0.2 rad.
+"""
+
+STRAY_DISTANCE = 0.2
+"""The standard deviation of the error of its distance, as a fraction of the measured distance."""
+
+
+def stray_variances(v: Array, omega: Array, noise: Noise, period: float) -> Array:
+    """Return the variances that a stray adds to those of v and omega, 0 at rest; (..., k) -> (..., 2, k)."""
+    moving = _moving(v, omega, noise)
+    return np.stack((moving * np.square(STRAY_DISTANCE * v), moving * (STRAY_TURN / period) ** 2), -2)
+
+
 def variances(v: Array, omega: Array, noise: VelocityNoise) -> Array:
     """Return the variances of the measured v and omega; (..., k) each -> (..., 2, k)."""
     of_v = np.square(noise.v * v) + noise.v_floor**2
     return np.stack((of_v, np.square(noise.omega * omega) + noise.omega_floor**2), -2)
 
 
+def expected_variances(v: Array, omega: Array, noise: Noise, period: float) -> Array:
+    """Return the variances of v and omega with those of strays, by their share; shapes as in `variances`."""
+    white = variances(v, omega, noise.odometry)
+    if noise.odometry_strays:
+        white += noise.odometry_strays * stray_variances(v, omega, noise, period)
+    return white
+
+
 def is_noisy(noise: Noise) -> bool:
     """Return whether odometry may differ from the executed motion."""
-    return noise.priors.of_odometry or noise.odometry != VelocityNoise()
+    return noise.priors.of_odometry or noise.wanders
 
 
 def wander(

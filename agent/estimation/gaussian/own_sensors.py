@@ -184,6 +184,7 @@ def _profile(name: ProfileName, noise: Noise, share: float = 1.0) -> Noise:
         outlier_bias=noise.outlier_bias,
         actuation=noise.actuation,
         odometry=noise.odometry,
+        odometry_strays=noise.odometry_strays,
     )
 
 

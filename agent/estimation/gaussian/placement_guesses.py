@@ -37,6 +37,7 @@ from agent.estimation.gaussian.odometry_noise import (
     wander,
 )
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, mixture
+from agent.estimation.gaussian.range_weights import weighted_noise
 from agent.estimation.smoother import Singular
 from protocol.motion import rotated
 
@@ -143,7 +144,8 @@ def _encounter(own: Fit, base: int, ticks: tuple[int, ...]) -> Encounter:
         of, (errors,) = own.problem.measured, own.start.errors
         correction = np.stack((errors.v, errors.omega)) + summed(errors.constant, of.patterns[0])
         path = corrected(np.stack((of.v[0], of.omega[0])), correction, of.period, of.slip[0])
-        model = wander(path, correction, of.patterns[0], of.white[0]).since(since)
+        white = weighted_noise(of, np.full(of.v.shape, 1.0 - own.problem.noise.odometry_strays))[0]
+        model = wander(path, correction, of.patterns[0], white).since(since)
         rows = Projection.pose(path, base)
         effects, patterns = constant_effects(model, rows)[:-1], of.patterns[0].copy()
         patterns[:, :, :since] = 0.0

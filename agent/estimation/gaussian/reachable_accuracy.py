@@ -23,9 +23,9 @@ from agent.estimation.gaussian.odometry_noise import (
     Array,
     Projection,
     Ticks,
+    expected_variances,
     spread,
     track,
-    variances,
     wander,
 )
 from protocol.mission import Mission
@@ -146,7 +146,9 @@ def reference_sigma(mission: Mission, distance: float, noise: Noise) -> float:
     (ax, ay), (bx, by) = places
     gap = hypot(ax - bx, ay - by)
     together = range(AROUND_ANCHOR + 1, AROUND_ANCHOR + TOGETHER + 2)
-    white = replace(noise, odometry=VelocityNoise(), outliers=0.0, strays=0.0, sigma_degrees=0.0)
+    white = replace(
+        noise, odometry=VelocityNoise(), outliers=0.0, strays=0.0, odometry_strays=0.0, sigma_degrees=0.0
+    )
     mutual = [(tick, float(gap[tick])) for tick in together]
     pair = near_anchors(paths, lists, ((0.0, 0.0), apart), white, reach, mutual)
     return max(position_sigmas(pair, np.array(starts)))
@@ -169,7 +171,7 @@ def swept_sigma(mission: Mission, way: Sequence[Place]) -> float:
     """
     v, omega = _driven(way, mission)
     path, k = track(v, omega, mission.period), len(v)
-    white = variances(v, omega, mission.noise.odometry)
+    white = expected_variances(v, omega, mission.noise, mission.period)
     model = wander(path, np.zeros((2, k)), np.zeros((0, 2, k)), white)
     along_x = np.repeat((1.0, 0.0), k)
     rows = Projection.positions(

@@ -93,10 +93,11 @@ class AssumedNoise(NamedTuple):
         """The noise of odometry over one second; None: what the recording states."""
         return None if self.noise.odometry == VelocityNoise() else self.noise.odometry
 
-    @property
-    def of_fit(self) -> Noise:
-        """The noise in a fit, whose increments have the variances of what was recorded."""
-        return replace(self.noise, odometry=VelocityNoise(0.0, 0.0, self.sigma / RESIDUAL_S, RESIDUAL_TURN))
+    def of_fit(self, steps: float) -> Noise:
+        """Return the noise in a fit, in which a recorded increment, with its own variances, lasts `steps`."""
+        share = self.noise.odometry_strays / max(steps, 1.0)
+        odometry = VelocityNoise(0.0, 0.0, self.sigma / RESIDUAL_S, RESIDUAL_TURN)
+        return replace(self.noise, odometry=odometry, odometry_strays=share)
 
 
 def stated_noise(recording: RangeRecording) -> AssumedNoise:

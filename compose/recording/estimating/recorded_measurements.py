@@ -211,6 +211,8 @@ def _measurements(part: RangeRecording, assumed: AssumedNoise, ticks: int | None
     ends = t0 + np.arange(1, len(skipped_s) + 1) * EPOCH_S + skipped_s
     last = arrivals[np.searchsorted(arrivals, ends + SAME_TIME_S) - 1]
     used = part._replace(ranges=steps.ranges)
+    lasts = np.median(np.concatenate([one.odometry.t1 - one.odometry.t0 for one in part.robots]))
+    noise = assumed.of_fit(float(lasts) / period)
     anchors = [used.anchors_of(i)[:MOST_USED_ANCHORS] for i in range(len(names))]
     ranges = list(_ranges(used, steps, assumed, anchors))
     placed = {one.id: one for own in anchors for one in own}.values()
@@ -226,7 +228,7 @@ def _measurements(part: RangeRecording, assumed: AssumedNoise, ticks: int | None
     return Measurements(
         source=part.source,
         robots=tuple(map(MeasuredRobot, map(with_bridged_truth, whole.robots), anchors, prepared)),
-        joint=joint_measurements(Facts(frozenset(facts.union(ranges))), assumed.of_fit, period),
+        joint=joint_measurements(Facts(frozenset(facts.union(ranges))), noise, period),
         t0=t0,
         ticks_per_epoch=ticks,
         noise=assumed.name,
