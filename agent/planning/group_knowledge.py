@@ -1,4 +1,4 @@
-"""What a robot of a group knows besides its present meeting: about others, and by earlier meetings."""
+"""The knowledge of a robot of a group besides its present meeting: of others, and by earlier meetings."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class Confirming(msgspec.Struct, frozen=True):
 
 
 class Resected(msgspec.Struct, frozen=True):
-    """What a robot without an anchor knows with exact sensors: ranges to robots that report their poses."""
+    """The knowledge of a robot without an anchor, exact sensors: ranges to robots that report their poses."""
 
     base: Pose = ORIGIN
     """The odometry at the place where it stands, or stood before its square."""
@@ -111,7 +111,7 @@ class Finder(msgspec.Struct, frozen=True):
 
 
 class Contacted(msgspec.Struct, frozen=True):
-    """What a robot without an anchor knows with noisy sensors: by the robot that has found it."""
+    """The knowledge of a robot without an anchor with noisy sensors: by the robot that has found it."""
 
     finder: Finder | None = None
     """The robot that has found it; None while there is none."""

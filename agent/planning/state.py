@@ -134,7 +134,7 @@ class RobotState(Knowledge, frozen=True):
     confirming: Confirming = Confirming()
     """The meetings that confirm that pose, if a claim of it needs several peers."""
     found: Resected | Contacted | None = None
-    """What a robot without an anchor knows by those that are localised; None with an anchor."""
+    """The knowledge of a robot without an anchor by those that are localised; None with an anchor."""
     failure: messages.Verdict | None = None
     """The verdict of the latest meeting that has failed before the robot was localised."""
     frame: Pose = ORIGIN

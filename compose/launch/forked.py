@@ -113,9 +113,9 @@ class ChildProcess:
         self._link = Connection(link.detach())
         self._errors = errors
         self.stderr_text = ""
-        """What it has written to its standard error, at most its last ERROR_BYTES, once it has ended."""
+        """The end of its standard error, at most ERROR_BYTES, once the process has ended."""
         self.how_ended = ""
-        """How it has ended, as part of an error message."""
+        """The way in which it has ended, as part of an error message."""
         self._over = threading.Event()
 
     @property
