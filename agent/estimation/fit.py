@@ -359,5 +359,5 @@ def _evidence(problem: Problem, found: Fitted) -> float:
     noise, count = problem.noise, found.inliers
     weight = -0.5 * (found.step.volume - problem.log_information + math.log(2.0 * math.pi) * count)
     weight += misfit_log_likelihood(found.step.chi2, count - problem.weighing.free, noise.sigma_degrees)
-    weight += float(np.count_nonzero(found.sound <= INLIER)) * problem.weighing.astray_odds
+    weight += float(np.count_nonzero(found.sound <= INLIER)) * problem.weighing.astray_ratio
     return weight + count * math.log1p(-noise.outliers - noise.strays) + found.outliers

@@ -37,7 +37,7 @@ class _Weighing(ctypes.Structure):
 
     _fields_ = [
         *[(name, ctypes.c_double) for name in ("longest", "inlier", "outlier", "stray", "least", "most")],
-        *[(name, ctypes.c_double) for name in ("degrees", "astray", "astray_odds")],
+        *[(name, ctypes.c_double) for name in ("degrees", "astray", "astray_ratio")],
         *[(name, ctypes.c_longlong) for name in ("free", "robust", "noisy")],
         *[(name, Pointer) for name in ("sigma", "holding", "by_radio")],
     ]
@@ -77,7 +77,7 @@ class Kernel:
         self._weighing = ctypes.byref(
             _Weighing(
                 *(by.longest, by.inlier, by.outlier, by.stray, by.least, by.most, by.degrees),
-                *(by.astray, by.astray_odds, by.free, by.robust, by.noisy),
+                *(by.astray, by.astray_ratio, by.free, by.robust, by.noisy),
                 *at[len(arrays) :],
             )
         )

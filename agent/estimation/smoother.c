@@ -79,7 +79,7 @@ typedef struct {
 
 /* range_weights.Weighing: first the numbers, then the arrays. */
 typedef struct {
-    double longest, inlier, outlier, stray, least, most, degrees, astray, astray_odds;
+    double longest, inlier, outlier, stray, least, most, degrees, astray, astray_ratio;
     Index free, robust, noisy;
     const double *sigma;
     const Index *holding, *by_radio;
@@ -772,7 +772,7 @@ static void sound_by_errors(const Measured *of, const Weighing *by, const double
     const Index K = of->ticks;
     for (Index tick = 0; tick < of->robots * K; tick++) {
         const Index begin = tick / K * 2 * K + tick % K;
-        double ratio = by->astray_odds;
+        double ratio = by->astray_ratio;
         for (Index e = begin; e <= begin + K; e += K) {
             const double least = of->white[e], most = of->stray[e];
             const double usual = (1.0 - by->astray) * least + by->astray * most;
@@ -816,7 +816,7 @@ static void sound_probabilities(
         to[tick] = 1.0;
         if (!(of->stray[v] > of->white[v] || of->stray[omega] > of->white[omega])) continue;
         others_of(shocks + 5 * tick, white[v], white[omega], others);
-        const double ratio = by->astray_odds + evidence_of(others, of->stray[v], of->stray[omega], scale)
+        const double ratio = by->astray_ratio + evidence_of(others, of->stray[v], of->stray[omega], scale)
             - evidence_of(others, of->white[v], of->white[omega], scale);
         to[tick] = 0.5 * (before[tick] + 1.0 / (1.0 + exp(smaller(ratio, LARGEST_RATIO))));
     }

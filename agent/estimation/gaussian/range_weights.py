@@ -48,8 +48,8 @@ class Weighing(NamedTuple):
     """logarithm of the probability of strays, and of their density in units of sigma"""
     astray: float
     """the probability that the odometry of a tick in motion is a stray"""
-    astray_odds: float
-    """logarithm of the odds of that; 0 if there are none"""
+    astray_ratio: float
+    """logarithm of the ratio of that to the probability of no stray; 0 if there are none"""
     least: float
     """the least bias of an outlier in m"""
     most: float
@@ -195,7 +195,7 @@ def sound_by_errors(of: Measured, by: Weighing, white: Array) -> Array:
     """
     sound = np.ones((of.robots, of.ticks * of.strays))
     for i, k in np.ndindex(sound.shape):
-        ratio = by.astray_odds
+        ratio = by.astray_ratio
         for e in range(2):
             least, most, error = float(of.white[i, e, k]), float(of.stray[i, e, k]), float(white[i, e, k])
             if most > least:
@@ -220,7 +220,7 @@ def sound_probabilities(
         if most_v > v or most_omega > omega:
             others = _others(shocks[i, k].tolist(), *white[i, :, k].tolist())
             ratio = (
-                by.astray_odds
+                by.astray_ratio
                 + _evidence(others, most_v, most_omega, scale)
                 - _evidence(others, v, omega, scale)
             )
