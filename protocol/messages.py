@@ -50,17 +50,7 @@ from protocol.mission import HEADING_ACCURACY, Anchor, Mission, Options, Planner
 from protocol.motion import Controls, Covariance, Pose, Segment
 from protocol.orbits import Orbit, Rendezvous, visiting
 from protocol.sweep_strips import SweptArea, widest_distance
-from protocol.units import (
-    Angle,
-    AngularVelocity,
-    Count,
-    Finite,
-    Range,
-    RobotId,
-    Tick,
-    Time,
-    Velocity,
-)
+from protocol.units import Angle, AngularVelocity, Count, Finite, Range, RobotId, Tick, Time, Velocity
 
 Outcome = Literal["localised", "undecided", "inconsistent", "wrong", "failed"]
 """The outcome of a run. Only `localised` is a success.

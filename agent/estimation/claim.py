@@ -15,26 +15,13 @@ import numpy as np
 from agent.estimation.elementary import eigh
 from agent.estimation.fit import deviation
 from agent.estimation.gaussian.claim_rivals import WRONG_SIGMAS
-from agent.estimation.gaussian.consistency import (
-    CLAIM_P_VALUE,
-    EARLY_CLAIM_P_VALUE,
-    FINISHED,
-)
+from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, EARLY_CLAIM_P_VALUE, FINISHED
 from agent.estimation.gaussian.evidence import mutual_evidence
-from agent.estimation.gaussian.joint_claims import (
-    DISPLACED_SIGMAS,
-    open_position,
-)
+from agent.estimation.gaussian.joint_claims import DISPLACED_SIGMAS, open_position
 from agent.estimation.gaussian.noise_level import INLIER
 from agent.estimation.gaussian.odometry_noise import Array
 from agent.estimation.gaussian.own_sensors import contradiction
-from agent.estimation.judged import (
-    EVERYBODY,
-    FIRST_CLAIMS,
-    Judged,
-    User,
-    sufficient_mutual_ranges,
-)
+from agent.estimation.judged import EVERYBODY, FIRST_CLAIMS, Judged, User, sufficient_mutual_ranges
 from protocol.messages import Localised
 
 EARLY_RANGES = 16

@@ -10,13 +10,7 @@ from msgspec.structs import replace
 
 from agent.estimation import precision
 from agent.estimation.estimator import AnchorEstimate, Estimator, FittedBranch, PairEstimate
-from agent.estimation.exact import (
-    Branch,
-    PairObservation,
-    branches,
-    weigh_branches,
-    weigh_placements,
-)
+from agent.estimation.exact import Branch, PairObservation, branches, weigh_branches, weigh_placements
 from agent.estimation.knowledge import Belief, Knowledge, off_anchor
 from agent.estimation.mutual_ranges import base, redundant, solve
 from protocol.messages import Inconsistent, Localised, Observation, Verdict

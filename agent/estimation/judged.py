@@ -7,12 +7,7 @@ from typing import Literal, NamedTuple, get_args
 
 from agent.estimation.fit import Fit
 from agent.estimation.gaussian.claim_rivals import Rival, likeliest_rival
-from agent.estimation.gaussian.consistency import (
-    HIGHEST_LEVEL,
-    Inconsistency,
-    chi2_p_value,
-    consistency_test,
-)
+from agent.estimation.gaussian.consistency import HIGHEST_LEVEL, Inconsistency, chi2_p_value, consistency_test
 from agent.estimation.gaussian.inference import (
     PlanningHypothesis,
     localised,
@@ -20,10 +15,7 @@ from agent.estimation.gaussian.inference import (
     pair_planning_hypotheses,
     to_second_order,
 )
-from agent.estimation.gaussian.joint_claims import (
-    Displacement,
-    decisive_ranges,
-)
+from agent.estimation.gaussian.joint_claims import Displacement, decisive_ranges
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.posterior import Certainty, Hypothesis, Posterior
 from protocol.messages import Localised, RobotConfig

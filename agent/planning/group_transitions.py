@@ -17,15 +17,7 @@ from agent.planning import passing, phase2_orbit, sweep_transitions, transitions
 from agent.planning.group_knowledge import Fix
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Travelling
 from agent.planning.state import MODE_NAMES, UNCONFIRMED, Asleep, Done, RobotState
-from protocol.messages import (
-    Appointment,
-    Contact,
-    Localised,
-    Member,
-    Report,
-    Undecided,
-    Verdict,
-)
+from protocol.messages import Appointment, Contact, Localised, Member, Report, Undecided, Verdict
 from protocol.mission import Role
 from protocol.motion import compose
 from protocol.orbits import Rendezvous

@@ -10,11 +10,7 @@ from msgspec.structs import replace
 from agent.estimation.claim import BEFORE_SEARCH, Blocked, blocked, claim, early_consistency, profiles, rivals
 from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.claim_rivals import Rival
-from agent.estimation.gaussian.consistency import (
-    CLAIM_P_VALUE,
-    INCONSISTENT_SEARCHES,
-    rejecting_p_value,
-)
+from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, INCONSISTENT_SEARCHES, rejecting_p_value
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.own_sensors import DOUBTFUL_CLAIMS
 from agent.estimation.gaussian.search import search

@@ -17,14 +17,7 @@ from typing import Any, Generic, TypeVar
 import msgspec
 
 from agent.planning.manoeuvres import Manoeuvres
-from protocol.messages import (
-    BranchKind,
-    Command,
-    Estimate,
-    Observation,
-    Probability,
-    RobotConfig,
-)
+from protocol.messages import BranchKind, Command, Estimate, Observation, Probability, RobotConfig
 from protocol.mission import Mission
 from protocol.orbits import Rendezvous, rendezvous
 

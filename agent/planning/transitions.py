@@ -12,14 +12,7 @@ from agent.planning.active_sensing import Retreating, Surveying
 from agent.planning.manoeuvres import Manoeuvres
 from agent.planning.phase1_anchor import ThirdPoint
 from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent, Travelling
-from agent.planning.phase3_last_manoeuvre import (
-    LastManoeuvre,
-    Plan,
-    Question,
-    Returning,
-    Standing,
-    Waiting,
-)
+from agent.planning.phase3_last_manoeuvre import LastManoeuvre, Plan, Question, Returning, Standing, Waiting
 from agent.planning.range_seeking import (
     Backing,
     Circling,

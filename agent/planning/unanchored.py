@@ -29,14 +29,7 @@ from agent.planning.phase3_last_manoeuvre import Standing
 from agent.planning.planner import Planner, Summary
 from agent.planning.state import UNCONFIRMED, Awaiting, Done, RobotState
 from agent.planning.sweep import LOOPS_FOR, Looping
-from protocol.messages import (
-    Command,
-    Estimate,
-    Localised,
-    Observation,
-    Report,
-    RobotConfig,
-)
+from protocol.messages import Command, Estimate, Localised, Observation, Report, RobotConfig
 from protocol.mission import Mission
 from protocol.motion import ORIGIN, Pose, compose, inverse, wrap
 from protocol.rounding import SURE
