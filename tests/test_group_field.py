@@ -222,7 +222,9 @@ def test_robots_of_a_group_that_are_killed_at_any_moment_resume(tmp_path: Path) 
             four.start(*killed)
         all_are_localised(tmp_path, four)
         for name, ticks in before.items():
-            assert f"{name}: in run four, resumed at tick {ticks - 1}" in four.robots[name].out
+            # a driver that is killed may have journaled a tick that its agent has not
+            resumed = [f"{name}: in run four, resumed at tick {tick}" for tick in (ticks - 1, ticks)]
+            assert any(one in four.robots[name].out for one in resumed)
             assert len(told(tmp_path, name).steps) > ticks
 
 
