@@ -41,7 +41,7 @@ from agent.estimation.gaussian.range_model import SIGMA_FLOOR, inlier_probabilit
 from protocol.motion import rotated, rotated_back
 
 ARCCOS, ARCTAN2 = np.vectorize(math.acos), np.vectorize(math.atan2)
-"""Those of the C library; those of numpy may differ in the last bit."""
+"""The functions of the C library; those of numpy may differ in the last bit."""
 
 
 class Residuals(NamedTuple):

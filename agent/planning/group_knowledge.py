@@ -67,7 +67,7 @@ class Confirming(msgspec.Struct, frozen=True):
     """The meetings that confirm the pose of a robot, if robots of its group may report false data."""
 
     meetings: tuple[Knowledge, ...] = ()
-    """Its knowledge at the claims in its meetings with different peers, in the order of these meetings."""
+    """The knowledge at the claims in its meetings with different peers, in the order of these meetings."""
     visits: int = 0
     """The number of visits for this that the robot has begun or left out."""
     until: float | None = None

@@ -130,7 +130,7 @@ class RobotState(Knowledge, frozen=True):
     fix: Fix | None = None
     """The pose that the robot knows, and by which it drives; None until a meeting has determined it."""
     located: Knowledge | None = None
-    """Its knowledge at its claim in the latest meeting in which it was localised."""
+    """The knowledge at its claim in the latest meeting in which it was localised."""
     confirming: Confirming = Confirming()
     """The meetings that confirm that pose, if a claim of it needs several peers."""
     found: Resected | Contacted | None = None
