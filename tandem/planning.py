@@ -12,7 +12,7 @@ from typing import Any
 
 from agent.estimation.gaussian.inference import PlanningHypothesis
 from agent.planning.assured import Assured
-from agent.planning.log_exchange import LogPlanner
+from agent.planning.exchange import LogPlanner
 from agent.planning.paper import Paper
 from agent.planning.phase3_last_manoeuvre import Plan, Question
 from agent.planning.planner import Planner, Summary

@@ -7,12 +7,20 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
+from agent.planning import tasks
 from agent.planning.planner import Planner
 from agent.planning.registry import PLANNER_CLASSES
 from agent.planning.state import RobotState
 from compose.scenario.scenario_file import load
 from protocol.messages import Command, Observation, Report
 from world.tick import World, advance, observations, release
+
+NAMES = [
+    name
+    for one in vars(tasks).values()
+    if isinstance(one, type) and isinstance(name := getattr(one, "name", None), str)
+]
+"""The names of all tasks but those of a verdict and of a planner of the user."""
 
 
 class Step(NamedTuple):

@@ -20,8 +20,9 @@ from agent.estimation.exact import PairObservation, turn_error, weigh_placements
 from agent.estimation.mutual_ranges import base, solve
 from agent.estimation.precision import combined_error, odometry_rounding
 from agent.planning.assured import Assured
-from agent.planning.phase3_last_manoeuvre import LAST_SPEEDS, TURN_RATES, LastManoeuvre
+from agent.planning.phase3_last_manoeuvre import LAST_SPEEDS, TURN_RATES
 from agent.planning.state import RobotState
+from agent.planning.tasks import LastManoeuvre
 from compose.launch.in_process import run_mission
 from compose.recording.run import Run
 from compose.scenario.scenario_file import parse
@@ -403,8 +404,8 @@ def test_the_last_manoeuvre_leaves_no_more_placements_out_of_range_than_it_must(
     for seed in (*range(20), 64, 78, 83, 86):
         for moment in steps_of(tmp_path, SLOW, seed):
             state = Assured().decide(moment.observed["b"], moment.heard["b"])
-            if isinstance(state.mode, LastManoeuvre) and not isinstance(
-                moment.before["b"].mode, LastManoeuvre
+            if isinstance(state.task, LastManoeuvre) and not isinstance(
+                moment.before["b"].task, LastManoeuvre
             ):
                 candidates = state.belief.placements
                 command = moment.commands["b"]

@@ -37,7 +37,7 @@ def test_the_shown_value_of_a_last_manoeuvre_is_that_of_its_planner(case: str, t
         (state.tick, robot): state.plan.separation_m2
         for robot in run.robots
         for state in agent_replay(run, robot).states
-        if state.mode_name == "last-manoeuvre" and state.plan and state.plan.separation_m2 is not None
+        if state.task.name == "last-manoeuvre" and state.plan and state.plan.separation_m2 is not None
     }
     found = {
         (tick, one.manoeuvre.robot): one.manoeuvre

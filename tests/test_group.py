@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from agent.planning import group_transitions
+from agent.planning.drive import towards
 from agent.planning.group_knowledge import Fix
-from agent.planning.group_transitions import PEER_LOST_AFTER, TRAVELLING_MODE
-from agent.planning.phase2_orbit import Travelling, next_leg, travel_controls
-from agent.planning.state import Done
-from agent.planning.visit import MOST_SIDES
+from agent.planning.group_transitions import PEER_LOST_AFTER
+from agent.planning.tasks import Done, Travelling
+from agent.planning.visit import MOST_SIDES, next_leg
 from compose.errors import BadScenario, Unworkable, UserError
 from compose.launch.in_process import run_mission
 from compose.launch.planner_loader import planner_of
@@ -81,7 +81,7 @@ def test_a_noisy_visitor_states_no_covariance_on_its_way(tmp_path: Path) -> None
         for one in agent.steps:
             assert one.command is not None
             assert one.estimate is not None
-            if one.command.task == TRAVELLING_MODE:
+            if one.command.task == Travelling.name:
                 assert one.estimate.covariance is None
                 on_the_way += 1
             elif one.command.task == "localised":
@@ -188,7 +188,7 @@ def test_a_localised_robot_waits_for_its_peer_beside_it_for_a_bounded_time(
     config = scenario.config(scenario.meetings[-1].visitor)
     planner = planner_of(config)
     state, claim = planner.start(config), Localised(Pose(0.0, 0.0, 0.0))
-    state = replace(state, mode=Done(3, claim), in_contact=True, fix=Fix(0, claim, (config.peer,)))
+    state = replace(state, task=Done(3, claim), in_contact=True, fix=Fix(0, claim, (config.peer,)))
     state = replace(state, robot_verdict=claim, silence=silence)
     assert group_transitions.onward(state, peer_has_left=refused).visiting == leaves
 
@@ -331,10 +331,10 @@ PLACES = st.tuples(st.floats(-50.0, 50.0), st.floats(-50.0, 50.0))
 def test_a_visitor_reaches_its_place_by_a_turn_and_straights(
     place: tuple[float, float], heading: float
 ) -> None:
-    pose, mode = Pose(0.0, 0.0, heading), Travelling(place)
+    pose = Pose(0.0, 0.0, heading)
     distance = math.hypot(*place)
     for _ in range(math.ceil(distance) + 4):
-        controls = travel_controls(mode, pose, MISSION, 1e-9)
+        controls = towards(place, pose, MISSION, 1e-9)
         if controls is None:
             break
         assert abs(controls.v) <= MISSION.max_speed * (1.0 + 1e-12)
@@ -374,7 +374,7 @@ def test_the_ticks_of_a_search_are_those_of_its_legs() -> None:
         mode, pose, ticks = Travelling((short, 0.0)), Pose(short, 0.0, 0.0), 0
         for _ in range(search_legs(sides)):
             mode = next_leg(mode, (0.0, 0.0), (way, 0.0), noisy)
-            while (controls := travel_controls(mode, pose, noisy, 1e-9)) is not None:
+            while (controls := towards(mode.place, pose, noisy, 1e-9)) is not None:
                 pose, ticks = step(pose, controls.v, controls.omega, noisy.period), ticks + 1
         assert ticks <= search_ticks(noisy, sides) <= 1.2 * ticks + 2
 

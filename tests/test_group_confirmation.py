@@ -16,11 +16,10 @@ from msgspec.structs import astuple, replace
 
 from agent.estimation.gaussian.claim_agreement import agreement, covariance_union, difference, minus
 from agent.peer.motion_log import MotionLog
-from agent.planning.active_sensing import Listening, Surveying
 from agent.planning.group import GroupPlanner
 from agent.planning.own_pose import later_pose
-from agent.planning.range_seeking import Homing
 from agent.planning.state import RobotState
+from agent.planning.tasks import Homing, Listening, Surveying
 from compose.audit.replay import replayed
 from compose.errors import Unworkable
 from compose.figures.agent_replay import agent_replay
@@ -241,10 +240,10 @@ def test_a_visitor_does_not_drive_home_because_of_ranges_of_earlier_meetings() -
     met_again = 0
     for robot in run.agents:
         for before, after in pairwise(states(run, robot)):
-            meets = before.config.role == "a" and isinstance(before.mode, Surveying | Listening)
+            meets = before.config.role == "a" and isinstance(before.task, Surveying | Listening)
             if meets and len(before.mutual) > 60:
                 met_again += 1
-                assert not isinstance(after.mode, Homing)
+                assert not isinstance(after.task, Homing)
     assert met_again
 
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agent.planning.passing import BLOCKED_AFTER, YIELDS, Bypass, leeway, passed, yielding
-from agent.planning.phase2_orbit import Orbiting, Travelling
+from agent.planning.tasks import Orbiting, Travelling
 from compose.audit.rules import audit_run
 from compose.launch.in_process import run_mission
 from compose.recording.closest_approach import nearest

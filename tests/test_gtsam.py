@@ -21,7 +21,8 @@ from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.search import search
 from agent.estimation.posterior import Hypothesis
 from agent.planning.assured import Assured
-from agent.planning.state import Done, RobotState
+from agent.planning.state import RobotState
+from agent.planning.tasks import Done
 from compose.launch.in_process import run_mission
 from compose.scenario.scenario_file import parse
 from protocol.journal import journal_file
@@ -155,7 +156,7 @@ def remembered(folder: Path, robot: str) -> tuple[RobotState, Localised]:
     The state has a result from the start, so it makes no decisions, and is computed quickly.
     """
     config = decode(list(journal_file.read(folder / f"agent-{robot}.journal"))[1], RobotConfig)
-    state = RobotState(config, mode=Done(1, Undecided("was not asked")))
+    state = RobotState(config, task=Done(1, Undecided("was not asked")))
     heard: list[Report] = []
     for message in said(folder, robot):
         match message:

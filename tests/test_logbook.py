@@ -12,8 +12,9 @@ from msgspec.structs import replace
 
 from agent.peer.motion_log import MotionLog
 from agent.peer.peer_state import PeerState, contradiction, with_report
-from agent.planning.exchange import report as report_of
-from agent.planning.state import Done, RobotState
+from agent.planning.assured import Assured
+from agent.planning.state import RobotState
+from agent.planning.tasks import Done
 from compose.scenario.scenario_file import load
 from protocol.messages import MAX_REPORT_RANGES, MAX_REPORT_RUNS, Localised, Ranged, Report, Undecided
 from protocol.motion import ORIGIN, Pose, Segment, step
@@ -51,7 +52,7 @@ def prefixes(driven: list[Tick]) -> list[MotionLog]:
 
 def told(book: MotionLog, radio: PeerState) -> Report:
     """Return the Report of a planner with this log and this state of the peer."""
-    return report_of(replace(STATE, log=book, peer_state=radio, tick=book.through))
+    return Assured().report(replace(STATE, log=book, peer_state=radio, tick=book.through))
 
 
 @st.composite
@@ -213,12 +214,12 @@ def test_the_longest_report_that_there_is_fits_its_frame(begin: int, verdict: st
     state = replace(
         STATE,
         config=replace(STATE.config, robot="r" * 32),
-        mode=Done(3, said) if said is not None else STATE.mode,
+        task=Done(3, said) if said is not None else STATE.task,
         log=book,
         tick=book.through,
         peer_state=PeerState(acknowledged=begin),
     )
-    report = report_of(state)
+    report = Assured().report(state)
     assert report.runs
     size = len(encode(report))
     assert size <= MAX_REPORT_BYTES

@@ -31,7 +31,6 @@ from agent.estimation.gaussian.search import starts_about
 from agent.peer.peer_state import PeerState
 from agent.planning.assured import Assured
 from agent.planning.plausibility import objection
-from agent.planning.state import MODE_NAMES
 from compose.errors import BadScenario, Unworkable
 from compose.launch.in_process import run_mission
 from compose.recording.reasons import reason_for
@@ -362,11 +361,11 @@ def test_a_robot_searches_when_drop_outs_hardly_explain_that_it_has_no_range(
 ) -> None:
     told = f"{{anchor_sigma = 0.05, mutual_sigma = 0.05, drop_outs = {drop_outs}}}"
     start = Assured().start(parsed(told, 0.3).config("a"))
-    modes = []
+    tasks = []
     for tick in range(ticks + 1):
         start = Assured().observe(start, Observation(tick, "a", REST if tick else None, None))
-        modes.append(MODE_NAMES[type(start.mode)])
-    assert modes == ["asleep"] * ticks + ["straight"]
+        tasks.append(start.task.name)
+    assert tasks == ["asleep"] * ticks + ["straight"]
 
 
 def test_many_ranges_are_not_shrunk_to_make_their_noise_smaller() -> None:

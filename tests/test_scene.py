@@ -9,7 +9,7 @@ from typing import NamedTuple
 import pytest
 from msgspec.structs import replace
 
-from agent.planning.state import MODE_NAMES, UNCONFIRMED
+from agent.planning.tasks import UNCONFIRMED
 from compose.launch import in_process
 from compose.recording.recording_files import WORLD_JOURNAL
 from compose.recording.run import read as read_record
@@ -26,6 +26,7 @@ from protocol.messages import MissionEnd
 from protocol.motion import compose, wrap
 from protocol.wire import decode
 from tests.report_outcomes import flights_of
+from tests.steps import NAMES
 from world.channel import LinkState
 from world.world_journal import world_history
 
@@ -282,7 +283,7 @@ def test_the_process_that_writes_a_journal_is_known_by_its_lock(tmp_path: Path) 
 
 
 def test_every_state_has_its_sentence() -> None:
-    assert set(MODE_NAMES.values()) | {"localised", UNCONFIRMED} == {*DOING, *SEEKING}
+    assert {*NAMES, "localised", UNCONFIRMED} == {*DOING, *SEEKING}
     robot_setup = of_scenario(load("paper-1")).robot_setup("b")
     for phase in (1, 2, 3):
         for state in (*DOING, *SEEKING):

@@ -11,8 +11,7 @@ import tandem
 from agent.estimation.gaussian.inference import PlanningHypothesis
 from agent.estimation.gaussian.odometry_noise import Array, Track, track
 from agent.planning.active_sensing import STALLED, plan_alone, plan_together
-from agent.planning.stalls import PLANS, is_stalled
-from agent.planning.strides import choice, stride
+from agent.planning.strides import PLANS, choice, is_stalled, stride
 from compose.launch.in_process import run_mission
 from protocol.mission import Mission, Role
 from protocol.motion import REST

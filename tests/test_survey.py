@@ -23,8 +23,9 @@ from agent.peer.motion_log import MotionLog
 from agent.planning import pair_claim
 from agent.planning.accuracy_seeking import OFF_RADIUS
 from agent.planning.assured import Assured
-from agent.planning.phase2_orbit import Aligning, Radial, orientation
+from agent.planning.phase2_orbit import orientation
 from agent.planning.state import RobotState
+from agent.planning.tasks import Aligning, Radial
 from compose.launch.in_process import run_mission
 from compose.recording.run import Run
 from compose.recording.summary_json import summary
@@ -392,15 +393,15 @@ def turns_onto_its_radius_again(seed: int) -> bool:
     while isinstance(world, World):
         for observation in observations(world):
             state = PLANNER.observe(states[observation.robot], observation)
-            if observation.robot == "b" and not misled and isinstance(state.mode, Aligning):
+            if observation.robot == "b" and not misled and isinstance(state.task, Aligning):
                 off = abs(orientation(state.local_pose))
                 if off <= 2.0 * OFF_RADIUS:
                     return False
-                state, misled = replace(state, mode=Radial()), True
+                state, misled = replace(state, task=Radial()), True
             states[observation.robot] = PLANNER.decide(state)
             if misled and observation.robot == "b":
-                assert isinstance(state.mode, Radial | Aligning), "neither lost nor on its circle"
-                if isinstance(state.mode, Aligning):
+                assert isinstance(state.task, Radial | Aligning), "neither lost nor on its circle"
+                if isinstance(state.task, Aligning):
                     return True
         onward = advance(world, {robot: PLANNER.command(state) for robot, state in states.items()})
         assert isinstance(onward, World)

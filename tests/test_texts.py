@@ -12,7 +12,6 @@ import pytest
 from msgspec.inspect import StrType, StructType, type_info
 from msgspec.structs import replace
 
-from agent.planning.state import MODE_NAMES
 from agent.process.agent_journal import agent_history
 from agent.process.robot import Robot
 from compose.launch.planner_loader import planner_of
@@ -37,6 +36,7 @@ from protocol.network.inbox import Inbox
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode, encode
 from tests.commands import BOUND_S, PAPER_1, tandem, world
 from tests.examples import EXAMPLES
+from tests.steps import NAMES
 from tests.test_wire import changed, framed, packed, parts, plain
 from world.simulation import Simulation, resumed
 from world.world_journal import world_history
@@ -156,7 +156,7 @@ def _taken(message: Message, path: tuple[object, ...], value: str) -> bool:
 
 
 def test_every_word_for_a_state_is_within_its_bound() -> None:
-    for word in (*MODE_NAMES.values(), "localised", "undecided", "inconsistent"):
+    for word in (*NAMES, "localised", "undecided", "inconsistent"):
         command = Command(0, "a", 0.0, 0.0, 1, word)
         assert decode(encode(command), Command) == command
 

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from agent.planning.group_transitions import TRAVELLING_MODE
 from agent.planning.state import RobotState
+from agent.planning.tasks import Travelling
 from agent.planning.unanchored import UnanchoredPlanner
 from compose.audit.replay import replayed
 from compose.errors import UserError
@@ -22,14 +22,7 @@ from compose.scenario.scenario_change import file_table
 from compose.scenario.scenario_file import ScenarioTemplate, validate
 from compose.sweep import spec
 from compose.sweep.cells import cells, setting_of
-from protocol.messages import (
-    Contact,
-    Localised,
-    Observation,
-    Report,
-    ReportedPose,
-    Undecided,
-)
+from protocol.messages import Contact, Localised, Observation, Report, ReportedPose, Undecided
 from protocol.motion import ORIGIN, REST, Controls, Pose, Segment, compose, step, wrap
 from protocol.rounding import TOLERANCE
 from tests.test_audit import kept
@@ -238,7 +231,7 @@ def test_a_robot_without_an_anchor_that_claims_to_visit_is_not_met() -> None:
     for tick in range(done + 1):
         state = planner.decide(planner.observe(state, run.observations[tick]["a"]))
     assert state.verdict is None
-    visit = Report(done, "u", 3, TRAVELLING_MODE, ORIGIN, 0, 1, (Segment(1, 0.0, 0.0),), 0, (), 0, 0)
+    visit = Report(done, "u", 3, Travelling.name, ORIGIN, 0, 1, (Segment(1, 0.0, 0.0),), 0, (), 0, 0)
     assert visit.has_log
     met = Observation(done + 1, "a", REST, None, (Contact("u", 1.0, (done,)),))
     after = planner.decide(planner.observe(state, met), [visit])

@@ -7,10 +7,13 @@ import math
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from agent.estimation.resection import RangedPlace, is_certain, is_fixed, poses, positions
-from agent.planning import sweep
-from agent.planning.sweep import Looping, Sweeping
+from agent.planning import drive, sweep
+from agent.planning.state import RobotState
+from agent.planning.tasks import Looping, Sweeping
+from compose.scenario.scenario_file import load
 from protocol.mission import Mission
 from protocol.motion import ORIGIN, Pose, compose, step
 from protocol.sweep_strips import SIDE, STRIP_REACH, SweptArea
@@ -90,14 +93,14 @@ LENGTHS = st.floats(0.0, 40.0)
 
 def driven(places: tuple[tuple[float, float], ...], start: Pose, mission: Mission = MISSION) -> list[Pose]:
     """Return the poses of each tick of a robot that drives to `places`, one after the other."""
-    path = [start]
-    mode: Sweeping | Looping = Sweeping(places)
+    path, config = [start], replace(load("paper-1").config("a"), mission=mission)
+    task: Sweeping | Looping = Sweeping(places)
     while True:
-        mode = sweep.onward(mode, path[-1], mission, 1e-9)
-        controls = sweep.controls(mode, path[-1], mission, 1e-9)
-        if controls is None:
+        task = sweep.onward(task, path[-1], mission, 1e-9)
+        if not task.places:
             return path
-        path.append(step(path[-1], controls.v, controls.omega, mission.period))
+        driven = drive.controls(RobotState(config, task=task, odometry=path[-1]))
+        path.append(step(path[-1], driven.v, driven.omega, mission.period))
 
 
 @given(LENGTHS, LENGTHS, st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.sampled_from([0.4, 1.0, 20.0]))

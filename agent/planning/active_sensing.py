@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,10 +20,9 @@ from agent.estimation.gaussian.inference import PlanningHypothesis
 from agent.estimation.gaussian.odometry_noise import Array, Places
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
 from agent.planning import separation
-from agent.planning.range_seeking import Beacon
 from agent.planning.strides import STRIDES_AHEAD, Choice, choice, stride
 from protocol.mission import Mission, Role
-from protocol.motion import REST, Controls
+from protocol.motion import Controls
 
 NEGLIGIBLE_GAIN = 0.03
 """The standard deviation below which a further improvement has no value, as a fraction of the accuracy."""
@@ -42,7 +40,7 @@ It is also that of stalled robots, to which a missing range tells which hypothes
 """
 
 STALLED_COST = 1e9
-"""The cost of standing still for a stalled robot (see `stalls`)."""
+"""The cost of standing still for a stalled robot (see `strides`)."""
 
 
 class Objective(NamedTuple):
@@ -60,33 +58,7 @@ CONTINUED = Objective(STRIDES_AHEAD, OUTSIDE_COST, 0.0)
 """The objective of robots that get further with each plan."""
 
 STALLED = Objective(1, OUTSIDE_COST_ALONE, STALLED_COST)
-"""The objective of stalled robots: the next stride counts alone, and they move (see `stalls`)."""
-
-
-class Surveying(msgspec.Struct, frozen=True):
-    """The robot drives to where its next ranges are expected to be most informative."""
-
-    beacon: Beacon
-    command: Controls = REST
-    since: int = 0
-    """The tick of the first of the consecutive plans of which this is the last."""
-
-
-class Listening(msgspec.Struct, frozen=True):
-    """The robot stands still in range of the peer, and waits for the missing part of the peer's log."""
-
-    command: Controls = REST
-
-
-class Retreating(msgspec.Struct, frozen=True):
-    """The robot has left the peer's range. It drives back the same way, and as far again.
-
-    The second half prevents that it takes the same decision, and leaves the range, once more.
-    """
-
-    command: Controls
-    since: int
-    """The tick in which the peer was out of range for the first time."""
+"""The objective of stalled robots: the next stride counts alone, and they move (see `strides`)."""
 
 
 def plan_alone(

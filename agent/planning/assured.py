@@ -12,17 +12,23 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from agent.estimation.gaussian.inference import PlanningHypothesis
-from agent.planning import accuracy_seeking, active_sensing, exchange, phase3_last_manoeuvre, transitions
-from agent.planning.log_exchange import LogPlanner
-from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent, Travelling
-from agent.planning.phase3_last_manoeuvre import Standing, Waiting
-from agent.planning.state import MODE_NAMES, Done, RobotState
+from agent.planning import (
+    accuracy_seeking,
+    active_sensing,
+    drive,
+    exchange,
+    phase3_last_manoeuvre,
+    transitions,
+)
+from agent.planning.exchange import LogPlanner
+from agent.planning.state import RobotState
+from agent.planning.tasks import Done, Orbital, Resting, Standing, Travelling, Waiting
 from protocol.messages import Command, Localised, Observation, Report
 from protocol.mission import Mission
 from protocol.motion import REST, Controls
 
-PEER_RESTS = (MODE_NAMES[Standing], MODE_NAMES[Waiting])
-"""The modes of the peer in which this robot may plan a manoeuvre.
+PEER_RESTS = (Standing.name, Waiting.name)
+"""The tasks of the peer in which this robot may plan a manoeuvre.
 
 If both moved at once, they might do so in mirror image, and the new range would not select a placement.
 """
@@ -35,36 +41,36 @@ class Assured(LogPlanner):
     ACTIVE_SENSING = True
 
     def observe(self, state: RobotState, observation: Observation) -> RobotState:
-        """Return `state` with the sensor data of one tick, and with the mode that follows from them."""
+        """Return `state` with the sensor data of one tick, and with the task that follows from them."""
         if state.estimator.corrects_poses:
             return accuracy_seeking.observed(state, observation)
         return super().observe(state, observation)
 
     def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
-        """Return `state` with the peer's `reports` and with the mode that follows from them.
+        """Return `state` with the peer's `reports` and with the task that follows from them.
 
         With exact sensors, phase 3 begins as soon as the peer's phase 1 has ended and b is far enough from
         its anchor.
         """
         if reports:
             state = exchange.with_reports(state, reports)
-        if not state.in_contact or isinstance(state.mode, Done):
+        if not state.in_contact or isinstance(state.task, Done):
             return state
         if state.estimator.corrects_poses:
             return accuracy_seeking.decided(state, self.joint_manoeuvres)
-        match state.mode:
-            case Aligning() | Radial() | Tangent() | Orbiting() | Travelling():
+        match state.task:
+            case Orbital() | Travelling():
                 peer = state.peer_state
                 met = peer.phase == 3 or (peer.start is not None and state.off_anchor)
                 return transitions.begin_phase3(state) if met else state
-            case Standing() | Waiting():
+            case Resting():
                 return self._decide_phase3(state)
             case _:
                 return state
 
     def command(self, state: RobotState) -> Command:
         """Return the command for the next tick, with the phase, the task and the verdict."""
-        return exchange.command(state, REST if self._must_wait(state) else transitions.controls(state))
+        return exchange.command(state, REST if self._must_wait(state) else drive.controls(state))
 
     def joint_manoeuvres(
         self,
@@ -77,8 +83,8 @@ class Assured(LogPlanner):
 
         `hypotheses` are about the poses of both robots relative to M1, the most probable first. M2 is at
         `m2` in m, and `rho` is the latest range between the robots in m. A subclass may plan others; both
-        robots compute both from the same measurements. It is not asked while they are stalled (see `stalls`),
-        nor when one of them has claimed its pose.
+        robots compute both from the same measurements. It is not asked while they are stalled (see
+        `strides`), nor when one of them has claimed its pose.
         """
         return active_sensing.plan_together(hypotheses, m2, rho, mission)
 
@@ -91,7 +97,7 @@ class Assured(LogPlanner):
         return (
             state.in_contact
             and (state.peer_state.start is None or state.config.role == "a")
-            and isinstance(state.mode, Aligning | Radial | Tangent | Orbiting | Travelling)
+            and isinstance(state.task, Orbital | Travelling)
         )
 
     def _after_range(self, state: RobotState) -> RobotState:
@@ -122,7 +128,7 @@ class Assured(LogPlanner):
             return state
         state, estimate = transitions.pair_estimate(evaluated, 0, second_range=True)
         if estimate is None:  # There are too few ranges, or b was still driving while a drove straight on.
-            b_is_standing = isinstance(state.mode, Waiting) and state.peer_state.state == MODE_NAMES[Standing]
+            b_is_standing = isinstance(state.task, Waiting) and state.peer_state.state == Standing.name
             return transitions.begin_phase3(state) if b_is_standing else state
         if state.verdict is not None:
             return state

@@ -1,18 +1,21 @@
-"""The exchange of a tick: sensor data and reports come in; a report, a command and an estimate go out."""
+"""The exchange of a tick, and the base of planners whose robots exchange their motion logs."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+import msgspec
 from msgspec.structs import replace
 
+from agent.estimation.judged import required_mutual_ranges
 from agent.estimation.solver import Solver
 from agent.peer import false_reports, peer_state
 from agent.peer.motion_log import MotionLog
-from agent.planning import phase1_anchor, plausibility, separation
-from agent.planning.active_sensing import Retreating
-from agent.planning.phase1_anchor import ThirdPoint
+from agent.planning import phase1_anchor, phase3_last_manoeuvre, plausibility, separation, transitions
+from agent.planning.phase3_last_manoeuvre import Plan, Question
+from agent.planning.planner import Manoeuvres, Planner, Summary
 from agent.planning.state import RobotState
+from agent.planning.tasks import Retreating, ThirdPoint
 from protocol.messages import (
     Command,
     Estimate,
@@ -25,12 +28,8 @@ from protocol.messages import (
     Undecided,
     Verdict,
 )
+from protocol.mission import Mission
 from protocol.motion import REST, Controls, Pose, compose, inverse, step
-
-
-def start(config: RobotConfig, solver: Solver | None = None) -> RobotState:
-    """Return the state of a robot that has measured nothing yet; `solver` fits its poses under noise."""
-    return RobotState(config, solver=solver)
 
 
 def dead_reckoned(
@@ -73,34 +72,6 @@ def observed(state: RobotState, observation: Observation) -> RobotState:
     )
 
 
-def report(state: RobotState) -> Report:
-    """Return the report of this tick: the part of the log that the peer has not acknowledged.
-
-    If the configuration contains an attack, the report holds the falsified log (see `protocol.attack`).
-    """
-    since, ranges_since = state.peer_state.acknowledged, state.peer_state.ranges_acknowledged
-    start = state.belief.branch.start if state.belief.branch and state.phase > 1 else None
-    log = _reported_log(state)
-    if (attack := state.config.attack) is not None:
-        start = false_reports.start(start, attack) if start is not None else None
-    unacknowledged = log.after(since, ranges_since)
-    return Report(
-        tick=state.tick,
-        robot=state.config.robot,
-        phase=state.phase,
-        state=state.mode_name,
-        start=start,
-        since=since,
-        through=unacknowledged.through,
-        runs=unacknowledged.runs,
-        ranges_since=ranges_since,
-        ranges=unacknowledged.ranges,
-        heard=state.peer_state.peer.through,
-        ranges_heard=len(state.peer_state.peer.ranges),
-        verdict=state.verdict,
-    )
-
-
 def _reported_log(state: RobotState) -> MotionLog:
     """Return the log of the robot, falsified if its configuration contains an attack."""
     attack, belief = state.config.attack, state.belief
@@ -131,7 +102,7 @@ def report_without_log(state: RobotState, verdict: Verdict | None) -> Report:
         tick=state.tick,
         robot=state.config.robot,
         phase=state.phase,
-        state=state.mode_name,
+        state=state.task.name,
         ranges_since=len(state.log.ranges),
         verdict=verdict,
     )
@@ -164,7 +135,7 @@ def with_reports(state: RobotState, reports: Sequence[Report]) -> RobotState:
 
 
 def command(state: RobotState, controls: Controls) -> Command:
-    """Return the command with `controls`, limited by the safety distance, the mode and the verdict."""
+    """Return the command with `controls`, limited by the safety distance, the task and the verdict."""
     config = state.config
     if state.in_contact and config.mission.safety_distance:
         controls = _safe(state, controls)
@@ -174,7 +145,7 @@ def command(state: RobotState, controls: Controls) -> Command:
         controls.v,
         controls.omega,
         state.phase,
-        state.mode_name,
+        state.task.name,
         state.verdict,
         config.peer,
         config.role,
@@ -189,7 +160,7 @@ def _safe(state: RobotState, controls: Controls) -> Controls:
     phase 3, and on the way back into range.
     """
     mission = state.config.mission
-    if state.phase == 3 and not isinstance(state.mode, Retreating):
+    if state.phase == 3 and not isinstance(state.task, Retreating):
         return controls
     if not state.mutual or state.mutual[-1].tick != state.tick:  # the range was not measured
         return REST
@@ -198,26 +169,139 @@ def _safe(state: RobotState, controls: Controls) -> Controls:
     )
 
 
-def estimate(state: RobotState) -> Estimate:
-    """Return all poses that the robot considers possible in its anchor's frame and in <W>."""
-    belief, verdict = state.belief, state.verdict
-    branches_left = belief.branches
-    if not branches_left and belief.branch is not None:
-        branches_left = (belief.branch,)
-    elif not branches_left and isinstance(state.mode, ThirdPoint):
-        branches_left = state.mode.branches
-    if belief.poses:
-        world: tuple[Pose, ...] = state.poses
-    elif isinstance(verdict, Localised):
-        world = (verdict.pose,)
-    else:
-        world = tuple([state.world_pose(placement) for placement in belief.placements])
-    return Estimate(
-        tick=state.tick,
-        robot=state.config.robot,
-        local=tuple(phase1_anchor.local(branches_left, state.odometry)),
-        world=world,
-        localised=isinstance(verdict, Localised),
-        probabilities=tuple([one.probability for one in belief.pair or belief.own]),
-        covariance=belief.covariance,
-    )
+KEPT_PLACES = 3
+"""The number of relative placements that a claim from exact ranges needs; two leave several solutions."""
+
+
+class LogPlanner(Planner[RobotState, Report]):
+    """A planner with the state of the shipped planners. Subclasses define `decide` and `command`."""
+
+    BODY = Report
+    MANOEUVRES: Manoeuvres
+    SOLVER: Solver | None = None
+    """The solver that fits the poses under noise; None for the smoother. A subclass may choose its own."""
+    REQUIRED_PLACES = KEPT_PLACES
+
+    def start(self, config: RobotConfig) -> RobotState:
+        """Return the state of a robot that has measured nothing yet."""
+        return RobotState(config, solver=self.SOLVER)
+
+    def observe(self, state: RobotState, observation: Observation) -> RobotState:
+        """Return `state` with the sensor data of one tick, and with the task that follows from them."""
+        state = observed(state, observation)
+        return transitions.after_observation(
+            state, observation.anchor_range, self.MANOEUVRES, self._after_range
+        )
+
+    def _after_range(self, state: RobotState) -> RobotState:
+        """Return `state` with the next task of phase 1, after a range to the anchor."""
+        raise NotImplementedError
+
+    def report(self, state: RobotState) -> Report:
+        """Return the report of this tick: the part of the log that the peer has not acknowledged.
+
+        If the configuration contains an attack, the report holds the falsified log (see `protocol.attack`).
+        """
+        since, ranges_since = state.peer_state.acknowledged, state.peer_state.ranges_acknowledged
+        start = state.belief.branch.start if state.belief.branch and state.phase > 1 else None
+        log = _reported_log(state)
+        if (attack := state.config.attack) is not None:
+            start = false_reports.start(start, attack) if start is not None else None
+        unacknowledged = log.after(since, ranges_since)
+        return Report(
+            tick=state.tick,
+            robot=state.config.robot,
+            phase=state.phase,
+            state=state.task.name,
+            start=start,
+            since=since,
+            through=unacknowledged.through,
+            runs=unacknowledged.runs,
+            ranges_since=ranges_since,
+            ranges=unacknowledged.ranges,
+            heard=state.peer_state.peer.through,
+            ranges_heard=len(state.peer_state.peer.ranges),
+            verdict=state.verdict,
+        )
+
+    def estimate(self, state: RobotState) -> Estimate:
+        """Return all poses that the robot considers possible in its anchor's frame and in <W>."""
+        belief, verdict = state.belief, state.verdict
+        branches_left = belief.branches
+        if not branches_left and belief.branch is not None:
+            branches_left = (belief.branch,)
+        elif not branches_left and isinstance(state.task, ThirdPoint):
+            branches_left = state.task.branches
+        if belief.poses:
+            world: tuple[Pose, ...] = state.poses
+        elif isinstance(verdict, Localised):
+            world = (verdict.pose,)
+        else:
+            world = tuple([state.world_pose(placement) for placement in belief.placements])
+        return Estimate(
+            tick=state.tick,
+            robot=state.config.robot,
+            local=tuple(phase1_anchor.local(branches_left, state.odometry)),
+            world=world,
+            localised=isinstance(verdict, Localised),
+            probabilities=tuple([one.probability for one in belief.pair or belief.own]),
+            covariance=belief.covariance,
+        )
+
+    def last_manoeuvre(self, question: Question, mission: Mission) -> Plan | None:
+        """Return the last manoeuvre for `question`; None if every one violates the safety distance (eq. (8)).
+
+        A subclass may plan another one. It is executed for one tick, and driven back if it leaves the peer's
+        range.
+        """
+        return phase3_last_manoeuvre.last_manoeuvre(
+            question.mover, question.a, question.b, question.candidates, mission, self.MANOEUVRES
+        )
+
+    def required_mutual_ranges(self, mission: Mission) -> int:
+        """Return the minimum number of noisy mutual ranges before a claim."""
+        return required_mutual_ranges(mission.noise)
+
+    def malformed(self, body: Report) -> str | None:
+        """Return the reason why the log in a report is malformed, or None."""
+        return peer_state.contradiction(body)
+
+    def summary(self, state: RobotState) -> Summary:
+        """Return the numbers of ranges and hypotheses, and the last manoeuvre."""
+        belief, plan = state.belief, state.plan
+        return Summary(
+            anchor_ranges=len(state.log.ranges),
+            mutual_ranges=len(state.mutual),
+            reports_heard=state.peer_state.heard,
+            branch=belief.branch_kind,
+            alpha=belief.branch.alpha if belief.branch is not None else None,
+            candidates=belief.candidates,
+            last_turn_rate=plan.command.omega if plan is not None else None,
+            separation_m2=plan.separation_m2 if plan is not None else None,
+            hypotheses=(len(belief.pair or belief.placements) if belief.candidates is not None else None),
+            probability=belief.pair[0].probability if belief.pair else None,
+            blocking_reason=belief.blocking_reason,
+            p_value=belief.p_value,
+        )
+
+    def misreport(self, body: Report, observations: Sequence[Observation]) -> str | None:
+        """Return how the manoeuvres and ranges in a report differ from the robot's own; None if not."""
+        contradiction = peer_state.contradiction(body)
+        if contradiction is not None:
+            return f"it reported {contradiction}"
+        k = body.since
+        for run in body.runs:
+            for _ in range(run.ticks):
+                k += 1
+                driven = observations[k].executed
+                if driven != Controls(run.v, run.omega):
+                    return f"it reported ({run.v:g}, {run.omega:g}) until tick {k}, expected {_json(driven)}"
+        for reported in body.ranges:
+            ranged = observations[reported.tick].anchor_range
+            if ranged != reported.range:
+                return f"it reported {reported.range!r} m at tick {reported.tick}, expected {_json(ranged)}"
+        return None
+
+
+def _json(value: Controls | float | None) -> str:
+    return msgspec.json.encode(value).decode()

@@ -16,15 +16,23 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from agent.planning import confirmation, exchange, group_transitions, noisy_search, sweep_transitions, visit
-from agent.planning.active_sensing import Retreating
-from agent.planning.log_exchange import LogPlanner
+from agent.planning import confirmation, exchange, group_transitions, noisy_search, sweep, visit
+from agent.planning.exchange import LogPlanner
 from agent.planning.meeting_planner import MeetingPlanner
-from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Travelling
 from agent.planning.planner import Planner, Summary
-from agent.planning.range_seeking import Homing
 from agent.planning.separation import slowed
-from agent.planning.state import UNCONFIRMED, Deciding, Done, RobotState
+from agent.planning.state import RobotState
+from agent.planning.tasks import (
+    UNCONFIRMED,
+    Aligning,
+    Deciding,
+    Done,
+    Homing,
+    Orbiting,
+    Radial,
+    Retreating,
+    Travelling,
+)
 from protocol.messages import (
     Command,
     Estimate,
@@ -68,11 +76,11 @@ class GroupPlanner(Planner[RobotState, Report]):
                 ranges = (*other.mutual, Ranged(observation.tick, contact.range))
                 state = state.with_other(contact.peer, replace(other, mutual=ranges))
         if state.visiting and _is_out_of_range_again(before, state):
-            state = replace(state, mode=Travelling(visit.stop(state)))
+            state = replace(state, task=Travelling(visit.stop(state)))
         state = group_transitions.passing_others(state, observation.contacts)
-        if isinstance(state.mode, Travelling) and not state.in_contact and not state.passing.places:
+        if isinstance(state.task, Travelling) and not state.in_contact and not state.passing.places:
             state = visit.searching(state)
-        ended = isinstance(state.mode, Done)
+        ended = isinstance(state.task, Done)
         unmet = state.unmet + 1 if ended and not state.in_contact else 0
         lingering = state.lingering + 1 if ended and state.in_contact else 0
         if (unmet, lingering) == (state.unmet, state.lingering):
@@ -89,7 +97,7 @@ class GroupPlanner(Planner[RobotState, Report]):
         A robot without an anchor gets the pose of a localised one until it has determined its own by it.
         Until this robot is localised, one with which its meeting has failed gets the verdict of that meeting.
         """
-        if sweep_transitions.is_helped(state, peer) and noisy_search.applies(state):
+        if sweep.is_helped(state, peer) and noisy_search.applies(state):
             return noisy_search.report(state, peer)
         if peer == state.config.peer and noisy_search.is_sweeping(state):
             return self.report(state)
@@ -99,7 +107,7 @@ class GroupPlanner(Planner[RobotState, Report]):
             return self.report(state)
         else:
             report = exchange.report_without_log(state, state.robot_verdict)
-            if sweep_transitions.is_helped(state, peer) and isinstance(state.robot_verdict, Localised):
+            if sweep.is_helped(state, peer) and isinstance(state.robot_verdict, Localised):
                 pose = exchange.reported_pose(state, state.frame)
                 report = replace(report, prior=ReportedPose(state.tick, pose))
         unconfirmed = state.config.confirms and state.fix is not None and report.verdict is None
@@ -120,7 +128,7 @@ class GroupPlanner(Planner[RobotState, Report]):
             state = group_transitions.with_sender(state, one)
         anchored = [one.robot for one in state.config.members]
         logs = [one for one in reports if one.has_log and one.robot in anchored]  # others are in no meeting
-        visitors = [one.robot for one in logs if one.state == group_transitions.TRAVELLING_MODE]
+        visitors = [one.robot for one in logs if one.state == Travelling.name]
         before = group_transitions.answering(state, visitors)
         peer = before.config.peer
         alone = not before.meets or group_transitions.refused(before, peer)
@@ -203,6 +211,6 @@ def _is_out_of_range_again(before: RobotState, after: RobotState) -> bool:
 
     That planner sends a robot to its orbit, or back to its own anchor, which may be far from here.
     """
-    back = isinstance(before.mode, Retreating) and isinstance(after.mode, Homing)
-    left = isinstance(after.mode, Deciding) and not after.in_contact
-    return back or left or isinstance(after.mode, Aligning | Radial | Orbiting)
+    back = isinstance(before.task, Retreating) and isinstance(after.task, Homing)
+    left = isinstance(after.task, Deciding) and not after.in_contact
+    return back or left or isinstance(after.task, Aligning | Radial | Orbiting)

@@ -13,17 +13,15 @@ from msgspec.structs import replace
 from agent.estimation.gaussian.claim_agreement import difference
 from agent.estimation.knowledge import Belief
 from agent.peer.peer_state import PeerState
-from agent.planning import passing, phase2_orbit, sweep_transitions, transitions, visit
+from agent.planning import passing, phase2_orbit, sweep, transitions, visit
+from agent.planning.drive import towards
 from agent.planning.group_knowledge import Fix
-from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Travelling
-from agent.planning.state import MODE_NAMES, UNCONFIRMED, Asleep, Done, RobotState
+from agent.planning.state import RobotState
+from agent.planning.tasks import UNCONFIRMED, Aligning, Asleep, Done, Orbiting, Radial, Travelling
 from protocol.messages import Appointment, Contact, Localised, Member, Report, Undecided, Verdict
 from protocol.mission import Role
 from protocol.motion import compose
 from protocol.orbits import Rendezvous
-
-TRAVELLING_MODE = MODE_NAMES[Travelling]
-"""The mode of a robot that is localised, and drives to another one."""
 
 PARTED_AFTER = 8
 """The ticks out of range of a peer after which a robot whose meeting has ended goes on.
@@ -49,7 +47,7 @@ def with_sender(state: RobotState, report: Report) -> RobotState:
     """
     known, travels, confirms = (
         state.other(report.robot),
-        report.state == TRAVELLING_MODE,
+        report.state == Travelling.name,
         state.config.confirms,
     )
     claims = not report.has_log and isinstance(report.verdict, Localised)
@@ -185,9 +183,9 @@ def onward(state: RobotState, *, peer_has_left: bool = False) -> RobotState:
         return _after_failure(state)
     if state.sweeps:
         assert state.robot_verdict is not None
-        swept = sweep_transitions.onward(state)
+        swept = sweep.swept(state)
         done = Done(state.phase, state.robot_verdict)
-        return swept or next_visit(replace(state, mode=done))
+        return swept or next_visit(replace(state, task=done))
     if state.visiting and state.verdict is None:
         if state.other(peer).localised and state.robot_verdict is not None:  # by another robot
             return next_visit(state)
@@ -197,7 +195,7 @@ def onward(state: RobotState, *, peer_has_left: bool = False) -> RobotState:
         if _is_silent(state):
             return next_visit(_after_meeting(state))
         return state
-    if not isinstance(state.mode, Done) or _must_linger(state):
+    if not isinstance(state.task, Done) or _must_linger(state):
         return state
     if not isinstance(state.verdict, Localised):
         reported = state.lingering > 0 or not state.in_contact  # to the peer, before this robot leaves
@@ -213,7 +211,7 @@ def _is_over(state: RobotState) -> bool:
 
 def rests(state: RobotState) -> bool:
     """Return whether the robot has its result, its meeting is over, and it has no robot to drive to."""
-    if state.robot_verdict is None or not isinstance(state.mode, Done) or _must_linger(state):
+    if state.robot_verdict is None or not isinstance(state.task, Done) or _must_linger(state):
         return False
     return _is_over(state)
 
@@ -298,10 +296,10 @@ def _after_meeting(state: RobotState) -> RobotState:
 
 def _waiting(state: RobotState, peer: str, orbits: Rendezvous | None = None) -> RobotState:
     """Return `state` of a robot that waits beside its anchor, in a meeting with `peer`."""
-    before, waits = state.mode, state.config.role == "b"
+    before, waits = state.task, state.config.role == "b"
     state = _in_meeting(state, peer, "b", orbits)
     if waits and isinstance(before, Orbiting | Aligning | Radial):
-        return replace(state, mode=before)
+        return replace(state, task=before)
     return _aligned(state)
 
 
@@ -329,9 +327,9 @@ def next_visit(state: RobotState) -> RobotState:
     state = replace(state, visits=visits)
     if config.confirms:
         return at_anchor(state)
-    seeks = sweep_transitions.wanted(state)
+    seeks = sweep.wanted(state)
     if seeks and state.parts == 0:
-        return sweep_transitions.next_part(state)
+        return sweep.next_part(state)
     here, tick = compose(state.frame, state.odometry), state.tick
     late = [
         (_missed(state, one), math.hypot(one.anchor.x - here.x, one.anchor.y - here.y), one.robot)
@@ -341,7 +339,7 @@ def next_visit(state: RobotState) -> RobotState:
     ]
     if late:
         return on_visit(state, min(late)[2])
-    return sweep_transitions.next_part(state) if seeks else state
+    return sweep.next_part(state) if seeks else state
 
 
 def _missed(state: RobotState, member: Member) -> int:
@@ -374,7 +372,7 @@ def at_anchor(state: RobotState) -> RobotState:
 def on_visit(state: RobotState, peer: str) -> RobotState:
     """Return `state` of a localised robot that drives to `peer`."""
     state = _in_meeting(state, peer, "a")
-    return replace(state, mode=Travelling(visit.stop(state)), visiting=True)
+    return replace(state, task=Travelling(visit.stop(state)), visiting=True)
 
 
 def _in_meeting(state: RobotState, peer: str, role: Role, orbits: Rendezvous | None = None) -> RobotState:
@@ -398,7 +396,7 @@ def _in_meeting(state: RobotState, peer: str, role: Role, orbits: Rendezvous | N
             earlier_ranges=len(mutual),
         ),
         peer_state=PeerState(),
-        mode=Asleep(),
+        task=Asleep(),
         plan=None,
         meeting=state.meeting + 1,
         alone=False,
@@ -414,18 +412,18 @@ def passing_others(state: RobotState, contacts: Sequence[Contact]) -> RobotState
     if not mission.safety_distance:
         return state
     free = passing.leeway(contacts, state.config.peer if state.in_contact else None, mission)
-    mode = state.mode
-    if isinstance(mode, Travelling) and passing.yielding(state.passing, _leading(state, contacts), mission):
+    task = state.task
+    if isinstance(task, Travelling) and passing.yielding(state.passing, _leading(state, contacts), mission):
         passed = replace(state.passing, leeway=0.0, blocked=0, yielded=state.passing.yielded + 1)
         return replace(state, passing=passed)
-    passed = passing.passed(state.passing, mode, state.odometry, free, mission)
-    if isinstance(mode, Travelling) and (passed.places or state.passing.places):
+    passed = passing.passed(state.passing, task, state.odometry, free, mission)
+    if isinstance(task, Travelling) and (passed.places or state.passing.places):
         places, tolerance = passed.places, state.estimator.pose_tolerance
-        if places and phase2_orbit.arrived(Travelling(places[0]), state.odometry, mission, tolerance):
+        if places and towards(places[0], state.odometry, mission, tolerance) is None:
             places = places[1:]
         passed = replace(passed, places=places)
-        mode = Travelling(places[0] if places else visit.stop(state))
-    return replace(state, mode=mode, passing=passed)
+        task = Travelling(places[0] if places else visit.stop(state))
+    return replace(state, task=task, passing=passed)
 
 
 def _leading(state: RobotState, contacts: Sequence[Contact]) -> list[Contact]:

@@ -13,10 +13,10 @@ import msgspec
 from msgspec.structs import replace
 
 from agent.peer import peer_state
-from agent.planning import exchange, transitions
-from agent.planning.phase2_orbit import Travelling
+from agent.planning import drive, exchange
 from agent.planning.planner import Planner, Summary
-from agent.planning.state import Asleep, Deciding, Done, RobotState
+from agent.planning.state import RobotState
+from agent.planning.tasks import Asleep, Deciding, Done, Travelling
 from protocol.messages import Command, Estimate, Observation, Report, RobotConfig
 from protocol.mission import Mission
 from protocol.motion import Controls
@@ -55,7 +55,7 @@ class MeetingPlanner(Planner[RobotState, Report]):
             state.tick,
             state.config.robot,
             phase=state.phase,
-            state=state.mode_name,
+            state=state.task.name,
             heard=max(state.peer_state.latest, 0),
             verdict=state.verdict,
             body=_encoder.encode(body),
@@ -69,22 +69,22 @@ class MeetingPlanner(Planner[RobotState, Report]):
         bodies = [self._decoder.decode(one.body) for one in reports if one.body is not None]
         own = self._planner.decide(self._own(state), bodies)
         state = replace(state, own=(state.meeting, own), peer_state=peer)
-        if isinstance(state.mode, Done) or (isinstance(state.mode, Travelling) and not state.in_contact):
+        if isinstance(state.task, Done) or (isinstance(state.task, Travelling) and not state.in_contact):
             return state
         command, belief = self._planner.command(own), state.belief
         if belief.phase1_done_tick is None and (command.phase > 1 or command.verdict is not None):
             state = replace(state, belief=replace(belief, phase1_done_tick=state.tick))
         if command.verdict is not None:
-            return replace(state, mode=Done(command.phase, command.verdict))
-        return replace(state, mode=Deciding(command.phase, command.task))
+            return replace(state, task=Done(command.phase, command.verdict))
+        return replace(state, task=Deciding(command.phase, command.task))
 
     def command(self, state: RobotState) -> Command:
         """Return the command of the user's planner; on the way to another robot, that of the group."""
-        decides = isinstance(state.mode, Asleep | Deciding)
-        if isinstance(state.mode, Done):
+        decides = isinstance(state.task, Asleep | Deciding)
+        if isinstance(state.task, Done):
             decides = state.in_contact  # the peer may need further ranges
         if not decides:
-            return exchange.command(state, transitions.controls(state))
+            return exchange.command(state, drive.controls(state))
         command = self._planner.command(self._own(state))
         return exchange.command(state, Controls(command.v, command.omega))
 

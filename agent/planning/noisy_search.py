@@ -13,10 +13,10 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from agent.estimation.gaussian.claim_agreement import difference
-from agent.planning import exchange, group_transitions, own_pose, sweep, sweep_transitions
+from agent.planning import exchange, group_transitions, own_pose, sweep
 from agent.planning.group_knowledge import Other
-from agent.planning.state import Done, RobotState
-from agent.planning.sweep import Sweeping
+from agent.planning.state import RobotState
+from agent.planning.tasks import Done, Sweeping
 from protocol.messages import Localised, Report, ReportedPose, Undecided
 from protocol.motion import inverse
 from protocol.sweep_strips import ALONG, ASIDE, STRIP_REACH, surveyed_path
@@ -86,7 +86,7 @@ def begun(state: RobotState) -> RobotState:
     assert config.sweep is not None
     assert isinstance(state.robot_verdict, Localised)
     if config.part >= config.sweep.parts:
-        return replace(state, mode=Done(3, state.robot_verdict))
+        return replace(state, task=Done(3, state.robot_verdict))
     assert located is not None
     # after a visit in vain, or one that contradicts what this robot knows
     if not state.belief.pair or state.config.peer != located.config.peer:
@@ -107,7 +107,7 @@ def begun(state: RobotState) -> RobotState:
         (anchor.x, anchor.y),
         own_pose.beacon_place(state),
     )
-    return replace(state, mode=Sweeping(sweep.transformed(inverse(state.frame), path)))
+    return replace(state, task=Sweeping(sweep.transformed(inverse(state.frame), path)))
 
 
 # --- contacts -----------------------------------------------------------------------------------------
@@ -121,17 +121,17 @@ def _onward(state: RobotState) -> RobotState:
     mission, odometry, phase = state.config.mission, state.odometry, state.phase
     along, aside = ALONG * mission.sensing_range, ASIDE * mission.sensing_range
     helped = [one for one in _helped(state) if _ticks_since(state, one) <= LINGER]
-    state = sweep_transitions.moved_on(
+    state = sweep.moved_on(
         state,
         helped,
         lambda since, then: sweep.looping_both_ways(odometry, along, aside, since, then),
         stops=any(_stops_for(state, one) for one in helped),
         longest=contact_ticks(mission),
     )
-    if not sweep_transitions.is_over(state):
+    if not sweep.is_over(state):
         return state
     assert state.robot_verdict is not None
-    state = replace(_with_reference(state, None), mode=Done(phase, state.robot_verdict))
+    state = replace(_with_reference(state, None), task=Done(phase, state.robot_verdict))
     following = group_transitions.next_visit(state)
     return begun(following) if following.sweeps else following
 
@@ -173,9 +173,7 @@ def _agreed(state: RobotState, reference: ReportedPose) -> RobotState:
 def _helped(state: RobotState) -> list[str]:
     """Return the robots without an anchor that are not localised, and with which no contact has failed."""
     return [
-        one
-        for one in state.config.unanchored
-        if sweep_transitions.is_helped(state, one) and not state.other(one).failed
+        one for one in state.config.unanchored if sweep.is_helped(state, one) and not state.other(one).failed
     ]
 
 

@@ -18,15 +18,11 @@ from agent.estimation.gaussian.inference import path_of
 from agent.peer.motion_log import MotionLog
 from agent.planning import sweep
 from agent.planning.group_knowledge import Contacted, Finder
-from agent.planning.phase3_last_manoeuvre import Standing
-from agent.planning.state import MODE_NAMES, Awaiting, Done, RobotState
-from agent.planning.sweep import Looping, Sweeping
+from agent.planning.state import RobotState
+from agent.planning.tasks import Awaiting, Done, Looping, Standing, Sweeping
 from protocol.messages import Localised, Observation, Ranged, Report
 from protocol.sweep_strips import OWN_SIDE
 from protocol.sweep_ticks import contact_ticks
-
-SWEEPING = MODE_NAMES[Sweeping]
-"""The mode of a localised robot that looks for robots without an anchor."""
 
 EACH = 3
 """The number of further ranges, and of ticks, after which the pose is estimated again.
@@ -56,12 +52,12 @@ def decided(state: RobotState, reports: Sequence[Report]) -> RobotState:
             log = MotionLog(through=prior.tick)
             finder = Finder(report.robot, prior.tick, prior.pose, prior.covariance, log, report.tick)
             found = _with_finder(state, found, finder, report)
-        elif found.finder is None and report.state == SWEEPING:
+        elif found.finder is None and report.state == Sweeping.name:
             why = f"{report.robot} has passed it, and does not know its own pose well enough"
             found = replace(found, failure=why)
     found, claim = _estimated(state, found)
     if claim is not None:
-        return replace(state, mode=Done(3, claim), found=found)
+        return replace(state, task=Done(3, claim), found=found)
     return _moved_on(state, found)
 
 
@@ -127,17 +123,17 @@ def _moved_on(state: RobotState, found: Contacted) -> RobotState:
     """Return `state` after a tick: in a loop while an accurate finder reports, else standing."""
     finder, mission = found.finder, state.config.mission
     if finder is None:
-        return replace(state, mode=Awaiting(), found=found)
+        return replace(state, task=Awaiting(), found=found)
     if finder.latest <= state.tick - _kept(state):
-        return replace(state, mode=Awaiting(), found=replace(found, finder=None, estimate=None))
+        return replace(state, task=Awaiting(), found=replace(found, finder=None, estimate=None))
     state = replace(state, found=found)
     if finder.covariance.position_sigma > mission.accuracy:
-        return replace(state, mode=Standing())
-    if isinstance(state.mode, Looping):
-        moved = sweep.onward(state.mode, state.odometry, mission, state.estimator.pose_tolerance)
+        return replace(state, task=Standing())
+    if isinstance(state.task, Looping):
+        moved = sweep.onward(state.task, state.odometry, mission, state.estimator.pose_tolerance)
         if moved.places and isinstance(moved, Looping):
-            return replace(state, mode=moved)
+            return replace(state, task=moved)
     if finder.latest <= state.tick - contact_ticks(mission) // 2:
-        return replace(state, mode=Standing())
+        return replace(state, task=Standing())
     side = OWN_SIDE * mission.sensing_range
-    return replace(state, mode=sweep.looping_both_ways(state.odometry, side, side, state.tick))
+    return replace(state, task=sweep.looping_both_ways(state.odometry, side, side, state.tick))

@@ -20,7 +20,7 @@ from agent.estimation.knowledge import Knowledge
 from agent.estimation.posterior import PAIR, Hypothesis, Posterior, follow, settled
 from agent.planning import sweep
 from agent.planning.state import RobotState
-from agent.planning.sweep import Looping, Sweeping
+from agent.planning.tasks import Looping, Sweeping
 from protocol.messages import Localised, ReportedPose
 from protocol.motion import Covariance, compose, inverse
 from protocol.sweep_strips import Place
@@ -116,11 +116,11 @@ def _with_estimate(state: RobotState, scored: Sequence[Hypothesis], judged: Judg
     now = judged.localised
     assert now.covariance is not None
     framed = state.with_frame(now.pose)
-    turn, mode = compose(inverse(framed.frame), state.frame), state.mode
-    if isinstance(mode, Sweeping):
-        mode = Sweeping(sweep.transformed(turn, mode.places))
-    elif isinstance(mode, Looping):
-        mode = replace(mode, then=sweep.transformed(turn, mode.then))
+    turn, task = compose(inverse(framed.frame), state.frame), state.task
+    if isinstance(task, Sweeping):
+        task = Sweeping(sweep.transformed(turn, task.places))
+    elif isinstance(task, Looping):
+        task = replace(task, then=sweep.transformed(turn, task.then))
     belief = replace(state.belief, pair=tuple(scored))
     ranges = len(state.log.ranges) + len(state.mutual)
     was_lost = before.sigma > LOST_SIGMA * state.config.mission.sensing_range
@@ -131,7 +131,7 @@ def _with_estimate(state: RobotState, scored: Sequence[Hypothesis], judged: Judg
         sigma=now.covariance.position_sigma,
         ranges_when_lost=before.ranges if was_lost and ranges > before.ranges else before.ranges_when_lost,
     )
-    return replace(framed, belief=belief, mode=mode, own_pose=own_pose)
+    return replace(framed, belief=belief, task=task, own_pose=own_pose)
 
 
 def _reference(state: RobotState, judged: Judged | None) -> ReportedPose | None:

@@ -17,7 +17,8 @@ from agent.estimation.gaussian.search import search
 from agent.estimation.judged import FEWEST_FOR_CLAIM, Judged, of_pair
 from agent.estimation.knowledge import Belief, Knowledge
 from agent.estimation.posterior import PAIR, Posterior, follow
-from agent.planning.state import Done, RobotState
+from agent.planning.state import RobotState
+from agent.planning.tasks import Done
 from protocol.messages import Localised
 
 PAIR_SEARCHES = frozenset((FEWEST_FOR_CLAIM, *(8 * 2**n for n in range(12))))
@@ -79,7 +80,7 @@ def with_claim(state: RobotState, judged: Judged | None) -> tuple[RobotState, Ri
     match claim(judged):
         case Localised() as claimed:
             belief = replace(state.belief, doubtful_claims=0, p_value=_least_p_value(state.belief))
-            return replace(state, mode=Done(3, claimed), belief=belief), None
+            return replace(state, task=Done(3, claimed), belief=belief), None
         case Blocked(condition, reason):
             doubtful = state.belief.doubtful_claims
             if condition != early_consistency:

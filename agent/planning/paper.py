@@ -11,13 +11,11 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from agent.planning import exchange, transitions
-from agent.planning.log_exchange import LogPlanner
-from agent.planning.manoeuvres import Manoeuvres
-from agent.planning.phase1_anchor import ThirdPoint
-from agent.planning.phase2_orbit import Orbiting
-from agent.planning.phase3_last_manoeuvre import Standing, Waiting
-from agent.planning.state import MODE_NAMES, RobotState
+from agent.planning import drive, exchange, transitions
+from agent.planning.exchange import LogPlanner
+from agent.planning.planner import Manoeuvres
+from agent.planning.state import RobotState
+from agent.planning.tasks import Orbiting, Resting, Standing, ThirdPoint, Waiting
 from protocol.messages import Command, Report
 from protocol.mission import Mission
 from protocol.orbits import Rendezvous, rendezvous
@@ -30,7 +28,7 @@ class Paper(LogPlanner):
     """Forward, to the left in phase 1, and at v_max."""
 
     def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
-        """Return `state` with the peer's `reports` and with the mode that follows from them.
+        """Return `state` with the peer's `reports` and with the task that follows from them.
 
         Phase 3 begins when both robots are on their orbits.
         """
@@ -38,10 +36,10 @@ class Paper(LogPlanner):
             state = exchange.with_reports(state, reports)
         if not state.in_contact:
             return state
-        match state.mode:
-            case Orbiting() if state.peer_state.phase == 3 or state.peer_state.state == state.mode_name:
+        match state.task:
+            case Orbiting() if state.peer_state.phase == 3 or state.peer_state.state == state.task.name:
                 return transitions.begin_phase3(state)
-            case Standing() | Waiting():
+            case Resting():
                 return self._decide_phase3(state)
             case _:
                 return state
@@ -52,14 +50,14 @@ class Paper(LogPlanner):
 
     def command(self, state: RobotState) -> Command:
         """Return the command for the next tick, with the phase, the task and the verdict."""
-        return exchange.command(state, transitions.controls(state))
+        return exchange.command(state, drive.controls(state))
 
     def _after_range(self, state: RobotState) -> RobotState:
         """Continue phase 1 with the branches +alpha and -alpha that the ranges allow (eq. (2)).
 
         The third range is the last one. It selects the most probable branch, if there is one.
         """
-        kind, third = transitions.branch_kind(state), isinstance(state.mode, ThirdPoint)
+        kind, third = transitions.branch_kind(state), isinstance(state.task, ThirdPoint)
         estimate = transitions.anchor_estimate(state)
         state = replace(state, belief=estimate.belief)
         branch = estimate.best if third or len(estimate.branches) == 1 else None
@@ -73,14 +71,14 @@ class Paper(LogPlanner):
         """Evaluate phase 3 after a's second mutual range, and again after b's last manoeuvre.
 
         The mutual ranges count from the encounter on. Return `state` with a verdict, with b's last
-        manoeuvre, or with the same mode.
+        manoeuvre, or with the same task.
         """
         evaluated = transitions.with_new_ticks(state)
         if evaluated is None:
             return state
         first_tick, planned = state.belief.encounter_tick, state.plan is not None
         assert first_tick is not None
-        a_waits = not isinstance(state.mode, Standing) or state.peer_state.state == MODE_NAMES[Waiting]
+        a_waits = not isinstance(state.task, Standing) or state.peer_state.state == Waiting.name
         second = a_waits or planned
         state, estimate = transitions.pair_estimate(evaluated, first_tick, second_range=second)
         if estimate is None or state.verdict is not None or state.config.role == "a":

@@ -14,7 +14,7 @@ import msgspec
 from msgspec.structs import replace
 
 from agent.planning import separation
-from agent.planning.phase2_orbit import Travelling
+from agent.planning.tasks import Travelling
 from protocol.messages import Contact
 from protocol.mission import Mission
 from protocol.motion import Pose
@@ -70,9 +70,9 @@ def yielding(passing: Bypass, leading: Sequence[Contact], mission: Mission) -> b
     return close and passing.yielded < YIELDS
 
 
-def passed(passing: Bypass, mode: object, odometry: Pose, free: float, mission: Mission) -> Bypass:
-    """Return `passing` after a tick that led to `odometry` in `mode`, where `free` m may be driven next."""
-    if not isinstance(mode, Travelling):
+def passed(passing: Bypass, task: object, odometry: Pose, free: float, mission: Mission) -> Bypass:
+    """Return `passing` after a tick that led to `odometry` in `task`, where `free` m may be driven next."""
+    if not isinstance(task, Travelling):
         return Bypass(free, detours=passing.detours)
     blocked = passing.blocked + 1 if free < BLOCKED * mission.first_straight else 0
     passing = replace(
@@ -80,7 +80,7 @@ def passed(passing: Bypass, mode: object, odometry: Pose, free: float, mission: 
     )
     if passing.places or blocked < BLOCKED_AFTER:
         return passing
-    places = _aside(odometry, mode.place, mission, 1.0 if passing.detours % 2 == 0 else -1.0)
+    places = _aside(odometry, task.place, mission, 1.0 if passing.detours % 2 == 0 else -1.0)
     return Bypass(free, detours=passing.detours + 1, places=places)
 
 

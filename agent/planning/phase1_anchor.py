@@ -6,10 +6,8 @@ import math
 from collections.abc import Sequence
 from itertools import combinations
 
-import msgspec
-
 from agent.estimation.exact import Branch
-from agent.planning.manoeuvres import Manoeuvres
+from agent.planning.planner import Manoeuvres
 from protocol.mission import RANGE_MARGIN, Mission, third_point_turn_rate
 from protocol.motion import Controls, Pose, chord, compose, rotated_back
 
@@ -21,14 +19,6 @@ SHORTEST_MANOEUVRE = 1e-9
 
 IN_RANGE_SIGMAS = 3.0
 """The distance inside R, in standard deviations of a range, at which a noisy point counts as in range."""
-
-
-class ThirdPoint(msgspec.Struct, frozen=True):
-    """The robot drives to a point where the remaining branches predict different ranges (eqs. (3) to (5))."""
-
-    branches: tuple[Branch, ...]
-    origin: Pose
-    command: Controls
 
 
 def third_point(

@@ -8,14 +8,13 @@ from functools import cache, reduce
 from itertools import pairwise
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.closed_forms import Placement
 from agent.estimation.exact import PairObservation, information
 from agent.estimation.mutual_ranges import ELSEWHERE
-from agent.planning.manoeuvres import Manoeuvres
+from agent.planning.planner import Manoeuvres
 from agent.planning.separation import nearest
 from protocol.mission import RANGE_MARGIN, Mission, Role
 from protocol.motion import Controls, Pose, placed, relative, travelled
@@ -38,41 +37,6 @@ REGULARISATION = 1e-8
 These are the largest contributions of one range. Without the regularisation, the first of two missing ranges
 would not increase the determinant.
 """
-
-
-class Standing(msgspec.Struct, frozen=True):
-    """Robot b stands still. It waits for a's second range or, after its own manoeuvre, for a's report."""
-
-    through: int = -1
-    """The last tick whose measurements have been evaluated."""
-
-
-class Waiting(msgspec.Struct, frozen=True):
-    """Robot a stands still. It has its second range and waits for b's last manoeuvre.
-
-    Robot a makes a further manoeuvre if b's last one was not sufficient.
-    """
-
-    through: int = -1
-    """The last tick whose measurements have been evaluated."""
-
-
-class LastManoeuvre(msgspec.Struct, frozen=True):
-    """The robot drives to a point where the remaining placements predict different ranges."""
-
-    command: Controls
-    origin: Pose
-
-
-class Returning(msgspec.Struct, frozen=True):
-    """The robot has left the peer's range. It drives the same arc backwards, to be able to report again."""
-
-    command: Controls
-    origin: Pose
-
-
-Resting = Standing | Waiting
-State = Resting | LastManoeuvre | Returning
 
 
 class Question(NamedTuple):
@@ -125,18 +89,6 @@ def turn(pair_observations: Sequence[PairObservation]) -> Role:
         if travelled(before.a, latest.a) > 0.0:
             return "b"
     return "b"
-
-
-def advanced(state: LastManoeuvre | Returning, pose: Pose, in_contact: bool, rest: Resting) -> State:
-    """Return the mode after a tick that led to `pose`: `rest`, or back into the peer's range."""
-    match state:
-        case LastManoeuvre(command) if not in_contact:
-            return Returning(Controls(-command.v, -command.omega), pose)
-        case _:
-            return rest
-
-
-# --- the last manoeuvre -------------------------------------------------------------------------------
 
 
 def last_manoeuvre(

@@ -16,7 +16,6 @@ from typing import Any, Generic, TypeVar
 
 import msgspec
 
-from agent.planning.manoeuvres import Manoeuvres
 from protocol.messages import BranchKind, Command, Estimate, Observation, Probability, RobotConfig
 from protocol.mission import Mission
 from protocol.orbits import Rendezvous, rendezvous
@@ -166,3 +165,24 @@ class Planner(Generic[S, B]):
         """Return the minimum number of noisy mutual ranges before a claim. The audit checks it."""
         del mission
         return 0
+
+
+class Manoeuvres(msgspec.Struct, frozen=True):
+    """The directions and speeds among which a planner chooses."""
+
+    directions: tuple[float, ...]
+    """The signs of v in phase 1: 1 forward, -1 backward."""
+    sides: tuple[float, ...]
+    """The signs of omega_1 in eq. (4): 1 to the left, -1 to the right."""
+    last_speeds: tuple[float, ...] | None
+    """The values of v_2 in eq. (8), in units of A_0 / T_s; None for v_max alone."""
+    fewest_out_of_range: bool
+    """True if only last manoeuvres count that leave the fewest placements out of range.
+
+    No detection selects those placements.
+    """
+
+    @property
+    def backward(self) -> bool:
+        """Return whether the robot also drives backward."""
+        return -1.0 in self.directions

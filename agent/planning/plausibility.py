@@ -10,8 +10,7 @@ import math
 from agent.estimation.gaussian.odometry_noise import STRAY_DISTANCE, STRAY_TURN
 from agent.peer.motion_log import MotionLog
 from agent.peer.peer_state import PeerState
-from agent.planning.phase2_orbit import Orbiting
-from agent.planning.state import MODE_NAMES
+from agent.planning.tasks import Orbiting
 from protocol.messages import Inconsistent, Report, RobotConfig
 from protocol.mission import Mission
 from protocol.motion import wrap
@@ -121,7 +120,7 @@ def _off_orbit(
     """Return a contradiction if an orbiting peer is off its orbit, or does not head along it."""
     plan = config.rendezvous
     orbit = plan.b if config.role == "a" else plan.a
-    if report.state != MODE_NAMES[Orbiting] or after.start is None or after.peer.through != report.tick:
+    if report.state != Orbiting.name or after.start is None or after.peer.through != report.tick:
         return None
     pose = after.peer.pose(after.start, report.tick, config.mission.period)
     residual = abs(math.hypot(pose.x, pose.y) - orbit.radius)

@@ -1,4 +1,4 @@
-"""The transitions between modes that planners share, and the controls of each mode."""
+"""The transitions between tasks that planners share."""
 
 from __future__ import annotations
 
@@ -7,27 +7,14 @@ from collections.abc import Callable
 from msgspec.structs import replace
 
 from agent.estimation.estimator import AnchorEstimate, FittedBranch, PairEstimate
-from agent.planning import phase1_anchor, phase2_orbit, phase3_last_manoeuvre, range_seeking, sweep
-from agent.planning.active_sensing import Retreating, Surveying
-from agent.planning.manoeuvres import Manoeuvres
-from agent.planning.phase1_anchor import ThirdPoint
-from agent.planning.phase2_orbit import Aligning, Orbiting, Radial, Tangent, Travelling
-from agent.planning.phase3_last_manoeuvre import LastManoeuvre, Plan, Question, Returning, Standing, Waiting
-from agent.planning.range_seeking import (
-    Backing,
-    Circling,
-    Homing,
-    Seeking,
-    Straight,
-    Turning,
-    moved,
-    step_length,
-)
-from agent.planning.state import Asleep, Done, RobotState
-from agent.planning.sweep import Looping, Sweeping
+from agent.planning import drive, phase1_anchor, phase2_orbit, phase3_last_manoeuvre, range_seeking, tasks
+from agent.planning.phase3_last_manoeuvre import Plan, Question
+from agent.planning.planner import Manoeuvres
+from agent.planning.range_seeking import moved, step_length
+from agent.planning.state import RobotState
 from protocol.messages import BranchKind
 from protocol.mission import SHORTEST_STEP, Mission
-from protocol.motion import REST, Controls
+from protocol.motion import Controls
 
 # --- the robot's own sensors --------------------------------------------------------------------------
 
@@ -38,29 +25,29 @@ def after_observation(
     manoeuvres: Manoeuvres,
     after_range: Callable[[RobotState], RobotState],
 ) -> RobotState:
-    """Return `state` with the mode that follows from the robot's own sensors, on the paper's way.
+    """Return `state` with the task that follows from the robot's own sensors, on the paper's way.
 
     `after_range` continues phase 1 once a second or a further anchor range is measured.
     """
-    mode = state.mode
-    match mode:
-        case Orbiting() if mode.command is None:  # most ticks
+    task = state.task
+    match task:
+        case tasks.Orbiting() if task.command is None:  # most ticks
             return state
-        case Orbiting() | Aligning() | Radial() | Tangent():
-            return continue_phase2(state, mode)
-        case Standing() | Waiting() | Done():
+        case tasks.Orbital():
+            return continue_phase2(state, task)
+        case tasks.Resting() | tasks.Done():
             return state
-        case Straight(beacon) | Backing(beacon) | Turning(beacon) | Circling(beacon):
+        case tasks.Searching(beacon):
             measured = state.in_contact if beacon == "peer" else anchor_range is not None
-            seeking = sought(state, mode, measured, manoeuvres)
+            seeking = sought(state, task, measured, manoeuvres)
             if seeking is not None:
                 return seeking
-            return replace(state, mode=Waiting()) if beacon == "peer" else after_range(state)
-        case ThirdPoint(_, origin) if moved(origin, state.odometry):
+            return replace(state, task=tasks.Waiting()) if beacon == "peer" else after_range(state)
+        case tasks.ThirdPoint(_, origin) if moved(origin, state.odometry):
             return after_range(state)
-        case LastManoeuvre(_, origin) | Returning(_, origin) if moved(origin, state.odometry):
-            return after_last_manoeuvre(state, mode)
-        case Asleep():
+        case tasks.LastManoeuvre(_, origin) | tasks.Returning(_, origin) if moved(origin, state.odometry):
+            return after_last_manoeuvre(state, task)
+        case tasks.Asleep():
             return start_phase1(state, anchor_range)
         case _:
             return state
@@ -78,24 +65,26 @@ def start_phase1(state: RobotState, rho0: float | None) -> RobotState:
     on_anchor = state.estimator.on_anchor(state, rho0)
     if on_anchor is not None:
         return end_phase1(state, on_anchor, "on-anchor")
-    return replace(state, mode=Straight("anchor", state.odometry, rho0))
+    return replace(state, task=tasks.Straight("anchor", state.odometry, rho0))
 
 
-def sought(state: RobotState, mode: Seeking, measured: bool, manoeuvres: Manoeuvres) -> RobotState | None:
-    """Return `state` after a tick of the search `mode`; None once the second range is measured."""
+def sought(
+    state: RobotState, task: tasks.Searching, measured: bool, manoeuvres: Manoeuvres
+) -> RobotState | None:
+    """Return `state` after a tick of the search `task`; None once the second range is measured."""
     mission = state.config.mission
-    next_mode = range_seeking.onward(
-        mode, state.odometry, measured, mission, manoeuvres, state.estimator.pose_tolerance
+    next_task = range_seeking.onward(
+        task, state.odometry, measured, mission, manoeuvres, state.estimator.pose_tolerance
     )
-    if next_mode is None:
+    if next_task is None:
         return None
-    return state if next_mode is mode else replace(state, mode=next_mode)
+    return state if next_task is task else replace(state, task=next_task)
 
 
 def anchor_estimate(state: RobotState) -> AnchorEstimate:
     """Return the branches that the anchor ranges allow, after the second or a further one."""
-    mode = state.mode
-    return state.estimator.anchor(state, mode.branches if isinstance(mode, ThirdPoint) else ())
+    task = state.task
+    return state.estimator.anchor(state, task.branches if isinstance(task, tasks.ThirdPoint) else ())
 
 
 def branch_kind(state: RobotState) -> BranchKind | None:
@@ -103,11 +92,11 @@ def branch_kind(state: RobotState) -> BranchKind | None:
 
     A third range that is missing is the paper's virtual measurement.
     """
-    match state.mode:
-        case ThirdPoint():
+    match state.task:
+        case tasks.ThirdPoint():
             measured = state.log.ranges[-1].tick == state.tick
             return "three-ranges" if measured else "three-ranges-virtual"
-        case Circling():
+        case tasks.Circling():
             return "circle"
         case _:
             return None
@@ -125,7 +114,7 @@ def to_third_point(
     )
     if command is None:
         return state.undecided("eq. (5) allows no manoeuvre to a third range")
-    return replace(state, mode=ThirdPoint(estimate.branches, state.odometry, command))
+    return replace(state, task=tasks.ThirdPoint(estimate.branches, state.odometry, command))
 
 
 def end_phase1(state: RobotState, fitted: FittedBranch, kind: BranchKind) -> RobotState:
@@ -139,18 +128,18 @@ def end_phase1(state: RobotState, fitted: FittedBranch, kind: BranchKind) -> Rob
     )
     state = replace(state, belief=belief)
     mu = phase2_orbit.orientation(state.local_pose)
-    return continue_phase2(state, Aligning(state.odometry.heading - mu))
+    return continue_phase2(state, tasks.Aligning(state.odometry.heading - mu))
 
 
-def continue_phase2(state: RobotState, mode: phase2_orbit.Phase2Mode) -> RobotState:
-    """Continue phase 2 from `mode`. A robot whose pose is corrected follows its orbit by pursuit."""
+def continue_phase2(state: RobotState, task: tasks.Orbital) -> RobotState:
+    """Continue phase 2 from `task`. A robot whose pose is corrected follows its orbit by pursuit."""
     estimator, mission = state.estimator, state.config.mission
-    next_mode = phase2_orbit.onward(
-        mode, state.odometry, state.start, state.orbit, mission, estimator.pose_tolerance
+    next_task = phase2_orbit.onward(
+        task, state.odometry, state.start, state.orbit, mission, estimator.pose_tolerance
     )
-    if isinstance(next_mode, Orbiting) and estimator.corrects_poses:
-        next_mode = Orbiting(phase2_orbit.pursuit(state.local_pose, state.orbit, mission))
-    return state if next_mode is state.mode else replace(state, mode=next_mode)
+    if isinstance(next_task, tasks.Orbiting) and estimator.corrects_poses:
+        next_task = tasks.Orbiting(drive.pursuit(state.local_pose, state.orbit, mission))
+    return state if next_task is state.task else replace(state, task=next_task)
 
 
 # --- phase 3 ------------------------------------------------------------------------------------------
@@ -163,13 +152,13 @@ def begin_phase3(state: RobotState) -> RobotState:
     """
     belief = replace(state.belief, encounter_tick=state.tick)
     if state.config.role == "b":
-        return replace(state, mode=Standing(), belief=belief)
+        return replace(state, task=tasks.Standing(), belief=belief)
     # In contact without a range (a drop-out), the peer is only known to be within R.
     rho = state.mutual[-1].range if state.mutual else state.config.mission.sensing_range
     if state.config.mission.safety_distance and not _may_drive_straight(state):
         return state
-    straight = Straight("peer", state.odometry, rho)
-    return replace(state, mode=straight, belief=belief)
+    straight = tasks.Straight("peer", state.odometry, rho)
+    return replace(state, task=straight, belief=belief)
 
 
 def _may_drive_straight(state: RobotState) -> bool:
@@ -178,10 +167,12 @@ def _may_drive_straight(state: RobotState) -> bool:
     return now and step_length("peer", state.mutual[-1].range, state.config.mission) >= SHORTEST_STEP
 
 
-def after_last_manoeuvre(state: RobotState, mode: LastManoeuvre | Returning) -> RobotState:
+def after_last_manoeuvre(state: RobotState, task: tasks.LastManoeuvre | tasks.Returning) -> RobotState:
     """Return `state` after a tick of a last manoeuvre: at rest, or on the way back into the peer's range."""
-    rest = Standing() if state.config.role == "b" else Waiting()
-    return replace(state, mode=phase3_last_manoeuvre.advanced(mode, state.odometry, state.in_contact, rest))
+    if isinstance(task, tasks.LastManoeuvre) and not state.in_contact:
+        back = Controls(-task.command.v, -task.command.omega)
+        return replace(state, task=tasks.Returning(back, state.odometry))
+    return replace(state, task=tasks.Standing() if state.config.role == "b" else tasks.Waiting())
 
 
 def with_new_ticks(state: RobotState) -> RobotState | None:
@@ -189,11 +180,11 @@ def with_new_ticks(state: RobotState) -> RobotState | None:
 
     The result is also None until the peer's log covers every tick up to the one in which this robot stopped.
     """
-    assert isinstance(state.mode, Standing | Waiting)
+    assert isinstance(state.task, tasks.Resting)
     last = min(state.tick, state.peer_state.peer.through)
-    if last < state.log.moved() or last == state.mode.through:
+    if last < state.log.moved() or last == state.task.through:
         return None
-    return replace(state, mode=replace(state.mode, through=last))
+    return replace(state, task=replace(state.task, through=last))
 
 
 def pair_estimate(
@@ -206,8 +197,8 @@ def pair_estimate(
     estimate = state.estimator.pair(state, first_tick, second_range=second_range)
     if estimate is None:
         return state, None
-    mode = state.mode if estimate.verdict is None else Done(3, estimate.verdict)
-    return replace(state, belief=estimate.belief, mode=mode), estimate
+    task = state.task if estimate.verdict is None else tasks.Done(3, estimate.verdict)
+    return replace(state, belief=estimate.belief, task=task), estimate
 
 
 def last_manoeuvre(
@@ -227,40 +218,4 @@ def last_manoeuvre(
         plan = planned(Question(mover, a, b, tuple(placements)), mission)
     if plan is None:
         return None
-    return replace(state, mode=LastManoeuvre(plan.command, state.odometry), plan=plan)
-
-
-def homing_controls(state: RobotState) -> Controls | None:
-    """Return the controls on the way back to the anchor's range; None once the robot is there."""
-    assert isinstance(state.mode, Homing)
-    tolerance = state.estimator.pose_tolerance
-    return range_seeking.homing_controls(state.mode, state.odometry, state.config.mission, tolerance)
-
-
-# --- commands -----------------------------------------------------------------------------------------
-
-
-def controls(state: RobotState) -> Controls:
-    """Return the controls of the current mode."""
-    mode = state.mode
-    match mode:
-        case Orbiting():
-            return mode.command or state.orbit.controls
-        case Aligning() | Radial() | Tangent():
-            return phase2_orbit.controls(mode, state.odometry, state.start, state.orbit, state.config.mission)
-        case Straight() | Backing() | Turning() | Circling():
-            return range_seeking.controls(mode, state.odometry, state.config.mission)
-        case ThirdPoint(command=planned) | LastManoeuvre(planned) | Returning(planned):
-            return planned
-        case Surveying(command=planned) | Retreating(planned):
-            return planned
-        case Homing():
-            return homing_controls(state) or REST
-        case Travelling():
-            tolerance = state.estimator.pose_tolerance
-            return phase2_orbit.travel_controls(mode, state.odometry, state.config.mission, tolerance) or REST
-        case Sweeping() | Looping():
-            tolerance = state.estimator.pose_tolerance
-            return sweep.controls(mode, state.odometry, state.config.mission, tolerance) or REST
-        case _:
-            return REST
+    return replace(state, task=tasks.LastManoeuvre(plan.command, state.odometry), plan=plan)

@@ -23,12 +23,12 @@ from agent.estimation.compiled import library
 from agent.estimation.judged import sufficient_mutual_ranges
 from agent.estimation.resection import RangedPlace
 from agent.peer import peer_state
-from agent.planning import exchange, noisy_unanchored, sweep, transitions
+from agent.planning import drive, exchange, noisy_unanchored, sweep
 from agent.planning.group_knowledge import Contacted, Resected
-from agent.planning.phase3_last_manoeuvre import Standing
 from agent.planning.planner import Planner, Summary
-from agent.planning.state import UNCONFIRMED, Awaiting, Done, RobotState
-from agent.planning.sweep import LOOPS_FOR, Looping
+from agent.planning.state import RobotState
+from agent.planning.sweep import LOOPS_FOR
+from agent.planning.tasks import UNCONFIRMED, Awaiting, Done, Looping, Standing
 from protocol.messages import Command, Estimate, Localised, Observation, Report, RobotConfig
 from protocol.mission import Mission
 from protocol.motion import ORIGIN, Pose, compose, inverse, wrap
@@ -61,7 +61,7 @@ class UnanchoredPlanner(Planner[RobotState, Report]):
 
     def start(self, config: RobotConfig) -> RobotState:
         """Return the state of a robot that has measured nothing yet. Raises NoKernel."""
-        state = RobotState(config, mode=Awaiting())
+        state = RobotState(config, task=Awaiting())
         if not state.estimator.corrects_poses:
             return replace(state, found=Resected())
         library()  # it is needed when the robot is found, and would end the mission then
@@ -122,7 +122,7 @@ class UnanchoredPlanner(Planner[RobotState, Report]):
 
     def command(self, state: RobotState) -> Command:
         """Return the command for the next tick, with the phase, the task and the verdict."""
-        return replace(exchange.command(state, transitions.controls(state)), peer=None, role=None)
+        return replace(exchange.command(state, drive.controls(state)), peer=None, role=None)
 
     def estimate(self, state: RobotState) -> Estimate:
         """Return the possible poses in <W>.
@@ -192,7 +192,7 @@ class UnanchoredPlanner(Planner[RobotState, Report]):
 def _decided(state: RobotState, found: Resected, reports: Sequence[Report]) -> RobotState:
     """Return `state` with the poses in `reports`, and with what follows from them."""
     ranges, places = dict(found.ranges), dict(found.places)
-    if not isinstance(state.mode, Looping):  # a robot that comes back may have corrected its pose
+    if not isinstance(state.task, Looping):  # a robot that comes back may have corrected its pose
         places = {key: report for key, report in places.items() if key[1] > state.tick - LOOPS_FOR}
     for report in reports:
         if (prior := report.prior) is None or report.robot in found.candidates:
@@ -217,11 +217,11 @@ def _resected(state: RobotState, found: Resected) -> RobotState:
         ranged = [found.places[key] for key in sorted(found.places) if key[0] == robot]
         standing = [one for one in ranged if one.odometry == ORIGIN]
         moved = [one for one in ranged if one.odometry != ORIGIN]
-        if not isinstance(state.mode, Looping):
+        if not isinstance(state.task, Looping):
             positions = resection.positions(standing, LARGEST_MISFIT)
             if len(positions) == 1 and resection.is_fixed(standing, positions[0]):
-                mode = sweep.looping(state.odometry, state.config.mission, state.tick)
-                return replace(state, mode=mode, found=found)
+                task = sweep.looping(state.odometry, state.config.mission, state.tick)
+                return replace(state, task=task, found=found)
         elif moved and (possible := resection.poses(standing, moved, LARGEST_MISFIT)):
             found = replace(found, possible=possible)
             if resection.is_certain(standing, moved, possible):
@@ -240,7 +240,7 @@ def _with_candidate(state: RobotState, found: Resected, robot: str) -> tuple[Rob
     others = [compose(one, state.odometry) for by, one in found.candidates.items() if by != robot]
     found = replace(found, candidates={**found.candidates, robot: compose(pose, inverse(state.odometry))})
     if 1 + sum([_agree(pose, other) for other in others]) > state.config.tolerates:
-        state = replace(state, mode=Done(3, Localised(pose)))
+        state = replace(state, task=Done(3, Localised(pose)))
     return state, found
 
 
@@ -264,14 +264,14 @@ def _moved_on(state: RobotState, found: Resected) -> RobotState:
     If nobody has reported a pose for KEPT ticks, except robots by which it knows a pose, the robot stands
     still again, and forgets all ranges: those to the next robot that comes begin where it is then.
     """
-    if not isinstance(state.mode, Looping):
-        return replace(state, mode=Standing() if found.places or found.candidates else Awaiting())
-    mission, since, tolerance = state.config.mission, state.mode.since, state.estimator.pose_tolerance
-    mode = sweep.onward(state.mode, state.odometry, mission, tolerance)
-    if mode.places:
-        return replace(state, mode=mode)
+    if not isinstance(state.task, Looping):
+        return replace(state, task=Standing() if found.places or found.candidates else Awaiting())
+    mission, since, tolerance = state.config.mission, state.task.since, state.estimator.pose_tolerance
+    task = sweep.onward(state.task, state.odometry, mission, tolerance)
+    if task.places:
+        return replace(state, task=task)
     latest = max([tick for robot, tick in found.places if robot not in found.candidates], default=-KEPT)
     if latest > state.tick - KEPT and since > state.tick - LOOPS_FOR:
-        return replace(state, mode=sweep.looping(state.odometry, mission, since))
+        return replace(state, task=sweep.looping(state.odometry, mission, since))
     found = Resected(state.odometry, candidates=found.candidates)
-    return replace(state, mode=Standing() if found.candidates else Awaiting(), found=found)
+    return replace(state, task=Standing() if found.candidates else Awaiting(), found=found)

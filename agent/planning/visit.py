@@ -9,11 +9,12 @@ import math
 
 from msgspec.structs import replace
 
-from agent.planning import phase2_orbit
-from agent.planning.phase2_orbit import Travelling
+from agent.planning.drive import towards
 from agent.planning.state import RobotState
+from agent.planning.tasks import Travelling
+from protocol.mission import Mission
 from protocol.motion import Pose, compose, inverse
-from protocol.orbits import SEARCH_SIDES, SHORT_OF_ANCHOR, search_legs
+from protocol.orbits import SEARCH_SIDES, SHORT_OF_ANCHOR, leg_end, search_legs
 
 SEARCHED_SIGMAS = 4.0
 """The sigmas of the heading at the claim that a visitor's search allows for."""
@@ -24,19 +25,35 @@ MOST_SIDES = 8
 
 def searching(state: RobotState) -> RobotState:
     """Return `state` of a visitor out of range; if it has arrived, on the next leg of its search."""
-    assert isinstance(state.mode, Travelling)
+    assert isinstance(state.task, Travelling)
     mission, tolerance = state.config.mission, state.estimator.pose_tolerance
-    if not phase2_orbit.arrived(state.mode, state.odometry, mission, tolerance):
+    if towards(state.task.place, state.odometry, mission, tolerance) is not None:
         return state
     begin, anchor = state.framed_at, _peer_anchor(state)
-    leg = phase2_orbit.next_leg(state.mode, (begin.x, begin.y), (anchor.x, anchor.y), mission)
-    return replace(state, mode=leg)
+    leg = next_leg(state.task, (begin.x, begin.y), (anchor.x, anchor.y), mission)
+    return replace(state, task=leg)
+
+
+def next_leg(
+    task: Travelling, begin: tuple[float, float], anchor: tuple[float, float], mission: Mission
+) -> Travelling:
+    """Return the leg after `task` of the search for a robot that waits beside `anchor` (see `leg_end`).
+
+    The robot knew its pose at `begin`. An error of its heading there turns the way about that place. So the
+    legs end on the arc about it that leads through the anchor. Both places are in m in the frame of the
+    odometry, in which the anchor is where it would be without that error.
+    """
+    leg, (dx, dy) = task.leg + 1, (anchor[0] - begin[0], anchor[1] - begin[1])
+    radius, aside = math.hypot(dx, dy), leg_end(leg) * mission.sensing_range
+    turned = min(max(aside / radius, -math.pi), math.pi) if radius else 0.0
+    bearing = math.atan2(dy, dx) + turned
+    return Travelling((begin[0] + radius * math.cos(bearing), begin[1] + radius * math.sin(bearing)), leg)
 
 
 def has_searched(state: RobotState) -> bool:
     """Return whether the robot has searched for its peer in vain."""
-    mode = state.mode
-    return isinstance(mode, Travelling) and mode.leg > 0 and mode.leg > search_legs(_search_sides(state))
+    task = state.task
+    return isinstance(task, Travelling) and task.leg > 0 and task.leg > search_legs(_search_sides(state))
 
 
 def _search_sides(state: RobotState) -> int:

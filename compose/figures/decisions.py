@@ -8,9 +8,9 @@ from typing import NamedTuple
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from agent.planning.active_sensing import Surveying
 from agent.planning.state import RobotState
 from agent.planning.strides import stride
+from agent.planning.tasks import Surveying
 from compose.figures.pair import PairRecord
 from compose.figures.sheet import NO_ENCOUNTER, Absent, Window, circle, series, some, square
 from compose.figures.style import INK, PALE, PALER, ROLE_MARKERS, SCREEN, Medium
@@ -44,7 +44,7 @@ def decisions(pair: PairRecord) -> list[PairDecision]:
         before: object = ()
         for state in pair.states(role):
             hypotheses = state.belief.pair
-            surveys = isinstance(state.mode, Surveying) and state.phase == 3
+            surveys = isinstance(state.task, Surveying) and state.phase == 3
             if hypotheses and hypotheses is not before and (surveys or state.verdict is not None):
                 found.setdefault(state.tick, {})[role] = state
             before = hypotheses
@@ -165,9 +165,9 @@ def _drive(axes: Axes, pair: PairRecord, role: Role, state: RobotState) -> None:
 
 def _ends(state: RobotState, pair: PairRecord) -> list[Pose]:
     """Return poses along the chosen manoeuvre from the most probable pose; empty if none was chosen."""
-    if not isinstance(state.mode, Surveying) or not state.belief.poses:
+    if not isinstance(state.task, Surveying) or not state.belief.poses:
         return []
-    command, ticks = state.mode.command, stride(pair.mission)
+    command, ticks = state.task.command, stride(pair.mission)
     pieces = SEGMENTS_PER_TICK * ticks
     period = ticks * pair.mission.period
     return [

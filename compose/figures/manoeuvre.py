@@ -12,7 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from agent.estimation.closed_forms import Placement
-from agent.planning.phase3_last_manoeuvre import Array, Compared, LastManoeuvre, Plan, compared
+from agent.planning.phase3_last_manoeuvre import Array, Compared, Plan, compared
+from agent.planning.tasks import LastManoeuvre
 from compose.figures.pair import PairRecord
 from compose.figures.sheet import ANCHORS, LABEL, NO_ENCOUNTER, Absent, Sheet, circle
 from compose.figures.style import INK, PALE, PALER, ROLE_MARKERS, SCREEN, Medium
@@ -39,10 +40,9 @@ def planned(pair: PairRecord, role: Role) -> Iterator[Planned]:
     """Yield every last manoeuvre of one robot, in order."""
     before = None
     for state in pair.states(role):
-        if state.plan is not before and isinstance(state.mode, LastManoeuvre):
-            before = state.plan
-            assert before is not None
-            yield Planned(state.tick, before)
+        if (plan := state.plan) is not before and plan is not None and isinstance(state.task, LastManoeuvre):
+            before = plan
+            yield Planned(state.tick, plan)
 
 
 def draw(pair: PairRecord, medium: Medium = SCREEN) -> dict[str, Figure | Absent]:

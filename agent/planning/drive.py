@@ -1,0 +1,126 @@
+"""The controls of each task: how the robot drives in the next tick."""
+
+from __future__ import annotations
+
+import math
+
+from agent.planning import tasks
+from agent.planning.phase2_orbit import left_to_orbit
+from agent.planning.range_seeking import distance_ahead, inside_arc, step_length
+from agent.planning.state import RobotState
+from protocol.mission import Mission
+from protocol.motion import REST, Controls, Pose, travelled, wrap
+from protocol.orbits import Orbit
+from protocol.sweep_strips import Place
+from protocol.sweep_ticks import sweep_speed
+
+ASIDE = 1e-9
+"""The distance from a place at which a straight to it may end beside it, as a fraction of A_0."""
+
+LOOKAHEAD = 2.0
+"""The distance of the pursued point ahead on the orbit, in ticks of the orbit's speed."""
+
+
+def controls(state: RobotState) -> Controls:
+    """Return the controls of the current task."""
+    task, odometry, mission = state.task, state.odometry, state.config.mission
+    match task:
+        case tasks.Orbiting():
+            return task.command or state.orbit.controls
+        case tasks.Aligning(heading) | tasks.Tangent(heading) | tasks.Turning(heading=heading):
+            return turn(odometry, heading, mission)
+        case tasks.Radial():
+            return straight(left_to_orbit(odometry, state.start, state.orbit), mission)
+        case tasks.Straight() | tasks.Backing() | tasks.Circling():
+            return _seeking(task, odometry, mission)
+        case (
+            tasks.ThirdPoint()
+            | tasks.LastManoeuvre()
+            | tasks.Returning()
+            | tasks.Surveying()
+            | tasks.Retreating()
+        ):
+            return task.command
+        case tasks.Homing(place):
+            return homing(place, odometry, mission, state.estimator.pose_tolerance) or REST
+        case tasks.Travelling(place):
+            return towards(place, odometry, mission, state.estimator.pose_tolerance) or REST
+        case tasks.Sweeping((place, *_)) | tasks.Looping((place, *_)):
+            way = towards(place, odometry, mission, state.estimator.pose_tolerance) or REST
+            return Controls(min(way.v, sweep_speed(mission)), way.omega)
+        case _:
+            return REST
+
+
+def _seeking(
+    task: tasks.Straight | tasks.Backing | tasks.Circling, odometry: Pose, mission: Mission
+) -> Controls:
+    """Return the controls of a search for a second range to a beacon."""
+    step = step_length(task.beacon, task.rho0, mission)
+    match task:
+        case tasks.Straight():
+            return straight(step - travelled(task.origin, odometry), mission)
+        case tasks.Backing():
+            return straight(-step - distance_ahead(task.origin, odometry), mission)
+        case tasks.Circling():
+            part = inside_arc(task.rho0, step, mission.sensing_range) / mission.period
+            omega = min(mission.max_turn_rate, part, mission.max_speed / step)
+            return Controls(omega * step, omega)
+
+
+def homing(place: Pose, pose: Pose, mission: Mission, tolerance: float) -> Controls | None:
+    """Return the controls from `pose` to `place`, or None once the robot is there.
+
+    The robot drives backward if that needs the smaller turn. `tolerance` is `Estimator.pose_tolerance`.
+    """
+    distance = travelled(pose, place)
+    if distance <= tolerance * mission.first_straight:
+        return None
+    bearing_error = wrap(math.atan2(place.y - pose.y, place.x - pose.x) - pose.heading)
+    forward = abs(bearing_error) <= math.pi / 2
+    remaining_turn = bearing_error if forward else wrap(bearing_error + math.pi)
+    if abs(remaining_turn) > tolerance:
+        return turn(pose, pose.heading + remaining_turn, mission)
+    return straight(distance if forward else -distance, mission)
+
+
+def towards(place: Place, odometry: Pose, mission: Mission, tolerance: float) -> Controls | None:
+    """Return the controls from the pose `odometry` to `place`: a turn, then straight on; None on arrival.
+
+    `tolerance` is `Estimator.pose_tolerance`.
+    """
+    dx, dy = place[0] - odometry.x, place[1] - odometry.y
+    distance = math.hypot(dx, dy)
+    if distance <= tolerance * mission.first_straight:
+        return None
+    bearing = wrap(math.atan2(dy, dx) - odometry.heading)
+    # a tick of driving that begins with a small error of the heading ends beside the place by that error
+    if abs(bearing) > max(tolerance, ASIDE * mission.first_straight / distance):
+        return turn(odometry, odometry.heading + bearing, mission)
+    return straight(distance, mission)
+
+
+def pursuit(local: Pose, orbit: Orbit, mission: Mission) -> Controls:
+    """Return the controls that lead back to the orbit after odometry or actuation noise (pure pursuit).
+
+    The robot drives an arc to the point of the orbit LOOKAHEAD ticks ahead. On the orbit, this is eq. (6).
+    """
+    ahead = math.atan2(local.y, local.x) + LOOKAHEAD * orbit.omega * mission.period
+    x, y = orbit.radius * math.cos(ahead) - local.x, orbit.radius * math.sin(ahead) - local.y
+    omega = 2.0 * wrap(math.atan2(y, x) - local.heading) / (LOOKAHEAD * mission.period)
+    limit = mission.max_turn_rate
+    return Controls(orbit.v, min(max(omega, -limit), limit))
+
+
+def turn(pose: Pose, heading: float, mission: Mission) -> Controls:
+    """Return the controls of a turn on the spot towards `heading`, limited to one tick."""
+    rate = (heading - pose.heading) / mission.period
+    if rate == 0.0:
+        return REST
+    return Controls(0.0, math.copysign(min(abs(rate), mission.max_turn_rate), rate))
+
+
+def straight(distance: float, mission: Mission) -> Controls:
+    """Return the controls of a straight by `distance` m (backward if negative), limited to one tick."""
+    speed = distance / mission.period
+    return Controls(math.copysign(min(abs(speed), mission.max_speed), speed), 0.0)
