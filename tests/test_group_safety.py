@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agent.planning.passing import BLOCKED_AFTER, YIELDS, Bypass, leeway, passed, yielding
+from agent.planning.agenda import Bypass
 from agent.planning.tasks import Orbiting, Travelling
+from agent.planning.visit import BLOCKED_AFTER, YIELDS, leeway, passed, yielding
 from compose.audit.rules import audit_run
 from compose.launch.in_process import run_mission
 from compose.recording.closest_approach import nearest

@@ -20,9 +20,9 @@ from msgspec.structs import replace
 from agent.estimation.claim import is_definite
 from agent.estimation.gaussian.contact_fit import ContactRanges, estimated
 from agent.estimation.gaussian.odometry_noise import Track, track
+from agent.planning.agenda import Contacted
 from agent.planning.assured import Assured
 from agent.planning.group import GroupPlanner
-from agent.planning.group_knowledge import Contacted
 from agent.planning.state import RobotState
 from agent.planning.unanchored import UnanchoredPlanner
 from agent.process.agent_journal import Step
@@ -33,9 +33,7 @@ from compose.launch.in_process import run_mission
 from compose.recording.claim_errors import nees
 from compose.recording.recording_files import agent_journal
 from compose.recording.run import Run, of_frames
-from protocol.messages import (
-    Contact as Detection,
-)
+from protocol.messages import Contact as Detection
 from protocol.messages import (
     Estimate,
     Localised,
@@ -264,11 +262,11 @@ def in_search(run: Run, peers: tuple[str, ...], shift: float) -> RobotState | No
     state, changed = planner.start(agent.config), False
     for one in agent.steps:
         state = planner.observe(state, one.observation)
-        fix = state.fix
+        fix = state.agenda.fix
         if not changed and fix is not None and state.config.peer == "c" and state.in_contact:
             pose = replace(fix.claim.pose, x=fix.claim.pose.x + shift)
             fix = replace(fix, peers=peers, claim=replace(fix.claim, pose=pose))
-            state, changed = replace(state, fix=fix), True
+            state, changed = state.with_agenda(fix=fix), True
         state = planner.decide(state, of_robots(one))
         if state.sweeps:
             return state
@@ -298,13 +296,13 @@ def test_a_claim_that_later_ranges_contradict_is_withdrawn_in_the_search_and_no_
     state = planner.start(agent.config)
     for one in agent.steps[: first + 1]:
         if one.observation.tick == first:
-            assert state.fix is not None
-            claim = state.fix.claim
+            assert state.agenda.fix is not None
+            claim = state.agenda.fix.claim
             claim = replace(claim, pose=replace(claim.pose, x=claim.pose.x + shift))
-            state = replace(state, fix=replace(state.fix, claim=claim, peers=peers))
+            state = state.with_agenda(fix=replace(state.agenda.fix, claim=claim, peers=peers))
         state = planner.observe(state, one.observation)
         state = planner.decide(state, of_robots(one))
-    assert (state.own_pose.reference is not None) == (shift == 0.0)
+    assert (state.agenda.own_pose.reference is not None) == (shift == 0.0)
     if shift == 0.0 or len(peers) > 1:
         assert isinstance(planner.command(state).verdict, Localised)
         assert state.sweeps
@@ -312,9 +310,9 @@ def test_a_claim_that_later_ranges_contradict_is_withdrawn_in_the_search_and_no_
     command = planner.command(state)
     assert command.verdict is None
     assert command.task in ("aligning", "radial", "orbiting")
-    assert isinstance(state.failure, Undecided)
-    assert state.failure.reason.startswith("its ranges since its claim contradict it by ")
-    assert planner.report_to(state, state.config.peer).verdict == state.failure
+    assert isinstance(state.agenda.failure, Undecided)
+    assert state.agenda.failure.reason.startswith("its ranges since its claim contradict it by ")
+    assert planner.report_to(state, state.config.peer).verdict == state.agenda.failure
 
 
 def test_a_robot_that_takes_a_finder_anew_receives_the_manoeuvres_since_the_reference_again() -> None:
@@ -577,8 +575,8 @@ def test_a_robot_that_reports_another_reference_in_each_tick_costs_an_estimate_i
         report = Report(tick, "b", 2, "looping", since=here, through=tick, runs=runs, prior=prior)
         assert planner.malformed(report) is None
         state = planner.decide(state, [report])
-        assert isinstance(state.found, Contacted)
-        estimates.add(state.found.estimated_tick)
+        assert isinstance(state.agenda.found, Contacted)
+        estimates.add(state.agenda.found.estimated_tick)
     assert 5 <= len(estimates) <= 20
 
 

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from agent.planning import confirmation, exchange, group_transitions, noisy_search, sweep, visit
+from agent.planning import appointments, confirmation, exchange, meetings, noisy_search, sweep, visit
 from agent.planning.exchange import LogPlanner
 from agent.planning.meeting_planner import MeetingPlanner
 from agent.planning.planner import Planner, Summary
@@ -68,24 +68,24 @@ class GroupPlanner(Planner[RobotState, Report]):
     def observe(self, state: RobotState, observation: Observation) -> RobotState:
         """Return `state` with the sensor data of one tick, ranges to all robots of the group included."""
         before, state = state, self.pair_planner.observe(state, observation)
-        if state.in_contact and (before.alone or group_transitions.refused(before, state.config.peer)):
+        if state.in_contact and (before.agenda.alone or appointments.refused(before, state.config.peer)):
             state = replace(state, in_contact=False)
         for contact in observation.contacts:
             if contact.peer != state.config.peer and contact.range is not None:
                 other = state.other(contact.peer)
                 ranges = (*other.mutual, Ranged(observation.tick, contact.range))
                 state = state.with_other(contact.peer, replace(other, mutual=ranges))
-        if state.visiting and _is_out_of_range_again(before, state):
+        if state.agenda.visiting and _is_out_of_range_again(before, state):
             state = replace(state, task=Travelling(visit.stop(state)))
-        state = group_transitions.passing_others(state, observation.contacts)
-        if isinstance(state.task, Travelling) and not state.in_contact and not state.passing.places:
+        state = visit.passing_others(state, observation.contacts)
+        if isinstance(state.task, Travelling) and not state.in_contact and not state.agenda.passing.places:
             state = visit.searching(state)
         ended = isinstance(state.task, Done)
-        unmet = state.unmet + 1 if ended and not state.in_contact else 0
-        lingering = state.lingering + 1 if ended and state.in_contact else 0
-        if (unmet, lingering) == (state.unmet, state.lingering):
+        unmet = state.agenda.unmet + 1 if ended and not state.in_contact else 0
+        lingering = state.agenda.lingering + 1 if ended and state.in_contact else 0
+        if (unmet, lingering) == (state.agenda.unmet, state.agenda.lingering):
             return state
-        return replace(state, unmet=unmet, lingering=lingering)
+        return state.with_agenda(unmet=unmet, lingering=lingering)
 
     def report(self, state: RobotState) -> Report:
         """Return the report to the peer of the present meeting."""
@@ -101,16 +101,16 @@ class GroupPlanner(Planner[RobotState, Report]):
             return noisy_search.report(state, peer)
         if peer == state.config.peer and noisy_search.is_sweeping(state):
             return self.report(state)
-        if group_transitions.refused(state, peer):
-            report = exchange.report_without_log(state, state.failure)
+        if appointments.refused(state, peer):
+            report = exchange.report_without_log(state, state.agenda.failure)
         elif peer == state.config.peer and state.meets:
             return self.report(state)
         else:
-            report = exchange.report_without_log(state, state.robot_verdict)
-            if sweep.is_helped(state, peer) and isinstance(state.robot_verdict, Localised):
-                pose = exchange.reported_pose(state, state.frame)
+            report = exchange.report_without_log(state, state.agenda.robot_verdict)
+            if sweep.is_helped(state, peer) and isinstance(state.agenda.robot_verdict, Localised):
+                pose = exchange.reported_pose(state, state.agenda.frame)
                 report = replace(report, prior=ReportedPose(state.tick, pose))
-        unconfirmed = state.config.confirms and state.fix is not None and report.verdict is None
+        unconfirmed = state.config.confirms and state.agenda.fix is not None and report.verdict is None
         return replace(report, state=UNCONFIRMED) if unconfirmed else report
 
     def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
@@ -125,46 +125,48 @@ class GroupPlanner(Planner[RobotState, Report]):
     def _met(self, state: RobotState, reports: Sequence[Report]) -> RobotState:
         """Return `state` with the decisions of the present meeting, or in the next one if it has ended."""
         for one in reports:
-            state = group_transitions.with_sender(state, one)
+            state = meetings.with_sender(state, one)
         anchored = [one.robot for one in state.config.members]
         logs = [one for one in reports if one.has_log and one.robot in anchored]  # others are in no meeting
         visitors = [one.robot for one in logs if one.state == Travelling.name]
-        before = group_transitions.answering(state, visitors)
+        before = meetings.answering(state, visitors)
         peer = before.config.peer
-        alone = not before.meets or group_transitions.refused(before, peer)
+        alone = not before.meets or appointments.refused(before, peer)
         of_peer = [] if alone else [one for one in logs if one.robot == peer]
         state = self.pair_planner.decide(before, of_peer)
         if before.verdict is None and state.verdict is not None and state.belief.phase1_done_tick is None:
-            return group_transitions.without_peer(before, state.verdict)
-        silence = state.silence + 1 if state.in_contact and not of_peer else 0
-        if silence != state.silence:
-            state = replace(state, silence=silence)
+            return meetings.without_peer(before, state.verdict)
+        silence = state.agenda.silence + 1 if state.in_contact and not of_peer else 0
+        if silence != state.agenda.silence:
+            state = state.with_agenda(silence=silence)
         if isinstance(state.verdict, Localised) and before.verdict is None:
-            state = group_transitions.with_pose(state, state.verdict)
+            state = meetings.with_pose(state, state.verdict)
         refusals = [one for one in reports if one.robot == peer and not one.has_log]
         has_failed = any(isinstance(one.verdict, Inconsistent | Undecided) for one in refusals)
         if state.verdict is None and not alone and has_failed:
-            return group_transitions.after_refusal(state)
+            return meetings.after_refusal(state)
         # exact robots claim within a tick of each other, and wait for each other's verdict
         left = any(
             one.state == UNCONFIRMED or (isinstance(one.verdict, Localised) and one.verdict.covariance)
             for one in refusals
         )
-        return group_transitions.onward(state, peer_has_left=left or has_failed)
+        return meetings.onward(state, peer_has_left=left or has_failed)
 
     def command(self, state: RobotState) -> Command:
         """Return the command for the next tick, with the phase, the task and the robot's verdict."""
-        rests, config = group_transitions.rests(state), state.config
+        rests, config = meetings.rests(state), state.config
         meets = state.meets and not rests
         command = self.pair_planner.command(state)
-        unconfirmed = config.confirms and state.robot_verdict is None and isinstance(state.verdict, Localised)
-        controls = slowed(Controls(command.v, command.omega), state.passing.leeway, config.mission)
+        unconfirmed = (
+            config.confirms and state.agenda.robot_verdict is None and isinstance(state.verdict, Localised)
+        )
+        controls = slowed(Controls(command.v, command.omega), state.agenda.passing.leeway, config.mission)
         return replace(
             command,
             v=controls.v,
             omega=controls.omega,
             task=UNCONFIRMED if unconfirmed else command.task,
-            verdict=state.robot_verdict,
+            verdict=state.agenda.robot_verdict,
             peer=config.peer if meets else None,
             role=config.role if meets else None,
             rests=rests,
@@ -177,12 +179,12 @@ class GroupPlanner(Planner[RobotState, Report]):
         planner does not compute how the noise of the odometry adds up.
         """
         estimate, latest = self.pair_planner.estimate(state), state.verdict
-        if state.fix is None:
+        if state.agenda.fix is None:
             return estimate
         return replace(
             estimate,
-            world=(compose(state.frame, state.odometry),),
-            localised=isinstance(state.robot_verdict, Localised),
+            world=(compose(state.agenda.frame, state.odometry),),
+            localised=isinstance(state.agenda.robot_verdict, Localised),
             probabilities=(),
             covariance=latest.covariance if isinstance(latest, Localised) else None,
         )

@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from agent.estimation.gaussian.claim_agreement import difference
-from agent.planning import exchange, group_transitions, own_pose, sweep
-from agent.planning.group_knowledge import Other
+from agent.planning import appointments, exchange, meetings, own_pose, sweep
+from agent.planning.agenda import Other
 from agent.planning.state import RobotState
 from agent.planning.tasks import Done, Sweeping
 from protocol.messages import Localised, Report, ReportedPose, Undecided
@@ -51,15 +51,15 @@ def is_apart(state: RobotState) -> bool:
     if not applies(state) or state.sweeps:
         return is_sweeping(state)
     assert config.sweep is not None
-    if config.part < config.sweep.parts or state.visits < len(config.visits):
+    if config.part < config.sweep.parts or state.agenda.visits < len(config.visits):
         return False
-    return isinstance(state.verdict, Localised) and isinstance(state.robot_verdict, Localised)
+    return isinstance(state.verdict, Localised) and isinstance(state.agenda.robot_verdict, Localised)
 
 
 def report(state: RobotState, peer: str) -> Report:
     """Return the report to `peer` without an anchor: the verdict, and the reference with the log since."""
-    without_log = exchange.report_without_log(state, state.robot_verdict)
-    reference = state.own_pose.reference
+    without_log = exchange.report_without_log(state, state.agenda.robot_verdict)
+    reference = state.agenda.own_pose.reference
     if reference is None:
         return without_log
     since = max(reference.tick, min(state.other(peer).acknowledged, state.log.through))
@@ -70,7 +70,7 @@ def report(state: RobotState, peer: str) -> Report:
 def decided(state: RobotState, reports: Sequence[Report]) -> RobotState:
     """Return `state` of a robot that is in no meeting, with the `reports` of others, and one tick on."""
     for one in reports:
-        state = group_transitions.with_sender(state, one)
+        state = meetings.with_sender(state, one)
         sender = state.other(one.robot)  # if it is overtaken, more is sent again
         state = state.with_other(one.robot, replace(sender, acknowledged=one.heard))
     of_peer = [one for one in reports if one.has_log and one.robot == state.config.peer]
@@ -82,11 +82,11 @@ def decided(state: RobotState, reports: Sequence[Report]) -> RobotState:
 
 def begun(state: RobotState) -> RobotState:
     """Return `state`, which begins a part of the sweep, on its way; or still, if it sweeps none."""
-    config, located = state.config, state.located
+    config, located = state.config, state.agenda.located
     assert config.sweep is not None
-    assert isinstance(state.robot_verdict, Localised)
+    assert isinstance(state.agenda.robot_verdict, Localised)
     if config.part >= config.sweep.parts:
-        return replace(state, task=Done(3, state.robot_verdict))
+        return replace(state, task=Done(3, state.agenda.robot_verdict))
     assert located is not None
     # after a visit in vain, or one that contradicts what this robot knows
     if not state.belief.pair or state.config.peer != located.config.peer:
@@ -97,9 +97,9 @@ def begun(state: RobotState) -> RobotState:
             belief=located.belief,
             peer_state=located.peer_state,
         )
-    due = replace(state.own_pose, estimated_tick=None, reference=None)
-    state = own_pose.updated(replace(state, own_pose=due))
-    part, anchor = (config.part + state.parts - 1) % config.sweep.parts, config.anchor
+    due = replace(state.agenda.own_pose, estimated_tick=None, reference=None)
+    state = own_pose.updated(state.with_agenda(own_pose=due))
+    part, anchor = (config.part + state.agenda.parts - 1) % config.sweep.parts, config.anchor
     path = surveyed_path(
         config.sweep,
         part,
@@ -107,7 +107,7 @@ def begun(state: RobotState) -> RobotState:
         (anchor.x, anchor.y),
         own_pose.beacon_place(state),
     )
-    return replace(state, task=Sweeping(sweep.transformed(inverse(state.frame), path)))
+    return replace(state, task=Sweeping(sweep.transformed(inverse(state.agenda.frame), path)))
 
 
 # --- contacts -----------------------------------------------------------------------------------------
@@ -130,17 +130,17 @@ def _onward(state: RobotState) -> RobotState:
     )
     if not sweep.is_over(state):
         return state
-    assert state.robot_verdict is not None
-    state = replace(_with_reference(state, None), task=Done(phase, state.robot_verdict))
-    following = group_transitions.next_visit(state)
+    assert state.agenda.robot_verdict is not None
+    state = replace(_with_reference(state, None), task=Done(phase, state.agenda.robot_verdict))
+    following = appointments.next_visit(state)
     return begun(following) if following.sweeps else following
 
 
 def _with_contact(state: RobotState) -> RobotState:
     """Return `state` with a reference if a contact has begun in this tick, and without one at its end."""
     ticks = [_ticks_since(state, one) for one in _helped(state)]
-    searched = state.own_pose.searched_tick
-    if state.own_pose.reference is not None:
+    searched = state.agenda.own_pose.searched_tick
+    if state.agenda.own_pose.reference is not None:
         return _with_reference(state, None) if all(since > LINGER for since in ticks) else state
     if 0 not in ticks or (searched is not None and state.tick - searched <= LINGER):
         return state
@@ -149,7 +149,7 @@ def _with_contact(state: RobotState) -> RobotState:
 
 
 def _with_reference(state: RobotState, reference: ReportedPose | None) -> RobotState:
-    return replace(state, own_pose=replace(state.own_pose, reference=reference))
+    return state.with_agenda(own_pose=replace(state.agenda.own_pose, reference=reference))
 
 
 def _agreed(state: RobotState, reference: ReportedPose) -> RobotState:
@@ -158,7 +158,7 @@ def _agreed(state: RobotState, reference: ReportedPose) -> RobotState:
     The ranges since the claim may have ruled out the hypothesis on which it rests. A claim from a single
     meeting is then withdrawn. If several meetings agree on the claim, there is no reference.
     """
-    fix, mission = state.fix, state.config.mission
+    fix, mission = state.agenda.fix, state.config.mission
     assert fix is not None
     now = Localised(reference.pose, reference.covariance)
     off = difference(fix.claim, fix.tick, now, reference.tick, state.log, mission)
@@ -167,7 +167,7 @@ def _agreed(state: RobotState, reference: ReportedPose) -> RobotState:
     if len(fix.peers) > 1:
         return state
     why = f"its ranges since its claim contradict it by {off.position:.3g} m and {off.heading:.3g} rad"
-    return group_transitions.withdrawn(state, Undecided(f"{why} (p = {off.p_value:.2g})"))
+    return meetings.withdrawn(state, Undecided(f"{why} (p = {off.p_value:.2g})"))
 
 
 def _helped(state: RobotState) -> list[str]:
@@ -185,7 +185,7 @@ def _ticks_since(state: RobotState, robot: str) -> int:
 
 def _stops_for(state: RobotState, robot: str) -> bool:
     """Return whether this robot stops for `robot`: it has just passed it, and knows its own pose well."""
-    reference, mission = state.own_pose.reference, state.config.mission
+    reference, mission = state.agenda.own_pose.reference, state.config.mission
     covariance = reference.covariance if reference is not None else None
     if covariance is None or covariance.position_sigma > WORTH * mission.accuracy:
         return False

@@ -17,7 +17,7 @@ from agent.estimation.gaussian.contact_fit import ContactRanges, estimated
 from agent.estimation.gaussian.inference import path_of
 from agent.peer.motion_log import MotionLog
 from agent.planning import sweep
-from agent.planning.group_knowledge import Contacted, Finder
+from agent.planning.agenda import Contacted, Finder
 from agent.planning.state import RobotState
 from agent.planning.tasks import Awaiting, Done, Looping, Standing, Sweeping
 from protocol.messages import Localised, Observation, Ranged, Report
@@ -45,7 +45,7 @@ def ranged(state: RobotState, observation: Observation) -> RobotState:
 
 def decided(state: RobotState, reports: Sequence[Report]) -> RobotState:
     """Return `state` with the data in `reports`, and with a verdict if they determine the own pose."""
-    found = state.found
+    found = state.agenda.found
     assert isinstance(found, Contacted)
     for report in reports:
         if (prior := report.prior) is not None and prior.covariance is not None:
@@ -57,7 +57,7 @@ def decided(state: RobotState, reports: Sequence[Report]) -> RobotState:
             found = replace(found, failure=why)
     found, claim = _estimated(state, found)
     if claim is not None:
-        return replace(state, task=Done(3, claim), found=found)
+        return replace(state, task=Done(3, claim)).with_agenda(found=found)
     return _moved_on(state, found)
 
 
@@ -123,10 +123,10 @@ def _moved_on(state: RobotState, found: Contacted) -> RobotState:
     """Return `state` after a tick: in a loop while an accurate finder reports, else standing."""
     finder, mission = found.finder, state.config.mission
     if finder is None:
-        return replace(state, task=Awaiting(), found=found)
+        return replace(state, task=Awaiting()).with_agenda(found=found)
     if finder.latest <= state.tick - _kept(state):
-        return replace(state, task=Awaiting(), found=replace(found, finder=None, estimate=None))
-    state = replace(state, found=found)
+        return replace(state, task=Awaiting()).with_agenda(found=replace(found, finder=None, estimate=None))
+    state = state.with_agenda(found=found)
     if finder.covariance.position_sigma > mission.accuracy:
         return replace(state, task=Standing())
     if isinstance(state.task, Looping):

@@ -56,7 +56,7 @@ SMALLEST_LOSS = 1e-6
 
 def updated(state: RobotState) -> RobotState:
     """Return `state` with a new estimate of the pose, if one is due."""
-    before = state.own_pose.estimated_tick
+    before = state.agenda.own_pose.estimated_tick
     ranged = bool(state.log.ranges) and state.log.ranges[-1].tick == state.tick
     ranged |= bool(state.mutual) and state.mutual[-1].tick == state.tick
     if before is not None and state.tick - before < (REFIT_WITH_RANGES if ranged else REFIT):
@@ -74,7 +74,7 @@ def searched(state: RobotState) -> tuple[RobotState, ReportedPose | None]:
     scored, judged = _estimate(state, searched=True)
     state = _with_estimate(state, scored, judged)
     reference = _reference(state, judged)
-    return replace(state, own_pose=replace(state.own_pose, searched_tick=state.tick)), reference
+    return state.with_agenda(own_pose=replace(state.agenda.own_pose, searched_tick=state.tick)), reference
 
 
 def beacon_place(state: RobotState) -> Place:
@@ -104,19 +104,19 @@ def _estimate(state: RobotState, *, searched: bool) -> tuple[tuple[Hypothesis, .
 def _measured(state: RobotState) -> JointMeasurements:
     """Return the measurements of the latest meeting: all until its claim, and some of the later ranges."""
     measured = inference.pair_of(state)
-    claimed = state.located.tick if state.located is not None else -1
+    claimed = state.agenda.located.tick if state.agenda.located is not None else -1
     return measured.thinned_after(claimed, MOST_WEIGHED)
 
 
 def _with_estimate(state: RobotState, scored: Sequence[Hypothesis], judged: Judged | None) -> RobotState:
     """Return `state` with an estimate. The places to which the robot drives stay where they are in <W>."""
-    before = state.own_pose
+    before = state.agenda.own_pose
     if judged is None:
-        return replace(state, own_pose=replace(before, estimated_tick=state.tick))
+        return state.with_agenda(own_pose=replace(before, estimated_tick=state.tick))
     now = judged.localised
     assert now.covariance is not None
     framed = state.with_frame(now.pose)
-    turn, task = compose(inverse(framed.frame), state.frame), state.task
+    turn, task = compose(inverse(framed.agenda.frame), state.agenda.frame), state.task
     if isinstance(task, Sweeping):
         task = Sweeping(sweep.transformed(turn, task.places))
     elif isinstance(task, Looping):
@@ -131,12 +131,12 @@ def _with_estimate(state: RobotState, scored: Sequence[Hypothesis], judged: Judg
         sigma=now.covariance.position_sigma,
         ranges_when_lost=before.ranges if was_lost and ranges > before.ranges else before.ranges_when_lost,
     )
-    return replace(framed, belief=belief, task=task, own_pose=own_pose)
+    return replace(framed, belief=belief, task=task).with_agenda(own_pose=own_pose)
 
 
 def _reference(state: RobotState, judged: Judged | None) -> ReportedPose | None:
     """Return the pose that was `judged` if the robot may report it (see `searched`); None if not."""
-    own_pose = state.own_pose
+    own_pose = state.agenda.own_pose
     if judged is not None and own_pose.ranges_when_lost is not None:
         required = own_pose.ranges_when_lost + RANGES_AGAIN
         judged = judged._replace(ranges=own_pose.ranges, required=required)

@@ -79,17 +79,11 @@ def next_part(state: RobotState) -> RobotState:
     assert config.sweep is not None
     for robot in config.unanchored:
         state = state.with_other(robot, replace(state.other(robot), failed=False))
-    part = (config.part + state.parts) % config.sweep.parts
+    part = (config.part + state.agenda.parts) % config.sweep.parts
     path = config.sweep.path(part, config.mission.sensing_range)
-    task = Sweeping(transformed(inverse(state.frame), path))
-    return replace(
-        state,
-        task=task,
-        parts=state.parts + 1,
-        part_tick=state.tick,
-        visiting=False,
-        unmet=0,
-        silence=0,
+    task = Sweeping(transformed(inverse(state.agenda.frame), path))
+    return replace(state, task=task).with_agenda(
+        parts=state.agenda.parts + 1, part_tick=state.tick, visiting=False, unmet=0, silence=0
     )
 
 

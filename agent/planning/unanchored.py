@@ -24,7 +24,7 @@ from agent.estimation.judged import sufficient_mutual_ranges
 from agent.estimation.resection import RangedPlace
 from agent.peer import peer_state
 from agent.planning import drive, exchange, noisy_unanchored, sweep
-from agent.planning.group_knowledge import Contacted, Resected
+from agent.planning.agenda import Contacted, Resected
 from agent.planning.planner import Planner, Summary
 from agent.planning.state import RobotState
 from agent.planning.sweep import LOOPS_FOR
@@ -63,16 +63,16 @@ class UnanchoredPlanner(Planner[RobotState, Report]):
         """Return the state of a robot that has measured nothing yet. Raises NoKernel."""
         state = RobotState(config, task=Awaiting())
         if not state.estimator.corrects_poses:
-            return replace(state, found=Resected())
+            return state.with_agenda(found=Resected())
         library()  # it is needed when the robot is found, and would end the mission then
-        return replace(state, found=Contacted())
+        return state.with_agenda(found=Contacted())
 
     def observe(self, state: RobotState, observation: Observation) -> RobotState:
         """Return `state` with the odometry and the ranges of one tick."""
         state = exchange.observed(state, observation)
         if state.verdict is not None:
             return state
-        match state.found:
+        match state.agenda.found:
             case Contacted():
                 return noisy_unanchored.ranged(state, observation)
             case Resected(base=base) as found:
@@ -85,7 +85,7 @@ class UnanchoredPlanner(Planner[RobotState, Report]):
                 }
                 first = observation.tick - KEPT
                 recent = {key: contact for key, contact in found.ranges.items() if key[1] > first}
-                return replace(state, found=replace(found, ranges={**recent, **new})) if new else state
+                return state.with_agenda(found=replace(found, ranges={**recent, **new})) if new else state
         raise AssertionError
 
     def report(self, state: RobotState) -> Report:
@@ -98,7 +98,7 @@ class UnanchoredPlanner(Planner[RobotState, Report]):
         With exact sensors, a robot by which it knows a pose does not stop any longer.
         """
         report = self.report(state)
-        match state.found:
+        match state.agenda.found:
             case Contacted(finder) if finder is not None and finder.robot == peer:
                 return replace(report, heard=finder.log.through)
             case Resected(candidates=candidates) if state.verdict is None and peer in candidates:
@@ -109,7 +109,7 @@ class UnanchoredPlanner(Planner[RobotState, Report]):
         """Return `state` with the data in `reports`, and with a verdict if they determine the own pose."""
         if state.verdict is not None:
             return state
-        match state.found:
+        match state.agenda.found:
             case Contacted() as found:
                 if state.elapsed >= state.config.gives_up:
                     return state.undecided(found.failure)
@@ -137,7 +137,7 @@ class UnanchoredPlanner(Planner[RobotState, Report]):
             world=(),
             localised=isinstance(state.verdict, Localised),
         )
-        match state.found:
+        match state.agenda.found:
             case Contacted(estimate=latest) as found:
                 if latest is None or (found.estimated_tick != state.tick and state.verdict is None):
                     return estimate
@@ -171,7 +171,7 @@ class UnanchoredPlanner(Planner[RobotState, Report]):
 
     def summary(self, state: RobotState) -> Summary:
         """Return the number of possible poses; with noisy sensors also what prevents a claim."""
-        match state.found:
+        match state.agenda.found:
             case Resected() as found:
                 return Summary(hypotheses=len(found.possible) or len(found.candidates) or None)
             case Contacted(estimate=estimate) as found:
@@ -202,8 +202,8 @@ def _decided(state: RobotState, found: Resected, reports: Sequence[Report]) -> R
             places[report.robot, prior.tick] = RangedPlace((prior.pose.x, prior.pose.y), odometry, distance)
     if places.keys() != found.places.keys():
         state = _resected(state, replace(found, ranges=ranges, places=places))
-    assert isinstance(state.found, Resected)
-    return _moved_on(state, state.found) if state.verdict is None else state
+    assert isinstance(state.agenda.found, Resected)
+    return _moved_on(state, state.agenda.found) if state.verdict is None else state
 
 
 def _now(state: RobotState, found: Resected, base: Pose) -> Pose:
@@ -221,14 +221,14 @@ def _resected(state: RobotState, found: Resected) -> RobotState:
             positions = resection.positions(standing, LARGEST_MISFIT)
             if len(positions) == 1 and resection.is_fixed(standing, positions[0]):
                 task = sweep.looping(state.odometry, state.config.mission, state.tick)
-                return replace(state, task=task, found=found)
+                return replace(state, task=task).with_agenda(found=found)
         elif moved and (possible := resection.poses(standing, moved, LARGEST_MISFIT)):
             found = replace(found, possible=possible)
             if resection.is_certain(standing, moved, possible):
                 state, found = _with_candidate(state, found, robot)
                 if state.verdict is not None:
                     break
-    return replace(state, found=found)
+    return state.with_agenda(found=found)
 
 
 def _with_candidate(state: RobotState, found: Resected, robot: str) -> tuple[RobotState, Resected]:
@@ -274,4 +274,4 @@ def _moved_on(state: RobotState, found: Resected) -> RobotState:
     if latest > state.tick - KEPT and since > state.tick - LOOPS_FOR:
         return replace(state, task=sweep.looping(state.odometry, mission, since))
     found = Resected(state.odometry, candidates=found.candidates)
-    return replace(state, task=Standing() if found.candidates else Awaiting(), found=found)
+    return replace(state, task=Standing() if found.candidates else Awaiting()).with_agenda(found=found)

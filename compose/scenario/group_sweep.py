@@ -19,7 +19,7 @@ from protocol.sweep_ticks import part_ticks, straight_ticks, sweepers_of_part, t
 from world.scenario import PlannedMeeting, PlannedSweep
 
 LEAVING_TICKS = 10
-"""The bound on the ticks after a meeting until a robot goes on (see `group_transitions.PARTED_AFTER`)."""
+"""The bound on the ticks after a meeting until a robot goes on (see `meetings.PARTED_AFTER`)."""
 
 LEAVES_WITHIN = 2.0
 """The largest distance from the anchor of its last meeting at which a robot goes on, in units of R."""

@@ -1,8 +1,10 @@
-"""The knowledge of a robot of a group besides its present meeting: of others, and by earlier meetings."""
+"""The agenda of a robot of a group: what it knows and does beyond its present meeting."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from typing import Any
 
 import msgspec
 
@@ -10,7 +12,7 @@ from agent.estimation.gaussian.contact_fit import ContactEstimate
 from agent.estimation.knowledge import Knowledge
 from agent.estimation.resection import RangedPlace
 from agent.peer.motion_log import MotionLog
-from protocol.messages import Localised, Ranged, ReportedPose
+from protocol.messages import Localised, Ranged, ReportedPose, Verdict
 from protocol.motion import ORIGIN, Covariance, Pose
 
 
@@ -28,8 +30,8 @@ class Other(msgspec.Struct, frozen=True):
     to confirm it."""
     travels: bool = False
     """True if it drives to another robot, by its latest report. It counts only with a safety distance."""
-    missed: int | None = None
-    """The latest tick in which this robot has not found it where it should wait; None if there is none."""
+    missed: int = -1
+    """The latest tick in which this robot has not found it where it should wait; -1 if there is none."""
     acknowledged: int = 0
     """The last tick of this robot's manoeuvres that it has acknowledged, if it has no anchor."""
 
@@ -123,3 +125,75 @@ class Contacted(msgspec.Struct, frozen=True):
     """The number of ranges to the finder at the latest estimate."""
     failure: str = "no localised robot has found it"
     """The reason for which it has no claim yet."""
+
+
+# --- all of it ---
+
+
+class Bypass(msgspec.Struct, frozen=True):
+    """The passing of robots of other meetings."""
+
+    leeway: float = math.inf
+    """The length in m that the robot may drive in the next tick."""
+    blocked: int = 0
+    """The number of consecutive ticks in which it has hardly moved on its way."""
+    yielded: int = 0
+    """The number of consecutive ticks in which it has stood still, to let another one go first."""
+    detours: int = 0
+    """The number of times that it has driven aside."""
+    places: tuple[tuple[float, float], ...] = ()
+    """The ends of the straights of the way aside, in m in the frame of the odometry."""
+
+
+class Agenda(msgspec.Struct, frozen=True):
+    """What a robot of a group knows and does beyond its present meeting."""
+
+    meeting: int = 0
+    """The number of the present meeting; that of the first is 0."""
+    own: Any = None
+    """The number of the meeting, and the state in it, of a planner of the user; None with `assured`."""
+    robot_verdict: Verdict | None = None
+    """The verdict over all meetings: the pose that the robot claims, or why it claims none.
+
+    It is None again when another meeting contradicts that one.
+    """
+    fix: Fix | None = None
+    """The pose that the robot knows, and by which it drives; None until a meeting has determined it."""
+    located: Knowledge | None = None
+    """The knowledge at its claim in the latest meeting in which it was localised."""
+    confirming: Confirming = Confirming()
+    """The meetings that confirm that pose, if a claim of it needs several peers."""
+    found: Resected | Contacted | None = None
+    """The knowledge of a robot without an anchor by those that are localised; None with an anchor."""
+    failure: Verdict | None = None
+    """The verdict of the latest meeting that has failed before the robot was localised."""
+    frame: Pose = ORIGIN
+    """The pose in <W> of the odometry's frame, from the latest meeting in which the robot was localised."""
+    framed_at: Pose = ORIGIN
+    """The odometry where `frame` was determined. An error of its heading turns ways about this place."""
+    own_pose: OwnPose = OwnPose()
+    """The accuracy of its pose while it sweeps, with noisy sensors."""
+    others: Mapping[str, Other] = {}
+    """The knowledge about each robot that this one has been in range of, or heard of."""
+    visits: int = 0
+    """The number of planned visits that the robot has begun or left out."""
+    retries: int = 0
+    """The number of retries whose time has come."""
+    parts: int = 0
+    """The number of parts of an area that the robot has begun to sweep for robots without an anchor."""
+    part_tick: int = -1
+    """The tick in which it began the latest of them."""
+    until: float | None = None
+    """The time in s at which the search of a retry ends; None if there is none."""
+    alone: bool = False
+    """True if the robot is at its anchor, or on its way there, and in no meeting until a visitor comes."""
+    visiting: bool = False
+    """True if the present meeting is a visit: the robot knows its pose already."""
+    unmet: int = 0
+    """The number of consecutive ticks out of range of the peer since this robot's verdict in the meeting."""
+    lingering: int = 0
+    """The number of consecutive ticks in range of the peer since the end of their meeting."""
+    silence: int = 0
+    """The number of consecutive ticks in range of the peer without a log of it."""
+    passing: Bypass = Bypass()
+    """The way past robots of other meetings, if the mission has a safety distance."""

@@ -1,0 +1,194 @@
+"""The meetings of a robot of a group: how they begin and end, and the pose that the robot knows by them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from msgspec.structs import replace
+
+from agent.estimation.gaussian.claim_agreement import difference
+from agent.planning import appointments, sweep, visit
+from agent.planning.agenda import Fix
+from agent.planning.state import RobotState
+from agent.planning.tasks import UNCONFIRMED, Done, Travelling
+from protocol.messages import Localised, Report, Undecided, Verdict
+
+PARTED_AFTER = 8
+"""The ticks out of range of a peer after which a robot whose meeting has ended goes on.
+
+In range, it waits for the verdict of the peer. Out of range, it may have missed it; the peer, which has left,
+has received that of this robot before.
+"""
+
+LINGERING = 6
+"""The ticks in contact for which a visited robot waits for its visitor to leave, with a safety distance."""
+
+
+def with_sender(state: RobotState, report: Report) -> RobotState:
+    """Return `state` with what `report` says about its sender: whether it travels, is localised or served.
+
+    If poses have to be confirmed, a robot that travels need not have claimed its own.
+    """
+    known, travels, confirms = (
+        state.other(report.robot),
+        report.state == Travelling.name,
+        state.config.confirms,
+    )
+    claims = not report.has_log and isinstance(report.verdict, Localised)
+    localised = known.localised or claims or (travels and not confirms)
+    served = known.served or (report.state == UNCONFIRMED and not confirms)
+    if (travels, localised, served) == (known.travels, known.localised, known.served):
+        return state
+    return state.with_other(report.robot, replace(known, travels=travels, localised=localised, served=served))
+
+
+def answering(state: RobotState, visitors: Sequence[str]) -> RobotState:
+    """Return `state` in a meeting with one of `visitors`, which have come to it, if it waits for one."""
+    if not state.waits or state.belief.phase1_done_tick is None:
+        return state
+    if state.config.peer in visitors and not (
+        state.agenda.alone or appointments.refused(state, state.config.peer)
+    ):
+        # a robot that searches for its peer must not wait for that one's manoeuvre while it waits for its own
+        return appointments.waiting(state, state.config.peer) if state.config.role == "a" else state
+    if appointments.is_met(state):
+        return state
+    for visitor in visitors:
+        if not appointments.refused(state, visitor):
+            return appointments.waiting(state, visitor)
+    return state
+
+
+def with_pose(state: RobotState, claim: Localised) -> RobotState:
+    """Return `state` of a robot that has determined its pose in the present meeting, and knows it now.
+
+    It claims the pose, unless others have to confirm it. If this contradicts the pose that it knows, one of
+    two peers has reported false data. A pose on which several meetings agree stays. One that follows from a
+    single meeting is withdrawn, because nothing tells which of the two it was, and the robot waits for a
+    third one. A planner of the user claims its pose once.
+    """
+    if state.agenda.own is not None and state.agenda.fix is not None:
+        return state
+    peer, fix, known = state.config.peer, state.agenda.fix, state.knowledge
+    if state.config.confirms:
+        earlier = [one for one in state.agenda.confirming.meetings if one.config.peer != peer]
+        confirming = replace(state.agenda.confirming, meetings=(*earlier, known))
+        fix = Fix(state.tick, claim, (peer,))
+        return state.with_agenda(fix=fix, located=known, confirming=confirming).with_frame(claim.pose)
+    state = state.with_other(peer, replace(state.other(peer), localised=True))
+    contradiction = _contradiction(state, claim)
+    if contradiction is None:
+        fix = Fix(state.tick, claim, (*(fix.peers if fix is not None else ()), peer))
+        state = state.with_agenda(fix=fix, located=known).with_frame(claim.pose)
+        return state if state.agenda.robot_verdict is not None else state.with_agenda(robot_verdict=claim)
+    assert fix is not None
+    if len(fix.peers) > 1:
+        return appointments.parted(state)
+    (other,) = fix.peers
+    state = state.with_other(other, replace(state.other(other), failed=True))
+    return state.with_agenda(robot_verdict=None, fix=None, located=None, failure=contradiction)
+
+
+def _contradiction(state: RobotState, claim: Localised) -> Undecided | None:
+    """Return how `claim`, of the present meeting, contradicts the known pose; None if it does not.
+
+    The claims of robots with exact sensors have no covariance, and are never wrong.
+    """
+    fix, mission = state.agenda.fix, state.config.mission
+    if fix is None or claim.covariance is None:
+        return None
+    off = difference(fix.claim, fix.tick, claim, state.tick, state.log, mission)
+    if off.p_value >= 1.0 - mission.confidence:
+        return None
+    return Undecided(
+        f"{fix.peers[-1]} and {state.config.peer} contradict each other: by their reports, its pose differs "
+        f"by {off.position:.3g} m and {off.heading:.3g} rad (p = {off.p_value:.2g})"
+    )
+
+
+def withdrawn(state: RobotState, failure: Undecided) -> RobotState:
+    """Return `state` without a claim, because of `failure`: the robot waits for another one than its peer."""
+    peer = state.config.peer
+    state = state.with_agenda(robot_verdict=None, fix=None, located=None, failure=failure, visiting=False)
+    return appointments.waiting(appointments.parted(state), peer)
+
+
+def _is_withdrawn(state: RobotState) -> bool:
+    """Return whether the present meeting contradicts an earlier one, so that the robot knows no pose."""
+    return (
+        state.agenda.fix is None
+        and state.agenda.robot_verdict is None
+        and isinstance(state.verdict, Localised)
+    )
+
+
+def without_peer(state: RobotState, failure: Verdict) -> RobotState:
+    """Return `state` without its peer, because of `failure`; a robot in phase 1 goes on with that."""
+    return appointments.parted(state.with_agenda(failure=failure))
+
+
+def after_refusal(state: RobotState) -> RobotState:
+    """Return `state` of a robot whose peer has ended their meeting, because it contradicts what it knows."""
+    if state.agenda.visiting:
+        return appointments.next_visit(appointments.parted(state))
+    failed = without_peer(state, Undecided(f"{state.config.peer} does not go on with the meeting"))
+    return failed if state.belief.phase1_done_tick is None else appointments.resumed(failed)
+
+
+def onward(state: RobotState, *, peer_has_left: bool = False) -> RobotState:
+    """Return `state` in the next meeting if the present one is over.
+
+    `peer_has_left` says that the peer has a result, and has reported it from outside the meeting.
+    """
+    peer = state.config.peer
+    over = peer_has_left or _is_over(state)
+    if _is_withdrawn(state):
+        parted = appointments.parted(state).with_agenda(visiting=False)
+        return appointments.waiting(parted, peer) if over else state
+    if state.agenda.fix is None:
+        return appointments.after_failure(state)
+    if state.sweeps:
+        assert state.agenda.robot_verdict is not None
+        swept = sweep.swept(state)
+        done = Done(state.phase, state.agenda.robot_verdict)
+        return swept or appointments.next_visit(replace(state, task=done))
+    if state.agenda.visiting and state.verdict is None:
+        if state.other(peer).localised and state.agenda.robot_verdict is not None:  # by another robot
+            return appointments.next_visit(state)
+        if visit.has_searched(state):
+            other = replace(state.other(peer), missed=state.tick)
+            return appointments.next_visit(state.with_other(peer, other))
+        if appointments.is_silent(state):
+            return appointments.next_visit(appointments.parted(state))
+        return state
+    if not isinstance(state.task, Done) or _must_linger(state):
+        return state
+    if not isinstance(state.verdict, Localised):
+        reported = state.agenda.lingering > 0 or not state.in_contact  # to the peer, before this robot leaves
+        return appointments.next_visit(appointments.parted(state)) if reported else state
+    return appointments.next_visit(state) if over else state
+
+
+def _is_over(state: RobotState) -> bool:
+    """Return whether the peer has a result in the present meeting, or is not there any more."""
+    has_left = state.agenda.unmet >= PARTED_AFTER or appointments.is_silent(state)
+    return has_left or state.peer_state.verdict is not None
+
+
+def rests(state: RobotState) -> bool:
+    """Return whether the robot has its result, its meeting is over, and it has no robot to drive to."""
+    if state.agenda.robot_verdict is None or not isinstance(state.task, Done) or _must_linger(state):
+        return False
+    return _is_over(state)
+
+
+def _must_linger(state: RobotState) -> bool:
+    """Return whether a robot whose meeting is over lets its peer leave first, as the visited one does.
+
+    If both left at once, they could be in each other's way.
+    """
+    if not state.config.mission.safety_distance or state.config.role == "a" or not state.in_contact:
+        return False
+    if state.other(state.config.peer).travels:
+        return state.agenda.lingering < appointments.PEER_LOST_AFTER
+    return state.agenda.lingering < LINGERING
