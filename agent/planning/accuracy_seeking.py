@@ -20,14 +20,25 @@ from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.odometry_noise import Track
 from agent.estimation.judged import FEWEST_FOR_CLAIM, sufficient_mutual_ranges
 from agent.estimation.posterior import Hypothesis
-from agent.planning import active_sensing, drive, exchange, phase2_orbit, range_seeking, tasks, transitions
+from agent.planning import active_sensing, drive, phase2_orbit, range_seeking, transitions
 from agent.planning.active_sensing import CONTINUED, STALLED, Objective
 from agent.planning.pair_claim import inferred, with_claim, with_consistency_test
 from agent.planning.phase3_last_manoeuvre import LAST_SPEEDS
 from agent.planning.planner import Manoeuvres
 from agent.planning.state import RobotState
 from agent.planning.strides import is_stalled, stride
-from protocol.messages import BranchKind, Localised, Observation
+from agent.planning.tasks import (
+    Beacon,
+    Homing,
+    Listening,
+    Orbital,
+    Orbiting,
+    Radial,
+    Retreating,
+    Straight,
+    Surveying,
+)
+from protocol.messages import BranchKind, Localised
 from protocol.mission import Mission, Role
 from protocol.motion import ORIGIN, REST, Controls, Pose, compose, inverse
 
@@ -61,6 +72,9 @@ OFF_RADIUS = 0.5
 DROP_OUT_SIGMAS = 3.0
 """The margin for the number of drop-outs, in standard deviations."""
 
+UNLIKELY_DROP_OUTS = 1e-3
+"""The probability of so many drop-outs in a row from which on a robot searches for its first range."""
+
 
 JointManoeuvres = Callable[
     [Sequence[PlanningHypothesis], tuple[float, float], float, Mission], tuple[Controls, Controls]
@@ -68,35 +82,32 @@ JointManoeuvres = Callable[
 """The type of `Assured.joint_manoeuvres`."""
 
 
-def observed(state: RobotState, observation: Observation) -> RobotState:
-    """Return `state` with the sensor data of one tick, and with the task that follows from them."""
-    state, anchor_range = exchange.observed(state, observation), observation.anchor_range
+def sensed(state: RobotState, ranged: bool) -> RobotState:
+    """Return `state` with the task that follows one of active sensing, or of the search for the anchor."""
     match state.task:
-        case tasks.Asleep() if anchor_range is None and state.tick >= _first_range_timeout(
-            state.config.mission
-        ):
-            return replace(
-                state, task=tasks.Straight("anchor", state.odometry, state.config.mission.sensing_range)
-            )
-        case tasks.Asleep():
-            return transitions.start_phase1(state, anchor_range)
-        case tasks.Searching("anchor"):
-            seeking = transitions.sought(state, state.task, anchor_range is not None, MANOEUVRES)
-            return seeking if seeking is not None else _continue_phase1(state)
-        case tasks.Surveying("anchor"):
-            return _continue_phase1(state) if is_planning_tick(state) else state
-        case tasks.Homing() if anchor_range is not None:
-            return _continue_phase1(state)
-        case tasks.Homing(place, side) if _is_at(state, place):
+        case Surveying("anchor"):
+            return continue_phase1(state) if is_planning_tick(state) else state
+        case Homing() if ranged:
+            return continue_phase1(state)
+        case Homing(place, side) if _is_at(state, place):
             if side is None:
-                return replace(state, task=tasks.Straight("anchor", state.odometry, 0.0))
+                return replace(state, task=Straight("anchor", state.odometry, 0.0))
             return replace(state, task=_next_side(place, side, state.config.mission))
-        case tasks.Orbital():
-            return _continue_phase2(state, anchor_range is not None)
-        case tasks.Surveying("peer") | tasks.Listening() | tasks.Retreating():
+        case Surveying("peer") | Listening() | Retreating():
             return _continue_phase3(state)
         case _:
             return state
+
+
+def without_range(state: RobotState) -> RobotState:
+    """Return `state` of a robot that has no range to its anchor yet: it waits, or searches for one.
+
+    A robot whose first ranges are drop-outs waits. If drop-outs hardly explain it, R is smaller than told.
+    """
+    mission, p = state.config.mission, state.config.mission.noise.drop_outs
+    if 0.0 < p < 1.0 and state.tick < math.ceil(math.log(UNLIKELY_DROP_OUTS) / math.log(p)):
+        return state
+    return replace(state, task=Straight("anchor", state.odometry, mission.sensing_range))
 
 
 def _is_at(state: RobotState, place: Pose) -> bool:
@@ -105,25 +116,12 @@ def _is_at(state: RobotState, place: Pose) -> bool:
     return drive.homing(place, state.odometry, mission, tolerance) is None
 
 
-def _first_range_timeout(mission: Mission) -> int:
-    """Return the tick from which on a robot without any anchor range searches for one.
-
-    A robot whose first ranges are drop-outs waits. If drop-outs hardly explain it, R is smaller than told.
-    """
-    p = mission.noise.drop_outs
-    return math.ceil(math.log(UNLIKELY_DROP_OUTS) / math.log(p)) if 0.0 < p < 1.0 else 0
-
-
-UNLIKELY_DROP_OUTS = 1e-3
-"""The probability of so many drop-outs in a row from which on a robot searches for its first range."""
-
-
 def is_planning_tick(state: RobotState) -> bool:
     """Return whether the robot plans a manoeuvre in this tick. Both robots plan in the same ticks."""
     return state.tick % stride(state.config.mission) == 0
 
 
-def _continue_phase1(state: RobotState) -> RobotState:
+def continue_phase1(state: RobotState) -> RobotState:
     """Continue phase 1: update the hypotheses about the anchor, and end phase 1 if they are accurate enough.
 
     If no hypothesis explains the ticks without detection, the ranges are misleading. The robot then takes
@@ -138,7 +136,7 @@ def _continue_phase1(state: RobotState) -> RobotState:
     if not scored or _are_misleading(state, scored[0]):
         if not ranged:
             return _return_to_anchor(state)
-        return replace(state, task=tasks.Straight("anchor", state.odometry, state.log.ranges[-1].range))
+        return replace(state, task=Straight("anchor", state.odometry, state.log.ranges[-1].range))
     mission = state.config.mission
     if inference.is_anchor_known(state, scored):
         kind: BranchKind = "circle" if len(state.log.ranges) == 2 else "three-ranges"
@@ -152,13 +150,13 @@ def _continue_phase1(state: RobotState) -> RobotState:
     since, objective = _objective(state, "anchor", (inference.own_path(state),))
     hypotheses = inference.anchor_planning_hypotheses(state)
     command = active_sensing.plan_alone(hypotheses, mission, objective=objective)
-    return replace(state, task=tasks.Surveying("anchor", command, since))
+    return replace(state, task=Surveying("anchor", command, since))
 
 
-def _objective(state: RobotState, beacon: tasks.Beacon, paths: Sequence[Track]) -> tuple[int, Objective]:
+def _objective(state: RobotState, beacon: Beacon, paths: Sequence[Track]) -> tuple[int, Objective]:
     """Return the tick of the first of the consecutive plans, and the objective of the next one."""
     match state.task:
-        case tasks.Surveying(before, _, since) if before == beacon:
+        case Surveying(before, _, since) if before == beacon:
             mission = state.config.mission
             return since, STALLED if is_stalled(paths, since, stride(mission), mission) else CONTINUED
         case _:
@@ -192,7 +190,7 @@ def _return_to_anchor(state: RobotState) -> RobotState:
     last_range_tick = state.log.ranges[-1].tick
     place = state.log.pose(ORIGIN, last_range_tick, state.config.mission.period)
     belief = replace(state.belief, own=(), encounter_tick=None, pair=(), returns=state.belief.returns + 1)
-    return replace(state, task=tasks.Homing(place), belief=belief)
+    return replace(state, task=Homing(place), belief=belief)
 
 
 def _begin_again(state: RobotState, start: Pose) -> RobotState:
@@ -201,7 +199,7 @@ def _begin_again(state: RobotState, start: Pose) -> RobotState:
     The place of the last range is on the rim of the anchor's range, which a robot misses more easily.
     """
     anchor = inverse(start)
-    return replace(_return_to_anchor(state), task=tasks.Homing(Pose(anchor.x, anchor.y, 0.0), 0))
+    return replace(_return_to_anchor(state), task=Homing(Pose(anchor.x, anchor.y, 0.0), 0))
 
 
 def _leave(state: RobotState) -> RobotState:
@@ -240,42 +238,37 @@ def _of_this_attempt(state: RobotState) -> RobotState:
     return replace(state, belief=belief)
 
 
-def _next_side(place: Pose, side: int, mission: Mission) -> tasks.Homing:
+def _next_side(place: Pose, side: int, mission: Mission) -> Homing:
     """Return the way along the side after `side` of the spiral on which a robot searches its anchor."""
     x, y = range_seeking.next_on_spiral((place.x, place.y), side, mission)
-    return tasks.Homing(Pose(x, y, 0.0), side + 1)
+    return Homing(Pose(x, y, 0.0), side + 1)
 
 
 def _start_phase2(state: RobotState) -> RobotState:
     """Start phase 2, for the first time or again."""
-    mu = phase2_orbit.orientation(state.local_pose)
-    return _continue_phase2(replace(state, task=tasks.Aligning(state.odometry.heading - mu)), False)
+    return continue_phase2(state, transitions.aligning(state), ranged=False)
 
 
-def _continue_phase2(state: RobotState, ranged: bool) -> RobotState:
+def continue_phase2(state: RobotState, task: Orbital, *, ranged: bool) -> RobotState:
     """Continue phase 2 with the latest anchor range, if `ranged`. Robot b takes ranges while it waits."""
     mission = state.config.mission
     planning = ranged and is_planning_tick(state)
-    waiting = isinstance(state.task, tasks.Orbiting) and state.orbit.v == 0.0
+    waiting = isinstance(task, Orbiting) and state.orbit.v == 0.0
     due = planning and (not waiting or inference.is_fit_due(state))
     if due and (scored := inference.own_anchor(state)):
         state = replace(state, belief=inference.with_own(state, scored))
-        if (
-            isinstance(state.task, tasks.Radial)
-            and abs(phase2_orbit.orientation(state.local_pose)) > OFF_RADIUS
-        ):
+        if isinstance(task, Radial) and abs(phase2_orbit.orientation(state.local_pose)) > OFF_RADIUS:
             return _start_phase2(state)
-    assert isinstance(state.task, tasks.Orbital)
     tolerance = state.estimator.pose_tolerance
-    task = phase2_orbit.onward(state.task, state.odometry, state.start, state.orbit, mission, tolerance)
+    task = phase2_orbit.onward(task, state.odometry, state.start, state.orbit, mission, tolerance)
     timeout: float = LOST_AFTER * stride(mission)
     if (
         state.orbit.v == 0.0
-        and isinstance(task, tasks.Radial | tasks.Orbiting)
+        and isinstance(task, Radial | Orbiting)
         and _ticks_without_range(state) >= timeout
     ):
         return _return_to_anchor(state)
-    if isinstance(task, tasks.Orbiting):
+    if isinstance(task, Orbiting):
         since = task.since or state.tick
         timeout += state.config.rendezvous.bound / mission.period
         if state.orbit.v != 0.0 and state.tick - since > timeout and not state.in_contact:
@@ -288,7 +281,7 @@ def _continue_phase2(state: RobotState, ranged: bool) -> RobotState:
             )
         else:
             command = REST if is_planning_tick(state) else task.command or REST
-        task = tasks.Orbiting(command, since)
+        task = Orbiting(command, since)
     return replace(state, task=task)
 
 
@@ -299,39 +292,27 @@ def _continue_phase3(state: RobotState) -> RobotState:
     """Continue phase 3 depending on whether the peer, and for b also its anchor, are in range."""
     ticks = stride(state.config.mission)
     match state.task:
-        case tasks.Retreating(_, since) if state.tick - since < 2 * ticks:
+        case Retreating(_, since) if state.tick - since < 2 * ticks:
             return state
-        case tasks.Retreating():
+        case Retreating():
             if not state.in_contact:
                 return _start_phase2(state)
-            return replace(state, task=tasks.Surveying("peer", since=state.tick))
+            return replace(state, task=Surveying("peer", since=state.tick))
         case _ if state.config.role == "b" and _ticks_without_range(state) >= LOST_AFTER_IN_PHASE_3 * ticks:
             return _return_to_anchor(state)
-        case tasks.Surveying(_, command) | tasks.Listening(command) if not state.in_contact:
-            return replace(
-                state, task=tasks.Retreating(Controls(0.0 - command.v, 0.0 - command.omega), state.tick)
-            )
+        case Surveying(_, command) | Listening(command) if not state.in_contact:
+            return replace(state, task=Retreating(Controls(0.0 - command.v, 0.0 - command.omega), state.tick))
         case _:
             return state
 
 
 def decided(state: RobotState, planned: JointManoeuvres) -> RobotState:
-    """Return `state`, in contact with the peer and without a verdict, with the task that follows."""
-    match state.task:
-        case tasks.Asleep():
-            return state
-        case tasks.Surveying("anchor") | tasks.Searching() | tasks.Homing():
-            return state
-        case _ if state.peer_state.start is None:
-            return state
-        case tasks.Retreating():
-            return state
-        case tasks.Surveying("peer") | tasks.Listening() if not is_planning_tick(state):
-            return state
-        case _ if not inference.peer_log_suffices(state):
-            return replace(state, task=tasks.Listening())
-        case _:
-            return _decide_phase3(state, planned)
+    """Return `state`, in contact with a peer that it has not heard of, listening, or with the next plan."""
+    if state.peer_state.start is None:
+        return state
+    if not inference.peer_log_suffices(state):
+        return replace(state, task=Listening())
+    return _decide_phase3(state, planned)
 
 
 def _decide_phase3(state: RobotState, planned: JointManoeuvres) -> RobotState:
@@ -366,7 +347,7 @@ def _decide_phase3(state: RobotState, planned: JointManoeuvres) -> RobotState:
     since, objective = _objective(state, "peer", pair.paths)
     manoeuvres = _manoeuvres(state, objective) or planned
     a, b = manoeuvres(hypotheses, inference.m2_of(state.config), state.mutual[-1].range, mission)
-    return replace(tested, task=tasks.Surveying("peer", a if role == "a" else b, since))
+    return replace(tested, task=Surveying("peer", a if role == "a" else b, since))
 
 
 def _measures_in_vain(state: RobotState, pair: JointMeasurements) -> bool:
@@ -389,6 +370,6 @@ def _drive_without_hypotheses(state: RobotState) -> RobotState:
     """Drive without hypotheses about the poses: b stands, a drives straight on (Section III.C.a)."""
     mission = state.config.mission
     if state.config.role == "b" or not state.mutual:
-        return replace(state, task=tasks.Surveying("peer", since=state.tick))
+        return replace(state, task=Surveying("peer", since=state.tick))
     step = range_seeking.step_length("peer", state.mutual[-1].range, mission)
-    return replace(state, task=tasks.Surveying("peer", Controls(step / mission.period, 0.0), state.tick))
+    return replace(state, task=Surveying("peer", Controls(step / mission.period, 0.0), state.tick))

@@ -22,8 +22,8 @@ from agent.planning import (
 )
 from agent.planning.exchange import LogPlanner
 from agent.planning.state import RobotState
-from agent.planning.tasks import Done, Orbital, Resting, Standing, Travelling, Waiting
-from protocol.messages import Command, Localised, Observation, Report
+from agent.planning.tasks import Done, Listening, Orbital, Resting, Standing, Surveying, Travelling, Waiting
+from protocol.messages import Command, Localised, Report
 from protocol.mission import Mission
 from protocol.motion import REST, Controls
 
@@ -40,31 +40,19 @@ class Assured(LogPlanner):
     MANOEUVRES = accuracy_seeking.MANOEUVRES
     ACTIVE_SENSING = True
 
-    def observe(self, state: RobotState, observation: Observation) -> RobotState:
-        """Return `state` with the sensor data of one tick, and with the task that follows from them."""
-        if state.estimator.corrects_poses:
-            return accuracy_seeking.observed(state, observation)
-        return super().observe(state, observation)
-
     def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
-        """Return `state` with the peer's `reports` and with the task that follows from them.
-
-        With exact sensors, phase 3 begins as soon as the peer's phase 1 has ended and b is far enough from
-        its anchor.
-        """
+        """Return `state` with the peer's `reports` and with the task that follows from them."""
         if reports:
             state = exchange.with_reports(state, reports)
         if not state.in_contact or isinstance(state.task, Done):
             return state
-        if state.estimator.corrects_poses:
-            return accuracy_seeking.decided(state, self.joint_manoeuvres)
         match state.task:
             case Orbital() | Travelling():
-                peer = state.peer_state
-                met = peer.phase == 3 or (peer.start is not None and state.off_anchor)
-                return transitions.begin_phase3(state) if met else state
+                return self._begin_phase3(state)
             case Resting():
                 return self._decide_phase3(state)
+            case Listening() | Surveying("peer") if accuracy_seeking.is_planning_tick(state):
+                return accuracy_seeking.decided(state, self.joint_manoeuvres)
             case _:
                 return state
 
@@ -100,12 +88,38 @@ class Assured(LogPlanner):
             and isinstance(state.task, Orbital | Travelling)
         )
 
+    def _start_phase1(self, state: RobotState, rho0: float | None) -> RobotState:
+        """Start phase 1 with the first range `rho0` in m; under noise, it may be missing by chance."""
+        if rho0 is None and state.estimator.corrects_poses:
+            return accuracy_seeking.without_range(state)
+        return transitions.start_phase1(state, rho0)
+
+    def _continue_phase2(self, state: RobotState, task: Orbital, ranged: bool) -> RobotState:
+        """Continue phase 2 from `task`; under noise, the latest range corrects the pose."""
+        if state.estimator.corrects_poses:
+            return accuracy_seeking.continue_phase2(state, task, ranged=ranged)
+        return transitions.continue_phase2(state, task)
+
+    def _sense(self, state: RobotState, ranged: bool) -> RobotState:
+        """Continue active sensing, or the search for the anchor: tasks under noise alone."""
+        return accuracy_seeking.sensed(state, ranged)
+
+    def _begin_phase3(self, state: RobotState) -> RobotState:
+        """Begin phase 3 once the peer's phase 1 has ended, and with exact sensors b is off its anchor."""
+        peer = state.peer_state
+        if state.estimator.corrects_poses:
+            return accuracy_seeking.decided(state, self.joint_manoeuvres)
+        met = peer.phase == 3 or (peer.start is not None and state.off_anchor)
+        return transitions.begin_phase3(state) if met else state
+
     def _after_range(self, state: RobotState) -> RobotState:
         """Continue phase 1 with the branches +alpha and -alpha that the ranges allow (eq. (2)).
 
         Phase 1 ends when one branch is left, and the ranges determine the anchor's position as accurately as
-        a claim needs.
+        a claim needs. Under noise, further ranges follow until they are no longer worth the time.
         """
+        if state.estimator.corrects_poses:
+            return accuracy_seeking.continue_phase1(state)
         kind = transitions.branch_kind(state)
         estimate = transitions.anchor_estimate(state)
         state = replace(state, belief=estimate.belief)

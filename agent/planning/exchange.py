@@ -14,8 +14,21 @@ from agent.peer.motion_log import MotionLog
 from agent.planning import phase1_anchor, phase3_last_manoeuvre, plausibility, separation, transitions
 from agent.planning.phase3_last_manoeuvre import Plan, Question
 from agent.planning.planner import Manoeuvres, Planner, Summary
+from agent.planning.range_seeking import moved
 from agent.planning.state import RobotState
-from agent.planning.tasks import Retreating, ThirdPoint
+from agent.planning.tasks import (
+    Asleep,
+    Done,
+    LastManoeuvre,
+    Orbital,
+    Orbiting,
+    Resting,
+    Retreating,
+    Returning,
+    Searching,
+    ThirdPoint,
+    Waiting,
+)
 from protocol.messages import (
     Command,
     Estimate,
@@ -188,14 +201,44 @@ class LogPlanner(Planner[RobotState, Report]):
 
     def observe(self, state: RobotState, observation: Observation) -> RobotState:
         """Return `state` with the sensor data of one tick, and with the task that follows from them."""
-        state = observed(state, observation)
-        return transitions.after_observation(
-            state, observation.anchor_range, self.MANOEUVRES, self._after_range
-        )
+        state, ranged = observed(state, observation), observation.anchor_range is not None
+        task, manoeuvres = state.task, self.MANOEUVRES
+        match task:
+            case Orbiting(None) | Resting() | Done():  # most ticks
+                return state
+            case Orbital():
+                return self._continue_phase2(state, task, ranged)
+            case Searching("anchor"):
+                return transitions.sought(state, task, ranged, manoeuvres) or self._after_range(state)
+            case Searching():
+                seeking = transitions.sought(state, task, state.in_contact, manoeuvres)
+                return seeking or replace(state, task=Waiting())
+            case ThirdPoint(_, origin) if moved(origin, state.odometry):
+                return self._after_range(state)
+            case LastManoeuvre(_, origin) | Returning(_, origin) if moved(origin, state.odometry):
+                return transitions.after_last_manoeuvre(state, task)
+            case Asleep():
+                return self._start_phase1(state, observation.anchor_range)
+            case _:
+                return self._sense(state, ranged)
+
+    def _start_phase1(self, state: RobotState, rho0: float | None) -> RobotState:
+        """Return `state` at the start of phase 1, with the first range `rho0` in m or without one."""
+        return transitions.start_phase1(state, rho0)
 
     def _after_range(self, state: RobotState) -> RobotState:
-        """Return `state` with the next task of phase 1, after a range to the anchor."""
+        """Return `state` with the next task of phase 1, after a second or further range to the anchor."""
         raise NotImplementedError
+
+    def _continue_phase2(self, state: RobotState, task: Orbital, ranged: bool) -> RobotState:
+        """Return `state` with the task that follows `task`; `ranged` if it has a new range to its anchor."""
+        del ranged
+        return transitions.continue_phase2(state, task)
+
+    def _sense(self, state: RobotState, ranged: bool) -> RobotState:
+        """Return `state` with the task that follows one that the paper does not have."""
+        del ranged
+        return state
 
     def report(self, state: RobotState) -> Report:
         """Return the report of this tick: the part of the log that the peer has not acknowledged.

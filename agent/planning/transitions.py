@@ -10,48 +10,11 @@ from agent.estimation.estimator import AnchorEstimate, FittedBranch, PairEstimat
 from agent.planning import drive, phase1_anchor, phase2_orbit, phase3_last_manoeuvre, range_seeking, tasks
 from agent.planning.phase3_last_manoeuvre import Plan, Question
 from agent.planning.planner import Manoeuvres
-from agent.planning.range_seeking import moved, step_length
+from agent.planning.range_seeking import step_length
 from agent.planning.state import RobotState
 from protocol.messages import BranchKind
 from protocol.mission import SHORTEST_STEP, Mission
 from protocol.motion import Controls
-
-# --- the robot's own sensors --------------------------------------------------------------------------
-
-
-def after_observation(
-    state: RobotState,
-    anchor_range: float | None,
-    manoeuvres: Manoeuvres,
-    after_range: Callable[[RobotState], RobotState],
-) -> RobotState:
-    """Return `state` with the task that follows from the robot's own sensors, on the paper's way.
-
-    `after_range` continues phase 1 once a second or a further anchor range is measured.
-    """
-    task = state.task
-    match task:
-        case tasks.Orbiting() if task.command is None:  # most ticks
-            return state
-        case tasks.Orbital():
-            return continue_phase2(state, task)
-        case tasks.Resting() | tasks.Done():
-            return state
-        case tasks.Searching(beacon):
-            measured = state.in_contact if beacon == "peer" else anchor_range is not None
-            seeking = sought(state, task, measured, manoeuvres)
-            if seeking is not None:
-                return seeking
-            return replace(state, task=tasks.Waiting()) if beacon == "peer" else after_range(state)
-        case tasks.ThirdPoint(_, origin) if moved(origin, state.odometry):
-            return after_range(state)
-        case tasks.LastManoeuvre(_, origin) | tasks.Returning(_, origin) if moved(origin, state.odometry):
-            return after_last_manoeuvre(state, task)
-        case tasks.Asleep():
-            return start_phase1(state, anchor_range)
-        case _:
-            return state
-
 
 # --- phase 1 ------------------------------------------------------------------------------------------
 
@@ -127,8 +90,12 @@ def end_phase1(state: RobotState, fitted: FittedBranch, kind: BranchKind) -> Rob
         own_anchor=fitted.anchor_error,
     )
     state = replace(state, belief=belief)
-    mu = phase2_orbit.orientation(state.local_pose)
-    return continue_phase2(state, tasks.Aligning(state.odometry.heading - mu))
+    return continue_phase2(state, aligning(state))
+
+
+def aligning(state: RobotState) -> tasks.Aligning:
+    """Return the first task of phase 2, from the present pose."""
+    return tasks.Aligning(state.odometry.heading - phase2_orbit.orientation(state.local_pose))
 
 
 def continue_phase2(state: RobotState, task: tasks.Orbital) -> RobotState:
