@@ -27,17 +27,7 @@ from agent.planning.phase3_last_manoeuvre import LAST_SPEEDS
 from agent.planning.planner import Manoeuvres
 from agent.planning.state import RobotState
 from agent.planning.strides import is_stalled, stride
-from agent.planning.tasks import (
-    Beacon,
-    Homing,
-    Listening,
-    Orbital,
-    Orbiting,
-    Radial,
-    Retreating,
-    Straight,
-    Surveying,
-)
+from agent.planning.tasks import Homing, Listening, Orbital, Orbiting, Radial, Retreating, Straight, Surveying
 from protocol.messages import BranchKind, Localised
 from protocol.mission import Mission, Role
 from protocol.motion import ORIGIN, REST, Controls, Pose, compose, inverse
@@ -153,7 +143,7 @@ def continue_phase1(state: RobotState) -> RobotState:
     return replace(state, task=Surveying("anchor", command, since))
 
 
-def _objective(state: RobotState, beacon: Beacon, paths: Sequence[Track]) -> tuple[int, Objective]:
+def _objective(state: RobotState, beacon: str, paths: Sequence[Track]) -> tuple[int, Objective]:
     """Return the tick of the first of the consecutive plans, and the objective of the next one."""
     match state.task:
         case Surveying(before, _, since) if before == beacon:

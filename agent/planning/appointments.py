@@ -10,8 +10,8 @@ from agent.estimation.knowledge import Belief
 from agent.peer.peer_state import PeerState
 from agent.planning import sweep, transitions, visit
 from agent.planning.state import RobotState
-from agent.planning.tasks import Aligning, Asleep, Orbiting, Radial, Travelling
-from protocol.messages import Appointment, Member, Undecided
+from agent.planning.tasks import Asleep, Orbital, Travelling
+from protocol.messages import Appointment, Member, Undecided, Verdict
 from protocol.mission import Role
 from protocol.motion import compose
 from protocol.orbits import Rendezvous
@@ -87,21 +87,15 @@ def after_failure(state: RobotState) -> RobotState:
     config = state.config
     if state.belief.phase1_done_tick is None:
         return state.with_agenda(robot_verdict=state.verdict)
-    now = state.elapsed
-    if now >= config.gives_up or (state.verdict is None and _has_nobody(state)):
+    now, others = state.elapsed, [one.robot for one in config.members if one.robot != config.robot]
+    if now >= config.gives_up or (state.verdict is None and all(state.other(one).failed for one in others)):
         late = Undecided(f"not localised after {now:g} s")
         return state.with_agenda(robot_verdict=state.verdict or state.agenda.failure or late)
     if state.verdict is not None:
-        state = resumed(parted(state.with_agenda(failure=state.verdict)))
+        state = resumed(parted(state, state.verdict))
     elif _has_orbited(state) and (not state.in_contact or is_silent(state)):
         state = waiting(state.with_agenda(until=None), config.peer)
     return _trying_again(state)
-
-
-def _has_nobody(state: RobotState) -> bool:
-    """Return whether the meetings of this robot with all others have failed."""
-    own = state.config.robot
-    return all(state.other(one.robot).failed for one in state.config.members if one.robot != own)
 
 
 def _has_orbited(state: RobotState) -> bool:
@@ -119,14 +113,10 @@ def _has_orbited(state: RobotState) -> bool:
 
 def _trying_again(state: RobotState) -> RobotState:
     """Return `state` of a robot that is not localised, in the retry whose time has come."""
-    config = state.config
-    if (
-        state.agenda.retries >= len(config.retries)
-        or state.elapsed < config.retries[state.agenda.retries].begins
-    ):
+    config, number = state.config, state.agenda.retries
+    if number >= len(config.retries) or state.elapsed < config.retries[number].begins:
         return state
-    retry = config.retries[state.agenda.retries]
-    state = state.with_agenda(retries=state.agenda.retries + 1)
+    retry, state = config.retries[number], state.with_agenda(retries=number + 1)
     # with its peer, which it has only been near so far, the robot meets in the roles of the retry
     peer = retry.peer_of(config.robot)
     begun = peer != config.peer or state.peer_state.latest >= 0
@@ -157,7 +147,7 @@ def waiting(state: RobotState, peer: str, orbits: Rendezvous | None = None) -> R
     """Return `state` of a robot that waits beside its anchor, in a meeting with `peer`."""
     before, waits = state.task, state.config.role == "b"
     state = _in_meeting(state, peer, "b", orbits)
-    if waits and isinstance(before, Orbiting | Aligning | Radial):
+    if waits and isinstance(before, Orbital):
         return replace(state, task=before)
     return _aligned(state)
 
@@ -171,7 +161,7 @@ def _aligned(state: RobotState) -> RobotState:
 
 def _in_meeting(state: RobotState, peer: str, role: Role, orbits: Rendezvous | None = None) -> RobotState:
     """Return `state` in a new meeting with `peer`, of which the robot knows only its ranges to it."""
-    state = state.with_other(state.config.peer, replace(state.other(state.config.peer), mutual=state.mutual))
+    state = state.with_other(state.config.peer, mutual=state.mutual)
     belief, mutual = state.belief, state.other(peer).mutual
     return replace(
         state,
@@ -195,10 +185,10 @@ def _in_meeting(state: RobotState, peer: str, role: Role, orbits: Rendezvous | N
     ).with_agenda(meeting=state.agenda.meeting + 1, alone=False, visiting=False, unmet=0, silence=0)
 
 
-def parted(state: RobotState) -> RobotState:
-    """Return `state` of a robot whose meeting has failed, and which does not meet its peer again."""
-    peer = state.config.peer
-    return state.with_other(peer, replace(state.other(peer), failed=True))
+def parted(state: RobotState, failure: Verdict | None = None) -> RobotState:
+    """Return `state` of a robot whose meeting has failed, by `failure`, and which meets its peer no more."""
+    failed = state.with_other(state.config.peer, failed=True)
+    return failed.with_agenda(failure=failure) if failure is not None else failed
 
 
 def is_met(state: RobotState) -> bool:

@@ -12,14 +12,8 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from agent.estimation.gaussian.inference import PlanningHypothesis
-from agent.planning import (
-    accuracy_seeking,
-    active_sensing,
-    drive,
-    exchange,
-    phase3_last_manoeuvre,
-    transitions,
-)
+from agent.planning import accuracy_seeking, active_sensing, exchange, phase3_last_manoeuvre, transitions
+from agent.planning.drive import controls
 from agent.planning.exchange import LogPlanner
 from agent.planning.state import RobotState
 from agent.planning.tasks import Done, Listening, Orbital, Resting, Standing, Surveying, Travelling, Waiting
@@ -58,7 +52,7 @@ class Assured(LogPlanner):
 
     def command(self, state: RobotState) -> Command:
         """Return the command for the next tick, with the phase, the task and the verdict."""
-        return exchange.command(state, REST if self._must_wait(state) else drive.controls(state))
+        return exchange.command(state, REST if self._must_wait(state) else controls(state))
 
     def joint_manoeuvres(
         self,

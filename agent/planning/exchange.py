@@ -11,24 +11,11 @@ from agent.estimation.judged import required_mutual_ranges
 from agent.estimation.solver import Solver
 from agent.peer import false_reports, peer_state
 from agent.peer.motion_log import MotionLog
-from agent.planning import phase1_anchor, phase3_last_manoeuvre, plausibility, separation, transitions
+from agent.planning import phase1_anchor, phase3_last_manoeuvre, plausibility, separation, tasks, transitions
 from agent.planning.phase3_last_manoeuvre import Plan, Question
 from agent.planning.planner import Manoeuvres, Planner, Summary
 from agent.planning.range_seeking import moved
 from agent.planning.state import RobotState
-from agent.planning.tasks import (
-    Asleep,
-    Done,
-    LastManoeuvre,
-    Orbital,
-    Orbiting,
-    Resting,
-    Retreating,
-    Returning,
-    Searching,
-    ThirdPoint,
-    Waiting,
-)
 from protocol.messages import (
     Command,
     Estimate,
@@ -45,27 +32,15 @@ from protocol.mission import Mission
 from protocol.motion import REST, Controls, Pose, compose, inverse, step
 
 
-def dead_reckoned(
-    log: MotionLog, odometry: Pose, leg: Pose, executed: Controls | None, period: float
-) -> tuple[MotionLog, Pose, Pose]:
-    """Return `log`, `odometry` and `leg` after a tick of `period` s that the odometry measured as `executed`.
-
-    `leg` is the odometry at the beginning of the last segment of `log`, which is one step of the motion.
-    """
-    if executed is None:
-        return log, odometry, leg
-    log = log.drove(executed.v, executed.omega)
-    ticks = log.runs[-1].ticks
-    if ticks == 1:
-        leg = odometry
-    return log, step(leg, executed.v, executed.omega, ticks * period), leg
-
-
 def observed(state: RobotState, observation: Observation) -> RobotState:
     """Return `state` with the sensor data of one tick: odometry, anchor range, contact and mutual range."""
-    log, odometry, leg = dead_reckoned(
-        state.log, state.odometry, state.leg, observation.executed, state.config.mission.period
-    )
+    log, odometry, leg = state.log, state.odometry, state.leg
+    if (executed := observation.executed) is not None:
+        log = log.drove(executed.v, executed.omega)
+        ticks = log.runs[-1].ticks
+        if ticks == 1:
+            leg = odometry
+        odometry = step(leg, executed.v, executed.omega, ticks * state.config.mission.period)
     if observation.anchor_range is not None and state.estimator.is_informative(state, observation):
         log = log.ranged(observation.anchor_range)
     mutual, in_contact = state.mutual, False
@@ -173,7 +148,7 @@ def _safe(state: RobotState, controls: Controls) -> Controls:
     phase 3, and on the way back into range.
     """
     mission = state.config.mission
-    if state.phase == 3 and not isinstance(state.task, Retreating):
+    if state.phase == 3 and not isinstance(state.task, tasks.Retreating):
         return controls
     if not state.mutual or state.mutual[-1].tick != state.tick:  # the range was not measured
         return REST
@@ -204,20 +179,20 @@ class LogPlanner(Planner[RobotState, Report]):
         state, ranged = observed(state, observation), observation.anchor_range is not None
         task, manoeuvres = state.task, self.MANOEUVRES
         match task:
-            case Orbiting(None) | Resting() | Done():  # most ticks
+            case tasks.Orbiting(None) | tasks.Resting() | tasks.Done():  # most ticks
                 return state
-            case Orbital():
+            case tasks.Orbital():
                 return self._continue_phase2(state, task, ranged)
-            case Searching("anchor"):
+            case tasks.Searching("anchor"):
                 return transitions.sought(state, task, ranged, manoeuvres) or self._after_range(state)
-            case Searching():
+            case tasks.Searching():
                 seeking = transitions.sought(state, task, state.in_contact, manoeuvres)
-                return seeking or replace(state, task=Waiting())
-            case ThirdPoint(_, origin) if moved(origin, state.odometry):
+                return seeking or replace(state, task=tasks.Waiting())
+            case tasks.ThirdPoint(_, origin) if moved(origin, state.odometry):
                 return self._after_range(state)
-            case LastManoeuvre(_, origin) | Returning(_, origin) if moved(origin, state.odometry):
+            case tasks.LastManoeuvre(_, origin) | tasks.Returning(_, origin) if moved(origin, state.odometry):
                 return transitions.after_last_manoeuvre(state, task)
-            case Asleep():
+            case tasks.Asleep():
                 return self._start_phase1(state, observation.anchor_range)
             case _:
                 return self._sense(state, ranged)
@@ -230,7 +205,7 @@ class LogPlanner(Planner[RobotState, Report]):
         """Return `state` with the next task of phase 1, after a second or further range to the anchor."""
         raise NotImplementedError
 
-    def _continue_phase2(self, state: RobotState, task: Orbital, ranged: bool) -> RobotState:
+    def _continue_phase2(self, state: RobotState, task: tasks.Orbital, ranged: bool) -> RobotState:
         """Return `state` with the task that follows `task`; `ranged` if it has a new range to its anchor."""
         del ranged
         return transitions.continue_phase2(state, task)
@@ -273,7 +248,7 @@ class LogPlanner(Planner[RobotState, Report]):
         branches_left = belief.branches
         if not branches_left and belief.branch is not None:
             branches_left = (belief.branch,)
-        elif not branches_left and isinstance(state.task, ThirdPoint):
+        elif not branches_left and isinstance(state.task, tasks.ThirdPoint):
             branches_left = state.task.branches
         if belief.poses:
             world: tuple[Pose, ...] = state.poses

@@ -22,17 +22,7 @@ from agent.planning.meeting_planner import MeetingPlanner
 from agent.planning.planner import Planner, Summary
 from agent.planning.separation import slowed
 from agent.planning.state import RobotState
-from agent.planning.tasks import (
-    UNCONFIRMED,
-    Aligning,
-    Deciding,
-    Done,
-    Homing,
-    Orbiting,
-    Radial,
-    Retreating,
-    Travelling,
-)
+from agent.planning.tasks import UNCONFIRMED, Deciding, Done, Homing, Orbital, Retreating, Travelling
 from protocol.messages import (
     Command,
     Estimate,
@@ -72,18 +62,17 @@ class GroupPlanner(Planner[RobotState, Report]):
             state = replace(state, in_contact=False)
         for contact in observation.contacts:
             if contact.peer != state.config.peer and contact.range is not None:
-                other = state.other(contact.peer)
-                ranges = (*other.mutual, Ranged(observation.tick, contact.range))
-                state = state.with_other(contact.peer, replace(other, mutual=ranges))
+                latest = Ranged(observation.tick, contact.range)
+                state = state.with_other(contact.peer, mutual=(*state.other(contact.peer).mutual, latest))
         if state.agenda.visiting and _is_out_of_range_again(before, state):
             state = replace(state, task=Travelling(visit.stop(state)))
         state = visit.passing_others(state, observation.contacts)
         if isinstance(state.task, Travelling) and not state.in_contact and not state.agenda.passing.places:
             state = visit.searching(state)
-        ended = isinstance(state.task, Done)
-        unmet = state.agenda.unmet + 1 if ended and not state.in_contact else 0
-        lingering = state.agenda.lingering + 1 if ended and state.in_contact else 0
-        if (unmet, lingering) == (state.agenda.unmet, state.agenda.lingering):
+        ended, agenda = isinstance(state.task, Done), state.agenda
+        unmet = agenda.unmet + 1 if ended and not state.in_contact else 0
+        lingering = agenda.lingering + 1 if ended and state.in_contact else 0
+        if (unmet, lingering) == (agenda.unmet, agenda.lingering):
             return state
         return state.with_agenda(unmet=unmet, lingering=lingering)
 
@@ -135,7 +124,7 @@ class GroupPlanner(Planner[RobotState, Report]):
         of_peer = [] if alone else [one for one in logs if one.robot == peer]
         state = self.pair_planner.decide(before, of_peer)
         if before.verdict is None and state.verdict is not None and state.belief.phase1_done_tick is None:
-            return meetings.without_peer(before, state.verdict)
+            return appointments.parted(before, state.verdict)  # it goes on with phase 1
         silence = state.agenda.silence + 1 if state.in_contact and not of_peer else 0
         if silence != state.agenda.silence:
             state = state.with_agenda(silence=silence)
@@ -157,16 +146,15 @@ class GroupPlanner(Planner[RobotState, Report]):
         rests, config = meetings.rests(state), state.config
         meets = state.meets and not rests
         command = self.pair_planner.command(state)
-        unconfirmed = (
-            config.confirms and state.agenda.robot_verdict is None and isinstance(state.verdict, Localised)
-        )
+        verdict = state.agenda.robot_verdict
+        unconfirmed = config.confirms and verdict is None and isinstance(state.verdict, Localised)
         controls = slowed(Controls(command.v, command.omega), state.agenda.passing.leeway, config.mission)
         return replace(
             command,
             v=controls.v,
             omega=controls.omega,
             task=UNCONFIRMED if unconfirmed else command.task,
-            verdict=state.agenda.robot_verdict,
+            verdict=verdict,
             peer=config.peer if meets else None,
             role=config.role if meets else None,
             rests=rests,
@@ -215,4 +203,4 @@ def _is_out_of_range_again(before: RobotState, after: RobotState) -> bool:
     """
     back = isinstance(before.task, Retreating) and isinstance(after.task, Homing)
     left = isinstance(after.task, Deciding) and not after.in_contact
-    return back or left or isinstance(after.task, Aligning | Radial | Orbiting)
+    return back or left or isinstance(after.task, Orbital)

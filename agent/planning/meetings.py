@@ -11,7 +11,7 @@ from agent.planning import appointments, sweep, visit
 from agent.planning.agenda import Fix
 from agent.planning.state import RobotState
 from agent.planning.tasks import UNCONFIRMED, Done, Travelling
-from protocol.messages import Localised, Report, Undecided, Verdict
+from protocol.messages import Localised, Report, Undecided
 
 PARTED_AFTER = 8
 """The ticks out of range of a peer after which a robot whose meeting has ended goes on.
@@ -29,28 +29,24 @@ def with_sender(state: RobotState, report: Report) -> RobotState:
 
     If poses have to be confirmed, a robot that travels need not have claimed its own.
     """
-    known, travels, confirms = (
-        state.other(report.robot),
-        report.state == Travelling.name,
-        state.config.confirms,
-    )
+    known, confirms = state.other(report.robot), state.config.confirms
+    travels = report.state == Travelling.name
     claims = not report.has_log and isinstance(report.verdict, Localised)
     localised = known.localised or claims or (travels and not confirms)
     served = known.served or (report.state == UNCONFIRMED and not confirms)
     if (travels, localised, served) == (known.travels, known.localised, known.served):
         return state
-    return state.with_other(report.robot, replace(known, travels=travels, localised=localised, served=served))
+    return state.with_other(report.robot, travels=travels, localised=localised, served=served)
 
 
 def answering(state: RobotState, visitors: Sequence[str]) -> RobotState:
     """Return `state` in a meeting with one of `visitors`, which have come to it, if it waits for one."""
     if not state.waits or state.belief.phase1_done_tick is None:
         return state
-    if state.config.peer in visitors and not (
-        state.agenda.alone or appointments.refused(state, state.config.peer)
-    ):
+    peer = state.config.peer
+    if peer in visitors and not (state.agenda.alone or appointments.refused(state, peer)):
         # a robot that searches for its peer must not wait for that one's manoeuvre while it waits for its own
-        return appointments.waiting(state, state.config.peer) if state.config.role == "a" else state
+        return appointments.waiting(state, peer) if state.config.role == "a" else state
     if appointments.is_met(state):
         return state
     for visitor in visitors:
@@ -67,25 +63,26 @@ def with_pose(state: RobotState, claim: Localised) -> RobotState:
     single meeting is withdrawn, because nothing tells which of the two it was, and the robot waits for a
     third one. A planner of the user claims its pose once.
     """
-    if state.agenda.own is not None and state.agenda.fix is not None:
+    agenda, peer, known = state.agenda, state.config.peer, state.knowledge
+    fix = agenda.fix
+    if agenda.own is not None and fix is not None:
         return state
-    peer, fix, known = state.config.peer, state.agenda.fix, state.knowledge
     if state.config.confirms:
-        earlier = [one for one in state.agenda.confirming.meetings if one.config.peer != peer]
-        confirming = replace(state.agenda.confirming, meetings=(*earlier, known))
+        earlier = [one for one in agenda.confirming.meetings if one.config.peer != peer]
+        confirming = replace(agenda.confirming, meetings=(*earlier, known))
         fix = Fix(state.tick, claim, (peer,))
         return state.with_agenda(fix=fix, located=known, confirming=confirming).with_frame(claim.pose)
-    state = state.with_other(peer, replace(state.other(peer), localised=True))
+    state = state.with_other(peer, localised=True)
     contradiction = _contradiction(state, claim)
     if contradiction is None:
         fix = Fix(state.tick, claim, (*(fix.peers if fix is not None else ()), peer))
         state = state.with_agenda(fix=fix, located=known).with_frame(claim.pose)
-        return state if state.agenda.robot_verdict is not None else state.with_agenda(robot_verdict=claim)
+        return state if agenda.robot_verdict is not None else state.with_agenda(robot_verdict=claim)
     assert fix is not None
     if len(fix.peers) > 1:
         return appointments.parted(state)
     (other,) = fix.peers
-    state = state.with_other(other, replace(state.other(other), failed=True))
+    state = state.with_other(other, failed=True)
     return state.with_agenda(robot_verdict=None, fix=None, located=None, failure=contradiction)
 
 
@@ -113,25 +110,12 @@ def withdrawn(state: RobotState, failure: Undecided) -> RobotState:
     return appointments.waiting(appointments.parted(state), peer)
 
 
-def _is_withdrawn(state: RobotState) -> bool:
-    """Return whether the present meeting contradicts an earlier one, so that the robot knows no pose."""
-    return (
-        state.agenda.fix is None
-        and state.agenda.robot_verdict is None
-        and isinstance(state.verdict, Localised)
-    )
-
-
-def without_peer(state: RobotState, failure: Verdict) -> RobotState:
-    """Return `state` without its peer, because of `failure`; a robot in phase 1 goes on with that."""
-    return appointments.parted(state.with_agenda(failure=failure))
-
-
 def after_refusal(state: RobotState) -> RobotState:
     """Return `state` of a robot whose peer has ended their meeting, because it contradicts what it knows."""
     if state.agenda.visiting:
         return appointments.next_visit(appointments.parted(state))
-    failed = without_peer(state, Undecided(f"{state.config.peer} does not go on with the meeting"))
+    why = Undecided(f"{state.config.peer} does not go on with the meeting")
+    failed = appointments.parted(state, why)
     return failed if state.belief.phase1_done_tick is None else appointments.resumed(failed)
 
 
@@ -140,31 +124,31 @@ def onward(state: RobotState, *, peer_has_left: bool = False) -> RobotState:
 
     `peer_has_left` says that the peer has a result, and has reported it from outside the meeting.
     """
-    peer = state.config.peer
+    agenda, peer = state.agenda, state.config.peer
     over = peer_has_left or _is_over(state)
-    if _is_withdrawn(state):
+    if agenda.fix is None and agenda.robot_verdict is None and isinstance(state.verdict, Localised):
+        # it contradicts an earlier meeting
         parted = appointments.parted(state).with_agenda(visiting=False)
         return appointments.waiting(parted, peer) if over else state
-    if state.agenda.fix is None:
+    if agenda.fix is None:
         return appointments.after_failure(state)
     if state.sweeps:
-        assert state.agenda.robot_verdict is not None
+        assert agenda.robot_verdict is not None
         swept = sweep.swept(state)
-        done = Done(state.phase, state.agenda.robot_verdict)
+        done = Done(state.phase, agenda.robot_verdict)
         return swept or appointments.next_visit(replace(state, task=done))
-    if state.agenda.visiting and state.verdict is None:
-        if state.other(peer).localised and state.agenda.robot_verdict is not None:  # by another robot
+    if agenda.visiting and state.verdict is None:
+        if state.other(peer).localised and agenda.robot_verdict is not None:  # by another robot
             return appointments.next_visit(state)
         if visit.has_searched(state):
-            other = replace(state.other(peer), missed=state.tick)
-            return appointments.next_visit(state.with_other(peer, other))
+            return appointments.next_visit(state.with_other(peer, missed=state.tick))
         if appointments.is_silent(state):
             return appointments.next_visit(appointments.parted(state))
         return state
     if not isinstance(state.task, Done) or _must_linger(state):
         return state
     if not isinstance(state.verdict, Localised):
-        reported = state.agenda.lingering > 0 or not state.in_contact  # to the peer, before this robot leaves
+        reported = agenda.lingering > 0 or not state.in_contact  # to the peer, before this robot leaves
         return appointments.next_visit(appointments.parted(state)) if reported else state
     return appointments.next_visit(state) if over else state
 

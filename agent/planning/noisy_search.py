@@ -71,8 +71,7 @@ def decided(state: RobotState, reports: Sequence[Report]) -> RobotState:
     """Return `state` of a robot that is in no meeting, with the `reports` of others, and one tick on."""
     for one in reports:
         state = meetings.with_sender(state, one)
-        sender = state.other(one.robot)  # if it is overtaken, more is sent again
-        state = state.with_other(one.robot, replace(sender, acknowledged=one.heard))
+        state = state.with_other(one.robot, acknowledged=one.heard)  # if overtaken, more is sent again
     of_peer = [one for one in reports if one.has_log and one.robot == state.config.peer]
     heard = exchange.with_reports(state, of_peer)
     if heard.verdict == state.verdict:

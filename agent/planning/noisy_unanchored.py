@@ -39,7 +39,7 @@ def ranged(state: RobotState, observation: Observation) -> RobotState:
             other, first = state.other(contact.peer), observation.tick - _kept(state)
             recent = [each for each in other.mutual if each.tick > first]
             mutual = (*recent, Ranged(observation.tick, contact.range))
-            state = state.with_other(contact.peer, replace(other, mutual=mutual))
+            state = state.with_other(contact.peer, mutual=mutual)
     return state
 
 

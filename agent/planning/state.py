@@ -94,6 +94,6 @@ class RobotState(Knowledge, frozen=True):
         """Return what the robot knows of `robot`."""
         return self.agenda.others.get(robot, Other())
 
-    def with_other(self, robot: str, other: Other) -> RobotState:
-        """Return this state with what the robot now knows of `robot`."""
-        return self.with_agenda(others={**self.agenda.others, robot: other})
+    def with_other(self, robot: str, **fields: Any) -> RobotState:
+        """Return this state with other values of some fields of what the robot knows of `robot`."""
+        return self.with_agenda(others={**self.agenda.others, robot: replace(self.other(robot), **fields)})

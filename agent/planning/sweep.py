@@ -78,7 +78,7 @@ def next_part(state: RobotState) -> RobotState:
     config = state.config
     assert config.sweep is not None
     for robot in config.unanchored:
-        state = state.with_other(robot, replace(state.other(robot), failed=False))
+        state = state.with_other(robot, failed=False)
     part = (config.part + state.agenda.parts) % config.sweep.parts
     path = config.sweep.path(part, config.mission.sensing_range)
     task = Sweeping(transformed(inverse(state.agenda.frame), path))
@@ -123,7 +123,7 @@ def moved_on(
     task = onward(state.task, state.odometry, mission, tolerance)
     if isinstance(task, Looping) and state.tick - task.since > longest:
         for robot in helped:
-            state = state.with_other(robot, replace(state.other(robot), failed=True))
+            state = state.with_other(robot, failed=True)
         helped = []
     match task:
         case Sweeping(places) if stops:
