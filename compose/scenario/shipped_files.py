@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping
-from importlib import resources
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from protocol.spelling import did_you_mean
 
 
-def shipped(package: str = "scenario") -> dict[str, Path]:
+@cache
+def shipped(package: str = "scenario") -> Mapping[str, Path]:
     """Return the shipped scenario files by name; for the package `sweep`, the shipped sweep files."""
-    path = Path(str(resources.files("compose") / package / "shipped"))
+    path = Path(__file__).parents[1] / package / "shipped"
     return {file.stem: file for file in sorted(path.glob("*.toml"), key=lambda file: file.stem)}
 
 
@@ -39,10 +40,9 @@ def misplaced(source: str, table: Mapping[str, Any], folder: str) -> str | None:
 
     Return None if `table` has a field that marks the kind of file in `folder`, or no mark at all.
     """
-    if REQUIRED_FIELDS[folder].isdisjoint(table):
-        for other, (kind, command) in SHIPPED_KINDS.items():
-            if not REQUIRED_FIELDS[other].isdisjoint(table):
-                return _other_kind(source, kind, command)
+    for other, (kind, command) in SHIPPED_KINDS.items():
+        if REQUIRED_FIELDS[folder].isdisjoint(table) and not REQUIRED_FIELDS[other].isdisjoint(table):
+            return _other_kind(source, kind, command)
     return None
 
 

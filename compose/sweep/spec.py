@@ -152,7 +152,7 @@ class Sweep(msgspec.Struct, frozen=True):
         return len(robots) > 2 and not any("peer" in robot for robot in robots if isinstance(robot, dict))
 
 
-def shipped() -> dict[str, Path]:
+def shipped() -> Mapping[str, Path]:
     """Return the paths of the shipped sweep files, by name."""
     return shipped_files.shipped("sweep")
 
