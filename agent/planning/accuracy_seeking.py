@@ -81,8 +81,8 @@ def sensed(state: RobotState, ranged: bool) -> RobotState:
             return continue_phase1(state)
         case Homing(place, side) if _is_at(state, place):
             if side is None:
-                return replace(state, task=Straight("anchor", state.odometry, 0.0))
-            return replace(state, task=_next_side(place, side, state.config.mission))
+                return state.doing(Straight("anchor", state.odometry, 0.0))
+            return state.doing(_next_side(place, side, state.config.mission))
         case Surveying("peer") | Listening() | Retreating():
             return _continue_phase3(state)
         case _:
@@ -97,7 +97,7 @@ def without_range(state: RobotState) -> RobotState:
     mission, p = state.config.mission, state.config.mission.noise.drop_outs
     if 0.0 < p < 1.0 and state.tick < math.ceil(math.log(UNLIKELY_DROP_OUTS) / math.log(p)):
         return state
-    return replace(state, task=Straight("anchor", state.odometry, mission.sensing_range))
+    return state.doing(Straight("anchor", state.odometry, mission.sensing_range))
 
 
 def _is_at(state: RobotState, place: Pose) -> bool:
@@ -126,7 +126,7 @@ def continue_phase1(state: RobotState) -> RobotState:
     if not scored or _are_misleading(state, scored[0]):
         if not ranged:
             return _return_to_anchor(state)
-        return replace(state, task=Straight("anchor", state.odometry, state.log.ranges[-1].range))
+        return state.doing(Straight("anchor", state.odometry, state.log.ranges[-1].range))
     mission = state.config.mission
     if inference.is_anchor_known(state, scored):
         kind: BranchKind = "circle" if len(state.log.ranges) == 2 else "three-ranges"
@@ -140,7 +140,7 @@ def continue_phase1(state: RobotState) -> RobotState:
     since, objective = _objective(state, "anchor", (inference.own_path(state),))
     hypotheses = inference.anchor_planning_hypotheses(state)
     command = active_sensing.plan_alone(hypotheses, mission, objective=objective)
-    return replace(state, task=Surveying("anchor", command, since))
+    return state.doing(Surveying("anchor", command, since))
 
 
 def _objective(state: RobotState, beacon: str, paths: Sequence[Track]) -> tuple[int, Objective]:
@@ -189,7 +189,7 @@ def _begin_again(state: RobotState, start: Pose) -> RobotState:
     The place of the last range is on the rim of the anchor's range, which a robot misses more easily.
     """
     anchor = inverse(start)
-    return replace(_return_to_anchor(state), task=Homing(Pose(anchor.x, anchor.y, 0.0), 0))
+    return _return_to_anchor(state).doing(Homing(Pose(anchor.x, anchor.y, 0.0), 0))
 
 
 def _leave(state: RobotState) -> RobotState:
@@ -249,8 +249,7 @@ def continue_phase2(state: RobotState, task: Orbital, *, ranged: bool) -> RobotS
         state = replace(state, belief=inference.with_own(state, scored))
         if isinstance(task, Radial) and abs(phase2_orbit.orientation(state.local_pose)) > OFF_RADIUS:
             return _start_phase2(state)
-    tolerance = state.estimator.pose_tolerance
-    task = phase2_orbit.onward(task, state.odometry, state.start, state.orbit, mission, tolerance)
+    task = phase2_orbit.onward(state, task)
     timeout: float = LOST_AFTER * stride(mission)
     if (
         state.orbit.v == 0.0
@@ -272,7 +271,7 @@ def continue_phase2(state: RobotState, task: Orbital, *, ranged: bool) -> RobotS
         else:
             command = REST if is_planning_tick(state) else task.command or REST
         task = Orbiting(command, since)
-    return replace(state, task=task)
+    return state.doing(task)
 
 
 # --- in contact with the peer -------------------------------------------------------------------------
@@ -287,11 +286,11 @@ def _continue_phase3(state: RobotState) -> RobotState:
         case Retreating():
             if not state.in_contact:
                 return _start_phase2(state)
-            return replace(state, task=Surveying("peer", since=state.tick))
+            return state.doing(Surveying("peer", since=state.tick))
         case _ if state.config.role == "b" and _ticks_without_range(state) >= LOST_AFTER_IN_PHASE_3 * ticks:
             return _return_to_anchor(state)
         case Surveying(_, command) | Listening(command) if not state.in_contact:
-            return replace(state, task=Retreating(Controls(0.0 - command.v, 0.0 - command.omega), state.tick))
+            return state.doing(Retreating(Controls(0.0 - command.v, 0.0 - command.omega), state.tick))
         case _:
             return state
 
@@ -301,7 +300,7 @@ def decided(state: RobotState, planned: JointManoeuvres) -> RobotState:
     if state.peer_state.start is None:
         return state
     if not inference.peer_log_suffices(state):
-        return replace(state, task=Listening())
+        return state.doing(Listening())
     return _decide_phase3(state, planned)
 
 
@@ -337,7 +336,7 @@ def _decide_phase3(state: RobotState, planned: JointManoeuvres) -> RobotState:
     since, objective = _objective(state, "peer", pair.paths)
     manoeuvres = _manoeuvres(state, objective) or planned
     a, b = manoeuvres(hypotheses, inference.m2_of(state.config), state.mutual[-1].range, mission)
-    return replace(tested, task=Surveying("peer", a if role == "a" else b, since))
+    return tested.doing(Surveying("peer", a if role == "a" else b, since))
 
 
 def _measures_in_vain(state: RobotState, pair: JointMeasurements) -> bool:
@@ -360,6 +359,6 @@ def _drive_without_hypotheses(state: RobotState) -> RobotState:
     """Drive without hypotheses about the poses: b stands, a drives straight on (Section III.C.a)."""
     mission = state.config.mission
     if state.config.role == "b" or not state.mutual:
-        return replace(state, task=Surveying("peer", since=state.tick))
+        return state.doing(Surveying("peer", since=state.tick))
     step = range_seeking.step_length("peer", state.mutual[-1].range, mission)
-    return replace(state, task=Surveying("peer", Controls(step / mission.period, 0.0), state.tick))
+    return state.doing(Surveying("peer", Controls(step / mission.period, 0.0), state.tick))

@@ -70,7 +70,7 @@ def _is_late(state: RobotState, member: Member) -> bool:
 def on_visit(state: RobotState, peer: str) -> RobotState:
     """Return `state` of a localised robot that drives to `peer`."""
     state = _in_meeting(state, peer, "a")
-    return replace(state, task=Travelling(visit.stop(state))).with_agenda(visiting=True)
+    return state.doing(Travelling(visit.stop(state))).with_agenda(visiting=True)
 
 
 def at_anchor(state: RobotState) -> RobotState:
@@ -148,7 +148,7 @@ def waiting(state: RobotState, peer: str, orbits: Rendezvous | None = None) -> R
     before, waits = state.task, state.config.role == "b"
     state = _in_meeting(state, peer, "b", orbits)
     if waits and isinstance(before, Orbital):
-        return replace(state, task=before)
+        return state.doing(before)
     return _aligned(state)
 
 

@@ -6,10 +6,10 @@ import math
 
 from agent.planning import tasks
 from agent.planning.phase2_orbit import left_to_orbit
-from agent.planning.range_seeking import distance_ahead, inside_arc, step_length
+from agent.planning.range_seeking import inside_arc, step_length
 from agent.planning.state import RobotState
 from protocol.mission import Mission
-from protocol.motion import REST, Controls, Pose, travelled, wrap
+from protocol.motion import REST, Controls, Pose, relative, travelled, wrap
 from protocol.orbits import Orbit
 from protocol.sweep_strips import Place
 from protocol.sweep_ticks import sweep_speed
@@ -30,7 +30,7 @@ def controls(state: RobotState) -> Controls:
         case tasks.Aligning(heading) | tasks.Tangent(heading) | tasks.Turning(heading=heading):
             return turn(odometry, heading, mission)
         case tasks.Radial():
-            return straight(left_to_orbit(odometry, state.start, state.orbit), mission)
+            return straight(left_to_orbit(state), mission)
         case tasks.Straight() | tasks.Backing() | tasks.Circling():
             return _seeking(task, odometry, mission)
         case (
@@ -61,7 +61,7 @@ def _seeking(
         case tasks.Straight():
             return straight(step - travelled(task.origin, odometry), mission)
         case tasks.Backing():
-            return straight(-step - distance_ahead(task.origin, odometry), mission)
+            return straight(-step - relative(task.origin, odometry).x, mission)
         case tasks.Circling():
             part = inside_arc(task.rho0, step, mission.sensing_range) / mission.period
             omega = min(mission.max_turn_rate, part, mission.max_speed / step)

@@ -11,10 +11,10 @@ from agent.estimation.judged import required_mutual_ranges
 from agent.estimation.solver import Solver
 from agent.peer import false_reports, peer_state
 from agent.peer.motion_log import MotionLog
-from agent.planning import phase1_anchor, phase3_last_manoeuvre, plausibility, separation, tasks, transitions
+from agent.planning import phase3_last_manoeuvre, plausibility, range_seeking, separation, tasks, transitions
+from agent.planning.phase1_anchor import local
 from agent.planning.phase3_last_manoeuvre import Plan, Question
 from agent.planning.planner import Manoeuvres, Planner, Summary
-from agent.planning.range_seeking import moved
 from agent.planning.state import RobotState
 from protocol.messages import (
     Command,
@@ -177,20 +177,21 @@ class LogPlanner(Planner[RobotState, Report]):
     def observe(self, state: RobotState, observation: Observation) -> RobotState:
         """Return `state` with the sensor data of one tick, and with the task that follows from them."""
         state, ranged = observed(state, observation), observation.anchor_range is not None
-        task, manoeuvres = state.task, self.MANOEUVRES
-        match task:
+        task = state.task
+        match task:  # in real time, a manoeuvre may not have been executed
             case tasks.Orbiting(None) | tasks.Resting() | tasks.Done():  # most ticks
                 return state
             case tasks.Orbital():
                 return self._continue_phase2(state, task, ranged)
-            case tasks.Searching("anchor"):
-                return transitions.sought(state, task, ranged, manoeuvres) or self._after_range(state)
-            case tasks.Searching():
-                seeking = transitions.sought(state, task, state.in_contact, manoeuvres)
-                return seeking or replace(state, task=tasks.Waiting())
-            case tasks.ThirdPoint(_, origin) if moved(origin, state.odometry):
+            case tasks.Searching(beacon):
+                measured = state.in_contact if beacon == "peer" else ranged
+                seeking = range_seeking.onward(state, task, measured, self.MANOEUVRES)
+                if seeking is not None:
+                    return state.doing(seeking)
+                return state.doing(tasks.Waiting()) if beacon == "peer" else self._after_range(state)
+            case tasks.ThirdPoint(_, origin) if state.odometry != origin:
                 return self._after_range(state)
-            case tasks.LastManoeuvre(_, origin) | tasks.Returning(_, origin) if moved(origin, state.odometry):
+            case tasks.LastManoeuvre(_, origin) | tasks.Returning(_, origin) if state.odometry != origin:
                 return transitions.after_last_manoeuvre(state, task)
             case tasks.Asleep():
                 return self._start_phase1(state, observation.anchor_range)
@@ -259,7 +260,7 @@ class LogPlanner(Planner[RobotState, Report]):
         return Estimate(
             tick=state.tick,
             robot=state.config.robot,
-            local=tuple(phase1_anchor.local(branches_left, state.odometry)),
+            local=tuple(local(branches_left, state.odometry)),
             world=world,
             localised=isinstance(verdict, Localised),
             probabilities=tuple([one.probability for one in belief.pair or belief.own]),

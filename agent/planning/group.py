@@ -65,7 +65,7 @@ class GroupPlanner(Planner[RobotState, Report]):
                 latest = Ranged(observation.tick, contact.range)
                 state = state.with_other(contact.peer, mutual=(*state.other(contact.peer).mutual, latest))
         if state.agenda.visiting and _is_out_of_range_again(before, state):
-            state = replace(state, task=Travelling(visit.stop(state)))
+            state = state.doing(Travelling(visit.stop(state)))
         state = visit.passing_others(state, observation.contacts)
         if isinstance(state.task, Travelling) and not state.in_contact and not state.agenda.passing.places:
             state = visit.searching(state)

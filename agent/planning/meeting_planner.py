@@ -76,8 +76,8 @@ class MeetingPlanner(Planner[RobotState, Report]):
         if belief.phase1_done_tick is None and (command.phase > 1 or command.verdict is not None):
             state = replace(state, belief=replace(belief, phase1_done_tick=state.tick))
         if command.verdict is not None:
-            return replace(state, task=Done(command.phase, command.verdict))
-        return replace(state, task=Deciding(command.phase, command.task))
+            return state.doing(Done(command.phase, command.verdict))
+        return state.doing(Deciding(command.phase, command.task))
 
     def command(self, state: RobotState) -> Command:
         """Return the command of the user's planner; on the way to another robot, that of the group."""

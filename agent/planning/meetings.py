@@ -136,7 +136,7 @@ def onward(state: RobotState, *, peer_has_left: bool = False) -> RobotState:
         assert agenda.robot_verdict is not None
         swept = sweep.swept(state)
         done = Done(state.phase, agenda.robot_verdict)
-        return swept or appointments.next_visit(replace(state, task=done))
+        return swept or appointments.next_visit(state.doing(done))
     if agenda.visiting and state.verdict is None:
         if state.other(peer).localised and agenda.robot_verdict is not None:  # by another robot
             return appointments.next_visit(state)

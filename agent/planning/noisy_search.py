@@ -85,7 +85,7 @@ def begun(state: RobotState) -> RobotState:
     assert config.sweep is not None
     assert isinstance(state.agenda.robot_verdict, Localised)
     if config.part >= config.sweep.parts:
-        return replace(state, task=Done(3, state.agenda.robot_verdict))
+        return state.doing(Done(3, state.agenda.robot_verdict))
     assert located is not None
     # after a visit in vain, or one that contradicts what this robot knows
     if not state.belief.pair or state.config.peer != located.config.peer:
@@ -106,7 +106,7 @@ def begun(state: RobotState) -> RobotState:
         (anchor.x, anchor.y),
         own_pose.beacon_place(state),
     )
-    return replace(state, task=Sweeping(sweep.transformed(inverse(state.agenda.frame), path)))
+    return state.doing(Sweeping(sweep.transformed(inverse(state.agenda.frame), path)))
 
 
 # --- contacts -----------------------------------------------------------------------------------------
@@ -130,7 +130,7 @@ def _onward(state: RobotState) -> RobotState:
     if not sweep.is_over(state):
         return state
     assert state.agenda.robot_verdict is not None
-    state = replace(_with_reference(state, None), task=Done(phase, state.agenda.robot_verdict))
+    state = _with_reference(state, None).doing(Done(phase, state.agenda.robot_verdict))
     following = appointments.next_visit(state)
     return begun(following) if following.sweeps else following
 

@@ -57,7 +57,7 @@ def decided(state: RobotState, reports: Sequence[Report]) -> RobotState:
             found = replace(found, failure=why)
     found, claim = _estimated(state, found)
     if claim is not None:
-        return replace(state, task=Done(3, claim)).with_agenda(found=found)
+        return state.doing(Done(3, claim)).with_agenda(found=found)
     return _moved_on(state, found)
 
 
@@ -123,17 +123,17 @@ def _moved_on(state: RobotState, found: Contacted) -> RobotState:
     """Return `state` after a tick: in a loop while an accurate finder reports, else standing."""
     finder, mission = found.finder, state.config.mission
     if finder is None:
-        return replace(state, task=Awaiting()).with_agenda(found=found)
+        return state.doing(Awaiting()).with_agenda(found=found)
     if finder.latest <= state.tick - _kept(state):
-        return replace(state, task=Awaiting()).with_agenda(found=replace(found, finder=None, estimate=None))
+        return state.doing(Awaiting()).with_agenda(found=replace(found, finder=None, estimate=None))
     state = state.with_agenda(found=found)
     if finder.covariance.position_sigma > mission.accuracy:
-        return replace(state, task=Standing())
+        return state.doing(Standing())
     if isinstance(state.task, Looping):
         moved = sweep.onward(state.task, state.odometry, mission, state.estimator.pose_tolerance)
         if moved.places and isinstance(moved, Looping):
-            return replace(state, task=moved)
+            return state.doing(moved)
     if finder.latest <= state.tick - contact_ticks(mission) // 2:
-        return replace(state, task=Standing())
+        return state.doing(Standing())
     side = OWN_SIDE * mission.sensing_range
-    return replace(state, task=sweep.looping_both_ways(state.odometry, side, side, state.tick))
+    return state.doing(sweep.looping_both_ways(state.odometry, side, side, state.tick))

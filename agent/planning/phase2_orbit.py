@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 
+from agent.planning.state import RobotState
 from agent.planning.tasks import Aligning, Orbital, Orbiting, Radial, Tangent
-from protocol.mission import Mission
-from protocol.motion import Pose, compose, wrap
-from protocol.orbits import Orbit
+from protocol.motion import Pose, wrap
 
 
 def orientation(local: Pose) -> float:
@@ -17,29 +16,24 @@ def orientation(local: Pose) -> float:
     return wrap(local.heading - math.atan2(local.y, local.x))
 
 
-def onward(
-    task: Orbital, odometry: Pose, start: Pose, orbit: Orbit, mission: Mission, tolerance: float
-) -> Orbital:
-    """Return the task that follows `task` at the pose `odometry`. Completed steps are skipped.
-
-    `start` is the pose of tick 0 in the anchor's frame, and `tolerance` is `Estimator.pose_tolerance`.
-    """
-    distance_tolerance = tolerance * mission.first_straight
+def onward(state: RobotState, task: Orbital) -> Orbital:
+    """Return the task that follows `task` at the present pose. Completed steps are skipped."""
+    heading, tolerance = state.odometry.heading, state.estimator.pose_tolerance
     while True:
         match task:
-            case Aligning(heading) if abs(heading - odometry.heading) <= tolerance:
+            case Aligning(target) if abs(target - heading) <= tolerance:
                 task = Radial()
-            case Radial() if abs(left_to_orbit(odometry, start, orbit)) <= distance_tolerance:
-                if orbit.v == 0.0:
+            case Radial() if abs(left_to_orbit(state)) <= tolerance * state.config.mission.first_straight:
+                if state.orbit.v == 0.0:
                     return Orbiting()
-                task = Tangent(odometry.heading + math.copysign(math.pi / 2, orbit.omega))
-            case Tangent(heading) if abs(heading - odometry.heading) <= tolerance:
+                task = Tangent(heading + math.copysign(math.pi / 2, state.orbit.omega))
+            case Tangent(target) if abs(target - heading) <= tolerance:
                 return Orbiting()
             case _:
                 return task
 
 
-def left_to_orbit(odometry: Pose, start: Pose, orbit: Orbit) -> float:
+def left_to_orbit(state: RobotState) -> float:
     """Return the distance in m from the robot outward to its orbit; negative outside the orbit."""
-    local = compose(start, odometry)
-    return orbit.radius - math.hypot(local.x, local.y)
+    local = state.local_pose
+    return state.orbit.radius - math.hypot(local.x, local.y)

@@ -11,9 +11,10 @@ import math
 
 from agent.planning.planner import Manoeuvres
 from agent.planning.separation import leeway
+from agent.planning.state import RobotState
 from agent.planning.tasks import Backing, Beacon, Circling, Searching, Straight, Turning
 from protocol.mission import Mission
-from protocol.motion import TAU, Pose, relative, travelled
+from protocol.motion import TAU, relative, travelled
 
 
 def step_length(beacon: Beacon, rho0: float, mission: Mission) -> float:
@@ -25,42 +26,28 @@ def step_length(beacon: Beacon, rho0: float, mission: Mission) -> float:
     return step if beacon == "anchor" else min(step, leeway(rho0, mission))
 
 
-def moved(origin: Pose, pose: Pose) -> bool:
-    """Return whether the manoeuvre that began at `origin` was executed; in real time it may not be."""
-    return pose != origin
-
-
-def distance_ahead(origin: Pose, pose: Pose) -> float:
-    """Return the distance in m from `origin` to `pose` along the heading of `origin`; negative behind it."""
-    return relative(origin, pose).x
-
-
-def onward(
-    state: Searching, pose: Pose, measured: bool, mission: Mission, manoeuvres: Manoeuvres, tolerance: float
-) -> Searching | None:
-    """Return the task after a tick that led to `pose`, or None once the second range is measured.
-
-    `tolerance` is `Estimator.pose_tolerance`.
-    """
-    distance_tolerance = tolerance * mission.first_straight
-    step = step_length(state.beacon, state.rho0, mission)
-    match state:
+def onward(state: RobotState, task: Searching, measured: bool, manoeuvres: Manoeuvres) -> Searching | None:
+    """Return the task after a tick of `task`, or None once the second range is `measured`."""
+    pose, tolerance = state.odometry, state.estimator.pose_tolerance
+    distance_tolerance = tolerance * state.config.mission.first_straight
+    step = step_length(task.beacon, task.rho0, state.config.mission)
+    match task:
         case Straight(beacon, origin, rho0):
             if travelled(origin, pose) < step - distance_tolerance:
-                return state
+                return task
             if measured:
                 return None
             if manoeuvres.backward:
                 return Backing(beacon, origin, rho0)
             return Turning(beacon, origin, rho0, pose.heading + math.pi / 2)
         case Backing(beacon, origin, rho0):
-            if distance_ahead(origin, pose) > distance_tolerance - step:
-                return state
+            if relative(origin, pose).x > distance_tolerance - step:
+                return task
             return None if measured else Turning(beacon, origin, rho0, pose.heading - math.pi / 2)
         case Turning(beacon, origin, rho0, heading):
-            return state if abs(heading - pose.heading) > tolerance else Circling(beacon, origin, rho0)
+            return task if abs(heading - pose.heading) > tolerance else Circling(beacon, origin, rho0)
         case _:
-            return None if measured else state
+            return None if measured else task
 
 
 def next_on_spiral(place: tuple[float, float], side: int, mission: Mission) -> tuple[float, float]:

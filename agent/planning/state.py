@@ -82,6 +82,10 @@ class RobotState(Knowledge, frozen=True):
         """Return the time since tick 0 in s."""
         return self.tick * self.config.mission.period
 
+    def doing(self, task: Task) -> RobotState:
+        """Return this state with the task `task`."""
+        return self if task is self.task else replace(self, task=task)
+
     def with_agenda(self, **fields: Any) -> RobotState:
         """Return this state with other values of some fields of its agenda."""
         return replace(self, agenda=replace(self.agenda, **fields))

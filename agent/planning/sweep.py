@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 
 import msgspec
-from msgspec.structs import replace
 
 from agent.planning.drive import towards
 from agent.planning.state import RobotState
@@ -82,7 +81,7 @@ def next_part(state: RobotState) -> RobotState:
     part = (config.part + state.agenda.parts) % config.sweep.parts
     path = config.sweep.path(part, config.mission.sensing_range)
     task = Sweeping(transformed(inverse(state.agenda.frame), path))
-    return replace(state, task=task).with_agenda(
+    return state.doing(task).with_agenda(
         parts=state.agenda.parts + 1, part_tick=state.tick, visiting=False, unmet=0, silence=0
     )
 
@@ -132,7 +131,7 @@ def moved_on(
             task = loop(since, then)
         case Looping(_, then) if not helped:
             task = onward(Sweeping(then), state.odometry, mission, tolerance)
-    return replace(state, task=task)
+    return state.doing(task)
 
 
 def is_over(state: RobotState) -> bool:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from msgspec.structs import replace
 
 from agent.estimation.estimator import AnchorEstimate, FittedBranch, PairEstimate
-from agent.planning import drive, phase1_anchor, phase2_orbit, phase3_last_manoeuvre, range_seeking, tasks
+from agent.planning import drive, phase1_anchor, phase2_orbit, phase3_last_manoeuvre, tasks
 from agent.planning.phase3_last_manoeuvre import Plan, Question
 from agent.planning.planner import Manoeuvres
 from agent.planning.range_seeking import step_length
@@ -28,20 +28,7 @@ def start_phase1(state: RobotState, rho0: float | None) -> RobotState:
     on_anchor = state.estimator.on_anchor(state, rho0)
     if on_anchor is not None:
         return end_phase1(state, on_anchor, "on-anchor")
-    return replace(state, task=tasks.Straight("anchor", state.odometry, rho0))
-
-
-def sought(
-    state: RobotState, task: tasks.Searching, measured: bool, manoeuvres: Manoeuvres
-) -> RobotState | None:
-    """Return `state` after a tick of the search `task`; None once the second range is measured."""
-    mission = state.config.mission
-    next_task = range_seeking.onward(
-        task, state.odometry, measured, mission, manoeuvres, state.estimator.pose_tolerance
-    )
-    if next_task is None:
-        return None
-    return state if next_task is task else replace(state, task=next_task)
+    return state.doing(tasks.Straight("anchor", state.odometry, rho0))
 
 
 def anchor_estimate(state: RobotState) -> AnchorEstimate:
@@ -77,7 +64,7 @@ def to_third_point(
     )
     if command is None:
         return state.undecided("eq. (5) allows no manoeuvre to a third range")
-    return replace(state, task=tasks.ThirdPoint(estimate.branches, state.odometry, command))
+    return state.doing(tasks.ThirdPoint(estimate.branches, state.odometry, command))
 
 
 def end_phase1(state: RobotState, fitted: FittedBranch, kind: BranchKind) -> RobotState:
@@ -100,13 +87,10 @@ def aligning(state: RobotState) -> tasks.Aligning:
 
 def continue_phase2(state: RobotState, task: tasks.Orbital) -> RobotState:
     """Continue phase 2 from `task`. A robot whose pose is corrected follows its orbit by pursuit."""
-    estimator, mission = state.estimator, state.config.mission
-    next_task = phase2_orbit.onward(
-        task, state.odometry, state.start, state.orbit, mission, estimator.pose_tolerance
-    )
-    if isinstance(next_task, tasks.Orbiting) and estimator.corrects_poses:
-        next_task = tasks.Orbiting(drive.pursuit(state.local_pose, state.orbit, mission))
-    return state if next_task is state.task else replace(state, task=next_task)
+    task = phase2_orbit.onward(state, task)
+    if isinstance(task, tasks.Orbiting) and state.estimator.corrects_poses:
+        task = tasks.Orbiting(drive.pursuit(state.local_pose, state.orbit, state.config.mission))
+    return state.doing(task)
 
 
 # --- phase 3 ------------------------------------------------------------------------------------------
@@ -138,8 +122,8 @@ def after_last_manoeuvre(state: RobotState, task: tasks.LastManoeuvre | tasks.Re
     """Return `state` after a tick of a last manoeuvre: at rest, or on the way back into the peer's range."""
     if isinstance(task, tasks.LastManoeuvre) and not state.in_contact:
         back = Controls(-task.command.v, -task.command.omega)
-        return replace(state, task=tasks.Returning(back, state.odometry))
-    return replace(state, task=tasks.Standing() if state.config.role == "b" else tasks.Waiting())
+        return state.doing(tasks.Returning(back, state.odometry))
+    return state.doing(tasks.Standing() if state.config.role == "b" else tasks.Waiting())
 
 
 def with_new_ticks(state: RobotState) -> RobotState | None:
@@ -151,7 +135,7 @@ def with_new_ticks(state: RobotState) -> RobotState | None:
     last = min(state.tick, state.peer_state.peer.through)
     if last < state.log.moved() or last == state.task.through:
         return None
-    return replace(state, task=replace(state.task, through=last))
+    return state.doing(replace(state.task, through=last))
 
 
 def pair_estimate(

@@ -221,7 +221,7 @@ def _resected(state: RobotState, found: Resected) -> RobotState:
             positions = resection.positions(standing, LARGEST_MISFIT)
             if len(positions) == 1 and resection.is_fixed(standing, positions[0]):
                 task = sweep.looping(state.odometry, state.config.mission, state.tick)
-                return replace(state, task=task).with_agenda(found=found)
+                return state.doing(task).with_agenda(found=found)
         elif moved and (possible := resection.poses(standing, moved, LARGEST_MISFIT)):
             found = replace(found, possible=possible)
             if resection.is_certain(standing, moved, possible):
@@ -240,7 +240,7 @@ def _with_candidate(state: RobotState, found: Resected, robot: str) -> tuple[Rob
     others = [compose(one, state.odometry) for by, one in found.candidates.items() if by != robot]
     found = replace(found, candidates={**found.candidates, robot: compose(pose, inverse(state.odometry))})
     if 1 + sum([_agree(pose, other) for other in others]) > state.config.tolerates:
-        state = replace(state, task=Done(3, Localised(pose)))
+        state = state.doing(Done(3, Localised(pose)))
     return state, found
 
 
@@ -265,13 +265,13 @@ def _moved_on(state: RobotState, found: Resected) -> RobotState:
     still again, and forgets all ranges: those to the next robot that comes begin where it is then.
     """
     if not isinstance(state.task, Looping):
-        return replace(state, task=Standing() if found.places or found.candidates else Awaiting())
+        return state.doing(Standing() if found.places or found.candidates else Awaiting())
     mission, since, tolerance = state.config.mission, state.task.since, state.estimator.pose_tolerance
     task = sweep.onward(state.task, state.odometry, mission, tolerance)
     if task.places:
-        return replace(state, task=task)
+        return state.doing(task)
     latest = max([tick for robot, tick in found.places if robot not in found.candidates], default=-KEPT)
     if latest > state.tick - KEPT and since > state.tick - LOOPS_FOR:
-        return replace(state, task=sweep.looping(state.odometry, mission, since))
+        return state.doing(sweep.looping(state.odometry, mission, since))
     found = Resected(state.odometry, candidates=found.candidates)
-    return replace(state, task=Standing() if found.candidates else Awaiting()).with_agenda(found=found)
+    return state.doing(Standing() if found.candidates else Awaiting()).with_agenda(found=found)

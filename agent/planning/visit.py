@@ -50,7 +50,7 @@ def searching(state: RobotState) -> RobotState:
         return state
     begin, anchor = state.agenda.framed_at, _peer_anchor(state)
     leg = next_leg(state.task, (begin.x, begin.y), (anchor.x, anchor.y), mission)
-    return replace(state, task=leg)
+    return state.doing(leg)
 
 
 def next_leg(
@@ -125,7 +125,7 @@ def passing_others(state: RobotState, contacts: Sequence[Contact]) -> RobotState
             places = places[1:]
         now = replace(now, places=places)
         task = Travelling(places[0] if places else stop(state))
-    return replace(state, task=task).with_agenda(passing=now)
+    return state.doing(task).with_agenda(passing=now)
 
 
 def _leading(state: RobotState, contacts: Sequence[Contact]) -> list[Contact]:
