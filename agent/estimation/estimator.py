@@ -1,8 +1,8 @@
 """The estimator contract: hypotheses about the poses of one robot or of both, from its measurements.
 
 `exact_estimator` and `gaussian.gaussian_estimator` implement it. Planners do not ask which of the two they
-have: the mission's noise selects it, in `planning.state`. Only `planning.accuracy_seeking`, the planner for
-noisy sensors alone, plans with covariances, and takes them from `gaussian.inference`.
+have: the mission's noise selects it, in `planning.state`. Only `planning.accuracy_seeking`, the steps of
+`assured` under noise, plans with covariances, and takes them from `gaussian.inference`.
 """
 
 from __future__ import annotations

@@ -74,6 +74,8 @@ JointManoeuvres = Callable[
 
 def sensed(state: RobotState, ranged: bool) -> RobotState:
     """Return `state` with the task that follows one of active sensing, or of the search for the anchor."""
+    if not state.log.ranges:  # it is asleep
+        return _without_range(state)
     match state.task:
         case Surveying("anchor"):
             return continue_phase1(state) if is_planning_tick(state) else state
@@ -89,10 +91,10 @@ def sensed(state: RobotState, ranged: bool) -> RobotState:
             return state
 
 
-def without_range(state: RobotState) -> RobotState:
-    """Return `state` of a robot that has no range to its anchor yet: it waits, or searches for one.
+def _without_range(state: RobotState) -> RobotState:
+    """Return `state` of a robot whose first ranges are drop-outs: it waits for one, or searches.
 
-    A robot whose first ranges are drop-outs waits. If drop-outs hardly explain it, R is smaller than told.
+    If drop-outs hardly explain that it has none, R is smaller than told.
     """
     mission, p = state.config.mission, state.config.mission.noise.drop_outs
     if 0.0 < p < 1.0 and state.tick < math.ceil(math.log(UNLIKELY_DROP_OUTS) / math.log(p)):

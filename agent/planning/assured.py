@@ -82,12 +82,6 @@ class Assured(LogPlanner):
             and isinstance(state.task, Orbital | Travelling)
         )
 
-    def _start_phase1(self, state: RobotState, rho0: float | None) -> RobotState:
-        """Start phase 1 with the first range `rho0` in m; under noise, it may be missing by chance."""
-        if rho0 is None and state.estimator.corrects_poses:
-            return accuracy_seeking.without_range(state)
-        return transitions.start_phase1(state, rho0)
-
     def _continue_phase2(self, state: RobotState, task: Orbital, ranged: bool) -> RobotState:
         """Continue phase 2 from `task`; under noise, the latest range corrects the pose."""
         if state.estimator.corrects_poses:
@@ -95,7 +89,7 @@ class Assured(LogPlanner):
         return transitions.continue_phase2(state, task)
 
     def _sense(self, state: RobotState, ranged: bool) -> RobotState:
-        """Continue active sensing, or the search for the anchor: tasks under noise alone."""
+        """Continue active sensing, or search for the anchor: only under noise."""
         return accuracy_seeking.sensed(state, ranged)
 
     def _begin_phase3(self, state: RobotState) -> RobotState:

@@ -193,14 +193,10 @@ class LogPlanner(Planner[RobotState, Report]):
                 return self._after_range(state)
             case tasks.LastManoeuvre(_, origin) | tasks.Returning(_, origin) if state.odometry != origin:
                 return transitions.after_last_manoeuvre(state, task)
-            case tasks.Asleep():
-                return self._start_phase1(state, observation.anchor_range)
-            case _:
+            case tasks.Asleep() if ranged or not state.estimator.corrects_poses:
+                return transitions.start_phase1(state, observation.anchor_range)
+            case _:  # under noise, the first range may be missing by chance
                 return self._sense(state, ranged)
-
-    def _start_phase1(self, state: RobotState, rho0: float | None) -> RobotState:
-        """Return `state` at the start of phase 1, with the first range `rho0` in m or without one."""
-        return transitions.start_phase1(state, rho0)
 
     def _after_range(self, state: RobotState) -> RobotState:
         """Return `state` with the next task of phase 1, after a second or further range to the anchor."""
@@ -212,7 +208,7 @@ class LogPlanner(Planner[RobotState, Report]):
         return transitions.continue_phase2(state, task)
 
     def _sense(self, state: RobotState, ranged: bool) -> RobotState:
-        """Return `state` with the task that follows one that the paper does not have."""
+        """Return `state` with the task that follows one that the paper does not have: the robot waits."""
         del ranged
         return state
 

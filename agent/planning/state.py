@@ -13,8 +13,7 @@ from agent.estimation.knowledge import Knowledge
 from agent.planning.agenda import Agenda, Other
 from agent.planning.phase3_last_manoeuvre import Plan
 from agent.planning.tasks import Asleep, Done, Looping, Sweeping, Task
-from protocol import messages
-from protocol.messages import Inconsistent, Undecided
+from protocol.messages import Inconsistent, Undecided, Verdict
 from protocol.motion import ORIGIN, Pose, compose, inverse
 from protocol.orbits import Orbit
 
@@ -48,7 +47,7 @@ class RobotState(Knowledge, frozen=True):
         return self.task.phase
 
     @property
-    def verdict(self) -> messages.Verdict | None:
+    def verdict(self) -> Verdict | None:
         """Return the verdict of the present meeting, or None if the robot has not reached one."""
         return self.task.verdict if isinstance(self.task, Done) else None
 

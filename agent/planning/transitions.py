@@ -21,8 +21,6 @@ from protocol.motion import Controls
 
 def start_phase1(state: RobotState, rho0: float | None) -> RobotState:
     """Start phase 1 with the first anchor range `rho0` in m; None if the anchor was not detected."""
-    if rho0 is None and state.estimator.corrects_poses:
-        return state  # a range may be missing by chance: the robot waits for its first one
     if rho0 is None:
         return state.undecided("the anchor is out of range at the start")
     on_anchor = state.estimator.on_anchor(state, rho0)
