@@ -262,6 +262,7 @@ def test_stamps_that_are_all_equal_are_refused(tmp_path: Path) -> None:
     [
         (("bad.pyfg",), "bad.pyfg, line 1: VERTEX_XY has 1 fields and needs 3"),
         ((str(SAMPLE), "--robots", "C"), "has no robot C; it has A, B"),
+        ((str(CASES / "missing"), "--out", "no/radios.toml"), "--out: no/radios.toml cannot be written"),
         ((str(SAMPLE), "--out", "radios"), "--out: radios is not the path of a .toml file"),
         ((str(SAMPLE), "--without-truth", "--window", "0..5"), "without true poses, an estimate of A and B"),
         (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
 from typing import TYPE_CHECKING
 
 from compose.errors import ENDED, UserError, writing
@@ -24,15 +24,18 @@ def main(options: argparse.Namespace) -> int:
 
     if options.out is not None and options.out.suffix != ".toml":
         raise UserError(f"--out: {options.out} is not the path of a .toml file")
-    recording = read_ranges(options.recording, options.anchors)
-    found = calibrated(
-        recording, options.robots, options.window, by_fit=options.without_truth, fitting=_fitting
-    )
-    anchors = frozenset([one.id for one in recording.anchors])
-    text = profile_toml(found, anchors, f"{found.source} of {recording.source}")
-    if options.out is not None:
-        with writing(f"--out: {options.out}"):
-            files.write(options.out, text)
+    with ExitStack() as written:  # a path that cannot be written is refused before the work
+        if options.out is not None:
+            written.enter_context(writing(f"--out: {options.out}"))
+            draft = written.enter_context(files.draft(options.out))
+        recording = read_ranges(options.recording, options.anchors)
+        found = calibrated(
+            recording, options.robots, options.window, by_fit=options.without_truth, fitting=_fitting
+        )
+        anchors = frozenset([one.id for one in recording.anchors])
+        text = profile_toml(found, anchors, f"{found.source} of {recording.source}")
+        if options.out is not None:
+            draft.write_text(text)
     tell(*_lines(found))
     say(*(["", *text.splitlines()] if options.out is None else [str(options.out)]))
     return ENDED
