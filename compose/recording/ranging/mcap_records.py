@@ -10,7 +10,7 @@ from typing import BinaryIO
 
 import lz4.frame
 import zstandard
-from mcap.exceptions import EndOfFile, McapError, RecordLengthLimitExceeded
+from mcap.exceptions import EndOfFile, InvalidMagic, McapError, RecordLengthLimitExceeded
 from mcap.records import Channel, Chunk, McapRecord, Message
 from mcap.stream_reader import StreamReader
 
@@ -23,6 +23,9 @@ EXPANSION, SMALL_BYTES = 1000, 1 << 22
 
 JSON has 5 to 50. With zstd, 65 kB can hold 2 GB.
 """
+
+MAGIC_BYTES = 8
+"""The bytes with which an MCAP file begins and ends."""
 
 
 class EndOfStream(BadRecording):
@@ -77,6 +80,8 @@ def entries(file: BinaryIO, path: object, size: int | None) -> Iterator[Channel 
         while source.at == 0 or not source.is_at_end():
             yield None
             yield from _of_file(source)
+    except InvalidMagic:
+        raise BadRecording(f"{wrong}no MCAP begins or ends at byte {source.at - MAGIC_BYTES}") from None
     except RecordLengthLimitExceeded as error:
         raise BadRecording(f"{path}: before byte {source.at}: {error}") from None
     except EndOfFile as error:
