@@ -99,22 +99,39 @@ class SweptArea(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fie
         """The axis across the strips: 0 for x, 1 for y."""
         return 1 if self.x_max - self.x_min >= self.y_max - self.y_min else 0
 
-    def path(self, part: int, sensing_range: float, half_width: float = HALF_WIDTH) -> tuple[Place, ...]:
-        """Return the ends of the strips of a part, in m in <W>, in the order in which they are driven.
+    def strips(self, sensing_range: float, half_width: float = HALF_WIDTH) -> int:
+        """Return the number of strips: every point is within `half_width` R of the middle line of one."""
+        low, high = (self.x_min, self.y_min)[self.across], (self.x_max, self.y_max)[self.across]
+        return max(1, math.ceil((high - low) / (2.0 * half_width * sensing_range)))
 
-        Every point of the area is within `half_width` R of the middle line of a strip. The numbers of strips
-        of two parts differ by at most 1; a part may have none.
+    def strips_of(self, part: int, sensing_range: float, half_width: float = HALF_WIDTH) -> tuple[int, int]:
+        """Return the first strip of a part, and the one after its last.
+
+        The numbers of strips of two parts differ by at most 1; a part may have none.
+        """
+        count = self.strips(sensing_range, half_width)
+        return count * part // self.parts, count * (part + 1) // self.parts
+
+    def path(
+        self, strips: tuple[int, int], sensing_range: float, half_width: float = HALF_WIDTH
+    ) -> tuple[Place, ...]:
+        """Return the ends of `strips` in m in <W>, in the order in which they are driven.
+
+        They are the first of them, and the one after the last.
         """
         low, high = (self.x_min, self.y_min), (self.x_max, self.y_max)
         aside, along = self.across, 1 - self.across
-        width = high[aside] - low[aside]
-        count = max(1, math.ceil(width / (2.0 * half_width * sensing_range)))
+        width, count = high[aside] - low[aside], self.strips(sensing_range, half_width)
         places: list[Place] = []
-        for i in range(count * part // self.parts, count * (part + 1) // self.parts):
+        for i in range(*strips):
             middle = low[aside] + (i + 0.5) * width / count
             ends = (low[along], high[along]) if i % 2 == 0 else (high[along], low[along])
             places += [(end, middle) if along == 0 else (middle, end) for end in ends]
         return tuple(places)
+
+    def part_of(self, strip: int, sensing_range: float) -> int:
+        """Return the part that has `strip`."""
+        return next(k for k in range(self.parts) if strip < self.strips_of(k, sensing_range)[1])
 
 
 def surveyed_path(
@@ -126,7 +143,8 @@ def surveyed_path(
     ranges to both, it knows its pose again. The strips nearest to its anchor come first, because its pose
     becomes more accurate with each round.
     """
-    strips = area.path(part, sensing_range, NOISY_HALF_WIDTH)
+    own = area.strips_of(part, sensing_range, NOISY_HALF_WIDTH)
+    strips = area.path(own, sensing_range, NOISY_HALF_WIDTH)
     passing = (
         *_passed(anchor, anchor, beacon, sensing_range),
         *_passed(beacon, anchor, beacon, sensing_range),

@@ -49,9 +49,13 @@ def way_ticks(places: Sequence[Place], mission: Mission) -> int:
 
 
 def helping_ticks(mission: Mission) -> int:
-    """Return a bound on the ticks for which a sweeping robot stops to localise another one."""
-    side = SIDE * mission.sensing_range
-    return LOOPS * way_ticks([(0.0, 0.0), (side, 0.0), (side, side), (0.0, side), (0.0, 0.0)], mission)
+    """Return a bound on the ticks for which a sweeping robot stops to localise another one.
+
+    It includes the way of that one, at most R long, to the way of the first, half of whose strips it sweeps.
+    """
+    side, reach = SIDE * mission.sensing_range, mission.sensing_range
+    square = way_ticks([(0.0, 0.0), (side, 0.0), (side, side), (0.0, side), (0.0, 0.0)], mission)
+    return LOOPS * square + straight_ticks(reach, mission) + turn_ticks(mission)
 
 
 def contact_ticks(mission: Mission) -> int:
@@ -83,7 +87,9 @@ def ticks_of_parts(area: SweptArea, mission: Mission, widest: float, unanchored:
     exact, reach = mission.noise.exact, mission.sensing_range
     x, y = area.corners[0]
     paths = [
-        area.path(part, reach) if exact else surveyed_path(area, part, reach, (x, y), (x + widest, y))
+        area.path(area.strips_of(part, reach), reach)
+        if exact
+        else surveyed_path(area, part, reach, (x, y), (x + widest, y))
         for part in range(area.parts)
     ]
     return [straight_ticks(widest, mission) + part_ticks(path, mission, unanchored) for path in paths]

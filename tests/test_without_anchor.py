@@ -108,7 +108,7 @@ def test_a_sweep_comes_near_each_place_of_the_area_in_a_tick(
     wide: float, high: float, x: float, y: float, speed: float
 ) -> None:
     area = SweptArea(5.0, -3.0, 5.0 + wide, -3.0 + high, 1)
-    path = driven(area.path(0, R), Pose(0.0, 0.0, 1.0), Mission(R, 1.0, speed, 0.7))
+    path = driven(area.path(area.strips_of(0, R), R), Pose(0.0, 0.0, 1.0), Mission(R, 1.0, speed, 0.7))
     place = (5.0 + x * wide, -3.0 + y * high)
     # the robot may be on a square of its own, because another one has passed
     assert min(math.dist((pose.x, pose.y), place) for pose in path) <= STRIP_REACH * R - math.sqrt(2.0) * FAR
@@ -119,14 +119,16 @@ def test_a_sweep_takes_no_more_ticks_than_its_bound(
     wide: float, high: float, speed: float, turn_rate: float
 ) -> None:
     mission = Mission(R, 1.0, speed, turn_rate)
-    places = SweptArea(5.0, -3.0, 5.0 + wide, -3.0 + high, 1).path(0, R)
+    area = SweptArea(5.0, -3.0, 5.0 + wide, -3.0 + high, 1)
+    places = area.path(area.strips_of(0, R), R)
     path = driven(places, Pose(0.0, 0.0, 1.0), mission)
     assert len(path) - 1 <= way_ticks([(0.0, 0.0), *places], mission)
 
 
 @pytest.mark.parametrize("parts", [1, 2, 3, 7, 30])
 def test_the_strips_are_split_into_parts_without_a_gap(parts: int) -> None:
-    whole = SweptArea(0.0, 0.0, 30.0, 25.0, 1).path(0, R)
-    split = [SweptArea(0.0, 0.0, 30.0, 25.0, parts).path(part, R) for part in range(parts)]
+    area = SweptArea(0.0, 0.0, 30.0, 25.0, parts)
+    whole = area.path((0, area.strips(R)), R)
+    split = [area.path(area.strips_of(part, R), R) for part in range(parts)]
     assert [place for part in split for place in part] == list(whole)
     assert max(map(len, split)) - min(map(len, split)) <= 2

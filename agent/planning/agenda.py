@@ -183,6 +183,8 @@ class Agenda(msgspec.Struct, frozen=True):
     """The number of parts of an area that the robot has begun to sweep for robots without an anchor."""
     part_tick: int = -1
     """The tick in which it began the latest of them."""
+    strips_end: int | None = None
+    """The strip after the last one of its sweep; None if it does not leave strips to others."""
     until: float | None = None
     """The time in s at which the search of a retry ends; None if there is none."""
     alone: bool = False

@@ -29,9 +29,7 @@ from protocol.messages import (
     Inconsistent,
     Localised,
     Observation,
-    Ranged,
     Report,
-    ReportedPose,
     RobotConfig,
     Undecided,
 )
@@ -60,10 +58,7 @@ class GroupPlanner(Planner[RobotState, Report]):
         before, state = state, self.pair_planner.observe(state, observation)
         if state.in_contact and (before.agenda.alone or appointments.refused(before, state.config.peer)):
             state = replace(state, in_contact=False)
-        for contact in observation.contacts:
-            if contact.peer != state.config.peer and contact.range is not None:
-                latest = Ranged(observation.tick, contact.range)
-                state = state.with_other(contact.peer, mutual=(*state.other(contact.peer).mutual, latest))
+        state = meetings.with_ranges(state, observation)
         if state.agenda.visiting and _is_out_of_range_again(before, state):
             state = state.doing(Travelling(visit.stop(state)))
         state = visit.passing_others(state, observation.contacts)
@@ -81,9 +76,8 @@ class GroupPlanner(Planner[RobotState, Report]):
         return self.pair_planner.report(state)
 
     def report_to(self, state: RobotState, peer: str) -> Report:
-        """Return the report to `peer`: the log, or outside a meeting only this robot's verdict.
+        """Return the report to `peer`: the log, or outside a meeting what others need to know.
 
-        A robot without an anchor gets the pose of a localised one until it has determined its own by it.
         Until this robot is localised, one with which its meeting has failed gets the verdict of that meeting.
         """
         if sweep.is_helped(state, peer) and noisy_search.applies(state):
@@ -95,10 +89,7 @@ class GroupPlanner(Planner[RobotState, Report]):
         elif peer == state.config.peer and state.meets:
             return self.report(state)
         else:
-            report = exchange.report_without_log(state, state.agenda.robot_verdict)
-            if sweep.is_helped(state, peer) and isinstance(state.agenda.robot_verdict, Localised):
-                pose = exchange.reported_pose(state, state.agenda.frame)
-                report = replace(report, prior=ReportedPose(state.tick, pose))
+            report = sweep.outside_meeting(state, peer)
         unconfirmed = state.config.confirms and state.agenda.fix is not None and report.verdict is None
         return replace(report, state=UNCONFIRMED) if unconfirmed else report
 

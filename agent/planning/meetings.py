@@ -11,7 +11,7 @@ from agent.planning import appointments, sweep, visit
 from agent.planning.agenda import Fix
 from agent.planning.state import RobotState
 from agent.planning.tasks import UNCONFIRMED, Done, Travelling
-from protocol.messages import Localised, Report, Undecided
+from protocol.messages import Localised, Observation, Ranged, Report, Undecided
 
 PARTED_AFTER = 8
 """The ticks out of range of a peer after which a robot whose meeting has ended goes on.
@@ -24,11 +24,22 @@ LINGERING = 6
 """The ticks in contact for which a visited robot waits for its visitor to leave, with a safety distance."""
 
 
+def with_ranges(state: RobotState, observation: Observation) -> RobotState:
+    """Return `state` with the ranges of `observation` to all robots but the peer."""
+    for contact in observation.contacts:
+        if contact.peer != state.config.peer and contact.range is not None:
+            latest = Ranged(observation.tick, contact.range)
+            state = state.with_other(contact.peer, mutual=(*state.other(contact.peer).mutual, latest))
+    return state
+
+
 def with_sender(state: RobotState, report: Report) -> RobotState:
     """Return `state` with what `report` says about its sender: whether it travels, is localised or served.
 
-    If poses have to be confirmed, a robot that travels need not have claimed its own.
+    If poses have to be confirmed, a robot that travels need not have claimed its own. Strips that the sender
+    sweeps are not swept by this robot.
     """
+    state = sweep.without_strips(state, report.strips)
     known, confirms = state.other(report.robot), state.config.confirms
     travels = report.state == Travelling.name
     claims = not report.has_log and isinstance(report.verdict, Localised)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 
-import msgspec
+from msgspec.structs import replace
 
+from agent.planning import exchange
 from agent.planning.drive import towards
 from agent.planning.state import RobotState
 from agent.planning.tasks import Looping, Sweeping
+from protocol.messages import Localised, Report, ReportedPose
 from protocol.mission import Mission
 from protocol.motion import Pose, compose, inverse
 from protocol.sweep_strips import SIDE, STRIP_REACH, Place
@@ -54,7 +56,7 @@ def onward(
 ) -> Sweeping | Looping:
     """Return `task` without the places at which the robot has arrived."""
     while task.places and towards(task.places[0], odometry, mission, tolerance) is None:
-        task = msgspec.structs.replace(task, places=task.places[1:])
+        task = replace(task, places=task.places[1:])
     return task
 
 
@@ -66,7 +68,46 @@ def wanted(state: RobotState) -> bool:
 def is_helped(state: RobotState, robot: str) -> bool:
     """Return whether `robot` has no anchor, and still needs the poses of this robot, as far as it knows."""
     other = state.other(robot)
-    return robot in state.config.unanchored and not (other.localised or other.served)
+    finished = other.localised or other.served or robot == state.config.robot
+    return robot in state.config.unanchored and not finished
+
+
+def outside_meeting(state: RobotState, peer: str) -> Report:
+    """Return the report to `peer` outside a meeting: this robot's verdict, and the strips that it sweeps.
+
+    A robot without an anchor gets the pose of a localised one until it has determined its own by it.
+    """
+    agenda, pose = state.agenda, None
+    if is_helped(state, peer) and isinstance(agenda.robot_verdict, Localised):
+        pose = ReportedPose(state.tick, exchange.reported_pose(state, agenda.frame))
+    return replace(exchange.report_without_log(state, agenda.robot_verdict), prior=pose, strips=strips(state))
+
+
+def strips(state: RobotState) -> tuple[int, int] | None:
+    """Return the strips that the robot still sweeps, as Report.strips has them."""
+    match state.task:
+        case Sweeping(places):
+            left = len(places)
+        case Looping(_, then):
+            left = len(then) - 1  # the first one is where it has left its strip
+        case _:
+            return None
+    end = state.agenda.strips_end
+    return None if end is None else (end - (left + 1) // 2, end)
+
+
+def without_strips(state: RobotState, others: tuple[int, int] | None) -> RobotState:
+    """Return `state` without the last strips of its sweep, if these are those that another robot sweeps."""
+    own = strips(state)
+    if own is None or others is None or own[1] != others[1] or own[0] >= others[0]:
+        return state
+    most, task = -2 * (others[1] - others[0]), state.task
+    match task:
+        case Sweeping(places):
+            task = Sweeping(places[:most])
+        case Looping(_, then):
+            task = replace(task, then=then[:most])
+    return state.doing(task).with_agenda(strips_end=others[0])
 
 
 def next_part(state: RobotState) -> RobotState:
@@ -79,11 +120,39 @@ def next_part(state: RobotState) -> RobotState:
     for robot in config.unanchored:
         state = state.with_other(robot, failed=False)
     part = (config.part + state.agenda.parts) % config.sweep.parts
-    path = config.sweep.path(part, config.mission.sensing_range)
-    task = Sweeping(transformed(inverse(state.agenda.frame), path))
-    return state.doing(task).with_agenda(
-        parts=state.agenda.parts + 1, part_tick=state.tick, visiting=False, unmet=0, silence=0
-    )
+    state = _along(state, config.sweep.strips_of(part, config.mission.sensing_range))
+    return state.with_agenda(part_tick=state.tick, visiting=False, unmet=0, silence=0)
+
+
+def second_half(state: RobotState, others: tuple[int, int]) -> RobotState:
+    """Return `state` of a robot that sweeps the second half of the strips of another one, which it is beside.
+
+    It stands still until that one has heard it. Its way to them is at most R longer than that one's. Strips
+    that the area does not have change nothing.
+    """
+    begin, end = others
+    first = begin + (end - begin + 1) // 2
+    area, reach = state.config.sweep, state.config.mission.sensing_range
+    assert area is not None
+    if not begin < end <= area.strips(reach):
+        return state
+    part = area.part_of(begin, reach)
+    if first == end:  # it begins with the next part
+        return replace(state, config=replace(state.config, part=part + 1))
+    state = _along(replace(state, config=replace(state.config, part=part)), (first, end))
+    assert isinstance(state.task, Sweeping)
+    here = (state.odometry.x, state.odometry.y)
+    return state.doing(Looping((), (here, *state.task.places), state.tick))
+
+
+def _along(state: RobotState, along: tuple[int, int]) -> RobotState:
+    """Return `state` at the begin of a sweep of the strips `along`."""
+    config, agenda = state.config, state.agenda
+    assert config.sweep is not None
+    path = config.sweep.path(along, config.mission.sensing_range)
+    shares = config.mission.noise.exact and not config.tolerates
+    state = state.with_agenda(parts=agenda.parts + 1, strips_end=along[1] if shares else None)
+    return state.doing(Sweeping(transformed(inverse(agenda.frame), path)))
 
 
 def swept(state: RobotState) -> RobotState | None:

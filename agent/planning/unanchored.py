@@ -23,12 +23,12 @@ from agent.estimation.compiled import library
 from agent.estimation.judged import sufficient_mutual_ranges
 from agent.estimation.resection import RangedPlace
 from agent.peer import peer_state
-from agent.planning import drive, exchange, noisy_unanchored, sweep
+from agent.planning import drive, exchange, meetings, noisy_unanchored, sweep
 from agent.planning.agenda import Contacted, Resected
 from agent.planning.planner import Planner, Summary
 from agent.planning.state import RobotState
 from agent.planning.sweep import LOOPS_FOR
-from agent.planning.tasks import UNCONFIRMED, Awaiting, Done, Looping, Standing
+from agent.planning.tasks import UNCONFIRMED, Awaiting, Done, Looping, Standing, Sweeping
 from protocol.messages import Command, Estimate, Localised, Observation, Report, RobotConfig
 from protocol.mission import Mission
 from protocol.motion import ORIGIN, Pose, compose, inverse, wrap
@@ -70,8 +70,8 @@ class UnanchoredPlanner(Planner[RobotState, Report]):
     def observe(self, state: RobotState, observation: Observation) -> RobotState:
         """Return `state` with the odometry and the ranges of one tick."""
         state = exchange.observed(state, observation)
-        if state.verdict is not None:
-            return state
+        if state.agenda.robot_verdict is not None:
+            return meetings.with_ranges(state, observation) if _searches(state) else state
         match state.agenda.found:
             case Contacted():
                 return noisy_unanchored.ranged(state, observation)
@@ -90,13 +90,16 @@ class UnanchoredPlanner(Planner[RobotState, Report]):
 
     def report(self, state: RobotState) -> Report:
         """Return the report to a robot that has not found it: without a log, as it is in no meeting."""
-        return exchange.report_without_log(state, state.verdict)
+        return exchange.report_without_log(state, state.agenda.robot_verdict)
 
     def report_to(self, state: RobotState, peer: str) -> Report:
         """Return the report to `peer`: with noisy sensors, it acknowledges the manoeuvres of its finder.
 
-        With exact sensors, a robot by which it knows a pose does not stop any longer.
+        With exact sensors, a robot by which it knows a pose does not stop any longer. Once localised, it
+        reports its pose to others without an anchor.
         """
+        if _searches(state):
+            return sweep.outside_meeting(state, peer)
         report = self.report(state)
         match state.agenda.found:
             case Contacted(finder) if finder is not None and finder.robot == peer:
@@ -106,9 +109,17 @@ class UnanchoredPlanner(Planner[RobotState, Report]):
         return report
 
     def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
-        """Return `state` with the data in `reports`, and with a verdict if they determine the own pose."""
-        if state.verdict is not None:
-            return state
+        """Return `state` with the data in `reports`, and with a verdict if they determine the own pose.
+
+        With exact sensors, a robot that is localised looks for the others without an anchor.
+        """
+        if state.agenda.robot_verdict is None:
+            state = self._found(state, reports)
+            state = state if state.verdict is None else state.with_agenda(robot_verdict=state.verdict)
+        return _searching(state, reports) if _searches(state) else state
+
+    def _found(self, state: RobotState, reports: Sequence[Report]) -> RobotState:
+        """Return `state` of a robot that is not localised yet, with the data in `reports`."""
         match state.agenda.found:
             case Contacted() as found:
                 if state.elapsed >= state.config.gives_up:
@@ -122,7 +133,8 @@ class UnanchoredPlanner(Planner[RobotState, Report]):
 
     def command(self, state: RobotState) -> Command:
         """Return the command for the next tick, with the phase, the task and the verdict."""
-        return replace(exchange.command(state, drive.controls(state)), peer=None, role=None)
+        command = exchange.command(state, drive.controls(state))
+        return replace(command, peer=None, role=None, verdict=state.agenda.robot_verdict)
 
     def estimate(self, state: RobotState) -> Estimate:
         """Return the possible poses in <W>.
@@ -135,7 +147,7 @@ class UnanchoredPlanner(Planner[RobotState, Report]):
             robot=state.config.robot,
             local=(),
             world=(),
-            localised=isinstance(state.verdict, Localised),
+            localised=isinstance(state.agenda.robot_verdict, Localised),
         )
         match state.agenda.found:
             case Contacted(estimate=latest) as found:
@@ -240,8 +252,40 @@ def _with_candidate(state: RobotState, found: Resected, robot: str) -> tuple[Rob
     others = [compose(one, state.odometry) for by, one in found.candidates.items() if by != robot]
     found = replace(found, candidates={**found.candidates, robot: compose(pose, inverse(state.odometry))})
     if 1 + sum([_agree(pose, other) for other in others]) > state.config.tolerates:
-        state = state.doing(Done(3, Localised(pose)))
+        state = state.doing(Done(3, Localised(pose))).with_frame(pose)
     return state, found
+
+
+def _searches(state: RobotState) -> bool:
+    """Return whether the robot is localised and looks for others that have no anchor.
+
+    With noisy sensors it cannot, because it has no anchor and no beacon that correct its odometry. If robots
+    may report false data, its pose is not independent of those that have found it.
+    """
+    config = state.config
+    claimed = isinstance(state.agenda.robot_verdict, Localised)
+    return claimed and config.mission.noise.exact and not config.tolerates
+
+
+def _searching(state: RobotState, reports: Sequence[Report]) -> RobotState:
+    """Return `state` of a localised robot that looks for others, first in strips that its finder leaves it.
+
+    It begins when its finder, in range, has heard that it is localised, and reports no pose any more.
+    """
+    for one in reports:
+        state = meetings.with_sender(state, one)
+    if state.agenda.parts == 0:
+        offered = [one.strips for one in reports if one.strips is not None]
+        state = sweep.second_half(state, offered[0]) if offered else state
+    if any(one.prior is not None for one in reports) and not isinstance(state.task, Sweeping):
+        return state
+    if state.sweeps:
+        swept = sweep.swept(state)
+        if swept is not None:
+            return swept
+        assert state.agenda.robot_verdict is not None
+        state = state.doing(Done(3, state.agenda.robot_verdict))
+    return sweep.next_part(state) if sweep.wanted(state) else state
 
 
 def _agree(one: Pose, other: Pose) -> bool:

@@ -159,7 +159,7 @@ def _planned_sweep(
     off_anchor = straight_ticks(LEAVES_WITHIN * reach, mission)
     latest = 0.0
     for part, robot in enumerate(finders):
-        path = sweep.path(part, reach)
+        path = sweep.path(sweep.strips_of(part, reach), reach)
         if not exact:
             path = surveyed_path(sweep, part, reach, anchors[robot], places[robot])
         if not path:
