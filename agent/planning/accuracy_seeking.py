@@ -52,8 +52,14 @@ If it is smaller even for the most probable hypothesis, the ranges are misleadin
 CONVINCING_RANGES = 14
 """The number of anchor ranges from which on detections do not make them misleading.
 
-It is twice the number that ends phase 1 with outliers. Without this bound, a robot whose ranges are 0.35 m
-too long drove to and fro for ever, because it had ranges longer than R.
+It is more than twice the number that ends phase 1 with outliers. Without this bound, a robot whose ranges
+are 0.35 m too long drove to and fro for ever, because it had ranges longer than R.
+"""
+
+JOINING_TURN = math.pi / 2
+"""The angle in rad that a robot can turn in a tick if it joins its orbit without a turn on the spot.
+
+A robot that turns more slowly would drive a wide arc on the way out, and overshoot its orbit.
 """
 
 OFF_RADIUS = 0.5
@@ -141,7 +147,8 @@ def continue_phase1(state: RobotState) -> RobotState:
         return _start_phase2(state)
     since, objective = _objective(state, "anchor", (inference.own_path(state),))
     hypotheses = inference.anchor_planning_hypotheses(state)
-    command = active_sensing.plan_alone(hypotheses, mission, objective=objective)
+    searches = state.orbit.v != 0.0
+    command = active_sensing.plan_alone(hypotheses, mission, objective=objective, outward=searches)
     return state.doing(Surveying("anchor", command, since))
 
 
@@ -251,6 +258,8 @@ def continue_phase2(state: RobotState, task: Orbital, *, ranged: bool) -> RobotS
         state = replace(state, belief=inference.with_own(state, scored))
         if isinstance(task, Radial) and abs(phase2_orbit.orientation(state.local_pose)) > OFF_RADIUS:
             return _start_phase2(state)
+    if state.orbit.v != 0.0 and mission.max_turn_rate * mission.period >= JOINING_TURN:
+        task = task if isinstance(task, Orbiting) else Orbiting()
     task = phase2_orbit.onward(state, task)
     timeout: float = LOST_AFTER * stride(mission)
     if (
@@ -261,7 +270,8 @@ def continue_phase2(state: RobotState, task: Orbital, *, ranged: bool) -> RobotS
         return _return_to_anchor(state)
     if isinstance(task, Orbiting):
         since = task.since or state.tick
-        timeout += state.config.rendezvous.bound / mission.period
+        way_out = state.orbit.radius / mission.max_speed
+        timeout += (way_out + state.config.rendezvous.bound) / mission.period
         if state.orbit.v != 0.0 and state.tick - since > timeout and not state.in_contact:
             return _begin_again(state, state.start) if state.config.begins_again else _return_to_anchor(state)
         if state.orbit.v != 0.0:

@@ -17,8 +17,11 @@ from protocol.sweep_ticks import sweep_speed
 ASIDE = 1e-9
 """The distance from a place at which a straight to it may end beside it, as a fraction of A_0."""
 
-LOOKAHEAD = 2.0
-"""The distance of the pursued point ahead on the orbit, in ticks of the orbit's speed."""
+LOOKAHEAD = 1.5
+"""The distance of the pursued point ahead on the orbit, in ticks of the orbit's speed.
+
+With more, a robot joins its orbit later; with 1, it turns to and fro about it.
+"""
 
 
 def controls(state: RobotState) -> Controls:

@@ -147,7 +147,7 @@ class Orbiting(Orbital, frozen=True):
     command: Controls | None = None
     """Noisy sensors: the controls of pure pursuit, or of active sensing while the robot waits."""
     since: int = 0
-    """Noisy sensors: the tick in which the robot reached its orbit."""
+    """Noisy sensors: the tick in which the robot reached its orbit, or set out for it without a stop."""
 
 
 class Travelling(msgspec.Struct, frozen=True):

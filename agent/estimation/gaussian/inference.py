@@ -209,7 +209,8 @@ def is_anchor_known(knowledge: Knowledge, scored: Sequence[Hypothesis]) -> bool:
     good = int(np.count_nonzero(best.fit.weights > 0.5))
     if good < LEAST_RANGES or best.probability < SURE_OF_BRANCH:
         return False
-    if _anchor_sigma(best.fit) > mission.required_anchor_sigma:
+    share = SEARCHING_SIGMAS if knowledge.config.orbit.v != 0.0 else 1.0
+    if _anchor_sigma(best.fit) > share * mission.required_anchor_sigma:
         return False
     if mission.noise.outliers or good >= ANCHOR_RANGES:
         return good >= (ANCHOR_RANGES_WITH_OUTLIERS if mission.noise.outliers else ANCHOR_RANGES)
@@ -229,6 +230,13 @@ SURE_OF_BRANCH = 0.999
 """The probability from which on a robot accepts a branch and ends phase 1.
 
 A wrong branch does not lead to a wrong claim: all branches take part in the search of phase 3.
+"""
+
+SEARCHING_SIGMAS = 1.5
+"""The largest sigma of the anchor's position with which a robot ends phase 1 to search for its peer.
+
+It is in units of `required_anchor_sigma`. On the way out, two or three further ranges follow, which correct
+the orbit, and later the mutual ranges correct the pose.
 """
 
 ANCHOR_EVIDENCE = 20.0
@@ -253,7 +261,7 @@ later drive back; with more, robots whose anchor is known too badly range in vai
 little noise never come near it.
 """
 
-ANCHOR_RANGES, ANCHOR_RANGES_WITH_OUTLIERS = 5, 7
+ANCHOR_RANGES, ANCHOR_RANGES_WITH_OUTLIERS = 5, 6
 """The numbers of anchor ranges that end phase 1 without such evidence, without and with outliers.
 
 Set on the sweep `noise`. With sigmas of R / 30 and more, ranges give little evidence: it would take twice as
