@@ -147,8 +147,7 @@ def continue_phase1(state: RobotState) -> RobotState:
         return _start_phase2(state)
     since, objective = _objective(state, "anchor", (inference.own_path(state),))
     hypotheses = inference.anchor_planning_hypotheses(state)
-    searches = state.orbit.v != 0.0
-    command = active_sensing.plan_alone(hypotheses, mission, objective=objective, outward=searches)
+    command = active_sensing.plan_alone(hypotheses, mission, objective=objective)
     return state.doing(Surveying("anchor", command, since))
 
 

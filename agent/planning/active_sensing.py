@@ -39,13 +39,6 @@ OUTSIDE_COST_ALONE = 10.0
 It is also that of stalled robots, to which a missing range tells which hypothesis is false.
 """
 
-OUTWARD_VALUE = 0.3
-"""The value of being A_0 farther from the anchor after the manoeuvre, in variances of the accuracy.
-
-Set on the scenario `noisy`, by a's first contact with b in the mean over all bearings of b. With 0, it is 0.4
-ticks later; with 1 it is as early, but robots leave the anchor with an inaccurate position more often.
-"""
-
 STALLED_COST = 1e9
 """The cost of standing still for a stalled robot (see `strides`)."""
 
@@ -73,14 +66,12 @@ def plan_alone(
     mission: Mission,
     within: float | None = None,
     objective: Objective = CONTINUED,
-    outward: bool = False,
 ) -> Controls:
     """Return the manoeuvre whose ranges to the anchor are expected to be most informative.
 
     The anchor is the origin, and the covariance of each hypothesis is that of the anchor's position. `within`
     is the largest allowed distance from the anchor in m. The `outside_cost` of the objective does not count:
-    that of a robot alone is OUTSIDE_COST_ALONE, or OUTSIDE_COST beyond `within`. If the robot will have to
-    drive `outward`, the way that it has done by then has a value, too (OUTWARD_VALUE).
+    that of a robot alone is OUTSIDE_COST_ALONE, or OUTSIDE_COST beyond `within`.
     """
     ways = choice(mission, objective.strides)
     best = hypotheses[0]
@@ -105,8 +96,6 @@ def plan_alone(
         cost += one.probability * OUTSIDE_COST * np.maximum(0.0, NEAREST_TO_ANCHOR * reach - distance[:, 0])
         margin = math.sqrt(max(0.0, float(np.trace(one.covariance)))) if within is None else 0.0
         loss = OUTSIDE_COST if within is not None else OUTSIDE_COST_ALONE
-        if outward:
-            cost -= one.probability * OUTWARD_VALUE * distance[:, -1] / mission.first_straight
         cost += one.probability * loss * np.maximum(0.0, distance[:, 0] + min(margin, 0.1 * reach) - limit)
     i = int(np.argmin(cost))
     return Controls(float(ways.v[i]), float(ways.omega[i]))
