@@ -6,6 +6,7 @@ import math
 import tracemalloc
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,8 +16,8 @@ from msgspec.structs import replace
 
 from agent.estimation import closed_forms, posterior
 from agent.estimation.closed_forms import Placement, same_placement
-from agent.estimation.fit import Fit, HeldFit, fits
-from agent.estimation.gauss_newton import Convergence
+from agent.estimation.fit import fits
+from agent.estimation.gauss_newton import Convergence, Fitted
 from agent.estimation.gaussian import claim_rivals, evidence, inference, placement_guesses
 from agent.estimation.gaussian import search as searching
 from agent.estimation.gaussian.anchor_guesses import anchors
@@ -34,6 +35,7 @@ from agent.estimation.gaussian.joint_ranges import (
 from agent.estimation.gaussian.odometry_noise import Array, constant_errors, track
 from agent.estimation.gaussian.placement_guesses import _encounter, placements
 from agent.estimation.gaussian.search import COARSE_STILL, _until_now, of_anchor, search, starts_about
+from agent.estimation.kernel import Kernel
 from agent.estimation.posterior import NO_HYPOTHESES, Hypothesis, Posterior, follow
 from agent.estimation.smoother import Singular
 from protocol.motion import Pose, step, wrap
@@ -573,12 +575,14 @@ def test_numbers_beyond_floats_block_a_claim(monkeypatch: pytest.MonkeyPatch) ->
     first = search(pair).hypotheses[0]
     one_stray = first.fit._replace(weights=np.append(0.0, first.fit.weights[1:]))
 
-    def held(_: JointMeasurements, begun: Fit, steps: int) -> HeldFit:
-        if steps == 0:
-            raise Singular
-        return HeldFit(-100.0, begun.poses)
+    held = Kernel.held
 
-    monkeypatch.setattr(claim_rivals, "held_fit", held)
+    def held_after_steps(self: Kernel, *begun: Any) -> Fitted:
+        if begun[-1] == 0:
+            raise Singular
+        return held(self, *begun)
+
+    monkeypatch.setattr(Kernel, "held", held_after_steps)
     (claimed,) = inference.pair_planning_hypotheses([first])
     rival = claim_rivals.likeliest_rival(first.fit, pair, claimed, (0, 1))
     assert rival.log_likelihood_ratio == math.inf

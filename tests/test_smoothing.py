@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from agent.estimation import smoother
-from agent.estimation.fit import Fit, Start, deviation, fits, held_fit
+from agent.estimation.fit import Fit, Start, deviation, fits, held_fits
 from agent.estimation.gauss_newton import LAST_STEP, Convergence, moved
 from agent.estimation.gaussian import joint_ranges, odometry_noise
 from agent.estimation.gaussian.claim_rivals import FAR_ANCHOR, _holding
@@ -702,7 +702,7 @@ def test_a_range_that_holds_a_coordinate_is_no_outlier_and_has_no_bias(
     place, sigma = begun.poses[1, :2], 1e-4
     away = FAR_ANCHOR * pair.reach
     measured = _holding(pair, 1, place - away * along, away + offset, sigma)
-    held = held_fit(measured, begun, 5)
+    (held,) = held_fits(measured, begun, [(away + offset, 5)])
     # a few full steps: each is bounded, and none is made shorter if it does not descend
     assert 0.0 < (held.poses[1, :2] - place) @ along / offset < 1.5
     (whole,) = fits(measured, [begun.start], Convergence(20))

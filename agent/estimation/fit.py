@@ -274,17 +274,27 @@ class HeldFit(NamedTuple):
     """The pose of each robot at the end of its path, relative to the origin, in m and rad; shape (n, 3)."""
 
 
-def held_fit(measured: JointMeasurements, begun: Fit, steps: int) -> HeldFit:
-    """Return the fit to `measured` after `steps` steps from the fit `begun`.
+def held_fits(measured: JointMeasurements, begun: Fit, held: Sequence[tuple[float, int]]) -> list[HeldFit]:
+    """Return the fits from the fit `begun` with one more range, the last one, which holds a coordinate.
 
-    The last of the ranges is not one of those of that fit. It holds a coordinate. Raises Singular.
+    `held` has that range (m) and the number of steps of each fit. A fit is as likely as can be if a number is
+    too large for a float.
     """
-    problem = Problem.of(measured)
+    problem, found = Problem.of(measured), []
     poses, constant, white, _ = _begin(problem, begun.start)
     weights = np.append(begun.weights, 1.0)[problem.order]
-    found = problem.kernel.held(poses, constant, white, weights, steps)
-    volume = 0.5 * found.step.of_start
-    return HeldFit(_evidence(problem, found) - volume, found.final.walk.place[:, -1])
+    for length, steps in held:
+        rho = problem.measured.rho.copy()
+        rho[problem.back[-1]] = length
+        kernel = Kernel(problem.measured._replace(rho=rho), problem.weighing)
+        try:
+            fitted = kernel.held(poses, constant, white, weights, steps)
+        except Singular:
+            found.append(HeldFit(math.inf, begun.poses))
+            continue
+        log_likelihood = _evidence(problem, fitted) - 0.5 * fitted.step.of_start
+        found.append(HeldFit(log_likelihood, fitted.final.walk.place[:, -1]))
+    return found
 
 
 def _without_outliers(problem: Problem, measured: JointMeasurements, starts: Sequence[Start]) -> list[Start]:

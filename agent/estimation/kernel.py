@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ctypes
 import math
-from functools import cached_property
 from itertools import accumulate, pairwise
 
 import numpy as np
@@ -81,11 +80,11 @@ class Kernel:
                 *at[len(arrays) :],
             )
         )
-        self._of_walk = ((n, k + 1, 3), (n, k, 8), (count, 2), (count,), (count,))
-        of_errors, ticks = ((n, 2, k), *[(count,)] * 5), k * of.strays
-        self._of_step = ((size,), (size,), (size, size), *of_errors, (n3, n3), (n, ticks, 5), (4,))
-        of_point = ((n3,), (c,), (n, m), (n, 2, k), (count,), (count,), *self._of_walk, (count,), (1,))
-        self._fitted = _Layout(*of_point, *of_point, *self._of_step, (count,), (count,), (n, ticks), (6,))
+        self._of_walk = ((n, k + 1, 3), (n, k, 8), (count, 2), count, count)
+        ticks, of_ranges = k * of.strays, (count, count, count, count, count)
+        self._of_step = (size, size, (size, size), (n, 2, k), *of_ranges, (n3, n3), (n, ticks, 5), 4)
+        of_point = (n3, c, (n, m), (n, 2, k), count, count, *self._of_walk, count, 1)
+        self._fitted = _Layout(*of_point, *of_point, *self._of_step, count, count, (n, ticks), 6)
         vectors = (count, count, count * q, count * s, s, s * q, s * s, q * q, q)
         spaces = (s, s * size, s * s, s, size, size * size, max(size, n3) ** 2, *[max(q, of.radios)] * 2)
         weights = (*[count] * 4, n3, n * ticks, 2 * n * ticks)
@@ -201,14 +200,12 @@ class _Layout:
         self._ends = [0, *accumulate([one if isinstance(one, int) else math.prod(one) for one in shapes])]
         self._bytes = np.array(self._ends[:-1]) * np.dtype(np.float64).itemsize
 
-    @cached_property
-    def _parts(self) -> list[tuple[slice, tuple[int, ...] | int]]:
-        return [(slice(*each), one) for each, one in zip(pairwise(self._ends), self._shapes, strict=True)]
-
     def new(self) -> tuple[Places, list[Array]]:
         """Return the addresses of new arrays, and the arrays."""
         at, memory = self.space()
-        return at, [memory[part].reshape(shape) for part, shape in self._parts]
+        parts = [memory[begin:end] for begin, end in pairwise(self._ends)]
+        shaped = zip(parts, self._shapes, strict=True)
+        return at, [one if isinstance(shape, int) else one.reshape(shape) for one, shape in shaped]
 
     def space(self) -> tuple[Places, Array]:
         """Return the addresses of new arrays, and their memory."""

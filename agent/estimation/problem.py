@@ -67,13 +67,15 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
         n, lengths = len(measured.paths), tuple([len(path.v) for path in measured.paths])
         ticks = max(lengths, default=0)
         tick = np.minimum(ranges.tick, ticks)
-        order = np.argsort(tick, kind="stable")
+        order = tick.argsort(kind="stable")
         back = np.empty_like(order)
         back[order] = np.arange(len(order))
-        radios, holding = sorted(set(ranges.radio.tolist()) - {-1}), ranges.radio[order] < 0
-        radio = np.where(holding, -1, np.searchsorted(radios, ranges.radio[order]))  # without gaps
-        common = ranges.common_errors(priors)[order]
+        tick, radio, rho = tick[order], ranges.radio[order], ranges.rho[order]
+        holding, common = radio < 0, ranges.common_errors(priors)[order]
         common[holding] = 0.0
+        numbers = sorted(set(radio.tolist()) - {-1})
+        if numbers != list(range(len(numbers))):
+            radio = np.where(holding, -1, np.searchsorted(numbers, radio))  # without gaps
         v, omega, slip = _velocities(measured.paths, ticks)
         anchor, anchors = _unsure_anchors(ranges) if priors.survey_error else (np.full(len(order), -1), 0)
         white = _variances(measured, v, omega)
@@ -89,11 +91,11 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
             white=white,
             stray=stray,
             patterns=constant_errors(v, omega, noise),
-            begin=np.searchsorted(tick[order], np.arange(ticks + 2)),
+            begin=tick.searchsorted(np.arange(ticks + 2)),
             first=ranges.first[order],
             second=ranges.second[order],
             place=ranges.place[order],
-            rho=ranges.rho[order],
+            rho=rho,
             common=common,
             scaled=-1 if not priors.range_scale or few else SCALE_AFTER_BIAS * bool(priors.range_bias),
             scale=priors.range_scale,
@@ -102,7 +104,7 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
             anchors=anchors,
             survey=priors.survey_error,
             radio=radio,
-            radios=int(radio.max(initial=-1)) + 1 if priors.slow_sigma else 0,
+            radios=len(numbers) if priors.slow_sigma else 0,
             slow=priors.slow_sigma**2,
             decay=math.exp(-measured.period / priors.slow_time),
             mean=np.zeros(3 * n) if prior is None else prior.mean.ravel(),
@@ -113,8 +115,8 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
             noise,
             ranges.sigma[order],
             holding.astype(np.intp),
-            np.argsort(radio, kind="stable"),
-            max(float(np.max(ranges.rho[order[~holding]], initial=0.0)), SIGMA_FLOOR),
+            radio.argsort(kind="stable"),
+            float(rho[~holding].max(initial=SIGMA_FLOOR)),
             free=3 * n - (0 if prior is None else prior.rank),
             noisy=bool(of.patterns.shape[1]) or bool(of.white.any()) or bool(of.stray.any()),
         )
@@ -140,12 +142,10 @@ def _variances(measured: JointMeasurements, v: Array, omega: Array) -> Array:
     """
     white = variances(v, omega, measured.noise.odometry)
     for i, path in enumerate(measured.paths):
-        if measured.is_anchor(i):
-            white[i] = 0.0
-        known = len(path.v)
+        known = 0 if measured.is_anchor(i) else len(path.v)
         white[i, :, known:] = 0.0
         if path.extra is not None:
-            white[i, :, :known] += path.extra
+            white[i, :, :known] += path.extra[:, :known]
     return white
 
 

@@ -16,11 +16,10 @@ import numpy as np
 from msgspec.structs import replace
 
 from agent.estimation.elementary import eigh
-from agent.estimation.fit import Fit, HeldFit, deviation, held_fit
+from agent.estimation.fit import Fit, deviation, held_fits
 from agent.estimation.gaussian.inference import PlanningHypothesis
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges
 from agent.estimation.gaussian.odometry_noise import Array
-from agent.estimation.smoother import Singular
 
 WRONG_SIGMAS = 5.0
 """The number of claimed sigmas from which on the referee calls a claim wrong."""
@@ -70,10 +69,8 @@ def likeliest_rival(
         variances, axes = eigh(covariance[i : i + 2, i : i + 2])
         along, far = axes[:, 1], WRONG_SIGMAS * deviation(float(np.sum(variances)))
         place, away, held = fitted.poses[robot, :2], FAR_ANCHOR * measured.reach, HOLDING_SIGMA * far
-        here, *there = [
-            _held(_holding(measured, robot, place - away * along, away + offset, held), fitted, steps)
-            for offset, steps in ((0.0, 0), (far, HELD_STEPS), (-far, HELD_STEPS))
-        ]
+        lengths = ((away, 0), (away + far, HELD_STEPS), (away - far, HELD_STEPS))
+        here, *there = held_fits(_holding(measured, robot, place - away * along, away, held), fitted, lengths)
         best = max(there, key=lambda one: one.log_likelihood)
         ratio = math.inf  # a claim whose own likelihood is not known may have any rival
         if math.isfinite(here.log_likelihood):
@@ -82,14 +79,6 @@ def likeliest_rival(
         poses = PlanningHypothesis(probability, best.poses.ravel(), fitted.covariance)
         rivals.append(Rival(robot, ratio, poses))
     return max(rivals, key=lambda one: one.log_likelihood_ratio)
-
-
-def _held(measured: JointMeasurements, fitted: Fit, steps: int) -> HeldFit:
-    """Return a fit with a held coordinate; as likely as can be if a number is too large for a float."""
-    try:
-        return held_fit(measured, fitted, steps)
-    except Singular:
-        return HeldFit(math.inf, fitted.poses)
 
 
 def _holding(

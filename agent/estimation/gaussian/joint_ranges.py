@@ -261,9 +261,9 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
     def pivots(self) -> Array:
         """The pivot of each robot: the mean place of its anchors; NaN, without any, for its start; (n, 2)."""
         ranges, found = self.ranges, np.full((len(self.robots), 2), math.nan)
+        of_anchors = (ranges.second < 0) & (ranges.radio >= 0)
         for i in range(len(found)):
-            own = ranges.to_anchors(i) & (ranges.radio >= 0)
-            places = dict.fromkeys([tuple(place) for place in ranges.place[own].tolist()])
+            places = set(zip(*ranges.place[of_anchors & (ranges.first == i)].T.tolist(), strict=True))
             if places:
                 found[i] = [math.fsum(axis) / len(places) for axis in zip(*places, strict=True)]
         return found
@@ -336,13 +336,16 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
         nothing = np.zeros(len(own.rho), np.intp)
         ranges = msgspec.structs.replace(own, first=nothing, place=np.zeros((len(nothing), 2)), radio=nothing)
         silent = [one._replace(first=0) for one in self.silent if (one.first, one.second) == (robot, -1)]
+        noise = (
+            msgspec.structs.replace(self.noise, survey_error=0.0) if self.noise.survey_error else self.noise
+        )
         return msgspec.structs.replace(
             self,
             robots=("",),
             paths=(self.paths[robot],),
             ranges=ranges,
             origin=(0.0, 0.0),
-            noise=msgspec.structs.replace(self.noise, survey_error=0.0),
+            noise=noise,
             prior=PosePrior(np.zeros((1, 3)), np.diag((0.0, 0.0, HELD)), 1, math.log(HELD)),
             silent=tuple(silent),
         )

@@ -158,12 +158,11 @@ class OdometryNoiseModel(NamedTuple):
 def constant_errors(v: Array, omega: Array, noise: Noise) -> Array:
     """Return the `patterns` of a robot that measured v and omega: two scale errors, and the bias of omega."""
     priors = noise.priors
-    moving = _moving(v, omega, noise)
     patterns = np.zeros((*v.shape[:-1], 3 * priors.of_odometry, 2, v.shape[-1]))
     if priors.of_odometry:
         np.multiply(v, priors.wheel_scale, out=patterns[..., 0, 0, :])
         np.multiply(omega, priors.wheel_scale, out=patterns[..., 1, 1, :])
-        np.multiply(moving, priors.gyro_bias, out=patterns[..., 2, 1, :])
+        np.multiply(_moving(v, omega, noise), priors.gyro_bias, out=patterns[..., 2, 1, :])
     return patterns
 
 
@@ -190,8 +189,10 @@ def stray_variances(v: Array, omega: Array, noise: Noise, period: float) -> Arra
 
 def variances(v: Array, omega: Array, noise: VelocityNoise) -> Array:
     """Return the variances of the measured v and omega; (..., k) each -> (..., 2, k)."""
-    of_v = np.square(noise.v * v) + noise.v_floor**2
-    return np.stack((of_v, np.square(noise.omega * omega) + noise.omega_floor**2), -2)
+    found = np.empty((*v.shape[:-1], 2, v.shape[-1]))
+    np.add(np.square(noise.v * v), noise.v_floor**2, out=found[..., 0, :])
+    np.add(np.square(noise.omega * omega), noise.omega_floor**2, out=found[..., 1, :])
+    return found
 
 
 def expected_variances(v: Array, omega: Array, noise: Noise, period: float) -> Array:
