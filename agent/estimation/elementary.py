@@ -60,9 +60,8 @@ def product(left: Array, right: Array) -> Array:
     assert right.shape[:-2] in ((), leading)
     (p, q), r = left.shape[-2:], right.shape[-1]
     assert right.shape[-2] == q
-    steps = [one.shape[-2] * one.shape[-1] * (one.ndim > 2) for one in (left, right)]
     to = np.empty((*leading, p, r))
-    with_steps = (address(left), steps[0], address(right), steps[1])
+    with_steps = (address(left), p * q * (left.ndim > 2), address(right), q * r * (right.ndim > 2))
     library().products(math.prod(leading), p, q, r, *with_steps, address(to))
     return to
 

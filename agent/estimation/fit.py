@@ -67,8 +67,6 @@ class Fit(NamedTuple):
     """The estimate of the noise level tau^2."""
     constants: Array
     """The constant errors of ranges, then of each robot's odometry, in their sigmas; shape (c + m n,)."""
-    constant_sigmas: Array
-    """Their standard deviations in the same unit."""
     paths: Array
     """The x, y (m, relative to the origin) and heading (rad) of each robot at each tick; (n, K + 1, 3)."""
     problem: Problem
@@ -111,6 +109,11 @@ class Fit(NamedTuple):
         """The covariance of `guess`; shape (3 n, 3 n)."""
         n3 = self.start.poses.size
         return np.asarray(self.level * self.linear.step.inverse[:n3, :n3], np.float64)
+
+    @property
+    def constant_sigmas(self) -> Array:
+        """The standard deviations of `constants` in the same unit."""
+        return np.sqrt(np.maximum(np.diagonal(self.linear.step.inverse)[self.start.poses.size :], 0.0))
 
     @property
     def ticks(self) -> Places:
@@ -304,7 +307,7 @@ def _without_outliers(problem: Problem, measured: JointMeasurements, starts: Seq
     Without them, a fit first allows for the uncertainty of the odometry too, which can explain an outlier
     and draw the fit away from the start.
     """
-    if not problem.weighing.robust:
+    if not (starts and problem.weighing.robust):
         return []
     kernel, found = problem.kernel, []
     sigma = np.sqrt(np.square(measured.ranges.sigma) + measured.loosened)[problem.order]
@@ -347,7 +350,6 @@ def _fit(problem: Problem, found: Fitted) -> Fit:
         found.last_step,
         level,
         step.change[n3:],
-        np.sqrt(np.maximum(np.diagonal(step.inverse)[n3:], 0.0)),
         final.walk.place,
         problem,
         Linear(kernel, model.walk, model.poses, found.variance, step),

@@ -203,9 +203,8 @@ class _Layout:
     def new(self) -> tuple[Places, list[Array]]:
         """Return the addresses of new arrays, and the arrays."""
         at, memory = self.space()
-        parts = [memory[begin:end] for begin, end in pairwise(self._ends)]
-        shaped = zip(parts, self._shapes, strict=True)
-        return at, [one if isinstance(shape, int) else one.reshape(shape) for one, shape in shaped]
+        parts = zip([memory[slice(*each)] for each in pairwise(self._ends)], self._shapes, strict=True)
+        return at, [one if isinstance(shape, int) else one.reshape(shape) for one, shape in parts]
 
     def space(self) -> tuple[Places, Array]:
         """Return the addresses of new arrays, and their memory."""
