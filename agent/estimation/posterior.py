@@ -45,8 +45,8 @@ MOST_POSES = 24
 WARM_STEPS = 2
 """The Gauss-Newton steps from the fit of the previous tick.
 
-Where the best fit has not converged by then, it may be on its way to another mode, and the plane is searched.
-With one step, that is every third tick; with more, each tick takes longer."""
+Where the best fit has not converged by then, all fits go on to their end (see `settled`). With one step, that
+is every third tick; with more, each tick takes longer."""
 
 FOLLOWED = Convergence(WARM_STEPS)
 """The convergence of fits that begin at those of the previous tick."""

@@ -16,7 +16,7 @@ from agent.estimation.gaussian.own_sensors import DOUBTFUL_CLAIMS
 from agent.estimation.gaussian.search import search
 from agent.estimation.judged import FEWEST_FOR_CLAIM, Judged, of_pair
 from agent.estimation.knowledge import Belief, Knowledge
-from agent.estimation.posterior import PAIR, Posterior, follow
+from agent.estimation.posterior import PAIR, Posterior, settled
 from agent.planning.state import RobotState
 from agent.planning.tasks import Done
 from protocol.messages import Localised
@@ -25,7 +25,8 @@ PAIR_SEARCHES = frozenset((FEWEST_FOR_CLAIM, *(8 * 2**n for n in range(12))))
 """The numbers of mutual ranges at which the whole plane is searched again for hypotheses.
 
 They only bound how long a missed hypothesis stays missed: the plane is also searched before each claim, and
-whenever the best fit still moves. More searches cost time; with fewer, robots plan with too few hypotheses.
+where the best fit does not converge. More searches cost time; with fewer, robots plan with too few
+hypotheses.
 """
 
 
@@ -42,13 +43,11 @@ class PairInference(NamedTuple):
 def inferred(state: Knowledge, pair: JointMeasurements) -> PairInference:
     """Return the hypotheses about both robots, from those of the last tick or from a search.
 
-    The whole plane is searched if nothing is known, at the counts PAIR_SEARCHES, if the best fit still moves,
-    because it may be on its way to another mode, and before a claim or a suspicion.
+    The whole plane is searched if nothing is known, at the counts PAIR_SEARCHES, if the best fit does not
+    converge, and before a claim or a suspicion.
     """
-    known, mutual = (
-        follow(Posterior(PAIR, state.belief.pair), pair),
-        int(np.count_nonzero(pair.ranges.mutual)),
-    )
+    known = settled(Posterior(PAIR, state.belief.pair), pair)
+    mutual = int(np.count_nonzero(pair.ranges.mutual))
     due = any(state.belief.ranges_at_last_search < count <= mutual for count in PAIR_SEARCHES)
     if known.hypotheses and known.has_converged and not due:
         followed = _inference(state, pair, known, searched=False)
