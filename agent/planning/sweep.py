@@ -150,7 +150,7 @@ def _along(state: RobotState, along: tuple[int, int]) -> RobotState:
     config, agenda = state.config, state.agenda
     assert config.sweep is not None
     path = config.sweep.path(along, config.mission.sensing_range)
-    shares = config.mission.noise.exact and not config.tolerates
+    shares = not (state.estimator.corrects_poses or config.tolerates)
     state = state.with_agenda(parts=agenda.parts + 1, strips_end=along[1] if shares else None)
     return state.doing(Sweeping(transformed(inverse(agenda.frame), path)))
 

@@ -262,9 +262,8 @@ def _searches(state: RobotState) -> bool:
     With noisy sensors it cannot, because it has no anchor and no beacon that correct its odometry. If robots
     may report false data, its pose is not independent of those that have found it.
     """
-    config = state.config
     claimed = isinstance(state.agenda.robot_verdict, Localised)
-    return claimed and config.mission.noise.exact and not config.tolerates
+    return claimed and not (state.estimator.corrects_poses or state.config.tolerates)
 
 
 def _searching(state: RobotState, reports: Sequence[Report]) -> RobotState:
