@@ -60,7 +60,7 @@ def test_the_next_manoeuvre_is_planned_with_the_rival_that_blocks_a_claim(
 
     monkeypatch.setattr(accuracy_seeking, "with_claim", with_claim)
     monkeypatch.setattr(Assured, "joint_manoeuvres", lambda _, *args: plan_together(*args))
-    assert_localised(run_mission(scenario_of(SIGMA, 393, reach=1.5)))
+    assert_localised(run_mission(scenario_of(SIGMA, 382, reach=1.5)))
     assert rivals
     for rival in rivals:
         (claimed, other, *_) = next(some for some in planned if rival.hypothesis in some)

@@ -32,7 +32,7 @@ from tests.groups import SIGMA, R, group_of, localised, random_group, table_of
 from world.faults import EXCHANGED, IN_TURN, Fault, exchange_ticks
 from world.scenario import Scenario
 
-TURNED = {"kind": "rotate", "part": "orbit", "size": math.radians(20.0)}
+TURNED = {"kind": "rotate", "part": "orbit", "size": math.radians(15.0)}
 """False reports that pass the first meeting of r3 in the group of `attacked`."""
 
 
@@ -80,7 +80,7 @@ def test_a_noisy_group_whose_anchors_are_all_at_one_place_is_refused_in_one_line
 
 
 def attacked() -> Scenario:
-    """Return a group whose attacker r1 turns the path of its visit to r3 by 20 degrees; r3 then visits r2."""
+    """Return a group whose attacker r1 turns the path of its visit to r3 by 15 degrees; r3 then visits r2."""
     return random_group(120, robots=3, attack=TURNED)
 
 

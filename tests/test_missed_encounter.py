@@ -38,12 +38,12 @@ from world.scenario import Scenario
 DRIFT = "anchor_sigma = 0.05\nmutual_sigma = 0.05\nodometry = {omega_floor = 0.02}"
 """Noise with which one of twenty robots a misses b: the heading drifts by 0.15 rad on an orbit."""
 MISSED = (
-    7461357922965555064,
-    2320446363199997944,
+    4555997949307862513,
+    1723396742918998267,
+    787813770569954228,
     6283387047437257040,
-    8900357934714246900,  # b has not moved since a began again
-    9220778401274251137,
-    2126934262022313336,
+    3408464632754983231,
+    6689259541481075102,
 )
 """Seeds of DRIFT in which a misses b at first."""
 WHEELS = """anchor_sigma = 0.05
@@ -53,8 +53,8 @@ actuation = {v = 0.05, omega = 0.05}"""
 """Noise with which one of sixteen robots a meets b, and cannot claim after 60 mutual ranges."""
 UNSETTLED = (
     411770278714326748,
-    5241815115701522205,
-    3089281989611340424,
+    5187163166335705732,
+    3405456778290464655,
 )
 """Seeds of WHEELS, three of the first that were drawn, in which a leaves b after a meeting."""
 PASSED = 49

@@ -611,7 +611,7 @@ def test_a_finder_that_has_died_is_named_with_the_robots_that_it_has_not_found(t
     why = "u: no localised robot has found it; a is dead from tick 60 on; v is not localised either"
     assert done.status == 1
     assert why in done.out
-    assert "all robots but u, v were localised by tick 27" in done.out
+    assert "all robots but u, v were localised by tick 21" in done.out
     found = json.loads((out / "summary.json").read_text())
     assert found["reason"] == why
     assert found["group"]["not_localised"] == dict.fromkeys("uv", "no localised robot has found it")

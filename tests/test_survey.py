@@ -215,7 +215,7 @@ def test_the_robots_keep_apart_and_b_stays_in_range_of_its_anchor(noise: str) ->
 def test_a_lost_contact_is_found_again() -> None:
     """After a tick without contact there is one with contact, and the mission ends localised."""
     lost = 0
-    for seed in (*SEEDS, 43, 58):
+    for seed in (*SEEDS, 3, 13, 20):
         recording = survey(NOISES["drop-outs"], seed)
         contact = in_contact(recording)
         met = next(
@@ -267,7 +267,7 @@ def test_a_robot_whose_first_ranges_are_outliers_localises() -> None:
 # --- repetition ---------------------------------------------------------------------------------------
 
 
-SHORT = 0
+SHORT = 6
 """The seed of a short mission."""
 
 
@@ -412,7 +412,7 @@ def turns_onto_its_radius_again(seed: int) -> bool:
 
 def test_a_robot_that_left_its_peers_range_does_not_go_there_again() -> None:
     """An outlier misled both robots' plans to stay in range, and driving back is not enough."""
-    recording = run_mission(scenario_of("outliers = 0.05", 3908951350665596971, accuracy=0.03))
+    recording = run_mission(scenario_of("outliers = 0.05", 5855543267441242937, accuracy=0.03))
     begun = [now for before, now in pairwise(states(recording, "a")) if before != now == "retreating"]
     assert len(begun) == 1
     assert_localised(recording)
