@@ -20,8 +20,8 @@ from msgspec.structs import replace
 from agent.estimation.claim import is_definite
 from agent.estimation.gaussian.contact_fit import ContactRanges, estimated
 from agent.estimation.gaussian.odometry_noise import Track, track
-from agent.planning.agenda import Contacted
 from agent.planning.assured import Assured
+from agent.planning.contacted import Contacted
 from agent.planning.group import GroupPlanner
 from agent.planning.state import RobotState
 from agent.planning.unanchored import UnanchoredPlanner

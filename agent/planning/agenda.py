@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from agent.estimation.gaussian.contact_fit import ContactEstimate
 from agent.estimation.knowledge import Knowledge
-from agent.estimation.resection import RangedPlace
-from agent.peer.motion_log import MotionLog
 from protocol.messages import Localised, Ranged, ReportedPose, Verdict
-from protocol.motion import ORIGIN, Covariance, Pose
+from protocol.motion import ORIGIN, Pose
+
+if TYPE_CHECKING:
+    from agent.planning.contacted import Contacted
+    from agent.planning.resected import Resected
 
 
 class Other(msgspec.Struct, frozen=True):
@@ -76,58 +77,6 @@ class Confirming(msgspec.Struct, frozen=True):
     """The time in s at which the present one ends; None if there is none."""
     ranges: int = 0
     """The number of ranges to its anchor when it has last compared the poses of its meetings."""
-
-
-# --- a robot without an anchor --------------------------------------------------------------------------
-
-
-class Resected(msgspec.Struct, frozen=True):
-    """The knowledge of a robot without an anchor, exact sensors: ranges to robots that report their poses."""
-
-    base: Pose = ORIGIN
-    """The odometry at the place where it stands, or stood before its square."""
-    ranges: Mapping[tuple[str, int], tuple[float, Pose]] = {}
-    """The ranges without a reported pose yet, with the own pose relative to `base`, by robot and tick."""
-    places: Mapping[tuple[str, int], RangedPlace] = {}
-    """The ranges to robots that have reported their poses in those ticks, by robot and tick."""
-    possible: tuple[Pose, ...] = ()
-    """The poses of `base` in <W> that agree with the ranges; empty before the heading can be determined."""
-    candidates: Mapping[str, Pose] = {}
-    """The pose in <W> of the frame of the odometry, by the robot from whose reports it follows."""
-
-
-class Finder(msgspec.Struct, frozen=True):
-    """The localised robot that has found one without an anchor, as far as the latter knows it."""
-
-    robot: str
-    reference: int
-    """The tick of `pose`."""
-    pose: Pose
-    """The pose of the finder at that tick in <W>, as it has estimated it."""
-    covariance: Covariance
-    """The covariance of the error of `pose`."""
-    log: MotionLog
-    """The manoeuvres of that robot from the reference tick on."""
-    latest: int
-    """The tick of its latest report."""
-
-
-class Contacted(msgspec.Struct, frozen=True):
-    """The knowledge of a robot without an anchor with noisy sensors: by the robot that has found it."""
-
-    finder: Finder | None = None
-    """The robot that has found it; None while there is none."""
-    estimate: ContactEstimate | None = None
-    """The latest estimate of the pose; None without one."""
-    estimated_tick: int = -1
-    """The tick of the latest estimate; -1 before the first."""
-    ranges_at_estimate: int = 0
-    """The number of ranges to the finder at the latest estimate."""
-    failure: str = "no localised robot has found it"
-    """The reason for which it has no claim yet."""
-
-
-# --- all of it ---
 
 
 class Bypass(msgspec.Struct, frozen=True):

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from agent.planning import appointments, confirmation, exchange, meetings, noisy_search, sweep, visit
+from agent.planning import appointments, confirmation, exchange, meetings, own_pose, search, visit
 from agent.planning.exchange import LogPlanner
 from agent.planning.meeting_planner import MeetingPlanner
 from agent.planning.planner import Planner, Summary
@@ -80,26 +80,23 @@ class GroupPlanner(Planner[RobotState, Report]):
 
         Until this robot is localised, one with which its meeting has failed gets the verdict of that meeting.
         """
-        if sweep.is_helped(state, peer) and noisy_search.applies(state):
-            return noisy_search.report(state, peer)
-        if peer == state.config.peer and noisy_search.is_sweeping(state):
-            return self.report(state)
+        noisy = search.applies(state)
+        if noisy and search.is_helped(state, peer):
+            return search.outside_meeting(state, peer)
         if appointments.refused(state, peer):
             report = exchange.report_without_log(state, state.agenda.failure)
-        elif peer == state.config.peer and state.meets:
+        elif peer == state.config.peer and (state.meets or (noisy and state.sweeps)):
             return self.report(state)
         else:
-            report = sweep.outside_meeting(state, peer)
+            report = search.outside_meeting(state, peer)
         unconfirmed = state.config.confirms and state.agenda.fix is not None and report.verdict is None
         return replace(report, state=UNCONFIRMED) if unconfirmed else report
 
     def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
         """Return `state` with the `reports` of others, and in the next meeting if this one has ended."""
-        if noisy_search.is_apart(state):
-            return noisy_search.decided(state, reports)
+        if search.is_apart(state):
+            return _apart(state, reports)
         state = self._met(state, reports)
-        if noisy_search.is_sweeping(state):
-            return noisy_search.begun(state)
         return confirmation.onward(state) if state.config.confirms else state
 
     def _met(self, state: RobotState, reports: Sequence[Report]) -> RobotState:
@@ -185,6 +182,18 @@ class GroupPlanner(Planner[RobotState, Report]):
     def required_mutual_ranges(self, mission: Mission) -> int:
         """Return the minimum number of noisy mutual ranges before a claim."""
         return self.pair_planner.required_mutual_ranges(mission)
+
+
+def _apart(state: RobotState, reports: Sequence[Report]) -> RobotState:
+    """Return `state` of a robot that is in no meeting, with the `reports` of others, and one tick on."""
+    for one in reports:
+        state = meetings.with_sender(state, one)
+        state = state.with_other(one.robot, acknowledged=one.heard)  # if overtaken, more is sent again
+    of_peer = [one for one in reports if one.has_log and one.robot == state.config.peer]
+    heard = exchange.with_reports(state, of_peer)
+    if heard.verdict == state.verdict:
+        state = heard
+    return meetings.onward(own_pose.updated(state)) if state.sweeps else state
 
 
 def _is_out_of_range_again(before: RobotState, after: RobotState) -> bool:

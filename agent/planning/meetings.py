@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from agent.estimation.gaussian.claim_agreement import difference
-from agent.planning import appointments, sweep, visit
+from agent.planning import appointments, search, sweep, visit
 from agent.planning.agenda import Fix
 from agent.planning.state import RobotState
 from agent.planning.tasks import UNCONFIRMED, Done, Travelling
@@ -114,10 +114,19 @@ def _contradiction(state: RobotState, claim: Localised) -> Undecided | None:
     )
 
 
-def withdrawn(state: RobotState, failure: Undecided) -> RobotState:
-    """Return `state` without a claim, because of `failure`: the robot waits for another one than its peer."""
-    peer = state.config.peer
-    state = state.with_agenda(robot_verdict=None, fix=None, located=None, failure=failure, visiting=False)
+def _on_sweep(state: RobotState) -> RobotState:
+    """Return `state` after a tick of a sweep: on the next visit at its end, or without its claim.
+
+    Without it, the robot waits for another one than its peer.
+    """
+    agenda, peer = state.agenda, state.config.peer
+    assert agenda.robot_verdict is not None
+    swept, done = search.swept(state), Done(state.phase, agenda.robot_verdict)
+    if swept.verdict is None:
+        return appointments.next_visit(swept.doing(done)) if sweep.is_over(swept) else swept
+    state = swept.with_agenda(
+        robot_verdict=None, fix=None, located=None, failure=swept.verdict, visiting=False
+    )
     return appointments.waiting(appointments.parted(state), peer)
 
 
@@ -144,10 +153,7 @@ def onward(state: RobotState, *, peer_has_left: bool = False) -> RobotState:
     if agenda.fix is None:
         return appointments.after_failure(state)
     if state.sweeps:
-        assert agenda.robot_verdict is not None
-        swept = sweep.swept(state)
-        done = Done(state.phase, agenda.robot_verdict)
-        return swept or appointments.next_visit(state.doing(done))
+        return _on_sweep(state)
     if agenda.visiting and state.verdict is None:
         if state.other(peer).localised and agenda.robot_verdict is not None:  # by another robot
             return appointments.next_visit(state)

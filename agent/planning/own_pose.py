@@ -18,9 +18,8 @@ from agent.estimation.gaussian.search import search
 from agent.estimation.judged import Judged, of_pair
 from agent.estimation.knowledge import Knowledge
 from agent.estimation.posterior import PAIR, Hypothesis, Posterior, follow, settled
-from agent.planning import sweep
 from agent.planning.state import RobotState
-from agent.planning.tasks import Looping, Sweeping
+from agent.planning.tasks import Looping, Sweeping, transformed
 from protocol.messages import Localised, ReportedPose
 from protocol.motion import Covariance, compose, inverse
 from protocol.sweep_strips import Place
@@ -118,9 +117,9 @@ def _with_estimate(state: RobotState, scored: Sequence[Hypothesis], judged: Judg
     framed = state.with_frame(now.pose)
     turn, task = compose(inverse(framed.agenda.frame), state.agenda.frame), state.task
     if isinstance(task, Sweeping):
-        task = Sweeping(sweep.transformed(turn, task.places))
+        task = Sweeping(transformed(turn, task.places))
     elif isinstance(task, Looping):
-        task = replace(task, then=sweep.transformed(turn, task.then))
+        task = replace(task, then=transformed(turn, task.then))
     belief = replace(state.belief, pair=tuple(scored))
     ranges = len(state.log.ranges) + len(state.mutual)
     was_lost = before.sigma > LOST_SIGMA * state.config.mission.sensing_range

@@ -1,29 +1,18 @@
-"""The sweep of an area, in which a localised robot looks for robots without an anchor, and stops for them."""
+"""The ways of a sweep of an area, and the loops of a robot that stops for one without an anchor."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 
 from msgspec.structs import replace
 
-from agent.planning import exchange
 from agent.planning.drive import towards
 from agent.planning.state import RobotState
-from agent.planning.tasks import Looping, Sweeping
-from protocol.messages import Localised, Report, ReportedPose
+from agent.planning.tasks import Looping, Sweeping, transformed
 from protocol.mission import Mission
-from protocol.motion import Pose, compose, inverse
-from protocol.sweep_strips import SIDE, STRIP_REACH, Place
-
-LOOPS_FOR = 200
-"""The ticks after which robots stop driving squares that have localised nobody: the other one may be dead."""
-
-
-def transformed(transform: Pose, places: Iterable[Place]) -> tuple[Place, ...]:
-    """Return `places`, in m, in the frame in which their own frame has the pose `transform`."""
-    moved = [compose(transform, Pose(x, y, 0.0)) for x, y in places]
-    return tuple([(one.x, one.y) for one in moved])
+from protocol.motion import Pose, inverse
+from protocol.sweep_strips import SIDE, Place
 
 
 def looping(odometry: Pose, mission: Mission, since: int, then: tuple[Place, ...] = ()) -> Looping:
@@ -60,27 +49,13 @@ def onward(
     return task
 
 
-def wanted(state: RobotState) -> bool:
-    """Return whether there are robots without an anchor that this robot can still help."""
-    return any(is_helped(state, robot) for robot in state.config.unanchored)
+def shares(state: RobotState) -> bool:
+    """Return whether robots that were found search with those that have found them.
 
-
-def is_helped(state: RobotState, robot: str) -> bool:
-    """Return whether `robot` has no anchor, and still needs the poses of this robot, as far as it knows."""
-    other = state.other(robot)
-    finished = other.localised or other.served or robot == state.config.robot
-    return robot in state.config.unanchored and not finished
-
-
-def outside_meeting(state: RobotState, peer: str) -> Report:
-    """Return the report to `peer` outside a meeting: this robot's verdict, and the strips that it sweeps.
-
-    A robot without an anchor gets the pose of a localised one until it has determined its own by it.
+    With noisy sensors they cannot, because they have no anchor and no beacon that correct their odometry. If
+    robots may report false data, their poses are not independent of those that have found them.
     """
-    agenda, pose = state.agenda, None
-    if is_helped(state, peer) and isinstance(agenda.robot_verdict, Localised):
-        pose = ReportedPose(state.tick, exchange.reported_pose(state, agenda.frame))
-    return replace(exchange.report_without_log(state, agenda.robot_verdict), prior=pose, strips=strips(state))
+    return not (state.estimator.corrects_poses or state.config.tolerates)
 
 
 def strips(state: RobotState) -> tuple[int, int] | None:
@@ -110,20 +85,6 @@ def without_strips(state: RobotState, others: tuple[int, int] | None) -> RobotSt
     return state.doing(task).with_agenda(strips_end=others[0])
 
 
-def next_part(state: RobotState) -> RobotState:
-    """Return `state` of a localised robot that sweeps the next part of the area, its own one first.
-
-    It stops again for robots that it has left before.
-    """
-    config = state.config
-    assert config.sweep is not None
-    for robot in config.unanchored:
-        state = state.with_other(robot, failed=False)
-    part = (config.part + state.agenda.parts) % config.sweep.parts
-    state = _along(state, config.sweep.strips_of(part, config.mission.sensing_range))
-    return state.with_agenda(part_tick=state.tick, visiting=False, unmet=0, silence=0)
-
-
 def second_half(state: RobotState, others: tuple[int, int]) -> RobotState:
     """Return `state` of a robot that sweeps the second half of the strips of another one, which it is beside.
 
@@ -139,37 +100,19 @@ def second_half(state: RobotState, others: tuple[int, int]) -> RobotState:
     part = area.part_of(begin, reach)
     if first == end:  # it begins with the next part
         return replace(state, config=replace(state.config, part=part + 1))
-    state = _along(replace(state, config=replace(state.config, part=part)), (first, end))
+    state = along(replace(state, config=replace(state.config, part=part)), (first, end))
     assert isinstance(state.task, Sweeping)
     here = (state.odometry.x, state.odometry.y)
     return state.doing(Looping((), (here, *state.task.places), state.tick))
 
 
-def _along(state: RobotState, along: tuple[int, int]) -> RobotState:
+def along(state: RobotState, along: tuple[int, int]) -> RobotState:
     """Return `state` at the begin of a sweep of the strips `along`."""
     config, agenda = state.config, state.agenda
     assert config.sweep is not None
     path = config.sweep.path(along, config.mission.sensing_range)
-    shares = not (state.estimator.corrects_poses or config.tolerates)
-    state = state.with_agenda(parts=agenda.parts + 1, strips_end=along[1] if shares else None)
+    state = state.with_agenda(parts=agenda.parts + 1, strips_end=along[1] if shares(state) else None)
     return state.doing(Sweeping(transformed(inverse(agenda.frame), path)))
-
-
-def swept(state: RobotState) -> RobotState | None:
-    """Return `state` after a tick of a sweep with exact sensors; None at its end.
-
-    Near robots without an anchor, it drives squares until they are localised or LOOPS_FOR ticks are over.
-    """
-    mission, odometry = state.config.mission, state.odometry
-    helped = [one for one in state.config.unanchored if is_helped(state, one) and _is_near(state, one)]
-    moved = moved_on(
-        state,
-        helped,
-        lambda since, then: looping(odometry, mission, since, then),
-        stops=bool(helped),
-        longest=LOOPS_FOR,
-    )
-    return None if is_over(moved) else moved
 
 
 def moved_on(
@@ -206,14 +149,3 @@ def moved_on(
 def is_over(state: RobotState) -> bool:
     """Return whether the robot has driven along all strips of its part."""
     return isinstance(state.task, Sweeping) and not state.task.places
-
-
-def _is_near(state: RobotState, robot: str) -> bool:
-    """Return whether this robot is near enough to `robot` to drive a square, or drives one already."""
-    other = state.other(robot)
-    if other.failed or not other.mutual or other.mutual[-1].tick != state.tick:
-        return False
-    return (
-        isinstance(state.task, Looping)
-        or other.mutual[-1].range <= STRIP_REACH * state.config.mission.sensing_range
-    )

@@ -5,13 +5,14 @@ Each task has a `name`, which reports, commands and recordings use, and the `pha
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import ClassVar, Literal
 
 import msgspec
 
 from agent.estimation.exact import Branch
 from protocol.messages import Inconsistent, Localised, Verdict
-from protocol.motion import REST, Controls, Pose
+from protocol.motion import REST, Controls, Pose, compose
 from protocol.sweep_strips import Place
 
 Beacon = Literal["anchor", "peer"]
@@ -162,6 +163,12 @@ class Travelling(msgspec.Struct, frozen=True):
     """The end of the present straight, in m in the frame of the odometry."""
     leg: int = 0
     """The number of legs of the search up to this place; 0 on the way to the robot."""
+
+
+def transformed(transform: Pose, places: Iterable[Place]) -> tuple[Place, ...]:
+    """Return `places`, in m, in the frame in which their own frame has the pose `transform`."""
+    moved = [compose(transform, Pose(x, y, 0.0)) for x, y in places]
+    return tuple([(one.x, one.y) for one in moved])
 
 
 class Sweeping(msgspec.Struct, frozen=True):

@@ -1,4 +1,4 @@
-"""A robot of a group without an anchor, with noisy sensors: it waits until a localised robot finds it.
+"""A robot without an anchor that determines its pose by a joint fit with the robot that has found it.
 
 That robot, the finder, sends its pose at a reference tick with a covariance, and its odometry from then on.
 Both drive loops in range of each other, and the ranges between them give the pose of this robot
@@ -10,17 +10,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import msgspec
 from msgspec.structs import replace
 
 from agent.estimation.gaussian.beacon_guesses import FEWEST_FOR_POSE
-from agent.estimation.gaussian.contact_fit import ContactRanges, estimated
+from agent.estimation.gaussian.contact_fit import ContactEstimate, ContactRanges, estimated
 from agent.estimation.gaussian.inference import path_of
 from agent.peer.motion_log import MotionLog
 from agent.planning import sweep
-from agent.planning.agenda import Contacted, Finder
+from agent.planning.planner import Summary
 from agent.planning.state import RobotState
 from agent.planning.tasks import Awaiting, Done, Looping, Standing, Sweeping
-from protocol.messages import Localised, Observation, Ranged, Report
+from protocol.messages import Estimate, Localised, Observation, Ranged, Report
+from protocol.motion import Covariance, Pose
 from protocol.sweep_strips import OWN_SIDE
 from protocol.sweep_ticks import contact_ticks
 
@@ -32,33 +34,92 @@ The ticks bound the time that a robot takes which reports another reference in e
 """
 
 
-def ranged(state: RobotState, observation: Observation) -> RobotState:
-    """Return `state` with the ranges of `observation`, without those that are too old."""
-    for contact in observation.contacts:
-        if contact.range is not None:
-            other, first = state.other(contact.peer), observation.tick - _kept(state)
-            recent = [each for each in other.mutual if each.tick > first]
-            mutual = (*recent, Ranged(observation.tick, contact.range))
-            state = state.with_other(contact.peer, mutual=mutual)
-    return state
+class Finder(msgspec.Struct, frozen=True):
+    """The localised robot that has found one without an anchor, as far as the latter knows it."""
+
+    robot: str
+    reference: int
+    """The tick of `pose`."""
+    pose: Pose
+    """The pose of the finder at that tick in <W>, as it has estimated it."""
+    covariance: Covariance
+    """The covariance of the error of `pose`."""
+    log: MotionLog
+    """The manoeuvres of that robot from the reference tick on."""
+    latest: int
+    """The tick of its latest report."""
 
 
-def decided(state: RobotState, reports: Sequence[Report]) -> RobotState:
-    """Return `state` with the data in `reports`, and with a verdict if they determine the own pose."""
-    found = state.agenda.found
-    assert isinstance(found, Contacted)
-    for report in reports:
-        if (prior := report.prior) is not None and prior.covariance is not None:
-            log = MotionLog(through=prior.tick)
-            finder = Finder(report.robot, prior.tick, prior.pose, prior.covariance, log, report.tick)
-            found = _with_finder(state, found, finder, report)
-        elif found.finder is None and report.state == Sweeping.name:
-            why = f"{report.robot} has passed it, and does not know its own pose well enough"
-            found = replace(found, failure=why)
-    found, claim = _estimated(state, found)
-    if claim is not None:
-        return state.doing(Done(3, claim)).with_agenda(found=found)
-    return _moved_on(state, found)
+class Contacted(msgspec.Struct, frozen=True):
+    """The robot that has found it, with the covariance of its pose, and the fit of the ranges to it."""
+
+    finder: Finder | None = None
+    """The robot that has found it; None while there is none."""
+    fit: ContactEstimate | None = None
+    """The latest estimate of the pose; None without one."""
+    estimated_tick: int = -1
+    """The tick of the latest estimate; -1 before the first."""
+    ranges_at_estimate: int = 0
+    """The number of ranges to the finder at the latest estimate."""
+    failure: str = "no localised robot has found it"
+    """The reason for which it has no claim yet."""
+
+    def ranged(self, state: RobotState, observation: Observation) -> RobotState:
+        """Return `state` with the ranges of `observation`, without those that are too old."""
+        for contact in observation.contacts:
+            if contact.range is not None:
+                other, first = state.other(contact.peer), observation.tick - _kept(state)
+                recent = [each for each in other.mutual if each.tick > first]
+                mutual = (*recent, Ranged(observation.tick, contact.range))
+                state = state.with_other(contact.peer, mutual=mutual)
+        return state
+
+    def told(self, state: RobotState, reports: Sequence[Report]) -> RobotState:
+        """Return `state` with the data in `reports`, and with a verdict if they determine the own pose."""
+        found = self
+        for report in reports:
+            if (prior := report.prior) is not None and prior.covariance is not None:
+                log = MotionLog(through=prior.tick)
+                finder = Finder(report.robot, prior.tick, prior.pose, prior.covariance, log, report.tick)
+                found = _with_finder(state, found, finder, report)
+            elif found.finder is None and report.state == Sweeping.name:
+                why = f"{report.robot} has passed it, and does not know its own pose well enough"
+                found = replace(found, failure=why)
+        found, claim = _estimated(state, found)
+        if claim is not None:
+            return state.doing(Done(3, claim)).with_agenda(found=found)
+        return _moved_on(state, found)
+
+    def answered(self, report: Report, peer: str) -> Report:
+        """Return `report` to `peer`: it acknowledges the manoeuvres of the finder."""
+        finder = self.finder
+        return replace(report, heard=finder.log.through) if finder and finder.robot == peer else report
+
+    def why_undecided(self, state: RobotState) -> str:
+        """Return why the robot has not claimed a pose, for a user."""
+        del state
+        return self.failure
+
+    def estimate(self, state: RobotState, of_tick: Estimate) -> Estimate:
+        """Return `of_tick` with the possible poses of the latest fit."""
+        latest = self.fit
+        if latest is None or (self.estimated_tick != state.tick and state.verdict is None):
+            return of_tick
+        return replace(
+            of_tick, world=latest.poses, probabilities=latest.probabilities, covariance=latest.covariance
+        )
+
+    def summary(self, state: RobotState) -> Summary:
+        """Return the number of possible poses, and what prevents a claim."""
+        latest = self.fit
+        if latest is None:
+            return Summary(blocking_reason=None if state.verdict is not None else self.failure)
+        return Summary(
+            hypotheses=len(latest.poses),
+            probability=latest.probabilities[0],
+            blocking_reason=None if isinstance(state.verdict, Localised) else self.failure,
+            p_value=latest.p_value,
+        )
 
 
 def _kept(state: RobotState) -> int:
@@ -81,7 +142,7 @@ def _with_finder(state: RobotState, found: Contacted, finder: Finder, report: Re
             return found
         present = None
     if present is None:
-        present, found = finder, replace(found, ranges_at_estimate=0, estimate=None)
+        present, found = finder, replace(found, ranges_at_estimate=0, fit=None)
     log = present.log.extended(report.since, 0, MotionLog(report.through, report.runs))
     return replace(found, finder=replace(present, log=log, latest=max(present.latest, report.tick)))
 
@@ -111,7 +172,7 @@ def _estimated(state: RobotState, found: Contacted) -> tuple[Contacted, Localise
     own = MotionLog(state.tick, state.log.between(finder.reference, state.tick))
     there, here = (path_of(log, 0, log.through, mission) for log in (finder.log, own))
     estimate = estimated(ContactRanges(finder.pose, finder.covariance, there, here, ranges), mission)
-    found = replace(found, estimate=estimate, estimated_tick=state.tick, ranges_at_estimate=len(ranges))
+    found = replace(found, fit=estimate, estimated_tick=state.tick, ranges_at_estimate=len(ranges))
     if estimate is None:
         return replace(found, failure=f"no pose explains the ranges to {finder.robot}"), None
     if estimate.blocking_reason:
@@ -125,7 +186,7 @@ def _moved_on(state: RobotState, found: Contacted) -> RobotState:
     if finder is None:
         return state.doing(Awaiting()).with_agenda(found=found)
     if finder.latest <= state.tick - _kept(state):
-        return state.doing(Awaiting()).with_agenda(found=replace(found, finder=None, estimate=None))
+        return state.doing(Awaiting()).with_agenda(found=replace(found, finder=None, fit=None))
     state = state.with_agenda(found=found)
     if finder.covariance.position_sigma > mission.accuracy:
         return state.doing(Standing())

@@ -1,0 +1,177 @@
+"""A robot without an anchor that determines its pose by squares: first its finder's, then its own.
+
+The finder drives a square while this robot stands still; that determines this robot's position. Then this one
+drives a square, too; that determines its heading. The pose rests on the ranges to one other robot, in the
+order of their ticks, so it does not depend on the order in which reports arrive.
+
+If f robots may report false data, it claims a pose on which f + 1 of them agree, at least one of which is
+honest. Until then, it waits for the next one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import msgspec
+from msgspec.structs import replace
+
+from agent.estimation import resection
+from agent.estimation.resection import RangedPlace
+from agent.planning import sweep
+from agent.planning.planner import Summary
+from agent.planning.search import LOOPS_FOR
+from agent.planning.state import RobotState
+from agent.planning.tasks import UNCONFIRMED, Awaiting, Done, Looping, Standing
+from protocol.messages import Estimate, Localised, Observation, Report
+from protocol.motion import ORIGIN, Pose, compose, inverse, wrap
+from protocol.rounding import SURE
+
+LARGEST_MISFIT = 0.1 * SURE
+"""The largest difference in m between a measured range and the one that a possible pose predicts.
+
+It is far above the rounding errors of the poses of both robots, and far below what a wrong pose predicts.
+"""
+
+KEPT = 64
+"""The number of ticks for which a range is kept until the report of that tick arrives."""
+
+AGREE = SURE
+"""The largest difference in m and rad between poses that two robots confirm.
+
+One of them is honest, so the error of both is smaller than the tolerance of a claim, 2 SURE.
+"""
+
+
+class Resected(msgspec.Struct, frozen=True):
+    """The ranges to robots that report exact poses, and the poses that agree with them."""
+
+    base: Pose = ORIGIN
+    """The odometry at the place where it stands, or stood before its square."""
+    ranges: Mapping[tuple[str, int], tuple[float, Pose]] = {}
+    """The ranges without a reported pose yet, with the own pose relative to `base`, by robot and tick."""
+    places: Mapping[tuple[str, int], RangedPlace] = {}
+    """The ranges to robots that have reported their poses in those ticks, by robot and tick."""
+    possible: tuple[Pose, ...] = ()
+    """The poses of `base` in <W> that agree with the ranges; empty before the heading can be determined."""
+    candidates: Mapping[str, Pose] = {}
+    """The pose in <W> of the frame of the odometry, by the robot from whose reports it follows."""
+
+    def ranged(self, state: RobotState, observation: Observation) -> RobotState:
+        """Return `state` with the ranges of `observation`, without those that are too old."""
+        # where it stands, rounding must not look like a motion
+        moved = compose(inverse(self.base), state.odometry) if state.odometry != self.base else ORIGIN
+        new = {
+            (contact.peer, observation.tick): (contact.range, moved)
+            for contact in observation.contacts
+            if contact.range is not None
+        }
+        first = observation.tick - KEPT
+        recent = {key: contact for key, contact in self.ranges.items() if key[1] > first}
+        return state.with_agenda(found=replace(self, ranges={**recent, **new})) if new else state
+
+    def told(self, state: RobotState, reports: Sequence[Report]) -> RobotState:
+        """Return `state` with the data in `reports`, and with a verdict if they determine the own pose."""
+        ranges, places, found = dict(self.ranges), dict(self.places), self
+        if not isinstance(state.task, Looping):  # a robot that comes back may have corrected its pose
+            places = {key: report for key, report in places.items() if key[1] > state.tick - LOOPS_FOR}
+        for report in reports:
+            if (prior := report.prior) is None or report.robot in self.candidates:
+                continue
+            if (ranged := ranges.pop((report.robot, prior.tick), None)) is not None:
+                distance, odometry = ranged
+                place = RangedPlace((prior.pose.x, prior.pose.y), odometry, distance)
+                places[report.robot, prior.tick] = place
+        if places.keys() != self.places.keys():
+            state, found = _resected(state, replace(self, ranges=ranges, places=places))
+            state = state.with_agenda(found=found)
+        return _moved_on(state, found) if state.verdict is None else state
+
+    def answered(self, report: Report, peer: str) -> Report:
+        """Return `report` to `peer`: a robot by which it knows a pose does not stop any longer."""
+        return (
+            replace(report, state=UNCONFIRMED)
+            if report.verdict is None and peer in self.candidates
+            else report
+        )
+
+    def why_undecided(self, state: RobotState) -> str:
+        """Return why the robot has not claimed a pose, for a user."""
+        if not self.candidates:
+            return "no localised robot has found it"
+        finders = ", ".join(sorted(self.candidates))
+        return f"{state.config.tolerates + 1} robots must agree on its pose; it is found by: {finders}"
+
+    def estimate(self, state: RobotState, of_tick: Estimate) -> Estimate:
+        """Return `of_tick` with the poses that agree with all ranges, or are not confirmed yet."""
+        world = [_now(state, self, one) for one in self.possible]
+        if not world:
+            world = [compose(self.candidates[robot], state.odometry) for robot in sorted(self.candidates)]
+        return replace(of_tick, world=tuple(world))
+
+    def summary(self, state: RobotState) -> Summary:
+        """Return the number of possible poses."""
+        del state
+        return Summary(hypotheses=len(self.possible) or len(self.candidates) or None)
+
+
+def _now(state: RobotState, found: Resected, base: Pose) -> Pose:
+    """Return the present pose in <W> if that of `found.base` is `base`."""
+    return compose(base, compose(inverse(found.base), state.odometry))
+
+
+def _resected(state: RobotState, found: Resected) -> tuple[RobotState, Resected]:
+    """Return both with what follows from the ranges to each robot: a square to drive, or a verdict."""
+    for robot in sorted({robot for robot, _ in found.places} - found.candidates.keys()):
+        ranged = [found.places[key] for key in sorted(found.places) if key[0] == robot]
+        standing = [one for one in ranged if one.odometry == ORIGIN]
+        moved = [one for one in ranged if one.odometry != ORIGIN]
+        if not isinstance(state.task, Looping):
+            positions = resection.positions(standing, LARGEST_MISFIT)
+            if len(positions) == 1 and resection.is_fixed(standing, positions[0]):
+                return state.doing(sweep.looping(state.odometry, state.config.mission, state.tick)), found
+        elif moved and (possible := resection.poses(standing, moved, LARGEST_MISFIT)):
+            found = replace(found, possible=possible)
+            if resection.is_certain(standing, moved, possible):
+                state, found = _with_candidate(state, found, robot)
+                if state.verdict is not None:
+                    break
+    return state, found
+
+
+def _with_candidate(state: RobotState, found: Resected, robot: str) -> tuple[RobotState, Resected]:
+    """Return both with the first possible pose, which follows from the reports of `robot`.
+
+    It is claimed if as many robots agree on it as are needed for one of them to be honest.
+    """
+    pose = _now(state, found, found.possible[0])
+    others = [compose(one, state.odometry) for by, one in found.candidates.items() if by != robot]
+    found = replace(found, candidates={**found.candidates, robot: compose(pose, inverse(state.odometry))})
+    if 1 + sum([_agree(pose, other) for other in others]) > state.config.tolerates:
+        state = state.doing(Done(3, Localised(pose))).with_frame(pose)
+    return state, found
+
+
+def _agree(one: Pose, other: Pose) -> bool:
+    """Return whether two poses are the same to AGREE."""
+    apart = math.hypot(one.x - other.x, one.y - other.y)
+    return max(apart, abs(wrap(one.heading - other.heading))) <= AGREE
+
+
+def _moved_on(state: RobotState, found: Resected) -> RobotState:
+    """Return `state` after a tick of a square. The square is repeated until the pose is known.
+
+    If nobody has reported a pose for KEPT ticks, except robots by which it knows a pose, the robot stands
+    still again, and forgets all ranges: those to the next robot that comes begin where it is then.
+    """
+    if not isinstance(state.task, Looping):
+        return state.doing(Standing() if found.places or found.candidates else Awaiting())
+    mission, since, tolerance = state.config.mission, state.task.since, state.estimator.pose_tolerance
+    task = sweep.onward(state.task, state.odometry, mission, tolerance)
+    if task.places:
+        return state.doing(task)
+    latest = max([tick for robot, tick in found.places if robot not in found.candidates], default=-KEPT)
+    if latest > state.tick - KEPT and since > state.tick - LOOPS_FOR:
+        return state.doing(sweep.looping(state.odometry, mission, since))
+    found = Resected(state.odometry, candidates=found.candidates)
+    return state.doing(Standing() if found.candidates else Awaiting()).with_agenda(found=found)
