@@ -14,7 +14,7 @@ from agent.estimation.closed_forms import Placement
 from agent.planning.assured import Assured
 from agent.planning.paper import Paper
 from agent.planning.phase1_anchor import third_point
-from agent.planning.phase3_last_manoeuvre import LAST_SPEEDS, TURN_RATES, last_manoeuvre
+from agent.planning.phase3_last_manoeuvre import LAST_SPEEDS, TURN_RATES, Question, last_manoeuvre
 from compose.launch.in_process import run_mission
 from compose.recording.run import Run
 from compose.scenario.scenario_file import load, parse
@@ -299,7 +299,7 @@ def test_the_last_manoeuvre_of_the_paper_planner_maximises_eq_8_at_full_speed(
     case: tuple[Pose, Pose, list[Placement]],
 ) -> None:
     b, a, found = case
-    plan = last_manoeuvre("b", a, b, found, SECTION_IV, Paper.MANOEUVRES)
+    plan = last_manoeuvre(Question("b", a, b, tuple(found)), SECTION_IV, Paper.MANOEUVRES)
     assert plan is not None
     best = max(least(predicted(b, a, found, 1.0, omega)) for omega in grid())
     assert plan.command.v == 1.0
@@ -316,7 +316,7 @@ def test_the_assured_last_manoeuvre_keeps_as_many_candidates_in_range_as_it_can(
     """Among manoeuvres with as many candidates in range, it is the optimum of eq. (8)."""
     b, a, found = case
     rim = SECTION_IV.sensing_range - 1e-6
-    plan = last_manoeuvre("b", a, b, found, SECTION_IV, Assured.MANOEUVRES)
+    plan = last_manoeuvre(Question("b", a, b, tuple(found)), SECTION_IV, Assured.MANOEUVRES)
     assert plan is not None
 
     def value(v: float, omega: float) -> tuple[int, float]:
@@ -333,7 +333,7 @@ def test_the_assured_last_manoeuvre_keeps_as_many_candidates_in_range_as_it_can(
 def test_a_single_candidate_is_checked_from_where_its_range_changes_most() -> None:
     b, a = Pose(0.0, 0.0, 0.0), Pose(6.5, 0.0, 0.0)
     ahead = Placement(0.0, -4.5, 0.0)
-    plan = last_manoeuvre("b", a, b, [ahead], SECTION_IV, Assured.MANOEUVRES)
+    plan = last_manoeuvre(Question("b", a, b, (ahead,)), SECTION_IV, Assured.MANOEUVRES)
     assert plan is not None
     assert plan.command.v == 1.0
     assert plan.command.omega == pytest.approx(0.0, abs=1e-9)

@@ -1,4 +1,4 @@
-"""The transitions of `assured` with noisy sensors: it measures until poses are as accurate as it is asked.
+"""The steps of `assured` with noisy sensors: it measures until poses are as accurate as it is asked.
 
 The phases are those of the paper. In phase 1, a robot collects ranges to its anchor until a better estimate
 is not worth the time. In phase 3, both robots move, each to where its next ranges are expected to tell
@@ -20,7 +20,7 @@ from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.odometry_noise import Track
 from agent.estimation.judged import FEWEST_FOR_CLAIM, sufficient_mutual_ranges
 from agent.estimation.posterior import Hypothesis
-from agent.planning import active_sensing, drive, phase2_orbit, range_seeking, transitions
+from agent.planning import active_sensing, drive, phase2_orbit, range_seeking
 from agent.planning.active_sensing import CONTINUED, STALLED, Objective
 from agent.planning.pair_claim import inferred, with_claim, with_consistency_test
 from agent.planning.phase3_last_manoeuvre import LAST_SPEEDS
@@ -82,15 +82,17 @@ def sensed(state: RobotState, ranged: bool) -> RobotState:
     """Return `state` with the task that follows one of active sensing, or of the search for the anchor."""
     if not state.log.ranges:  # it is asleep
         return _without_range(state)
+    mission, tolerance = state.config.mission, state.estimator.pose_tolerance
     match state.task:
         case Surveying("anchor"):
             return continue_phase1(state) if is_planning_tick(state) else state
         case Homing() if ranged:
             return continue_phase1(state)
-        case Homing(place, side) if _is_at(state, place):
+        case Homing(place, side) if drive.homing(place, state.odometry, mission, tolerance) is None:
             if side is None:
                 return state.doing(Straight("anchor", state.odometry, 0.0))
-            return state.doing(_next_side(place, side, state.config.mission))
+            x, y = range_seeking.next_on_spiral((place.x, place.y), side, mission)
+            return state.doing(Homing(Pose(x, y, 0.0), side + 1))
         case Surveying("peer") | Listening() | Retreating():
             return _continue_phase3(state)
         case _:
@@ -108,23 +110,19 @@ def _without_range(state: RobotState) -> RobotState:
     return state.doing(Straight("anchor", state.odometry, mission.sensing_range))
 
 
-def _is_at(state: RobotState, place: Pose) -> bool:
-    """Return whether the robot is at `place`, in the frame of the odometry."""
-    mission, tolerance = state.config.mission, state.estimator.pose_tolerance
-    return drive.homing(place, state.odometry, mission, tolerance) is None
-
-
 def is_planning_tick(state: RobotState) -> bool:
     """Return whether the robot plans a manoeuvre in this tick. Both robots plan in the same ticks."""
     return state.tick % stride(state.config.mission) == 0
 
 
-def continue_phase1(state: RobotState) -> RobotState:
+def continue_phase1(state: RobotState, manoeuvres: Manoeuvres | None = None) -> RobotState:
     """Continue phase 1: update the hypotheses about the anchor, and end phase 1 if they are accurate enough.
 
     If no hypothesis explains the ticks without detection, the ranges are misleading. The robot then takes
-    further ranges around the place of the last one, as at the start.
+    further ranges around the place of the last one, as at the start. The `manoeuvres` are those of
+    `active_sensing`.
     """
+    del manoeuvres
     ranged = state.log.ranges[-1].tick == state.tick
     scored = inference.own_anchor(state)
     if scored:
@@ -138,13 +136,11 @@ def continue_phase1(state: RobotState) -> RobotState:
     mission = state.config.mission
     if inference.is_anchor_known(state, scored):
         kind: BranchKind = "circle" if len(state.log.ranges) == 2 else "three-ranges"
-        phase1_done_tick = (
-            state.tick if state.belief.phase1_done_tick is None else state.belief.phase1_done_tick
+        first = state.belief.phase1_done_tick
+        done = state.tick if first is None else first
+        return _start_phase2(
+            replace(state, belief=replace(state.belief, branch_kind=kind, phase1_done_tick=done))
         )
-        state = replace(
-            state, belief=replace(state.belief, branch_kind=kind, phase1_done_tick=phase1_done_tick)
-        )
-        return _start_phase2(state)
     since, objective = _objective(state, "anchor", (inference.own_path(state),))
     hypotheses = inference.anchor_planning_hypotheses(state)
     command = active_sensing.plan_alone(hypotheses, mission, objective=objective)
@@ -164,18 +160,15 @@ def _objective(state: RobotState, beacon: str, paths: Sequence[Track]) -> tuple[
 def _are_misleading(state: RobotState, best: Hypothesis) -> bool:
     """Return whether the detections and the ticks without one contradict the most probable hypothesis.
 
-    With CONVINCING_RANGES, ranges count more: R may not be as it was told.
+    With CONVINCING_RANGES, ranges count more: R may not be as it was told. As many drop-outs as are to be
+    expected at most contradict nothing.
     """
     if len(state.log.ranges) >= CONVINCING_RANGES:
         return False
-    return best.detections < MISLEADING + _drop_out_log_likelihood(state)
-
-
-def _drop_out_log_likelihood(state: RobotState) -> float:
-    """Return the log-likelihood of the largest number of drop-outs to be expected so far."""
     p = state.config.mission.noise.drop_outs
     expected = p * (state.tick + 1)
-    return (expected + DROP_OUT_SIGMAS * math.sqrt(expected)) * math.log(p) if p else 0.0
+    most = expected + DROP_OUT_SIGMAS * math.sqrt(expected)
+    return best.detections < MISLEADING + (most * math.log(p) if p else 0.0)
 
 
 def _ticks_without_range(state: RobotState) -> int:
@@ -236,18 +229,12 @@ def _of_this_attempt(state: RobotState) -> RobotState:
     return replace(state, belief=belief)
 
 
-def _next_side(place: Pose, side: int, mission: Mission) -> Homing:
-    """Return the way along the side after `side` of the spiral on which a robot searches its anchor."""
-    x, y = range_seeking.next_on_spiral((place.x, place.y), side, mission)
-    return Homing(Pose(x, y, 0.0), side + 1)
-
-
 def _start_phase2(state: RobotState) -> RobotState:
     """Start phase 2, for the first time or again."""
-    return continue_phase2(state, transitions.aligning(state), ranged=False)
+    return continue_phase2(state, phase2_orbit.aligning(state))
 
 
-def continue_phase2(state: RobotState, task: Orbital, *, ranged: bool) -> RobotState:
+def continue_phase2(state: RobotState, task: Orbital, ranged: bool = False) -> RobotState:
     """Continue phase 2 with the latest anchor range, if `ranged`. Robot b takes ranges while it waits."""
     mission = state.config.mission
     planning = ranged and is_planning_tick(state)

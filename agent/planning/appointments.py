@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from agent.estimation.knowledge import Belief
 from agent.peer.peer_state import PeerState
-from agent.planning import search, transitions, visit
+from agent.planning import phase2_orbit, search, visit
 from agent.planning.state import RobotState
 from agent.planning.tasks import Asleep, Orbital, Travelling
 from protocol.messages import Appointment, Member, Undecided, Verdict
@@ -156,7 +156,7 @@ def _aligned(state: RobotState) -> RobotState:
     """Return `state` on the way to its orbit or waiting place; a planner of the user drives there itself."""
     if state.agenda.own is not None:
         return state
-    return transitions.continue_phase2(state, transitions.aligning(state))
+    return phase2_orbit.begun(state)
 
 
 def _in_meeting(state: RobotState, peer: str, role: Role, orbits: Rendezvous | None = None) -> RobotState:

@@ -7,25 +7,40 @@ as the mission asks (`accuracy_seeking`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-from msgspec.structs import replace
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 from agent.estimation.gaussian.inference import PlanningHypothesis
-from agent.planning import accuracy_seeking, active_sensing, exchange, phase3_last_manoeuvre, transitions
+from agent.planning import accuracy_seeking, active_sensing, exchange, phase2_orbit, turns
+from agent.planning.accuracy_seeking import JointManoeuvres
 from agent.planning.drive import controls
 from agent.planning.exchange import LogPlanner
+from agent.planning.planner import Manoeuvres
 from agent.planning.state import RobotState
-from agent.planning.tasks import Done, Listening, Orbital, Resting, Standing, Surveying, Travelling, Waiting
-from protocol.messages import Command, Localised, Report
+from agent.planning.tasks import Done, Listening, Orbital, Resting, Surveying, Travelling
+from protocol.messages import Command, Report
 from protocol.mission import Mission
 from protocol.motion import REST, Controls
 
-PEER_RESTS = (Standing.name, Waiting.name)
-"""The tasks of the peer in which this robot may plan a manoeuvre.
 
-If both moved at once, they might do so in mirror image, and the new range would not select a placement.
-"""
+class Steps(NamedTuple):
+    """The steps of `assured` that differ with what later ranges tell: chosen once, by the estimator."""
+
+    phase1: Callable[[RobotState, Manoeuvres], RobotState]
+    """It continues phase 1 after a second or further range to the anchor."""
+    phase2: Callable[[RobotState, Orbital, bool], RobotState]
+    """It continues phase 2 from a task; the last argument says whether there is a new range to the anchor."""
+    phase3: Callable[[RobotState, JointManoeuvres], RobotState]
+    """It begins phase 3 in contact with the peer, if that can begin."""
+
+
+BY_TURNS = Steps(turns.continue_phase1, phase2_orbit.continued, turns.met)
+"""The paper's steps, with more manoeuvres to choose from."""
+
+BY_ACCURACY = Steps(
+    accuracy_seeking.continue_phase1, accuracy_seeking.continue_phase2, accuracy_seeking.decided
+)
+"""The steps of robots whose pose each range corrects."""
 
 
 class Assured(LogPlanner):
@@ -42,9 +57,9 @@ class Assured(LogPlanner):
             return state
         match state.task:
             case Orbital() | Travelling():
-                return self._begin_phase3(state)
+                return self._steps(state).phase3(state, self.joint_manoeuvres)
             case Resting():
-                return self._decide_phase3(state)
+                return turns.decided(state, self.last_manoeuvre)
             case Listening() | Surveying("peer") if accuracy_seeking.is_planning_tick(state):
                 return accuracy_seeking.decided(state, self.joint_manoeuvres)
             case _:
@@ -82,61 +97,15 @@ class Assured(LogPlanner):
             and isinstance(state.task, Orbital | Travelling)
         )
 
+    def _steps(self, state: RobotState) -> Steps:
+        return BY_ACCURACY if state.estimator.corrects_poses else BY_TURNS
+
     def _continue_phase2(self, state: RobotState, task: Orbital, ranged: bool) -> RobotState:
-        """Continue phase 2 from `task`; under noise, the latest range corrects the pose."""
-        if state.estimator.corrects_poses:
-            return accuracy_seeking.continue_phase2(state, task, ranged=ranged)
-        return transitions.continue_phase2(state, task)
+        return self._steps(state).phase2(state, task, ranged)
 
     def _sense(self, state: RobotState, ranged: bool) -> RobotState:
         """Continue active sensing, or search for the anchor: only under noise."""
         return accuracy_seeking.sensed(state, ranged)
 
-    def _begin_phase3(self, state: RobotState) -> RobotState:
-        """Begin phase 3 once the peer's phase 1 has ended, and with exact sensors b is off its anchor."""
-        peer = state.peer_state
-        if state.estimator.corrects_poses:
-            return accuracy_seeking.decided(state, self.joint_manoeuvres)
-        met = peer.phase == 3 or (peer.start is not None and state.off_anchor)
-        return transitions.begin_phase3(state) if met else state
-
     def _after_range(self, state: RobotState) -> RobotState:
-        """Continue phase 1 with the branches +alpha and -alpha that the ranges allow (eq. (2)).
-
-        Phase 1 ends when one branch is left, and the ranges determine the anchor's position as accurately as
-        a claim needs. Under noise, further ranges follow until they are no longer worth the time.
-        """
-        if state.estimator.corrects_poses:
-            return accuracy_seeking.continue_phase1(state)
-        kind = transitions.branch_kind(state)
-        estimate = transitions.anchor_estimate(state)
-        state = replace(state, belief=estimate.belief)
-        if kind is not None and len(estimate.branches) == 1:
-            fitted = state.estimator.fitted(state, estimate.branches[0])
-            if fitted.enough:
-                return transitions.end_phase1(state, fitted, kind)
-        return transitions.to_third_point(
-            state, estimate, self.MANOEUVRES, pinning=len(estimate.branches) == 1
-        )
-
-    def _decide_phase3(self, state: RobotState) -> RobotState:
-        """Return `state` after the evaluation of both logs: with a verdict, a last manoeuvre, or as it was.
-
-        All ticks count, including those before the encounter. The robots take turns until a redundant range
-        has confirmed the placement, and then until the ranges determine it.
-        """
-        evaluated = transitions.with_new_ticks(state)
-        if evaluated is None:
-            return state
-        state, estimate = transitions.pair_estimate(evaluated, 0, second_range=True)
-        if estimate is None:  # There are too few ranges, or b was still driving while a drove straight on.
-            b_is_standing = isinstance(state.task, Waiting) and state.peer_state.state == Standing.name
-            return transitions.begin_phase3(state) if b_is_standing else state
-        if state.verdict is not None:
-            return state
-        # A peer that has localised itself does not move again.
-        if not isinstance(state.peer_state.verdict, Localised):
-            turn = phase3_last_manoeuvre.turn(estimate.observations) if estimate.checked else "b"
-            if state.config.role != turn or state.peer_state.state not in PEER_RESTS:
-                return state
-        return transitions.last_manoeuvre(state, estimate, self.last_manoeuvre) or state
+        return self._steps(state).phase1(state, self.MANOEUVRES)

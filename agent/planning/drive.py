@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 from agent.planning import tasks
-from agent.planning.phase2_orbit import left_to_orbit
 from agent.planning.range_seeking import inside_arc, step_length
 from agent.planning.state import RobotState
 from protocol.mission import Mission
@@ -34,8 +33,15 @@ def controls(state: RobotState) -> Controls:
             return turn(odometry, heading, mission)
         case tasks.Radial():
             return straight(left_to_orbit(state), mission)
-        case tasks.Straight() | tasks.Backing() | tasks.Circling():
-            return _seeking(task, odometry, mission)
+        case tasks.Straight(beacon, origin, rho0) | tasks.Backing(beacon, origin, rho0):
+            step, forward = step_length(beacon, rho0, mission), isinstance(task, tasks.Straight)
+            left = step - travelled(origin, odometry) if forward else -step - relative(origin, odometry).x
+            return straight(left, mission)
+        case tasks.Circling(beacon, _, rho0):
+            radius = step_length(beacon, rho0, mission)
+            part = inside_arc(rho0, radius, mission.sensing_range) / mission.period
+            omega = min(mission.max_turn_rate, part, mission.max_speed / radius)
+            return Controls(omega * radius, omega)
         case (
             tasks.ThirdPoint()
             | tasks.LastManoeuvre()
@@ -55,20 +61,10 @@ def controls(state: RobotState) -> Controls:
             return REST
 
 
-def _seeking(
-    task: tasks.Straight | tasks.Backing | tasks.Circling, odometry: Pose, mission: Mission
-) -> Controls:
-    """Return the controls of a search for a second range to a beacon."""
-    step = step_length(task.beacon, task.rho0, mission)
-    match task:
-        case tasks.Straight():
-            return straight(step - travelled(task.origin, odometry), mission)
-        case tasks.Backing():
-            return straight(-step - relative(task.origin, odometry).x, mission)
-        case tasks.Circling():
-            part = inside_arc(task.rho0, step, mission.sensing_range) / mission.period
-            omega = min(mission.max_turn_rate, part, mission.max_speed / step)
-            return Controls(omega * step, omega)
+def left_to_orbit(state: RobotState) -> float:
+    """Return the distance in m from the robot outward to its orbit; negative outside the orbit."""
+    local = state.local_pose
+    return state.orbit.radius - math.hypot(local.x, local.y)
 
 
 def homing(place: Pose, pose: Pose, mission: Mission, tolerance: float) -> Controls | None:

@@ -11,8 +11,16 @@ from agent.estimation.judged import required_mutual_ranges
 from agent.estimation.solver import Solver
 from agent.peer import false_reports, peer_state
 from agent.peer.motion_log import MotionLog
-from agent.planning import phase3_last_manoeuvre, plausibility, range_seeking, separation, tasks, transitions
-from agent.planning.phase1_anchor import local
+from agent.planning import (
+    phase1_anchor,
+    phase2_orbit,
+    phase3_last_manoeuvre,
+    plausibility,
+    range_seeking,
+    separation,
+    tasks,
+    turns,
+)
 from agent.planning.phase3_last_manoeuvre import Plan, Question
 from agent.planning.planner import Manoeuvres, Planner, Summary
 from agent.planning.state import RobotState
@@ -192,9 +200,9 @@ class LogPlanner(Planner[RobotState, Report]):
             case tasks.ThirdPoint(_, origin) if state.odometry != origin:
                 return self._after_range(state)
             case tasks.LastManoeuvre(_, origin) | tasks.Returning(_, origin) if state.odometry != origin:
-                return transitions.after_last_manoeuvre(state, task)
+                return turns.after_last_manoeuvre(state, task)
             case tasks.Asleep() if ranged or not state.estimator.corrects_poses:
-                return transitions.start_phase1(state, observation.anchor_range)
+                return phase1_anchor.begun(state, observation.anchor_range)
             case _:  # under noise, the first range may be missing by chance
                 return self._sense(state, ranged)
 
@@ -204,8 +212,7 @@ class LogPlanner(Planner[RobotState, Report]):
 
     def _continue_phase2(self, state: RobotState, task: tasks.Orbital, ranged: bool) -> RobotState:
         """Return `state` with the task that follows `task`; `ranged` if it has a new range to its anchor."""
-        del ranged
-        return transitions.continue_phase2(state, task)
+        return phase2_orbit.continued(state, task, ranged)
 
     def _sense(self, state: RobotState, ranged: bool) -> RobotState:
         """Return `state` with the task that follows one that the paper does not have: the robot waits."""
@@ -256,7 +263,7 @@ class LogPlanner(Planner[RobotState, Report]):
         return Estimate(
             tick=state.tick,
             robot=state.config.robot,
-            local=tuple(local(branches_left, state.odometry)),
+            local=tuple(phase1_anchor.local(branches_left, state.odometry)),
             world=world,
             localised=isinstance(verdict, Localised),
             probabilities=tuple([one.probability for one in belief.pair or belief.own]),
@@ -269,9 +276,7 @@ class LogPlanner(Planner[RobotState, Report]):
         A subclass may plan another one. It is executed for one tick, and driven back if it leaves the peer's
         range.
         """
-        return phase3_last_manoeuvre.last_manoeuvre(
-            question.mover, question.a, question.b, question.candidates, mission, self.MANOEUVRES
-        )
+        return phase3_last_manoeuvre.last_manoeuvre(question, mission, self.MANOEUVRES)
 
     def required_mutual_ranges(self, mission: Mission) -> int:
         """Return the minimum number of noisy mutual ranges before a claim."""

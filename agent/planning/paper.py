@@ -9,9 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from msgspec.structs import replace
-
-from agent.planning import drive, exchange, transitions
+from agent.planning import drive, exchange, phase1_anchor, turns
 from agent.planning.exchange import LogPlanner
 from agent.planning.planner import Manoeuvres
 from agent.planning.state import RobotState
@@ -38,7 +36,7 @@ class Paper(LogPlanner):
             return state
         match state.task:
             case Orbiting() if state.peer_state.phase == 3 or state.peer_state.state == state.task.name:
-                return transitions.begin_phase3(state)
+                return turns.begun(state)
             case Resting():
                 return self._decide_phase3(state)
             case _:
@@ -57,15 +55,14 @@ class Paper(LogPlanner):
 
         The third range is the last one. It selects the most probable branch, if there is one.
         """
-        kind, third = transitions.branch_kind(state), isinstance(state.task, ThirdPoint)
-        estimate = transitions.anchor_estimate(state)
-        state = replace(state, belief=estimate.belief)
+        third = isinstance(state.task, ThirdPoint)
+        state, estimate, kind = phase1_anchor.with_branches(state)
         branch = estimate.best if third or len(estimate.branches) == 1 else None
         if kind is not None and branch is not None:
-            return transitions.end_phase1(state, state.estimator.fitted(state, branch), kind)
+            return phase1_anchor.ended(state, state.estimator.fitted(state, branch), kind)
         if estimate.branches and third:
             return state.undecided("the third range does not distinguish +alpha from -alpha")
-        return transitions.to_third_point(state, estimate, self.MANOEUVRES)
+        return phase1_anchor.to_third_point(state, estimate, self.MANOEUVRES)
 
     def _decide_phase3(self, state: RobotState) -> RobotState:
         """Evaluate phase 3 after a's second mutual range, and again after b's last manoeuvre.
@@ -73,17 +70,17 @@ class Paper(LogPlanner):
         The mutual ranges count from the encounter on. Return `state` with a verdict, with b's last
         manoeuvre, or with the same task.
         """
-        evaluated = transitions.with_new_ticks(state)
+        evaluated = turns.with_new_ticks(state)
         if evaluated is None:
             return state
         first_tick, planned = state.belief.encounter_tick, state.plan is not None
         assert first_tick is not None
         a_waits = not isinstance(state.task, Standing) or state.peer_state.state == Waiting.name
         second = a_waits or planned
-        state, estimate = transitions.pair_estimate(evaluated, first_tick, second_range=second)
+        state, estimate = turns.pair_estimate(evaluated, first_tick, second_range=second)
         if estimate is None or state.verdict is not None or state.config.role == "a":
             return state
         if planned:
             return state.undecided(estimate.failure)
-        moving = transitions.last_manoeuvre(state, estimate, self.last_manoeuvre)
+        moving = turns.last_manoeuvre(state, estimate, self.last_manoeuvre)
         return moving if moving is not None else state.undecided("no manoeuvre keeps the safety distance")

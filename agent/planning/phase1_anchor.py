@@ -1,4 +1,4 @@
-"""Phase 1: the manoeuvre to a further range to the own anchor (Section III.A, eqs. (3) to (5))."""
+"""Phase 1: the branches about the own anchor, and the manoeuvre to a further range (Section III.A)."""
 
 from __future__ import annotations
 
@@ -6,8 +6,14 @@ import math
 from collections.abc import Sequence
 from itertools import combinations
 
+from msgspec.structs import replace
+
+from agent.estimation.estimator import AnchorEstimate, FittedBranch
 from agent.estimation.exact import Branch
+from agent.planning import phase2_orbit, tasks
 from agent.planning.planner import Manoeuvres
+from agent.planning.state import RobotState
+from protocol.messages import BranchKind
 from protocol.mission import RANGE_MARGIN, Mission, third_point_turn_rate
 from protocol.motion import Controls, Pose, chord, compose, rotated_back
 
@@ -100,3 +106,56 @@ def _separation(length: float, along: Sequence[float]) -> float:
 def local(branches: Sequence[Branch], odometry: Pose) -> list[Pose]:
     """Return the robot's current pose in its anchor's frame for each of `branches`."""
     return [compose(branch.start, odometry) for branch in branches]
+
+
+def begun(state: RobotState, rho0: float | None) -> RobotState:
+    """Start phase 1 with the first anchor range `rho0` in m; None if the anchor was not detected."""
+    if rho0 is None:
+        return state.undecided("the anchor is out of range at the start")
+    on_anchor = state.estimator.on_anchor(state, rho0)
+    if on_anchor is not None:
+        return ended(state, on_anchor, "on-anchor")
+    return state.doing(tasks.Straight("anchor", state.odometry, rho0))
+
+
+def with_branches(state: RobotState) -> tuple[RobotState, AnchorEstimate, BranchKind | None]:
+    """Return `state` with the branches that its anchor ranges allow, these, and how phase 1 ends with one.
+
+    The last is None if a further range has to check it. A third range that is missing is the paper's virtual
+    measurement.
+    """
+    candidates: tuple[Branch, ...] = ()
+    kind: BranchKind | None = None
+    match state.task:
+        case tasks.ThirdPoint(candidates):
+            measured = state.log.ranges[-1].tick == state.tick
+            kind = "three-ranges" if measured else "three-ranges-virtual"
+        case tasks.Circling():
+            kind = "circle"
+    estimate = state.estimator.anchor(state, candidates)
+    return replace(state, belief=estimate.belief), estimate, kind
+
+
+def to_third_point(
+    state: RobotState, estimate: AnchorEstimate, manoeuvres: Manoeuvres, *, pinning: bool = False
+) -> RobotState:
+    """Plan the manoeuvre to the next measurement point of phase 1 (see `third_point`)."""
+    if not estimate.branches:
+        return state.undecided("no pose explains the anchor ranges")
+    places = local(estimate.branches, state.odometry)
+    command = third_point(places, state.config.mission, manoeuvres, margin=estimate.margin, pinning=pinning)
+    if command is None:
+        return state.undecided("eq. (5) allows no manoeuvre to a third range")
+    return state.doing(tasks.ThirdPoint(estimate.branches, state.odometry, command))
+
+
+def ended(state: RobotState, fitted: FittedBranch, kind: BranchKind) -> RobotState:
+    """End phase 1: store the branch and the anchor error of `fitted`, and start phase 2."""
+    belief = replace(
+        state.belief,
+        branch=fitted.branch,
+        branch_kind=kind,
+        phase1_done_tick=state.tick,
+        own_anchor=fitted.anchor_error,
+    )
+    return phase2_orbit.begun(replace(state, belief=belief))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+from agent.planning import drive
+from agent.planning.drive import left_to_orbit
 from agent.planning.state import RobotState
 from agent.planning.tasks import Aligning, Orbital, Orbiting, Radial, Tangent
 from protocol.motion import Pose, wrap
@@ -33,7 +35,20 @@ def onward(state: RobotState, task: Orbital) -> Orbital:
                 return task
 
 
-def left_to_orbit(state: RobotState) -> float:
-    """Return the distance in m from the robot outward to its orbit; negative outside the orbit."""
-    local = state.local_pose
-    return state.orbit.radius - math.hypot(local.x, local.y)
+def begun(state: RobotState) -> RobotState:
+    """Return `state` at the beginning of phase 2, from the present pose."""
+    return continued(state, aligning(state))
+
+
+def aligning(state: RobotState) -> Aligning:
+    """Return the first task of phase 2, from the present pose."""
+    return Aligning(state.odometry.heading - orientation(state.local_pose))
+
+
+def continued(state: RobotState, task: Orbital, ranged: bool = False) -> RobotState:
+    """Continue phase 2 from `task`, `ranged` or not. A robot whose pose is corrected follows by pursuit."""
+    del ranged
+    task = onward(state, task)
+    if isinstance(task, Orbiting) and state.estimator.corrects_poses:
+        task = Orbiting(drive.pursuit(state.local_pose, state.orbit, state.config.mission))
+    return state.doing(task)

@@ -43,6 +43,7 @@ class Question(NamedTuple):
     """The problem that the last manoeuvre solves: which of `candidates` is the true placement."""
 
     mover: Role
+    """The robot that moves, in the paper always b."""
     a: Pose
     """The pose of a in <a(M1)>."""
     b: Pose
@@ -91,32 +92,22 @@ def turn(pair_observations: Sequence[PairObservation]) -> Role:
     return "b"
 
 
-def last_manoeuvre(
-    mover: Role,
-    a: Pose,
-    b: Pose,
-    candidates: Sequence[Placement],
-    mission: Mission,
-    manoeuvres: Manoeuvres,
-) -> Plan | None:
-    """Return the manoeuvre that best distinguishes `candidates` by the range after it (eq. (8)).
+def last_manoeuvre(question: Question, mission: Mission, manoeuvres: Manoeuvres) -> Plan | None:
+    """Return the manoeuvre that best distinguishes the candidates by the range after it (eq. (8)).
 
-    It maximises the smallest difference of the predicted ranges, in squares.
-
-    `mover` is the robot that moves, in the paper always b. `a` is given in <a(M1)> and `b` in <b(M2)>. The
-    maximum is found by enumeration of `manoeuvres`.
+    It maximises the smallest difference of the predicted ranges, in squares. The maximum is found by
+    enumeration of `manoeuvres`.
 
     With one candidate, the manoeuvre is a check: it approaches the candidate so that the squared range
     decreases most, since no detection would check nothing. The result is None if every manoeuvre violates the
     safety distance.
     """
-    question = Question(mover, a, b, tuple(candidates))
     reach, gap, value = compared(question, mission, manoeuvres)
     row, column = _best(value)
     if value[row, column] == -np.inf:
         return None
     command = Controls(float(reach.v[row, 0]), float(reach.omega[column]))
-    return Plan(command, float(gap[row, column]) if len(candidates) > 1 else None, question)
+    return Plan(command, float(gap[row, column]) if len(question.candidates) > 1 else None, question)
 
 
 def compared(question: Question, mission: Mission, manoeuvres: Manoeuvres) -> Compared:
@@ -154,20 +145,15 @@ def _gap(one: Array, other: Array) -> Array:
 
 
 def most_informative_manoeuvre(
-    mover: Role,
-    a: Pose,
-    b: Pose,
-    placement: Placement,
-    pair_observations: Sequence[PairObservation],
-    mission: Mission,
+    question: Question, pair_observations: Sequence[PairObservation], mission: Mission
 ) -> Plan | None:
-    """Return the manoeuvre after which a range determines `placement` best, or None (see `last_manoeuvre`).
+    """Return the manoeuvre after which a range determines the placement best, or None (see `last_manoeuvre`).
 
     It applies to the only remaining placement if the ranges in `pair_observations` do not determine it,
     because both robots and their anchors lie on one line. The criterion is the determinant of the information
     matrix. Both robots have to move to raise it.
     """
-    question = Question(mover, a, b, (placement,))
+    mover, a, b, (placement,) = question
     reach = reachable(a if mover == "a" else b, mission, LAST_SPEEDS)
     (ax, ay), (bx, by) = _positions_in_b(mover, a, b, placement, reach.x, reach.y)
     dx, dy = ax - bx, ay - by
