@@ -82,13 +82,15 @@ def sensed(state: RobotState, ranged: bool) -> RobotState:
     """Return `state` with the task that follows one of active sensing, or of the search for the anchor."""
     if not state.log.ranges:  # it is asleep
         return _without_range(state)
-    mission, tolerance = state.config.mission, state.estimator.pose_tolerance
     match state.task:
         case Surveying("anchor"):
             return continue_phase1(state) if is_planning_tick(state) else state
         case Homing() if ranged:
             return continue_phase1(state)
-        case Homing(place, side) if drive.homing(place, state.odometry, mission, tolerance) is None:
+        case Homing(place, side):
+            mission, tolerance = state.config.mission, state.estimator.pose_tolerance
+            if drive.homing(place, state.odometry, mission, tolerance) is not None:
+                return state
             if side is None:
                 return state.doing(Straight("anchor", state.odometry, 0.0))
             x, y = range_seeking.next_on_spiral((place.x, place.y), side, mission)
