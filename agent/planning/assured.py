@@ -98,6 +98,7 @@ class Assured(LogPlanner):
         )
 
     def _steps(self, state: RobotState) -> Steps:
+        """Return the steps for the sensors of the mission."""
         return BY_ACCURACY if state.estimator.corrects_poses else BY_TURNS
 
     def _continue_phase2(self, state: RobotState, task: Orbital, ranged: bool) -> RobotState:

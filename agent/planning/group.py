@@ -80,7 +80,7 @@ class GroupPlanner(Planner[RobotState, Report]):
 
         Until this robot is localised, one with which its meeting has failed gets the verdict of that meeting.
         """
-        noisy = search.applies(state)
+        noisy = search.reports_covariance(state)
         if noisy and search.is_helped(state, peer):
             return search.outside_meeting(state, peer)
         if appointments.refused(state, peer):

@@ -32,7 +32,6 @@ WORTH = 0.9
 The ranges between them add to it: with a larger one, the other robot can make no claim.
 """
 
-
 LOOPS_FOR = 200
 """The ticks after which robots stop driving squares that have localised nobody: the other one may be dead."""
 
@@ -49,7 +48,7 @@ def is_helped(state: RobotState, robot: str) -> bool:
     return robot in state.config.unanchored and not finished
 
 
-def applies(state: RobotState) -> bool:
+def reports_covariance(state: RobotState) -> bool:
     """Return whether robots without an anchor need the covariance of the pose that this one reports."""
     return bool(state.config.unanchored) and state.estimator.corrects_poses
 
@@ -60,8 +59,8 @@ def is_apart(state: RobotState) -> bool:
     A beacon stays where it is: it sweeps no part, and its planned meetings are over.
     """
     config = state.config
-    if not applies(state) or state.sweeps:
-        return state.sweeps and applies(state)
+    if not reports_covariance(state) or state.sweeps:
+        return state.sweeps and reports_covariance(state)
     assert config.sweep is not None
     if config.part < config.sweep.parts or state.agenda.visits < len(config.visits):
         return False
@@ -78,7 +77,7 @@ def outside_meeting(state: RobotState, peer: str) -> Report:
     report = replace(exchange.report_without_log(state, agenda.robot_verdict), strips=sweep.strips(state))
     if not (is_helped(state, peer) and isinstance(agenda.robot_verdict, Localised)):
         return report
-    if not applies(state):
+    if not reports_covariance(state):
         return replace(report, prior=ReportedPose(state.tick, exchange.reported_pose(state, agenda.frame)))
     reference = agenda.own_pose.reference
     if reference is None:
@@ -99,7 +98,7 @@ def next_part(state: RobotState) -> RobotState:
         state = state.with_other(robot, failed=False)
     part = (config.part + state.agenda.parts) % config.sweep.parts
     state = state.with_agenda(part_tick=state.tick, visiting=False, unmet=0, silence=0)
-    if not applies(state):
+    if not reports_covariance(state):
         return sweep.along(state, config.sweep.strips_of(part, config.mission.sensing_range))
     state = state.with_agenda(parts=state.agenda.parts + 1)
     if config.part >= config.sweep.parts:
@@ -133,7 +132,7 @@ def swept(state: RobotState) -> RobotState:
     well enough; its verdict is Undecided if that contradicts its claim.
     """
     mission, odometry, helped = state.config.mission, state.odometry, _helped(state)
-    if applies(state):
+    if reports_covariance(state):
         state = _with_contact(state, helped)
         if state.verdict is not None:
             return state
