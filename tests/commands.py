@@ -36,7 +36,7 @@ period = 1.0
 max_speed = 1.0
 max_turn_rate = 3.141592653589793
 """
-BENT = 34
+BENT = 249
 """A seed of `noisy` with which both positions lie along arcs for a tick."""
 
 PAPER_1 = f"""

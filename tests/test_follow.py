@@ -204,7 +204,7 @@ def test_a_stream_is_ended_by_ctrl_c_and_by_the_end_of_its_reader_and_the_files_
         (("bad.mcap", "--follow"), "bad.mcap, /ranges, message 1: range: expected a number, got 'str'"),
         (
             ("bad.txt", "--follow"),
-            "bad.txt: it is not a complete MCAP file: no MCAP begins or ends at byte 0",
+            "bad.txt: it is not a complete MCAP file: no MCAP begins or ends before byte 8",
         ),
         (("empty.mcap", "--follow", "--out", "bad.txt"), "bad.txt cannot be written: File exists"),
         (("empty.mcap", "--follow"), "empty.mcap: there is no second with odometry of all robots"),

@@ -76,11 +76,6 @@ def has_failed(knowledge: Knowledge, before: int, tick: int) -> bool:
     return count >= MANY_MUTUAL_RANGES
 
 
-def _own_beginning(knowledge: Knowledge) -> int:
-    """Return the tick from which on the robot's own measurements count; see `beginning`."""
-    return beginning(knowledge, knowledge.tick) if knowledge.config.role == "a" else 0
-
-
 def path_of(log: MotionLog, first: int, through: int, mission: Mission) -> Track:
     """Return the odometry of `log` up to tick `through`, as if it had not moved until `first`."""
     return _path_of(log.runs, first, through, mission.period, mission.noise.odometry)
@@ -112,7 +107,8 @@ def own_path(knowledge: Knowledge) -> Track:
 
 def _own_measurements(knowledge: Knowledge) -> JointMeasurements:
     """Return the odometry of the robot and its ranges to its anchor, without those that do not count."""
-    mission, now, first = knowledge.config.mission, knowledge.tick, _own_beginning(knowledge)
+    mission, now = knowledge.config.mission, knowledge.tick
+    first = beginning(knowledge, now) if knowledge.config.role == "a" else 0
     ranges = _ranges_within(knowledge.log, first, now)
     silent = Silence(0, -1, _missing(ranges, now + 1, first))
     own = near_anchors(

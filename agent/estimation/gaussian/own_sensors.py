@@ -94,7 +94,8 @@ def doubt(own: JointMeasurements, pair: JointMeasurements | None = None, robot: 
     if len(own.ranges.rho) < FEWEST_RANGES:
         return None
     told = _log_evidence(own)
-    others = {name: _log_evidence(_near_anchor(own, _profile(name, noise))) - told for name in _others(noise)}
+    profiles = {name: replace(own, noise=_profile(name, noise)).alone(0) for name in _others(noise)}
+    others = {name: _log_evidence(one) - told for name, one in profiles.items()}
     found = _best(OWN_SENSORS, others, DOUBTED_EVIDENCE)
     if found is not None or pair is None:
         return found
@@ -186,11 +187,6 @@ def _profile(name: ProfileName, noise: Noise, share: float = 1.0) -> Noise:
         odometry=noise.odometry,
         odometry_strays=noise.odometry_strays,
     )
-
-
-def _near_anchor(own: JointMeasurements, noise: Noise) -> JointMeasurements:
-    """Return the measurements of one robot near its anchor under other `noise`."""
-    return replace(own, noise=noise).alone(0)
 
 
 def _log_evidence(own: JointMeasurements) -> float:

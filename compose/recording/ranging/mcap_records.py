@@ -24,9 +24,6 @@ EXPANSION, SMALL_BYTES = 1000, 1 << 22
 JSON has 5 to 50. With zstd, 65 kB can hold 2 GB.
 """
 
-MAGIC_BYTES = 8
-"""The bytes with which an MCAP file begins and ends."""
-
 
 class EndOfStream(BadRecording):
     """The file or stream ends before its end record."""
@@ -81,7 +78,7 @@ def entries(file: BinaryIO, path: object, size: int | None) -> Iterator[Channel 
             yield None
             yield from _of_file(source)
     except InvalidMagic:
-        raise BadRecording(f"{wrong}no MCAP begins or ends at byte {source.at - MAGIC_BYTES}") from None
+        raise BadRecording(f"{wrong}no MCAP begins or ends before byte {source.at}") from None
     except RecordLengthLimitExceeded as error:
         raise BadRecording(f"{path}: before byte {source.at}: {error}") from None
     except EndOfFile as error:

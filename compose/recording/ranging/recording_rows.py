@@ -206,7 +206,8 @@ class RecordingBuilder:
                     raise BadRecording(
                         f"{place}: it needs all of sigma_dx, sigma_dy, sigma_dheading, or none"
                     )
-                self.add_odometry(row, _diagonal(*stated) if stated else None, place)
+                x, y, turn = [one**2 for one in stated or (0.0, 0.0, 0.0)]
+                self.add_odometry(row, (x, 0.0, 0.0, y, 0.0, turn) if stated else None, place)
             case RangeRow():
                 self._add_range(row, place)
             case AnchorRow():
@@ -358,10 +359,6 @@ A driver may send a few in one message; an estimate needs eight.
 """
 
 UNSTATED_COVARIANCE = (np.nan,) * 6
-
-
-def _diagonal(dx: float, dy: float, dheading: float) -> Covariance6:
-    return (dx**2, 0.0, 0.0, dy**2, 0.0, dheading**2)
 
 
 def _column(values: list[float]) -> Any:
