@@ -174,6 +174,8 @@ def test_a_finder_and_the_robot_that_it_has_found_sweep_each_strip_once(
     assert told == ends
     beyond = (first, area.strips(R) + more)
     assert second_half(RobotState(config), beyond) == RobotState(config)
+    for others in (beyond, (ends[1], ends[1]), (ends[1] + 3, ends[1]), ends):  # a peer may report anything
+        assert without_strips(finder, others) == finder
     found = second_half(RobotState(config), told)
     left = without_strips(finder, strips(found))
     assert isinstance(left.task, Sweeping)

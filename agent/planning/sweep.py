@@ -74,7 +74,7 @@ def strips(state: RobotState) -> tuple[int, int] | None:
 def without_strips(state: RobotState, others: tuple[int, int] | None) -> RobotState:
     """Return `state` without the last strips of its sweep, if these are those that another robot sweeps."""
     own = strips(state)
-    if own is None or others is None or own[1] != others[1] or own[0] >= others[0]:
+    if own is None or others is None or not own[0] < others[0] < others[1] == own[1]:
         return state
     most, task = -2 * (others[1] - others[0]), state.task
     match task:
