@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from agent.estimation.knowledge import Belief
 from agent.peer.peer_state import PeerState
-from agent.planning import phase2_orbit, search, visit
+from agent.planning import phase2_orbit, searching, visit
 from agent.planning.state import RobotState
 from agent.planning.tasks import Asleep, Orbital, Travelling
 from protocol.messages import Appointment, Member, Undecided, Verdict
@@ -36,9 +36,9 @@ def next_visit(state: RobotState) -> RobotState:
     state = state.with_agenda(visits=visits)
     if config.confirms:
         return at_anchor(state)
-    seeks = search.wanted(state)
+    seeks = searching.wanted(state)
     if seeks and state.agenda.parts == 0:
-        return search.next_part(state)
+        return searching.next_part(state)
     here, tick = compose(state.agenda.frame, state.odometry), state.tick
     late = [
         (state.other(one.robot).missed, math.hypot(one.anchor.x - here.x, one.anchor.y - here.y), one.robot)
@@ -48,7 +48,7 @@ def next_visit(state: RobotState) -> RobotState:
     ]
     if late:
         return on_visit(state, min(late)[2])
-    return search.next_part(state) if seeks else state
+    return searching.next_part(state) if seeks else state
 
 
 def _is_late(state: RobotState, member: Member) -> bool:

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from agent.planning import appointments, confirmation, exchange, meetings, own_pose, search, visit
+from agent.planning import appointments, confirmation, exchange, meetings, own_pose, searching, visit
 from agent.planning.exchange import LogPlanner
 from agent.planning.meeting_planner import MeetingPlanner
 from agent.planning.planner import Planner, Summary
@@ -80,21 +80,21 @@ class GroupPlanner(Planner[RobotState, Report]):
 
         Until this robot is localised, one with which its meeting has failed gets the verdict of that meeting.
         """
-        noisy = search.reports_covariance(state)
-        if noisy and search.is_helped(state, peer):
-            return search.outside_meeting(state, peer)
+        noisy = searching.reports_covariance(state)
+        if noisy and searching.is_helped(state, peer):
+            return searching.outside_meeting(state, peer)
         if appointments.refused(state, peer):
             report = exchange.report_without_log(state, state.agenda.failure)
         elif peer == state.config.peer and (state.meets or (noisy and state.sweeps)):
             return self.report(state)
         else:
-            report = search.outside_meeting(state, peer)
+            report = searching.outside_meeting(state, peer)
         unconfirmed = state.config.confirms and state.agenda.fix is not None and report.verdict is None
         return replace(report, state=UNCONFIRMED) if unconfirmed else report
 
     def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
         """Return `state` with the `reports` of others, and in the next meeting if this one has ended."""
-        if search.is_apart(state):
+        if searching.is_apart(state):
             return _apart(state, reports)
         state = self._met(state, reports)
         return confirmation.onward(state) if state.config.confirms else state

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from agent.estimation.gaussian.claim_agreement import difference
-from agent.planning import appointments, search, sweep, visit
+from agent.planning import appointments, searching, sweep, visit
 from agent.planning.agenda import Fix
 from agent.planning.state import RobotState
 from agent.planning.tasks import UNCONFIRMED, Done, Travelling
@@ -121,7 +121,7 @@ def _on_sweep(state: RobotState) -> RobotState:
     """
     agenda, peer = state.agenda, state.config.peer
     assert agenda.robot_verdict is not None
-    swept, done = search.swept(state), Done(state.phase, agenda.robot_verdict)
+    swept, done = searching.swept(state), Done(state.phase, agenda.robot_verdict)
     if swept.verdict is None:
         return appointments.next_visit(swept.doing(done)) if sweep.is_over(swept) else swept
     state = swept.with_agenda(

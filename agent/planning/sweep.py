@@ -59,7 +59,7 @@ def shares(state: RobotState) -> bool:
 
 
 def strips(state: RobotState) -> tuple[int, int] | None:
-    """Return the strips that the robot still sweeps, as Report.strips has them."""
+    """Return the strips that the robot has not begun to sweep, as Report.strips has them."""
     match state.task:
         case Sweeping(places):
             left = len(places)
@@ -68,7 +68,7 @@ def strips(state: RobotState) -> tuple[int, int] | None:
         case _:
             return None
     end = state.agenda.strips_end
-    return None if end is None else (end - (left + 1) // 2, end)
+    return None if end is None else (end - left // 2, end)
 
 
 def without_strips(state: RobotState, others: tuple[int, int] | None) -> RobotState:

@@ -15,7 +15,7 @@ from agent.estimation.claim import is_definite
 from agent.estimation.compiled import library
 from agent.estimation.judged import sufficient_mutual_ranges
 from agent.peer import peer_state
-from agent.planning import drive, exchange, meetings, search, sweep
+from agent.planning import drive, exchange, meetings, searching, sweep
 from agent.planning.contacted import Contacted
 from agent.planning.planner import Planner, Summary
 from agent.planning.resected import Resected
@@ -56,7 +56,7 @@ class UnanchoredPlanner(Planner[RobotState, Report]):
     def report_to(self, state: RobotState, peer: str) -> Report:
         """Return the report to `peer`. Once localised, it has the pose for others without an anchor."""
         if _searches(state):
-            return search.outside_meeting(state, peer)
+            return searching.outside_meeting(state, peer)
         return _found(state).answered(self.report(state), peer)
 
     def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
@@ -131,9 +131,9 @@ def _searching(state: RobotState, reports: Sequence[Report]) -> RobotState:
     if any(one.prior is not None for one in reports) and not isinstance(state.task, Sweeping):
         return state
     if state.sweeps:
-        state = search.swept(state)
+        state = searching.swept(state)
         if not sweep.is_over(state):
             return state
         assert state.agenda.robot_verdict is not None
         state = state.doing(Done(3, state.agenda.robot_verdict))
-    return search.next_part(state) if search.wanted(state) else state
+    return searching.next_part(state) if searching.wanted(state) else state
