@@ -115,9 +115,9 @@ class SweptArea(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fie
     def path(
         self, strips: tuple[int, int], sensing_range: float, half_width: float = HALF_WIDTH
     ) -> tuple[Place, ...]:
-        """Return the ends of `strips` in m in <W>, in the order in which they are driven.
+        """Return the ends of strips in m in <W>, in the order in which they are driven.
 
-        They are the first of them, and the one after the last.
+        `strips` is the first of them, and the one after the last.
         """
         low, high = (self.x_min, self.y_min), (self.x_max, self.y_max)
         aside, along = self.across, 1 - self.across
