@@ -546,9 +546,8 @@ class Report(Message, frozen=True):
     prior: ReportedPose | None = None
     """The sender's pose, for a receiver without an anchor; None to others."""
     strips: tuple[Count, Count] | None = None
-    """The strips that the sender has still to begin: the first, and the one after the last. None if it sweeps
-    none, or cannot leave some to another robot: with noisy sensors, and where robots may report false data.
-    """
+    """The strips that the sender has still to begin: the first, and the one after the last. None if it leaves
+    none to other robots: under noise, where robots may report false data, and where it does not sweep."""
     body: Annotated[bytes, Meta(max_length=MAX_BODY_BYTES)] | None = None
     """The value that `Planner.report` returns, in msgpack; None from the shipped planners."""
 

@@ -16,7 +16,7 @@ SPEC = """
 name = "few-attacks"
 scenario = "random"
 trials = 4
-seed = 3
+seed = 4
 
 [[axis]]
 name = "attack"
