@@ -176,6 +176,10 @@ def test_a_finder_and_the_robot_that_it_has_found_sweep_each_strip_once(
     assert second_half(RobotState(config), beyond) == RobotState(config)
     for others in (beyond, (ends[1], ends[1]), (ends[1] + 3, ends[1]), ends):  # a peer may report anything
         assert without_strips(finder, others) == finder
+    stopped = finder.doing(
+        Looping((), ((0.0, 0.0), (0.0, 1.0), *whole))
+    )  # on its way back to the first strip
+    assert strips(stopped) == ends
     found = second_half(RobotState(config), told)
     left = without_strips(finder, strips(found))
     assert isinstance(left.task, Sweeping)
