@@ -95,7 +95,7 @@ class Bypass(msgspec.Struct, frozen=True):
 
 
 class Agenda(msgspec.Struct, frozen=True):
-    """What a robot of a group knows and does beyond its present meeting."""
+    """The knowledge of a robot of a group beyond its present meeting, and its place in the plan."""
 
     meeting: int = 0
     """The number of the present meeting; that of the first is 0."""

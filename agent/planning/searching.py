@@ -58,13 +58,13 @@ def is_apart(state: RobotState) -> bool:
 
     A beacon stays where it is: it sweeps no part, and its planned meetings are over.
     """
-    config = state.config
-    if not reports_covariance(state) or state.sweeps:
-        return state.sweeps and reports_covariance(state)
-    assert config.sweep is not None
-    if config.part < config.sweep.parts or state.agenda.visits < len(config.visits):
+    config, agenda = state.config, state.agenda
+    if not reports_covariance(state):
         return False
-    return isinstance(state.verdict, Localised) and isinstance(state.agenda.robot_verdict, Localised)
+    assert config.sweep is not None
+    if state.sweeps or config.part < config.sweep.parts or agenda.visits < len(config.visits):
+        return state.sweeps
+    return isinstance(state.verdict, Localised) and isinstance(agenda.robot_verdict, Localised)
 
 
 def outside_meeting(state: RobotState, peer: str) -> Report:

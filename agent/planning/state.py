@@ -29,7 +29,7 @@ class RobotState(Knowledge, frozen=True):
     plan: Plan | None = None
     """The latest plan of a last manoeuvre of this robot."""
     agenda: Agenda = Agenda()
-    """What it knows and does beyond the present meeting: only a robot of a group has more than one."""
+    """The knowledge beyond the present meeting: only a robot of a group has more than one."""
 
     @property
     def estimator(self) -> Estimator:

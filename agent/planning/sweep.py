@@ -106,12 +106,12 @@ def second_half(state: RobotState, others: tuple[int, int]) -> RobotState:
     return state.doing(Looping((), (here, *state.task.places), state.tick))
 
 
-def along(state: RobotState, along: tuple[int, int]) -> RobotState:
-    """Return `state` at the begin of a sweep of the strips `along`."""
+def along(state: RobotState, chosen: tuple[int, int]) -> RobotState:
+    """Return `state` at the begin of a sweep of the strips `chosen`."""
     config, agenda = state.config, state.agenda
     assert config.sweep is not None
-    path = config.sweep.path(along, config.mission.sensing_range)
-    state = state.with_agenda(parts=agenda.parts + 1, strips_end=along[1] if shares(state) else None)
+    path = config.sweep.path(chosen, config.mission.sensing_range)
+    state = state.with_agenda(parts=agenda.parts + 1, strips_end=chosen[1] if shares(state) else None)
     return state.doing(Sweeping(transformed(inverse(agenda.frame), path)))
 
 
