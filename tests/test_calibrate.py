@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -16,7 +17,7 @@ from compose.errors import USER_ERROR, UserError
 from compose.recording.estimating.calibration import calibrated, correction_of, noise_table, profile_toml
 from compose.recording.estimating.estimate_run import estimated
 from compose.recording.estimating.noise_files import told_noise
-from compose.recording.estimating.radio_errors import true_errors
+from compose.recording.estimating.radio_errors import PairErrors, range_calibration, true_errors
 from compose.recording.estimating.recorded_measurements import measurements
 from compose.recording.estimating.recording_estimator import ClaimRule
 from compose.recording.ranging.range_files import read_ranges
@@ -145,6 +146,30 @@ def test_slow_errors_are_told_from_white_ones(sample: RangeRecording) -> None:
     white = np.random.default_rng(1).normal(0.0, 0.1, len(sample.ranges.t))
     assert slow(sample.ranges.range + wave) > 0.05
     assert slow(sample.ranges.range + white) < 0.05
+
+
+def sonar_errors(slow: float, seed: int) -> dict[tuple[str, str], PairErrors]:
+    """Return errors of 3 m of four pairs, a part of which is slow: over 40 s, where ranges are 3 s apart."""
+    draws, t = np.random.default_rng(seed), 3.0 * np.arange(1500.0)
+    errors = {}
+    for name in "abcd":
+        kept, wanders = math.exp(-3.0 / 40.0), [draws.normal()]
+        for each in draws.normal(size=len(t) - 1).tolist():
+            wanders.append(kept * wanders[-1] + math.sqrt(1.0 - kept**2) * each)
+        error = slow * np.array(wanders) + math.sqrt(9.0 - slow**2) * draws.normal(size=len(t))
+        errors["auv", name] = PairErrors(t, 200.0 + 100.0 * np.sin(t / 90.0) + error, error)
+    return errors
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_time_of_slow_errors_follows_from_rare_ranges(seed: int) -> None:
+    found = range_calibration(sonar_errors(2.5, seed), "the truth")
+    table = noise_table(found, frozenset("abcd"))
+    assert table["slow_sigma"] == pytest.approx(2.5, rel=0.2)
+    assert table["anchor_sigma"] == pytest.approx(math.sqrt(9.0 - 2.5**2), rel=0.3)
+    assert 20.0 <= table["slow_time"] <= 80.0
+    white = noise_table(range_calibration(sonar_errors(0.0, seed), "the truth"), frozenset("abcd"))
+    assert white["slow_sigma"] < 1.0
 
 
 @pytest.mark.long

@@ -15,7 +15,6 @@ from compose.recording.estimating.noise_files import RangeCorrection
 from compose.recording.estimating.radio_errors import (
     FEWEST_ERRORS,
     MOST_SLOW,
-    SLOW_TIME_S,
     PairErrors,
     RadioErrors,
     RangeCalibration,
@@ -158,7 +157,7 @@ def noise_table(calibration: RangeCalibration, anchors: frozenset[str]) -> dict[
         "pair_bias": max(spread, LEAST_BIAS),
         "range_scale": max(math.hypot(calibration.scale_sigma, calibration.scale_spread), LEAST_SCALE),
         "slow_sigma": slow,
-        "slow_time": SLOW_TIME_S,
+        "slow_time": calibration.slow_time,
         "wheel_scale": PROFILES[WHEELS]["wheel_scale"],
         "gyro_bias": PROFILES[WHEELS]["gyro_bias"],
         "strays": min(max(outliers, LEAST_STRAYS), LARGEST_OUTLIER_SHARE),

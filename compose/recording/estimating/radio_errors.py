@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -42,12 +42,22 @@ SCALE_PRIOR = 0.05
 TOLD_SCALE = 0.5 * SCALE_PRIOR
 """The largest sigma of a scale that is told from a bias. With more, most of it would be the prior."""
 
-SLOW_LAG_S, SLOW_TIME_S = 1.0, 2.0
-"""The lag in s at which the correlation of errors is measured, and the time in s in which it is taken to fall
-to 1 / e. Errors within a second are correlated by 0.2 to 0.7 on UWB radios, white ones are not."""
+SLOW_LAG_S = 1.0
+"""The least lag in s at which the correlation of errors is measured; of rare ranges, it is their interval.
+
+Errors within a second are correlated by 0.2 to 0.7 on UWB radios, white ones are not.
+"""
+
+SLOW_TIME = 2.0
+"""The least time, in such lags, in which the correlation is taken to fall to 1 / e.
+
+With less, the slow part at no lag would be extrapolated from noise."""
 
 LAG_SHARE, MOST_SLOW = 0.25, 0.8
 """The tolerance of the lag, as a fraction, and the largest part of the variance that is slow."""
+
+FAINT = 0.05
+"""The least correlation from which the time follows, as a fraction of that at the first lag."""
 
 MOST_BIAS_SHARE, MOST_SCALE = 0.25, 0.25
 """The largest bias, as a fraction of the longest range, and the largest scale that are taken for a radio's.
@@ -117,6 +127,8 @@ class RangeCalibration(NamedTuple):
     """The standard deviation (m) of what all biases have in common, if it is more than the lines tell."""
     unused: int = 0
     """The number of ranges of which no errors follow."""
+    slow_time: float = SLOW_TIME * SLOW_LAG_S
+    """The time (s) in which the correlation of the slow errors falls to 1 / e."""
 
 
 def absurd_error(bias: float, scale: float, longest: float) -> str:
@@ -159,16 +171,19 @@ def range_calibration(errors: Mapping[tuple[str, str], PairErrors], source: str)
     told = bool(covariance[-1, -1] <= TOLD_SCALE**2)
     if not told:
         line, covariance, off, good = _lines(which, np.zeros_like(reference), error, repeated, first)
+    inlying = [(one.t[good[which == i]], off[good & (which == i)]) for i, one in enumerate(each)]
+    lag = max(SLOW_LAG_S, float(np.median(np.concatenate([np.diff(one.t) for one in each]))))
+    slow_time = _slow_time(inlying, lag)
     pairs = {}
     for i, (name, one) in enumerate(errors.items()):
-        own, inliers = which == i, (which == i) & good
+        inliers = (which == i) & good
         pairs[name] = RadioErrors(
             len(one.t),
             float(line[i]),
             math.sqrt(covariance[i, i]),
             *_own_scale(reference[inliers], error[inliers], repeated[i]),
             float(np.std(off[inliers])),
-            _slow_sigma(one.t[good[own]], off[inliers]),
+            _slow_sigma(*inlying[i], lag, slow_time),
             1.0 - float(np.count_nonzero(inliers)) / len(one.t),
         )
     common = float(line[-1])
@@ -176,7 +191,9 @@ def range_calibration(errors: Mapping[tuple[str, str], PairErrors], source: str)
         (one.scale - common) ** 2 - one.scale_sigma**2 for one in pairs.values() if one.scale is not None
     ]
     spread = math.sqrt(max(sum(beyond) / (len(beyond) - 1), 0.0)) if len(beyond) > 1 else 0.0
-    return RangeCalibration(pairs, common, math.sqrt(covariance[-1, -1]), source, spread, told)
+    return RangeCalibration(
+        pairs, common, math.sqrt(covariance[-1, -1]), source, spread, told, slow_time=slow_time
+    )
 
 
 def _lines(
@@ -219,14 +236,36 @@ def _own_scale(reference: Numbers, error: Numbers, repeated: float) -> tuple[flo
     return slope / (1.0 + slope), math.sqrt(variance)
 
 
-def _slow_sigma(t: Numbers, off: Numbers) -> float:
-    """Return the sigma (m) of what errors a second apart have in common; 0 if that is not known."""
-    after = np.searchsorted(t, t + SLOW_LAG_S)
+def _products(t: Numbers, off: Numbers, lag: float) -> Numbers:
+    """Return the products (m^2) of errors that are `lag` s apart."""
+    after = np.searchsorted(t, t + lag)
     first = np.flatnonzero(after < len(t))
     second = after[first]
-    near = np.abs(t[second] - t[first] - SLOW_LAG_S) <= LAG_SHARE * SLOW_LAG_S
-    if np.count_nonzero(near) < FEWEST_ERRORS:
-        return 0.0
+    near = np.abs(t[second] - t[first] - lag) <= LAG_SHARE * lag
     centred = off - np.mean(off)
-    common = float(np.mean(centred[first[near]] * centred[second[near]])) * math.exp(SLOW_LAG_S / SLOW_TIME_S)
+    found: Numbers = centred[first[near]] * centred[second[near]]
+    return found
+
+
+def _slow_time(errors: Sequence[tuple[Numbers, Numbers]], lag: float) -> float:
+    """Return the time (s) in which the correlation of all `errors` falls to 1 / e after `lag` s."""
+    at_first, longer = 0.0, lag
+    while len(products := np.concatenate([_products(*one, longer) for one in errors])) >= FEWEST_ERRORS:
+        common = float(np.mean(products))
+        at_first = common if longer == lag else at_first
+        if at_first <= 0.0:
+            break
+        if common < at_first / math.e:
+            falls = math.log(at_first / max(common, FAINT * at_first))
+            return max((longer - lag) / falls, SLOW_TIME * lag)
+        longer *= 2.0
+    return SLOW_TIME * lag
+
+
+def _slow_sigma(t: Numbers, off: Numbers, lag: float, slow_time: float) -> float:
+    """Return the sigma (m) of what errors `lag` s apart have in common; 0 if that is not known."""
+    products = _products(t, off, lag)
+    if len(products) < FEWEST_ERRORS:
+        return 0.0
+    common = float(np.mean(products)) * math.exp(lag / slow_time)
     return math.sqrt(min(max(common, 0.0), MOST_SLOW * float(np.var(off))))
