@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from compose.recording.estimating.calibration import calibrated, profile_toml
-from compose.recording.estimating.estimate_rows import PoseEstimate, rows_of
+from compose.recording.estimating.estimate_rows import PoseEstimate
 from compose.recording.estimating.estimate_summary import summary_of
 from compose.recording.estimating.recorded_measurements import measurements
 from compose.recording.estimating.recording_estimator import ClaimRule, RecordingEstimator
@@ -212,7 +212,7 @@ def claimed(trial: Trial) -> Claimed:
     cpu_s = time.process_time() - begun
     if epoch is None:
         return Claimed(math.inf, (), cpu_s)
-    summary = summary_of(problem, rows_of(epoch, problem.robots), [epoch], rule)
+    summary = summary_of(problem, [epoch], rule)
     claims = tuple([one.final for one in summary.robots.values() if one.final is not None])
     return Claimed(epoch.t - problem.t0, claims, cpu_s)
 

@@ -23,8 +23,6 @@ from compose.recording.ranging.range_recording import (
 )
 from compose.recording.ranging.range_steps import (
     RangeSteps,
-    SpeedBound,
-    StepOptions,
     dead_reckoned,
     gross,
     speed_bound,
@@ -102,7 +100,7 @@ stamps = st.lists(
 def test_the_steps_compose_to_the_same_pose_as_the_recorded_increments(
     odometry: RobotOdometry, period_s: float
 ) -> None:
-    found = steps_of(recording_of([odometry], []), ["0"], StepOptions(period_s))
+    found = steps_of(recording_of([odometry], []), period_s)
     last = found.t[-1]
     whole = odometry.t1 <= last
     end = end_of(odometry.increments[whole])
@@ -122,15 +120,15 @@ def test_a_range_lies_at_its_time(
 ) -> None:
     recording = recording_of([a, b], ranges)
     try:
-        found = steps_of(recording, ["0", "1"], StepOptions(period_s, range_spacing_s=0.0))
+        found = steps_of(recording, period_s, 0.0)
     except BadRecording:
         assert min(a.t1[-1], b.t1[-1]) - max(a.t0[0], b.t0[0]) < period_s
         return
     begin, end = found.t[found.step], found.t[found.step + 1]
     assert np.all((found.fraction >= 0.0) & (found.fraction <= 1.0))
     np.testing.assert_allclose(begin + found.fraction * (end - begin), found.ranges.t, rtol=0, atol=1e-9)
-    assert len(found.ranges.t) + found.outside == len(ranges)
-    assert found.thinned == 0
+    assert found.unused["within a second after another"] == 0
+    assert len(found.ranges.t) + found.unused["without odometry of all robots"] == len(ranges)
 
 
 @given(odometries(st.just(0.0)), st.floats(0.1, 1.0), stamps)
@@ -139,9 +137,9 @@ def test_thinned_ranges_of_a_pair_are_apart_and_none_is_left_out_without_one_bef
     odometry: RobotOdometry, spacing_s: float, ranges: list[tuple[float, int, int]]
 ) -> None:
     recording = recording_of([odometry, odometry], ranges)
-    every = steps_of(recording, ["0", "1"], StepOptions(0.5, 0.0)).ranges
-    found = steps_of(recording, ["0", "1"], StepOptions(0.5, spacing_s))
-    assert found.thinned == len(every.t) - len(found.ranges.t)
+    every = steps_of(recording, 0.5, 0.0).ranges
+    found = steps_of(recording, 0.5, spacing_s)
+    assert found.unused["within a second after another"] == len(every.t) - len(found.ranges.t)
     for first, second in {(0, 1), (0, 2), (1, 2)}:
         kept = found.ranges.t[(found.ranges.first == first) & (found.ranges.second == second)]
         assert np.all(np.diff(kept) >= spacing_s - 2 * SAME_TIME_S)
@@ -153,7 +151,7 @@ def test_thinned_ranges_of_a_pair_are_apart_and_none_is_left_out_without_one_bef
 
 @given(odometries(), st.floats(0.1, 1.0))
 def test_the_steps_last_as_long_as_the_odometry(odometry: RobotOdometry, period_s: float) -> None:
-    found = steps_of(recording_of([odometry], []), ["0"], StepOptions(period_s))
+    found = steps_of(recording_of([odometry], []), period_s)
     assert np.all(np.diff(found.t) > 0.0)
     assert found.t[0] == odometry.t0[0]
     assert odometry.t1[-1] - found.t[-1] < period_s + SAME_TIME_S
@@ -161,7 +159,7 @@ def test_the_steps_last_as_long_as_the_odometry(odometry: RobotOdometry, period_
 
 def test_a_step_in_a_gap_has_no_motion() -> None:
     odometry = odometry_of([0.0, 4.0], [1.5, 5.0], [(0.3, 0.0, 0.0), (0.4, 0.0, 0.0)])
-    found = steps_of(recording_of([odometry], []), ["0"])
+    found = steps_of(recording_of([odometry], []))
     np.testing.assert_allclose(found.increments[0, :, 0], [0.2, 0.1, 0.0, 0.0, 0.4], atol=1e-12)
     np.testing.assert_allclose(found.covariance[0, :, 0, 0], [1e-4 / 1.5, 0.5e-4 / 1.5, 0.0, 0.0, 1e-4])
 
@@ -208,14 +206,14 @@ def test_a_gross_increment_is_flagged_and_no_other(row: int, axis: int, sign: fl
 
 def test_an_increment_above_either_bound_is_gross() -> None:
     odometry = odometry_of([0.0, 1.0], [1.0, 2.0], [(0.5, 0.0, 0.1), (0.1, 0.0, 0.4)])
-    assert list(gross(odometry, SpeedBound(0.4, 0.3))) == [True, True]
-    assert list(gross(odometry, SpeedBound(0.6, 0.3))) == [False, True]
+    assert list(gross(odometry, (0.4, 0.3))) == [True, True]
+    assert list(gross(odometry, (0.6, 0.3))) == [False, True]
     standing = odometry_of([0.0], [1.0], [(0.0, 0.0, 0.0)])
     assert speed_bound(standing) == (math.inf, math.inf)
 
 
 def pair_steps() -> RangeSteps:
-    return steps_of(read_ranges(SAMPLE), ["A", "B"])
+    return steps_of(read_ranges(SAMPLE))
 
 
 def test_the_sample_has_29_steps_and_a_range_of_each_pair_in_nearly_every_one() -> None:
@@ -226,7 +224,7 @@ def test_the_sample_has_29_steps_and_a_range_of_each_pair_in_nearly_every_one() 
     }
     assert set(pairs) == {("A", "B"), ("A", "LC0"), ("B", "LC1")}
     assert all(20 <= count <= 30 for count in pairs.values())
-    assert len(found.ranges.t) + found.thinned + found.outside == 184 + 171 + 133
+    assert len(found.ranges.t) + sum(found.unused.values()) == 184 + 171 + 133
 
 
 def test_robots_without_common_odometry_are_refused() -> None:
@@ -235,6 +233,6 @@ def test_robots_without_common_odometry_are_refused() -> None:
     none = odometry_of([], [], [])
     recording = recording_of([one, other, none], [])
     with pytest.raises(BadRecording, match=r"it: there is less than a step of 1 s .* of 0 and 1 \(none\)"):
-        steps_of(recording, ["0", "1"])
+        steps_of(recording.part(["0", "1"], 0.0, 5.0))
     with pytest.raises(BadRecording, match="it: 2 has no odometry"):
-        steps_of(recording, ["2"])
+        steps_of(recording.part(["2"], 0.0, 5.0))

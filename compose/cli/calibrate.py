@@ -5,23 +5,21 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack
-from typing import TYPE_CHECKING
 
 from compose.errors import ENDED, UserError, writing
+from compose.recording.estimating.calibration import calibrated, profile_toml
+from compose.recording.estimating.radio_errors import FEWEST_ERRORS, RangeCalibration
+from compose.recording.estimating.true_poses import TRUTH_GAP_S
+from compose.recording.ranging.range_files import read_ranges
 from compose.terminal.outcome import counting
+from compose.terminal.tables import shown
 from compose.terminal.text_width import tell
 from protocol import files
 from protocol.output import say
 
-if TYPE_CHECKING:
-    from compose.recording.estimating.radio_errors import RangeCalibration
-
 
 def main(options: argparse.Namespace) -> int:
     """Calibrate, print the table, and write or print the profile."""
-    from compose.recording.estimating.calibration import calibrated, profile_toml  # noqa: PLC0415  # numpy
-    from compose.recording.ranging.range_files import read_ranges  # noqa: PLC0415
-
     if options.out is not None and options.out.suffix != ".toml":
         raise UserError(f"--out: {options.out} is not the path of a .toml file")
     with ExitStack() as written:  # a path that cannot be written is refused before the work
@@ -50,10 +48,6 @@ def _fitting(why: str, epochs: int) -> AbstractContextManager[Callable[[], None]
 
 def _lines(found: RangeCalibration) -> list[str]:
     """Return the table of the errors of each pair of radios."""
-    from compose.recording.estimating.radio_errors import FEWEST_ERRORS  # noqa: PLC0415  # they take time
-    from compose.recording.estimating.true_poses import TRUTH_GAP_S  # noqa: PLC0415
-    from compose.terminal.tables import shown  # noqa: PLC0415
-
     rows = [
         (
             "-".join(pair),

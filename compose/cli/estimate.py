@@ -8,23 +8,30 @@ from collections.abc import Iterator
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from agent.estimation.solver import Solver
 from compose.errors import BROKEN_PIPE, ENDED, NOT_LOCALISED, STOPPED_STATUS, UserError, writing
 from compose.extras import need
 from compose.launch.solver_loader import solver_named
+from compose.recording.estimating.estimate_rows import (
+    ESTIMATE_COLUMNS,
+    PoseEstimateRow,
+    RobotEstimate,
+    csv_line,
+)
+from compose.recording.estimating.estimate_run import RecordingEstimate, StreamEstimate, estimated
+from compose.recording.estimating.estimate_summary import write_estimate
+from compose.recording.estimating.noise_files import told_noise
+from compose.recording.estimating.recorded_measurements import Measurements, listed, measurements
+from compose.recording.estimating.recording_estimator import ClaimRule
+from compose.recording.estimating.true_poses import TRUTH_GAP_S
+from compose.recording.ranging.range_files import read_ranges
+from compose.recording.ranging.range_recording import RecordedRobot
 from compose.recording.recording_files import make_folder
 from compose.terminal.outcome import counting
+from compose.terminal.tables import shown
 from compose.terminal.text_width import tell
 from protocol.output import discard, say
-
-if TYPE_CHECKING:
-    from agent.estimation.solver import Solver
-    from compose.recording.estimating.estimate_rows import PoseEstimateRow, RobotEstimate
-    from compose.recording.estimating.estimate_run import RecordingEstimate
-    from compose.recording.estimating.recorded_measurements import Measurements
-    from compose.recording.estimating.recording_estimator import ClaimRule
-    from compose.recording.ranging.range_recording import RecordedRobot
 
 
 def main(options: argparse.Namespace) -> int:
@@ -33,11 +40,6 @@ def main(options: argparse.Namespace) -> int:
     Return NOT_LOCALISED if a robot may not claim its pose at the end; if a stream was ended by a signal
     STOPPED_STATUS, and BROKEN_PIPE if the reader of the output has gone.
     """
-    from compose.recording.estimating.estimate_run import estimated  # noqa: PLC0415  # numpy takes time
-    from compose.recording.estimating.recorded_measurements import measurements  # noqa: PLC0415
-    from compose.recording.estimating.recording_estimator import ClaimRule  # noqa: PLC0415
-    from compose.recording.ranging.range_files import read_ranges  # noqa: PLC0415
-
     stopped = None
     rule = ClaimRule(options.accuracy, options.confidence)
     solver = solver_named(options.solver) if options.solver is not None else None
@@ -67,10 +69,7 @@ def _followed(
 ) -> tuple[Measurements, RecordingEstimate, int | None]:
     """Print the estimates of a stream until it ends; return all of them, and the status if it did not end."""
     need("mcap")
-    from compose.recording.estimating.estimate_rows import ESTIMATE_COLUMNS, csv_line  # noqa: PLC0415
-    from compose.recording.estimating.estimate_run import StreamEstimate  # noqa: PLC0415
-    from compose.recording.estimating.noise_files import told_noise  # noqa: PLC0415
-    from compose.recording.ranging.range_mcap import rows_as_they_arrive  # noqa: PLC0415
+    from compose.recording.ranging.range_mcap import rows_as_they_arrive  # noqa: PLC0415  # optional
 
     if options.window is not None or options.anchors is not None:
         raise UserError("--follow: a stream has its own anchors, and no window")
@@ -103,8 +102,6 @@ def _doubted(name: str, doubt: str) -> None:
 
 def _written(out: Path, problem: Measurements, estimate: RecordingEstimate) -> list[Path]:
     """Write all files into `out`, and return their paths. Raises UserError."""
-    from compose.recording.estimating.estimate_summary import write_estimate  # noqa: PLC0415  # they need numpy
-
     with writing(out):
         return [*write_estimate(out, estimate.rows, estimate.summary), *_drawn(out, problem, estimate)]
 
@@ -127,8 +124,6 @@ def _drawn(out: Path, problem: Measurements, estimate: RecordingEstimate) -> lis
 
 def _lines(problem: Measurements, estimate: RecordingEstimate) -> list[str]:
     """Return the table of the estimates, what limits them, and last which claims do not hold at the end."""
-    from compose.terminal.tables import shown  # noqa: PLC0415  # it takes time
-
     summary = estimate.summary
     rows = [_row(name, one, summary.begin_s) for name, one in summary.robots.items()]
     right = ("first claim s", "x, y, heading", "sigma m", "error m", "NEES")
@@ -158,21 +153,18 @@ def _lines(problem: Measurements, estimate: RecordingEstimate) -> list[str]:
 
 def _about(name: str, one: RobotEstimate) -> Iterator[str]:
     """Yield what was changed in the odometry of a robot."""
-    if one.whole_turns:
-        what = "increments of odometry turned" if one.whole_turns > 1 else "increment of odometry turned"
-        yield f"{name}: {one.whole_turns} {what} by 2 pi or more too far: whole turns were removed"
-    if one.gross_increments:
-        what = "increments of odometry were" if one.gross_increments > 1 else "increment of odometry was"
-        yield (
-            f"{name}: {one.gross_increments} {what} replaced: more than three times as fast as nearly "
-            "all others"
-        )
+    changes = {
+        "turned by 2 pi or more too far: whole turns were removed": one.whole_turns,
+        "replaced: more than three times as fast as nearly all others": one.gross_increments,
+    }
+    for what, count in changes.items():
+        if count:
+            verb = "" if what.startswith("turned") else "were " if count > 1 else "was "
+            yield f"{name}: {count} increment{'s' if count > 1 else ''} of odometry {verb}{what}"
 
 
 def _without_truth(robot: RecordedRobot, rows: list[PoseEstimateRow]) -> Iterator[str]:
     """Yield how many estimates of a robot with true poses have no error."""
-    from compose.recording.estimating.true_poses import TRUTH_GAP_S  # noqa: PLC0415  # it takes time
-
     without = sum([row.true_x is None for row in rows])
     if robot.truth is not None and without:
         why = f"no true poses around them are within {TRUTH_GAP_S:g} s"
@@ -180,7 +172,6 @@ def _without_truth(robot: RecordedRobot, rows: list[PoseEstimateRow]) -> Iterato
 
 
 def _row(name: str, one: RobotEstimate, begin_s: float) -> list[str]:
-    from compose.recording.estimating.recorded_measurements import listed  # noqa: PLC0415  # it takes time
 
     first, last = one.first_claim, one.final
     if last is None:

@@ -10,6 +10,7 @@ import csv
 import io
 import math
 from collections.abc import Callable, Iterable, Iterator
+from typing import Any
 
 import msgspec
 from msgspec.structs import astuple
@@ -190,22 +191,21 @@ def tick_rows(run: recorded.Run) -> Iterator[TickRow]:
     for tick in range(run.length):
         for robot, observation in run.observations[tick].items():
             pose = truths[robot][tick] if truths[robot] else None
-            contact = run.contact(robot, tick)
-            driven = run.driven(robot, tick)
-            command = run.command(robot, tick)
-            yield TickRow(
+            contact, command = run.contact(robot, tick), run.command(robot, tick)
+            values: list[Any] = [
                 tick,
                 robot,
-                x=pose.x if pose is not None else None,
-                y=pose.y if pose is not None else None,
-                heading=wrap(pose.heading) if pose is not None else None,
-                v=driven.v if driven is not None else None,
-                omega=driven.omega if driven is not None else None,
-                anchor_range=observation.anchor_range,
-                mutual_range=contact.range if contact is not None else None,
-                phase=command.phase if command is not None else None,
-                state=command.task if command is not None else None,
-            )
+                *parts(pose, "x", "y"),
+                wrap(pose.heading) if pose is not None else None,
+            ]
+            values += [*parts(run.driven(robot, tick), "v", "omega"), observation.anchor_range]
+            values += [*parts(contact, "range"), *parts(command, "phase", "task")]
+            yield TickRow(*values)
+
+
+def parts(value: object | None, *names: str) -> list[Any]:
+    """Return the attributes `names` of `value`; None for each if there is none."""
+    return [getattr(value, name, None) for name in names]
 
 
 def truth_rows(run: recorded.Run, period: float) -> Iterator[TruthRow]:
@@ -222,16 +222,15 @@ def observation_rows(run: recorded.Run, period: float) -> Iterator[ObservationRo
     for tick, observations in enumerate(run.observations[: run.length]):
         for robot, one in observations.items():
             contact = recorded.nearest_contact(one.contacts)
-            yield ObservationRow(
+            values: list[Any] = [
                 tick,
                 tick * period,
                 robot,
-                one.executed.v if one.executed is not None else None,
-                one.executed.omega if one.executed is not None else None,
+                *parts(one.executed, "v", "omega"),
                 one.anchor_range,
-                contact is not None,
-                contact.range if contact is not None else None,
-            )
+            ]
+            values += [contact is not None, *parts(contact, "range")]
+            yield ObservationRow(*values)
 
 
 def command_rows(run: recorded.Run, period: float) -> Iterator[CommandRow]:
@@ -259,23 +258,12 @@ def hypotheses(one: Estimate, truth: Pose | None, period: float) -> Iterator[Est
     for place, pose in enumerate(one.world or one.local):
         covariance = one.covariance if one.world and not place else None
         position, heading = errors(pose, truth) if one.world and truth is not None else (None, None)
-        yield EstimateRow(
-            one.tick,
-            one.tick * period,
-            one.robot,
-            "world" if one.world else "local",
-            place,
-            one.localised,
-            pose.x,
-            pose.y,
-            wrap(pose.heading),
-            one.probabilities[place] if one.probabilities else None,
-            covariance.position_sigma if covariance is not None else None,
-            covariance.heading_sigma if covariance is not None else None,
-            position,
-            heading,
-            nees(pose, truth, covariance) if covariance is not None and truth is not None else None,
-        )
+        values: list[Any] = [one.tick, one.tick * period, one.robot, "world" if one.world else "local", place]
+        values += [one.localised, pose.x, pose.y, wrap(pose.heading)]
+        values += [one.probabilities[place] if one.probabilities else None]
+        squared = nees(pose, truth, covariance) if covariance is not None and truth is not None else None
+        values += [*parts(covariance, "position_sigma", "heading_sigma"), position, heading, squared]
+        yield EstimateRow(*values)
 
 
 def message_rows(
@@ -290,26 +278,14 @@ def message_rows(
 def claim_rows(run: recorded.Run) -> Iterator[ClaimRow]:
     """Yield the result of each robot."""
     for robot in run.robots:
-        claim, counts = _claim(run, robot), run.final_reports.get(robot)
-        covariance = claim.covariance if claim is not None else None
-        yield ClaimRow(
-            robot=robot,
-            localised=claim is not None,
-            tick=claim.tick if claim is not None else None,
-            x=claim.pose.x if claim is not None else None,
-            y=claim.pose.y if claim is not None else None,
-            heading=wrap(claim.pose.heading) if claim is not None else None,
-            position_error_m=claim.position_error if claim is not None else None,
-            heading_error_rad=claim.heading_error if claim is not None else None,
-            position_sigma_m=covariance.position_sigma if covariance is not None else None,
-            heading_sigma_rad=covariance.heading_sigma if covariance is not None else None,
-            nees=claim.nees if claim is not None else None,
-            **{name: getattr(counts, name, None) for name in _COUNTS},
-        )
-
-
-_COUNTS = ("anchor_ranges", "mutual_ranges", "reports_sent", "reports_heard", "bytes_sent")
-"""The columns of a ClaimRow that a FinalReport has."""
+        claim = _claim(run, robot)
+        pose, covariance = parts(claim, "pose", "covariance")
+        values: list[Any] = [robot, claim is not None, *parts(claim, "tick"), *parts(pose, "x", "y")]
+        values += [wrap(pose.heading) if pose is not None else None]
+        values += parts(claim, "position_error", "heading_error")
+        values += [*parts(covariance, "position_sigma", "heading_sigma"), *parts(claim, "nees")]
+        values += parts(run.final_reports.get(robot), *ClaimRow.__struct_fields__[-5:])
+        yield ClaimRow(*values)
 
 
 def _claim(run: recorded.Run, robot: str) -> Claim | None:

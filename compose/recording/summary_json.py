@@ -16,7 +16,7 @@ from compose.extras import version
 from compose.recording.corrected_bounds import corrected_bounds
 from compose.recording.group_localisation import MeetingResult, SearchResult, meeting_results, search_results
 from compose.recording.reasons import of_it, outcome_after, reason_for
-from compose.recording.rows import ticks_csv
+from compose.recording.rows import parts, ticks_csv
 from compose.recording.run import Run
 from protocol import files
 from protocol.messages import FinalReport
@@ -94,24 +94,21 @@ def first_contact(run: Run) -> int | None:
 
 
 def _robot_summary(run: Run, robot: str) -> dict[str, Any]:
-    final_report = run.final_reports.get(robot)
-    claimed = run.claim(robot)
-    covariance = claimed.covariance if claimed is not None else None
-    truth = run.truth(robot)
+    final_report, claimed, truth = run.final_reports.get(robot), run.claim(robot), run.truth(robot)
+    pose, covariance = parts(claimed, "pose", "covariance")
     at_claim = {"truth_at_claim": _listed(truth[claimed.tick]) if claimed is not None else None}
+    names = ("position_error_m", "heading_error_rad", "position_sigma_m", "heading_sigma_rad", "nees")
+    errors = parts(claimed, "position_error", "heading_error")
+    errors += [*parts(covariance, "position_sigma", "heading_sigma"), *parts(claimed, "nees")]
     return {
         "localised": claimed is not None,
         "localised_tick": claimed.tick if claimed is not None else None,
-        "estimate": _listed(claimed.pose) if claimed is not None else None,
+        "estimate": _listed(pose) if pose is not None else None,
         "covariance": covariance.matrix if covariance is not None else None,
         "truth": _listed(truth[-1]) if truth else None,
         **(at_claim if run.scenario.meetings else {}),
-        "position_error_m": claimed.position_error if claimed is not None else None,
-        "heading_error_rad": claimed.heading_error if claimed is not None else None,
-        "position_sigma_m": covariance.position_sigma if covariance is not None else None,
-        "heading_sigma_rad": covariance.heading_sigma if covariance is not None else None,
-        "nees": claimed.nees if claimed is not None else None,
-        **{field: getattr(final_report, field, None) for field in _FINAL_REPORT_COUNTS},
+        **dict(zip(names, errors, strict=True)),
+        **dict(zip(_FINAL_REPORT_COUNTS, parts(final_report, *_FINAL_REPORT_COUNTS), strict=True)),
         "no_farewell": None if final_report is not None else _missing_final_report(run, robot),
         "deadlines_missed": sum([robot not in tick.commands for tick in run.ticks[:-1]]),
     }

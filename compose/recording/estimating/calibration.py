@@ -9,7 +9,6 @@ from contextlib import AbstractContextManager, nullcontext
 import numpy as np
 
 from compose.errors import UserError
-from compose.recording.estimating.doubtful_units import doubtful_lengths
 from compose.recording.estimating.estimate_run import estimated
 from compose.recording.estimating.noise_files import RangeCorrection
 from compose.recording.estimating.radio_errors import (
@@ -63,9 +62,6 @@ def calibrated(
                 else f"no {FEWEST_ERRORS} ranges of a pair have true poses within {TRUTH_GAP_S:g} s"
             )
             return _by_fit(recording, robots, window, fitting, why)
-        lengths = {pair: (one.measured, one.measured - one.error) for pair, one in errors.items()}
-        if doubt := doubtful_lengths(lengths, "true poses and anchors"):
-            raise UserError(f"{recording.source}: {doubt}")
         found = range_calibration(errors, "the truth")
         for pair, one in found.pairs.items():
             if why := absurd_error(one.bias, one.sure_scale, float(np.max(errors[pair].measured))):
@@ -85,7 +81,7 @@ def _by_fit(
     measured = measurements(recording, robots, ASSUMED, window)
     without = f"{recording.source}: without true poses"
     with fitting(why, len(measured.ends)) as done:
-        _, epochs, summary = estimated(measured, RULE, done)
+        epochs, summary = estimated(measured, RULE, done)
     fitted = epochs[-1].fitted if epochs and all(epochs[-1].claims) else None
     if fitted is None or summary.calibration is None:
         who, reason = " and ".join(summary.robots), summary.blocking_reason or "too few ranges"

@@ -8,7 +8,7 @@ between ranges and positions of anchors. Nothing is converted: a user is told wh
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import combinations
 from typing import NamedTuple
 
@@ -54,11 +54,6 @@ NEAR_UNIT, NEAR_UNIT_OF_USUAL = 1.35, 3.0
 """The largest factor between what is measured and the unit that is named; if it is measured against the usual
 distance of two robots, which is about as far from the true one."""
 
-MOST_BIAS = 10.0
-"""The largest bias in m that is taken for one of radios at any distance.
-
-It is thirty times that of UWB radios. If ranges are all alike, a factor may explain a larger one."""
-
 LEAST_GAP, SAME_PLACE_S = 0.1, 1.0
 """The part of the longest other side by which ranges between robots must be off: below it, motion and biases
 count; and the time in s between two ranges in which a robot hardly moves."""
@@ -91,14 +86,14 @@ def doubtful_units(recording: RangeRecording) -> str:
 
 
 class _Factors(NamedTuple):
-    """The factors between units that the ranges of a robot to anchors tell."""
+    """The logarithms of the factors between units that the ranges of a robot to anchors tell."""
 
     degrees: bool
     """True if the turns of odometry are in degrees."""
     by_odometry: list[float]
-    """The logarithms of the factors of ranges to odometry."""
+    """Those of ranges to odometry."""
     by_anchors: list[float]
-    """The logarithms of the factors of ranges to positions of anchors."""
+    """Those of ranges to positions of anchors."""
 
 
 def _by_odometry(robots: Sequence[_Factors]) -> float:
@@ -133,36 +128,6 @@ def _doubt(robots: Sequence[_Factors], bound: float) -> str:
         case [False, True]:
             return _sentence("positions of anchors", 1.0 / by_anchors, "ranges and odometry")
     return ""
-
-
-def doubtful_lengths(lengths: Mapping[tuple[str, str], tuple[Numbers, Numbers]], others: str) -> str:
-    """Return the suspicion that the ranges of some pairs of radios are in another unit than `others`.
-
-    `lengths` has the measured and the true ranges of each pair, in m. An empty text if none are doubtful.
-    """
-    doubts = {pair: factor for pair, both in lengths.items() if (factor := _doubtful_factor(*both))}
-    logarithms = [math.log(factor) for factor in doubts.values()]
-    if len(doubts) == len(lengths) > 0 and max(logarithms) - min(logarithms) < LOG_ALIKE:
-        return _sentence("ranges", math.exp(float(np.median(logarithms))), others)
-    return "; ".join(
-        _sentence(f"ranges of {' and '.join(pair)}", factor, others) for pair, factor in doubts.items()
-    )
-
-
-def _doubtful_factor(measured: Numbers, true: Numbers) -> float:
-    """Return the factor of the ranges of a pair to true ones; 0 unless it explains them better than a bias.
-
-    Where both explain them alike, as those of radios that stand, the difference decides.
-    """
-    length, off = float(np.median(measured)), measured - true
-    factor = max(length, TINY) / max(float(np.median(true)), TINY)
-    if max(factor, 1.0 / factor) <= LEAST_FACTOR:
-        return 0.0
-    bias = float(np.median(off))
-    by_bias = float(np.median(np.abs(off - bias))) + SAME_FIT * length
-    by_factor = float(np.median(np.abs(measured - factor * true))) + SAME_FIT * length
-    decided = by_bias > DECISIVE * by_factor
-    return factor if decided or (abs(bias) > MOST_BIAS and by_factor < DECISIVE * by_bias) else 0.0
 
 
 def _sentence(subject: str, factor: float, others: str, near: float = NEAR_UNIT) -> str:

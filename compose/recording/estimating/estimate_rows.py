@@ -9,10 +9,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from compose.recording.estimating.recorded_measurements import MeasuredRobot
-from compose.recording.estimating.recording_estimator import EstimateEpoch
+from agent.estimation.posterior import Certainty
 from compose.recording.estimating.true_poses import true_pose
-from compose.recording.ranging.range_recording import Numbers
+from compose.recording.ranging.range_recording import Numbers, RecordedRobot
 from protocol.motion import wrap
 
 
@@ -191,28 +190,23 @@ class EstimateSummary(msgspec.Struct, frozen=True):
     """The anchors that seem to stand elsewhere than the recording says, with the reason."""
 
 
-def rows_of(epoch: EstimateEpoch, robots: Sequence[MeasuredRobot]) -> list[PoseEstimateRow]:
-    """Return the rows of all robots at one epoch; none without hypotheses."""
-    rows = []
-    for i, robot in enumerate(robots if epoch.hypotheses else ()):
-        if robot.id in epoch.undetermined:
-            continue
-        pose, covariance = epoch.hypotheses[0].poses[i], epoch.hypotheses[0].covariance[i]
-        values: list[Any] = [epoch.t, robot.id, *epoch.certainties[i], *pose.tolist()]
-        values += [*covariance[np.triu_indices(3)].tolist(), epoch.claims[i]]
-        true = true_pose(robot.recorded, epoch.t)
-        rows.append(PoseEstimateRow(*values, *_errors(pose, covariance, true)))
-    return rows
-
-
-def _errors(pose: Numbers, covariance: Numbers, true: Numbers | None) -> tuple[float, ...]:
-    """Return the true pose, the errors of position and heading, and the NEES; nothing without truth."""
-    if true is None:
-        return ()
-    error, (x, y, heading) = pose - true, true.tolist()
-    error[2] = wrap(float(error[2]))
-    nees = float(error @ np.linalg.solve(covariance, error))
-    return x, y, wrap(heading), math.hypot(error[0], error[1]), float(error[2]), nees
+def pose_row(
+    robot: RecordedRobot,
+    t: float,
+    certainty: Certainty,
+    pose: tuple[float, float, float],
+    covariance: Numbers,
+    *,
+    claim: bool,
+) -> PoseEstimateRow:
+    """Return the row of a robot at `t` s, with its errors if the true pose is known."""
+    values: list[Any] = [t, robot.id, *certainty, *pose, *covariance[np.triu_indices(3)].tolist(), claim]
+    if (true := true_pose(robot, t)) is not None:
+        error, (x, y, heading) = pose - true, true.tolist()
+        error[2] = wrap(float(error[2]))
+        nees = float(error @ np.linalg.solve(covariance, error))
+        values += [x, y, wrap(heading), math.hypot(error[0], error[1]), float(error[2]), nees]
+    return PoseEstimateRow(*values)
 
 
 ESTIMATE_COLUMNS = PoseEstimateRow.__struct_fields__

@@ -6,15 +6,14 @@ in the order of time, as in a file: a range that comes later counts from the nex
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from msgspec.structs import replace
 
-from agent.estimation.solver import Solver, UnusableSolution
+from agent.estimation.solver import Solver
 from compose.errors import UserError
-from compose.recording.estimating.estimate_rows import EstimateSummary, PoseEstimateRow, rows_of
+from compose.recording.estimating.estimate_rows import EstimateSummary, PoseEstimateRow
 from compose.recording.estimating.estimate_summary import summary_of
 from compose.recording.estimating.noise_files import AssumedNoise
 from compose.recording.estimating.recorded_measurements import (
@@ -40,54 +39,13 @@ EXAMINED_AFTER_S = 4.0
 class RecordingEstimate(NamedTuple):
     """The result of an estimate."""
 
-    rows: list[PoseEstimateRow]
     epochs: list[EstimateEpoch]
     summary: EstimateSummary
 
-
-class _Estimate:
-    """An estimate that grows with its measurements."""
-
-    def __init__(self, rule: ClaimRule, solver: Solver | None) -> None:
-        self.rule, self._solver = rule, solver
-        self.begin()
-        self.measured: Measurements | None = None
-        """The measurements of the last epoch."""
-        self.rows: list[PoseEstimateRow] = []
-        self.epochs: list[EstimateEpoch] = []
-
-    def begin(self) -> None:
-        """Begin the estimate of all further measurements again."""
-        self.estimator = RecordingEstimator(self.rule, self._solver)
-
-    def advanced(
-        self, measured: Measurements, done: Callable[[], None] = lambda: None
-    ) -> Iterator[PoseEstimateRow]:
-        """Yield the rows of all further epochs; `done` is called after each."""
-        if self.measured is None or not self.epochs:
-            self.measured = measured
-        self.measured = replace(self.measured, doubt=measured.doubt)
-        for epoch in self._epochs(measured, done):
-            with numerics(measured.source):
-                rows = rows_of(epoch, measured.robots)
-            self.measured = measured
-            self.rows += rows
-            self.epochs[-1:] = [one._replace(fitted=None) for one in self.epochs[-1:]]  # fits are large
-            self.epochs.append(epoch)
-            yield from rows
-
-    def _epochs(self, measured: Measurements, done: Callable[[], None]) -> Iterator[EstimateEpoch]:
-        """Yield all further epochs. Raises UserError if a solution of the user's solver cannot be used."""
-        try:
-            yield from self.estimator.epochs(measured, done, self.epochs[-1].t if self.epochs else -math.inf)
-        except UnusableSolution as error:
-            raise UserError(f"{self._solver}: {error}") from None
-
-    def result(self, measured: Measurements) -> RecordingEstimate:
-        """Return all estimates, the last of which follow from what was `measured`."""
-        with numerics(measured.source):
-            summary = summary_of(measured, self.rows, self.epochs, self.rule)
-        return RecordingEstimate(self.rows, self.epochs, summary)
+    @property
+    def rows(self) -> list[PoseEstimateRow]:
+        """The rows of all epochs."""
+        return [row for epoch in self.epochs for row in epoch.rows]
 
 
 def estimated(
@@ -100,10 +58,15 @@ def estimated(
 
     `solver` fits the poses; by default, the smoother does.
     """
-    estimate = _Estimate(rule, solver)
-    for _ in estimate.advanced(measured, done):
+    estimator = RecordingEstimator(rule, solver)
+    for _ in estimator.epochs(measured, done):
         pass
-    return estimate.result(measured)
+    return _result(measured, estimator)
+
+
+def _result(measured: Measurements, estimator: RecordingEstimator) -> RecordingEstimate:
+    with numerics(measured.source):
+        return RecordingEstimate(estimator.past, summary_of(measured, estimator.past, estimator.rule))
 
 
 class StreamEstimate:
@@ -126,10 +89,10 @@ class StreamEstimate:
         """
         self._builder = RecordingBuilder(source)
         self._robots, self._noise, self._doubted = robots, noise, doubted
-        self._estimate = _Estimate(rule, solver)
+        self._estimator = RecordingEstimator(rule, solver)
+        self._measured: Measurements | None = None
+        """The measurements of the last epoch."""
         self._doubt = ""
-        self._spans: dict[str, tuple[float, float]] = {}
-        """The first and the last time in s of the odometry of each robot."""
         self._count = 0
         """The number of robots in the estimate."""
         self._due_after_s, self._examined_after_s = EPOCH_S, EXAMINED_AFTER_S
@@ -140,19 +103,19 @@ class StreamEstimate:
         for row, place in arriving:
             self._builder.add(row, place)
             if isinstance(row, OdometryRow):
-                self._spans[row.robot] = self._spans.get(row.robot, (row.t0,))[0], row.t1
                 yield from self._due()
 
     def _due(self) -> Iterator[PoseEstimateRow]:
         """Yield the estimates of all epochs whose odometry is complete."""
-        names = list(self._spans) if self._robots is None else self._robots
-        if not names or not all(name in self._spans for name in names):
+        spans = self._builder.spans
+        names = list(spans) if self._robots is None else self._robots
+        if not names or not all(name in spans for name in names):
             return
         if len(names) > self._count:  # the estimates so far are kept, and are of other robots
             self._count = len(names)
-            self._estimate.begin()
+            self._estimator.begin()
             self._due_after_s, self._examined_after_s = EPOCH_S, EXAMINED_AFTER_S
-        lasts = min(self._spans[name][1] for name in names) - max(self._spans[name][0] for name in names)
+        lasts = min(spans[name][1] for name in names) - max(spans[name][0] for name in names)
         if lasts < self._due_after_s - SAME_TIME_S * EPOCH_S:
             return
         self._due_after_s = lasts + EPOCH_S  # if there is none, it is not tried with each row
@@ -169,13 +132,16 @@ class StreamEstimate:
         if measured.doubt and measured.doubt != self._doubt:
             self._doubted(measured.doubt)
         self._doubt = measured.doubt
-        yield from self._estimate.advanced(measured)
+        last = measured if self._measured is None or not self._estimator.past else self._measured
+        self._measured = replace(last, doubt=measured.doubt)
+        for epoch in self._estimator.epochs(measured):
+            self._measured = measured
+            yield from epoch.rows
         self._due_after_s = max([measured.t0, *measured.ends[-1:].tolist()]) - measured.t0 + EPOCH_S
 
     def result(self) -> tuple[Measurements, RecordingEstimate]:
         """Return all estimates so far. Raises UserError if no epoch is complete."""
-        measured = self._estimate.measured
-        if measured is None:
+        if self._measured is None:
             what = "no second with odometry of all robots and ranges to two anchors"
             raise UserError(f"{self._builder.source}: there is {what}")
-        return measured, self._estimate.result(measured)
+        return self._measured, _result(self._measured, self._estimator)

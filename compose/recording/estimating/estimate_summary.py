@@ -16,7 +16,6 @@ from agent.estimation.gaussian.noise_level import INLIER
 from compose.recording.estimating.estimate_rows import (
     EstimatedAnchor,
     EstimateSummary,
-    FinalHypothesis,
     LearnedError,
     LearnedErrors,
     PoseEstimate,
@@ -32,48 +31,37 @@ MOST_STRAYS, FEWEST_OF_ANCHOR = 0.5, 8
 """The share of ranges that fit no other above which an anchor is doubted, and the least number of ranges."""
 
 
-def summary_of(
-    measured: Measurements, rows: Sequence[PoseEstimateRow], epochs: Sequence[EstimateEpoch], rule: ClaimRule
-) -> EstimateSummary:
-    """Return the summary of all `rows` and `epochs`."""
+def summary_of(measured: Measurements, epochs: Sequence[EstimateEpoch], rule: ClaimRule) -> EstimateSummary:
+    """Return the summary of all `epochs`."""
     pairs, robots = ["-".join(pair) for pair in measured.joint.radios], measured.robots
-    last = epochs[-1] if epochs else _no_epoch(measured)
-    claims = [claim and not measured.doubt for claim in last.claims]
-    estimates = {
-        robot.id: _of_robot(robot, [row for row in rows if row.robot == robot.id], claim, last.t)
-        for robot, claim in zip(robots, claims, strict=True)
-    }
-    standing = _standing([one.id for one, claim in zip(robots, claims, strict=True) if not claim], measured)
+    nothing = EstimateEpoch(
+        *(math.nan, [], [], (0,) * len(pairs), (False,) * len(robots), "there is no epoch", None, {})
+    )
+    last = epochs[-1] if epochs else nothing
+    rows = [row for epoch in epochs for row in epoch.rows]
+    claims = dict(zip([one.id for one in robots], last.claims, strict=True))
+    if measured.doubt:
+        claims = dict.fromkeys(claims, False)
+    standing = _standing([name for name, claim in claims.items() if not claim], measured)
+    counts = dict(zip(pairs, last.ranges, strict=True))
     return EstimateSummary(
         measured.source,
         measured.noise,
         measured.t0,
         *rule,
-        estimates,
-        [
-            FinalHypothesis(
-                one.probability,
-                {
-                    robot.id: (pose[0], pose[1], pose[2])
-                    for robot, pose in zip(robots, one.poses.tolist(), strict=True)
-                    if not math.isnan(pose[0])
-                },
-            )
-            for one in last.hypotheses
-        ],
-        learned_errors(last.fitted, [name for name, count in zip(pairs, last.ranges, strict=True) if count]),
-        dict(zip(pairs, last.ranges, strict=True)),
+        {
+            one.id: _of_robot(one, [row for row in rows if row.robot == one.id], claims[one.id], last.t)
+            for one in robots
+        },
+        last.hypotheses,
+        learned_errors(last.fitted, [name for name, count in counts.items() if count]),
+        counts,
         measured.unused,
         measured.doubt or standing or last.blocking_reason,
-        dict(last.undetermined),
+        last.undetermined,
         dict(_anchors(*last.fitted, measured)) if last.fitted is not None else {},
         _doubtful(*last.fitted) if last.fitted is not None else {},
     )
-
-
-def _no_epoch(measured: Measurements) -> EstimateEpoch:
-    claims, ranges = (False,) * len(measured.robots), (0,) * len(measured.joint.radios)
-    return EstimateEpoch(math.nan, ranges, (), claims, "there is no epoch", None, (), {})
 
 
 def _of_robot(

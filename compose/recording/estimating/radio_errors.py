@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.gaussian.range_weights import MEDIAN
-from compose.recording.estimating.doubtful_units import MOST_BIAS
 from compose.recording.estimating.true_poses import true_antenna, with_bridged_truth
 from compose.recording.ranging.range_recording import Numbers, Places, RangeRecording
 
@@ -59,8 +58,9 @@ LAG_SHARE, MOST_SLOW = 0.25, 0.8
 FAINT = 0.05
 """The least correlation from which the time follows, as a fraction of that at the first lag."""
 
-MOST_BIAS_SHARE, MOST_SCALE = 0.25, 0.25
-"""The largest bias, as a fraction of the longest range, and the largest scale that are taken for a radio's.
+MOST_BIAS, MOST_BIAS_SHARE, MOST_SCALE = 10.0, 0.25, 0.25
+"""The largest bias in m and as a fraction of the longest range, and the largest scale that are taken for a
+radio's.
 
 Radios and sonars without any calibration are off by less than a tenth. With less, short ranges would be
 refused; with more, wrong stamps, positions or units are taken for errors of radios.

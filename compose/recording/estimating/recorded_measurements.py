@@ -32,18 +32,11 @@ from compose.recording.ranging.range_recording import (
     RecordedRobot,
     locked,
 )
-from compose.recording.ranging.range_steps import NEARLY_ALL, Flags, RangeSteps, StepOptions, speeds, steps_of
+from compose.recording.ranging.range_steps import NEARLY_ALL, Flags, RangeSteps, speeds, steps_of
 from protocol.noise import Noise
 
 EPOCH_S = 0.5
 """The time in s between two estimates."""
-
-RANGE_SPACING_S = 1.0
-"""The least time in s between two ranges of the same radios.
-
-The errors of a radio's ranges within a second are correlated: more of them would count for more than they
-tell. With less, claims are too confident.
-"""
 
 RANGE_SILENCE_S = 1.0
 """The time in s without a range and without the end of an increment after which there are no estimates.
@@ -206,7 +199,7 @@ def _measurements(part: RangeRecording, assumed: AssumedNoise, ticks: int | None
     part = part._replace(robots=tuple(moved))
     ticks = ticks or ticks_per_epoch(part, assumed.noise)
     period = EPOCH_S / ticks
-    steps = steps_of(part, names, StepOptions(period_s=period, range_spacing_s=RANGE_SPACING_S))
+    steps = steps_of(part, period)
     t0, skipped_s = float(steps.t[0]), steps.skipped_s[ticks::ticks]
     ends = t0 + np.arange(1, len(skipped_s) + 1) * EPOCH_S + skipped_s
     last = arrivals[np.searchsorted(arrivals, ends + SAME_TIME_S) - 1]
@@ -221,9 +214,7 @@ def _measurements(part: RangeRecording, assumed: AssumedNoise, ticks: int | None
         facts.update(_manoeuvres(name, increments, covariance, period))
     unused = {
         f"to others than the {MOST_USED_ANCHORS} anchors with the most": len(steps.ranges.t) - len(ranges),
-        "within a second after another": steps.thinned,
-        "without odometry of all robots": steps.outside,
-        "in a gap of the odometry": steps.in_gaps,
+        **steps.unused,
     }
     return Measurements(
         source=part.source,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import msgspec
@@ -15,10 +15,12 @@ from agent.estimation.gaussian.joint_claims import Displacement, displaced_ancho
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.search import candidates, extended, search
 from agent.estimation.judged import of_joint
-from agent.estimation.posterior import NO_HYPOTHESES, Certainty, Hypothesis, Posterior, certainties, settled
-from agent.estimation.solver import Solver
+from agent.estimation.posterior import NO_HYPOTHESES, Posterior, certainties, settled
+from agent.estimation.solver import Solver, UnusableSolution
+from compose.errors import UserError
+from compose.recording.estimating.estimate_rows import FinalHypothesis, PoseEstimateRow, pose_row
 from compose.recording.estimating.recorded_measurements import Measurements, numerics
-from compose.recording.ranging.range_recording import Numbers
+from compose.recording.ranging.range_recording import Numbers, RecordedRobot
 from protocol.motion import wrap
 
 GROUP_SEARCHES = tuple(8 * 2**n for n in range(16))
@@ -55,16 +57,6 @@ class ClaimRule(NamedTuple):
     """The least probability of the hypothesis."""
 
 
-class PosesHypothesis(NamedTuple):
-    """One hypothesis about the centres of all robots at the end of an epoch; NaN for those without a pose."""
-
-    probability: float
-    poses: Numbers
-    """x (m), y (m) and heading (rad) in <W> of each robot; shape (R, 3)."""
-    covariance: Numbers
-    """The covariance of each pose; shape (R, 3, 3)."""
-
-
 class EpochFit(NamedTuple):
     """The fit of the first hypothesis, and what it was fitted to."""
 
@@ -78,19 +70,19 @@ class EstimateEpoch(NamedTuple):
 
     t: float
     """The time in s, on the clock of the recording."""
+    rows: list[PoseEstimateRow]
+    """The poses of the first hypothesis; none before there are enough ranges."""
+    hypotheses: list[FinalHypothesis]
+    """The hypotheses, the most probable first."""
     ranges: tuple[int, ...]
     """The number of ranges that are used, of each pair of radios."""
-    hypotheses: tuple[PosesHypothesis, ...]
-    """The hypotheses, the most probable first; none before there are enough ranges."""
     claims: tuple[bool, ...]
     """True if a robot may claim the pose of the first hypothesis."""
     blocking_reason: str
     """The condition for a claim that is not met; empty if all are."""
     fitted: EpochFit | None
     """The fit of the first hypothesis; None without one, and if there is a later epoch."""
-    certainties: tuple[Certainty, ...]
-    """The certainty of the pose of each robot."""
-    undetermined: Mapping[str, str]
+    undetermined: dict[str, str]
     """The robots that have no pose, with the reason."""
 
 
@@ -102,7 +94,13 @@ class RecordingEstimator:
     """
 
     def __init__(self, rule: ClaimRule, solver: Solver | None = None) -> None:
-        self._rule, self._solver = rule, solver
+        self.rule, self._solver = rule, solver
+        self.past: list[EstimateEpoch] = []
+        """All epochs so far."""
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin the search of all further epochs again."""
         self._next = 0
         self._known: Posterior = NO_HYPOTHESES
         self._searched = self._searches = 0
@@ -112,20 +110,26 @@ class RecordingEstimator:
         self._tested = 0
 
     def epochs(
-        self, measured: Measurements, done: Callable[[], None] = lambda: None, after_s: float = -math.inf
+        self, measured: Measurements, done: Callable[[], None] = lambda: None
     ) -> Iterator[EstimateEpoch]:
-        """Yield the estimates at the ends of further epochs, of those after the time `after_s`.
+        """Yield the estimates at the ends of further epochs, of those after the last one.
 
         The measurements may have grown since the last call, and are otherwise the same; while their units are
         in doubt, epochs are left out. `done` is called after each epoch. Raises NoEstimate if numbers leave
-        the range of floats (see `numerics`).
+        the range of floats (see `numerics`), and UserError if a solution of the user's solver cannot be used.
         """
         numbers, self._next = range(self._next, len(measured.ends)), len(measured.ends)
+        after_s = self.past[-1].t if self.past else -math.inf
         for number in numbers if not measured.doubt else ():
             t = float(measured.ends[number])
             if t > after_s and not measured.silent[number]:
-                with numerics(f"{measured.source}: at {t:.15g} s"):
-                    epoch = self._epoch(measured, number)
+                try:
+                    with numerics(f"{measured.source}: at {t:.15g} s"):
+                        epoch = self._epoch(measured, number)
+                except UnusableSolution as error:
+                    raise UserError(f"{self._solver}: {error}") from None
+                self.past[-1:] = [one._replace(fitted=None) for one in self.past[-1:]]  # fits are large
+                self.past.append(epoch)
                 yield epoch
             done()
 
@@ -164,7 +168,7 @@ class RecordingEstimator:
         """Return what blocks the claim of each located robot; an empty text if nothing does."""
         part = used.some(found.located)
         judged = {
-            part.robots[i]: of_joint("recording", i, found, certainty, part, *self._rule)
+            part.robots[i]: of_joint("recording", i, found, certainty, part, *self.rule)
             for i, certainty in enumerate(certainties(found))
             if not part.is_anchor(i)
         }
@@ -186,44 +190,52 @@ def _result(
     reasons: dict[str, str],
 ) -> EstimateEpoch:
     """Return the estimate at the end of an epoch, by what was `found` with what is `used`."""
-    names, part = [one.id for one in measured.robots], used.some(found.located)
+    t, part, sure = float(measured.ends[number]), used.some(found.located), certainties(found)
     place = {used.robots[robot]: i for i, robot in enumerate(found.located)}
     without = {
-        name: open_position(place[name], found.hypotheses[0].fit, used)
-        if name in place
-        else undetermined(used.robots.index(name), found.located, used)
-        for name in names
+        one.id: open_position(place[one.id], found.hypotheses[0].fit, used)
+        if one.id in place
+        else undetermined(used.robots.index(one.id), found.located, used)
+        for one in measured.robots
     }
+    posed = [one for one in measured.robots if not without[one.id]]
     without = {name: why for name, why in without.items() if why}
-    sure, places = certainties(found), [None if name in without else place[name] for name in names]
-    reason = [f"{name}: {reasons[name]}" for name in names if reasons.get(name) and name not in without]
+    reason = [f"{one.id}: {reasons[one.id]}" for one in posed if reasons.get(one.id)]
     reason += [f"{name} is undetermined: {why}" for name, why in without.items()]
     more = f"; and {len(reason) - 1} more" if len(reason) > 1 else ""
+    claims = {one.id: reasons.get(one.id) == "" for one in measured.robots}
+    centres = [
+        {one.id: _centre(one.recorded, place[one.id], each.fit, used.origin) for one in posed}
+        for each in found.hypotheses
+    ]
+    rows = [
+        pose_row(one.recorded, t, sure[place[one.id]], *centres[0][one.id], claim=claims[one.id])
+        for one in posed
+    ]
     return EstimateEpoch(
-        float(measured.ends[number]),
+        t,
+        rows,
+        [
+            FinalHypothesis(each.probability, {name: pose for name, (pose, _) in poses.items()})
+            for each, poses in zip(found.hypotheses, centres, strict=True)
+        ],
         tuple(np.bincount(part.ranges.radio, minlength=len(measured.joint.radios)).tolist()),
-        tuple([_of_centres(one, places, measured) for one in found.hypotheses]),
-        tuple([reasons.get(name) == "" for name in names]),
+        tuple(claims.values()),
         reason[0] + more if reason else "",
         EpochFit(found.hypotheses[0].fit, part) if found.hypotheses else None,
-        tuple([sure[place[name]] if name in place else Certainty(0, 0.0) for name in names]),
         without,
     )
 
 
-def _of_centres(one: Hypothesis, places: Sequence[int | None], measured: Measurements) -> PosesHypothesis:
-    """Return a hypothesis about the centres of robots; their antennas are at `places` in the fit."""
-    poses, covariance = np.full((len(places), 3), np.nan), np.full((len(places), 3, 3), np.nan)
-    for i, k in enumerate(places):
-        if k is None:
-            continue
-        (x, y, heading), own = one.fit.poses[k].tolist(), slice(3 * k, 3 * k + 3)
-        forward, left, _ = measured.robots[i].recorded.antenna
-        offset = (forward + 1j * left) * np.exp(1j * heading)
-        x0, y0 = measured.joint.origin
-        poses[i] = x + x0 - offset.real, y + y0 - offset.imag, wrap(heading)
-        centred = np.array(((1.0, 0.0, offset.imag), (0.0, 1.0, -offset.real), (0.0, 0.0, 1.0)))
-        covariance[i] = centred @ one.fit.covariance[own, own] @ centred.T
-        if not np.all(np.isfinite(poses[i])):
-            raise FloatingPointError("a pose is not finite")
-    return PosesHypothesis(one.probability, poses, covariance)
+def _centre(
+    robot: RecordedRobot, k: int, fit: Fit, origin: tuple[float, float]
+) -> tuple[tuple[float, float, float], Numbers]:
+    """Return the pose of a robot's centre in <W> and its covariance; its antenna is robot `k` of a fit."""
+    (x, y, heading), own = fit.poses[k].tolist(), slice(3 * k, 3 * k + 3)
+    forward, left, _ = robot.antenna
+    offset = (forward + 1j * left) * np.exp(1j * heading)
+    pose = float(x + origin[0] - offset.real), float(y + origin[1] - offset.imag), wrap(heading)
+    if not all(map(math.isfinite, pose)):
+        raise FloatingPointError("a pose is not finite")
+    centred = np.array(((1.0, 0.0, offset.imag), (0.0, 1.0, -offset.real), (0.0, 0.0, 1.0)))
+    return pose, centred @ fit.covariance[own, own] @ centred.T

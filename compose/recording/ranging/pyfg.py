@@ -16,8 +16,9 @@ from typing import NamedTuple
 import numpy as np
 
 from compose.errors import BadRecording, UserError
-from compose.recording.ranging.range_recording import SAME_TIME_S, RangeRecording, RecordedRobot
+from compose.recording.ranging.range_recording import Numbers, RangeRecording
 from compose.recording.ranging.recording_rows import (
+    UPPER,
     AnchorRow,
     Covariance6,
     OdometryRow,
@@ -46,13 +47,6 @@ UNUSED = ("VERTEX_SE2:PRIOR", "EDGE_SE2_XY")
 """The kinds of lines that are not used."""
 
 
-class Vertex(NamedTuple):
-    """A pose with its stamp in s and its true pose."""
-
-    row: TruePoseRow
-    place: SourcePlace
-
-
 class Edge(NamedTuple):
     """An odometry edge from the pose with number `base` to the next."""
 
@@ -63,11 +57,8 @@ class Edge(NamedTuple):
     place: SourcePlace
 
 
-class Graph(NamedTuple):
-    """The poses and edges of each robot, by its name; poses also by their numbers."""
-
-    vertices: dict[str, dict[int, Vertex]]
-    edges: dict[str, list[Edge]]
+Poses = dict[int, tuple[TruePoseRow, SourcePlace]]
+"""The true poses of a robot and their places, by their numbers."""
 
 
 def read_pyfg(path: Path, anchors: Sequence[AnchorRow] = ()) -> RangeRecording:
@@ -79,46 +70,64 @@ def read_pyfg(path: Path, anchors: Sequence[AnchorRow] = ()) -> RangeRecording:
         text = files.read_text(path)
     except UnicodeDecodeError:
         raise BadRecording(f"{path}: it is not UTF-8 text") from None
-    builder, graph = RecordingBuilder(path, anchors), Graph({}, {})
+    builder = RecordingBuilder(path, anchors)
+    poses: dict[str, Poses] = {}
+    edges: dict[str, list[Edge]] = {}
     for number, line in enumerate(text.split("\n"), 1):
         if words := line.split():
-            _take(words[0], words[1:], SourcePlace(path, number), graph, builder)
-    for robot in {**graph.vertices, **graph.edges}:
+            _take(words, SourcePlace(path, number), builder, poses, edges)
+    for robot in {**poses, **edges}:
         builder.add_robot(robot)
-    ends = _stamps_are_ends(graph)
-    for robot, edges in graph.edges.items():
-        for row, covariance, place in _increments(robot, edges, graph.vertices.get(robot, {}), ends=ends):
+    ends = _stamps_are_ends(edges, poses)
+    for robot, own in edges.items():
+        for row, covariance, place in _increments(robot, own, poses.get(robot, {}), ends=ends):
             builder.add_odometry(row, covariance, place)
-    for vertices in graph.vertices.values():
-        for _, (truth, place) in sorted(vertices.items()):
+    for numbered in poses.values():
+        for _, (truth, place) in sorted(numbered.items()):
             builder.add(truth, place)
     return builder.recording()
 
 
 def _take(
-    kind: str, words: Sequence[str], place: SourcePlace, graph: Graph, builder: RecordingBuilder
+    words: Sequence[str],
+    place: SourcePlace,
+    builder: RecordingBuilder,
+    poses: dict[str, Poses],
+    edges: dict[str, list[Edge]],
 ) -> None:
-    """Take one line: its kind, and the words after that."""
-    if kind in UNUSED:
-        builder.unused[kind] += 1
-        return
+    """Take the words of one line."""
+    kind = words[0]
+    values = _values(kind, words[1:], place) if kind not in UNUSED else {}
+    match kind:
+        case "VERTEX_SE2":
+            robot, index = _pose(values.pop("name"), place)
+            if index in poses.setdefault(robot, {}):
+                raise BadRecording(f"{place}: there are two poses {robot}{index}")
+            poses[robot][index] = row_of({"robot": robot, **values}, TruePoseRow, place), place
+        case "EDGE_SE2":
+            (robot, base), to = _pose(values["from"], place), _pose(values["to"], place)
+            if to == (robot, base + 1):
+                edges.setdefault(robot, []).append(_edge(robot, base, values, place))
+            else:
+                builder.unused["EDGE_SE2 between poses that do not follow each other"] += 1
+        case "EDGE_RANGE":
+            builder.add(_range_row(values, place), place)
+        case "VERTEX_XY:PRIOR":
+            builder.add_prior(_prior_row(values, place))
+        case "VERTEX_XY":
+            builder.add(row_of(values, AnchorRow, place), place)
+        case _:
+            builder.unused[kind] += 1
+
+
+def _values(kind: str, words: Sequence[str], place: SourcePlace) -> dict[str, str]:
+    """Return the words of a line after its kind, by field."""
     if kind not in LINE_FIELDS:
         why = "; only two-dimensional files are read" if re.search("SE3|XYZ", kind) else ""
         raise BadRecording(f"{place}: unknown kind of line {kind[:40]!a}{why}")
     if len(words) != len(LINE_FIELDS[kind]):
         raise BadRecording(f"{place}: {kind} has {len(words)} fields and needs {len(LINE_FIELDS[kind])}")
-    values = dict(zip(LINE_FIELDS[kind], words, strict=True))
-    match kind:
-        case "VERTEX_SE2":
-            _take_vertex(values, place, graph)
-        case "EDGE_SE2":
-            _take_edge(values, place, graph, builder)
-        case "EDGE_RANGE":
-            builder.add(_range_row(values, place), place)
-        case "VERTEX_XY:PRIOR":
-            builder.add_prior(_prior_row(values, place))
-        case _:
-            builder.add(row_of(values, AnchorRow, place), place)
+    return dict(zip(LINE_FIELDS[kind], words, strict=True))
 
 
 def _pose(name: str, place: object) -> tuple[str, int]:
@@ -129,53 +138,33 @@ def _pose(name: str, place: object) -> tuple[str, int]:
     return found["robot"], int(found["index"])
 
 
-def _take_vertex(values: Mapping[str, str], place: SourcePlace, graph: Graph) -> None:
-    robot, index = _pose(values["name"], place)
-    vertices = graph.vertices.setdefault(robot, {})
-    if index in vertices:
-        raise BadRecording(f"{place}: there are two poses {robot}{index}")
-    pose = {name: values[name] for name in ("t", "x", "y", "heading")}
-    vertices[index] = Vertex(row_of({"robot": robot, **pose}, TruePoseRow, place), place)
-
-
-def _take_edge(
-    values: Mapping[str, str], place: SourcePlace, graph: Graph, builder: RecordingBuilder
-) -> None:
-    (robot, base), (other, to) = _pose(values["from"], place), _pose(values["to"], place)
-    if robot != other or to != base + 1:
-        builder.unused["EDGE_SE2 between poses that do not follow each other"] += 1
-        return
+def _edge(robot: str, base: int, values: Mapping[str, str], place: SourcePlace) -> Edge:
     moved = {name: values[name] for name in ("dx", "dy", "dheading")}
     row = row_of({"robot": robot, "t0": values["t"], "t1": values["t"], **moved}, OdometryRow, place)
-    stated = [_number(values[name], name, place) for name in COVARIANCE_FIELDS]
-    for name, value in zip(COVARIANCE_FIELDS, stated, strict=True):
-        if value < 0.0 and name in ("cov_xx", "cov_yy", "cov_hh"):
+    xx, xy, xh, yy, yh, hh = [_number(values, name, place) for name in COVARIANCE_FIELDS]
+    for name, value in zip(("cov_xx", "cov_yy", "cov_hh"), (xx, yy, hh), strict=True):
+        if value < 0.0:
             raise BadRecording(f"{place}: {name}: the variance {value:g} is negative")
-    xx, xy, xh, yy, yh, hh = stated
-    if not _is_covariance(xx, xy, xh, yy, yh, hh):
+    if (xy or xh or yh) and not _is_covariance(xx, xy, xh, yy, yh, hh):
         raise BadRecording(f"{place}: no errors have this covariance: it has a negative eigenvalue")
-    graph.edges.setdefault(robot, []).append(Edge(base, row, (xx, xy, xh, yy, yh, hh), place))
+    return Edge(base, row, (xx, xy, xh, yy, yh, hh), place)
 
 
-def _is_covariance(xx: float, xy: float, xh: float, yy: float, yh: float, hh: float) -> bool:
+def _is_covariance(*upper: float) -> bool:
     """Return whether a matrix with these elements, and variances from 0 on, has no negative eigenvalue."""
-    if not xy and not xh and not yh:
-        return True
-    x, y, h = [math.sqrt(value) or math.inf for value in (xx, yy, hh)]
-    if (xy and not xx * yy) or (xh and not xx * hh) or (yh and not yy * hh):
-        return False
-    a, b, c = xy / x / y, xh / x / h, yh / y / h
-    determinant = 1.0 + 2.0 * a * b * c - a * a - b * b - c * c
-    return max(abs(a), abs(b), abs(c)) <= 1.0 + DECIMALS_ROUNDING and determinant >= -DECIMALS_ROUNDING
+    matrix = np.array(upper)[UPPER]
+    sigmas = np.sqrt(np.diagonal(matrix))
+    matrix /= np.outer(*[np.where(sigmas > 0.0, sigmas, TINY)] * 2)
+    return bool(np.linalg.eigvalsh(matrix)[0] >= -DECIMALS_ROUNDING)
 
 
-DECIMALS_ROUNDING = 1e-6
-"""The error of correlations from the decimals of a file."""
+TINY, DECIMALS_ROUNDING = 1e-150, 1e-6
+"""The sigma in place of 0, and the error of correlations from the decimals of a file."""
 
 
 def _prior_row(values: Mapping[str, str], place: SourcePlace) -> AnchorRow:
     """Return the anchor of a prior, with the mean of both variances."""
-    xx, _, yy = [_number(values[name], name, place) for name in ("cov_xx", "cov_xy", "cov_yy")]
+    xx, _, yy = [_number(values, name, place) for name in ("cov_xx", "cov_xy", "cov_yy")]
     if min(xx, yy) < 0.0:
         raise BadRecording(f"{place}: cov_xx, cov_yy: a variance is negative")
     told = {name: values[name] for name in ("anchor", "x", "y")}
@@ -183,7 +172,7 @@ def _prior_row(values: Mapping[str, str], place: SourcePlace) -> AnchorRow:
 
 
 def _range_row(values: Mapping[str, str], place: SourcePlace) -> RangeRow:
-    variance = _number(values["variance"], "variance", place)
+    variance = _number(values, "variance", place)
     if variance <= 0.0:
         raise BadRecording(f"{place}: variance: {variance:g} is not positive")
     ends = {
@@ -197,10 +186,10 @@ def _range_row(values: Mapping[str, str], place: SourcePlace) -> RangeRow:
     )
 
 
-def _number(text: str, name: str, place: object) -> float:
-    value = number_of(text)
+def _number(values: Mapping[str, str], name: str, place: object) -> float:
+    value = number_of(values[name])
     if isinstance(value, str) or abs(value) > LARGEST_NUMBER:
-        raise BadRecording(f"{place}: {name}: {text[:40]!a} is not a number")
+        raise BadRecording(f"{place}: {name}: {values[name][:40]!a} is not a number")
     return value
 
 
@@ -208,20 +197,20 @@ LARGEST_NUMBER = 1e15
 """The largest variance or covariance."""
 
 
-def _stamps_are_ends(graph: Graph) -> bool:
+def _stamps_are_ends(edges: Mapping[str, Sequence[Edge]], poses: Mapping[str, Poses]) -> bool:
     """Return whether the stamps of edges are nearer to their later poses than to their earlier ones."""
     late = early = 0.0
-    for robot, edges in graph.edges.items():
-        vertices = graph.vertices.get(robot, {})
-        for edge in edges:
-            if edge.base in vertices and edge.base + 1 in vertices:
-                early += abs(edge.row.t1 - vertices[edge.base].row.t)
-                late += abs(edge.row.t1 - vertices[edge.base + 1].row.t)
+    for robot, each in edges.items():
+        own = poses.get(robot, {})
+        for edge in each:
+            if edge.base in own and edge.base + 1 in own:
+                early += abs(edge.row.t1 - own[edge.base][0].t)
+                late += abs(edge.row.t1 - own[edge.base + 1][0].t)
     return late <= early
 
 
 def _increments(
-    robot: str, unsorted: Sequence[Edge], vertices: Mapping[int, Vertex], *, ends: bool
+    robot: str, unsorted: Sequence[Edge], poses: Poses, *, ends: bool
 ) -> Iterator[tuple[OdometryRow, Covariance6, SourcePlace]]:
     """Yield the increments of `robot`; the stamps of edges are their ends, or their starts."""
     edges = sorted(unsorted, key=lambda edge: edge.base)
@@ -232,8 +221,8 @@ def _increments(
         stamp = row.t1
         if 0 <= far < len(edges) and edges[far].base == joined:
             other = edges[far].row.t1
-        elif pose in vertices:
-            at = vertices[pose].row.t
+        elif pose in poses:
+            at = poses[pose][0].t
             other = min(at, stamp) if ends else max(at, stamp)
         else:
             raise BadRecording(f"{place}: the time of {robot}{pose} is unknown: it has no VERTEX_SE2")
@@ -260,28 +249,39 @@ LETTERS = "ABCDEFGHIJKMNOPQRSTUVWXYZ"
 
 
 def written_pyfg(recording: RangeRecording) -> WrittenGraph:
-    """Return `recording` as text, with every number in its shortest exact form.
+    """Return the `recording` of a run as text, with every number in its shortest exact form.
 
-    Poses are numbered from 0, and each needs a true pose. Raises UserError if there is none, and for what the
-    format cannot hold: heights, antennas, more than 25 robots, and measurements without stated sigmas.
+    Poses are numbered from 0, and each needs a true pose. Raises UserError if there is none, and for more
+    than 25 robots.
     """
     names = _names(recording)
     lines: list[str] = []
     edges: list[str] = []
-    stamps: dict[str, np.ndarray] = {}
+    times: dict[str, Numbers] = {}
     for robot in recording.robots:
-        own, moves, stamps[robot.id] = _chain(recording, robot, names[robot.id])
-        lines += own
-        edges += moves
-    for anchor in recording.anchors:
-        if anchor.height:
-            raise UserError(f"{recording.source}: a .pyfg file cannot hold the height of {anchor.id}")
-        if anchor.sigma == math.inf:
-            raise UserError(
-                f"{recording.source}: the position of {anchor.id}, which a .pyfg file needs, is unknown"
-            )
-        lines.append(f"VERTEX_XY {names[anchor.id]} {anchor.x!r} {anchor.y!r}")
-    return WrittenGraph("\n".join([*lines, *edges, *_range_lines(recording, names, stamps), ""]), names)
+        letter, truth = names[robot.id], robot.truth
+        if truth is None:
+            what = f"the true poses of {robot.id}, which a .pyfg file needs, are unknown"
+            raise UserError(f"{recording.source}: {what}")
+        for i, (t, pose) in enumerate(zip(truth.t, truth.poses, strict=True)):
+            lines.append(f"VERTEX_SE2 {_plain(t)} {letter}{i} {_plain(*pose)}")
+        t0, t1, increments, covariance = robot.odometry
+        times[robot.id] = np.concatenate((t0[:1], t1)) if len(t0) else truth.t[:1]
+        for i, (t, move, matrix) in enumerate(zip(t1, increments, covariance, strict=True)):
+            moved = f"{_plain(*move)} {_plain(*matrix[UPPER_TRIANGLE])}"
+            edges.append(f"EDGE_SE2 {_plain(t)} {letter}{i} {letter}{i + 1} {moved}")
+    lines += [f"VERTEX_XY {names[one.id]} {one.x!r} {one.y!r}" for one in recording.anchors]
+    radios = recording.radios
+    for t, first, second, measured, sigma in zip(*recording.ranges, strict=True):
+        ends = [
+            names[name] + (str(np.argmin(np.abs(times[name] - t))) if name in times else "")
+            for name in (radios[first], radios[second])
+        ]
+        edges.append(f"EDGE_RANGE {_plain(t)} {' '.join(ends)} {_plain(measured, sigma * sigma)}")
+    return WrittenGraph("\n".join([*lines, *edges, ""]), names)
+
+
+UPPER_TRIANGLE = np.triu_indices(3)
 
 
 def _names(recording: RangeRecording) -> dict[str, str]:
@@ -294,60 +294,6 @@ def _names(recording: RangeRecording) -> dict[str, str]:
         capitals = list(LETTERS[: len(robots)])
     anchors = {anchor.id: f"L{i}" for i, anchor in enumerate(recording.anchors)}
     return dict(zip(robots, capitals, strict=True)) | anchors
-
-
-def _chain(
-    recording: RangeRecording, robot: RecordedRobot, letter: str
-) -> tuple[list[str], list[str], np.ndarray]:
-    """Return the lines of the poses and of the edges of `robot`, and the times in s of its poses."""
-    if any(robot.antenna):
-        raise UserError(f"{recording.source}: a .pyfg file cannot hold the antenna of {robot.id}")
-    t0, t1, increments, covariance = robot.odometry
-    if not np.all(np.isfinite(covariance)):
-        raise UserError(f"{recording.source}: the odometry of {robot.id} states no sigmas")
-    starts = np.ones(len(t0), bool)
-    starts[1:] = t0[1:] - t1[:-1] > SAME_TIME_S
-    base = np.arange(len(t0)) + np.cumsum(starts) - 1
-    times = np.empty(len(t0) + int(np.sum(starts)))
-    times[base + 1] = t1
-    times[base[starts]] = t0[starts]
-    truth = robot.truth
-    if truth is None:
-        raise UserError(
-            f"{recording.source}: the true poses of {robot.id}, which a .pyfg file needs, are unknown"
-        )
-    if not len(t0):
-        times = truth.t[:1]
-    if len(truth.t) != len(times):
-        poses = f"{len(truth.t)} true poses for {len(times)} poses"
-        raise UserError(f"{recording.source}: {robot.id} has {poses} of its odometry")
-    lines = [
-        f"VERTEX_SE2 {_plain(t)} {letter}{i} {_plain(*pose)}"
-        for i, (t, pose) in enumerate(zip(truth.t, truth.poses, strict=True))
-    ]
-    edges = [
-        f"EDGE_SE2 {_plain(t)} {letter}{i} {letter}{i + 1} {_plain(*move)} {_plain(*matrix[UPPER_TRIANGLE])}"
-        for i, t, move, matrix in zip(base, t1, increments, covariance, strict=True)
-    ]
-    return lines, edges, times
-
-
-UPPER_TRIANGLE = np.triu_indices(3)
-
-
-def _range_lines(
-    recording: RangeRecording, names: Mapping[str, str], stamps: Mapping[str, np.ndarray]
-) -> Iterator[str]:
-    """Yield the lines of the ranges, each with the poses that are nearest in time."""
-    radios = recording.radios
-    for t, first, second, measured, sigma in zip(*recording.ranges, strict=True):
-        if not math.isfinite(sigma):
-            raise UserError(f"{recording.source}: the range at {t:.15g} s states no sigma")
-        ends = []
-        for name in (radios[first], radios[second]):
-            times = stamps.get(name)
-            ends.append(names[name] + ("" if times is None else str(int(np.argmin(np.abs(times - t))))))
-        yield f"EDGE_RANGE {_plain(t)} {' '.join(ends)} {_plain(measured, sigma * sigma)}"
 
 
 def _plain(*values: float) -> str:

@@ -7,7 +7,7 @@ rad. All arrays are read-only.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,13 +103,8 @@ class RangeSeries(NamedTuple):
 
     def rows(self, chosen: NDArray[np.bool_] | Places) -> RangeSeries:
         """Return the ranges in `chosen`."""
-        return RangeSeries(
-            locked(self.t[chosen]),
-            locked(self.first[chosen]),
-            locked(self.second[chosen]),
-            locked(self.range[chosen]),
-            locked(self.sigma[chosen]),
-        )
+        columns: Any = [locked(column[chosen]) for column in self]
+        return RangeSeries(*columns)
 
 
 class RangeRecording(NamedTuple):
@@ -131,10 +126,10 @@ class RangeRecording(NamedTuple):
     @property
     def span(self) -> tuple[float, float]:
         """The first and the last time in s of all odometry; NaN if there is none."""
-        times = [(one.odometry.t0[0], one.odometry.t1[-1]) for one in self.robots if len(one.odometry.t0)]
-        if not times:
+        paths = [one.odometry for one in self.robots if len(one.odometry.t0)]
+        if not paths:
             return (np.nan, np.nan)
-        return float(min(first for first, _ in times)), float(max(last for _, last in times))
+        return float(min(one.t0[0] for one in paths)), float(max(one.t1[-1] for one in paths))
 
     def robot(self, name: str) -> RecordedRobot:
         """Return the robot `name`. Raises KeyError if there is none."""
@@ -206,14 +201,11 @@ SAME_TIME_S = 1e-6
 
 def _between(robot: RecordedRobot, first_s: float, last_s: float) -> RecordedRobot:
     whole = (robot.odometry.t0 >= first_s) & (robot.odometry.t1 <= last_s)
-    t0, t1, increments, covariance = robot.odometry
-    odometry = RobotOdometry(
-        locked(t0[whole]), locked(t1[whole]), locked(increments[whole]), locked(covariance[whole])
-    )
+    odometry = RobotOdometry(*[locked(column[whole]) for column in robot.odometry])
     truth = robot.truth
     if truth is not None:
         within = (truth.t >= first_s) & (truth.t <= last_s)
-        truth = TruePath(locked(truth.t[within]), locked(truth.poses[within]))
+        truth = TruePath(*[locked(column[within]) for column in truth])
     jumps = [one for one in robot.jumps if first_s <= one.begin_s and one.end_s <= last_s]
     return robot._replace(odometry=odometry, truth=truth, jumps=tuple(jumps))
 

@@ -6,7 +6,6 @@ Within an increment, a robot is assumed to turn and move at constant speeds.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -26,35 +25,9 @@ from compose.recording.ranging.range_recording import (
 Flags = NDArray[np.bool_]
 
 
-class SpeedBound(NamedTuple):
-    """The speeds above which an increment of odometry is gross."""
-
-    v: float
-    """The bound on the speed in m/s."""
-    omega: float
-    """The bound on the turn rate in rad/s."""
-
-
-class StepOptions(NamedTuple):
-    """The choices of `steps_of`."""
-
-    period_s: float = 1.0
-    """The length of a step in s."""
-    range_spacing_s: float = 1.0
-    """The least time in s between two ranges of the same two radios; 0 keeps all.
-
-    The errors of a radio's ranges within a second are correlated (0.2 to 0.7 was measured on UWB), so that
-    more ranges would count for more than they tell.
-    """
-
-
 class RangeSteps(NamedTuple):
-    """Odometry of R robots over K steps, and M ranges.
+    """Odometry of the R robots of a recording over K steps, and M ranges."""
 
-    The robots are those of `robots`, in this order; a radio is a robot or an anchor of the recording.
-    """
-
-    robots: tuple[str, ...]
     t: Numbers
     """The times in s of the ends of the steps, the first of their start; shape (K + 1,)."""
     increments: Numbers
@@ -67,52 +40,40 @@ class RangeSteps(NamedTuple):
     """The step in which each range lies; shape (M,)."""
     fraction: Numbers
     """The time of each range within its step, as a fraction of the step, from 0 to 1; shape (M,)."""
-    outside: int
-    """The number of ranges that are left out since they are before the first step or after the last."""
-    thinned: int
-    """The number of ranges that are left out since they are too close to the one before."""
-    in_gaps: int
-    """The number of ranges that are left out since they are in a long gap, of which one step is left."""
+    unused: dict[str, int]
+    """The number of ranges that are left out, by the reason."""
     skipped_s: Numbers
     """The time in s of long gaps that is left out before the end of each step; shape (K + 1,)."""
 
 
-DEFAULT_OPTIONS = StepOptions()
+def steps_of(recording: RangeRecording, period_s: float = 1.0, spacing_s: float = 1.0) -> RangeSteps:
+    """Return the steps of all robots, over the time in which all of them have odometry.
 
-
-def steps_of(
-    recording: RangeRecording, robots: Sequence[str], options: StepOptions = DEFAULT_OPTIONS
-) -> RangeSteps:
-    """Return the steps of `robots`, over the time in which all of them have odometry.
-
-    The ranges are those between these robots, and between one of them and an anchor. Raises BadRecording if
-    there is no such time.
+    A step lasts `period_s`. The ranges of two radios are at least `spacing_s` apart; 0 keeps all. The errors
+    of a radio's ranges within a second are correlated (0.2 to 0.7 was measured on UWB), so that more ranges
+    would count for more than they tell. Raises BadRecording if there is no such time.
     """
-    paths = [recording.robot(name).odometry for name in robots]
-    t, skipped_s = _common_times(recording, robots, paths, options.period_s)
-    own = {recording.radios.index(name) for name in robots} | set(
-        range(len(recording.robots), len(recording.radios))
-    )
-    among = np.isin(recording.ranges.first, list(own)) & np.isin(recording.ranges.second, list(own))
-    ranges = recording.ranges.rows(among)
+    paths, ranges = [one.odometry for one in recording.robots], recording.ranges
+    t, skipped_s = _common_times(recording, period_s)
     inside = (ranges.t >= t[0]) & (ranges.t <= t[-1])
     covered = ranges.rows(inside)
     in_gap = (np.diff(skipped_s) > 0.0)[_step_at(covered.t, t)]
     known = covered.rows(~in_gap)
-    kept = known.rows(spaced(known, options.range_spacing_s))
+    kept = known.rows(spaced(known, spacing_s))
     step = _step_at(kept.t, t)
     poses = [dead_reckoned(path, t) for path in paths]
     return RangeSteps(
-        tuple(robots),
         locked(t),
         locked(np.stack([relative(at[:-1], at[1:]) for at in poses])),
         locked(np.stack([step_covariance(path, t) for path in paths])),
         kept,
         locked(step),
         locked((kept.t - t[step]) / (t[step + 1] - t[step])),
-        int(np.count_nonzero(~inside)),
-        len(known.t) - len(kept.t),
-        int(np.count_nonzero(in_gap)),
+        {
+            "within a second after another": len(known.t) - len(kept.t),
+            "without odometry of all robots": int(np.count_nonzero(~inside)),
+            "in a gap of the odometry": int(np.count_nonzero(in_gap)),
+        },
         locked(skipped_s),
     )
 
@@ -126,30 +87,39 @@ def _step_at(times: Numbers, t: Numbers) -> Places:
     return np.clip(np.searchsorted(t, times, side="right") - 1, 0, len(t) - 2)
 
 
-def _common_times(
-    recording: RangeRecording, robots: Sequence[str], paths: Sequence[RobotOdometry], period_s: float
-) -> tuple[Numbers, Numbers]:
+def _common_times(recording: RangeRecording, period_s: float) -> tuple[Numbers, Numbers]:
     """Return the ends of steps of `period_s`, and the time in s that is left out before each; (K + 1,) each.
 
     Of a gap of more than LONG_GAP_S, whole seconds are left out, so that one step bridges them. What is left
     at the end is less than a step and left out.
     """
-    for name, path in zip(robots, paths, strict=True):
-        if not len(path.t0):
-            raise BadRecording(f"{recording.source}: {name} has no odometry")
+    for robot in recording.robots:
+        if not len(robot.odometry.t0):
+            raise BadRecording(f"{recording.source}: {robot.id} has no odometry")
+    paths = [one.odometry for one in recording.robots]
     first, last = max(path.t0[0] for path in paths), min(path.t1[-1] for path in paths)
     steps = math.floor((last - first) / period_s + SAME_TIME_S)
     if steps < 1:
         between = f"{first:.15g} s to {last:.15g} s" if last > first else "none"
-        what = f"less than a step of {period_s:g} s in which there is odometry of {' and '.join(robots)}"
+        names = " and ".join([one.id for one in recording.robots])
+        what = f"less than a step of {period_s:g} s in which there is odometry of {names}"
         raise NoSteps(f"{recording.source}: there is {what} ({between})")
-    number = np.concatenate([np.arange(*part) for part in _numbers(paths, first, steps, period_s)])
+    silent = np.concatenate([np.concatenate((path.gaps, np.stack((path.t0, path.t1), 1))) for path in paths])
+    whole_second, begun, numbers = max(round(1.0 / period_s), 1), 0, []
+    for begin, end in sorted(silent[silent[:, 1] - silent[:, 0] > LONG_GAP_S].tolist()):
+        inside = max(math.floor((begin - first) / period_s) + 1, begun + 1)
+        past = min(math.ceil((end - first) / period_s), steps + 1)
+        left_out = (past - inside) // whole_second * whole_second
+        if left_out > 0:
+            numbers.append(np.arange(begun, inside))
+            begun = inside + left_out
+    number = np.concatenate((*numbers, np.arange(begun, steps + 1)))
     if len(number) < 2:
         raise NoSteps(f"{recording.source}: there is no odometry but in a gap of more than {LONG_GAP_S:g} s")
     times: Numbers = first + period_s * number
     times[-1] = min(times[-1], last)
-    left_out: Numbers = np.multiply(period_s, number - np.arange(len(number)), dtype=np.float64)
-    return times, left_out
+    left: Numbers = np.multiply(period_s, number - np.arange(len(number)), dtype=np.float64)
+    return times, left
 
 
 LONG_GAP_S = 10.0
@@ -158,32 +128,6 @@ LONG_GAP_S = 10.0
 A robot of 0.5 m/s may be 5 m away then, and ranges to it say little. With less, the short gaps of radios and
 drivers would be bridged in one step; with more, a single row costs more steps.
 """
-
-
-def _numbers(
-    paths: Sequence[RobotOdometry], first: float, steps: int, period_s: float
-) -> Iterator[tuple[int, int]]:
-    """Yield the begin and the end of each run of the numbers of steps that are not left out."""
-    second = max(round(1.0 / period_s), 1)
-    begun = 0
-    for begin, end in _long_gaps(paths):
-        inside = max(math.floor((begin - first) / period_s) + 1, begun + 1)
-        past = min(math.ceil((end - first) / period_s), steps + 1)
-        left_out = (past - inside) // second * second
-        if left_out > 0:
-            yield begun, inside
-            begun = inside + left_out
-    yield begun, steps + 1
-
-
-def _long_gaps(paths: Sequence[RobotOdometry]) -> list[list[float]]:
-    """Return the begin and end in s of all gaps and increments of more than LONG_GAP_S of any robot."""
-    found = []
-    for path in paths:
-        alone = np.stack((path.t0, path.t1), 1)
-        for each in (path.gaps, alone):
-            found += each[each[:, 1] - each[:, 0] > LONG_GAP_S].tolist()
-    return sorted(found)
 
 
 def spaced(ranges: RangeSeries, spacing_s: float) -> Places:
@@ -318,17 +262,17 @@ def speeds(odometry: RobotOdometry) -> tuple[Numbers, Numbers]:
     return np.hypot(dx, dy) / lasts, np.abs(turn) / lasts
 
 
-def speed_bound(odometry: RobotOdometry) -> SpeedBound:
-    """Return GROSS_FACTOR times the speeds that nearly all increments with motion do not exceed."""
-    bounds = [
+def speed_bound(odometry: RobotOdometry) -> tuple[float, float]:
+    """Return GROSS_FACTOR times the speeds (m/s, rad/s) that nearly all increments with motion keep."""
+    v, omega = [
         GROSS_FACTOR * float(np.percentile(moving, NEARLY_ALL)) if len(moving := one[one > 0.0]) else math.inf
         for one in speeds(odometry)
     ]
-    return SpeedBound(*bounds)
+    return v, omega
 
 
-def gross(odometry: RobotOdometry, bound: SpeedBound) -> Flags:
-    """Return whether each increment is faster than `bound`; shape (N,)."""
+def gross(odometry: RobotOdometry, bound: tuple[float, float]) -> Flags:
+    """Return whether each increment is faster than `bound` (m/s, rad/s); shape (N,)."""
     speed, rate = speeds(odometry)
-    flags: Flags = (speed > bound.v) | (rate > bound.omega)
+    flags: Flags = (speed > bound[0]) | (rate > bound[1])
     return flags

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Annotated, Any, NamedTuple, TypeVar
 
 import msgspec
@@ -137,6 +137,14 @@ class TruePoseRow(Row, frozen=True):
 
 AnyRow = OdometryRow | RangeRow | AnchorRow | AntennaRow | TruePoseRow
 RowKind = TypeVar("RowKind", bound=Row)
+TABLES: dict[str, type[AnyRow]] = {
+    "odometry": OdometryRow,
+    "ranges": RangeRow,
+    "anchors": AnchorRow,
+    "antennas": AntennaRow,
+    "truth": TruePoseRow,
+}
+"""The rows of each table, by its name."""
 Covariance6 = tuple[float, float, float, float, float, float]
 """The upper triangle of a covariance of (dx, dy, dheading), row by row."""
 UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
@@ -189,12 +197,16 @@ class RecordingBuilder:
         self._jumps: dict[str, list[Jump]] = {}
         self._truth: dict[str, list[TruePoseRow]] = {}
         self._given = {row.anchor: row for row in anchors}
-        self._stated: dict[str, AnchorRow] = {}
         self._anchors: dict[str, AnchorRow] = {}
         self._antennas: dict[str, AntennaRow] = {}
         self._ranges: list[tuple[RangeRow, object]] = []
         self._last_range: dict[frozenset[str], float] = {}
         self._claims: list[tuple[str, object]] = []
+
+    @property
+    def spans(self) -> dict[str, tuple[float, float]]:
+        """The first and the last time in s of the odometry of each robot that has some."""
+        return {name: (rows[0][0].t0, rows[-1][0].t1) for name, rows in self._odometry.items() if rows}
 
     def add(self, row: AnyRow, place: object) -> None:
         """Add the row at `place`. Raises BadRecording if it contradicts an earlier row."""
@@ -212,9 +224,8 @@ class RecordingBuilder:
                 self._add_range(row, place)
             case AnchorRow():
                 check_anchor(row, place)
-                if self._stated.setdefault(row.anchor, row) != row:
+                if self._anchors.setdefault(row.anchor, row) != row:
                     raise BadRecording(f"{place}: there are two anchors {row.anchor}")
-                self._anchors[row.anchor] = self._given.get(row.anchor, row)
             case AntennaRow():
                 if self._antennas.setdefault(row.robot, row) != row:
                     raise BadRecording(f"{place}: there are two antennas of {row.robot}")
@@ -279,52 +290,46 @@ class RecordingBuilder:
         for robot, place in self._claims:
             if robot not in self._odometry:
                 raise BadRecording(f"{place}: robot: {robot} has no odometry")
-        self._anchors |= self._given
-        for anchor in self._anchors:
+        anchors = self._anchors | self._given
+        for anchor in anchors:
             if anchor in self._odometry:
                 raise BadRecording(f"{self.source}: {anchor} is a robot and an anchor")
-        robots = tuple([self._robot(name) for name in self._odometry])
-        anchors = tuple([one.fixed for one in self._anchors.values()])
-        recording = RangeRecording(self.source, robots, anchors, self._range_series(), dict(self.unused))
+        recording = RangeRecording(
+            self.source,
+            tuple(map(self._robot, self._odometry)),
+            tuple([one.fixed for one in anchors.values()]),
+            self._range_series([*self._odometry, *anchors]),
+            dict(self.unused),
+        )
         self._check_times(recording)
         return recording
 
     def _check_times(self, recording: RangeRecording) -> None:
         """Raise BadRecording if all ranges of a pair, or all increments of a robot, are of one time."""
-        for one in recording.robots:
-            t0, t1 = one.odometry.t0, one.odometry.t1
-            if len(t1) >= NOT_AT_ONCE and t0[-1] == t1[0]:
-                what = f"all {len(t1)} increments of {one.id} are of {t1[0]:.15g} s"
-                raise BadRecording(f"{self.source}: {what}: stamps are missing")
+        paths = [(f"increments of {one.id}", one.odometry.t0, one.odometry.t1) for one in recording.robots]
         for pair, rows in recording.pairs().items():
             t = recording.ranges.t[rows]
-            if len(t) >= NOT_AT_ONCE and t[0] == t[-1]:
-                what = f"all {len(t)} ranges of {' and '.join(pair)} are of {t[0]:.15g} s"
-                raise BadRecording(f"{self.source}: {what}: stamps are missing")
+            paths.append((f"ranges of {' and '.join(pair)}", t, t))
+        for what, begin, end in paths:
+            if len(end) >= NOT_AT_ONCE and begin[-1] == end[0]:
+                all_of_them = f"all {len(end)} {what} are of {end[0]:.15g} s"
+                raise BadRecording(f"{self.source}: {all_of_them}: stamps are missing")
 
     def _robot(self, name: str) -> RecordedRobot:
-        rows = self._odometry[name]
-        antenna = self._antennas.get(name)
-        truth = self._truth.get(name)
+        rows, truth, antenna = self._odometry[name], self._truth.get(name), self._antennas.get(name)
+        stated = _table([one or UNSTATED_COVARIANCE for _, one in rows], 6)
+        moved = _table([(row.t0, row.t1, row.dx, row.dy, row.dheading) for row, _ in rows], 5)
+        true = _table([(row.t, row.x, row.y, row.heading) for row in truth or ()], 4)
         return RecordedRobot(
             name,
-            RobotOdometry(
-                _column([row.t0 for row, _ in rows]),
-                _column([row.t1 for row, _ in rows]),
-                _table([(row.dx, row.dy, row.dheading) for row, _ in rows], 3),
-                locked(_table([stated or UNSTATED_COVARIANCE for _, stated in rows], 6)[:, UPPER]),
-            ),
-            TruePath(
-                _column([row.t for row in truth]), _table([(row.x, row.y, row.heading) for row in truth], 3)
-            )
-            if truth
-            else None,
+            RobotOdometry(*map(locked, (moved[:, 0], moved[:, 1], moved[:, 2:], stated[:, UPPER]))),
+            TruePath(locked(true[:, 0]), locked(true[:, 1:])) if truth else None,
             (antenna.forward, antenna.left, antenna.height) if antenna is not None else (0.0, 0.0, 0.0),
             tuple(self._jumps.get(name, ())),
         )
 
-    def _range_series(self) -> RangeSeries:
-        radios = {name: i for i, name in enumerate([*self._odometry, *self._anchors])}
+    def _range_series(self, names: Sequence[str]) -> RangeSeries:
+        radios = {name: i for i, name in enumerate(names)}
         robots = len(self._odometry)
         ends = np.empty((len(self._ranges), 2), np.intp)
         for i, (row, place) in enumerate(self._ranges):
@@ -336,12 +341,10 @@ class RecordingBuilder:
                 raise BadRecording(f"{place}: {row.first} and {row.second} are both anchors")
             if ends[i, 0] >= robots:
                 ends[i] = ends[i, ::-1]
-        times = np.array([row.t for row, _ in self._ranges])
-        sigmas = [row.sigma if row.sigma is not None else np.nan for row, _ in self._ranges]
-        unsorted = RangeSeries(
-            times, ends[:, 0], ends[:, 1], np.array([row.range for row, _ in self._ranges]), np.array(sigmas)
-        )
-        return unsorted.rows(np.argsort(times, kind="stable"))
+        lengths = [(row.t, row.range, np.nan if row.sigma is None else row.sigma) for row, _ in self._ranges]
+        t, measured, sigma = _table(lengths, 3).T
+        unsorted = RangeSeries(t, ends[:, 0], ends[:, 1], measured, sigma)
+        return unsorted.rows(np.argsort(t, kind="stable"))
 
 
 def check_anchor(row: AnchorRow, place: object) -> None:
@@ -361,9 +364,5 @@ A driver may send a few in one message; an estimate needs eight.
 UNSTATED_COVARIANCE = (np.nan,) * 6
 
 
-def _column(values: list[float]) -> Any:
-    return locked(np.array(values, float))
-
-
 def _table(rows: list[Any], columns: int) -> Any:
-    return locked(np.array(rows, float).reshape(-1, columns))
+    return np.array(rows, float).reshape(-1, columns)

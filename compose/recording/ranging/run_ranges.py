@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -18,8 +18,9 @@ from compose.recording.ranging.recording_rows import (
     TruePoseRow,
 )
 from compose.recording.run import Run
+from compose.recording.run_setup import RunSetup
 from protocol.messages import Observation
-from protocol.mission import Anchor, Mission
+from protocol.mission import Anchor
 from protocol.motion import ORIGIN, Controls, step
 from protocol.noise import VelocityNoise
 
@@ -50,52 +51,39 @@ def ranges_of_run(run: Run, given: Sequence[AnchorRow] = ()) -> RangeRecording:
             anchors[one.anchor] = name = f"anchor-{one.id}"
             builder.add(AnchorRow(name, one.anchor.x, one.anchor.y), run.source)
     anchor_of = {one.id: anchors[one.anchor] for one in setup.anchored}
-    ids = set(setup.ids)
+    period = setup.mission.period
     for tick in range(run.length):
-        observations = {robot: one for robot, one in run.observations[tick].items() if robot in ids}
-        for row, covariance in _moved(observations, setup.mission):
-            builder.add_odometry(row, covariance, run.source)
-        for ranged in _ranged(observations, anchor_of, ids, setup.mission):
-            builder.add(ranged, run.source)
+        observations = [one for robot, one in run.observations[tick].items() if robot in setup.ids]
+        _add_tick(builder, observations, anchor_of, setup)
     for robot in setup.ids:
         for tick, pose in enumerate(run.truth(robot)):
-            t = tick * setup.mission.period
-            builder.add(TruePoseRow(robot, t, pose.x, pose.y, pose.heading), run.source)
+            builder.add(TruePoseRow(robot, tick * period, pose.x, pose.y, pose.heading), run.source)
     return builder.recording()
 
 
-def _moved(
-    observations: Mapping[str, Observation], mission: Mission
-) -> Iterator[tuple[OdometryRow, Covariance6]]:
-    """Yield the increment of each robot in one tick, and its covariance."""
-    period = mission.period
-    for robot, observation in observations.items():
-        if (executed := observation.executed) is not None:
-            moved = step(ORIGIN, executed.v, executed.omega, period)
-            t0, t1 = (observation.tick - 1) * period, observation.tick * period
-            row = OdometryRow(robot, t0, t1, moved.x, moved.y, moved.heading)
-            yield row, increment_covariance(executed, period, mission.noise.odometry)
-
-
-def _ranged(
-    observations: Mapping[str, Observation],
+def _add_tick(
+    builder: RecordingBuilder,
+    observations: Sequence[Observation],
     anchor_of: Mapping[str, str],
-    ids: Collection[str],
-    mission: Mission,
-) -> Iterator[RangeRow]:
-    """Yield the ranges of one tick; those between two robots once."""
-    sigma = math.hypot(mission.noise.mutual_sigma, ADDED_SIGMA)
-    anchor_sigma = math.hypot(mission.noise.anchor_sigma, ADDED_SIGMA)
-    seen: set[frozenset[str]] = set()
-    for robot, observation in observations.items():
-        t = observation.tick * mission.period
-        if observation.anchor_range is not None:
-            yield RangeRow(t, robot, anchor_of[robot], observation.anchor_range, anchor_sigma)
-        for contact in observation.contacts:
-            pair = frozenset((robot, contact.peer))
-            if contact.range is not None and contact.peer in ids and pair not in seen:
-                seen.add(pair)
-                yield RangeRow(t, robot, contact.peer, contact.range, sigma)
+    setup: RunSetup,
+) -> None:
+    """Add the increments and the ranges of one tick; a range between two robots once."""
+    period, noise = setup.mission.period, setup.mission.noise
+    sigma, anchor_sigma = [math.hypot(one, ADDED_SIGMA) for one in (noise.mutual_sigma, noise.anchor_sigma)]
+    ranged: set[frozenset[str]] = set()
+    for observed in observations:
+        robot, t = observed.robot, observed.tick * period
+        if (executed := observed.executed) is not None:
+            moved = step(ORIGIN, executed.v, executed.omega, period)
+            row = OdometryRow(robot, (observed.tick - 1) * period, t, moved.x, moved.y, moved.heading)
+            builder.add_odometry(row, increment_covariance(executed, period, noise.odometry), builder.source)
+        if (rho := observed.anchor_range) is not None:
+            builder.add(RangeRow(t, robot, anchor_of[robot], rho, anchor_sigma), builder.source)
+        for one in observed.contacts:
+            pair = frozenset((robot, one.peer))
+            if one.range is not None and one.peer in setup.ids and pair not in ranged:
+                ranged.add(pair)
+                builder.add(RangeRow(t, robot, one.peer, one.range, sigma), builder.source)
 
 
 def increment_covariance(executed: Controls, period: float, noise: VelocityNoise) -> Covariance6:
