@@ -10,7 +10,7 @@ import pytest
 from agent.estimation.gaussian.beacon_guesses import predicted
 from agent.estimation.gaussian.consistency import chi2_p_value
 from compose.errors import UserError
-from compose.recording.estimating.calibration import calibrated
+from compose.recording.estimating.calibration import ASSUMED, calibrated_by_fit
 from compose.recording.estimating.estimate_rows import estimate_csv
 from compose.recording.estimating.estimate_run import RecordingEstimate, estimated
 from compose.recording.estimating.recorded_measurements import measurements
@@ -150,7 +150,7 @@ def test_the_derivatives_of_ranges_to_several_anchors_are_right() -> None:
 
 def test_the_radios_of_one_robot_are_calibrated_without_truth() -> None:
     recording = driven(sigma=0.05)
-    found = calibrated(recording, None, None, by_fit=True)
+    found = calibrated_by_fit(measurements(recording, None, ASSUMED))
     assert found.source == "the fit"
     assert {pair[1] for pair in found.pairs} == {one.id for one in ANCHORS}
     assert all(0.02 < one.sigma < 0.1 for one in found.pairs.values())

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 import msgspec
@@ -14,7 +12,15 @@ import pytest
 from msgspec.structs import replace
 
 from compose.errors import USER_ERROR, UserError
-from compose.recording.estimating.calibration import calibrated, correction_of, noise_table, profile_toml
+from compose.recording.estimating.calibration import (
+    ASSUMED,
+    NoTruth,
+    calibrated,
+    calibrated_by_fit,
+    correction_of,
+    noise_table,
+    profile_toml,
+)
 from compose.recording.estimating.estimate_run import estimated
 from compose.recording.estimating.noise_files import told_noise
 from compose.recording.estimating.radio_errors import PairErrors, range_calibration, true_errors
@@ -214,14 +220,10 @@ def test_the_scales_of_pairs_that_differ_widen_the_prior_of_the_scale(sample: Ra
 
 @pytest.mark.long
 def test_without_truth_the_fit_is_the_reference(sample: RangeRecording) -> None:
-    said: list[tuple[str, int]] = []
-
-    def fitting(why: str, epochs: int) -> AbstractContextManager[Callable[[], None]]:
-        said.append((why, epochs))
-        return nullcontext(lambda: None)
-
-    found = calibrated(with_seldom_truth(sample, 12.0), None, None, fitting=fitting)
-    assert said == [("no 8 ranges of a pair have true poses within 10 s", 59)]
+    recording = with_seldom_truth(sample, 12.0)
+    with pytest.raises(NoTruth, match="no 8 ranges of a pair have true poses within 10 s"):
+        calibrated(recording, None, None)
+    found = calibrated_by_fit(measurements(recording, None, ASSUMED))
     assert found.source == "the fit"
     assert set(found.pairs) == {("A", "LC0"), ("B", "LC1"), ("A", "B")}
     table = noise_table(found, frozenset({"LC0", "LC1"}))

@@ -15,7 +15,7 @@ from mcap.writer import Writer
 
 from compose.errors import BROKEN_PIPE, STOPPED_STATUS, USER_ERROR
 from compose.recording.estimating import estimate_run
-from compose.recording.estimating.estimate_rows import ESTIMATE_COLUMNS, estimate_csv
+from compose.recording.estimating.estimate_rows import PoseEstimateRow, estimate_csv
 from compose.recording.estimating.estimate_run import StreamEstimate, estimated
 from compose.recording.estimating.noise_files import told_noise
 from compose.recording.estimating.recorded_measurements import measurements
@@ -160,7 +160,7 @@ def test_estimates_are_printed_while_the_stream_is_open(messages: Messages, tmp_
         first = written(early, whole=False)
         process.stdin.write(first)
         process.stdin.flush()
-        assert process.stdout.readline().decode().strip() == ",".join(ESTIMATE_COLUMNS)
+        assert process.stdout.readline().decode().strip() == ",".join(PoseEstimateRow.__struct_fields__)
         lines = [process.stdout.readline().decode().split(",") for _ in range(10)]
         assert {line[1] for line in lines} == {"A", "B"}
         assert process.poll() is None

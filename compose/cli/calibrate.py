@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import ExitStack
 
 from compose.errors import ENDED, UserError, writing
-from compose.recording.estimating.calibration import calibrated, profile_toml
+from compose.recording.estimating.calibration import (
+    ASSUMED,
+    NoTruth,
+    calibrated,
+    calibrated_by_fit,
+    profile_toml,
+)
 from compose.recording.estimating.radio_errors import FEWEST_ERRORS, RangeCalibration
+from compose.recording.estimating.recorded_measurements import measurements
 from compose.recording.estimating.true_poses import TRUTH_GAP_S
 from compose.recording.ranging.range_files import read_ranges
+from compose.recording.ranging.range_recording import RangeRecording
 from compose.terminal.outcome import counting
 from compose.terminal.tables import shown
 from compose.terminal.text_width import tell
@@ -27,9 +34,7 @@ def main(options: argparse.Namespace) -> int:
             written.enter_context(writing(f"--out: {options.out}"))
             draft = written.enter_context(files.draft(options.out))
         recording = read_ranges(options.recording, options.anchors)
-        found = calibrated(
-            recording, options.robots, options.window, by_fit=options.without_truth, fitting=_fitting
-        )
+        found = _calibrated(recording, options)
         anchors = frozenset([one.id for one in recording.anchors])
         text = profile_toml(found, anchors, f"{found.source} of {recording.source}")
         if options.out is not None:
@@ -39,11 +44,20 @@ def main(options: argparse.Namespace) -> int:
     return ENDED
 
 
-def _fitting(why: str, epochs: int) -> AbstractContextManager[Callable[[], None]]:
-    """Say why there is a fit, and return a progress bar for it."""
-    if why:
-        say(f"tandem calibrate: {why}: the reference is an estimate of {epochs} epochs", error=True)
-    return counting("tandem calibrate", epochs)
+def _calibrated(recording: RangeRecording, options: argparse.Namespace) -> RangeCalibration:
+    """Return the errors against the truth, or against an estimate if there is none or the user says so."""
+    why = None
+    if not options.without_truth:
+        try:
+            return calibrated(recording, options.robots, options.window)
+        except NoTruth as error:
+            why = error
+    measured = measurements(recording, options.robots, ASSUMED, options.window)
+    if why is not None:
+        reference = f"the reference is an estimate of {len(measured.ends)} epochs"
+        say(f"tandem calibrate: {why}: {reference}", error=True)
+    with counting("tandem calibrate", len(measured.ends)) as done:
+        return calibrated_by_fit(measured, done)
 
 
 def _lines(found: RangeCalibration) -> list[str]:

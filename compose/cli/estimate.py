@@ -13,12 +13,7 @@ from agent.estimation.solver import Solver
 from compose.errors import BROKEN_PIPE, ENDED, NOT_LOCALISED, STOPPED_STATUS, UserError, writing
 from compose.extras import need
 from compose.launch.solver_loader import solver_named
-from compose.recording.estimating.estimate_rows import (
-    ESTIMATE_COLUMNS,
-    PoseEstimateRow,
-    RobotEstimate,
-    csv_line,
-)
+from compose.recording.estimating.estimate_rows import PoseEstimateRow, RobotEstimate, estimate_csv
 from compose.recording.estimating.estimate_run import RecordingEstimate, StreamEstimate, estimated
 from compose.recording.estimating.estimate_summary import write_estimate
 from compose.recording.estimating.noise_files import told_noise
@@ -82,12 +77,12 @@ def _followed(
         raise UserError(f"{name} cannot be read: {error.strerror or error}") from None
     if options.out is not None:
         make_folder(options.out)
-    heading = [",".join(ESTIMATE_COLUMNS)]
+    printed = 0
     with stream:
         try:
             for row in estimate.rows(rows_as_they_arrive(stream, name)):
-                say(*heading, csv_line(row))
-                heading = []
+                say(*estimate_csv([row]).splitlines()[printed:])
+                printed = 1  # the line of column names
         except BrokenPipeError:  # the files are of the estimates so far
             discard(sys.stdout)
             return *estimate.result(), BROKEN_PIPE
@@ -101,25 +96,19 @@ def _doubted(name: str, doubt: str) -> None:
 
 
 def _written(out: Path, problem: Measurements, estimate: RecordingEstimate) -> list[Path]:
-    """Write all files into `out`, and return their paths. Raises UserError."""
+    """Write all files into `out`, figures if there is Matplotlib; return their paths. Raises UserError."""
     with writing(out):
-        return [*write_estimate(out, estimate.rows, estimate.summary), *_drawn(out, problem, estimate)]
+        paths = write_estimate(out, estimate.rows, estimate.summary)
+        if find_spec("matplotlib") is None:
+            say("tandem estimate: no figures: they need matplotlib (extra lab)", error=True)
+            return paths
+        from compose.figures.estimated import estimate_figures  # noqa: PLC0415  # it takes time
+        from compose.figures.style import SCREEN, look, save  # noqa: PLC0415
 
-
-def _drawn(out: Path, problem: Measurements, estimate: RecordingEstimate) -> list[Path]:
-    """Draw the figures into `out`, and return their paths; none without Matplotlib. Raises OSError."""
-    if find_spec("matplotlib") is None:
-        say("tandem estimate: no figures: they need matplotlib (extra lab)", error=True)
-        return []
-    from compose.figures.estimated import estimate_figures  # noqa: PLC0415  # it takes time
-    from compose.figures.style import SCREEN, look, save  # noqa: PLC0415
-
-    with look(SCREEN):
-        return [
-            path
-            for name, figure in estimate_figures(problem, estimate)
-            for path in save(figure, out / name, ["svg", "png"], SCREEN.dpi)
-        ]
+        with look(SCREEN):
+            for name, figure in estimate_figures(problem, estimate):
+                paths += save(figure, out / name, ["svg", "png"], SCREEN.dpi)
+        return paths
 
 
 def _lines(problem: Measurements, estimate: RecordingEstimate) -> list[str]:

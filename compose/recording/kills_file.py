@@ -62,33 +62,17 @@ def kills_in(folder: Path) -> tuple[tuple[Killed, ...], str | None]:
     If the file cannot be read, there are none, and the second value is a line for the user that says why: the
     recording is complete without it.
     """
-    path = folder / KILLS
+    path, found = folder / KILLS, []
     try:
-        return _listed(path), None
-    except OSError as error:
-        why = f"{path}: {error.strerror or error}"
-    except CorruptJournal as error:
-        why = str(error)
-    return (), f"{why}; the recording is read without the processes that were killed"
-
-
-def _listed(path: Path) -> tuple[Killed, ...]:
-    """Return the processes in the file at `path`; none if there is no file.
-
-    Raises OSError if the file cannot be read, and CorruptJournal if a line is not that of a process or there
-    are more than MOST_KILLS_BYTES.
-    """
-    try:
-        with files.open_file(path) as file:
-            content = file.read(MOST_KILLS_BYTES + 1)
+        lines = files.read_bytes(path, MOST_KILLS_BYTES).split(b"\n")[:-1]
+        for number, line in enumerate(lines, 1):  # a line without an end is being written
+            try:
+                found.append(documents.json_value(line, Killed))
+            except msgspec.MsgspecError as error:
+                raise CorruptJournal(f"line {number}: {error}") from None
     except FileNotFoundError:
-        return ()
-    if len(content) > MOST_KILLS_BYTES:
-        raise CorruptJournal(f"{path}: it is larger than {MOST_KILLS_BYTES} bytes")
-    found = []
-    for number, line in enumerate(content.split(b"\n")[:-1], 1):  # a line without an end is being written
-        try:
-            found.append(documents.json_value(line, Killed))
-        except msgspec.MsgspecError as error:
-            raise CorruptJournal(f"{path}: line {number}: {error}") from None
-    return tuple(found)
+        return (), None
+    except (OSError, CorruptJournal) as error:
+        why = getattr(error, "strerror", None) or error
+        return (), f"{path}: {why}; the recording is read without the processes that were killed"
+    return tuple(found), None

@@ -310,5 +310,6 @@ def csv_text(kind: type[msgspec.Struct], rows: Iterable[msgspec.Struct]) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(kind.__struct_fields__)
-    writer.writerows([["" if one is None else one for one in astuple(row)] for row in rows])
+    for row in rows:
+        writer.writerow([str(one).lower() if isinstance(one, bool) else one for one in astuple(row)])
     return out.getvalue()

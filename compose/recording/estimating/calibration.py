@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
 
 import numpy as np
 
@@ -21,7 +20,7 @@ from compose.recording.estimating.radio_errors import (
     range_calibration,
     true_errors,
 )
-from compose.recording.estimating.recorded_measurements import chosen_part, measurements, numerics
+from compose.recording.estimating.recorded_measurements import Measurements, chosen_part, numerics
 from compose.recording.estimating.recording_estimator import ClaimRule
 from compose.recording.estimating.true_poses import TRUTH_GAP_S
 from compose.recording.ranging.range_recording import RangeRecording
@@ -33,35 +32,23 @@ ASSUMED = "uwb"
 RULE = ClaimRule(accuracy=1.0)
 """The claim rule of that estimate: the radios' errors need the right hypothesis, not an accurate one."""
 
-Fitting = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
-"""A function that is called before a fit, with the reason for it and the number of epochs.
 
-It returns the context of the fit, with a callback for each epoch.
-"""
+class NoTruth(UserError):
+    """No pair of radios has enough ranges whose ends have true poses."""
 
 
 def calibrated(
-    recording: RangeRecording,
-    robots: Sequence[str] | None,
-    window: tuple[float, float] | None,
-    *,
-    by_fit: bool = False,
-    fitting: Fitting = lambda _why, _epochs: nullcontext(lambda: None),
+    recording: RangeRecording, robots: Sequence[str] | None, window: tuple[float, float] | None
 ) -> RangeCalibration:
     """Return the errors of the radios of `robots`, or of all, within `window` (s from the first odometry on).
 
-    They are against the truth if there is some, unless `by_fit`; else against an estimate. Raises UserError.
+    They are against the truth. Raises NoTruth if there is none, and UserError.
     """
     part = chosen_part(recording, robots, window)
     with numerics(recording.source):
-        errors = {} if by_fit else true_errors(part)
+        errors = true_errors(part)
         if not errors:
-            why = (
-                ""
-                if by_fit
-                else f"no {FEWEST_ERRORS} ranges of a pair have true poses within {TRUTH_GAP_S:g} s"
-            )
-            return _by_fit(recording, robots, window, fitting, why)
+            raise NoTruth(f"no {FEWEST_ERRORS} ranges of a pair have true poses within {TRUTH_GAP_S:g} s")
         found = range_calibration(errors, "the truth")
         for pair, one in found.pairs.items():
             if why := absurd_error(one.bias, one.sure_scale, float(np.max(errors[pair].measured))):
@@ -70,18 +57,10 @@ def calibrated(
         return found._replace(unused=len(part.ranges.t) - sum([len(one.t) for one in errors.values()]))
 
 
-def _by_fit(
-    recording: RangeRecording,
-    robots: Sequence[str] | None,
-    window: tuple[float, float] | None,
-    fitting: Fitting,
-    why: str,
-) -> RangeCalibration:
-    """Return the errors against the ranges that the estimate of `robots` predicts."""
-    measured = measurements(recording, robots, ASSUMED, window)
-    without = f"{recording.source}: without true poses"
-    with fitting(why, len(measured.ends)) as done:
-        epochs, summary = estimated(measured, RULE, done)
+def calibrated_by_fit(measured: Measurements, done: Callable[[], None] = lambda: None) -> RangeCalibration:
+    """Return the errors against the ranges that an estimate predicts; `done` is called after each epoch."""
+    without = f"{measured.source}: without true poses"
+    epochs, summary = estimated(measured, RULE, done)
     fitted = epochs[-1].fitted if epochs and all(epochs[-1].claims) else None
     if fitted is None or summary.calibration is None:
         who, reason = " and ".join(summary.robots), summary.blocking_reason or "too few ranges"

@@ -12,6 +12,7 @@ import numpy as np
 from agent.estimation.posterior import Certainty
 from compose.recording.estimating.true_poses import true_pose
 from compose.recording.ranging.range_recording import Numbers, RecordedRobot
+from compose.recording.rows import csv_text
 from protocol.motion import wrap
 
 
@@ -209,17 +210,6 @@ def pose_row(
     return PoseEstimateRow(*values)
 
 
-ESTIMATE_COLUMNS = PoseEstimateRow.__struct_fields__
-"""The columns of `estimate.csv`."""
-
-
 def estimate_csv(rows: Sequence[PoseEstimateRow]) -> str:
-    """Return the table of `rows`, with a line of column names; numbers are exact."""
-    return "\n".join([",".join(ESTIMATE_COLUMNS), *map(csv_line, rows), ""])
-
-
-def csv_line(row: PoseEstimateRow) -> str:
-    """Return one row of the table, without the line break. No name has a comma."""
-    values = msgspec.structs.astuple(row)
-    texts = [str(one).lower() if isinstance(one, bool) else "" if one is None else str(one) for one in values]
-    return ",".join(texts)
+    """Return the table of `rows`, with a line of column names."""
+    return csv_text(PoseEstimateRow, rows)

@@ -75,7 +75,7 @@ def _of_robot(
         _pose(rows[claimed[0]]) if claimed else None,
         _pose(rows[-1]) if rows else None,
         len(robot.sound.gross),
-        len(robot.sound.gaps),
+        len(robot.recorded.odometry.gaps),
         len(robot.sound.whole_turns),
         None if claim or not claimed else later[0].t_s if later else end_s,
     )

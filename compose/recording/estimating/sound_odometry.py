@@ -46,8 +46,6 @@ class SoundOdometry(NamedTuple):
     """The odometry without gaps; each increment has a covariance."""
     gross: Places
     """The indices of the recorded increments that were replaced."""
-    gaps: Numbers
-    """The start and end in s of each gap that was filled; shape (G, 2)."""
     whole_turns: Places
     """The indices of the recorded increments whose turn was off by a whole turn, which was removed."""
 
@@ -76,7 +74,7 @@ def sound(odometry: RobotOdometry, told: VelocityNoise | None = None, sigma: flo
     variances = np.square(lost[:, None] * (usual[0], usual[0], usual[1]))
     covariance[unknown] = variances[:, :, None] * np.eye(3)
     whole = RobotOdometry(locked(t0), locked(t1), locked(increments), locked(covariance))
-    return SoundOdometry(whole, np.flatnonzero(flagged), gaps, whole_turns)
+    return SoundOdometry(whole, np.flatnonzero(flagged), whole_turns)
 
 
 def _without_whole_turns(odometry: RobotOdometry) -> tuple[RobotOdometry, Places]:

@@ -213,19 +213,15 @@ def _increments(
     robot: str, unsorted: Sequence[Edge], poses: Poses, *, ends: bool
 ) -> Iterator[tuple[OdometryRow, Covariance6, SourcePlace]]:
     """Yield the increments of `robot`; the stamps of edges are their ends, or their starts."""
-    edges = sorted(unsorted, key=lambda edge: edge.base)
-    for i, (base, row, covariance, place) in enumerate(edges):
-        far = i - 1 if ends else i + 1
-        joined = base - 1 if ends else base + 1
-        pose = base if ends else base + 1
-        stamp = row.t1
-        if 0 <= far < len(edges) and edges[far].base == joined:
-            other = edges[far].row.t1
-        elif pose in poses:
-            at = poses[pose][0].t
-            other = min(at, stamp) if ends else max(at, stamp)
+    stamps = {base + ends: row.t1 for base, row, _, _ in unsorted}
+    for base, row, covariance, place in sorted(unsorted, key=lambda edge: edge.base):
+        far, stamp = base if ends else base + 1, row.t1
+        if far in stamps:
+            other = stamps[far]
+        elif far in poses:
+            other = (min if ends else max)(poses[far][0].t, stamp)
         else:
-            raise BadRecording(f"{place}: the time of {robot}{pose} is unknown: it has no VERTEX_SE2")
+            raise BadRecording(f"{place}: the time of {robot}{far} is unknown: it has no VERTEX_SE2")
         if ends and other > stamp:
             before = f"the edge before it is of {other:.15g} s"
             raise BadRecording(f"{place}: t: it is of {stamp:.15g} s, and {before}")
