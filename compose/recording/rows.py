@@ -205,7 +205,7 @@ def tick_rows(run: recorded.Run) -> Iterator[TickRow]:
 
 def parts(value: object | None, *names: str) -> list[Any]:
     """Return the attributes `names` of `value`; None for each if there is none."""
-    return [getattr(value, name, None) for name in names]
+    return [getattr(value, name) if value is not None else None for name in names]
 
 
 def truth_rows(run: recorded.Run, period: float) -> Iterator[TruthRow]:

@@ -320,10 +320,12 @@ class RecordingBuilder:
         stated = _table([one or UNSTATED_COVARIANCE for _, one in rows], 6)
         moved = _table([(row.t0, row.t1, row.dx, row.dy, row.dheading) for row, _ in rows], 5)
         true = _table([(row.t, row.x, row.y, row.heading) for row in truth or ()], 4)
+        t0, t1, increments = [locked(moved[:, part].copy()) for part in (0, 1, slice(2, 5))]
+        path: Any = [locked(true[:, part].copy()) for part in (0, slice(1, 4))]
         return RecordedRobot(
             name,
-            RobotOdometry(*map(locked, (moved[:, 0], moved[:, 1], moved[:, 2:], stated[:, UPPER]))),
-            TruePath(locked(true[:, 0]), locked(true[:, 1:])) if truth else None,
+            RobotOdometry(t0, t1, increments, locked(stated[:, UPPER])),
+            TruePath(*path) if truth else None,
             (antenna.forward, antenna.left, antenna.height) if antenna is not None else (0.0, 0.0, 0.0),
             tuple(self._jumps.get(name, ())),
         )
