@@ -47,6 +47,7 @@ from compose.scenario.scenario_tables import (
 )
 from compose.sweep import spec
 from compose.sweep.draws import DrawTable, StartsTable
+from compose.sweep.group_columns import GroupColumns
 from compose.sweep.paired_differences import PairedDifference
 from compose.sweep.spec import AxisTable, RowTable, SpecFile
 from compose.sweep.statistics import CellSummary
@@ -323,6 +324,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "draw": partial(fields_of, DrawTable),
     "starts": partial(fields_of, StartsTable),
     "trial-columns": partial(columns_of, TrialRow),
+    "group-columns": partial(columns_of, GroupColumns),
     "robot-columns": partial(columns_of, RobotRow),
     "summary-columns": partial(columns_of, CellSummary),
     "difference-columns": partial(columns_of, PairedDifference),

@@ -28,11 +28,11 @@ class Owned(worker_pool.WorkerProcess):
     """A process for trials whose timeout applies only to trials that hang, however slow the machine is."""
 
     def answer(self, timeout: float) -> bytes:
-        """Return the next message. Raises Hung if the trial hangs, and Died if the process ends."""
+        """Return the next message. Raises TimeoutError if the trial hangs, and EOFError if it ends."""
         while True:
             try:
                 return super().answer(timeout)
-            except worker_pool.Hung:
+            except TimeoutError:
                 if Path(self._folder.name, HANGS).exists():
                     raise
 

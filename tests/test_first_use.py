@@ -5,11 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 
-import msgspec
-
-from compose.scenario.scenario_file import setting
-from compose.sweep.worker import Chunk, TrialOptions
-
 AT_ONCE = """
 import sys, threading
 sys.setswitchinterval(1e-7)
@@ -37,22 +32,12 @@ def decode_all():
     for frame, kind in frames:
         decode(frame, kind)
 """
-CHUNKS = """
-import sys
-from compose.sweep import worker_pool
-
-chunk = sys.stdin.buffer.read()
-worker_pool.dismiss("over")  # so no process is started
-
-def decode_all():
-    worker_pool.run("over", chunk)
-"""
 
 
-def of_four_threads(code: str, given: bytes = b"") -> tuple[int, str]:
+def of_four_threads(code: str) -> tuple[int, str]:
     """Return the exit status of a new process, and how many of its threads could run `decode_all`."""
     ended = subprocess.run(
-        [sys.executable, "-c", code + AT_ONCE], input=given, stdout=subprocess.PIPE, check=False, timeout=60.0
+        [sys.executable, "-c", code + AT_ONCE], stdout=subprocess.PIPE, check=False, timeout=60.0
     )
     return ended.returncode, ended.stdout.decode().strip()
 
@@ -60,9 +45,3 @@ def of_four_threads(code: str, given: bytes = b"") -> tuple[int, str]:
 def test_several_threads_can_be_the_first_that_decode_messages() -> None:
     for _ in range(3):
         assert of_four_threads(FRAMES) == (0, "4")
-
-
-def test_several_threads_can_be_the_first_that_decode_chunks_of_a_sweep() -> None:
-    chunk = Chunk(0, (0,), (1,), setting("paper-1"), TrialOptions(1, processes=False, timeout=1.0))
-    for _ in range(3):
-        assert of_four_threads(CHUNKS, msgspec.msgpack.encode(chunk)) == (0, "4")

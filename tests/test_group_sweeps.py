@@ -12,7 +12,7 @@ from compose.launch.in_process import run_mission
 from compose.scenario.scenario_file import load, scenario_table, validate
 from compose.sweep import spec
 from compose.sweep.cells import cells
-from compose.sweep.group_columns import GROUP_COLUMNS, group_columns
+from compose.sweep.group_columns import GroupColumns, group_columns
 from compose.sweep.statistics import columns_of
 from compose.sweep.table import schema_of
 from compose.sweep.trial import Trial, run_trial
@@ -61,15 +61,19 @@ def test_a_claim_that_is_off_is_counted_as_wrong() -> None:
 
 def test_honest_robots_and_their_meetings_with_an_attacker_are_counted() -> None:
     scenario = group_of(3, 1, attacker=1, attack=SCALED)
-    found = run_trial(trial(scenario, audit=True))
+    row = run_trial(trial(scenario, audit=True))
+    found = row.group
+    assert found is not None
     assert (found.honest_localised, found.honest_undecided, found.honest_wrong) == (2, 0, 0)
     assert found.attacker_met is not None
     assert found.attacker_found is not None
     assert 1 <= found.attacker_found <= found.attacker_met <= 2
     assert found.honest_tick is not None
-    assert found.ticks is not None
-    assert found.honest_tick < found.ticks  # the attacker is not localised
-    assert run_trial(trial(scenario)).attacker_met is None
+    assert row.ticks is not None
+    assert found.honest_tick < row.ticks  # the attacker is not localised
+    unaudited = run_trial(trial(scenario)).group
+    assert unaudited is not None
+    assert unaudited.attacker_met is None
 
 
 def test_a_robot_that_makes_no_claim_is_counted() -> None:
@@ -103,8 +107,8 @@ def test_the_robot_r1_of_a_drawn_group_may_have_an_attack() -> None:
 def test_only_sweeps_of_groups_have_the_columns_of_groups(name: str, of_group: bool) -> None:
     sweep = spec.load(name)
     names = set(schema_of(sweep, list(cells(sweep))[:1]).names)
-    assert (set(GROUP_COLUMNS) <= names) == of_group
-    assert bool(set(GROUP_COLUMNS) & names) == of_group
+    assert (set(GroupColumns.__struct_fields__) <= names) == of_group
+    assert bool(set(GroupColumns.__struct_fields__) & names) == of_group
     assert ("makespan_p50" in columns_of(sweep)) == of_group
     assert ("honest_wrong" in columns_of(sweep)) == of_group
 

@@ -311,7 +311,7 @@ def test_trials_that_raise_die_or_hang_are_rows_and_the_others_go_on(folder: Pat
     errors = {row["trial"]: row["error"] for row in found if row["error"] is not None}
     assert errors == {
         1: "ValueError: two\\nlines",
-        3: "died: exit status 3",
+        3: "died: its process ended with status 3",
         5: "hung: no answer within 1.5 s",
     }
     assert {row["outcome"] for row in found if row["error"] is not None} == {"failed"}

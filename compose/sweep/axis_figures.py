@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import pyarrow as pa
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
@@ -18,7 +17,7 @@ from matplotlib.ticker import LogFormatter
 from compose.figures.style import SWEEP_MEDIUM, look, save
 from compose.sweep.execution import Results
 from compose.sweep.spec import Axis, Sweep
-from compose.sweep.statistics import CellTrials, Floats, Interval, column, quantile, wilson
+from compose.sweep.statistics import CellTrials, Interval, quantile, wilson
 
 STYLES = (
     ("#0b3c6f", "-", "o"),
@@ -59,84 +58,74 @@ class FigurePoint(NamedTuple):
 
 
 class Statistic(NamedTuple):
-    """A rate or quantiles of the trials of a cell."""
+    """A rate or quantiles of trials."""
 
     label: str
     """The label of the vertical axis."""
-    estimates: Callable[[pa.Table], dict[str, Interval]]
-    """Returns the estimates from the trials of a table by their names; none if there are none."""
-    drawn: Callable[[pa.Table], bool] = lambda _: True
-    """Returns true if the figure says something about the trials of a table."""
-    logarithmic: bool = False
+    outcome: str = ""
+    """The outcome of a rate, among all trials that ran; empty for the quantiles of a column."""
+    column: str = ""
+    """The column whose QUANTILES are drawn."""
 
-
-def _rate(outcome: str) -> Callable[[pa.Table], dict[str, Interval]]:
-    """Return the function that estimates the rate of `outcome`."""
-
-    def estimates(table: pa.Table) -> dict[str, Interval]:
-        outcomes = CellTrials(table).outcomes
-        return {"": wilson(outcomes.count(outcome), len(outcomes))} if outcomes else {}
-
-    return estimates
-
-
-def _quantiles(values: Callable[[pa.Table], Floats]) -> Callable[[pa.Table], dict[str, Interval]]:
-    """Return the function that estimates QUANTILES of `values`."""
-
-    def estimates(table: pa.Table) -> dict[str, Interval]:
-        found = values(table)
-        return {name: quantile(found, p) for name, p in QUANTILES.items()} if len(found) else {}
-
-    return estimates
+    def estimates(self, trials: CellTrials) -> dict[str, Interval]:
+        """Return the estimates from `trials` by their names; none if there are none."""
+        if self.outcome:
+            n = len(trials.outcomes)
+            return {"": wilson(trials.outcomes.count(self.outcome), n)} if n else {}
+        known = trials.known(self.column)
+        return {name: quantile(known, p) for name, p in QUANTILES.items()} if len(known) else {}
 
 
 STATISTICS = {
-    "success": Statistic("localised, of all trials", _rate("localised")),
-    "inconsistent": Statistic(
-        "inconsistent, of all trials",
-        _rate("inconsistent"),
-        lambda table: "inconsistent" in table["outcome"].to_pylist(),
-    ),
-    "wrong": Statistic(
-        "wrong, of all trials", _rate("wrong"), lambda table: "wrong" in table["outcome"].to_pylist()
-    ),
-    "ticks": Statistic(
-        "ticks until localised", _quantiles(lambda table: CellTrials(table).ticks), logarithmic=True
-    ),
-    "wall": Statistic(
-        "wall time [s]",
-        _quantiles(lambda table: column(table, "wall_s")),
-        lambda table: table["kills"].null_count < len(table),
-    ),
+    "success": Statistic("localised, of all trials", "localised"),
+    "inconsistent": Statistic("inconsistent, of all trials", "inconsistent"),
+    "wrong": Statistic("wrong, of all trials", "wrong"),
+    "ticks": Statistic("ticks until localised", column="ticks"),
+    "wall": Statistic("wall time [s]", column="wall_s"),
 }
-"""The figures over an axis, by the start of their file names; `wall` is that of sweeps with kills."""
+"""The figures over an axis, by the start of their file names."""
+
+
+def _drawn(title: str, trials: CellTrials) -> bool:
+    """Return whether a figure says something about `trials`; the wall time is that of sweeps with kills."""
+    match title:
+        case "inconsistent" | "wrong":
+            return title in trials.outcomes
+        case "wall":
+            return len(trials.known("kills")) > 0
+    return True
 
 
 def draw(results: Results, folder: Path) -> None:
     """Draw all figures of the sweep into `folder`, each as SVG, PDF and PNG."""
     folder.mkdir(exist_ok=True)
+    trials = CellTrials(results.table)
     with look(SWEEP_MEDIUM):
         for place, axis in enumerate(results.sweep.axes):
-            if len(axis.values) < 2:
-                continue
             name = re.sub(r"[^A-Za-z0-9_-]+", "-", axis.name).strip("-")
             for title, statistic in STATISTICS.items():
-                if statistic.drawn(results.table):
+                if len(axis.values) > 1 and _drawn(title, trials):
                     figure = over_axis(results.sweep, place, statistic, points(results, place, statistic))
                     save(figure, folder / f"{title}-{name}")
 
 
 def points(results: Results, place: int, statistic: Statistic) -> list[FigurePoint]:
-    """Return the points of `statistic` over the axis at index `place`."""
-    axis = results.sweep.axes[place]
-    return [
-        FigurePoint(line, x, name, *estimate)
-        for line, chosen in _lines(results, place)
-        for x in range(len(axis.values))
-        for name, estimate in statistic.estimates(
-            results.of(*[i for i in chosen if results.cells[i].place[place] == x])
-        ).items()
-    ]
+    """Return the points of `statistic` over the axis at index `place`.
+
+    There is a line for each combination of values of the distinguished axes; cells of the others are pooled.
+    """
+    axes, distinguished = results.sweep.axes, _distinguished(results.sweep, place)
+    found = []
+    for *choice, x in product(*[range(len(axes[i].values)) for i in (*distinguished, place)]):
+        pooled = [
+            cell.index
+            for cell in results.cells
+            if [cell.place[i] for i in (*distinguished, place)] == [*choice, x]
+        ]
+        line = ", ".join([_named(axes[i], value) for i, value in zip(distinguished, choice, strict=True)])
+        estimates = statistic.estimates(CellTrials(results.of(*pooled)))
+        found += [FigurePoint(line, x, name, *estimate) for name, estimate in estimates.items()]
+    return found
 
 
 def over_axis(sweep: Sweep, place: int, statistic: Statistic, points: Sequence[FigurePoint]) -> Figure:
@@ -170,27 +159,14 @@ def over_axis(sweep: Sweep, place: int, statistic: Statistic, points: Sequence[F
     axes.set_ylabel(f"{statistic.label} (95 % interval)" if bounded else statistic.label)
     if not points:
         axes.annotate("no such trial", (0.5, 0.5), xycoords="axes fraction", ha="center")
-    elif statistic.logarithmic:
+    elif statistic.column == "ticks":
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter("{x:.0f}")
         axes.yaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False, minor_thresholds=(1.0, 0.4)))
         axes.grid(axis="y", which="minor", lw=0.25, color="0.9")
-    _legend(figure, axes, _unpaired(sweep, place))
+    others = [one for one in sweep.axes if one is not axis and len(one.values) > 1]
+    _legend(figure, axes, [one.name for one in others if not one.paired])
     return figure
-
-
-def _lines(results: Results, place: int) -> Iterator[tuple[str, set[int]]]:
-    """Yield the label and the cells of each line of a figure over the axis at index `place`.
-
-    There is one for each combination of values of the distinguished axes; cells of the others are pooled.
-    """
-    axes, distinguished = results.sweep.axes, _distinguished(results.sweep, place)
-    for choice in product(*[range(len(axes[i].values)) for i in distinguished]):
-        label = ", ".join([_named(axes[i], value) for i, value in zip(distinguished, choice, strict=True)])
-        yield (
-            label,
-            {cell.index for cell in results.cells if tuple([cell.place[i] for i in distinguished]) == choice},
-        )
 
 
 def _distinguished(sweep: Sweep, place: int) -> tuple[int, ...]:
@@ -244,15 +220,8 @@ def _numbers(axis: Axis) -> list[float] | None:
     return [float(value) for value in values]
 
 
-def _unpaired(sweep: Sweep, place: int) -> str | None:
-    """Return the title of a legend whose lines have other draws, with their axes; None if all are paired."""
-    axes = [axis for i, axis in enumerate(sweep.axes) if i != place and len(axis.values) > 1]
-    names = [axis.name for axis in axes if not axis.paired]
-    return f"other draws at each value of {', '.join(names)}" if names else None
-
-
-def _legend(figure: Figure, axes: Axes, title: str | None) -> None:
-    """Add a legend with this title above the axes, unless there are no labels."""
+def _legend(figure: Figure, axes: Axes, unpaired: Sequence[str]) -> None:
+    """Add a legend above the axes, unless there are no labels; its title names the axes with other draws."""
     handles, labels = axes.get_legend_handles_labels()
     if labels:
         longest = max(map(len, labels))
@@ -260,7 +229,7 @@ def _legend(figure: Figure, axes: Axes, title: str | None) -> None:
         figure.legend(
             handles,
             labels,
-            title=title,
+            title=f"other draws at each value of {', '.join(unpaired)}" if unpaired else None,
             loc="outside upper center",
             ncols=min(columns, len(labels)),
             frameon=False,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import product
 from typing import Any
 
@@ -12,7 +12,7 @@ import msgspec
 from compose.errors import Unworkable
 from compose.scenario.scenario_file import ScenarioTemplate, validate
 from compose.sweep.field_paths import canonical, with_value
-from compose.sweep.spec import Sweep
+from compose.sweep.spec import Axis, Sweep
 
 
 class Cell(msgspec.Struct, frozen=True):
@@ -29,6 +29,10 @@ class Cell(msgspec.Struct, frozen=True):
     table: dict[str, Any]
     """parsed table of its scenario file"""
 
+    def on_axes(self, axes: Sequence[Axis]) -> list[Any]:
+        """Return its values in the columns of `axes`: the label, if an axis has some, and those of fields."""
+        return [value for axis, i in zip(axes, self.place, strict=True) for value in axis.row(i)]
+
     @property
     def file_name(self) -> str:
         """The name of its scenario file."""
@@ -43,8 +47,8 @@ class RefusedCell(msgspec.Struct, frozen=True):
 
 def cells(sweep: Sweep) -> Iterator[Cell]:
     """Yield the cells of `sweep` in order; the last axis varies fastest."""
-    for index, place in enumerate(product(*[range(len(axis.values)) for axis in sweep.axes])):
-        yield _cell(sweep, index, place)
+    places = product(*[range(len(axis.values)) for axis in sweep.axes])
+    return (_cell(sweep, index, place) for index, place in enumerate(places))
 
 
 def cell_at(sweep: Sweep, index: int) -> Cell | None:
@@ -64,13 +68,12 @@ def _cell(sweep: Sweep, index: int, place: tuple[int, ...]) -> Cell:
     fields: dict[str, Any] = {}
     unpaired: dict[str, Any] = {}
     for axis, i in zip(sweep.axes, place, strict=True):
+        fields |= zip(axis.fields, axis.values[i], strict=True)
         for field, way, value in zip(axis.fields, axis.ways, axis.values[i], strict=True):
-            fields[field] = value
-            if value is None:
-                continue
-            table = with_value(table, way, value)
-            if not axis.paired:
-                unpaired[field] = value
+            if value is not None:
+                table = with_value(table, way, value)
+                if not axis.paired:
+                    unpaired[field] = value
     return Cell(index, place, fields, canonical(unpaired), table)
 
 

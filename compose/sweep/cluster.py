@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import secrets
 import tempfile
-import time
+from collections import deque
 from collections.abc import Callable, Coroutine, Iterator, Sequence
 from concurrent.futures import CancelledError, Future
 from contextlib import contextmanager, suppress
@@ -21,24 +22,25 @@ from distributed.security import Security
 
 from compose.errors import UserError
 from compose.sweep import worker_pool
-from compose.sweep.remaining_work import EngineFailed, Work, chunks_of
+from compose.sweep.execution import EngineFailed
 from compose.sweep.trial import TrialRow, lost
-from compose.sweep.worker import MAX_ERROR, Chunk, TrialOptions
+from compose.sweep.worker import Chunk, error_text
+from compose.sweep.worker_pool import Answers
 from protocol.network.inbox import Inbox
 from protocol.output import one_line
 
 T = TypeVar("T")
 
-CHUNKS_PER_THREAD = 2
-"""The number of chunks submitted per worker thread: one that runs, and one that waits."""
+MOST_CHUNKS = 256
+"""The largest number of chunks that are submitted at once."""
+MAX_CHUNK = 1000
+"""The largest number of trials in a chunk."""
+SHARES = 4
+"""The number of shares into which the trials that are left of a cell are divided, one of which is a chunk."""
 SCHEMES = ("tcp", "tls", "ws", "wss")
 """The schemes that the address of a scheduler may have."""
 SCHEDULER_S = 5.0
 """The time in s within which a scheduler must answer when a sweep begins, and its workers when it ends."""
-THREADS_COUNT_S = 1.0
-"""The time in s between two counts of the worker threads."""
-CHUNK_RETRIES = 2
-"""The number of retries of a chunk whose worker could not start a process for trials."""
 CONNECTED = ("running", "connecting")
 """The states of a client that has a connection to its scheduler, or tries to restore it."""
 CONNECTION_LOST = "the connection to the scheduler is lost"
@@ -46,10 +48,10 @@ SCHEDULER_ADDRESS = "127.0.0.1:0"
 
 
 @contextmanager
-def connect(workers: int, scheduler: str | None) -> Iterator[Client]:
+def connect(workers: int, scheduler: str | None, say: Callable[[str], None]) -> Iterator[Client]:
     """Yield a Dask client of `workers` threads in this process, or of the scheduler at an address.
 
-    Raises UserError if the scheduler cannot be reached.
+    `say` prints a line if the scheduler has no workers. Raises UserError if it cannot be reached.
     """
     dask.config.set({"distributed.admin.tick.limit": "1h"})
     for name in ["distributed", *logging.root.manager.loggerDict]:
@@ -57,7 +59,8 @@ def connect(workers: int, scheduler: str | None) -> Iterator[Client]:
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # this program reports errors itself
     if scheduler is not None:
         try:
-            asyncio.run(_look_for(scheduler))
+            if not asyncio.run(_workers(scheduler)):
+                say("the scheduler has no workers yet")
             client = Client(scheduler, set_as_default=False)
         except (OSError, ValueError, TypeError, RuntimeError, ImportError) as error:
             why = one_line(str(error).splitlines()[0] if str(error) else type(error).__name__)
@@ -98,8 +101,11 @@ def _system_errors() -> Iterator[None]:
         raise cause from None
 
 
-async def _look_for(address: str) -> None:
-    """Raise an error unless a scheduler answers within SCHEDULER_S. A Client would wait for ever."""
+async def _workers(address: str) -> int:
+    """Return the number of workers of a scheduler.
+
+    Raises an error unless it answers within SCHEDULER_S: a Client would wait for ever.
+    """
     scheme, location = parse_address(address)
     if scheme not in SCHEMES:
         raise ValueError(f"the scheme '{scheme}' is none of {', '.join(SCHEMES)}")
@@ -113,55 +119,37 @@ async def _look_for(address: str) -> None:
         raise TimeoutError(f"no answer within {SCHEDULER_S:g} s") from None
     if known.get("type") != "Scheduler":
         raise ValueError(f"the process at this address is a {known.get('type', 'stranger')}, not a scheduler")
+    return len(known["workers"])
 
 
-def play(
-    client: Client,
-    work: Sequence[Work],
-    orders: TrialOptions,
-    inbox: Inbox,
-    done: Callable[[list[TrialRow]], None],
-) -> None:
-    """Run all of `work`, and call `done` with the rows of each chunk as it completes.
+def play(client: Client, work: Sequence[Chunk], inbox: Inbox, done: Callable[[list[TrialRow]], None]) -> None:
+    """Run all trials of `work`, and call `done` with the rows of each chunk of them as it completes.
 
+    A chunk is a share of what is left of a cell, so that all worker threads get work, however many they are.
     A scheduler that is slow to answer, as on a busy machine, is waited for as long as its connection lives.
     Raises Interrupted if `inbox` receives a signal, and EngineFailed if the connection to the scheduler is
     lost. In any case, all chunks are cancelled and their processes ended.
     """
     sweep = secrets.token_hex(8)
-    running: dict[str, tuple[Future[list[bytes]], Chunk, Work]] = {}
-    counted = _begun(client, _threads(client))
-    counted.add_done_callback(lambda _: inbox.put("ended"))
+    left = deque(work)
+    running: dict[str, tuple[Future[Answers], Chunk]] = {}
     try:
-        while not counted.done():
-            inbox.next(THREADS_COUNT_S)
-        threads, looked = counted.result(), time.monotonic()
-        if not threads:
-            inbox.say("the scheduler has no workers yet")
-        chunks = chunks_of(work, orders, lambda: max(threads, 1))
-        while True:
-            while (
-                len(running) < CHUNKS_PER_THREAD * max(threads, 1)
-                and (following := next(chunks, None)) is not None
-            ):
-                chunk, source = following
-                outcome = _begun(client, _outcome(client, sweep, msgspec.msgpack.encode(chunk)))
-                running[str(id(outcome))] = outcome, chunk, source
+        while left or running:
+            while left and len(running) < MOST_CHUNKS:
+                trials = left.popleft()
+                chunk, rest = trials.split(min(math.ceil(len(trials.trials) / SHARES), MAX_CHUNK))
+                left.extendleft(rest)
+                outcome = _begun(client, _outcome(client, sweep, chunk))
+                running[str(id(outcome))] = outcome, chunk
                 outcome.add_done_callback(lambda ended: inbox.put("ended", str(id(ended))))
-            if not running:
-                return
-            arrival = inbox.next(THREADS_COUNT_S)
+            arrival = inbox.next(None)
             if arrival.key in running:
-                outcome, chunk, source = running.pop(arrival.key)
+                outcome, chunk = running.pop(arrival.key)
                 rows = _rows(outcome, chunk)
-                source.took(rows, orders.timeout)
+                left.extendleft(chunk.split(len(rows))[1])
                 done(rows)
-            if counted.done() and time.monotonic() - looked > THREADS_COUNT_S:
-                threads, looked = counted.result(), time.monotonic()
-                counted = _begun(client, _threads(client))
     finally:
-        counted.cancel()
-        for outcome, _, _ in running.values():
+        for outcome, _ in running.values():
             outcome.cancel()
         _begun(client, _dismiss(client, sweep)).result()
         worker_pool.dismiss(sweep)
@@ -172,54 +160,47 @@ def _begun(client: Client, coroutine: Coroutine[Any, Any, T]) -> Future[T]:
     return asyncio.run_coroutine_threadsafe(coroutine, client.loop.asyncio_loop)  # type: ignore[union-attr]
 
 
-async def _outcome(client: Client, sweep: str, encoded: bytes) -> list[bytes]:
-    """Return the encoded rows of an encoded chunk, which the workers of `client` run.
+async def _outcome(client: Client, sweep: str, chunk: Chunk) -> Answers:
+    """Return the answers to a chunk, which the workers of `client` run.
 
     If a worker dies while it runs the chunk, or before its rows are here, Dask runs the chunk on another one.
     If the connection to the scheduler breaks, Dask cancels the chunk and connects again, and the chunk is
     submitted again. Raises EngineFailed if Dask cannot connect, and any error of the chunk.
     """
+    given = sweep, msgspec.msgpack.encode(chunk), chunk.options.timeout
     future = None
     while client.status in CONNECTED:
         if future is None or future.cancelled():
-            future = client.submit(worker_pool.run, sweep, encoded, pure=False, retries=CHUNK_RETRIES)
+            future = client.submit(worker_pool.run, *given, pure=False)
         try:
-            rows: list[bytes] = await future
+            answers: Answers = await future
         except (CancelledError, OSError):
             if future.status == "error":  # of the chunk
                 raise
         else:
-            return rows
+            return answers
     raise EngineFailed(CONNECTION_LOST)
 
 
-def _rows(outcome: Future[list[bytes]], chunk: Chunk) -> list[TrialRow]:
-    """Return the rows of a chunk that has ended; if its worker or process died, each row is a lost trial.
+def _rows(outcome: Future[Answers], chunk: Chunk) -> list[TrialRow]:
+    """Return the rows of the first trials of a chunk; a trial whose process or worker died is a lost one.
 
     Raises EngineFailed if the connection to the scheduler is lost, or the worker failed for another reason.
     """
-    error = outcome.exception()
-    if error is None:
-        return [msgspec.msgpack.decode(row, type=TrialRow) for row in outcome.result()]
-    if isinstance(error, EngineFailed):
-        raise error
-    error_text = one_line(f"lost: {type(error).__name__}: {error}")[:MAX_ERROR]
-    if not isinstance(error, KilledWorker | worker_pool.Died | worker_pool.Hung):
-        # every chunk would fail like this one
-        raise EngineFailed(f"a worker cannot run trials: {error_text}")
-    return [
-        lost(chunk.cell, trial, seed, error_text, None)
-        for trial, seed in zip(chunk.trials, chunk.seeds, strict=True)
-    ]
-
-
-async def _threads(client: Client) -> int:
-    """Return the number of worker threads. Raises EngineFailed if the connection to the scheduler is lost."""
-    while client.status in CONNECTED:
-        with suppress(OSError):  # Dask connects again
-            return sum((await client.nthreads()).values())
-        await asyncio.sleep(THREADS_COUNT_S)
-    raise EngineFailed(CONNECTION_LOST)
+    numbers = list(zip(chunk.trials, chunk.seeds, strict=True))
+    try:
+        answers = outcome.result()
+    except KilledWorker as error:
+        return [lost(chunk.cell, *one, error_text(f"lost: KilledWorker: {error}"), None) for one in numbers]
+    except EngineFailed:
+        raise
+    except Exception as error:  # noqa: BLE001  # every chunk would fail like this one
+        why = error_text(f"lost: {type(error).__name__}: {error}")
+        raise EngineFailed(f"a worker cannot run trials: {why}") from None
+    rows = [msgspec.msgpack.decode(row, type=TrialRow) for row in answers.rows]
+    if answers.error:
+        rows.append(lost(chunk.cell, *numbers[len(rows)], answers.error, answers.wall_s))
+    return rows
 
 
 async def _dismiss(client: Client, sweep: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -14,19 +14,22 @@ import pyarrow as pa
 from compose.errors import BadSpec
 from compose.scenario.scenario_file import trust_classes
 from compose.sweep import SUMMARY_CSV
-from compose.sweep.cells import Cell, RefusedCell, setting_of
+from compose.sweep.cells import Cell, RefusedCell, setting_of, trial_seed
 from compose.sweep.paired_differences import PairedDifference, differences_csv, paired_differences
-from compose.sweep.remaining_work import EngineFailed, Work
 from compose.sweep.results_folder import Folder, opened
 from compose.sweep.spec import Sweep
-from compose.sweep.statistics import CellSummary, counted, header, summary_csv
+from compose.sweep.statistics import CellSummary, by_cell, counted, header, summary_csv
 from compose.sweep.trial import TrialRow
-from compose.sweep.worker import PLAY, TrialOptions
+from compose.sweep.worker import PLAY, Chunk, TrialOptions
 from protocol import files
 from protocol.network.inbox import Inbox, Interrupted
 
 DIFFERENCES = "differences.csv"
 """The name of the table of differences between cells of paired axes."""
+
+
+class EngineFailed(Exception):
+    """The sweep cannot continue. The text gives the reason."""
 
 
 class ExecutionOptions(msgspec.Struct, frozen=True):
@@ -98,7 +101,7 @@ def sweep(
         check_columns(sweep, folder.schema)
         if means.retry:
             folder.forget_lost()
-        work = _left(folder, progress)
+        work = _left(folder, means, progress)
         stopped, interrupted = None, False
         if work:
             try:
@@ -122,45 +125,44 @@ def check_columns(sweep: Sweep, schema: pa.Schema) -> None:
                 raise BadSpec(f"{sweep.source}: axis: {count} columns would have the name '{name}'")
 
 
-def _left(folder: Folder, progress: Progress) -> list[Work]:
-    """Return the trials that still have to run. Only the scenarios of their cells are validated.
+def _left(folder: Folder, means: ExecutionOptions, progress: Progress) -> list[Chunk]:
+    """Return the trials of each cell that still have to run. Only the scenarios of these cells are validated.
 
     Raises BadSpec if all cells are refused.
     """
-    sweep, refused = folder.sweep, dict(folder.refused)
-    done = folder.done()
+    sweep, refused, done = folder.sweep, dict(folder.refused), folder.done()
     surplus = sum([trial >= sweep.trials for trials in done.values() for trial in trials])
     if surplus:
         progress.say(f"{folder.path} holds {surplus} trials beyond the {sweep.trials} per cell; kept")
+    options = TrialOptions(
+        sweep.seed, means.processes, sweep.trial_timeout, means.play, means.audit, sweep.draws
+    )
     work = []
-    count = 0
     for cell in folder.cells.values():
-        if cell.index in refused:
-            continue
-        count += sweep.trials
         left = [trial for trial in range(sweep.trials) if trial not in done[cell.index]]
-        if not left:
+        if not left or cell.index in refused:
             continue
         trust_classes(cell.table)  # of the user's sweep: a folder with another one is refused
         setting = setting_of(sweep, cell)
         if isinstance(setting, RefusedCell):
             refused[cell.index] = setting.reason
-            count -= sweep.trials
         else:
-            work.append(Work(cell.index, cell.key, setting, left, cell.table))
+            seeds = tuple([trial_seed(sweep.seed, cell.key, trial) for trial in left])
+            table = cell.table if sweep.draws else {}
+            work.append(Chunk(cell.index, tuple(left), seeds, setting, options, table))
     if len(refused) == len(folder.cells):
         first, reason = next(iter(refused.items()))
         raise BadSpec(f"{sweep.source}: no cell can run; cell {first}: {reason}")
     folder.ask(refused)
     for part in folder.ignored:
         progress.say(f"{part} cannot be read: its trials will run again")
-    progress.begin(count - sum([len(one.trials) for one in work]), count)
+    progress.begin(folder.trials - sum([len(one.trials) for one in work]), folder.trials)
     return work
 
 
 def _play(
     folder: Folder,
-    work: list[Work],
+    work: list[Chunk],
     means: ExecutionOptions,
     inbox: Inbox,
     progress: Progress,
@@ -170,10 +172,6 @@ def _play(
 
     Raises Interrupted on a signal, EngineFailed if the scheduler is lost, and UserError if it is unreachable.
     """
-    sweep = folder.sweep
-    orders = TrialOptions(
-        sweep.seed, means.processes, sweep.trial_timeout, means.play, means.audit, sweep.draws
-    )
 
     def store(rows: list[TrialRow]) -> None:
         folder.add(rows)
@@ -182,16 +180,16 @@ def _play(
     from compose.sweep import cluster  # noqa: PLC0415  # importing Dask takes a second
 
     pa.array([])  # its first call imports pandas, where it is installed: another second
-    with cluster.connect(means.workers, means.scheduler) as client:
+    with cluster.connect(means.workers, means.scheduler, inbox.say) as client:
         take_signals()
-        cluster.play(client, work, orders, inbox, store)
+        cluster.play(client, work, inbox, store)
 
 
 def _gathered(folder: Folder, stopped: str | None, interrupted: bool) -> Results:
     """Write the tables of trials and cells, and return the results. A failure to write sets `stopped`."""
     table = folder.table()
     cells = tuple(folder.cells.values())
-    figures = _figures(table, cells, folder.refused)
+    figures = {i: counted(one, folder.refused.get(i)) for i, one in by_cell(table, cells).items()}
     differences = paired_differences(folder.sweep, cells, table)
     try:
         folder.gather(table)
@@ -200,15 +198,4 @@ def _gathered(folder: Folder, stopped: str | None, interrupted: bool) -> Results
             files.write(folder.path / DIFFERENCES, differences_csv(differences))
     except OSError as error:
         stopped = stopped or f"cannot be written: {files.error_text(error)}"
-    trials = folder.sweep.trials * (len(cells) - len(folder.refused))
-    return Results(folder.sweep, cells, table, figures, stopped, interrupted, trials, differences)
-
-
-def _figures(table: pa.Table, cells: tuple[Cell, ...], refused: Mapping[int, str]) -> dict[int, CellSummary]:
-    """Return the statistics of each cell; `table` is sorted by cell."""
-    ends = table["cell"].to_numpy().searchsorted([cell.index for cell in cells], side="right")
-    begins = [0, *ends[:-1]]
-    return {
-        cell.index: counted(table.slice(begin, end - begin), refused.get(cell.index))
-        for cell, begin, end in zip(cells, begins, ends, strict=True)
-    }
+    return Results(folder.sweep, cells, table, figures, stopped, interrupted, folder.trials, differences)

@@ -18,7 +18,8 @@ from protocol.spelling import did_you_mean
 
 Steps = tuple[str | int, ...]
 """A parsed path: table keys and list indices, from the top of the file."""
-_STEP = re.compile(r"(?P<dot>\.?)(?:(?P<key>[A-Za-z0-9_-]+)|\[(?P<place>[0-9]{1,4})\])")
+_STEP = re.compile(r"([A-Za-z0-9_-]+)|\[([0-9]{1,4})\]")
+_PATH = re.compile(r"[A-Za-z0-9_-]+(\.[A-Za-z0-9_-]+|\[[0-9]{1,4}\])*")
 SEED_FIELD = "seed"
 """The field that a sweep cannot vary, because every trial has its own seed."""
 
@@ -102,17 +103,10 @@ def value_at(table: Mapping[str, Any], way: Steps) -> Any:
 
 def _split(path: str) -> list[str | int]:
     """Return the steps of a path. Raises NoSuchField if its syntax is wrong."""
-    found: list[str | int] = []
-    at = 0
-    while at < len(path):
-        match = _STEP.match(path, at)
-        if match is None or bool(match["dot"]) != (at > 0 and match["key"] is not None):
-            raise NoSuchField("not a path such as mission.period, robot.a.start or robot[1].anchor[0]")
-        found.append(match["key"] or int(match["place"]))
-        at = match.end()
-    if not found:
-        raise NoSuchField("is empty")
-    return found
+    if not _PATH.fullmatch(path):
+        example = "not a path such as mission.period, robot.a.start or robot[1].anchor[0]"
+        raise NoSuchField(example if path else "is empty")
+    return [key or int(place) for key, place in _STEP.findall(path)]
 
 
 def _written(walked: Sequence[str | int]) -> str:

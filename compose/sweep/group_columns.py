@@ -17,22 +17,29 @@ from world.referee import mistake
 from world.scenario import Scenario
 
 
-class GroupColumns(msgspec.Struct, frozen=True):
-    """The columns of TrialRow that only trials of groups have; see there."""
+class GroupColumns(msgspec.Struct, frozen=True, array_like=True):
+    """The columns of a row that only trials of groups have."""
 
     bound_ticks: int
+    """the computed bound in ticks until all its robots are localised"""
     corrected_ticks: int | None
+    """the last of the bounds that correct it, if a robot was late"""
     travel_ticks: float | None
+    """a lower bound of these ticks, in which robots only travel after the first meetings, which end when they
+    did"""
     honest_tick: int | None
+    """tick of the last claim of an honest robot: one without an attack that does not die; None if one has no
+    claim at the end"""
     honest_localised: int
+    """number of honest robots whose claims are right"""
     honest_undecided: int
+    """number of honest robots that have no claim at the end"""
     honest_wrong: int
+    """number of honest robots whose claims are wrong"""
     attacker_met: int | None
+    """number of meetings of honest robots with one that has an attack; None if the trial was not audited"""
     attacker_found: int | None
-
-
-GROUP_COLUMNS = GroupColumns.__struct_fields__
-"""The names of these columns."""
+    """number of these in which the robot reported that the other's data are inconsistent"""
 
 
 def group_columns(run: Run) -> GroupColumns | None:

@@ -6,11 +6,10 @@ the difference of their results has a smaller variance than that of two medians.
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Sequence
 from statistics import NormalDist
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -19,7 +18,10 @@ from scipy.special import stdtrit  # type: ignore[import-untyped]
 
 from compose.sweep.cells import Cell
 from compose.sweep.spec import Sweep
-from compose.sweep.statistics import CONFIDENCE, Floats, column
+from compose.sweep.statistics import CONFIDENCE, CellTrials, Floats, Number, by_cell, column, csv_text
+
+MaybeInterval = tuple[Number, Number, Number]
+"""An estimate and the bounds of its interval, each None where there are too few values."""
 
 
 class PairedDifference(msgspec.Struct, frozen=True):
@@ -63,66 +65,42 @@ class PairedDifference(msgspec.Struct, frozen=True):
 
 
 def paired_differences(sweep: Sweep, cells: Sequence[Cell], table: pa.Table) -> tuple[PairedDifference, ...]:
-    """Return the differences of all cells of paired axes, in the order of the axes and of their cells.
-
-    `table` has the trials of the sweep, sorted by cell.
-    """
-    places = {cell.place: cell for cell in cells}
-    numbers = table["cell"].to_numpy()
-    trials = {
-        cell.index: _Trials.of(table.slice(begin, end - begin))
-        for cell in cells
-        for begin, end in [np.searchsorted(numbers, [cell.index, cell.index + 1])]
-    }
-    found = []
-    for i, axis in enumerate(sweep.axes):
-        for cell in cells if axis.paired else ():
-            if cell.place[i]:
-                first = places[(*cell.place[:i], 0, *cell.place[i + 1 :])]
-                found.append(
-                    _difference(
-                        (axis.name, axis.label(cell.place[i]), axis.label(0), cell.index, first.index),
-                        trials[cell.index],
-                        trials[first.index],
-                    )
-                )
-    return tuple(found)
-
-
-class _Trials(msgspec.Struct, frozen=True):
-    """The trials of a cell that ran: their numbers, whether they localised, and their ticks."""
-
-    numbers: np.ndarray
-    localised: np.ndarray
-    ticks: Floats
-
-    @classmethod
-    def of(cls, table: pa.Table) -> _Trials:
-        outcomes = table["outcome"].to_pylist()
-        ran = np.array([outcome != "refused" for outcome in outcomes], bool)
-        ran &= table["error"].is_null().to_numpy()
-        localised = np.array([outcome == "localised" for outcome in outcomes], bool)
-        return cls(table["trial"].to_numpy()[ran], localised[ran], column(table, "ticks")[ran])
-
-
-def _difference(names: tuple[str, str, str, int, int], these: _Trials, those: _Trials) -> PairedDifference:
-    """Return the difference of the trials `these` less `those`; both are sorted by number."""
-    shared, i, j = np.intersect1d(these.numbers, those.numbers, return_indices=True)
-    one, other = these.localised[i], those.localised[j]
-    both = one & other
-    only_value, only_reference = int((one & ~other).sum()), int((other & ~one).sum())
-    return PairedDifference(
-        *names,
-        len(shared),
-        int(both.sum()),
-        only_value,
-        only_reference,
-        *mean_interval(these.ticks[i][both] - those.ticks[j][both]),
-        *rate_interval(only_value, only_reference, len(shared)),
+    """Return the differences of all cells of paired axes, in the order of the axes and of their cells."""
+    table = table.filter(table["error"].is_null())
+    index_of = {cell.place: cell.index for cell in cells}
+    trials = {i: CellTrials(one) for i, one in by_cell(table, cells).items()}
+    return tuple(
+        PairedDifference(
+            axis.name,
+            axis.label(cell.place[i]),
+            axis.label(0),
+            cell.index,
+            first,
+            *_difference(trials[cell.index], trials[first]),
+        )
+        for i, axis in enumerate(sweep.axes)
+        for cell in (cells if axis.paired else ())
+        if cell.place[i]
+        for first in [index_of[(*cell.place[:i], 0, *cell.place[i + 1 :])]]
     )
 
 
-def mean_interval(values: Floats) -> tuple[float | None, float | None, float | None]:
+def _difference(these: CellTrials, those: CellTrials) -> tuple[Any, ...]:
+    """Return the fields of a PairedDifference from `pairs` on."""
+    numbers = [one.table["trial"].to_numpy() for one in (these, those)]
+    pairs, *places = np.intersect1d(*numbers, return_indices=True)
+    localised, ticks = [], []
+    for one, place in zip((these, those), places, strict=True):
+        localised.append(np.array(one.localised, bool)[place])
+        ticks.append(column(one.table, "ticks")[place])
+    both = localised[0] & localised[1]
+    only, only_other = [int((one & ~both).sum()) for one in localised]
+    mean = mean_interval((ticks[0] - ticks[1])[both])
+    rate = rate_interval(only, only_other, len(pairs))
+    return len(pairs), int(both.sum()), only, only_other, *mean, *rate
+
+
+def mean_interval(values: Floats) -> MaybeInterval:
     """Return the mean of `values` and the bounds of its interval; None where there are too few."""
     if not len(values):
         return None, None, None
@@ -134,9 +112,7 @@ def mean_interval(values: Floats) -> tuple[float | None, float | None, float | N
     return mean, mean - half, mean + half
 
 
-def rate_interval(
-    only_value: int, only_reference: int, pairs: int
-) -> tuple[float | None, float | None, float | None]:
+def rate_interval(only_value: int, only_reference: int, pairs: int) -> MaybeInterval:
     """Return the difference of two paired rates and the bounds of its interval; None without pairs.
 
     It is Wald's interval after one more pair of each kind that differs (D. G. Bonett and R. M. Price,
@@ -153,8 +129,4 @@ def rate_interval(
 
 def differences_csv(differences: Sequence[PairedDifference]) -> str:
     """Return the text of `differences.csv`."""
-    out = io.StringIO()
-    rows = csv.writer(out, lineterminator="\n")
-    rows.writerow(PairedDifference.__struct_fields__)
-    rows.writerows([msgspec.structs.astuple(one) for one in differences])
-    return out.getvalue()
+    return csv_text(PairedDifference.__struct_fields__, map(msgspec.structs.astuple, differences))

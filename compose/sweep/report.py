@@ -6,11 +6,11 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from datetime import timedelta
+from itertools import chain, count
 from pathlib import Path
 
 from rich import progress as bars
-from rich.table import Column, Table
+from rich.table import Column
 from rich.text import Text
 
 from compose.sweep import SUMMARY_CSV
@@ -26,6 +26,8 @@ from protocol.output import one_line, say
 
 RATE_OVER_S = 10.0
 """The time in s over which the rate of trials is averaged."""
+NO_VALUE = "-"
+"""The text of a value that does not apply."""
 OUTCOME_COLUMNS = ("localised", "undecided", "inconsistent", "wrong", "failed")
 """The columns that count outcomes."""
 COLUMN_NOTES = (
@@ -41,11 +43,6 @@ COLUMN_NOTES = (
     ("nees low", "nees: mean, and the 99 % band for consistent covariances"),
 )
 """The footnotes of the table, each with the column whose presence requires it."""
-COLUMN_CHOICES = tuple(
-    tuple([shown.title for shown in COLUMNS.values() if shown.title and 0 <= shown.rank <= most])
-    for most in range(max([shown.rank for shown in COLUMNS.values()]), -1, -1)
-)
-"""The possible choices of columns. The first that fits the terminal is used. Outcomes are never dropped."""
 SHOWN_GROUP_COLUMNS = ("share p50", "share max", "corrected", "travel p50", "travel p95", "honest")
 """The additional columns of sweeps of groups."""
 OF_ATTACKED_GROUP = ("found",)
@@ -54,6 +51,10 @@ OF_NOISE = ("within", "nees", "nees low", "nees high")
 """The additional columns of sweeps in which robots claim covariances."""
 OF_DIFFERENCES = ("both", "ticks", "low", "high", "rate %", "low", "high")
 """The columns of the table of differences, after the names of the cells."""
+DIFFERENCES_NOTE = (
+    "both: trials that localised in both cells, of all with the same draws; ticks: mean difference of these; "
+    "rate: difference of the shares of all that localised; low, high: 95 % intervals"
+)
 MOST_DIFFERENCES = 50
 """The largest number of differences that are shown; the file has all."""
 MOST_ROWS = 100
@@ -68,20 +69,6 @@ class _Rate(bars.ProgressColumn):
         return Text(f"{task.speed:.3g} trials/s" if task.speed else "")
 
 
-class _Times(bars.ProgressColumn):
-    """The progress column with the elapsed and the remaining time, each with its name."""
-
-    def render(self, task: bars.Task) -> Text:
-        """Return the times as text; Rich calls this method."""
-        left = f", {_clock(task.time_remaining)} left" if task.time_remaining is not None else ""
-        return Text(f"{_clock(task.elapsed or 0.0)} elapsed{left}")
-
-
-def _clock(seconds: float) -> str:
-    """Return a time as hours, minutes and seconds."""
-    return str(timedelta(seconds=round(seconds)))
-
-
 @contextmanager
 def progress(name: str, say: Callable[[str], None], visible: bool) -> Iterator[Progress]:
     """Yield the progress callbacks. If `visible`, they show a bar with the rate and the times."""
@@ -90,7 +77,10 @@ def progress(name: str, say: Callable[[str], None], visible: bool) -> Iterator[P
         bars.BarColumn(bar_width=None, table_column=Column(ratio=1)),
         bars.MofNCompleteColumn(),
         _Rate(Column(no_wrap=True)),
-        _Times(Column(no_wrap=True)),
+        bars.TimeElapsedColumn(Column(no_wrap=True)),
+        bars.TextColumn("elapsed,"),
+        bars.TimeRemainingColumn(table_column=Column(no_wrap=True)),
+        bars.TextColumn("left"),
         console=tables.display_console(sys.stdout),
         disable=not visible,
         transient=True,
@@ -146,17 +136,13 @@ def show(results: Results, out: Path, *, quiet: bool) -> None:
 def _difference_lines(results: Results) -> list[str]:
     """Return the lines of the differences between planners, and of the axes that are not paired."""
     planners = {axis.name for axis in results.sweep.axes if axis.of_planners}
-    rows = [_difference_row(one) for one in results.differences if one.axis in planners]
+    shown = [one for one in results.differences if one.axis in planners][:MOST_DIFFERENCES]
     found = []
-    if rows:
-        shown = rows[:MOST_DIFFERENCES]
-        as_table = tables.unbroken(["difference", "cells"], OF_DIFFERENCES, shown)
-        found += as_table or [line for row in shown for line in _difference_sentence(*row)]
-        found += [""]
-        found += text_width.wrapped(
-            "both: trials that localised in both cells, of all with the same draws; ticks: mean difference "
-            "of these; rate: difference of the shares of all that localised; low, high: 95 % intervals"
+    if shown:
+        found += tables.shown(
+            ["difference", "cells"], OF_DIFFERENCES, [_difference_row(one) for one in shown]
         )
+        found += ["", *text_width.wrapped(DIFFERENCES_NOTE)]
     unpaired = [axis.name for axis in results.sweep.axes if not axis.paired and len(axis.values) > 1]
     if unpaired:
         found += text_width.wrapped(
@@ -167,26 +153,16 @@ def _difference_lines(results: Results) -> list[str]:
 
 
 def _difference_row(one: PairedDifference) -> list[str]:
-    ticks = (one.ticks, one.ticks_low, one.ticks_high)
-    rates = (one.rate, one.rate_low, one.rate_high)
+    rates = [None if value is None else 100.0 * value for value in (one.rate, one.rate_low, one.rate_high)]
     return [
         f"{one.value} - {one.reference}",
         f"{one.cell} - {one.reference_cell}",
         f"{one.both_localised}/{one.pairs}",
-        *["-" if value is None else f"{value:+.1f}" for value in ticks],
-        *["-" if value is None else f"{100.0 * value:+.1f}" for value in rates],
+        *[
+            "-" if value is None else f"{value:+.1f}"
+            for value in (one.ticks, one.ticks_low, one.ticks_high, *rates)
+        ],
     ]
-
-
-def _difference_sentence(
-    difference: str, cells: str, both: str, ticks: str, low: str, high: str, rate: str, *bounds: str
-) -> list[str]:
-    """Return the lines of a row for a terminal on which the table does not fit."""
-    return text_width.wrapped(
-        f"{difference}, cells {cells}: both {both}; ticks {ticks} ({low} to {high}); "
-        f"rate {rate} % ({' to '.join(bounds)})",
-        2,
-    )
 
 
 def _block(lines: Sequence[str]) -> None:
@@ -209,11 +185,8 @@ def _refused(results: Results) -> Iterator[str]:
 
 def _new_folder(name: str) -> Path:
     """Return the path `name`; if it exists, with the first number from 2 on that makes it new."""
-    path, number = Path(name), 1
-    while path.exists():
-        number += 1
-        path = Path(f"{name}-{number}")
-    return path
+    paths = map(Path, chain([name], (f"{name}-{number}" for number in count(2))))
+    return next(path for path in paths if not path.exists())
 
 
 def _audited(results: Results) -> str:
@@ -231,24 +204,23 @@ def _lines(results: Results) -> tuple[list[str], Sequence[str]]:
 
     If none fits, they are those of a list, with a sentence for each cell.
     """
-    choices = _choices(results)
-    for columns in choices:
-        lines = tables.lines(_table(results, columns))
+    names = ["cell", *[axis.name.rpartition(".")[2] for axis in results.sweep.axes]]
+    rows = []
+    for cell in _shown(results):
+        axes = [axis.label(i) for axis, i in zip(results.sweep.axes, cell.place, strict=True)]
+        rows.append(([str(cell.index), *axes], _figures(results.figures[cell.index])))
+    for columns in _choices(results):
+        cells = [[*place, *[texts[column] for column in columns]] for place, texts in rows]
+        lines = tables.lines(tables.table(names, columns, cells))
         if tables.fits(lines):
             return lines, columns
     found: list[str] = []
-    names = [axis.name.rpartition(".")[2] for axis in results.sweep.axes]
-    for cell in _shown(results):
-        figures = results.figures[cell.index]
-        texts = _figures(figures)
-        place = [
-            f"{name} {label}" for name, label in zip(["cell", *names], _axes(results, cell), strict=True)
-        ]
-        counts = [f"{texts[one]} {one}" for one in ("trials", *OUTCOME_COLUMNS)]
-        sentence = f"{', '.join(place)}: {', '.join(counts)}"
-        if figures.rate is not None:
+    for place, texts in rows:
+        sentence = ", ".join([" ".join(one) for one in zip(names, place, strict=True)])
+        sentence += f": {', '.join([f'{texts[one]} {one}' for one in ('trials', *OUTCOME_COLUMNS)])}"
+        if texts["rate"] != NO_VALUE:
             sentence += f"; rate {texts['rate']} ({texts['rate_low']} to {texts['rate_high']})"
-        if figures.ticks_p50 is not None:
+        if texts["p50"] != NO_VALUE:
             sentence += f"; ticks p50 {texts['p50']}, p95 {texts['p95']}, max {texts['max']}"
         found += text_width.wrapped(sentence, 2)
     return found, ("rate_low", "p50")
@@ -256,55 +228,43 @@ def _lines(results: Results) -> tuple[list[str], Sequence[str]]:
 
 def _shown(results: Results) -> list[Cell]:
     """Return the cells to list: all, or those with a problem if there are more than MOST_ROWS cells."""
-    if len(results.cells) <= MOST_ROWS:
-        return list(results.cells)
-    return [cell for cell in results.cells if not _well(results.figures[cell.index])]
+    return [
+        cell
+        for cell in results.cells
+        for one in [results.figures[cell.index]]
+        if len(results.cells) <= MOST_ROWS
+        or (one.refused is not None or one.trials != one.localised or one.audited != one.clean)
+    ]
 
 
-def _well(figures: CellSummary) -> bool:
-    """Return true if all trials of a cell have localised and no audit found a violation."""
-    return (
-        figures.refused is None and figures.trials == figures.localised and figures.audited == figures.clean
-    )
-
-
-def _choices(results: Results) -> tuple[tuple[str, ...], ...]:
-    """Return the possible choices of columns, the widest first."""
+def _choices(results: Results) -> list[list[str]]:
+    """Return the possible choices of columns, the widest first. Outcomes are never dropped."""
+    figures = results.figures.values()
     more = (
         *(SHOWN_GROUP_COLUMNS if results.sweep.of_group else ()),
-        *(OF_ATTACKED_GROUP if any(one.attacker_met for one in results.figures.values()) else ()),
-        *(OF_NOISE if any(one.nees_mean is not None for one in results.figures.values()) else ()),
+        *(OF_ATTACKED_GROUP if any(one.attacker_met for one in figures) else ()),
+        *(OF_NOISE if any(one.nees_mean is not None for one in figures) else ()),
     )
-    if not more:
-        return COLUMN_CHOICES
-    return tuple((*columns, *more) for columns in COLUMN_CHOICES) + COLUMN_CHOICES[2:]
-
-
-def _table(results: Results, columns: Sequence[str]) -> Table:
-    axes = [axis.name.rpartition(".")[2] for axis in results.sweep.axes]
-    rows = []
-    for cell in _shown(results):
-        texts = _figures(results.figures[cell.index])
-        rows.append([*_axes(results, cell), *[texts[column] for column in columns]])
-    return tables.table(["cell", *axes], columns, rows)
-
-
-def _axes(results: Results, cell: Cell) -> list[str]:
-    places = zip(results.sweep.axes, cell.place, strict=True)
-    return [str(cell.index), *[axis.label(place) for axis, place in places]]
+    return [
+        [
+            *[one.title for one in COLUMNS.values() if one.title and 0 <= one.rank <= most],
+            *(more if most else ()),
+        ]
+        for most in range(max([one.rank for one in COLUMNS.values()]), -1, -1)
+    ]
 
 
 def _figures(figures: CellSummary) -> dict[str, str]:
     """Return the texts of the columns of a cell, by their titles."""
     texts = {
-        shown.title: "-" if (value := getattr(figures, name)) is None else format(value, shown.form)
+        shown.title: NO_VALUE if (value := getattr(figures, name)) is None else format(value, shown.form)
         for name, shown in COLUMNS.items()
         if shown.title
     }
     honest = (figures.honest_localised, figures.honest_undecided, figures.honest_wrong)
     return {
         **texts,
-        "clean": texts["clean"] if figures.audited else "-",
-        "honest": "-" if None in honest else "/".join(map(str, honest)),
-        "found": f"{figures.attacker_found}/{figures.attacker_met}" if figures.attacker_met else "-",
+        "clean": texts["clean"] if figures.audited else NO_VALUE,
+        "honest": NO_VALUE if None in honest else "/".join(map(str, honest)),
+        "found": f"{figures.attacker_found}/{figures.attacker_met}" if figures.attacker_met else NO_VALUE,
     }

@@ -58,6 +58,11 @@ class Folder:
         """reasons why cells are infeasible, by the index of the cell"""
         self._parts = path / PARTS
 
+    @property
+    def trials(self) -> int:
+        """The number of trials of all cells that are not refused."""
+        return self.sweep.trials * (len(self.cells) - len(self.refused))
+
     def done(self) -> dict[int, set[int]]:
         """Return the indices of the trials with a row, by the index of the cell."""
         found: dict[int, set[int]] = {index: set() for index in self.cells}
@@ -158,42 +163,38 @@ def _refused_before(path: Path, sweep: Sweep) -> dict[int, str]:
         return {}
     except ValueError as error:
         raise UserError(f"--out: {path / SWEEP_JSON} cannot be read: {error}") from None
-    difference = _difference(_identity(manifest.sweep), _identity(sweep))
-    if difference is not None:
-        raise UserError(f"--out: {path} contains another sweep: {difference}; choose another folder")
+    there, here = dict(_identity(manifest.sweep)), dict(_identity(sweep))
+    for name in {**there, **here}:
+        if there.get(name) != here.get(name):
+            one, other = [_cut(values.get(name, "not set")) for values in (there, here)]
+            raise UserError(
+                f"--out: {path} contains another sweep: {name} is {one} in the folder and {other} in this "
+                "sweep; choose another folder"
+            )
     return manifest.refused
 
 
-def _identity(sweep: Sweep) -> dict[str, Any]:
-    """Return the properties that must be equal for two runs to use one folder.
+def _identity(sweep: Sweep) -> Iterator[tuple[str, str]]:
+    """Yield the path and the text of each value that must be equal for two runs to use one folder.
 
     The number of trials and the timeout may differ.
     """
-    return {
-        "name": sweep.name,
-        "seed": sweep.seed,
-        "scenario": sweep.base,
-        "axis": [msgspec.to_builtins(axis) for axis in sweep.axes],
-        "draws": msgspec.to_builtins(sweep.draws),
-    }
+    left: list[tuple[str, Any]] = [
+        ("name", sweep.name),
+        ("seed", sweep.seed),
+        ("scenario", sweep.base),
+        ("axis", msgspec.to_builtins(sweep.axes)),
+        ("draws", msgspec.to_builtins(sweep.draws)),
+    ]
+    while left:
+        match left.pop(0):
+            case path, {**values} if values:
+                left[:0] = [(f"{path}.{name}", value) for name, value in values.items()]
+            case path, [*values] if values:
+                left[:0] = [(f"{path}[{i}]", value) for i, value in enumerate(values)]
+            case path, value:
+                yield path, canonical(value)
 
 
-def _difference(there: Any, here: Any, where: str = "") -> str | None:
-    """Return a description of the first field in which the two values differ; None if they are equal.
-
-    `where` is the path of the values.
-    """
-    if isinstance(there, Mapping) and isinstance(here, Mapping):
-        pairs = [(f"{where}.{key}".lstrip("."), there.get(key), here.get(key)) for key in {**there, **here}]
-    elif isinstance(there, list | tuple) and isinstance(here, list | tuple) and len(there) == len(here):
-        pairs = [(f"{where}[{i}]", *both) for i, both in enumerate(zip(there, here, strict=True))]
-    else:
-        same = canonical(there) == canonical(here)
-        return None if same else f"{where} is {_cut(there)} in the folder and {_cut(here)} in this sweep"
-    return next((found for name, one, other in pairs if (found := _difference(one, other, name))), None)
-
-
-def _cut(value: Any) -> str:
-    """Return the value as text of at most MAX_DIFFERENCE characters."""
-    text = "not set" if value is None else canonical(value)
+def _cut(text: str) -> str:
     return text if len(text) <= MAX_DIFFERENCE else f"{text[: MAX_DIFFERENCE - 3]}..."

@@ -6,7 +6,7 @@ Invalid input raises BadSpec, whose text is one line with the file and the field
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any
@@ -106,6 +106,15 @@ class Axis(msgspec.Struct, frozen=True):
     """true if the seeds of trials do not depend on this axis"""
 
     @property
+    def columns(self) -> list[str]:
+        """The names of its columns in tables: that of its labels, if it has some, and those of its fields."""
+        return [*([self.name] if self.labels is not None else []), *self.fields]
+
+    def row(self, place: int) -> tuple[Any, ...]:
+        """Return the elements of `columns` for the value at index `place`."""
+        return (*(self.labels[place : place + 1] if self.labels is not None else ()), *self.values[place])
+
+    @property
     def of_planners(self) -> bool:
         """True if it varies the planner or its options."""
         return any(way[0] == "planner" for way in self.ways)
@@ -197,12 +206,20 @@ def validated(
     axes = tuple(_axis(axis, f"{source}: axis[{i}]", base) for i, axis in enumerate(spec.axis))
     draws = Draws(_draws(spec, axes, base, source), spec.starts)
     _check_together(axes, draws, source)
-    axes = _paired(axes, [axis.paired for axis in spec.axis], base, draws)
+    varied = [way for axis in axes for way in axis.ways]
     found = Sweep(
         source=source,
         name=spec.name,
         base=base,
-        axes=axes,
+        axes=tuple(
+            msgspec.structs.replace(
+                axis,
+                paired=not any(changes_draws(way, base, varied, draws.fields) for way in axis.ways)
+                if given.paired is None
+                else given.paired,
+            )
+            for axis, given in zip(axes, spec.axis, strict=True)
+        ),
         trials=trials if trials is not None else spec.trials,
         seed=seed if seed is not None else spec.seed,
         trial_timeout=spec.trial_timeout,
@@ -217,7 +234,7 @@ def _base(spec: SpecFile, folder: Path, source: str) -> dict[str, Any]:
     """Return the table of the base scenario of `spec`. Raises BadSpec if it cannot be read."""
     file = shipped_files.shipped().get(spec.scenario, folder / spec.scenario)
     try:
-        return _with_fields(table_in(read_text(file), spec.scenario), spec.set, f"{source}: set")
+        base = table_in(read_text(file), spec.scenario)
     except FileNotFoundError:
         names = shipped_files.shipped()
         raise BadSpec(
@@ -226,14 +243,8 @@ def _base(spec: SpecFile, folder: Path, source: str) -> dict[str, Any]:
         ) from None
     except (ValueError, NotToml) as error:
         raise BadSpec(f"{source}: scenario: {error}") from None
-
-
-def _with_fields(base: dict[str, Any], fields: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Return `base` with the values in `fields`, by their paths. Raises BadSpec."""
-    for field, value in fields.items():
-        (way,) = _ways([field], base, where)
-        if not jsonable(value):
-            raise BadSpec(f"{where}: '{field}': {NOT_JSONABLE}")
+    for field, value in spec.set.items():
+        (way,) = _ways({field: value}, base, f"{source}: set")
         base = with_value(base, way, value)
     return base
 
@@ -242,56 +253,67 @@ def _axis(table: AxisTable, where: str, base: dict[str, Any]) -> Axis:
     """Return the validated axis; `where` is its prefix in error messages. Raises BadSpec."""
     if (table.values is None) == (table.rows is None):
         raise BadSpec(f"{where}: needs either 'values' or 'rows'")
-    if table.rows is not None:
-        return _axis_of_rows(table, table.rows, where, base)
-    assert table.values is not None
-    fields = _fields(table, where)
-    ways: list[Steps] = []
-    for i, field in enumerate(fields):
-        named = f"{where}.fields[{i}]" if table.fields is not None else f"{where}.field"
-        ways += _ways([field], base, named)
+    axis = (
+        _axis_of_rows(table, table.rows, where, base) if table.rows else _axis_of_values(table, where, base)
+    )
+    if table.name is None:
+        for form in ("rows", "fields", "labels"):
+            if getattr(table, form) is not None:
+                raise BadSpec(f"{where}.name: missing: an axis with '{form}' needs a name")
+    if table.name in axis.fields:
+        raise BadSpec(f"{where}.name: '{table.name}' is also one of the fields of this axis")
+    return axis
+
+
+def _axis_of_values(table: AxisTable, where: str, base: dict[str, Any]) -> Axis:
+    """Return the axis of a field, or of several that vary together. Raises BadSpec."""
+    if (table.field is None) == (table.fields is None):
+        raise BadSpec(f"{where}: needs either 'field', or 'name' and 'fields'")
+    if table.fields is None:
+        fields, ways = [str(table.field)], _ways([str(table.field)], base, f"{where}.field")
+    else:
+        fields = table.fields
+        ways = tuple(_ways([one], base, f"{where}.fields[{i}]")[0] for i, one in enumerate(fields))
     seen: dict[str, int] = {}
-    values = []
-    for i, value in enumerate(table.values):
-        values.append(_value(value, f"{where}.values[{i}]", table.fields))
+    values = table.values or []
+    for i, value in enumerate(values):
+        if not jsonable(value):
+            raise BadSpec(f"{where}.values[{i}]: {NOT_JSONABLE}")
+        if table.fields is not None and (not isinstance(value, list) or len(value) != len(fields)):
+            raise BadSpec(f"{where}.values[{i}]: must be a list of {len(fields)} values, one for each field")
         if (first := seen.setdefault(canonical(value), i)) != i:
             raise BadSpec(f"{where}.values[{i}]: equal to values[{first}]")
     if table.labels is not None and not len(table.labels) == len(set(table.labels)) == len(values):
         raise BadSpec(f"{where}.labels: must be {len(values)} different labels, one for each value")
     return Axis(
-        name=table.name if table.name is not None else fields[0],
+        name=table.name or fields[0],
         fields=tuple(fields),
-        ways=tuple(ways),
-        values=tuple(values),
+        ways=ways,
+        values=tuple((value,) if table.fields is None else tuple(value) for value in values),
         labels=tuple(table.labels) if table.labels is not None else None,
     )
 
 
 def _axis_of_rows(table: AxisTable, rows: Sequence[RowTable], where: str, base: dict[str, Any]) -> Axis:
-    """Return the validated axis of these rows. Raises BadSpec."""
+    """Return the axis whose values differ in different fields. Raises BadSpec."""
     for name in ("field", "fields", "labels"):
         if getattr(table, name) is not None:
             raise BadSpec(f"{where}.{name}: an axis with 'rows' has none")
-    if table.name is None:
-        raise BadSpec(f"{where}.name: missing: an axis with 'rows' needs a name")
     ways: dict[str, Steps] = {}
     labels: dict[str, int] = {}
     for i, row in enumerate(rows):
         named = f"{where}.rows[{i}]"
         if (first := labels.setdefault(row.label, i)) != i:
             raise BadSpec(f"{named}.label: equal to that of rows[{first}]")
-        _with_fields(base, row.set, f"{named}.set")
-        found = dict(zip(row.set, _ways(list(row.set), base, f"{named}.set"), strict=True))
+        found = dict(zip(row.set, _ways(row.set, base, f"{named}.set"), strict=True))
         for (field, way), (another, further) in combinations(found.items(), 2):
             if overlap(way, further):
                 raise BadSpec(f"{named}.set: '{another}' is already set by '{field}'")
         ways |= found
     if not ways:
         raise BadSpec(f"{where}.rows: no row sets a field")
-    if table.name in ways:
-        raise BadSpec(f"{where}.name: '{table.name}' is also one of the fields of this axis")
     return Axis(
-        name=table.name,
+        name=str(table.name),
         fields=tuple(ways),
         ways=tuple(ways.values()),
         values=tuple(tuple(row.set.get(field) for field in ways) for row in rows),
@@ -299,53 +321,23 @@ def _axis_of_rows(table: AxisTable, rows: Sequence[RowTable], where: str, base: 
     )
 
 
-def _paired(
-    axes: Sequence[Axis], given: Sequence[bool | None], base: dict[str, Any], draws: Draws
-) -> tuple[Axis, ...]:
-    """Return `axes`, paired as `given`; where that is None, if the axis does not change what is drawn."""
-    varied = [way for axis in axes for way in axis.ways]
-    return tuple(
-        [
-            msgspec.structs.replace(
-                axis,
-                paired=not any(changes_draws(way, base, varied, draws.fields) for way in axis.ways)
-                if chosen is None
-                else chosen,
-            )
-            for axis, chosen in zip(axes, given, strict=True)
-        ]
-    )
-
-
-def _fields(table: AxisTable, where: str) -> list[str]:
-    """Return the field paths of the axis. Raises BadSpec if fields or name are missing or ambiguous."""
-    if (table.field is None) == (table.fields is None):
-        raise BadSpec(f"{where}: needs either 'field', or 'name' and 'fields'")
-    fields = table.fields if table.fields is not None else [str(table.field)]
-    if table.name is None and table.fields is not None:
-        raise BadSpec(f"{where}.name: missing: an axis with 'fields' needs a name")
-    if table.name is None and table.labels is not None:
-        raise BadSpec(f"{where}.name: missing: an axis with 'labels' needs a name for their column")
-    if table.name in fields:
-        raise BadSpec(f"{where}.name: '{table.name}' is also one of the fields of this axis")
-    return fields
-
-
-def _value(value: Any, where: str, fields: Sequence[str] | None) -> tuple[Any, ...]:
-    """Return one value of an axis as a tuple with one element per field. Raises BadSpec."""
-    if not jsonable(value):
-        raise BadSpec(f"{where}: {NOT_JSONABLE}")
-    if fields is None:
-        return (value,)
-    if not isinstance(value, list) or len(value) != len(fields):
-        raise BadSpec(f"{where}: must be a list of {len(fields)} values, one for each field")
-    return tuple(value)
+def _ways(fields: Iterable[str] | Mapping[str, Any], base: dict[str, Any], where: str) -> tuple[Steps, ...]:
+    """Return the parsed paths of `fields`, which may have values. Raises BadSpec if one does not exist."""
+    found = []
+    for field in fields:
+        try:
+            found.append(steps(field, base))
+        except NoSuchField as error:
+            raise BadSpec(f"{where}: '{field}': {error}") from None
+        if isinstance(fields, Mapping) and not jsonable(fields[field]):
+            raise BadSpec(f"{where}: '{field}': {NOT_JSONABLE}")
+    return tuple(found)
 
 
 def _draws(spec: SpecFile, axes: Sequence[Axis], base: dict[str, Any], source: str) -> tuple[Draw, ...]:
     """Return the validated draws of `spec`, in order. Raises BadSpec."""
-    known: dict[Steps, tuple[Any, ...]] = {
-        way: tuple(value[i] for value in axis.values if value[i] is not None)
+    known: dict[Steps, Sequence[Any]] = {
+        way: [value[i] for value in axis.values if value[i] is not None]
         for axis in axes
         for i, way in enumerate(axis.ways)
     }
@@ -354,26 +346,18 @@ def _draws(spec: SpecFile, axes: Sequence[Axis], base: dict[str, Any], source: s
         where = f"{source}: draw[{i}]"
         if (table.uniform is None) == (table.log_uniform is None):
             raise BadSpec(f"{where}: needs exactly one of 'uniform' and 'log_uniform'")
-        interval = table.uniform or table.log_uniform
-        assert interval is not None
-        low, high = interval
-        if not low < high or not math.isfinite(high - low) or (table.log_uniform is not None and low <= 0.0):
-            above = " above 0" if table.log_uniform is not None else ""
+        low, high = interval = table.uniform or table.log_uniform or (0.0, 0.0)
+        logarithmic = table.log_uniform is not None
+        if not low < high or not math.isfinite(high - low) or (logarithmic and low <= 0.0):
+            above = " above 0" if logarithmic else ""
             raise BadSpec(f"{where}: {low:g} to {high:g} is not an interval{above}")
-        if table.log_uniform is not None and not math.isfinite(high / low):
+        if logarithmic and not math.isfinite(high / low):
             raise BadSpec(f"{where}: the interval {low:g} to {high:g} is too wide")
         (way,) = _ways([table.field], base, f"{where}.field")
         _check_takes_float(table.field, way, low, base, f"{where}.field")
-        draws.append(
-            Draw(
-                table.field,
-                way,
-                interval,
-                table.log_uniform is not None,
-                _known(table.times, f"{where}.times", base, known),
-                _known(table.over, f"{where}.over", base, known, zero=False),
-            )
-        )
+        times = _known(table.times, f"{where}.times", base, known)
+        over = _known(table.over, f"{where}.over", base, known, zero=False)
+        draws.append(Draw(table.field, way, interval, logarithmic, times, over))
         known[way] = ()
     return tuple(draws)
 
@@ -387,35 +371,23 @@ def _check_takes_float(field: str, way: Steps, value: float, base: dict[str, Any
             raise BadSpec(f"{where}: '{field}' is not a floating-point field and cannot be drawn") from None
 
 
-def _ways(fields: Sequence[str], base: dict[str, Any], where: str) -> tuple[Steps, ...]:
-    """Return the parsed paths of `fields`. Raises BadSpec if a field does not exist."""
-    found = []
-    for field in fields:
-        try:
-            found.append(steps(field, base))
-        except NoSuchField as error:
-            raise BadSpec(f"{where}: '{field}': {error}") from None
-    return tuple(found)
-
-
 def _known(
     fields: Sequence[str],
     where: str,
     base: dict[str, Any],
-    varied: Mapping[Steps, tuple[Any, ...]],
+    varied: Mapping[Steps, Sequence[Any]],
     *,
     zero: bool = True,
 ) -> tuple[Steps, ...]:
     """Return the parsed paths of `fields`, whose values scale a draw. Raises BadSpec.
 
     Each value must be a number that is known before the draw. `varied` contains the possible values of fields
-    that axes set, and an empty tuple for each field that is drawn earlier. A value may be 0 only if `zero` is
-    true.
+    that axes set, and none for each field that is drawn earlier. A value may be 0 only if `zero` is true.
     """
     ways = _ways(fields, base, where)
     for field, way in zip(fields, ways, strict=True):
         try:
-            values = varied[way] if way in varied else (value_at(base, way),)
+            values = varied[way] if way in varied else [value_at(base, way)]
         except (KeyError, IndexError):
             raise BadSpec(f"{where}: '{field}' is neither set by the scenario nor drawn earlier") from None
         if any(isinstance(value, bool) or not isinstance(value, int | float) for value in values):

@@ -6,7 +6,8 @@ The annotations of CellSummary hold the functions that compute it, so they are e
 import csv
 import io
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from statistics import NormalDist
 from typing import Annotated, Any, NamedTuple, get_type_hints
 
@@ -23,6 +24,7 @@ from compose.sweep.spec import Sweep
 from compose.sweep.trial import TrialOutcome
 
 Floats = NDArray[np.float64]
+Number = float | None
 CONFIDENCE = 0.95
 """The confidence level of the interval of a success rate."""
 NEES_CONFIDENCE = 0.99
@@ -43,41 +45,66 @@ class CellTrials:
     """The trials of a cell that were not refused, as the columns of `summary.csv` take them."""
 
     def __init__(self, table: pa.Table) -> None:
-        self.table = ran(table)
-        self.outcomes: list[str] = self.table["outcome"].to_pylist()
+        outcomes = np.array(table["outcome"].to_pylist(), object)
+        ran = outcomes != "refused"
+        self.table = table.filter(pa.array(ran))
+        self.outcomes: list[str] = outcomes[ran].tolist()
         self.refused = len(table) - len(self.outcomes)
 
     def known(self, name: str) -> Floats:
-        """Return the known values of a column; none if the sweep has no such column."""
-        return _known(column(self.table, name)) if name in self.table.schema.names else np.zeros(0)
+        """Return the known values of a column, or of one of DERIVED; none if the sweep has no such column."""
+        try:
+            values = DERIVED[name](self) if name in DERIVED else column(self.table, name)
+        except KeyError:  # a column of groups
+            return np.zeros(0)
+        return values[~np.isnan(values)]
 
     @property
-    def ticks(self) -> Floats:
-        """The ticks of the trials that localised."""
-        return _known(
-            column(self.table, "ticks")[np.array([one == "localised" for one in self.outcomes], bool)]
-        )
+    def localised(self) -> list[bool]:
+        """True for each trial that localised."""
+        return [one == "localised" for one in self.outcomes]
 
-    def shares(self, bound: str) -> Floats:
-        """Return the ticks of the last honest claim over those in `bound`, of trials that are not `wrong`."""
-        if bound not in self.table.schema.names:
-            return np.zeros(0)
-        right = np.array([one != "wrong" for one in self.outcomes], bool)
-        return _known((column(self.table, "honest_tick") / column(self.table, bound))[right])
+
+def _share(bound: str, trials: CellTrials) -> Floats:
+    """Return the ticks of the last honest claim over those in `bound`, of trials that are not `wrong`."""
+    right = [one != "wrong" for one in trials.outcomes]
+    return column(trials.table, "honest_tick")[right] / column(trials.table, bound)[right]
+
+
+def _orbited_over_t_max(trials: CellTrials) -> Floats:
+    """Return, per trial, the time from both in orbit to phase 3 divided by T_max.
+
+    It is 0 if phase 3 begins before both orbit, and NaN if it never begins.
+    """
+    meeting, orbiting = column(trials.table, "meeting_tick"), column(trials.table, "orbiting_tick")
+    orbited = meeting - np.where(np.isnan(orbiting), meeting, orbiting)
+    t_max = column(trials.table, "t_max_s")
+    at_once = np.where(orbited > 0.0, math.inf, orbited)  # used if T_max is 0
+    return np.divide(orbited * column(trials.table, "period_s"), t_max, out=at_once, where=t_max > 0.0)
+
+
+DERIVED: Mapping[str, Callable[[CellTrials], Floats]] = {
+    "ticks": lambda trials: column(trials.table, "ticks")[trials.localised],
+    "t_max_ratio": _orbited_over_t_max,
+    "bound_share": partial(_share, "bound_ticks"),
+    "corrected_share": partial(_share, "corrected_ticks"),
+    "makespan": partial(_share, "travel_ticks"),
+}
+"""The values that follow from several columns of a trial."""
 
 
 class SummaryColumn(NamedTuple):
     """A column of `summary.csv`: its value, and its place in the table on the terminal."""
 
-    value: Callable[[CellTrials], float | None]
+    value: Callable[[CellTrials], Number]
     title: str = ""
     """The title of its column on the terminal; empty if it is not shown there."""
     form: str = "d"
     """The format of its value there."""
-    of_group: bool = False
-    """True if only sweeps of groups have the column."""
     rank: int = -1
     """The larger it is, the earlier a table that is too wide lacks the column; -1 if another rule decides."""
+    of_group: bool = False
+    """True if only sweeps of groups have the column."""
 
 
 def _outcome(name: str) -> SummaryColumn:
@@ -86,47 +113,71 @@ def _outcome(name: str) -> SummaryColumn:
 
 def _rate(bound: int, title: str, rank: int) -> SummaryColumn:
     """Return the column with the rate of trials that localised (0), or a bound of its interval (1, 2)."""
-    return SummaryColumn(
-        lambda trials: (
-            wilson(trials.outcomes.count("localised"), n)[bound] if (n := len(trials.outcomes)) else None
-        ),
-        title,
-        ".4f",
-        rank=rank,
-    )
+
+    def value(trials: CellTrials) -> Number:
+        n = len(trials.outcomes)
+        return wilson(trials.outcomes.count("localised"), n)[bound] if n else None
+
+    return SummaryColumn(value, title, ".4f", rank)
 
 
-def _ticks(percent: float, title: str = "", rank: int = -1) -> SummaryColumn:
-    return SummaryColumn(lambda trials: _percentile(trials.ticks, percent), title, ".0f", rank=rank)
+def _of(statistic: Callable[[Floats], Any], name: str, *shown: Any, of_group: bool = False) -> SummaryColumn:
+    """Return the column with a statistic of the known values of `name`; `shown` is its place in the table."""
+
+    def value(trials: CellTrials) -> Number:
+        known = trials.known(name)
+        return statistic(known).item() if len(known) else None
+
+    return SummaryColumn(value, *shown)._replace(of_group=of_group)
 
 
-def _quantile(name: str, percent: float, title: str = "") -> SummaryColumn:
-    return SummaryColumn(lambda trials: _percentile(trials.known(name), percent), title, ".1e", rank=5)
+def _at(percent: float, name: str, *shown: Any, of_group: bool = False) -> SummaryColumn:
+    """Return the column with a percentile, with linear interpolation."""
+    return _of(partial(np.percentile, q=percent), name, *shown, of_group=of_group)
 
 
-def _share(bound: str, percent: float, title: str) -> SummaryColumn:
-    return SummaryColumn(
-        lambda trials: _percentile(trials.shares(bound), percent), title, ".2f", of_group=True
-    )
+def _sum(values: Floats) -> Any:
+    return values.sum().astype(int)
 
 
 def _total(name: str) -> SummaryColumn:
-    return SummaryColumn(lambda trials: int(trials.known(name).sum()))
+    return SummaryColumn(lambda trials: int(_sum(trials.known(name))))
 
 
-def _group_total(name: str) -> SummaryColumn:
-    """Return the column with the sum of another one; None where no trial has a value."""
-    return SummaryColumn(
-        lambda trials: int(known.sum()) if len(known := trials.known(name)) else None, of_group=True
-    )
-
-
-def _within(trials: CellTrials) -> float | None:
+def _within(trials: CellTrials) -> Number:
     claims = trials.known("claims").sum()
     return float(trials.known("claims_within").sum() / claims) if claims else None
 
 
-Number = float | None
+def _rmse_over_bound(trials: CellTrials) -> Number:
+    """Return the RMS position error over the RMS Cramér-Rao bound, of all robots with a bound."""
+    names = trials.table.schema.names
+    robots = [name.removesuffix("_bound_m") for name in names if name.endswith("_bound_m")]
+    bounds, errors = [
+        np.concatenate([np.zeros(0), *[column(trials.table, f"{robot}_{name}") for robot in robots]])
+        for name in ("bound_m", "position_error_m")
+    ]
+    known = ~np.isnan(bounds)
+    return float(np.sqrt(np.mean(errors[known] ** 2) / np.mean(bounds[known] ** 2))) if known.any() else None
+
+
+def nees_band(trials: int) -> tuple[Number, Number]:
+    """Return the bounds of the mean NEES of `trials` trials if the claimed covariances are consistent.
+
+    The NEES of one robot, summed over the trials, has a chi-square distribution with 3 degrees of freedom per
+    trial. The mean over the robots of a trial has the same variance if their errors are fully correlated, and
+    a smaller one otherwise. The probability of a mean outside the band is therefore at most 1 %.
+    """
+    if not trials:
+        return None, None
+    tail = 0.5 * (1.0 - NEES_CONFIDENCE)
+    half = 0.5 * DEGREES_OF_FREEDOM * trials  # chi-square with 2 a degrees of freedom = 2 gamma(a)
+    low, high = 2.0 * gammaincinv(half, tail) / trials, 2.0 * gammainccinv(half, tail) / trials
+    return float(low), float(high)
+
+
+def _nees_bound(bound: int, title: str) -> SummaryColumn:
+    return SummaryColumn(lambda trials: nees_band(len(trials.known("nees")))[bound], title, ".3g")
 
 
 class CellSummary(msgspec.Struct, frozen=True):
@@ -150,60 +201,47 @@ class CellSummary(msgspec.Struct, frozen=True):
     """lower bound of its 95 % Wilson interval"""
     rate_high: Annotated[Number, _rate(2, "rate_high", 4)]
     """upper bound of that interval"""
-    ticks_p10: Annotated[Number, _ticks(10)]
+    ticks_p10: Annotated[Number, _at(10, "ticks")]
     """10th percentile of the number of ticks of trials that localised"""
-    ticks_p50: Annotated[Number, _ticks(50, "p50", 3)]
+    ticks_p50: Annotated[Number, _at(50, "ticks", "p50", ".0f", 3)]
     """their median"""
-    ticks_p90: Annotated[Number, _ticks(90)]
+    ticks_p90: Annotated[Number, _at(90, "ticks")]
     """their 90th percentile"""
-    ticks_p95: Annotated[Number, _ticks(95, "p95", 4)]
+    ticks_p95: Annotated[Number, _at(95, "ticks", "p95", ".0f", 4)]
     """their 95th percentile"""
-    ticks_max: Annotated[Number, _ticks(100, "max", 3)]
+    ticks_max: Annotated[Number, _at(100, "ticks", "max", ".0f", 3)]
     """the largest of them"""
-    meeting_tick_p50: Annotated[Number, _quantile("meeting_tick", 50)]
+    meeting_tick_p50: Annotated[Number, _at(50, "meeting_tick")]
     """median tick at which phase 3 began, of trials in which it began"""
-    meeting_tick_max: Annotated[Number, _quantile("meeting_tick", 100)]
+    meeting_tick_max: Annotated[Number, _at(100, "meeting_tick")]
     """the largest of these ticks"""
-    t_max_s: Annotated[Number, _quantile("t_max_s", 100)]
+    t_max_s: Annotated[Number, _at(100, "t_max_s")]
     """largest T_max of a trial, in s"""
-    t_max_ratio_max: Annotated[
-        Number, SummaryColumn(lambda trials: _percentile(_known(orbited_over_t_max(trials.table)), 100))
-    ]
+    t_max_ratio_max: Annotated[Number, _at(100, "t_max_ratio")]
     """largest ratio of the time from both in orbit to phase 3 to T_max; the paper's T_max can be exceeded,
     since it holds in continuous time"""
-    error_p50_m: Annotated[Number, _quantile("position_error_m", 50, "error p50")]
+    error_p50_m: Annotated[Number, _at(50, "position_error_m", "error p50", ".1e", 5)]
     """median over trials with a claim of the largest position error of a robot"""
-    error_max_m: Annotated[Number, _quantile("position_error_m", 100, "error max")]
+    error_max_m: Annotated[Number, _at(100, "position_error_m", "error max", ".1e", 5)]
     """the largest of these errors"""
-    error_max_rad: Annotated[Number, _quantile("heading_error_rad", 100)]
+    error_max_rad: Annotated[Number, _at(100, "heading_error_rad")]
     """largest heading error of a claim"""
     claims: Annotated[int, _total("claims")]
     """number of claims by all robots"""
     within_3_accuracy: Annotated[Number, SummaryColumn(_within, "within", ".4f")]
     """fraction of the claims with a position error of at most 3 times mission.accuracy"""
-    truth_held: Annotated[
-        Number, SummaryColumn(lambda trials: _fraction(trials.table["truth_held"].to_pylist()))
-    ]
+    truth_held: Annotated[Number, _of(np.mean, "truth_held")]
     """fraction of the trials with claims under noise in which every such robot held the true hypothesis"""
-    nees_mean: Annotated[
-        Number,
-        SummaryColumn(
-            lambda one: float(known.mean()) if len(known := one.known("nees")) else None, "nees", ".3g"
-        ),
-    ]
+    nees_mean: Annotated[Number, _of(np.mean, "nees", "nees", ".3g")]
     """mean over trials of the mean NEES of their robots' claims, wrong ones included; 3 is expected if the
     claimed covariances are consistent. The errors of a pair are correlated, so a trial counts once"""
-    nees_low: Annotated[
-        Number, SummaryColumn(lambda one: nees_band(len(one.known("nees")))[0], "nees low", ".3g")
-    ]
+    nees_low: Annotated[Number, _nees_bound(0, "nees low")]
     """lower bound of the band that contains nees_mean in 99 % of sweeps if covariances are consistent"""
-    nees_high: Annotated[
-        Number, SummaryColumn(lambda one: nees_band(len(one.known("nees")))[1], "nees high", ".3g")
-    ]
+    nees_high: Annotated[Number, _nees_bound(1, "nees high")]
     """upper bound of that band"""
-    rmse_over_bound: Annotated[Number, SummaryColumn(lambda trials: _rmse_over_bound(trials.table))]
+    rmse_over_bound: Annotated[Number, SummaryColumn(_rmse_over_bound)]
     """root mean square of the position errors of all robots, divided by that of their Cramér-Rao bounds"""
-    reports_p50: Annotated[Number, _quantile("reports_sent", 50)]
+    reports_p50: Annotated[Number, _at(50, "reports_sent")]
     """median number of reports that all robots of a trial sent"""
     audited: Annotated[int, SummaryColumn(lambda trials: len(trials.known("violations")))]
     """number of audited trials"""
@@ -221,25 +259,25 @@ class CellSummary(msgspec.Struct, frozen=True):
     """number of trials whose scenario is infeasible with the drawn values; no other figure counts them"""
     refused: str | None
     """reason why the scenario of this cell is infeasible"""
-    bound_share_p50: Annotated[Number, _share("bound_ticks", 50, "share p50")]
+    bound_share_p50: Annotated[Number, _at(50, "bound_share", "share p50", ".2f", of_group=True)]
     """only for groups: median over trials in which all honest robots claimed of honest_tick / bound_ticks"""
-    bound_share_max: Annotated[Number, _share("bound_ticks", 100, "share max")]
+    bound_share_max: Annotated[Number, _at(100, "bound_share", "share max", ".2f", of_group=True)]
     """only for groups: the largest of these"""
-    corrected_share_max: Annotated[Number, _share("corrected_ticks", 100, "corrected")]
+    corrected_share_max: Annotated[Number, _at(100, "corrected_share", "corrected", ".2f", of_group=True)]
     """only for groups: the largest honest_tick / corrected_ticks, of trials with a corrected bound"""
-    makespan_p50: Annotated[Number, _share("travel_ticks", 50, "travel p50")]
+    makespan_p50: Annotated[Number, _at(50, "makespan", "travel p50", ".2f", of_group=True)]
     """only for groups: median over the same trials of honest_tick / travel_ticks"""
-    makespan_p95: Annotated[Number, _share("travel_ticks", 95, "travel p95")]
+    makespan_p95: Annotated[Number, _at(95, "makespan", "travel p95", ".2f", of_group=True)]
     """only for groups: the 95th percentile of these"""
-    honest_localised: Annotated[int | None, _group_total("honest_localised")]
+    honest_localised: Annotated[int | None, _of(_sum, "honest_localised", of_group=True)]
     """only for groups: number of honest robots, of all trials, whose claims are right"""
-    honest_undecided: Annotated[int | None, _group_total("honest_undecided")]
+    honest_undecided: Annotated[int | None, _of(_sum, "honest_undecided", of_group=True)]
     """only for groups: number of those that have no claim at the end"""
-    honest_wrong: Annotated[int | None, _group_total("honest_wrong")]
+    honest_wrong: Annotated[int | None, _of(_sum, "honest_wrong", of_group=True)]
     """only for groups: number of those whose claims are wrong"""
-    attacker_met: Annotated[int | None, _group_total("attacker_met")]
+    attacker_met: Annotated[int | None, _of(_sum, "attacker_met", of_group=True)]
     """only for groups: number of their meetings with a robot that has an attack, of audited trials"""
-    attacker_found: Annotated[int | None, _group_total("attacker_found")]
+    attacker_found: Annotated[int | None, _of(_sum, "attacker_found", of_group=True)]
     """only for groups: number of these in which they found its data inconsistent"""
 
 
@@ -259,7 +297,14 @@ class NotableTrial(msgspec.Struct, frozen=True):
     seed: int
     outcome: TrialOutcome
     ticks: int | None
-    why: str | None
+    first_violation: str | None
+    error: str | None
+    reason: str | None
+
+    @property
+    def why(self) -> str | None:
+        """The reason to look at it."""
+        return self.first_violation or self.error or self.reason
 
 
 def counted(table: pa.Table, refused: str | None = None) -> CellSummary:
@@ -272,20 +317,13 @@ def counted(table: pa.Table, refused: str | None = None) -> CellSummary:
     return CellSummary(refused=refused, **values)
 
 
-def _rmse_over_bound(table: pa.Table) -> float | None:
-    """Return the RMS position error over the RMS Cramér-Rao bound, of all robots with a bound.
-
-    None if no robot has one.
-    """
-    names = [name.removesuffix("_bound_m") for name in table.schema.names if name.endswith("_bound_m")]
-    if not names or not len(table):
-        return None
-    bounds = np.concatenate([column(table, f"{name}_bound_m") for name in names])
-    errors = np.concatenate([column(table, f"{name}_position_error_m") for name in names])
-    known = ~np.isnan(bounds)
-    if not known.any():
-        return None
-    return float(np.sqrt(np.mean(errors[known] ** 2) / np.mean(bounds[known] ** 2)))
+def by_cell(table: pa.Table, cells: Sequence[Cell]) -> dict[int, pa.Table]:
+    """Return the trials of each cell, by its index; `table` is sorted by cell."""
+    ends = table["cell"].to_numpy().searchsorted([cell.index for cell in cells], side="right")
+    return {
+        cell.index: table.slice(begin, end - begin)
+        for cell, begin, end in zip(cells, [0, *ends[:-1]], ends, strict=True)
+    }
 
 
 def wilson(k: int, n: int) -> Interval:
@@ -310,69 +348,37 @@ def quantile(values: Floats, p: float) -> Interval:
     )
 
 
-def nees_band(trials: int) -> tuple[float | None, float | None]:
-    """Return the bounds of the mean NEES of `trials` trials if the claimed covariances are consistent.
-
-    The NEES of one robot, summed over the trials, has a chi-square distribution with 3 degrees of freedom per
-    trial. The mean over the robots of a trial has the same variance if their errors are fully correlated, and
-    a smaller one otherwise. The probability of a mean outside the band is therefore at most 1 %.
-    """
-    if not trials:
-        return None, None
-    tail = 0.5 * (1.0 - NEES_CONFIDENCE)
-    half = 0.5 * DEGREES_OF_FREEDOM * trials  # chi-square with 2 a degrees of freedom = 2 gamma(a)
-    low, high = 2.0 * gammaincinv(half, tail) / trials, 2.0 * gammainccinv(half, tail) / trials
-    return float(low), float(high)
-
-
 def column(table: pa.Table, name: str) -> Floats:
-    """Return a numeric column as floats, shape (rows,), with NaN for missing values."""
+    """Return a column of numbers or truth values as floats, shape (rows,), with NaN for missing values."""
     return np.asarray(table[name].cast(pa.float64()).to_numpy(), float)
-
-
-def orbited_over_t_max(table: pa.Table) -> Floats:
-    """Return, per trial, the time from both in orbit to phase 3 divided by T_max.
-
-    It is 0 if phase 3 begins before both orbit, and NaN if it never begins.
-    """
-    meeting, orbiting = column(table, "meeting_tick"), column(table, "orbiting_tick")
-    orbited = meeting - np.where(np.isnan(orbiting), meeting, orbiting)
-    t_max = column(table, "t_max_s")
-    at_once = np.where(orbited > 0.0, math.inf, orbited)  # used if T_max is 0
-    return np.divide(orbited * column(table, "period_s"), t_max, out=at_once, where=t_max > 0.0)
 
 
 def summary_csv(sweep: Sweep, cells: Sequence[Cell], figures: Mapping[int, CellSummary]) -> str:
     """Return the text of `summary.csv`, with one row per cell."""
+    rows = [
+        [
+            cell.index,
+            *[
+                "" if value is None else value if isinstance(value, str) else canonical(value)
+                for value in cell.on_axes(sweep.axes)
+            ],
+            *[getattr(figures[cell.index], name) for name in columns_of(sweep)],
+        ]
+        for cell in cells
+    ]
+    return csv_text(header(sweep), rows)
+
+
+def csv_text(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """Return the text of a CSV file; None is empty."""
     out = io.StringIO()
-    rows = csv.writer(out, lineterminator="\n")
-    rows.writerow(header(sweep))
-    for cell in cells:
-        axes: list[Any] = []
-        for axis, place in zip(sweep.axes, cell.place, strict=True):
-            axes += [axis.label(place)] if axis.labels is not None else []
-            axes += [_text(value) for value in axis.values[place]]
-        rows.writerow(
-            [cell.index, *axes, *[getattr(figures[cell.index], name) for name in columns_of(sweep)]]
-        )
+    csv.writer(out, lineterminator="\n").writerows([header, *rows])
     return out.getvalue()
-
-
-def _text(value: Any) -> str:
-    """Return the value of a field as the text of a column; empty if the field is as in the base scenario."""
-    if value is None:
-        return ""
-    return value if isinstance(value, str) else canonical(value)
 
 
 def header(sweep: Sweep) -> list[str]:
     """Return the column names of `summary.csv`."""
-    axes = [
-        name
-        for axis in sweep.axes
-        for name in ([axis.name] if axis.labels is not None else []) + list(axis.fields)
-    ]
-    return ["cell", *axes, *columns_of(sweep)]
+    return ["cell", *[name for axis in sweep.axes for name in axis.columns], *columns_of(sweep)]
 
 
 def columns_of(sweep: Sweep) -> list[str]:
@@ -384,46 +390,17 @@ def columns_of(sweep: Sweep) -> list[str]:
     ]
 
 
-def ran(table: pa.Table) -> pa.Table:
-    """Return the trials of `table` that were not refused."""
-    return table.filter(
-        pa.array([outcome != "refused" for outcome in table["outcome"].to_pylist()], pa.bool_())
-    )
-
-
 def noted(table: pa.Table) -> NotableTrial | None:
     """Return the trial to look at first; None if none has run."""
-    table = ran(table)
-    if not len(table):
+    trials = CellTrials(table)
+    if not trials.outcomes:
         return None
-    outcomes = table["outcome"].to_pylist()
-    worst = next((outcome for outcome in WORSE if outcome in outcomes), None)
-    broken = np.flatnonzero(column(table, "violations") > 0.0)
+    worst = next((outcome for outcome in WORSE if outcome in trials.outcomes), None)
+    broken = np.flatnonzero(column(trials.table, "violations") > 0.0)
     if len(broken):
         place = int(broken[0])
+    elif worst is not None:
+        place = trials.outcomes.index(worst)
     else:
-        place = outcomes.index(worst) if worst is not None else int(np.nanargmax(column(table, "ticks")))
-    found = table.slice(place, 1).to_pylist()[0]
-    return NotableTrial(
-        cell=found["cell"],
-        trial=found["trial"],
-        seed=found["seed"],
-        outcome=found["outcome"],
-        ticks=found["ticks"],
-        why=found["first_violation"] or found["error"] or found["reason"],
-    )
-
-
-def _known(values: Floats) -> Floats:
-    return values[~np.isnan(values)]
-
-
-def _fraction(values: list[bool | None]) -> float | None:
-    """Return the fraction of the known values that are true; None if there are none."""
-    known = [value for value in values if value is not None]
-    return sum(known) / len(known) if known else None
-
-
-def _percentile(values: Floats, percent: float) -> float | None:
-    """Return the percentile of `values` with linear interpolation; None if there are none."""
-    return float(np.percentile(values, percent)) if len(values) else None
+        place = int(np.nanargmax(column(trials.table, "ticks")))
+    return msgspec.convert(trials.table.slice(place, 1).to_pylist()[0], NotableTrial)

@@ -6,44 +6,47 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
+import msgspec
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from msgspec.structs import asdict
 
 from compose.scenario.scenario_tables import MAX_ROBOTS
 from compose.sweep.cells import Cell
 from compose.sweep.field_paths import canonical
-from compose.sweep.group_columns import GROUP_COLUMNS
+from compose.sweep.group_columns import GroupColumns
 from compose.sweep.spec import Sweep
 from compose.sweep.trial import RobotRow, TrialRow
 from protocol.files import open_file
 
 _ARROW = {int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
-_TRIAL_TYPES: dict[str, pa.DataType] = {
-    name: next((_ARROW[one] for one in (bool, int, float) if one in (hint, *get_args(hint))), pa.string())
-    for row in (TrialRow, RobotRow)
-    for name, hint in get_type_hints(row).items()
-} | {"cell": pa.int32(), "trial": pa.int32()}
-"""The types of the columns of rows, by name."""
-_OF_ALL = [field for field in TrialRow.__struct_fields__ if field not in ("cell", "trial", "robots", "drawn")]
+
+
+def _fields(row: type[msgspec.Struct], prefix: str = "") -> list[pa.Field]:
+    """Return the columns of the fields of `row` that have one."""
+    kinds = {name: (hint, *get_args(hint)) for name, hint in get_type_hints(row).items()}
+    return [
+        pa.field(prefix + name, next((_ARROW[one] for one in (bool, int, float) if one in kind), pa.string()))
+        for name, kind in kinds.items()
+        if name not in ("cell", "trial", "robots", "drawn")
+    ]
 
 
 def schema_of(sweep: Sweep, cells: Sequence[Cell]) -> pa.Schema:
     """Return the schema of the table of trials, which the sweep and its cells determine."""
-    fields = [pa.field("cell", _TRIAL_TYPES["cell"])]
-    for axis in sweep.axes:
-        if axis.labels is not None:
-            fields.append(pa.field(axis.name, pa.string()))
-        for i, field in enumerate(axis.fields):
-            fields.append(pa.field(field, _kind([one[i] for one in axis.values if one[i] is not None])))
-    fields += [pa.field(draw.field, pa.float64()) for draw in sweep.draws.fields]
-    fields.append(pa.field("trial", _TRIAL_TYPES["trial"]))
-    fields += [
-        pa.field(name, _TRIAL_TYPES[name]) for name in _OF_ALL if name not in GROUP_COLUMNS or sweep.of_group
+    cell, trial = pa.field("cell", pa.int32()), pa.field("trial", pa.int32())
+    axes = [
+        pa.field(name, _kind([one for one in values if one is not None]))
+        for axis in sweep.axes
+        for name, *values in zip(axis.columns, *map(axis.row, range(len(axis.values))), strict=True)
     ]
-    for robot in _robots(cells):
-        fields += [pa.field(f"{robot}_{name}", _TRIAL_TYPES[name]) for name in RobotRow.__struct_fields__]
-    return pa.schema(fields)
+    draws = [pa.field(draw.field, pa.float64()) for draw in sweep.draws.fields]
+    fields = _fields(TrialRow)
+    place = [field.name for field in fields].index("group")
+    fields[place : place + 1] = _fields(GroupColumns) if sweep.of_group else []
+    robots = [field for robot in _robots(cells) for field in _fields(RobotRow, f"{robot}_")]
+    return pa.schema([cell, *axes, *draws, trial, *fields, *robots])
 
 
 def _robots(cells: Sequence[Cell]) -> list[str]:
@@ -61,45 +64,31 @@ def _robots(cells: Sequence[Cell]) -> list[str]:
 
 def _kind(values: Sequence[Any]) -> pa.DataType:
     """Return the column type for the values of an axis; a string for JSON text if no other type fits."""
-    if all(isinstance(value, bool) for value in values):
+    kinds = {type(value) for value in values}
+    if kinds <= {bool}:
         return pa.bool_()
-    if any(isinstance(value, bool) for value in values):
-        return pa.string()
-    if all(isinstance(value, int) and abs(value) < 2**63 for value in values):
+    if kinds <= {int} and all(abs(value) < 2**63 for value in values):
         return pa.int64()
-    if all(isinstance(value, int | float) for value in values):
-        return pa.float64()
-    return pa.string()
-
-
-def _cast(value: Any, kind: pa.DataType) -> Any:
-    """Return `value` as an element of a column of type `kind`; None if it is None."""
-    if value is None:
-        return None
-    if kind == pa.string() and not isinstance(value, str):
-        return canonical(value)
-    return float(value) if kind == pa.float64() else value
+    return pa.float64() if kinds <= {int, float} else pa.string()
 
 
 def of_rows(rows: Sequence[TrialRow], sweep: Sweep, cells: Mapping[int, Cell], schema: pa.Schema) -> pa.Table:
     """Return `rows` as a table of `schema`. The columns of the axes come from the cells."""
-    columns: dict[str, list[Any]] = {"cell": [row.cell for row in rows]}
-    for where, axis in enumerate(sweep.axes):
-        if axis.labels is not None:
-            columns[axis.name] = [axis.labels[cells[row.cell].place[where]] for row in rows]
-        for field in axis.fields:
-            kind = schema.field(field).type
-            columns[field] = [_cast(cells[row.cell].fields[field], kind) for row in rows]
-    for draw in sweep.draws.fields:
-        columns[draw.field] = [row.drawn.get(draw.field) for row in rows]
-    columns["trial"] = [row.trial for row in rows]
-    for name in _OF_ALL if sweep.of_group else [name for name in _OF_ALL if name not in GROUP_COLUMNS]:
-        columns[name] = [getattr(row, name) for row in rows]
-    nothing = RobotRow()
-    for robot in _robots(list(cells.values())):
-        for name in RobotRow.__struct_fields__:
-            columns[f"{robot}_{name}"] = [getattr(row.robots.get(robot, nothing), name) for row in rows]
-    return pa.table(columns, schema=schema)
+    names = [name for axis in sweep.axes for name in axis.columns]
+    texts = [schema.field(name).type == pa.string() for name in names]
+    axes = {}
+    for index in {row.cell for row in rows}:
+        values = [
+            canonical(value) if text and not isinstance(value, str | None) else value
+            for text, value in zip(texts, cells[index].on_axes(sweep.axes), strict=True)
+        ]
+        axes[index] = dict(zip(names, values, strict=True))
+    columns = [asdict(row) | row.drawn | axes[row.cell] for row in rows]
+    for row, found in zip(rows, columns, strict=True):
+        found.update(asdict(row.group) if row.group is not None else {})
+        for robot, one in row.robots.items():
+            found.update({f"{robot}_{name}": value for name, value in asdict(one).items()})
+    return pa.Table.from_pylist(columns, schema)
 
 
 def gathered(tables: Sequence[pa.Table]) -> pa.Table:

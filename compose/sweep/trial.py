@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import msgspec
 from msgspec.structs import asdict, replace
@@ -15,13 +15,12 @@ from compose.recording.reasons import reason_for
 from compose.recording.run import Run
 from compose.recording.summary_json import first_contact
 from compose.scenario.kills import Kill
-from compose.sweep.group_columns import group_columns
+from compose.sweep.group_columns import GroupColumns, group_columns
 from compose.sweep.trial_mission import as_processes, run_in_process
 from world.scenario import Scenario
 
 TrialOutcome = Literal["localised", "undecided", "inconsistent", "wrong", "failed", "refused"]
 """The outcome of a mission, or `refused`: the scenario with the drawn values is infeasible."""
-N = TypeVar("N", int, float)
 LARGEST = ("candidates", "candidates_left", "position_error_m", "heading_error_rad", "hypotheses")
 """The columns with the largest value of any robot."""
 TOTALS = ("reports_sent", "reports_heard", "reports_refused", "reports_lost", "bytes_sent")
@@ -121,27 +120,8 @@ class TrialRow(msgspec.Struct, frozen=True, array_like=True):
     """T_max in s, the bound on the time in orbit until two robots meet; the largest of all robots"""
     t_max_ticks: int | None = None
     """T_max in ticks, rounded up"""
-    bound_ticks: int | None = None
-    """only for a group: the computed bound in ticks until all its robots are localised"""
-    corrected_ticks: int | None = None
-    """only for a group: the last of the bounds that correct it, if a robot was late"""
-    travel_ticks: float | None = None
-    """only for a group: a lower bound of these ticks, in which robots only travel after the first meetings,
-    which end when they did"""
-    honest_tick: int | None = None
-    """only for a group: tick of the last claim of an honest robot: one without an attack that does not die;
-    None if one has no claim at the end"""
-    honest_localised: int | None = None
-    """only for a group: number of honest robots whose claims are right"""
-    honest_undecided: int | None = None
-    """only for a group: number of honest robots that have no claim at the end"""
-    honest_wrong: int | None = None
-    """only for a group: number of honest robots whose claims are wrong"""
-    attacker_met: int | None = None
-    """only for a group: number of meetings of honest robots with one that has an attack; None if the trial
-    was not audited"""
-    attacker_found: int | None = None
-    """only for a group: number of these in which the robot reported that the other's data are inconsistent"""
+    group: GroupColumns | None = None
+    """columns of a group, in this place"""
     candidates: int | None = None
     """largest number of solutions of eq. (7) of any robot"""
     candidates_left: int | None = None
@@ -235,16 +215,12 @@ def row(trial: Trial, run: Run, wall_s: float, findings: Findings | None = None)
     t_max_s = max(robot.rendezvous.bound for robot in scenario.robots)
     encounters = [_meeting(run, a, b, in_group=bool(scenario.meetings)) for a, b in run.pairs]
     final_reports = run.final_reports.values()
-    group = group_columns(run)
-    errors = [robot.position_error_m for robot in robots.values() if robot.position_error_m is not None]
-    largest: dict[str, Any] = {
-        name: max(
-            [one for robot in robots.values() if (one := getattr(robot, name)) is not None], default=None
-        )
-        for name in LARGEST
+    known: dict[str, list[Any]] = {
+        name: [value for robot in robots.values() if (value := getattr(robot, name)) is not None]
+        for name in (*LARGEST, "nees", "truth_held")
     }
-    nees = [robot.nees for robot in robots.values() if robot.nees is not None]
-    held = [robot.truth_held for robot in robots.values() if robot.truth_held is not None]
+    largest: dict[str, Any] = {name: max(known[name], default=None) for name in LARGEST}
+    errors, nees, held = known["position_error_m"], known["nees"], known["truth_held"]
     return TrialRow(
         cell=trial.cell,
         trial=trial.number,
@@ -258,7 +234,7 @@ def row(trial: Trial, run: Run, wall_s: float, findings: Findings | None = None)
         period_s=scenario.mission.period,
         t_max_s=t_max_s,
         t_max_ticks=math.ceil(t_max_s / scenario.mission.period - TICK_ROUNDING),
-        **(asdict(group) if group is not None else {}),
+        group=group_columns(run),
         **largest,
         nearest_m=nearest(run) if scenario.mission.safety_distance else None,
         claims=len(errors),
@@ -309,20 +285,12 @@ def _meeting(run: Run, a: str, b: str, *, in_group: bool) -> tuple[int | None, i
     The first is None if phase 3 begins earlier, and each is None if it never happens. In a group, where a may
     have been in phase 3 before, the tick is that of b, and the first is None.
     """
-    meeting = (b,) if in_group else (a, b)
     orbiting = None
     for tick in run.ticks:
-        commands = [
-            command for command in (tick.commands.get(a), tick.commands.get(b)) if command is not None
-        ]
-        if any(command.phase == 3 and command.robot in meeting for command in commands):
+        both = [tick.commands[robot] for robot in (a, b) if robot in tick.commands]
+        if any(one.phase == 3 and (one.robot == b or not in_group) for one in both):
             return orbiting, tick.truth.tick
-        if (
-            not in_group
-            and orbiting is None
-            and len(commands) == 2
-            and all(command.task == "orbiting" for command in commands)
-        ):
+        if orbiting is None and not in_group and [one.task for one in both] == ["orbiting"] * 2:
             orbiting = tick.truth.tick
     return orbiting, None
 

@@ -1,12 +1,13 @@
 """The process in which trials run, forked from a fork server that has imported this module.
 
-It receives chunks from its launcher, and sends one row per trial, both as msgpack. The process ends when the
-connection is closed, even during a trial that hangs.
+It receives chunks from its launcher, and sends one row per trial, both as msgpack, then READY. The process
+ends when the connection is closed, even during a trial that hangs.
 """
 
 from __future__ import annotations
 
 import os
+import select
 import shutil
 import sys
 import tempfile
@@ -15,7 +16,6 @@ import time
 from collections.abc import Callable
 from functools import cache
 from importlib import import_module
-from queue import Empty, SimpleQueue
 from typing import Any
 
 import msgspec
@@ -33,7 +33,12 @@ from protocol.output import one_line
 PLAY = "compose.sweep.trial:run_trial"
 """The default function that runs a trial."""
 READY = b""
-"""The first message, sent when all modules are imported."""
+"""The message for more work: the first one, when all modules are imported, and the last one of a chunk."""
+CHUNK_S = 1.0
+"""The wall time in s after which a process leaves the rest of a chunk to others.
+
+It is long compared to the overhead of a chunk, and short enough to lose.
+"""
 MAX_ERROR = 300
 """The largest length of an error text, in characters."""
 WORKER_IDLE_S = 300.0
@@ -61,7 +66,7 @@ class TrialOptions(msgspec.Struct, frozen=True):
 
 
 class Chunk(msgspec.Struct, frozen=True):
-    """Trials of one cell that a process runs in sequence."""
+    """Trials of one cell that a process runs in sequence, as many as it can in CHUNK_S, but at least one."""
 
     cell: int
     trials: tuple[int, ...]
@@ -73,45 +78,41 @@ class Chunk(msgspec.Struct, frozen=True):
     table: dict[str, Any] = {}
     """parsed table of the cell's scenario file; empty without draws"""
 
-    def after(self, done: int) -> Chunk:
-        """Return the chunk without its first `done` trials."""
-        return replace(self, trials=self.trials[done:], seeds=self.seeds[done:])
+    def split(self, size: int) -> tuple[Chunk, list[Chunk]]:
+        """Return the chunk with its first `size` trials only, and one with the others if there are any."""
+        parts = [
+            replace(self, trials=self.trials[part], seeds=self.seeds[part])
+            for part in (slice(size), slice(size, None))
+        ]
+        return parts[0], parts[1:] if parts[1].trials else []
 
 
 def main() -> None:
     """Run trials until the connection is closed, or until there has been no work for WORKER_IDLE_S."""
-    folder = sys.argv[1]
-    tempfile.tempdir = folder  # removed by the owner, with all files that trials leave in it
-    chunks: SimpleQueue[Chunk] = SimpleQueue()
-    threading.Thread(target=_listen, args=(chunks, folder), daemon=True).start()
+    tempfile.tempdir = sys.argv[1]  # removed by the owner, with all files that trials leave in it
+    threading.Thread(target=_end_with_owner, daemon=True).start()
+    owner, encoder, decoder = launcher(), msgspec.msgpack.Encoder(), msgspec.msgpack.Decoder(Chunk)
     try:
-        _play(chunks)
-    finally:  # the reader of the rows is gone, or there was no work for WORKER_IDLE_S
-        shutil.rmtree(folder, ignore_errors=True)
+        owner.send_bytes(READY)
+        while owner.poll(WORKER_IDLE_S):
+            chunk = decoder.decode(owner.recv_bytes())
+            began = time.monotonic()
+            for number, seed in zip(chunk.trials, chunk.seeds, strict=True):
+                owner.send_bytes(encoder.encode(played(chunk, number, seed)))
+                if time.monotonic() - began > CHUNK_S:
+                    break
+            owner.send_bytes(READY)
+    finally:  # the owner is gone, or there was no work for WORKER_IDLE_S
+        shutil.rmtree(sys.argv[1], ignore_errors=True)
 
 
-def _play(chunks: SimpleQueue[Chunk]) -> None:
-    """Run the trials of `chunks`, and send their rows."""
-    launcher().send_bytes(READY)
-    encoder = msgspec.msgpack.Encoder()
-    while True:
-        try:
-            chunk = chunks.get(timeout=WORKER_IDLE_S)
-        except Empty:
-            return
-        for number, seed in zip(chunk.trials, chunk.seeds, strict=True):
-            launcher().send_bytes(encoder.encode(played(chunk, number, seed)))
-
-
-def _listen(chunks: SimpleQueue[Chunk], folder: str) -> None:
-    """Receive chunks. End the process when the connection is closed, and remove `folder`."""
-    decoder = msgspec.msgpack.Decoder(Chunk)
-    try:
-        while True:
-            chunks.put(decoder.decode(launcher().recv_bytes()))
-    finally:  # the owner has closed the connection, or has ended
-        shutil.rmtree(folder, ignore_errors=True)
-        os._exit(0)
+def _end_with_owner() -> None:
+    """End the process once the connection is closed, and remove its files."""
+    connection = select.poll()
+    connection.register(launcher(), 0)  # the end of a connection is reported in any case
+    connection.poll()
+    shutil.rmtree(sys.argv[1], ignore_errors=True)
+    os._exit(0)
 
 
 def played(chunk: Chunk, number: int, seed: int) -> trial.TrialRow:
@@ -135,8 +136,13 @@ def played(chunk: Chunk, number: int, seed: int) -> trial.TrialRow:
         row = player(trial.Trial(chunk.cell, number, scenario, options.processes, options.audit, kills))
         return replace(row, drawn=drawn) if drawn else row
     except BaseException as error:  # noqa: BLE001  # SystemExit from a trial must not end the process
-        error_text = one_line(f"{type(error).__name__}: {error}")[:MAX_ERROR]
-        return trial.lost(chunk.cell, number, seed, error_text, time.perf_counter() - began)
+        why = error_text(f"{type(error).__name__}: {error}")
+        return trial.lost(chunk.cell, number, seed, why, time.perf_counter() - began)
+
+
+def error_text(text: str) -> str:
+    """Return `text` as the error of a row: one line of at most MAX_ERROR characters."""
+    return one_line(text)[:MAX_ERROR]
 
 
 @cache
