@@ -83,28 +83,19 @@ STATISTICS = {
     "ticks": Statistic("ticks until localised", column="ticks"),
     "wall": Statistic("wall time [s]", column="wall_s"),
 }
-"""The figures over an axis, by the start of their file names."""
-
-
-def _drawn(title: str, trials: CellTrials) -> bool:
-    """Return whether a figure says something about `trials`; the wall time is that of sweeps with kills."""
-    match title:
-        case "inconsistent" | "wrong":
-            return title in trials.outcomes
-        case "wall":
-            return len(trials.known("kills")) > 0
-    return True
+"""The figures over an axis, by the start of their file names; the wall time is that of sweeps with kills."""
 
 
 def draw(results: Results, folder: Path) -> None:
     """Draw all figures of the sweep into `folder`, each as SVG, PDF and PNG."""
     folder.mkdir(exist_ok=True)
     trials = CellTrials(results.table)
+    drawn = {"success", "ticks", *trials.outcomes, *(["wall"] if len(trials.known("kills")) else [])}
     with look(SWEEP_MEDIUM):
         for place, axis in enumerate(results.sweep.axes):
             name = re.sub(r"[^A-Za-z0-9_-]+", "-", axis.name).strip("-")
             for title, statistic in STATISTICS.items():
-                if len(axis.values) > 1 and _drawn(title, trials):
+                if len(axis.values) > 1 and title in drawn:
                     figure = over_axis(results.sweep, place, statistic, points(results, place, statistic))
                     save(figure, folder / f"{title}-{name}")
 
@@ -164,8 +155,19 @@ def over_axis(sweep: Sweep, place: int, statistic: Statistic, points: Sequence[F
         axes.yaxis.set_major_formatter("{x:.0f}")
         axes.yaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False, minor_thresholds=(1.0, 0.4)))
         axes.grid(axis="y", which="minor", lw=0.25, color="0.9")
-    others = [one for one in sweep.axes if one is not axis and len(one.values) > 1]
-    _legend(figure, axes, [one.name for one in others if not one.paired])
+    handles, labels = axes.get_legend_handles_labels()
+    if labels:
+        others = [one for one in sweep.axes if one is not axis and len(one.values) > 1]
+        unpaired = ", ".join([one.name for one in others if not one.paired])
+        columns = next((n for n in (4, 2) if n * max(map(len, labels)) < WIDEST_LEGEND), 1)
+        figure.legend(
+            handles,
+            labels,
+            title=f"other draws at each value of {unpaired}" if unpaired else None,
+            loc="outside upper center",
+            ncols=min(columns, len(labels)),
+            frameon=False,
+        )
     return figure
 
 
@@ -218,19 +220,3 @@ def _numbers(axis: Axis) -> list[float] | None:
     if any(isinstance(value, bool) or not isinstance(value, int | float) for value in values):
         return None
     return [float(value) for value in values]
-
-
-def _legend(figure: Figure, axes: Axes, unpaired: Sequence[str]) -> None:
-    """Add a legend above the axes, unless there are no labels; its title names the axes with other draws."""
-    handles, labels = axes.get_legend_handles_labels()
-    if labels:
-        longest = max(map(len, labels))
-        columns = next((count for count in (4, 2) if count * longest < WIDEST_LEGEND), 1)
-        figure.legend(
-            handles,
-            labels,
-            title=f"other draws at each value of {', '.join(unpaired)}" if unpaired else None,
-            loc="outside upper center",
-            ncols=min(columns, len(labels)),
-            frameon=False,
-        )

@@ -31,12 +31,10 @@ from protocol.output import one_line
 
 T = TypeVar("T")
 
-MOST_CHUNKS = 256
-"""The largest number of chunks that are submitted at once."""
+CHUNKS_PER_THREAD = 2
+"""The number of chunks submitted per worker thread: one that runs, and one that waits."""
 MAX_CHUNK = 1000
 """The largest number of trials in a chunk."""
-SHARES = 4
-"""The number of shares into which the trials that are left of a cell are divided, one of which is a chunk."""
 SCHEMES = ("tcp", "tls", "ws", "wss")
 """The schemes that the address of a scheduler may have."""
 SCHEDULER_S = 5.0
@@ -48,8 +46,8 @@ SCHEDULER_ADDRESS = "127.0.0.1:0"
 
 
 @contextmanager
-def connect(workers: int, scheduler: str | None, say: Callable[[str], None]) -> Iterator[Client]:
-    """Yield a Dask client of `workers` threads in this process, or of the scheduler at an address.
+def connect(workers: int, scheduler: str | None, say: Callable[[str], None]) -> Iterator[tuple[Client, int]]:
+    """Yield a Dask client and its number of worker threads: `workers` in this process, or a scheduler's.
 
     `say` prints a line if the scheduler has no workers. Raises UserError if it cannot be reached.
     """
@@ -59,14 +57,15 @@ def connect(workers: int, scheduler: str | None, say: Callable[[str], None]) -> 
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # this program reports errors itself
     if scheduler is not None:
         try:
-            if not asyncio.run(_workers(scheduler)):
-                say("the scheduler has no workers yet")
+            threads = asyncio.run(_threads(scheduler))
             client = Client(scheduler, set_as_default=False)
         except (OSError, ValueError, TypeError, RuntimeError, ImportError) as error:
             why = one_line(str(error).splitlines()[0] if str(error) else type(error).__name__)
             raise UserError(f"--scheduler: {scheduler} cannot be reached: {why}") from None
+        if not threads:
+            say("the scheduler has no workers yet")
         with client:
-            yield client
+            yield client, threads
         return
     with (
         _system_errors(),
@@ -84,7 +83,7 @@ def connect(workers: int, scheduler: str | None, say: Callable[[str], None]) -> 
         ) as cluster,
         Client(cluster, set_as_default=False) as client,
     ):
-        yield client
+        yield client, workers
 
 
 @contextmanager
@@ -101,8 +100,8 @@ def _system_errors() -> Iterator[None]:
         raise cause from None
 
 
-async def _workers(address: str) -> int:
-    """Return the number of workers of a scheduler.
+async def _threads(address: str) -> int:
+    """Return the number of worker threads of a scheduler.
 
     Raises an error unless it answers within SCHEDULER_S: a Client would wait for ever.
     """
@@ -119,25 +118,32 @@ async def _workers(address: str) -> int:
         raise TimeoutError(f"no answer within {SCHEDULER_S:g} s") from None
     if known.get("type") != "Scheduler":
         raise ValueError(f"the process at this address is a {known.get('type', 'stranger')}, not a scheduler")
-    return len(known["workers"])
+    return sum([worker["nthreads"] for worker in known["workers"].values()])
 
 
-def play(client: Client, work: Sequence[Chunk], inbox: Inbox, done: Callable[[list[TrialRow]], None]) -> None:
+def play(
+    client: Client,
+    threads: int,
+    work: Sequence[Chunk],
+    inbox: Inbox,
+    done: Callable[[list[TrialRow]], None],
+) -> None:
     """Run all trials of `work`, and call `done` with the rows of each chunk of them as it completes.
 
-    A chunk is a share of what is left of a cell, so that all worker threads get work, however many they are.
+    A chunk is a share of what is left of a cell, so that all `threads` get work; their number may change.
     A scheduler that is slow to answer, as on a busy machine, is waited for as long as its connection lives.
     Raises Interrupted if `inbox` receives a signal, and EngineFailed if the connection to the scheduler is
     lost. In any case, all chunks are cancelled and their processes ended.
     """
     sweep = secrets.token_hex(8)
     left = deque(work)
-    running: dict[str, tuple[Future[Answers], Chunk]] = {}
+    running: dict[str, tuple[Future[tuple[Answers, int]], Chunk]] = {}
     try:
         while left or running:
-            while left and len(running) < MOST_CHUNKS:
-                trials = left.popleft()
-                chunk, rest = trials.split(min(math.ceil(len(trials.trials) / SHARES), MAX_CHUNK))
+            most = CHUNKS_PER_THREAD * max(threads, 1)
+            while left and len(running) < most:
+                of_cell = left.popleft()
+                chunk, rest = of_cell.split(min(math.ceil(len(of_cell.trials) / most), MAX_CHUNK))
                 left.extendleft(rest)
                 outcome = _begun(client, _outcome(client, sweep, chunk))
                 running[str(id(outcome))] = outcome, chunk
@@ -145,7 +151,8 @@ def play(client: Client, work: Sequence[Chunk], inbox: Inbox, done: Callable[[li
             arrival = inbox.next(None)
             if arrival.key in running:
                 outcome, chunk = running.pop(arrival.key)
-                rows = _rows(outcome, chunk)
+                answers, known = outcome.result()
+                threads, rows = known or threads, _rows(answers, chunk)
                 left.extendleft(chunk.split(len(rows))[1])
                 done(rows)
     finally:
@@ -160,12 +167,13 @@ def _begun(client: Client, coroutine: Coroutine[Any, Any, T]) -> Future[T]:
     return asyncio.run_coroutine_threadsafe(coroutine, client.loop.asyncio_loop)  # type: ignore[union-attr]
 
 
-async def _outcome(client: Client, sweep: str, chunk: Chunk) -> Answers:
-    """Return the answers to a chunk, which the workers of `client` run.
+async def _outcome(client: Client, sweep: str, chunk: Chunk) -> tuple[Answers, int]:
+    """Return the answers to a chunk, which the workers of `client` run, and the number of their threads.
 
-    If a worker dies while it runs the chunk, or before its rows are here, Dask runs the chunk on another one.
-    If the connection to the scheduler breaks, Dask cancels the chunk and connects again, and the chunk is
-    submitted again. Raises EngineFailed if Dask cannot connect, and any error of the chunk.
+    If a worker dies while it runs the chunk, or before its rows are here, Dask runs the chunk on another one;
+    if that happens too often, the first trial is lost. If the connection to the scheduler breaks, Dask
+    cancels the chunk and connects again, and the chunk is submitted again. Raises EngineFailed if Dask cannot
+    connect, or a worker fails.
     """
     given = sweep, msgspec.msgpack.encode(chunk), chunk.options.timeout
     future = None
@@ -173,33 +181,24 @@ async def _outcome(client: Client, sweep: str, chunk: Chunk) -> Answers:
         if future is None or future.cancelled():
             future = client.submit(worker_pool.run, *given, pure=False)
         try:
-            answers: Answers = await future
-        except (CancelledError, OSError):
-            if future.status == "error":  # of the chunk
+            return await future, sum((await client.nthreads()).values())
+        except KilledWorker as error:
+            return Answers([], error_text(f"lost: KilledWorker: {error}")), 0
+        except Exception as error:
+            if future.status == "error":  # every chunk would fail like this one
+                why = error_text(f"lost: {type(error).__name__}: {error}")
+                raise EngineFailed(f"a worker cannot run trials: {why}") from None
+            if not isinstance(error, CancelledError | OSError):
                 raise
-        else:
-            return answers
     raise EngineFailed(CONNECTION_LOST)
 
 
-def _rows(outcome: Future[Answers], chunk: Chunk) -> list[TrialRow]:
-    """Return the rows of the first trials of a chunk; a trial whose process or worker died is a lost one.
-
-    Raises EngineFailed if the connection to the scheduler is lost, or the worker failed for another reason.
-    """
-    numbers = list(zip(chunk.trials, chunk.seeds, strict=True))
-    try:
-        answers = outcome.result()
-    except KilledWorker as error:
-        return [lost(chunk.cell, *one, error_text(f"lost: KilledWorker: {error}"), None) for one in numbers]
-    except EngineFailed:
-        raise
-    except Exception as error:  # noqa: BLE001  # every chunk would fail like this one
-        why = error_text(f"lost: {type(error).__name__}: {error}")
-        raise EngineFailed(f"a worker cannot run trials: {why}") from None
+def _rows(answers: Answers, chunk: Chunk) -> list[TrialRow]:
+    """Return the rows of the first trials of a chunk; that of a trial without an answer is a lost one."""
     rows = [msgspec.msgpack.decode(row, type=TrialRow) for row in answers.rows]
     if answers.error:
-        rows.append(lost(chunk.cell, *numbers[len(rows)], answers.error, answers.wall_s))
+        i = len(rows)
+        rows.append(lost(chunk.cell, chunk.trials[i], chunk.seeds[i], answers.error, answers.wall_s))
     return rows
 
 

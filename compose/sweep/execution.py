@@ -12,10 +12,11 @@ import numpy as np
 import pyarrow as pa
 
 from compose.errors import BadSpec
+from compose.recording.rows import csv_text
 from compose.scenario.scenario_file import trust_classes
 from compose.sweep import SUMMARY_CSV
 from compose.sweep.cells import Cell, RefusedCell, setting_of, trial_seed
-from compose.sweep.paired_differences import PairedDifference, differences_csv, paired_differences
+from compose.sweep.paired_differences import PairedDifference, paired_differences
 from compose.sweep.results_folder import Folder, opened
 from compose.sweep.spec import Sweep
 from compose.sweep.statistics import CellSummary, by_cell, counted, header, summary_csv
@@ -180,9 +181,9 @@ def _play(
     from compose.sweep import cluster  # noqa: PLC0415  # importing Dask takes a second
 
     pa.array([])  # its first call imports pandas, where it is installed: another second
-    with cluster.connect(means.workers, means.scheduler, inbox.say) as client:
+    with cluster.connect(means.workers, means.scheduler, inbox.say) as (client, threads):
         take_signals()
-        cluster.play(client, work, inbox, store)
+        cluster.play(client, threads, work, inbox, store)
 
 
 def _gathered(folder: Folder, stopped: str | None, interrupted: bool) -> Results:
@@ -195,7 +196,7 @@ def _gathered(folder: Folder, stopped: str | None, interrupted: bool) -> Results
         folder.gather(table)
         files.write(folder.path / SUMMARY_CSV, summary_csv(folder.sweep, cells, figures))
         if differences:
-            files.write(folder.path / DIFFERENCES, differences_csv(differences))
+            files.write(folder.path / DIFFERENCES, csv_text(PairedDifference, differences))
     except OSError as error:
         stopped = stopped or f"cannot be written: {files.error_text(error)}"
     return Results(folder.sweep, cells, table, figures, stopped, interrupted, folder.trials, differences)

@@ -18,7 +18,7 @@ from scipy.special import stdtrit  # type: ignore[import-untyped]
 
 from compose.sweep.cells import Cell
 from compose.sweep.spec import Sweep
-from compose.sweep.statistics import CONFIDENCE, CellTrials, Floats, Number, by_cell, column, csv_text
+from compose.sweep.statistics import CONFIDENCE, CellTrials, Floats, Number, by_cell, column
 
 MaybeInterval = tuple[Number, Number, Number]
 """An estimate and the bounds of its interval, each None where there are too few values."""
@@ -125,8 +125,3 @@ def rate_interval(only_value: int, only_reference: int, pairs: int) -> MaybeInte
     half = z * math.sqrt((one + other - (one - other) ** 2) / (pairs + 2.0))
     low, high = max(-1.0, one - other - half), min(1.0, one - other + half)
     return (only_value - only_reference) / pairs, low, high
-
-
-def differences_csv(differences: Sequence[PairedDifference]) -> str:
-    """Return the text of `differences.csv`."""
-    return csv_text(PairedDifference.__struct_fields__, map(msgspec.structs.astuple, differences))

@@ -18,7 +18,7 @@ from compose.sweep.cells import Cell
 from compose.sweep.execution import Progress, Results
 from compose.sweep.paired_differences import PairedDifference
 from compose.sweep.results_folder import CELLS
-from compose.sweep.statistics import COLUMNS, CellSummary, noted
+from compose.sweep.statistics import COLUMNS, CellSummary, counted, noted
 from compose.terminal import tables, text_width
 from compose.terminal.invocation import program
 from compose.terminal.text_width import tell
@@ -98,13 +98,19 @@ def progress(name: str, say: Callable[[str], None], visible: bool) -> Iterator[P
 
 def show(results: Results, out: Path, *, quiet: bool) -> None:
     """Print the results: with `quiet` only the counts, otherwise also the table and the trial to look at."""
-    total = {name: sum([getattr(one, name) for one in results.figures.values()]) for name in OUTCOME_COLUMNS}
-    total["refused"] = sum([one.refused_trials for one in results.figures.values()])
-    counts = ", ".join([f"{count} {name}" for name, count in total.items() if count])
+    total = counted(results.table)
+    outcomes = [(getattr(total, name), name) for name in OUTCOME_COLUMNS] + [
+        (total.refused_trials, "refused")
+    ]
+    counts = ", ".join([f"{n} {name}" for n, name in outcomes if n])
     cells = "one cell" if len(results.cells) == 1 else f"{len(results.cells)} cells"
     tell(f"{results.sweep.name}: {counts} of {len(results.table)} trials in {cells}")
-    if any(one.audited for one in results.figures.values()):
-        tell(_audited(results))
+    note = noted(results.table)
+    if total.audited:
+        first = ""
+        if note is not None and total.clean < total.audited:
+            first = f"; trial {note.trial} of cell {note.cell}: {note.why}"
+        tell(f"audited: {total.audited} of {total.trials} trials, {total.clean} clean{first}")
     if quiet:
         return
     shown = len(_shown(results))
@@ -117,7 +123,6 @@ def show(results: Results, out: Path, *, quiet: bool) -> None:
     _block(_difference_lines(results))
     _block([line for reason in _refused(results) for line in text_width.wrapped(one_line(reason))])
     say("")
-    note = noted(results.table)
     if note is not None:
         why = f" ({note.why})" if note.why else ""
         how = f"{note.outcome} after {note.ticks} ticks" if note.ticks is not None else note.outcome
@@ -128,7 +133,9 @@ def show(results: Results, out: Path, *, quiet: bool) -> None:
             source = shlex.quote(results.sweep.source)
             say(f"  {tandem} sweep {source} --print-trial {note.cell}:{note.trial} > trial.toml")
             file = "trial.toml"
-        recording = _new_folder(f"recording-{results.sweep.name}-{note.cell}-{note.trial}")
+        name = f"recording-{results.sweep.name}-{note.cell}-{note.trial}"
+        names = chain([name], (f"{name}-{number}" for number in count(2)))
+        recording = next(name for name in names if not Path(name).exists())
         say(f"  {tandem} run {file} --seed {note.seed} --out {recording}")
     say(f"results: {out}")
 
@@ -181,22 +188,6 @@ def _refused(results: Results) -> Iterator[str]:
         first = results.table.slice(outcomes.index("refused"), 1).to_pylist()[0]
         where = f"trial {first['trial']} of cell {first['cell']}"
         yield f"{outcomes.count('refused')} trials refused; the first is {where}: {first['reason']}"
-
-
-def _new_folder(name: str) -> Path:
-    """Return the path `name`; if it exists, with the first number from 2 on that makes it new."""
-    paths = map(Path, chain([name], (f"{name}-{number}" for number in count(2))))
-    return next(path for path in paths if not path.exists())
-
-
-def _audited(results: Results) -> str:
-    """Return the line with the number of audited trials, and the first violation."""
-    figures = results.figures.values()
-    audited, clean = sum([one.audited for one in figures]), sum([one.clean for one in figures])
-    note = noted(results.table) if clean < audited else None
-    first = f"; trial {note.trial} of cell {note.cell}: {note.why}" if note is not None else ""
-    total = sum([one.trials for one in figures])
-    return f"audited: {audited} of {total} trials, {clean} clean{first}"
 
 
 def _lines(results: Results) -> tuple[list[str], Sequence[str]]:

@@ -6,7 +6,7 @@ The annotations of CellSummary hold the functions that compute it, so they are e
 import csv
 import io
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from statistics import NormalDist
 from typing import Annotated, Any, NamedTuple, get_type_hints
@@ -355,24 +355,15 @@ def column(table: pa.Table, name: str) -> Floats:
 
 def summary_csv(sweep: Sweep, cells: Sequence[Cell], figures: Mapping[int, CellSummary]) -> str:
     """Return the text of `summary.csv`, with one row per cell."""
-    rows = [
-        [
-            cell.index,
-            *[
-                "" if value is None else value if isinstance(value, str) else canonical(value)
-                for value in cell.on_axes(sweep.axes)
-            ],
-            *[getattr(figures[cell.index], name) for name in columns_of(sweep)],
-        ]
-        for cell in cells
-    ]
-    return csv_text(header(sweep), rows)
-
-
-def csv_text(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Return the text of a CSV file; None is empty."""
     out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerows([header, *rows])
+    rows = csv.writer(out, lineterminator="\n")
+    rows.writerow(header(sweep))
+    for cell in cells:
+        axes = [
+            value if isinstance(value, str | None) else canonical(value) for value in cell.on_axes(sweep.axes)
+        ]
+        numbers = [getattr(figures[cell.index], name) for name in columns_of(sweep)]
+        rows.writerow([cell.index, *axes, *numbers])
     return out.getvalue()
 
 
