@@ -129,7 +129,9 @@ def test_however_a_trial_ends_its_processes_end_with_it(how: str, tmp_path: Path
     if "hung" in how:
         rows = pq.read_table(tmp_path / "out" / "trials.parquet").to_pylist()
         killed, hung = [row["error"] for row in rows]
-        assert killed.startswith("died: killed by SIGKILL")  # and its last line of output, if there was one
+        assert killed.startswith(
+            "died: its process was killed by signal 9"
+        )  # and its last line of output, if there was one
         assert hung == "hung: no answer within 10 s"
 
 

@@ -135,9 +135,7 @@ def _left(folder: Folder, means: ExecutionOptions, progress: Progress) -> list[C
     surplus = sum([trial >= sweep.trials for trials in done.values() for trial in trials])
     if surplus:
         progress.say(f"{folder.path} holds {surplus} trials beyond the {sweep.trials} per cell; kept")
-    options = TrialOptions(
-        sweep.seed, means.processes, sweep.trial_timeout, means.play, means.audit, sweep.draws
-    )
+    options = TrialOptions(means.processes, sweep.trial_timeout, means.play, means.audit, sweep.draws)
     work = []
     for cell in folder.cells.values():
         left = [trial for trial in range(sweep.trials) if trial not in done[cell.index]]

@@ -51,8 +51,6 @@ The command that started the sweep may have been killed while the Dask worker th
 class TrialOptions(msgspec.Struct, frozen=True):
     """The options that all trials of a sweep have in common."""
 
-    seed: int
-    """seed of the sweep"""
     processes: bool
     """true to run trials as processes over Zenoh"""
     timeout: float

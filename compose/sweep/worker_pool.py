@@ -11,7 +11,7 @@ import time
 from contextlib import ExitStack
 from typing import NamedTuple
 
-from compose.launch.forked import fork_server
+from compose.launch.forked import ending, fork_server
 from compose.sweep.worker import READY, error_text
 
 START_S = 60.0
@@ -53,8 +53,10 @@ class WorkerProcess:
         return self.child.receive(timeout)
 
     def how_ended(self) -> str:
-        """Return how the process ended, as part of an error message."""
-        return self.child.how_ended if self.child.wait(1.0) else "closed its connection"
+        """Return how the process ended, with the last line of its standard error."""
+        if not self.child.wait(1.0):
+            return "closed its connection"
+        return ending(self.child.status or 0, self.child.stderr_text.splitlines()[-1:])
 
     def close(self) -> None:
         """Kill the process and those that its trials started, and remove its files."""

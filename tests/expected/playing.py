@@ -55,9 +55,7 @@ def play(sweep: Sweep, jobs: int) -> tuple[pa.Table, list[str], float]:
 
 def _chunks(sweep: Sweep, every: list[Cell]) -> Iterator[Chunk]:
     """Yield the trials of all cells; those of the last cells, which may be the longest, first."""
-    options = TrialOptions(
-        sweep.seed, False, sweep.trial_timeout, play=f"{__name__}:run_trial", draws=sweep.draws
-    )
+    options = TrialOptions(False, sweep.trial_timeout, play=f"{__name__}:run_trial", draws=sweep.draws)
     for cell in reversed(every):
         setting = setting_of(sweep, cell)
         assert not isinstance(setting, RefusedCell)
