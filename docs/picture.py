@@ -54,8 +54,8 @@ from tandem.sweeps import sweep as run_sweep  # noqa: E402
 STYLE = ("compose/figures/style.py", "compose/view/colours.py")
 MISSIONS = ("compose/figures/*.py", "compose/view/colours.py", "compose/view/outlines.py")
 PAGE = (
-    *[f"compose/view/{name}.py" for name in ("configurations", "events", "outlines", "words")],
-    *["compose/view/story/*.py", "docs/film.py", "compose/view/web/standalone.py"],
+    *[f"compose/view/{name}.py" for name in ("captions", "configurations", "events", "outlines", "words")],
+    *["docs/film.py", "compose/view/web/standalone.py"],
     "compose/view/web/page/*",
 )
 """The code that draws figures of missions, and the page, as patterns of paths."""

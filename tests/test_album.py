@@ -27,9 +27,9 @@ from agent.planning.assured import Assured
 from agent.planning.phase3_last_manoeuvre import compared
 from agent.planning.strides import stride
 from compose.cli.figures import draw
-from compose.figures import PICTURES, catalogue, decisions, manoeuvre, over_time, phase_one, steps, trajectory
+from compose.figures import PICTURES, catalogue, encounter, manoeuvre, over_time, phase_one, trajectory
 from compose.figures.agent_replay import agent_replay
-from compose.figures.pair import PairRecord, pair_of
+from compose.figures.pair import PairRecord, encounters, pair_of
 from compose.figures.sheet import Absent
 from compose.figures.style import SCREEN, look
 from compose.launch.in_process import run_mission
@@ -96,9 +96,8 @@ def recorded(name: str, recordings: Path) -> Path:
 
 def pair(folder: Path, number: int = 0) -> PairRecord:
     run = read(folder)
-    robots = run.pairs[number]
-    known = [robot for robot in robots if (folder / agent_journal(robot)).exists()]
-    found = pair_of(run, robots, {robot: agent_replay(run, robot) for robot in known})
+    known = [robot for robot in run.pairs[number] if (folder / agent_journal(robot)).exists()]
+    found = pair_of(run, encounters(run)[number], {robot: agent_replay(run, robot) for robot in known})
     assert found is not None
     return found
 
@@ -234,8 +233,8 @@ def test_the_encounter_has_a_panel_for_each_mutual_range(
     name: str, ticks: list[int], recordings: Path
 ) -> None:
     told = pair(recorded(name, recordings))
-    assert steps.steps(told) == ticks
-    figure = drawn(steps.draw(told))
+    assert encounter.steps(told) == ticks
+    figure = drawn(encounter.draw(told))
     assert len(figure.axes) == 4, "a panel for each, and the key"
     for axes, tick in zip(figure.axes, ticks, strict=False):
         assert axes.get_title(loc="left").startswith(f"({ticks.index(tick) + 1}) $k$ = {tick}, ")
@@ -311,7 +310,7 @@ def test_all_error_lines_differ_in_grey(
 def test_a_panel_has_each_hypothesis_of_the_journal_under_noise(recordings: Path) -> None:
     folder = recorded("noisy", recordings)
     told = pair(folder)
-    figure = drawn(decisions.draw(told))
+    figure = drawn(encounter.draw_decisions(told))
     shown = {int(one.get_gid().split("-")[1]) for one in found(figure, r"truth-.*")}  # type: ignore[union-attr]
     assert len(shown) == len(figure.axes) - 1 > 1
     for role in ("a", "b"):

@@ -13,11 +13,10 @@ from compose.recording.run import Run, read
 from compose.recording.run_setup import RunSetup
 from compose.scenario.scenario_file import load, parse, setting
 from compose.scenario.shipped_files import shipped
+from compose.view.captions import FAULTS, Caption, captions
 from compose.view.recorded import run_data, scenes_of
 from compose.view.run_data import TickData
 from compose.view.scene import Scene, scene
-from compose.view.story.caption import FAULTS, Caption
-from compose.view.story.captions import captions
 from protocol.attack import Attack
 from protocol.messages import Cause, Contact, Inconsistent, Localised, MissionEnd, Outcome, Undecided
 from tests.commands import SECTION_IV
@@ -82,7 +81,7 @@ def test_the_story_of_paper_1_has_a_caption_for_each_of_its_beats(paper_1: Run) 
         ),
         (
             46,
-            "a and b meet, 2.95 m apart, and exchange reports of their paths. "
+            "a and b meet. Their distance is 2.95 m. They exchange reports of their paths. "
             "a drives on to measure a second distance, while b stands still.",
         ),
         (
@@ -140,7 +139,7 @@ def test_a_detected_attack_is_told_as_a_contradiction_and_named_with_the_truth_o
     )
     run = recorded(replace(scenario, robots=robots))
     captions = [caption for scene in scenes_of(run) for caption in scene.captions]
-    assert captions[-2].text.startswith("b finds that the reports of a contradict what it measured: ")
+    assert captions[-2].text.startswith("b found an inconsistency in the reports of a: ")
     assert captions[-1].text == "The mission ends, because measurements and reports contradict each other."
     assert [one.truth for one in captions if one.truth and "false data" in one.truth] == [
         "The simulated sensors are exact. a will report false data about itself.",
@@ -280,18 +279,18 @@ def test_a_robot_that_stops_without_a_claim_is_told_with_its_reason(paper_1: Run
     pose = now.commands["b"].verdict
     assert isinstance(pose, Localised)
     now = with_verdicts(now, a=Undecided("too few ranges"), b=pose)
-    told = [one.text for one in captions(setup, before, now, (), None)]
-    assert told[-2:] == ["a stops without a claim: too few ranges.", "b claims to know its pose."]
+    told = [one.text for one in scene(setup, before, now).captions]
+    assert told[-2:] == ["b claims to know its pose.", "a is undecided: too few ranges."]
 
 
 def test_a_contradiction_is_not_blamed_on_an_honest_robot(paper_1: Run) -> None:
     setup, before, now = last(paper_1)
     now = with_verdicts(now, b=Inconsistent("its path"))
-    told = [one for one in captions(setup, before, now, (), None) if one.kind == "inconsistent"]
+    told = [one for one in scene(setup, before, now).captions if one.kind == "inconsistent"]
     assert told == [
         Caption(
             "inconsistent",
-            "b finds that the reports of a contradict what it measured: its path.",
+            "b found an inconsistency in the reports of a: its path.",
             ("a", "b"),
             "No robot reports false data.",
         )

@@ -18,7 +18,7 @@ from compose.recording.run import read
 from compose.scenario.shipped_files import shipped
 from compose.scenario.toml_file import table_in
 from compose.sweep import results_folder, spec
-from compose.view.web import estimate_page, sweep_page
+from compose.view.web import results_page
 from compose.view.web.sources import Recorded
 from protocol import documents
 from protocol.documents import MOST_NESTED, Syntax, TooNested, check_nesting
@@ -58,8 +58,8 @@ def test_nested_results_are_one_line(tmp_path: Path) -> None:
         (tmp_path / name).write_text(NESTED)
     sweep = spec.load("noise")
     readers: list[Callable[[], Any]] = [
-        lambda: sweep_page.contents(tmp_path),
-        lambda: estimate_page.contents(tmp_path),
+        lambda: results_page.of_sweep(tmp_path),
+        lambda: results_page.of_estimate(tmp_path),
         lambda: _entered(results_folder.opened(tmp_path, sweep)),
     ]
     for reader in readers:
@@ -123,7 +123,7 @@ def test_a_document_that_is_too_large_is_not_read(tmp_path: Path) -> None:
     with (tmp_path / "sweep.json").open("wb") as file:
         file.truncate(10 << 30)
     with pytest.raises(UserError, match=f"larger than {documents.MOST_DOCUMENT_BYTES} bytes"):
-        sweep_page.contents(tmp_path)
+        results_page.of_sweep(tmp_path)
 
 
 @pytest.mark.long

@@ -36,8 +36,8 @@ from compose.launch import in_process
 from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
 from compose.recording.run import Run, read
 from compose.scenario.scenario_file import load
+from compose.view.drawing import LEAST_OPACITY
 from compose.view.export.folder import export
-from compose.view.foxglove.views import LEAST_OPACITY
 from protocol import wire
 from protocol.journal import journal_file
 from protocol.messages import Estimate, Observation

@@ -27,10 +27,11 @@ from compose.terminal import progress
 from compose.terminal.live_display import ProgressLine
 from compose.view.foxglove.views import Views
 from compose.view.numbers import Numbers
-from compose.view.recorded import Journals, run_data, scenes, scenes_of
+from compose.view.recorded import run_data, scenes, scenes_of
 from compose.view.run_data import RunData
 from compose.view.scene import Scene
 from compose.view.series import series
+from compose.view.web.sources import Recorded
 from compose.view.web.thumbnail import thumbnail
 from protocol.journal import journal_file
 from protocol.journal.journal_file import packed
@@ -171,7 +172,7 @@ def test_a_robot_of_a_group_rests_when_it_has_no_robot_to_drive_to_any_more(run:
 def test_journals_that_grow_show_the_same_meetings(folder: Path, run: Run, tmp_path: Path) -> None:
     names = [path.name for path in folder.glob("*.journal")]
     stored = {name: list(journal_file.read(folder / name)) for name in names}
-    journals = Journals(tmp_path)
+    journals = Recorded("", tmp_path)
     shown: list[Scene] = []
     for share in (0.2, 0.45, 0.7, 1.0):
         for name, frames in stored.items():
@@ -179,7 +180,7 @@ def test_journals_that_grow_show_the_same_meetings(folder: Path, run: Run, tmp_p
         journals.read()
         assert journals.setup is not None
         shown += scenes(journals.setup, journals.known, len(shown), journals.known.last - 5)
-    journals.fill()
+    journals.load()
     assert journals.setup is not None
     shown += scenes(journals.setup, journals.known, len(shown))
     assert peers(tuple(shown)) == WAYS
@@ -280,11 +281,11 @@ def test_the_captions_of_a_group_tell_who_drives_to_whom_and_how_many_are_locali
             "Eight robots measure no more than the distance to their own anchor. "
             "First, r1 meets r0; then those that are localised drive to the others.",
         ),
-        (19, "r1 and r0 meet. Their distance is 2.39 m."),
+        (19, "r1 and r0 meet. Their distance is 2.39 m. They exchange reports of their paths."),
         (21, "r0 and r1 claim to know their poses: 2 of 8 robots now do."),
         (22, "r0 drives to r3 and r1 drives to r2, which wait beside their anchors."),
-        (60, "r1 reaches r2. Their distance is 2.76 m."),
-        (62, "r0 reaches r3. Their distance is 2.59 m."),
+        (60, "r1 reaches r2. Their distance is 2.76 m. They exchange reports of their paths."),
+        (62, "r0 reaches r3. Their distance is 2.59 m. They exchange reports of their paths."),
     ]
     assert told[-1] == (108, "All 8 robots are localised: each knows its position and its heading.")
     assert (shown[-1].captions[-1].truth or "").startswith("The claimed positions are off by less than 1 µm")
@@ -370,7 +371,7 @@ def pairs(run: Run) -> list[PairRecord]:
 def test_a_meeting_is_drawn_from_the_tick_in_which_its_visitor_leaves(pairs: list[PairRecord]) -> None:
     (visit,) = [pair for pair in pairs if pair.name == "r0-r3"]
     assert visit.title.endswith("; meeting of r0 and r3, ticks 22 to 64")
-    assert (visit.first, visit.last, visit.encounter_tick) == (22, 64, 62)
+    assert (visit.first, len(visit.mutual), visit.encounter_tick) == (22, 65, 62)
     assert [(span.phase, span.first, span.last) for span in visit.spans("a", "b")] == [
         (2, 22, 61),
         (3, 62, 64),

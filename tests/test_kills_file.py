@@ -11,8 +11,9 @@ from msgspec.structs import replace
 from compose.recording.kills_file import KILLS, MOST_KILLS_BYTES, Killed
 from compose.recording.recording_files import KINDS, WORLD_JOURNAL
 from compose.recording.run import Run, of_frames, read
-from compose.view.recorded import Journals, scenes, scenes_of
+from compose.view.recorded import scenes, scenes_of
 from compose.view.run_data import RunData, TickData
+from compose.view.web.sources import Recorded
 from protocol.journal import journal_file
 from protocol.messages import Command, DeadlineMissed
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
@@ -70,11 +71,11 @@ def test_a_killed_process_is_shown_as_gone_and_back_with_what_it_replayed(distur
 
 
 def test_a_viewer_that_reads_the_kills_later_shows_the_same(disturbed: Path, tmp_path: Path) -> None:
-    growing = Journals(tmp_path)
+    growing = Recorded("", tmp_path)
     for path in (*disturbed.glob("*.journal"), disturbed / KILLS):
         shutil.copy(path, tmp_path)
         growing.read()
-    growing.fill()
+    growing.load()
     assert growing.setup is not None
     assert scenes(growing.setup, growing.known) == scenes_of(read(disturbed))
 
@@ -126,10 +127,9 @@ def test_a_damaged_file_is_one_note_and_the_recording_is_read_without_it(
     assert run.kills == ()
     assert len(run.notes) == 1
     assert f"{KILLS}: {complaint}" in run.notes[0]
-    viewer = Journals(tmp_path / "run")
-    viewer.read()
-    viewer.fill()
-    viewer.fill()
+    viewer = Recorded("", tmp_path / "run")
+    viewer.load()
+    viewer.load()
     assert viewer.notes == [*run.notes]
     assert viewer.known.last == 48
 
@@ -167,9 +167,8 @@ def test_a_list_that_is_a_folder_hides_no_journal(paper_1: Path, tmp_path: Path)
     (tmp_path / "run" / KILLS).mkdir()
     ended = tandem("replay", tmp_path / "run")
     assert (ended.status, ended.err.count("\n")) == (0, 1)
-    viewer = Journals(tmp_path / "run")
-    viewer.read()
-    viewer.fill()
+    viewer = Recorded("", tmp_path / "run")
+    viewer.load()
     assert viewer.known.last == 48
     assert [KILLS in note for note in viewer.notes] == [True]
 

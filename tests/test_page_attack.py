@@ -15,8 +15,9 @@ from playwright.sync_api import expect
 from compose.launch import in_process
 from compose.recording.run import read
 from compose.scenario.scenario_file import load
-from compose.view.recorded import Journals, scenes, scenes_of
+from compose.view.recorded import scenes, scenes_of
 from compose.view.scene import Scene
+from compose.view.web.sources import Recorded
 from protocol.attack import Attack
 from protocol.messages import Inconsistent
 from protocol.motion import travelled
@@ -90,8 +91,8 @@ def test_an_honest_scene_has_no_reported_pose_on_the_wire(paper_1: Path, recordi
 def test_without_the_ground_truth_nothing_is_known_to_be_false(recording: Path, tmp_path: Path) -> None:
     for path in recording.glob("agent-*.journal"):
         (tmp_path / path.name).write_bytes(path.read_bytes())
-    journals = Journals(tmp_path)
-    journals.read()
+    journals = Recorded("", tmp_path)
+    journals.load()
     assert journals.setup is not None
     assert journals.known.reported_logs["a"].through > 0
     shown = scenes(journals.setup, journals.known)

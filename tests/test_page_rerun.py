@@ -20,9 +20,9 @@ from compose.launch import in_process
 from compose.scenario.scenario_change import ScenarioChange, changed, values_of
 from compose.scenario.scenario_file import load, parse
 from compose.scenario.toml_file import field_first
-from compose.view.web import changed_missions
-from compose.view.web.changed_missions import MOST_MISSION_TICKS, ChangedMissions
+from compose.view.web import reruns
 from compose.view.web.requested_work import RequestedWork
+from compose.view.web.reruns import MOST_MISSION_TICKS, ChangedMissions
 from compose.view.web.sources import Recorded
 from tests.browser import Open, chromium_only, shot, until_loaded, until_shown
 from tests.commands import until
@@ -51,7 +51,7 @@ def test_a_mission_that_takes_too_long_is_ended(tmp_path: Path, monkeypatch: pyt
     show.load()
     missions = ChangedMissions(work)
     change = msgspec.convert(missions.values(show), ScenarioChange)
-    monkeypatch.setattr(changed_missions, "MISSION_S", 0.0)
+    monkeypatch.setattr(reruns, "MISSION_S", 0.0)
     with pytest.raises(UserError, match="the mission has not ended after 0 s: save it"):
         missions.run(show, change)
     missions.close()

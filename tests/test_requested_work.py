@@ -29,7 +29,7 @@ from compose.sweep.results_folder import Manifest
 from compose.sweep.spec import Axis, Sweep
 from compose.sweep.table import encoded, of_rows, schema_of
 from compose.sweep.trial import TrialRow
-from compose.view.web import sweep_page, trials
+from compose.view.web import reruns, results_page
 from compose.view.web.requested_work import RequestedWork
 from compose.view.web.server import application
 from compose.view.web.site import Site
@@ -149,7 +149,7 @@ def test_the_page_imports_what_a_folder_names_only_if_a_flag_does(
     asks = f"the {name} is stranger:{name.title()}; to run its code, add --{name} stranger:{name.title()}"
     with watching(f"{name}-sweep") as (_, address):
         status, answer = answered(address, "cells/0/worst", {})
-        assert status == 409
+        assert status == 422
         assert answer["error"].endswith(asks)
         assert not mark.exists()
     with watching(f"{name}-sweep", f"--{name}", f"stranger:{name.title()}") as (_, address):
@@ -187,14 +187,14 @@ def working_for(page: int) -> bool:
 def test_work_beyond_its_deadline_is_ended_with_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(trials, "TRIAL_S", 0.2)
+    monkeypatch.setattr(reruns, "TRIAL_S", 0.2)
     work = RequestedWork()
     with pytest.raises(UserError, match=r"^the trial has not ended after 0.2 s: print its scenario with"):
-        (slow := trials.Trials(results(tmp_path, ENDLESS), work)).worst(0)
+        (slow := reruns.Trials(results(tmp_path, ENDLESS), work)).worst(0)
     slow.close()
     work.stop()
     with pytest.raises(UserError, match="the server has been stopped"):
-        work.result(trials.run_worst, within=1.0, late="")
+        work.result(reruns.run_worst, within=1.0, late="")
 
 
 def test_a_cell_is_found_without_those_before_it(tmp_path: Path) -> None:
@@ -206,7 +206,7 @@ def test_a_cell_is_found_without_those_before_it(tmp_path: Path) -> None:
     assert [cell_at(few, i) for i in range(100)] == [*cells(few)]
     assert cell_at(few, 100) is None
     site = Site(folder=results(tmp_path, PAPER_1, *axes))
-    for cell, status in ((10**12 - 1, 409), (10**12, 409), (10**300, 404), ("-1", 404), ("x", 404)):
+    for cell, status in ((10**12 - 1, 422), (10**12, 422), (10**300, 404), ("-1", 404), ("x", 404)):
         assert posted(site, f"/api/cells/{cell}/worst", "127.0.0.1")[0] == status
     site.stop()
 
@@ -231,18 +231,18 @@ def test_links_and_what_is_no_file_are_not_served(tmp_path: Path) -> None:
     (folder / "figures" / "folder.svg").mkdir()
     os.mkfifo(folder / "figures" / "pipe.svg")
     site = Site(folder=folder)
-    assert sweep_page.contents(folder)["figures"] == ["good.svg"]
+    assert results_page.of_sweep(folder)["figures"] == ["good.svg"]
     assert site.figure("good.svg") == b"good"
     for name in ("link", "device", "folder", "pipe", "none"):
         assert site.figure(f"{name}.svg") is None
     (folder / "figures").rename(tmp_path / "elsewhere")
     (folder / "figures").symlink_to(tmp_path / "elsewhere")
-    assert sweep_page.contents(folder)["figures"] == []
+    assert results_page.of_sweep(folder)["figures"] == []
     for name in ("summary.csv", "sweep.json"):
         (folder / name).unlink(missing_ok=True)
         (folder / name).symlink_to(tmp_path / "secret.svg")
         with pytest.raises(UserError, match="cannot be read: it is a link"):
-            sweep_page.contents(folder)
+            results_page.of_sweep(folder)
     site.stop()
 
 

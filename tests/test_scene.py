@@ -15,7 +15,7 @@ from compose.recording.recording_files import WORLD_JOURNAL
 from compose.recording.run import read as read_record
 from compose.recording.run_setup import RunSetup, of_scenario
 from compose.scenario.scenario_file import load
-from compose.view.recorded import Journals, scenes, scenes_of
+from compose.view.recorded import scenes, scenes_of
 from compose.view.run_data import RunData
 from compose.view.scene import Scene
 from compose.view.web.sources import Recorded, writers_of
@@ -49,9 +49,8 @@ class Performance(NamedTuple):
 
 def read(folder: Path) -> Performance:
     """Read the journals as a viewer does, and as a recording: both show the same."""
-    run, journals = read_record(folder), Journals(folder)
-    journals.read()
-    journals.fill()
+    run, journals = read_record(folder), Recorded("", folder)
+    journals.load()
     assert journals.setup is not None
     assert run.setup == journals.setup
     shown = scenes(journals.setup, journals.known)
@@ -203,8 +202,8 @@ def test_every_report_has_the_outcome_of_its_deliveries(tmp_path: Path) -> None:
 
 
 def test_a_robot_is_shown_as_down_in_every_tick_without_its_process(paper_1: Path) -> None:
-    journals = Journals(paper_1)
-    journals.read()
+    journals = Recorded("", paper_1)
+    journals.load()
     known, setup = RunData(), journals.setup
     assert setup is not None
 

@@ -16,8 +16,8 @@ from compose.scenario.scenario_file import load
 from compose.view.outlines import box
 from compose.view.recorded import run_data
 from compose.view.web.requested_work import RequestedWork
+from compose.view.web.reruns import Trials
 from compose.view.web.thumbnail import HEIGHT, WIDTH, thumbnail
-from compose.view.web.trials import Trials
 from tests.browser import Open, shot, watching
 from tests.commands import BOUND_S, TandemProcess
 

@@ -13,7 +13,7 @@ import pytest
 from msgspec.structs import replace
 
 from compose.audit.rules import HARDWARE_RULES, audit_run
-from compose.figures import over_time, phase_one, steps, trajectory
+from compose.figures import encounter, over_time, phase_one, trajectory
 from compose.figures.sheet import NO_PLACES, Absent
 from compose.launch.in_process import run_mission
 from compose.recording.run import of_frames, read
@@ -184,7 +184,7 @@ def test_a_shorter_journal_does_not_shorten_that_of_the_peer(
     assert told.states("a") == known.states("a")
     assert len(told.a.path) == len(known.a.path)
     assert len(told.b.commands) < len(known.b.commands)
-    assert trajectory.draw(told) == steps.draw(told) == Absent(NO_PLACES)
+    assert trajectory.draw(told) == encounter.draw(told) == Absent(NO_PLACES)
     mutual = line(drawn(over_time.ranges(told)), "mutual-range")
     assert mutual == line(drawn(over_time.ranges(known)), "mutual-range")
     assert "; b: the recording breaks off after" in told.title
@@ -196,7 +196,7 @@ def test_paths_of_two_lengths_are_drawn(folders: tuple[Path, Path]) -> None:
     shorter = replace(told, b=replace(told.b, path=told.b.path[: told.contacts[0][0]]))
     figure = drawn(trajectory.draw(shorter))
     assert line(figure, "path-b") == [(p.x, p.y) for p in shorter.b.path]
-    assert isinstance(steps.draw(shorter), Absent)  # there is no tick with known poses of both
+    assert isinstance(encounter.draw(shorter), Absent)  # there is no tick with known poses of both
     drawn(over_time.ranges(shorter))
 
 

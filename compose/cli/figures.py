@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -40,22 +40,29 @@ def main(options: argparse.Namespace) -> int:
     kinds = [kind for kind in PICTURES if kind in (options.only or PICTURES)]
     formats = [one for one in FIGURE_FORMATS if one in (options.format or FIGURE_FORMATS)]
     pairs = encounters(run)
-    replayed: dict[str, AgentReplay | None] = {}
+    replays: dict[str, AgentReplay] = {}
+    paired = dict.fromkeys([robot for one in pairs for robot in (one.a, one.b)])
     drawn: list[Path] = []
-    with (
-        _printed(drawn),
-        counting("tandem figures", sum([len(robots) + len(kinds) for robots, _ in pairs])) as done,
-    ):
-        for robots, meeting in pairs:
-            replays, complete = _replays(run, robots, replayed, done)
-            status = status if complete else FAILED
-            torn = [
-                name for name, one in replays.items() if one.history is not None and one.history.end is None
-            ]
+    with ExitStack() as stack:
+        stack.callback(
+            lambda: say(*map(str, drawn)) if drawn else None
+        )  # a reader may leave at the first line
+        done = stack.enter_context(counting("tandem figures", len(paired) + len(pairs) * len(kinds)))
+        for robot in paired:
+            replay = _replay(run, robot)
+            if replay is not None:
+                replays[robot] = replay
+            if replay is None or replay.broken is not None:
+                status = FAILED
+            done()
+        for meeting in pairs:
+            robots = dict.fromkeys((meeting.a, meeting.b))
+            histories = {robot: replays[robot].history for robot in robots if robot in replays}
+            torn = [robot for robot, one in histories.items() if one is not None and one.end is None]
             torn += ["the world"] if run.world is not None and run.world.end is None else []
             if torn:
                 _say(f"the recording of {' and '.join(torn)} ends before the mission does")
-            pair = pair_of(run, robots, replays, meeting)
+            pair = pair_of(run, meeting, replays)
             if pair is None:
                 _say(f"no figure of {' and '.join(robots)}: the recording has no data")
                 status = FAILED
@@ -88,33 +95,6 @@ def draw(
             else:
                 paths += style.save(figure, folder / name, formats, medium.dpi)
     return paths
-
-
-@contextmanager
-def _printed(paths: Sequence[Path]) -> Iterator[None]:
-    """Print `paths` after the block, because the reader of the output may leave at the first line."""
-    try:
-        yield
-    finally:
-        if paths:
-            say(*map(str, paths))
-
-
-def _replays(
-    run: Run, robots: Sequence[str], known: dict[str, AgentReplay | None], done: Callable[[], None]
-) -> tuple[dict[str, AgentReplay], bool]:
-    """Return the replays of `robots`, added to those `known` so far, and whether all are complete."""
-    found = {}
-    complete = True
-    for robot in robots:
-        if robot not in known:
-            known[robot] = _replay(run, robot)
-        replay = known[robot]
-        if replay is not None:
-            found[robot] = replay
-        complete = complete and replay is not None and replay.broken is None
-        done()
-    return found, complete
 
 
 def _replay(run: Run, robot: str) -> AgentReplay | None:

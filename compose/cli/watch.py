@@ -29,14 +29,16 @@ NICENESS = 10
 def main(options: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C."""
     need("starlette", "uvicorn")
-    from compose.view.web import server, site  # noqa: PLC0415  # the libraries are optional
+    from compose.view.web import server  # noqa: PLC0415  # the libraries are optional
+    from compose.view.web.live import Listener  # noqa: PLC0415
+    from compose.view.web.site import Site  # noqa: PLC0415
 
     for name in options.planner:
         trust(name)
     if not options.recording:
         from compose.network import places  # noqa: PLC0415  # a recording needs no network
 
-        shown = site.of_network(places(options))
+        shown = Site(listeners=list(map(Listener, places(options))))
     elif options.connect or options.config or options.keys:
         flag = "--connect" if options.connect else "--config" if options.config else "--keys"
         raise UserError(f"{flag}: a recording needs no network; give either DIR or {flag}")
@@ -73,10 +75,13 @@ def main(options: argparse.Namespace) -> int:
 def _recorded(folders: Sequence[Path], launched: bool) -> Site:
     """Return the content for one folder, or for two recordings side by side. Raises UserError."""
     from compose.view.web import site  # noqa: PLC0415  # the libraries are optional
+    from compose.view.web.sources import Recorded  # noqa: PLC0415
 
     match folders:
+        case [one] if launched:  # the recording need not exist yet
+            return site.Site([Recorded(one.name, one, expected=True)])
         case [one]:
-            return site.of_record(one) if launched else site.of_folder(one)
+            return site.of_folder(one)
         case [_, _]:
             return site.of_two(folders)
     raise UserError(f"{folders[2]}: at most two recordings can be shown side by side")

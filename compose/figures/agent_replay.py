@@ -49,25 +49,17 @@ def agent_replay(run: Run, robot: str) -> AgentReplay:
     except UserError:
         return AgentReplay(history)
     drawn = planner.pair_planner if isinstance(planner, GroupPlanner) else planner
-    return _recomputed(history, planner, drawn) if drawn.MANOEUVRES is not None else AgentReplay(history)
-
-
-def _recomputed(history: AgentHistory, planner: Planner[Any, Any], drawn: Planner[Any, Any]) -> AgentReplay:
-    """Return the replay of `history`, which ends at the first decision that differs from the recording.
-
-    `drawn` is the planner of the states: `planner`, or in a group that of a meeting.
-    """
-    again = PlannerReplay(history, planner)
-    states: list[RobotState] = []
+    if drawn.MANOEUVRES is None:
+        return AgentReplay(history)
+    again, states, why = PlannerReplay(history, planner), [], None
     try:
         for step in again:
             if step.command is None:
                 break
             if again.robot.command_frame != step.command_frame:
                 why = f"the recorded decision at tick {again.tick} differs: another version wrote the journal"
-                return AgentReplay(history, tuple(states), why, drawn)
+                break
             states.append(again.robot.state)
     except Exception as error:  # noqa: BLE001  # recorded inputs may raise any error in the planner
         why = f"the planner fails on its inputs of tick {again.tick}: {type(error).__name__}: {error}"
-        return AgentReplay(history, tuple(states), why, drawn)
-    return AgentReplay(history, tuple(states), planner=drawn)
+    return AgentReplay(history, tuple(states), why, drawn)

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 from matplotlib.figure import Figure
 
-from compose.figures import decisions, manoeuvre, one_robot, over_time, phase_one, spread, steps, trajectory
+from compose.figures import encounter, manoeuvre, one_robot, over_time, phase_one, spread, trajectory
 from compose.figures.pair import PairRecord
 from compose.figures.sheet import Absent
 from compose.figures.style import SCREEN, Medium
 from compose.recording.group_localisation import past_meetings
 
 Picture = tuple[str, Figure | Absent]
-OF_PAIR: dict[str, Callable[[PairRecord, Medium], Figure | Absent]] = {
-    "trajectory": trajectory.draw,
-    "encounter": steps.draw,
-    "ranges": over_time.ranges,
-}
-"""The figures of which each pair has one."""
 
 
 def pictures(pair: PairRecord, kind: str, medium: Medium = SCREEN) -> Iterator[Picture]:
@@ -38,11 +32,14 @@ def pictures(pair: PairRecord, kind: str, medium: Medium = SCREEN) -> Iterator[P
             for role in pair.newcomers:
                 yield f"{kind}-{pair.robot(role).id}", draw(pair, role, medium) if known else foreign
         case "plan" if pair.senses_actively:
-            yield f"{kind}-{pair.name}", decisions.draw(pair, medium)
+            yield f"{kind}-{pair.name}", encounter.draw_decisions(pair, medium)
         case "plan" if pair.readable:
             plans = manoeuvre.draw(pair, medium) if pair.planner is not None else {pair.name: foreign}
             yield from [(f"{kind}-{name}", figure) for name, figure in plans.items()]
+        case "trajectory" | "encounter" | "ranges":
+            one = {"trajectory": trajectory.draw, "encounter": encounter.draw, "ranges": over_time.ranges}[
+                kind
+            ]
+            yield f"{kind}-{pair.name}", one(pair, medium)
         case "errors" if pair.readable:
             yield f"{kind}-{pair.name}", over_time.errors(pair, medium)
-        case _ if kind in OF_PAIR:
-            yield f"{kind}-{pair.name}", OF_PAIR[kind](pair, medium)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap, to_hex, to_rgba
@@ -11,16 +12,16 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Wedge
 
 from compose.figures.over_time import TALL, draw_errors, draw_hypotheses, timed
-from compose.figures.pair import PairRecord, Side, error, others
-from compose.figures.sheet import NO_TRUTH, Absent, Sheet, Window, plain
+from compose.figures.pair import PairRecord, Side, others
+from compose.figures.sheet import NO_TRUTH, Absent, Sheet, entry, heading, plain, trace
 from compose.figures.style import INK, PALE, SCREEN, Medium
-from compose.figures.trajectory import draw_plane, heading, window
+from compose.figures.trajectory import draw_plane, window
 from compose.recording.reasons import ended
 from compose.view.colours import COLOURS
-from compose.view.outlines import OUTLINE_SIGMAS, Point, Reach, outline
+from compose.view.outlines import OUTLINE_SIGMAS, Point, outline
 from protocol.messages import Estimate
 from protocol.mission import Role
-from protocol.motion import ORIGIN, Pose
+from protocol.motion import Pose, travelled
 from protocol.rounding import TOLERANCE
 
 MOSAIC = (
@@ -58,13 +59,16 @@ def draw(pair: PairRecord, role: Role, medium: Medium = SCREEN) -> Figure | Abse
     draw_estimates(axes, pair, role)
     sheet.plane("plane", window(pair), TALLEST)
     sheet.key(axes)
-    draw_near(near, pair, role)
     if pair.robot(role).likeliest:
-        sheet.plane("near", _near_window(pair, role))
+        half = draw_near(near, pair, role)
+        sheet.plane("near", (-half, half, -half, half))
         near.set(xlabel="x error [m]", ylabel="y error [m]")
         sheet.key(near, "ages", title="estimates, by tick")
     else:
+        near.set_axis_off()
         sheet.panels["ages"].set_axis_off()
+        middle: Any = {"transform": near.transAxes, "ha": "center", "va": "center", "color": PALE}
+        near.text(0.5, 0.5, "The recording has no\nmost probable pose.", gid="nothing-near", **middle)
     for name in ("errors", "hypotheses"):
         axes = sheet.tall(name, TALL - 0.3)
         timed(axes, pair, role, phases=name == "errors", label=name == "hypotheses")
@@ -91,32 +95,24 @@ def _title(pair: PairRecord, role: Role) -> list[str]:
 
 def draw_estimates(axes: Axes, pair: PairRecord, role: Role) -> None:
     """Draw the most probable pose over time, ever darker, legible outlines, and the other poses."""
-    one, ages = pair.robot(role), AGES[role]
+    one, hues = pair.robot(role), _ages(pair.robot(role), role)
     left, right, low, high = window(pair)
     ghosts = [pose for estimate, _ in one.placed for pose in others(estimate)]
     within = [pose for pose in ghosts if left <= pose.x <= right and low <= pose.y <= high]
     if within:
         weighed = any(estimate.probabilities for estimate, _ in one.placed)
-        axes.plot(
-            [p.x for p in within], [p.y for p in within], "x", ms=3.6, mew=0.8, color=COLOURS[role],
-            alpha=0.5, gid="ghosts", label="other hypotheses" if weighed else "possible poses",
-        )  # fmt: skip
+        label = "other hypotheses" if weighed else "possible poses"
+        trace(axes, within, "x", ms=3.6, mew=0.8, color=COLOURS[role], alpha=0.5, gid="ghosts", label=label)
     if not one.likeliest:
         return
-    shown = legible(pair, role)
-    poses = [estimate.world[0] for estimate, _ in one.likeliest]
-    axes.scatter(
-        [p.x for p in poses], [p.y for p in poses], s=7, marker="D", c=list(_ages(one, role).values()),
-        zorder=3, gid="estimates",
-    )  # fmt: skip
+    shown, poses = legible(pair, role), [estimate.world[0] for estimate, _ in one.likeliest]
+    places: Any = {"s": 7, "marker": "D", "c": list(hues.values()), "zorder": 3, "gid": "estimates"}
+    axes.scatter([p.x for p in poses], [p.y for p in poses], **places)
     for estimate, _ in shown:
-        _draw_outline(axes, pair, role, estimate, ORIGIN, f"outline-{estimate.tick}")
-    final = poses[-1]
-    axes.plot(final.x, final.y, "*", ms=9, mfc=ages(1.0), mec="white", mew=0.6, zorder=5, gid="final")
-    axes.plot(
-        [], [], "-" if shown else "", marker="D", ms=3, lw=1.0, color=ages(0.8),
-        label="estimate, 3 sigma" if shown else "estimate",
-    )  # fmt: skip
+        _draw_outline(axes, one, role, estimate, (0.0, 0.0), f"outline-{estimate.tick}")
+    trace(axes, poses[-1:], "*", ms=9, mfc=AGES[role](1.0), mec="white", mew=0.6, zorder=5, gid="final")
+    label, style = ("estimate, 3 sigma", "-") if shown else ("estimate", "")
+    entry(axes, label, ls=style, marker="D", ms=3, lw=1.0, color=AGES[role](0.8))
 
 
 def _ages(one: Side, role: Role) -> dict[int, str]:
@@ -135,109 +131,66 @@ def legible(pair: PairRecord, role: Role) -> list[tuple[Estimate, Pose]]:
     Outlines larger than the sensing range R are omitted, because they carry no information.
     """
     chosen: list[tuple[Estimate, Pose]] = []
-    largest = pair.mission.sensing_range
     for estimate, truth in reversed(pair.robot(role).likeliest):
-        if estimate.covariance is None or len(chosen) == OUTLINES_PER_ROBOT:
-            continue
-        if _size(pair, role, estimate) > largest:
+        size = _size(estimate)
+        if not 0.0 < size <= pair.mission.sensing_range or len(chosen) == OUTLINES_PER_ROBOT:
             continue
         if chosen:
             after = chosen[-1][0]
-            sizes = _size(pair, role, estimate), _size(pair, role, after)
-            apart = error(estimate.world[0], after.world[0])
-            if apart < sum(sizes) and sizes[1] > SMALLER * sizes[0]:
+            apart = travelled(estimate.world[0], after.world[0])
+            if apart < size + _size(after) and _size(after) > SMALLER * size:
                 continue
         chosen.append((estimate, truth))
     return chosen[::-1]
 
 
-def outline_of(pair: PairRecord, role: Role, estimate: Estimate) -> Sequence[Point]:
+def outline_of(estimate: Estimate) -> Sequence[Point]:
     """Return the closed outline of where the most probable position is; empty without a covariance."""
-    if estimate.covariance is None:
-        return ()
-    peer, tick = pair.robot("b" if role == "a" else "a"), estimate.tick
-    met, measured = pair.mutual[tick] if tick < len(pair.mutual) else (False, None)
-    theirs = next((one for one, _ in peer.placed if one.tick == tick), None) if met else None
-    reach = None
-    if theirs is not None:
-        reach = Reach.of(pair.mission, measured, theirs.world[0], theirs.covariance)
-    return outline(estimate.world[0], estimate.covariance, reach)
+    return () if estimate.covariance is None else outline(estimate.world[0], estimate.covariance)
 
 
-def _size(pair: PairRecord, role: Role, estimate: Estimate) -> float:
+def _size(estimate: Estimate) -> float:
     """Return the largest distance in m of that outline from the position; 0 without one."""
     pose = estimate.world[0]
-    return max([math.dist((pose.x, pose.y), one) for one in outline_of(pair, role, estimate)], default=0.0)
+    return max([math.dist((pose.x, pose.y), one) for one in outline_of(estimate)], default=0.0)
 
 
-def _draw_outline(
-    axes: Axes, pair: PairRecord, role: Role, estimate: Estimate, origin: Pose, gid: str
-) -> None:
+def _draw_outline(axes: Axes, one: Side, role: Role, estimate: Estimate, origin: Point, gid: str) -> None:
     """Draw that outline relative to `origin`; the last one is filled."""
-    one = pair.robot(role)
     colour, last = _ages(one, role)[estimate.tick], estimate is one.likeliest[-1][0]
-    points = [(x - origin.x, y - origin.y) for x, y in outline_of(pair, role, estimate)]
+    points = [(x - origin[0], y - origin[1]) for x, y in outline_of(estimate)]
     if points:
-        axes.add_patch(
-            Polygon(
-                points, facecolor=to_rgba(colour, 0.12 if last else 0.0), edgecolor=colour,
-                lw=1.4 if last else 0.8, zorder=4, gid=gid,
-            )
-        )  # fmt: skip
+        face, width = to_rgba(colour, 0.12 if last else 0.0), 1.4 if last else 0.8
+        axes.add_patch(Polygon(points, facecolor=face, edgecolor=colour, lw=width, zorder=4, gid=gid))
 
 
-def draw_near(axes: Axes, pair: PairRecord, role: Role) -> None:
-    """Draw the estimates relative to the true pose in the same tick, enlarged."""
-    one = pair.robot(role)
-    if not one.likeliest:
-        axes.set_axis_off()
-        axes.text(
-            0.5, 0.5, "The recording has no\nmost probable pose.",
-            transform=axes.transAxes, ha="center", va="center", color=PALE, gid="nothing-near",
-        )  # fmt: skip
-        return
+def draw_near(axes: Axes, pair: PairRecord, role: Role) -> float:
+    """Draw the estimates relative to the true pose in the same tick, and return the half-width in m."""
+    one, drawn = pair.robot(role), legible(pair, role)
+    last, truth = one.likeliest[-1]
+    sizes = [
+        _size(estimate) + travelled(estimate.world[0], then) for estimate, then in [*drawn, one.likeliest[-1]]
+    ]
+    least = EXACTLY * pair.mission.sensing_range if pair.exact else TOLERANCE
+    half = max(min(1.1 * max(sizes[:-1], default=sizes[-1]), LARGEST_PANEL * sizes[-1]), least)
     axes.set_title("relative to the true pose", color=PALE, pad=5, loc="left")
-    colours, (last, truth), half = _ages(one, role), one.likeliest[-1], _half(pair, role)
     heading(axes, Pose(0.0, 0.0, truth.heading), PANEL_ARROW * half, INK)
     axes.plot(0.0, 0.0, "o", ms=5, color=INK, gid="near-truth", label="true")
-    for estimate, then in legible(pair, role) or [(last, truth)]:
-        pose, marker = estimate.world[0], "*" if estimate is last else "D"
-        _draw_outline(axes, pair, role, estimate, then, f"near-{estimate.tick}")
+    hues = _ages(one, role)
+    for estimate, then in drawn or [(last, truth)]:
+        pose, (marker, size) = estimate.world[0], ("*", 9.0) if estimate is last else ("D", 3.5)
+        _draw_outline(axes, one, role, estimate, (then.x, then.y), f"near-{estimate.tick}")
         axes.plot(
-            pose.x - then.x, pose.y - then.y, marker, ms=9 if estimate is last else 3.5, ls="",
-            color=colours[estimate.tick], mec="white", mew=0.5, zorder=6, label=str(estimate.tick),
+            pose.x - then.x, pose.y - then.y, marker, ms=size, color=hues[estimate.tick], mec="white",
+            mew=0.5, zorder=6, label=str(estimate.tick),
         )  # fmt: skip
-    off = last.world[0].x - truth.x, last.world[0].y - truth.y
-    heading(axes, Pose(*off, last.world[0].heading), PANEL_ARROW * half, to_hex(AGES[role](1.0)))
+    pose, hue = last.world[0], to_hex(AGES[role](1.0))
+    off = pose.x - truth.x, pose.y - truth.y
+    heading(axes, Pose(*off, pose.heading), PANEL_ARROW * half, hue)
     if last.covariance is not None:
         spread = math.degrees(min(math.pi, OUTLINE_SIGMAS * last.covariance.heading_sigma))
-        middle = math.degrees(last.world[0].heading)
-        axes.add_patch(
-            Wedge(
-                off,
-                PANEL_ARROW * half,
-                middle - spread,
-                middle + spread,
-                color=AGES[role](1.0),
-                alpha=0.15,
-                lw=0,
-            )
-        )
+        middle = math.degrees(pose.heading)
+        sector = middle - spread, middle + spread
+        axes.add_patch(Wedge(off, PANEL_ARROW * half, *sector, color=hue, alpha=0.15, lw=0))
     axes.grid(lw=0.4, color="0.9")
-
-
-def _near_window(pair: PairRecord, role: Role) -> Window:
-    half = _half(pair, role)
-    return -half, half, -half, half
-
-
-def _half(pair: PairRecord, role: Role) -> float:
-    """Return the half-width of the enlarged panel, in m."""
-
-    def size(estimate: Estimate, truth: Pose) -> float:
-        return _size(pair, role, estimate) + error(estimate.world[0], truth)
-
-    last = size(*pair.robot(role).likeliest[-1])
-    most = max([size(*one) for one in legible(pair, role)], default=last)
-    least = EXACTLY * pair.mission.sensing_range if pair.exact else TOLERANCE
-    return max(min(1.1 * most, LARGEST_PANEL * last), least)
+    return half

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator
 
-from compose.figures.pair import PairRecord, error, others
-from compose.figures.sheet import ANCHORS, NO_TRUTH, Absent, Sheet
+from compose.figures.pair import PairRecord, others
+from compose.figures.sheet import ANCHORS, NO_TRUTH, Absent, Sheet, entry
 from compose.figures.style import INK, PALE, ROLE_MARKERS, SCREEN, SHADE, Medium
-from compose.recording.claim_errors import Claim
 from compose.view.colours import COLOURS
 from protocol.mission import ROLES, Role
-from protocol.motion import Covariance, Pose, wrap
+from protocol.motion import Pose, compose, inverse, travelled, wrap
 from protocol.rounding import TOLERANCE
 
 TALL = 1.9
@@ -45,7 +44,33 @@ SUREST = 1e-12
 """The smallest distance of the probability scale's ends from 0 and 1."""
 
 Points = Sequence[tuple[int, float]]
-Quantity = Literal["position", "heading"]
+
+
+def position_alone(pose: Pose, truth: Pose) -> float:
+    """Return the error of the distance to the anchor, in m, for two poses in the anchor's frame."""
+    return abs(math.hypot(pose.x, pose.y) - math.hypot(truth.x, truth.y))
+
+
+def heading_alone(pose: Pose, truth: Pose) -> float:
+    """Return the error in rad of mu, the heading relative to the line from the anchor, likewise."""
+    mu, true = (one.heading - math.atan2(one.y, one.x) for one in (pose, truth))
+    return abs(wrap(mu - true))
+
+
+class Quantity(NamedTuple):
+    """A quantity whose errors are drawn. Sigmas and errors of claims have its name in theirs."""
+
+    unit: str
+    error: Callable[[Pose, Pose], float]
+    """The error of a pose, given the true one."""
+    alone: Callable[[Pose, Pose], float]
+    """The error that is defined before the encounter, for two poses in the anchor's frame."""
+
+
+QUANTITIES = {
+    "position": Quantity("m", travelled, position_alone),
+    "heading": Quantity("rad", lambda pose, truth: abs(wrap(pose.heading - truth.heading)), heading_alone),
+}
 
 
 def timed(axes: Axes, pair: PairRecord, *roles: Role, phases: bool = True, label: bool = True) -> None:
@@ -78,69 +103,36 @@ def timed(axes: Axes, pair: PairRecord, *roles: Role, phases: bool = True, label
         axes.tick_params(labelbottom=False)
 
 
-def every(count: int) -> int:
-    """Return the number of points from one marker to the next, on a line of `count` points."""
-    return max(1, math.ceil(count / MOST_MARKERS))
+def _every(points: Points) -> int:
+    """Return the number of points from one marker to the next."""
+    return max(1, math.ceil(len(points) / MOST_MARKERS))
 
 
 def ranges(pair: PairRecord, medium: Medium = SCREEN) -> Figure:
     """Return the figure of the measured ranges and of the robots' separation."""
     sheet = Sheet(medium, True, [pair.title], [["ranges"], ["key"]])
-    axes = sheet.tall("ranges", TALL + 0.3)
+    axes, reach, first = sheet.tall("ranges", TALL + 0.3), pair.mission.sensing_range, pair.first
     timed(axes, pair, *ROLES)
-    _ranges(axes, pair)
+    apart = pair.separations[first : len(pair.mutual)]
+    label = "true separation" if pair.true else "separation, from claims"
+    _line(axes, list(enumerate(apart, first)), lw=1.1, color=INK, zorder=2, gid="separation", label=label)
+    for role in ROLES:
+        one, label = pair.robot(role), rf"$\rho$ of {pair.robot(role).id} to ${ANCHORS[role]}$, measured"
+        look = {"color": COLOURS[role], "gid": f"anchor-range-{one.id}", "label": label, **ROLE_MARKERS[role]}
+        _measured(axes, one.anchor_ranges, first, look)
+    look = {"color": INK, "gid": "mutual-range", "label": "mutual range, measured", "marker": "D"}
+    _measured(axes, [rho for _, rho in pair.mutual], first, look)
+    axes.axhline(reach, ls="-.", lw=0.9, color=PALE, gid="reach", label=f"$R$ = {reach:g} m", zorder=1)
+    axes.set_ylim(0.0, 1.05 * max([reach, *apart]))
     axes.set_ylabel("distance [m]")
     sheet.key(axes)
     return sheet.finished()
 
 
-def _ranges(axes: Axes, pair: PairRecord) -> None:
-    apart = pair.separations[pair.first : len(pair.mutual)]
-    if apart:
-        ticks = range(pair.first, pair.first + len(apart))
-        axes.plot(
-            ticks, apart, "-", lw=1.1, color=INK, zorder=2, gid="separation",
-            label="true separation" if pair.true else "separation, from claims",
-        )  # fmt: skip
-    for role in ROLES:
-        one = pair.robot(role)
-        _measured(
-            axes, one.anchor_ranges, f"anchor-range-{one.id}", COLOURS[role], ROLE_MARKERS[role],
-            rf"$\rho$ of {one.id} to ${ANCHORS[role]}$, measured", pair.first,
-        )  # fmt: skip
-    diamonds = {"marker": "D", "markerfacecolor": INK, "markeredgecolor": INK}
-    mutual = [rho for _, rho in pair.mutual]
-    _measured(axes, mutual, "mutual-range", INK, diamonds, "mutual range, measured", pair.first)
-    reach = pair.mission.sensing_range
-    axes.axhline(reach, ls="-.", lw=0.9, color=PALE, gid="reach", label=f"$R$ = {reach:g} m", zorder=1)
-    axes.set_ylim(0.0, 1.05 * max([reach, *pair.separations[pair.first :]]))
-
-
-def _measured(
-    axes: Axes,
-    values: Sequence[float | None],
-    gid: str,
-    colour: str,
-    mark: dict[str, Any],
-    label: str,
-    first: int,
-) -> None:
+def _measured(axes: Axes, values: Sequence[float | None], first: int, look: dict[str, Any]) -> None:
     """Draw the measured ranges from tick `first` on."""
     points = [(tick, rho) for tick, rho in enumerate(values) if rho is not None and tick >= first]
-    if points:
-        ticks, measured_ranges = zip(*points, strict=True)
-        axes.plot(
-            ticks,
-            measured_ranges,
-            ls="",
-            ms=3.2,
-            mew=0.9,
-            color=colour,
-            gid=gid,
-            label=label,
-            zorder=3,
-            **mark,
-        )
+    _line(axes, points, ls="", ms=3.2, mew=0.9, zorder=3, **look)
 
 
 def errors(pair: PairRecord, medium: Medium = SCREEN) -> Figure | Absent:
@@ -149,99 +141,73 @@ def errors(pair: PairRecord, medium: Medium = SCREEN) -> Figure | Absent:
         return Absent(NO_TRUTH)
     if not any(pair.robot(role).estimates for role in ROLES):
         return Absent("neither robot has an estimate of its pose")
-    quantities: tuple[Quantity, ...] = ("position", "heading")
-    sheet = Sheet(medium, True, [pair.title], [[*quantities[:1]], [*quantities[1:]], ["key"]])
-    for quantity in quantities:
-        axes, last = sheet.tall(quantity, TALL), quantity == "heading"
+    sheet = Sheet(medium, True, [pair.title], [[name] for name in (*QUANTITIES, "key")])
+    for name in QUANTITIES:
+        axes, last = sheet.tall(name, TALL), name == "heading"
         timed(axes, pair, *ROLES, phases=not last, label=last)
-        draw_errors(axes, pair, quantity, *ROLES)
+        draw_errors(axes, pair, name, *ROLES)
     sheet.key(sheet.panels["position"])
     return sheet.finished()
 
 
-def draw_errors(axes: Axes, pair: PairRecord, quantity: Quantity, *roles: Role) -> None:
+def draw_errors(axes: Axes, pair: PairRecord, name: str, *roles: Role) -> None:
     """Draw the errors of the most probable pose and of the other possible poses, and the claimed sigmas.
 
     Before the encounter, draw those of the pose relative to the anchor. Of one robot, the claimed sigma is
-    drawn too, and the errors within 3 sigma are shaded.
+    drawn too, and the errors within 3 sigma are shaded. `name` is one of QUANTITIES.
     """
-    off = error if quantity == "position" else lambda pose, truth: abs(wrap(pose.heading - truth.heading))
     sigmas: Points = ()
     for role in roles:
-        sigmas = _errors(axes, pair, role, quantity, off)
+        sigmas = _errors(axes, pair, role, name)
+    limit: dict[str, Any] = {"ls": "-.", "lw": 0.9, "color": PALE, "zorder": 1}
     if pair.exact:
-        axes.axhline(TOLERANCE, ls="-.", lw=0.9, color=PALE, gid="tolerance", zorder=1,
-                     label=f"tolerance: {TOLERANCE:g}; smaller\nthan {FLOOR:g} is drawn there")  # fmt: skip
-    elif quantity == "position":
-        required = pair.mission.accuracy
-        axes.axhline(required, ls="-.", lw=0.9, color=PALE, gid="accuracy", zorder=1,
-                     label=f"required sigma: {required:g} m")  # fmt: skip
-    if len(roles) == 1 and sigmas:
-        _line(axes, sigmas, lw=0.7, ls="-", color=COLOURS[roles[0]], gid="sigma", label="claimed sigma")
+        label = f"tolerance: {TOLERANCE:g}; smaller\nthan {FLOOR:g} is drawn there"
+        axes.axhline(TOLERANCE, gid="tolerance", label=label, **limit)
+    elif name == "position":
+        label = f"required sigma: {pair.mission.accuracy:g} m"
+        axes.axhline(pair.mission.accuracy, gid="accuracy", label=label, **limit)
     axes.set_yscale("log")
     if len(roles) == 1 and sigmas:
+        colour = COLOURS[roles[0]]
+        _line(axes, sigmas, lw=0.7, color=colour, gid="sigma", label="claimed sigma")
         low, _ = axes.get_ylim()
         ticks, values = np.array(sigmas).T
-        axes.fill_between(
-            ticks, low, np.maximum(BAND_SIGMAS * values, low), color=COLOURS[roles[0]], alpha=0.12, lw=0,
-            zorder=0, gid="envelope",
-        )  # fmt: skip
-    axes.set_ylabel(f"{quantity} error [{'m' if quantity == 'position' else 'rad'}]")
+        high = np.maximum(BAND_SIGMAS * values, low)
+        axes.fill_between(ticks, low, high, color=colour, alpha=0.12, lw=0, zorder=0, gid="envelope")
+    axes.set_ylabel(f"{name} error [{QUANTITIES[name].unit}]")
 
 
-def _errors(
-    axes: Axes, pair: PairRecord, role: Role, quantity: Quantity, off: Callable[[Pose, Pose], float]
-) -> Points:
+def _errors(axes: Axes, pair: PairRecord, role: Role, name: str) -> Points:
     """Draw the errors of one robot, and return its claimed sigmas."""
-    robot, colour = pair.robot(role), COLOURS[role]
-    anchor = robot.anchor
-    alone = [
-        (one.tick, max(_alone(pose, Pose(truth.x - anchor.x, truth.y - anchor.y, truth.heading))[quantity]
-                       for pose in one.local))
-        for one, truth in robot.estimates
-        if one.local and not one.world
-    ]  # fmt: skip
-    _line(axes, alone, ls=LONE_LINES[role], lw=1.0, color=colour, gid=f"{quantity}-alone-{robot.id}",
-          label=f"{robot.id}, relative to its anchor")  # fmt: skip
-    _line(axes, [(one.tick, off(pose, truth)) for one, truth in robot.placed for pose in others(one)],
-          ls="", marker="x" if role == "a" else "+", ms=4, mew=0.8, color=colour, alpha=0.75,
-          gid=f"{quantity}-others-{robot.id}", label=f"{robot.id}, other possible poses")  # fmt: skip
-    likeliest = [(one.tick, off(one.world[0], truth)) for one, truth in robot.likeliest]
-    _line(axes, likeliest, lw=1.2, ls=ROLE_LINES[role], ms=3.6, color=colour, gid=f"{quantity}-{robot.id}",
-          label=f"{robot.id}, {'pose' if pair.exact else 'most probable pose'}",
-          markevery=every(len(likeliest)), **ROLE_MARKERS[role])  # fmt: skip
-    sigmas = [(one.tick, _sigma(one.covariance, quantity)) for one, _ in robot.likeliest if one.covariance]
-    _line(axes, [(tick, BAND_SIGMAS * sigma) for tick, sigma in sigmas], lw=0.9, ls=CLAIMED[role],
-          color=colour, gid=f"{quantity}-sigma-{robot.id}",
-          label=rf"{robot.id}, claimed 3 $\sigma$")  # fmt: skip
-    if robot.claim is not None:
+    robot, quantity, look = pair.robot(role), QUANTITIES[name], {"color": COLOURS[role]}
+    at = inverse(Pose(robot.anchor.x, robot.anchor.y, 0.0))
+    before = [(one, compose(at, truth)) for one, truth in robot.estimates if one.local and not one.world]
+    alone = [(one.tick, max(quantity.alone(pose, truth) for pose in one.local)) for one, truth in before]
+    label = f"{robot.id}, relative to its anchor"
+    _line(axes, alone, ls=LONE_LINES[role], lw=1.0, gid=f"{name}-alone-{robot.id}", label=label, **look)
+    ghosts = [(one.tick, quantity.error(pose, true)) for one, true in robot.placed for pose in others(one)]
+    label, marker = f"{robot.id}, other possible poses", "x" if role == "a" else "+"
+    gid = f"{name}-others-{robot.id}"
+    _line(axes, ghosts, ls="", marker=marker, ms=4, mew=0.8, alpha=0.75, gid=gid, label=label, **look)
+    likeliest = [(one.tick, quantity.error(one.world[0], truth)) for one, truth in robot.likeliest]
+    label, every = f"{robot.id}, {'pose' if pair.exact else 'most probable pose'}", _every(likeliest)
+    marks = {**ROLE_MARKERS[role], "ms": 3.6, "markevery": every, **look}
+    _line(axes, likeliest, lw=1.2, ls=ROLE_LINES[role], gid=f"{name}-{robot.id}", label=label, **marks)
+    sigmas = [
+        (one.tick, getattr(one.covariance, f"{name}_sigma")) for one, _ in robot.likeliest if one.covariance
+    ]
+    bounds, label = (
+        [(tick, BAND_SIGMAS * sigma) for tick, sigma in sigmas],
+        rf"{robot.id}, claimed 3 $\sigma$",
+    )
+    _line(axes, bounds, lw=0.9, ls=CLAIMED[role], gid=f"{name}-sigma-{robot.id}", label=label, **look)
+    if (claim := robot.claim) is not None:
         axes.plot(
-            robot.claim.tick, max(_of_claim(robot.claim, quantity), FLOOR),
-            ROLE_MARKERS[role]["marker"], ms=9, mfc="none", mec=INK, mew=1.1, ls="", clip_on=False, zorder=5,
-            gid=f"claim-{robot.id}", label=f"claim of {robot.id}, tick {robot.claim.tick}",
+            claim.tick, max(getattr(claim, f"{name}_error"), FLOOR), ROLE_MARKERS[role]["marker"], ms=9,
+            mfc="none", mec=INK, mew=1.1, clip_on=False, zorder=5, gid=f"claim-{robot.id}",
+            label=f"claim of {robot.id}, tick {claim.tick}",
         )  # fmt: skip
     return sigmas
-
-
-def _sigma(covariance: Covariance, quantity: Quantity) -> float:
-    return covariance.position_sigma if quantity == "position" else covariance.heading_sigma
-
-
-def _of_claim(claim: Claim, quantity: Quantity) -> float:
-    return claim.position_error if quantity == "position" else claim.heading_error
-
-
-def _alone(pose: Pose, truth: Pose) -> dict[Quantity, float]:
-    """Return the errors that are defined before the encounter, for two poses in the anchor's frame.
-
-    These are the error of the distance to the anchor, in m, and that of mu, the heading relative to the line
-    from the anchor, in rad.
-    """
-    mu, true = (one.heading - math.atan2(one.y, one.x) for one in (pose, truth))
-    return {
-        "position": abs(math.hypot(pose.x, pose.y) - math.hypot(truth.x, truth.y)),
-        "heading": abs(wrap(mu - true)),
-    }
 
 
 def _line(axes: Axes, points: Points, **looks: Any) -> None:
@@ -256,10 +222,7 @@ def draw_hypotheses(axes: Axes, pair: PairRecord, role: Role) -> None:
     """Draw the probability of each hypothesis, or, with exact sensors, the number of possible poses."""
     robot = pair.robot(role)
     weighed = any(one.probabilities for one, _ in robot.estimates)
-    if weighed:
-        _probabilities(axes, pair, role)
-    else:
-        _count(axes, pair, role)
+    (_probabilities if weighed else _count)(axes, pair, role)
     words: dict[str, Any] = {"transform": axes.transAxes, "color": "0.3"}
     axes.text(0.0, 1.04, "branches in the anchor's frame", **words)
     if robot.placed:
@@ -270,50 +233,37 @@ def draw_hypotheses(axes: Axes, pair: PairRecord, role: Role) -> None:
 
 def _probabilities(axes: Axes, pair: PairRecord, role: Role) -> None:
     """Draw the probabilities on a logit scale, on which 99 % and 99.99 % are easy to distinguish."""
-    confidence = pair.mission.confidence
+    confidence, held = pair.mission.confidence, [one for one, _ in pair.robot(role).estimates]
     edge = max(SUREST, BEYOND * (1.0 - confidence))
     axes.set_yscale("logit")
+    first = {"ms": 3.6, "lw": 1.2, "color": COLOURS[role], **ROLE_MARKERS[role]}
+    other = {"ms": 3.6, "mew": 0.8, "lw": 0.7, "color": COLOURS[role], "alpha": 0.5, "marker": "x"}
     for rank in reversed(range(RANKS)):
         for placed in (False, True):
-            _rank(axes, pair, role, rank, placed, edge)
-    marker, colour = ROLE_MARKERS[role], COLOURS[role]
-    axes.plot([], [], "-", ms=3.6, lw=1.2, color=colour, label="most probable hypothesis", **marker)
-    if any(len(one.probabilities) > 1 for one, _ in pair.robot(role).estimates):
-        axes.plot([], [], "-x", ms=3.6, mew=0.8, lw=0.7, color=colour, alpha=0.5, label="other hypotheses")
-    axes.axhline(
-        confidence, color=PALE, lw=0.9, ls="-.", gid="confidence", label=f"required: {percent(confidence)}"
-    )
+            points = [
+                (one.tick, min(max(one.probabilities[rank], edge), 1.0 - edge))
+                if rank < len(one.probabilities)
+                else (one.tick, math.nan)
+                for one in held
+                if bool(one.world) == placed
+            ]
+            if any(not math.isnan(probability) for _, probability in points):
+                look = (
+                    other if rank else {**first, "clip_on": False, "zorder": 4, "markevery": _every(points)}
+                )
+                gid = f"probability-{rank + 1}-{'plane' if placed else 'anchor'}"
+                axes.plot(*zip(*points, strict=True), gid=gid, **look)
+    entry(axes, "most probable hypothesis", **first)
+    if any(len(one.probabilities) > 1 for one in held):
+        entry(axes, "other hypotheses", **other)
+    label = f"required: {percent(confidence)}"
+    axes.axhline(confidence, color=PALE, lw=0.9, ls="-.", gid="confidence", label=label)
     tails = [10.0**-k for k in range(2, 13, 2) if 10.0**-k > edge]
     ticks = [*tails[::-1], 0.5, *[1.0 - tail for tail in tails]]
     axes.set_yticks([edge, *ticks, 1.0 - edge], ["less", *map(percent, ticks), "more"])
     axes.yaxis.set_minor_locator(NullLocator())
     axes.set_ylim(edge, 1.0 - edge)
     axes.set_ylabel("probability of a hypothesis")
-
-
-def _rank(axes: Axes, pair: PairRecord, role: Role, rank: int, placed: bool, edge: float) -> None:
-    """Draw the probability of the hypothesis at `rank`: of placements if `placed`, else of branches."""
-    points = [
-        (
-            one.tick,
-            min(max(one.probabilities[rank], edge), 1.0 - edge)
-            if rank < len(one.probabilities)
-            else math.nan,
-        )
-        for one, _ in pair.robot(role).estimates
-        if bool(one.world) == placed
-    ]
-    if all(math.isnan(probability) for _, probability in points):
-        return
-    ticks, probability = zip(*points, strict=True)
-    gid = f"probability-{rank + 1}-{'plane' if placed else 'anchor'}"
-    if rank:
-        axes.plot(ticks, probability, "-x", ms=3.6, mew=0.8, lw=0.7, color=COLOURS[role], alpha=0.5, gid=gid)
-    else:
-        axes.plot(
-            ticks, probability, "-", ms=3.6, lw=1.2, color=COLOURS[role], gid=gid, clip_on=False, zorder=4,
-            markevery=every(len(ticks)), **ROLE_MARKERS[role],
-        )  # fmt: skip
 
 
 def percent(probability: float) -> str:
@@ -324,14 +274,9 @@ def percent(probability: float) -> str:
 def _count(axes: Axes, pair: PairRecord, role: Role) -> None:
     """Draw the number of possible poses. It is undefined while the robot may be anywhere on a circle."""
     counts = [(one.tick, len(one.world or one.local) or math.nan) for one, _ in pair.robot(role).estimates]
-    if counts:
-        ticks, held = zip(*counts, strict=True)
-        axes.plot(
-            ticks, held, "-", ms=3.6, lw=1.2, drawstyle="steps-post", color=COLOURS[role], gid="count",
-            markevery=every(len(ticks)), label="possible poses", **ROLE_MARKERS[role],
-        )  # fmt: skip
+    look = {"drawstyle": "steps-post", "markevery": _every(counts), **ROLE_MARKERS[role]}
+    _line(axes, counts, ms=3.6, lw=1.2, color=COLOURS[role], gid="count", label="possible poses", **look)
     axes.axhline(1.0, color=PALE, lw=0.9, ls="-.", label="one pose")
-    known = [count for _, count in counts if not math.isnan(count)]
-    axes.set_ylim(0.0, 1.0 + max(known, default=1))
+    axes.set_ylim(0.0, 1.0 + max([count for _, count in counts if not math.isnan(count)], default=1))
     axes.yaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))
     axes.set_ylabel("possible poses")

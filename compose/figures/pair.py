@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping, Sequence
+import sys
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from itertools import groupby
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
-from msgspec.structs import replace
 
 from agent.planning.planner import Planner
 from agent.planning.state import RobotState
@@ -17,13 +16,13 @@ from compose.figures.agent_replay import AgentReplay
 from compose.recording.claim_errors import Claim
 from compose.recording.group_localisation import PastMeeting, past_meetings
 from compose.recording.run import Run
-from protocol.messages import Command, Estimate, RobotConfig
+from protocol.messages import Command, Estimate
 from protocol.mission import ROLES, Anchor, Mission, PlannerName, Role
-from protocol.motion import Pose
+from protocol.motion import Pose, travelled
 from protocol.orbits import Orbit
 
 
-class Span(msgspec.Struct, frozen=True):
+class Span(NamedTuple):
     """The consecutive ticks `first` to `last` in which a robot is in one of the paper's phases."""
 
     phase: int
@@ -55,10 +54,9 @@ class Side(msgspec.Struct, frozen=True, dict=True):
     @cached_property
     def estimates(self) -> tuple[tuple[Estimate, Pose], ...]:
         """The journaled estimates of the meeting, each with the pose of `path` in the same tick, if known."""
+        known = range(self.first, len(self.path))
         estimates = self.replay.estimates if self.replay is not None else ()
-        return tuple(
-            [(one, self.path[one.tick]) for one in estimates if self.first <= one.tick < len(self.path)]
-        )
+        return tuple([(one, self.path[one.tick]) for one in estimates if one.tick in known])
 
     @property
     def on_orbit(self) -> bool:
@@ -124,16 +122,6 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
         return self.mission.noise.exact
 
     @property
-    def last(self) -> int:
-        """The last recorded tick."""
-        return max(0, len(self.mutual) - 1)
-
-    @property
-    def own_planner(self) -> bool:
-        """True if the phases are those of a planner of the user, and have no names."""
-        return self.run.setup is not None and any(one.own_planner for one in self.run.setup.robots)
-
-    @property
     def senses_actively(self) -> bool:
         """True if the robots choose their ranges by information, with states that can be drawn."""
         return self.planner is not None and self.planner.ACTIVE_SENSING and not self.exact
@@ -160,14 +148,9 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
     @property
     def unknown(self) -> str | None:
         """The reason why the planner states are incomplete; None if they are complete."""
-        robots = [
-            side.id
-            for side in (self.a, self.b)
-            if side.replay is None or side.replay.broken is not None
-        ]  # fmt: skip
-        if not robots:
-            return None
-        return f"the journal of {' and '.join(robots)} is missing or cannot be replayed to its end"
+        sides = [side for side in (self.a, self.b) if side.replay is None or side.replay.broken is not None]
+        robots = " and ".join([side.id for side in sides])
+        return f"the journal of {robots} is missing or cannot be replayed to its end" if sides else None
 
     @property
     def planner(self) -> Planner[Any, Any] | None:
@@ -193,28 +176,22 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
     @cached_property
     def separations(self) -> list[float]:
         """The distance between the robots in m, one entry per tick, from 0, in which both poses are known."""
-        return [math.hypot(p.x - q.x, p.y - q.y) for p, q in zip(self.a.path, self.b.path, strict=False)]
+        return list(map(travelled, self.a.path, self.b.path))
 
     @cached_property
     def contacts(self) -> list[tuple[int, int]]:
         """The first and the last tick of each stretch of contact."""
-        spans: list[tuple[int, int]] = []
-        for tick, (near, _) in enumerate(self.mutual):
-            if tick < self.first:
-                continue
-            if near and spans and spans[-1][1] == tick - 1:
-                spans[-1] = (spans[-1][0], tick)
-            elif near:
-                spans.append((tick, tick))
-        return spans
+        ticks = range(self.first, len(self.mutual))
+        pieces = [list(piece) for near, piece in groupby(ticks, lambda tick: self.mutual[tick][0]) if near]
+        return [(piece[0], piece[-1]) for piece in pieces]
 
     @cached_property
     def encounter_tick(self) -> int | None:
         """The first tick in which one of the robots is in phase 3; None if there is none."""
-        for tick in range(self.first, len(self.mutual)):
-            if any(tick < len(side.phases) and side.phases[tick] == 3 for side in (self.a, self.b)):
-                return tick
-        return None
+        met = [
+            side.phases.index(3, self.first) for side in (self.a, self.b) if 3 in side.phases[self.first :]
+        ]
+        return min([tick for tick in met if tick < len(self.mutual)], default=None)
 
     @property
     def first(self) -> int:
@@ -229,19 +206,13 @@ class PairRecord(msgspec.Struct, frozen=True, dict=True):
         sides = [self.robot(role) for role in roles]
         known = [side for side in sides if side.phases] or sides
         first, met = max(side.first for side in sides), self.encounter_tick
-        phases = [min(side.phase(tick) for side in known) for tick in range(first, len(self.mutual))]
-        if met is not None and len(roles) > 1:
-            phases[met - first :] = [3] * (len(phases) - (met - first))
-        spans = []
-        for phase, group in groupby(enumerate(phases, first), key=lambda one: one[1]):
-            ticks = [tick for tick, _ in group]
-            spans.append(Span(phase, ticks[0], ticks[-1]))
-        return tuple(spans) or (Span(1, 0, 0),)
 
+        def phase(tick: int) -> int:
+            together = met is not None and len(roles) > 1 and tick >= met
+            return 3 if together else min(side.phase(tick) for side in known)
 
-def error(pose: Pose, truth: Pose) -> float:
-    """Return the distance between the positions of two poses, in m."""
-    return math.hypot(pose.x - truth.x, pose.y - truth.y)
+        pieces = [(one, list(ticks)) for one, ticks in groupby(range(first, len(self.mutual)), phase)]
+        return tuple([Span(one, ticks[0], ticks[-1]) for one, ticks in pieces]) or (Span(1, 0, 0),)
 
 
 def others(estimate: Estimate) -> tuple[Pose, ...]:
@@ -249,50 +220,52 @@ def others(estimate: Estimate) -> tuple[Pose, ...]:
     return estimate.world[1:] if estimate.probabilities or len(estimate.world) == 1 else estimate.world
 
 
-def encounters(run: Run) -> list[tuple[Sequence[str], PastMeeting | None]]:
-    """Return the pairs of `run`; in a group, the robots of each meeting that has begun, with the meeting."""
-    return [((one.a, one.b), one) for one in past_meetings(run)] or [(robots, None) for robots in run.pairs]
+def encounters(run: Run) -> list[PastMeeting]:
+    """Return the meetings of `run` that have begun; a pair without a group has one, all the time."""
+    pairs = [PastMeeting(pair[0], pair[-1], 0, sys.maxsize - 1, 1, frozenset(pair)) for pair in run.pairs]
+    return [*past_meetings(run)] or pairs
 
 
 def pairs_of(run: Run, replays: Mapping[str, AgentReplay]) -> Iterator[PairRecord]:
     """Yield the pairs of `run` that have data; in a group, the meetings that have begun."""
-    found = [pair_of(run, robots, replays, meeting) for robots, meeting in encounters(run)]
+    found = [pair_of(run, meeting, replays) for meeting in encounters(run)]
     yield from [pair for pair in found if pair is not None]
 
 
-def pair_of(
-    run: Run, robots: Sequence[str], replays: Mapping[str, AgentReplay], meeting: PastMeeting | None = None
-) -> PairRecord | None:
-    """Return the pair of `robots`, role a first; None in hardware mode if no journal has a configuration.
+def pair_of(run: Run, meeting: PastMeeting, replays: Mapping[str, AgentReplay]) -> PairRecord | None:
+    """Return the pair of a meeting; None in hardware mode if no journal has a configuration.
 
-    In a group, it is their `meeting`. `replays` holds the readable journals by robot id.
+    `replays` holds the readable journals by robot id.
     """
+    robots = dict.fromkeys((meeting.a, meeting.b))
     histories = {one: replays[one].history for one in robots if one in replays}
     known = {robot: history for robot, history in histories.items() if history is not None}
     if run.world is not None:
-        config = run.scenario.config(robots[0])
+        config = run.scenario.config(meeting.a)
         ticks = dict.fromkeys(robots, run.length)
     elif known:
         config = next(iter(known.values())).config
         ticks = {robot: len(history.steps) for robot, history in known.items()}
     else:
         return None
-    if meeting is not None:
-        config = _in_meeting(config, meeting)
-        ticks = {robot: min(count, meeting.last + 1) for robot, count in ticks.items()}
-    peer = {config.robot: config.peer, config.peer: config.robot}
+    title = run.title(list(known))
+    if config.members:
+        title += f"; meeting of {meeting.a} and {meeting.b}, ticks {meeting.first} to {meeting.last}"
+        role: Role = "a" if config.robot == meeting.a else "b"
+        peer = meeting.b if role == "a" else meeting.a
+        config = config if config.peer == peer else config.in_meeting(peer, role)
+    ticks = {robot: min(count, meeting.last + 1) for robot, count in ticks.items()}
+    peers = {config.robot: config.peer, config.peer: config.robot}
     mutual: list[tuple[bool, float | None]] = []
     for tick in range(max(ticks.values())):
-        contacts = [one for robot in ticks if (one := run.contact(robot, tick, peer[robot])) is not None]
+        contacts = [one for robot in ticks if (one := run.contact(robot, tick, peers[robot])) is not None]
         mutual.append((bool(contacts), next((one.range for one in contacts if one.range is not None), None)))
 
     def side(role: Role) -> Side:
         own = config.role == role
         robot = config.robot if own else config.peer
-        first = meeting.first if meeting is not None and role == "a" else 0
-        later = meeting if meeting is not None and robot not in meeting.newcomers else None
-        claim = run.claim(robot)
-        if later is not None and claim is not None and not later.first <= claim.tick <= later.last:
+        claim, is_new = run.claim(robot), robot in meeting.newcomers or not config.members
+        if claim is not None and not is_new and not meeting.first <= claim.tick <= meeting.last:
             claim = None
         if run.world is not None:
             path = run.truth(robot) or (run.scenario.robot(robot).start,)
@@ -303,37 +276,16 @@ def pair_of(
             id=robot,
             anchor=config.anchor if own else config.peer_anchor,
             orbit=config.rendezvous.of(role),
-            path=path[: meeting.last + 1] if meeting is not None else path,
+            path=path[: meeting.last + 1],
             commands=tuple([run.command(robot, tick) for tick in seen]),
             anchor_ranges=tuple([run.observations[tick][robot].anchor_range for tick in seen]),
             replay=replays.get(robot),
             claim=claim,
-            first=first,
-            is_new=later is None,
+            first=meeting.first if role == "a" else 0,
+            is_new=is_new,
         )
 
-    title = run.title(list(known))
-    if meeting is not None:
-        title += f"; meeting of {robots[0]} and {robots[-1]}, ticks {meeting.first} to {meeting.last}"
-    pair = PairRecord(
-        title=title,
-        mission=config.mission,
-        planner_name=config.planner_name,
-        a=side("a"),
-        b=side("b"),
-        mutual=tuple(mutual),
-        run=run,
-        number=meeting.number if meeting is not None else 1,
-    )
-    if pair.true or not pair.placed:
-        return pair
-    return replace(pair, title=f"{pair.title}; positions from claims")
-
-
-def _in_meeting(config: RobotConfig, meeting: PastMeeting) -> RobotConfig:
-    """Return `config`, of a robot of a group, with its peer and its role in `meeting`."""
-    role: Role = "a" if config.robot == meeting.a else "b"
-    peer = meeting.b if role == "a" else meeting.a
-    if config.peer == peer or not config.members:
-        return config
-    return config.in_meeting(peer, role)
+    a, b = side("a"), side("b")
+    if run.world is None and a.path and b.path:
+        title += "; positions from claims"
+    return PairRecord(title, config.mission, config.planner_name, a, b, tuple(mutual), run, meeting.number)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from textwrap import wrap
 from typing import Any, NamedTuple, TypeVar
 
@@ -16,6 +16,7 @@ from matplotlib.transforms import Bbox, blended_transform_factory
 
 from compose.figures.style import INK, PAGE, TEXT, Medium
 from protocol.mission import Role
+from protocol.motion import Pose, compose
 
 PAD = 0.04
 """The distance in inches between panels, and of all from the edges of a figure."""
@@ -167,7 +168,25 @@ def circle(axes: Axes, place: tuple[float, float], radius: float, **look: Any) -
     label, gid = look.pop("label", None), look.pop("gid", None)
     axes.add_patch(Circle(place, radius, fill=False, gid=gid, **look))
     if label is not None:
-        axes.plot([], [], label=label, **look)
+        entry(axes, label, **look)
+
+
+def trace(axes: Axes, poses: Iterable[Pose], *style: str, **look: Any) -> None:
+    """Draw a line, or the markers of `style`, through the positions of `poses`."""
+    x, y = zip(*[(pose.x, pose.y) for pose in poses], strict=True)
+    axes.plot(x, y, *style, **look)
+
+
+def entry(axes: Axes, label: str, *style: str, **look: Any) -> None:
+    """Add an entry to the key of `axes`, of what is drawn without one."""
+    axes.plot([], [], *style, label=label, **look)
+
+
+def heading(axes: Axes, pose: Pose, length: float, colour: str, zorder: float = 4.5) -> None:
+    """Draw an arrow of `length` m along the heading of `pose`."""
+    looks = {"arrowstyle": "-|>", "color": colour, "lw": 1.1, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 8}
+    tip = compose(pose, Pose(length, 0.0, 0.0))
+    axes.annotate("", (tip.x, tip.y), (pose.x, pose.y), arrowprops=looks, zorder=zorder)
 
 
 def plain(text: str) -> str:

@@ -10,13 +10,24 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from compose.figures.pair import PairRecord, Side
-from compose.figures.sheet import ANCHORS, LABEL, NO_PLACES, Absent, Sheet, Window, around, circle
+from compose.figures.sheet import (
+    ANCHORS,
+    LABEL,
+    NO_PLACES,
+    Absent,
+    Sheet,
+    Window,
+    around,
+    circle,
+    entry,
+    heading,
+    trace,
+)
 from compose.figures.style import INK, PALE, ROLE_MARKERS, SCREEN, Medium
 from compose.view.colours import COLOURS, line_style
 from protocol.mission import ROLES, Role
-from protocol.motion import Pose
 
-TALLEST_TRAJECTORY = 4.6
+TALLEST_PLANE = 4.6
 """The maximum height of the plane, in inches."""
 MANY = 160
 """The maximum number of markers on a path."""
@@ -30,7 +41,7 @@ def draw(pair: PairRecord, medium: Medium = SCREEN) -> Figure | Absent:
         return Absent(NO_PLACES)
     sheet = Sheet(medium, True, [pair.title])
     draw_plane(sheet.panels["plane"], pair)
-    sheet.plane("plane", window(pair), TALLEST_TRAJECTORY)
+    sheet.plane("plane", window(pair), TALLEST_PLANE)
     sheet.key(sheet.panels["plane"])
     return sheet.finished()
 
@@ -38,23 +49,27 @@ def draw(pair: PairRecord, medium: Medium = SCREEN) -> Figure | Absent:
 def draw_plane(axes: Axes, pair: PairRecord, about: Role | None = None) -> None:
     """Draw the mission from above, with the last positions; `about` one robot, its peer is pale instead."""
     for role in ROLES:
-        draw_anchor(axes, pair, role)
-        one = pair.robot(role)
-        if one.on_orbit:
-            circle(
-            axes, (one.anchor.x, one.anchor.y), one.orbit.radius, lw=0.6, color=COLOURS[role], alpha=0.5,
-            gid=f"orbit-{one.id}", label=f"orbit of {one.id}, {one.orbit.radius:.4g} m",
-        )  # fmt: skip
+        _anchor(axes, pair, role)
     for role in ROLES:
-        _path(axes, pair, role, pale=about not in {None, role})
-    axes.plot([], [], "s", ms=6, mfc="white", mec=INK, mew=1.2, label="start")
+        _path(axes, pair, role, alpha=1.0 if about in (None, role) else 0.4)
+    entry(axes, "start", "s", ms=6, mfc="white", mec=INK, mew=1.2)
     for phase in sorted(
         {phase for role in ROLES for phase in pair.robot(role).phases[pair.robot(role).first :]}
     ):
-        axes.plot([], [], ls=line_style(phase), lw=1.2, color=PALE, label=f"path in phase {phase}")
-    _meetings(axes, pair)
+        entry(axes, f"path in phase {phase}", ls=line_style(phase), lw=1.2, color=PALE)
+    met, contact = pair.encounter_tick, next((first for first, _ in pair.contacts), None)
+    moments = {"contact": (contact, "first contact", ":"), "met": (met, "encounter", (0, (1, 1)))}
+    for gid, (tick, name, style) in moments.items():
+        if tick is not None and tick < pair.placed and (gid == "met" or tick != met):
+            ends, label = [pair.robot(role).path[tick] for role in ROLES], f"{name}, $k$ = {tick}"
+            trace(axes, ends, ls=style, color=INK, lw=1.4, zorder=5, gid=gid, label=label)
     if about is None:
-        _last(axes, pair)
+        last = sorted({len(pair.robot(role).path) - 1 for role in ROLES})
+        for role in ROLES:
+            one, look = pair.robot(role), {"ms": 9, "mec": "white", "mew": 0.6, "zorder": 6}
+            trace(axes, one.path[-1:], "*", mfc=COLOURS[role], gid=f"last-{one.id}", **look)
+        label = f"last position, $k$ = {' and '.join(map(str, last))}"
+        entry(axes, label, "*", ms=8, mfc=PALE, mec="white")
 
 
 def window(pair: PairRecord) -> Window:
@@ -67,42 +82,35 @@ def window(pair: PairRecord) -> Window:
     return around(points, 0.03)
 
 
-def draw_anchor(axes: Axes, pair: PairRecord, role: Role) -> None:
-    """Draw the anchor of the robot with `role`, and its sensing range."""
-    one, reach = pair.robot(role), pair.mission.sensing_range
-    place, first = (one.anchor.x, one.anchor.y), role == "a"
-    axes.plot(
-        *place, "x", color="k", ms=6, mew=1.4, gid=f"anchor-{one.id}", zorder=4, ls="",
-        label="anchors $M_1$, $M_2$" if first else None,
-    )  # fmt: skip
-    axes.annotate(
-        f"${ANCHORS[role]}$", place, xytext=(5, 5), textcoords="offset points", zorder=6, bbox=LABEL
-    )
-    circle(
-        axes, place, reach, ls=(0, (4, 3)), lw=0.8, color="k", gid=f"range-{one.id}",
-        label=f"sensing range, {reach:g} m" if first else None,
-    )  # fmt: skip
+def _anchor(axes: Axes, pair: PairRecord, role: Role) -> None:
+    """Draw the anchor of the robot with `role`, its sensing range, and its orbit if it drives there."""
+    one, reach, first = pair.robot(role), pair.mission.sensing_range, role == "a"
+    place, label = (one.anchor.x, one.anchor.y), "anchors $M_1$, $M_2$" if first else None
+    axes.plot(*place, "x", color="k", ms=6, mew=1.4, gid=f"anchor-{one.id}", zorder=4, label=label)
+    name = f"${ANCHORS[role]}$"
+    axes.annotate(name, place, xytext=(5, 5), textcoords="offset points", zorder=6, bbox=LABEL)
+    label = f"sensing range, {reach:g} m" if first else None
+    circle(axes, place, reach, ls=(0, (4, 3)), lw=0.8, color="k", gid=f"range-{one.id}", label=label)
+    if one.on_orbit:
+        label = f"orbit of {one.id}, {one.orbit.radius:.4g} m"
+        look = {"lw": 0.6, "color": COLOURS[role], "alpha": 0.5, "gid": f"orbit-{one.id}", "label": label}
+        circle(axes, place, one.orbit.radius, **look)
 
 
-def _path(axes: Axes, pair: PairRecord, role: Role, *, pale: bool) -> None:
+def _path(axes: Axes, pair: PairRecord, role: Role, alpha: float) -> None:
     """Draw a path: positions as markers, joined in the line style of each phase, from the start pose on."""
-    one, colour, alpha = pair.robot(role), COLOURS[role], 0.4 if pale else 1.0
+    one, colour, marks = pair.robot(role), COLOURS[role], ROLE_MARKERS[role]
+    every = max(1, math.ceil(len(one.way) / MANY))
     draw_trail(axes, one, role, range(one.first, len(one.path)), alpha=alpha)
-    axes.plot(
-        [p.x for p in one.way], [p.y for p in one.way], ls="", ms=2.6, mew=0.7, color=colour, alpha=alpha,
-        markevery=max(1, math.ceil(len(one.way) / MANY)), gid=f"path-{one.id}", zorder=3,
-        **ROLE_MARKERS[role],
+    trace(
+        axes, one.way, ls="", ms=2.6, mew=0.7, color=colour, alpha=alpha, markevery=every,
+        gid=f"path-{one.id}", zorder=3, **marks,
     )  # fmt: skip
     label = f"true path of {one.id}" if pair.true else f"path of {one.id}, from its claim"
-    axes.plot(
-        [], [], "-", lw=1.2, ms=3.5, mew=0.8, color=colour, alpha=alpha, label=label, **ROLE_MARKERS[role]
-    )
-    start = one.path[one.first]
-    axes.plot(
-        start.x, start.y, "s", ms=6, mfc="white", mec=colour, mew=1.2, zorder=4, gid=f"released-{one.id}",
-        alpha=alpha,
-    )  # fmt: skip
-    heading(axes, start, RANGE_ARROW * pair.mission.sensing_range, colour)
+    entry(axes, label, "-", lw=1.2, ms=3.5, mew=0.8, color=colour, alpha=alpha, **marks)
+    gid = f"released-{one.id}"
+    trace(axes, one.way[:1], "s", ms=6, mfc="white", mec=colour, mew=1.2, zorder=4, gid=gid, alpha=alpha)
+    heading(axes, one.way[0], RANGE_ARROW * pair.mission.sensing_range, colour)
 
 
 def draw_trail(
@@ -111,53 +119,7 @@ def draw_trail(
     """Join the positions in successive `ticks` by lines, one line style per phase."""
     for phase, group in groupby(ticks[:-1], key=one.phase):
         piece = list(group)
-        poses = one.path[piece[0] : piece[-1] + 2]
-        axes.plot(
-            [p.x for p in poses], [p.y for p in poses], ls=line_style(phase), lw=lw, color=COLOURS[role],
+        trace(
+            axes, one.path[piece[0] : piece[-1] + 2], ls=line_style(phase), lw=lw, color=COLOURS[role],
             alpha=alpha, zorder=2.5, gid=f"trail-{one.id}-{piece[0]}-{phase}",
         )  # fmt: skip
-
-
-def heading(axes: Axes, pose: Pose, length: float, colour: str, zorder: float = 4.5) -> None:
-    """Draw an arrow of `length` m along the heading of `pose`."""
-    axes.annotate(
-        "",
-        (pose.x + length * math.cos(pose.heading), pose.y + length * math.sin(pose.heading)),
-        (pose.x, pose.y),
-        arrowprops={
-            "arrowstyle": "-|>", "color": colour, "lw": 1.1, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 8
-        },
-        zorder=zorder,
-    )  # fmt: skip
-
-
-def _meetings(axes: Axes, pair: PairRecord) -> None:
-    """Draw the separation of the robots at the first contact and where the encounter begins."""
-    contact = next((first for first, _ in pair.contacts), None)
-    met = pair.encounter_tick
-    found = {
-        "contact": (contact, "first contact", ":"),
-        "met": (met, "encounter", (0, (1, 1))),
-    }
-    if contact == met:
-        del found["contact"]
-    for gid, (tick, name, style) in found.items():
-        if tick is not None and tick < pair.placed:
-            ends = [pair.robot(role).path[tick] for role in ROLES]
-            axes.plot(
-                [p.x for p in ends], [p.y for p in ends], ls=style, color=INK, lw=1.4, zorder=5, gid=gid,
-                label=f"{name}, $k$ = {tick}",
-            )  # fmt: skip
-
-
-def _last(axes: Axes, pair: PairRecord) -> None:
-    """Draw the last positions."""
-    for role in ROLES:
-        end = pair.robot(role).path[-1]
-        axes.plot(
-            end.x, end.y, "*", ms=9, mfc=COLOURS[role], mec="white", mew=0.6, zorder=6,
-            gid=f"last-{pair.robot(role).id}",
-        )  # fmt: skip
-    last = sorted({len(pair.robot(role).path) - 1 for role in ROLES})
-    label = f"last position, $k$ = {' and '.join(map(str, last))}"
-    axes.plot([], [], "*", ms=8, mfc=PALE, mec="white", ls="", label=label)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 
 import msgspec
@@ -11,7 +10,7 @@ from compose.recording.run_setup import RunSetup
 from compose.view.pair_data import PairData
 from compose.view.run_data import TickData
 from protocol.messages import Command, Estimate
-from protocol.motion import ORIGIN, Pose, compose, inverse
+from protocol.motion import ORIGIN, Pose, compose, inverse, travelled
 
 FITTING_M = 1e-3
 """The largest difference in m between an exact range and the distance of two poses of one configuration."""
@@ -56,7 +55,7 @@ class Configurations(msgspec.Struct, frozen=True, omit_defaults=True):
 def configurations(setup: RunSetup, before: TickData | None, now: TickData) -> Iterator[Configurations]:
     """Yield the configurations of each pair whose robots hold the same ones, at most MOST_CONFIGURATIONS."""
     for robots in setup.pairs():
-        pair = PairData(robots, setup.mission.noise.exact, before, now)
+        pair = PairData(robots, setup, before, now)
         poses = _joined(pair)
         if poses:
             manoeuvre = _manoeuvre(pair, setup, poses) if len(poses) > 1 else None
@@ -70,34 +69,24 @@ def _joined(pair: PairData) -> list[tuple[Pose, Pose]]:
     and b belong together if their distance is the range of this tick, or that of the tick before if the
     robots held as many poses then.
     """
-    held = [pair.held(robot)[1] for robot in pair.ids]
-    if not _as_many(held) or any(one is not None and len(one.world) > MOST_CONFIGURATIONS for one in held):
+    both = [pair.held(robot) for robot in pair.ids]
+    earlier, held = [_world(before) for before, _ in both], [_world(now) for _, now in both]
+    a, b = held
+    if not 0 < len(a) == len(b) <= MOST_CONFIGURATIONS:
         return []
-    poses = list(zip(*[one.world for one in held if one is not None], strict=True))
-    earlier = [pair.held(robot)[0] for robot in pair.ids]
     if not pair.exact:
-        joined = _same(held) or (len(poses) == 1 and _same(earlier))
-        return poses if joined and not any(_outdated(pair, robot) for robot in pair.ids) else []
-    same = _as_many(earlier) and all(
-        one is not None and two is not None and len(one.world) == len(two.world)
-        for one, two in zip(earlier, held, strict=True)
-    )
-    fitting = _fit(pair, pair.now, held) or (same and _fit(pair, pair.before, earlier))
-    return poses if fitting else []
+        joined = _same([now for _, now in both]) or (len(a) == 1 and _same([before for before, _ in both]))
+        # a robot that drives back into its peer's range under noise does not estimate again until it is there
+        unchanged = [robot for robot, was, now in zip(pair.ids, earlier, held, strict=True) if was == now]
+        joined = joined and not any(map(pair.drove, unchanged))
+    else:
+        as_many = [len(poses) for poses in earlier] == [len(a), len(b)]
+        joined = _fit(pair, pair.now, held) or (as_many and _fit(pair, pair.before, earlier))
+    return list(zip(a, b, strict=True)) if joined else []
 
 
-def _as_many(held: list[Estimate | None]) -> bool:
-    counts = {len(one.world) if one is not None else 0 for one in held}
-    return len(counts) == 1 and counts != {0}
-
-
-def _outdated(pair: PairData, robot: str) -> bool:
-    """Return whether the robot has driven, but its estimate is still that of the tick before.
-
-    A robot that only drives back into its peer's range under noise does not estimate again until it is there.
-    """
-    earlier, held = pair.held(robot)
-    return pair.drove(robot) and earlier is not None and held is not None and earlier.world == held.world
+def _world(held: Estimate | None) -> tuple[Pose, ...]:
+    return held.world if held is not None else ()
 
 
 def _same(held: list[Estimate | None]) -> bool:
@@ -106,13 +95,11 @@ def _same(held: list[Estimate | None]) -> bool:
     return len(found) == 1 and len(next(iter(found))) > 1
 
 
-def _fit(pair: PairData, data: TickData | None, held: list[Estimate | None]) -> bool:
+def _fit(pair: PairData, data: TickData | None, held: list[tuple[Pose, ...]]) -> bool:
     contact = pair.contact(data)
     if contact is None or contact.range is None:
         return False
-    a, b = [one.world for one in held if one is not None]
-    distances = [math.hypot(p.x - q.x, p.y - q.y) for p, q in zip(a, b, strict=True)]
-    return all(abs(distance - contact.range) < FITTING_M for distance in distances)
+    return all(abs(travelled(p, q) - contact.range) < FITTING_M for p, q in zip(*held, strict=True))
 
 
 def _manoeuvre(pair: PairData, setup: RunSetup, poses: list[tuple[Pose, Pose]]) -> ComparedManoeuvre | None:
@@ -140,14 +127,5 @@ def _compared(
     ways = compared(Question("a" if moves_a else "b", ORIGIN, ORIGIN, places), setup.mission, manoeuvres)
     row = int(abs(ways.reach.v[:, 0] - command.v).argmin())
     column = int(abs(ways.reach.omega - command.omega).argmin())
-    columns = range(0, len(ways.reach.omega), SHOWN_EVERY)
-    return ComparedManoeuvre(
-        robot,
-        float(ways.gap[row, column]),
-        tuple(
-            [
-                Reachable(float(ways.reach.x[row, i]), float(ways.reach.y[row, i]), float(ways.gap[row, i]))
-                for i in columns
-            ]
-        ),
-    )
+    shown = [values[row, ::SHOWN_EVERY].tolist() for values in (ways.reach.x, ways.reach.y, ways.gap)]
+    return ComparedManoeuvre(robot, float(ways.gap[row, column]), tuple(map(Reachable, *shown)))

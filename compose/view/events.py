@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Literal
@@ -15,7 +14,7 @@ from compose.view.deliveries import Passage, contact_of
 from compose.view.run_data import TickData
 from compose.view.words import doing
 from protocol.messages import Command, Inconsistent, Localised, MissionEnd
-from protocol.motion import wrap
+from protocol.motion import travelled, wrap
 
 Kind = Literal[
     "anchor", "anchor-lost", "contact", "contact-lost", "phase", "state", "branch", "candidates",
@@ -78,12 +77,9 @@ def _presence(robot: str | None, before: TickData | None, now: TickData) -> Iter
     if robot in now.down and (before is None or robot not in before.down - before.back):
         yield Event(now.tick, "down", robot, f"{name} is down: its process is gone")
     if robot in now.back:
-        ticks = now.replayed.get(robot)
-        what = (
-            f"replayed {ticks} tick{'' if ticks == 1 else 's'}, identical"
-            if ticks is not None
-            else "runs again"
-        )
+        ticks, what = now.replayed.get(robot), "runs again"
+        if ticks is not None:
+            what = f"replayed {ticks} tick{'' if ticks == 1 else 's'}, identical"
         yield Event(now.tick, "back", robot, f"{name} is back: its process {what}")
 
 
@@ -118,9 +114,7 @@ def _sensing(robot_setup: RobotSetup, before: TickData | None, now: TickData) ->
         yield Event(tick, "anchor", robot, text)
     if was is not None and observation.anchor_range is None:
         yield Event(tick, "anchor-lost", robot, f"{robot} is out of its anchor's range")
-    if (
-        robot_setup.role == "b" and peer in now.observations
-    ):  # the events of a pair are yielded once, for role a
+    if robot_setup.role == "b" and peer in now.observations:  # yielded once in a pair, for role a
         return
     contact = contact_of(now, robot, peer)
     near = before is not None and contact_of(before, robot, peer) is not None
@@ -161,11 +155,9 @@ def _verdict(robot_setup: RobotSetup, command: Command, now: TickData) -> Event:
     robot = robot_setup.id
     match command.verdict:
         case Localised(pose):
-            x, y, heading = pose.x, pose.y, wrap(pose.heading)
-            text = f"{robot} claims to be at ({x:.2f}, {y:.2f}) m, heading {heading:+.2f} rad"
-            error, truth = None, now.truth.get(robot)
-            if truth is not None:
-                error = f"the error is {metres(math.hypot(x - truth.x, y - truth.y))}"
+            place, truth = f"({pose.x:.2f}, {pose.y:.2f}) m", now.truth.get(robot)
+            text = f"{robot} claims to be at {place}, heading {wrap(pose.heading):+.2f} rad"
+            error = f"the error is {metres(travelled(pose, truth))}" if truth is not None else None
             return Event(now.tick, "claim", robot, text, error)
         case verdict:
             kind: Kind = "inconsistent" if isinstance(verdict, Inconsistent) else "undecided"
@@ -186,15 +178,12 @@ def _believing(robot_setup: RobotSetup, before: TickData | None, now: TickData) 
         text = f"{robot} has chosen its branch: its pose in its anchor's frame is unique"
         yield Event(tick, "branch", robot, text)
     previous, current = len(earlier.world), len(held.world)
-    if previous == 0 < current:
-        text = f"{robot} has {current} possible configuration{'s' if current > 1 else ''} of the pair"
-        if robot_setup.given_anchor is None:
-            text = f"{robot} has {current} possible pose{'s' if current > 1 else ''}"
-        yield Event(tick, "candidates", robot, text)
-    elif previous != current > 0:
+    what, of = ("pose", "") if robot_setup.given_anchor is None else ("configuration", " of the pair")
+    if previous != current > 0:
         change = "fall" if current < previous else "rise"
-        what = "configurations" if robot_setup.given_anchor is not None else "poses"
-        text = f"{robot}'s possible {what} {change} from {previous} to {current}"
+        text = f"{robot}'s possible {what}s {change} from {previous} to {current}"
+        if previous == 0:
+            text = f"{robot} has {current} possible {what}{'s' if current > 1 else ''}{of}"
         yield Event(tick, "candidates", robot, text)
 
 

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from compose.recording.run_setup import RunSetup
-from protocol.mission import Anchor, Mission
+from protocol.mission import Anchor
 from protocol.motion import Covariance, Pose, compose
 
 CORNERS = 72
@@ -50,113 +50,38 @@ def _sigmas(covariance: Covariance) -> tuple[float, float]:
     return math.sqrt(max(0.0, mean + spread)), math.sqrt(max(0.0, mean - spread))
 
 
-class Reach(NamedTuple):
-    """The places where a robot can be by its contact with a peer."""
-
-    places: Sequence[Point]
-    """The possible positions of the peer."""
-    length: float
-    """The largest distance in m from the nearest one."""
-
-    @staticmethod
-    def of(mission: Mission, measured: float | None, peer: Pose, covariance: Covariance | None) -> Reach:
-        """Return the reach of a robot in contact with a peer; `measured` is the range, if there is one."""
-        length = (
-            mission.sensing_range
-            if measured is None
-            else measured + OUTLINE_SIGMAS * mission.noise.mutual_sigma
-        )
-        turn = Turn.of(peer, covariance) if covariance is not None else None
-        places = [(peer.x, peer.y)] if turn is None else [turn.at(angle) for angle in turn.angles]
-        return Reach(places, length)
-
-
-class Turn(NamedTuple):
-    """The arc along which a position lies while its heading is uncertain."""
-
-    x: float
-    """The centre in m, like y."""
-    y: float
-    radius: float
-    """The radius in m."""
-    bearing: float
-    """The direction in rad from the centre to the position."""
-    heading_sigma: float
-    """The standard deviation of the heading in rad."""
-    across: float
-    """The standard deviation across the arc, with a known heading, in m."""
-
-    @staticmethod
-    def of(pose: Pose, covariance: Covariance) -> Turn | None:
-        """Return the arc of a pose; None if its ellipse shows as much."""
-        if covariance.hh <= 0.0:
-            return None
-        x, y = covariance.yh / covariance.hh, -covariance.xh / covariance.hh  # the position, from the centre
-        radius, bearing = math.hypot(x, y), math.atan2(y, x)
-        along, up = math.cos(bearing), math.sin(bearing)
-        xx, yy = covariance.xx - y * y * covariance.hh, covariance.yy - x * x * covariance.hh
-        xy = covariance.xy + x * y * covariance.hh
-        across = math.sqrt(max(0.0, along * along * xx + 2.0 * along * up * xy + up * up * yy))
-        found = Turn(pose.x - x, pose.y - y, radius, bearing, covariance.heading_sigma, across)
-        bend = radius * (1.0 - math.cos(found.largest))
-        return found if math.inf > bend > BENT_ARC * OUTLINE_SIGMAS * _sigmas(covariance)[1] else None
-
-    @property
-    def largest(self) -> float:
-        """The largest angle in rad by which the position is turned."""
-        return min(OUTLINE_SIGMAS * self.heading_sigma, math.pi)
-
-    @property
-    def angles(self) -> list[float]:
-        """Angles from the least to the largest, with 0 in the middle."""
-        return [self.largest * (2.0 * i / CORNERS - 1.0) for i in range(CORNERS + 1)]
-
-    def at(self, angle: float, beside: float = 0.0) -> Point:
-        """Return the position that is turned by `angle`, `beside` m farther from the centre."""
-        away, course = self.radius + beside, self.bearing + angle
-        return self.x + away * math.cos(course), self.y + away * math.sin(course)
-
-    def within(self, reach: Reach | None) -> list[float]:
-        """Return the angles around 0 at which the position is within `reach`; all of them if 0 is not."""
-        angles = self.angles
-        kept = [
-            reach is None or min(math.dist(self.at(one), place) for place in reach.places) <= reach.length
-            for one in angles
-        ]
-        first = last = CORNERS // 2
-        if not kept[first]:
-            return angles
-        while first > 0 and kept[first - 1]:
-            first -= 1
-        while last < CORNERS and kept[last + 1]:
-            last += 1
-        return angles[first : last + 1]
-
-
-def arc(pose: Pose, covariance: Covariance, reach: Reach | None = None) -> tuple[Point, ...]:
+def arc(pose: Pose, covariance: Covariance) -> tuple[Point, ...]:
     """Return the outline of the arc along which a position lies; empty if its ellipse shows as much.
 
-    It has OUTLINE_SIGMAS standard deviations, as far as the position is within `reach`.
+    It has OUTLINE_SIGMAS standard deviations.
     """
-    turn = Turn.of(pose, covariance)
-    if turn is None:
+    if covariance.hh <= 0.0:
         return ()
-    far: list[Point] = []
-    near: list[Point] = []
-    angles = turn.within(reach)
-    for angle in angles:
-        left = 1.0 - (angle / (OUTLINE_SIGMAS * turn.heading_sigma)) ** 2
-        wide = OUTLINE_SIGMAS * turn.across * math.sqrt(max(0.0, left))
-        far.append(turn.at(angle, wide))
-        near.append(turn.at(angle, -wide) if wide < turn.radius else (turn.x, turn.y))
-    if angles[-1] - angles[0] == 2.0 * math.pi and set(near) == {(turn.x, turn.y)}:
-        return tuple(far)
-    return (*far, *reversed(near))
+    x, y = covariance.yh / covariance.hh, -covariance.xh / covariance.hh  # the position, from the centre
+    radius, bearing, spread = math.hypot(x, y), math.atan2(y, x), OUTLINE_SIGMAS * covariance.heading_sigma
+    largest = min(spread, math.pi)
+    bend = radius * (1.0 - math.cos(largest))
+    if not math.inf > bend > BENT_ARC * OUTLINE_SIGMAS * _sigmas(covariance)[1]:
+        return ()
+    along, up = math.cos(bearing), math.sin(bearing)
+    xx, yy = covariance.xx - y * y * covariance.hh, covariance.yy - x * x * covariance.hh
+    xy = covariance.xy + x * y * covariance.hh
+    across = math.sqrt(max(0.0, along * along * xx + 2.0 * along * up * xy + up * up * yy))
+    centre = pose.x - x, pose.y - y
+    sides: tuple[list[Point], list[Point]] = ([], [])
+    for i in range(CORNERS + 1):
+        angle = largest * (2.0 * i / CORNERS - 1.0)
+        wide = OUTLINE_SIGMAS * across * math.sqrt(max(0.0, 1.0 - (angle / spread) ** 2))
+        for side, away in zip(sides, (radius + wide, max(0.0, radius - wide)), strict=True):
+            course = bearing + angle
+            side.append((centre[0] + away * math.cos(course), centre[1] + away * math.sin(course)))
+    far, near = sides
+    return tuple(far) if largest == math.pi and {*near} == {centre} else (*far, *reversed(near))
 
 
-def outline(pose: Pose, covariance: Covariance, reach: Reach | None = None) -> Sequence[Point]:
+def outline(pose: Pose, covariance: Covariance) -> Sequence[Point]:
     """Return the closed outline of where a position is, OUTLINE_SIGMAS standard deviations large."""
-    bent = arc(pose, covariance, reach)
+    bent = arc(pose, covariance)
     return (*bent, bent[0]) if bent else ellipse(pose, covariance)
 
 

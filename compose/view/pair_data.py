@@ -1,33 +1,40 @@
-"""The data of one pair of robots in a tick and in the one before."""
+"""The data of robots that belong together, in a tick and in the one before."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import msgspec
 
-from compose.recording.run_setup import RobotSetup
+from compose.recording.run_setup import RobotSetup, RunSetup
 from compose.view.deliveries import contact_of
+from compose.view.events import Event
 from compose.view.run_data import TickData
 from protocol.messages import Command, Contact, Estimate
 from protocol.motion import REST
 
 
 class PairData(msgspec.Struct, frozen=True):
-    """The robots of a pair, or one whose peer is unknown, with their data."""
+    """The robots of a pair, or one whose peer is unknown, or those of a group, with their data."""
 
-    robots: tuple[RobotSetup, ...]
-    """The robot of role a first."""
-    exact: bool
-    """True if sensors are exact."""
+    robots: Sequence[RobotSetup]
+    """The robots, in a pair that of role a first."""
+    setup: RunSetup
     before: TickData | None
     """The data of the tick before; None if it is unknown."""
     now: TickData
+    events: Sequence[Event] = ()
+    """The events of this tick."""
 
     @property
     def ids(self) -> tuple[str, ...]:
         """The ids of the robots."""
         return tuple([robot.id for robot in self.robots])
+
+    @property
+    def exact(self) -> bool:
+        """True if sensors are exact."""
+        return self.setup.mission.noise.exact
 
     @property
     def own_planner(self) -> bool:
@@ -70,7 +77,7 @@ class PairData(msgspec.Struct, frozen=True):
         begun = earlier is not None and earlier.task == state and not self.drove(robot)
         return command is not None and command.task == state and not begun
 
-    def state(self, robot: str) -> str | None:
-        """Return the state of the robot's command of this tick."""
-        command = self.now.commands.get(robot)
-        return command.task if command is not None else None
+    def in_state(self, *states: str) -> list[str]:
+        """Return the robots whose commands of this tick have one of `states`."""
+        found = {robot: self.now.commands.get(robot) for robot in self.ids}
+        return [robot for robot, command in found.items() if command is not None and command.task in states]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -96,10 +96,7 @@ class RunData:
         down = self.gone if tick > self.last else ()
         self.last = max(self.last, tick)
         self._touch(tick)
-        known = self.ticks.get(tick)
-        if known is None:
-            known = self.ticks[tick] = TickData(tick, down=set(down))
-        return known
+        return self.ticks.setdefault(tick, TickData(tick, down=set(down)))
 
     def between(self, first: int, last: int) -> list[int]:
         """Return the ticks from `first` to `last` with data, in order.
@@ -150,29 +147,22 @@ class RunData:
             data.commands.setdefault(robot, command)
         data.late.update({robot.id for robot in tick.world.scenario.robots} - tick.commands.keys())
 
-    def add_final_reports(self, reports: Mapping[str, FinalReport]) -> None:
-        """Add the FinalReports of the world's journal."""
-        self.final_reports.update(reports)
-
     def add_kills(self, kills: Iterable[Killed]) -> None:
         """Add processes that were killed, once the journals are complete; others than theirs are ignored."""
-        of_process: dict[str | None, dict[int, Killed]] = {}
-        for killed in kills:
-            of_process.setdefault(None if killed.who == WORLD else killed.who, {})[killed.tick] = killed
-        for robot, by_tick in of_process.items():
-            for tick, killed in by_tick.items():
-                if tick in self.ticks and (robot is None or robot in self.ticks[tick].truth):
-                    self._add_absence(robot, killed, by_tick)
+        found = {(None if one.who == WORLD else one.who, one.tick): one for one in kills}
+        for (robot, tick), killed in found.items():
+            if tick in self.ticks and (robot is None or robot in self.ticks[tick].truth):
+                self._add_absence(robot, killed, {tick for who, tick in found if who == robot})
 
-    def _add_absence(self, robot: str | None, killed: Killed, by_tick: Mapping[int, Killed]) -> None:
+    def _add_absence(self, robot: str | None, killed: Killed, ticks: set[int]) -> None:
         """Add the absence of a process in the tick of its kill, and in those after it that it was late for.
 
-        It ends before the next kill in `by_tick`. The process is back if it answers the next tick, or at the
-        end: it goes on only if what it replayed is identical to its journal.
+        It ends before the next of the `ticks` of its kills. The process is back if it answers the next tick,
+        or at the end: it goes on only if what it replayed is identical to its journal.
         """
         last = killed.tick
         self.at(last).down.add(robot)
-        while last + 1 not in by_tick and last + 1 in self.ticks and robot in self.ticks[last + 1].late:
+        while last + 1 not in ticks and last + 1 in self.ticks and robot in self.ticks[last + 1].late:
             last += 1
             self.at(last).down.add(robot)
         following = self.ticks.get(last + 1)
@@ -186,10 +176,9 @@ class RunData:
     def add_observations(self, worlds: Iterable[World]) -> None:
         """Add the Observations that are still missing in the ticks of `worlds`."""
         for world in worlds:
-            data = self.at(world.truth.tick)
-            if len(data.observations) < len(world.scenario.robots):
-                for observation in observations(world):
-                    data.observations.setdefault(observation.robot, observation)
+            known = self.at(world.truth.tick).observations
+            if len(known) < len(world.scenario.robots):
+                known.update({one.robot: one for one in observations(world) if one.robot not in known})
 
     def present(self, robot: str | None, there: bool) -> None:
         """Record that the process of `robot`, or of the world if None, is present or absent now.
@@ -237,8 +226,12 @@ class RunData:
             case DeadlineMissed(tick, robot):
                 data = self.at(tick)
                 (data.late if journal_owner is None else data.without).add(journal_owner or robot)
-            case _:
-                self._add_once(message)
+            case RobotConfig(robot):
+                self.configs.setdefault(robot, message)
+            case FinalReport(robot):
+                self.final_reports.setdefault(robot, message)
+            case MissionEnd():
+                self.conclude(message)
 
     def _receiver(self, sender: str, tick: int) -> str:
         """Return the receiver of the next report in its sender's journal: one for each contact, in order."""
@@ -266,12 +259,3 @@ class RunData:
             report.since, 0, MotionLog(report.through, report.runs)
         )
         self._touch(min(report.tick, log.through + 1))
-
-    def _add_once(self, message: Message) -> None:
-        match message:
-            case RobotConfig(robot):
-                self.configs.setdefault(robot, message)
-            case FinalReport(robot):
-                self.final_reports.setdefault(robot, message)
-            case MissionEnd():
-                self.conclude(message)

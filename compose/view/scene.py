@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 
 from compose.recording.run_setup import RobotSetup, RunSetup
+from compose.view.captions import Caption, captions
 from compose.view.configurations import Configurations, configurations
 from compose.view.deliveries import Passage, passages
 from compose.view.events import Event, events
-from compose.view.outlines import Point, Reach, arc, ellipse
+from compose.view.outlines import Point, arc, ellipse
 from compose.view.run_data import TickData
-from compose.view.story.caption import Caption
-from compose.view.story.captions import captions
 from compose.view.words import doing
-from protocol.messages import Contact, Localised, MissionEnd, Phase, Probability, Report, Verdict, Word
-from protocol.mission import Mission, Role
+from protocol.messages import Contact, Localised, MissionEnd, Phase, Probability, Verdict, Word
+from protocol.mission import Role
 from protocol.motion import Controls, Covariance, Pose, travelled, wrap
 
 
@@ -160,10 +159,9 @@ class Scene(msgspec.Struct, frozen=True):
         for one, other in setup.links():
             a, b = self.player(one.id), self.player(other.id)
             contact = next((contact for contact in a.contacts if contact.peer == other.id), None)
-            if contact is None or a.pose is None or b.pose is None:
-                yield PairLink(one.id, other.id)
-            else:
-                yield PairLink(one.id, other.id, ((a.pose.x, a.pose.y), (b.pose.x, b.pose.y)), contact.range)
+            ends = [(player.pose.x, player.pose.y) for player in (a, b) if player.pose is not None]
+            known = (tuple(ends), contact.range) if contact is not None and len(ends) == 2 else ()
+            yield PairLink(one.id, other.id, *known)
 
 
 def scene(
@@ -192,33 +190,17 @@ def scene(
     )
 
 
-def _sent(report: Report, size: int) -> Sent:
-    if report.body is not None:
-        return Sent(size)
-    return Sent(size, report.phase, report.state, report.through, report.heard)
-
-
-def held_poses(robot: str, now: TickData, mission: Mission) -> HeldPoses | None:
+def held_poses(robot: str, now: TickData) -> HeldPoses | None:
     """Return the poses that `robot` holds in the tick of `now`; None if its Estimate is unknown."""
     estimate = now.estimates.get(robot)
     if estimate is None:
         return None
     bent: tuple[Point, ...] = ()
     if estimate.world and estimate.covariance is not None:
-        bent = arc(estimate.world[0], estimate.covariance, _reach(robot, now, mission))
+        bent = arc(estimate.world[0], estimate.covariance)
     return HeldPoses(
         estimate.local, estimate.world, estimate.probabilities, estimate.covariance, estimate.localised, bent
     )
-
-
-def _reach(robot: str, now: TickData, mission: Mission) -> Reach | None:
-    """Return the reach of `robot` from a peer in contact that knows where it is; None if there is none."""
-    observation = now.observations.get(robot)
-    for contact in observation.contacts if observation is not None else ():
-        peer = now.estimates.get(contact.peer)
-        if peer is not None and peer.world:
-            return Reach.of(mission, contact.range, peer.world[0], peer.covariance)
-    return None
 
 
 def player_of(
@@ -226,40 +208,26 @@ def player_of(
 ) -> Player:
     """Return the entry of one robot in the scene of the tick of `now`; the arguments are as in `scene`."""
     robot, peer = robot_setup.id, robot_setup.peer
-    pose, observation, sent = (
-        now.truth.get(robot),
-        now.observations.get(robot),
-        now.reports.get((robot, peer)),
-    )
-    command = now.commands.get(robot)
+    pose, command, down = now.truth.get(robot), now.commands.get(robot), robot in now.down - now.back
     sentence = f"{robot} has not answered"
-    down = robot in now.down - now.back
     if down:
         sentence = f"{robot} is down: its process is gone"
     elif command is not None:
         sentence = doing(robot_setup, command.phase, command.task, command.verdict)
     elif robot in now.late:
         sentence = f"{robot} has missed the deadline and stands still"
-    return Player(
-        robot=robot,
-        activity=sentence,
-        pose=Pose(pose.x, pose.y, wrap(pose.heading)) if pose is not None else None,
-        sensed=observation is not None,
-        down=down,
-        executed=observation.executed if observation is not None else None,
-        anchor_range=observation.anchor_range if observation is not None else None,
-        contacts=observation.contacts if observation is not None else (),
-        sent=_sent(sent.report, sent.bytes) if sent is not None else None,
-        command=(
-            Decision(command.v, command.omega, command.phase, command.task, command.verdict)
-            if command is not None
-            else None
-        ),
-        held=held_poses(robot, now, setup.mission),
-        reported=(
-            FalsePose(reported, travelled(pose, reported))
-            if reported is not None and pose is not None
-            else None
-        ),
-        peer=peer if setup.visits else None,
-    )
+    known: dict[str, Any] = {}
+    if (observation := now.observations.get(robot)) is not None:
+        known |= {name: getattr(observation, name) for name in ("executed", "anchor_range", "contacts")}
+        known["sensed"] = True
+    if pose is not None:
+        known["pose"] = Pose(pose.x, pose.y, wrap(pose.heading))
+        known["reported"] = FalsePose(reported, travelled(pose, reported)) if reported is not None else None
+    if command is not None:
+        known["command"] = Decision(command.v, command.omega, command.phase, command.task, command.verdict)
+    if (sized := now.reports.get((robot, peer))) is not None:
+        report = sized.report
+        shared = (report.phase, report.state, report.through, report.heard) if report.body is None else ()
+        known["sent"] = Sent(sized.bytes, *shared)
+    held = held_poses(robot, now)
+    return Player(robot, sentence, down=down, held=held, peer=peer if setup.visits else None, **known)

@@ -61,40 +61,30 @@ def series(
     """
     last = max(min(last, known.last), first)
     step = -(-(last - first + 1) // MOST_BINS)
-    ticks: list[list[tuple[RunSetup, TickData]]] = [[] for _ in range(first, last + 1, step)]
+    bins: list[list[tuple[RunSetup, TickData]]] = [[] for _ in range(first, last + 1, step)]
     for tick in known.between(first, last):
         check()
-        ticks[(tick - first) // step].append((known.setup_at(setup, tick), known.ticks[tick]))
+        bins[(tick - first) // step].append((known.setup_at(setup, tick), known.ticks[tick]))
     found = []
     for place, one in enumerate(setup.robots):
-        if robots is not None and one.id not in robots:
-            continue
-        bins = []
-        for several in ticks:
-            check()
-            bins.append([_numbers(then, place, now) for then, now in several])
-        curves = {name: _curve(name, bins) for name in Numbers.__struct_fields__}
-        found.append(
-            RobotSeries(
-                one.id,
-                {name: curve for name, curve in curves.items() if any(low is not None for low in curve.low)},
-            )
-        )
+        if robots is None or one.id in robots:
+            numbers = []
+            for several in bins:
+                check()
+                numbers.append([_numbers(then, place, now) for then, now in several])
+            curves = {name: _curve(name, numbers) for name in Numbers.__struct_fields__}
+            known_ones = {name: curve for name, curve in curves.items() if {*curve.low} != {None}}
+            found.append(RobotSeries(one.id, known_ones))
     return Series(first, last, step, setup.mission.noise.exact, tuple(found))
 
 
 def _numbers(setup: RunSetup, place: int, now: TickData) -> Numbers:
     robot = setup.robots[place]
-    return Numbers.of(
-        player_of(robot, setup, now), robot.given_anchor, held_poses(robot.peer, now, setup.mission)
-    )
+    return Numbers.of(player_of(robot, setup, now), robot.given_anchor, held_poses(robot.peer, now))
 
 
 def _curve(name: str, bins: Iterable[Sequence[Numbers]]) -> Curve:
-    low: list[float | None] = []
-    high: list[float | None] = []
-    for numbers in bins:
-        values = [value for one in numbers if (value := getattr(one, name)) is not UNSET]
-        low.append(min(values, default=None))
-        high.append(max(values, default=None))
-    return Curve(tuple(low), tuple(high))
+    values = [[value for one in several if (value := getattr(one, name)) is not UNSET] for several in bins]
+    return Curve(
+        tuple([min(one, default=None) for one in values]), tuple([max(one, default=None) for one in values])
+    )

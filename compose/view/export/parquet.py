@@ -14,7 +14,7 @@ from compose.recording.frames import verdict_name
 from compose.recording.rows import TickRow, hypotheses
 from compose.recording.run import Run
 from protocol.messages import Estimate
-from protocol.motion import Covariance, Pose, wrap
+from protocol.motion import Covariance, Pose
 
 _POSE = pa.struct([(name, pa.float64()) for name in Pose.__struct_fields__])
 _TICK_TYPES: dict[str, pa.DataType] = {
@@ -45,27 +45,25 @@ def write_ticks(run: Run, ticks: Iterable[TickRow], period: float, path: Path) -
     `period` is T_s in s.
     """
     estimates = {(robot, one.tick): one for robot, agent in run.agents.items() for one in agent.estimates}
-    truths = {robot: run.truth(robot) for robot in run.robots}
     lines = []
     for row in ticks:
-        more: dict[str, Any] = {"time_s": row.tick * period}
-        more["verdict"] = verdict_name(run.command(row.robot, row.tick))
+        line = asdict(row) | {"time_s": row.tick * period}
+        line["verdict"] = verdict_name(run.command(row.robot, row.tick))
         held = estimates.get((row.robot, row.tick))
         if held is not None:
-            pose = truths[row.robot][row.tick] if truths[row.robot] else None
-            more |= _estimate(held, Pose(pose.x, pose.y, wrap(pose.heading)) if pose else None, period)
-        lines.append(asdict(row) | more)
+            truth = None
+            if row.x is not None and row.y is not None and row.heading is not None:
+                truth = Pose(row.x, row.y, row.heading)
+            line |= _estimate(held, truth, period)
+        lines.append(line)
     schema = pa.schema([pa.field(name, _TICK_TYPES.get(name, pa.float64())) for name in TICK_COLUMNS])
     pq.write_table(pa.Table.from_pylist(lines, schema=schema), path)
 
 
 def _estimate(held: Estimate, truth: Pose | None, period: float) -> dict[str, Any]:
     """Return the columns of an estimate, with the errors of its first world pose if the truth is known."""
-    columns: dict[str, Any] = {
-        "local": [asdict(pose) for pose in held.local],
-        "world": [asdict(pose) for pose in held.world],
-        "probability": list(held.probabilities),
-    }
+    columns: dict[str, Any] = {name: list(map(asdict, getattr(held, name))) for name in ("local", "world")}
+    columns["probability"] = list(held.probabilities)
     if held.world:
         first = next(hypotheses(held, truth, period))
         columns |= {f"estimate_{name}": value for name, value in asdict(held.world[0]).items()}

@@ -7,7 +7,7 @@ timelines are `tick` and `time`, the simulated time.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import rerun as rr
@@ -16,10 +16,10 @@ from msgspec import UNSET
 
 from compose.recording.run_setup import RobotSetup, RunSetup
 from compose.view import colours
+from compose.view.drawing import WIDE, Entity, Lines, drawing, standing
 from compose.view.numbers import HYPOTHESES, PLOTS, PLOTTED, RANGES, Numbers
-from compose.view.outlines import box, circle
+from compose.view.outlines import box
 from compose.view.scene import Player, Scene
-from protocol.mission import Role
 from protocol.motion import Pose, compose
 
 TICK, TIME = "tick", "time"
@@ -32,9 +32,8 @@ FPS = 8.0
 """The ticks played each second."""
 HEIGHT = 1.1
 """The height of the eye above the scene, as a multiple of its extent."""
-LINE_RADII = {"thin": -0.8, "path": -1.8, "contact": -3.0}
-"""The radii of lines. Negative radii are in pixels of the window."""
-GREEN, GREY = (0, 128, 90), (128, 128, 128)
+RADIUS_OF_WIDTH = 0.6
+"""The radius of a line, as a multiple of its width."""
 RERUN_LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
 NONE = rr.Clear(recursive=False)
 """The component that ends the display of an entity."""
@@ -59,16 +58,8 @@ def blueprint(setup: RunSetup) -> rrb.Blueprint:
     """Return the arrangement of the views: the scene from above beside the plots and the log."""
     middle = box(setup)
     paths = [f"robots/{robot}/path" for robot in setup.ids]
-    whole = rrb.VisibleTimeRanges(
-        [
-            rrb.VisibleTimeRange(
-                timeline,
-                start=rrb.TimeRangeBoundary.infinite(),
-                end=rrb.TimeRangeBoundary.cursor_relative(),
-            )
-            for timeline in (TICK, TIME)
-        ]
-    )
+    begin, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
+    whole = rrb.VisibleTimeRanges([rrb.VisibleTimeRange(one, start=begin, end=now) for one in (TICK, TIME)])
     scene = rrb.Spatial3DView(
         origin="/",
         contents=["stage/**", "robots/**", "contact/**"],
@@ -95,7 +86,8 @@ def blueprint(setup: RunSetup) -> rrb.Blueprint:
         )
         for title, numbers in PLOTS.items()
     ]
-    beside = rrb.Vertical(*plots, _log(), row_shares=[1, 1, 1, 1.5])
+    log = rrb.TextLogView(origin="log", name="Log")
+    beside = rrb.Vertical(*plots, log, row_shares=[1, 1, 1, 1.5])
     return rrb.Blueprint(
         rrb.Horizontal(scene, beside, column_shares=[3, 2]),
         rrb.BlueprintPanel(state="collapsed"),
@@ -103,22 +95,6 @@ def blueprint(setup: RunSetup) -> rrb.Blueprint:
         rrb.TimePanel(state="collapsed", timeline=TICK, fps=FPS),
         auto_layout=False,
         auto_views=False,
-    )
-
-
-def _log() -> rrb.TextLogView:
-    """Return the log, with the tick, the level and the text of each event."""
-    kinds = rrb.encodings.TextLogColumnKind
-    shown = {kinds.EntityPath: False, kinds.LogLevel: True, kinds.Body: True}
-    return rrb.TextLogView(
-        origin="log",
-        name="Log",
-        columns=rrb.TextLogColumns(
-            timeline_columns=[rrb.components.TimelineColumn(TICK)],
-            text_log_columns=[
-                rrb.components.TextLogColumn(kind, visible=visible) for kind, visible in shown.items()
-            ],
-        ),
     )
 
 
@@ -131,34 +107,27 @@ class _Drawing:
         self._unit = BODY_OF_SCENE * box(setup).extent
         self._last: dict[str, Pose] = {}
         self._shown: set[str] = set()
-        """The entities of `_while` that are displayed."""
+        """The entities that are displayed."""
 
     def stand(self) -> None:
         """Draw what does not change: anchors, sensing ranges and orbits, and the style of the plots."""
-        for robot in self._setup.anchored:
-            colour = GREY if self._setup.visits else _colour(robot.role)
-            at = (robot.anchor.x, robot.anchor.y)
-            self._fixed(
-                f"stage/anchor/{robot.id}",
-                rr.Points3D(
-                    [(*at, 0.0)], radii=self._unit / 5, colors=[colour], labels=[f"{robot.id}'s anchor"]
-                ),
-            )
-            reach, orbit = circle(at, self._setup.mission.sensing_range), circle(at, robot.orbit.radius)
-            self._fixed(f"stage/range/{robot.id}", _lines([reach], colour, "thin"))
-            self._fixed(f"stage/orbit/{robot.id}", _lines([orbit], GREY, "thin"))
-        ends = [((a.anchor.x, a.anchor.y), (b.anchor.x, b.anchor.y)) for a, b in self._setup.links()]
-        if self._setup.visits:
-            self._fixed("stage/meetings", _lines(ends, GREY, "thin"))
+        for one in standing(self._setup):
+            if one.place is not None:
+                at, label = [(*one.place, 0.0)], [f"{one.id.removesuffix('/anchor')}'s anchor"]
+                points = rr.Points3D(at, radii=self._unit / 5, colors=[one.rgb], labels=label)
+                self._stream.log(one.path, points, static=True)
+            for lines in one.lines:
+                self._stream.log(lines.path, _lines(lines), static=True)
         for robot in self._setup.robots[:PLOTTED]:
             for numbers in PLOTS.values():
                 for place, number in enumerate(numbers):
-                    self._fixed(f"plots/{robot.id}/{number}", self._curve(robot, number, place))
+                    path, curve = f"plots/{robot.id}/{number}", self._curve(robot, number, place)
+                    self._stream.log(path, curve, static=True)
 
     def _curve(self, robot: RobotSetup, number: str, place: int) -> rr.SeriesLines | rr.SeriesPoints:
         """Return the style of a number, which is the `place`-th of its plot. Ranges are single points."""
         name = [f"{robot.id}: {number.removesuffix('_m').replace('_', ' ')}"]
-        colour = [_colour(robot.role)] if len(self._setup.robots) == 2 else None
+        colour = [colours.rgb(robot.role)] if len(self._setup.robots) == 2 else None
         if number.endswith("_range_m"):
             shape = (rr.components.MarkerShape.Circle, rr.components.MarkerShape.Diamond)[place]
             return rr.SeriesPoints(names=name, colors=colour, markers=[shape], marker_sizes=[4.0])
@@ -169,108 +138,63 @@ class _Drawing:
         """Draw one tick."""
         self._stream.set_time(TICK, sequence=scene.tick)
         self._stream.set_time(TIME, duration=scene.tick * self._setup.mission.period)
+        for one in drawing(self._setup, scene):
+            if one.topic != "/contact":
+                self._while(one.path, self._arrows(one) if one.arrows else None)
+            for lines in one.lines:
+                self._while(lines.path, _lines(lines) if lines.strips else None)
         for player in scene.players:
-            robot = self._setup.robot_setup(player.robot)
-            self._draw_robot(robot, player)
-            self._draw_hypotheses(robot, player)
+            self._extend_path(self._setup.robot_setup(player.robot), player)
         for robot in self._setup.robots[:PLOTTED]:
             numbers = Numbers.in_scene(scene, robot)
-            for number in numbers.__struct_fields__:
+            for number in [number for plotted in PLOTS.values() for number in plotted]:
                 value = getattr(numbers, number)
-                if any(number in plotted for plotted in PLOTS.values()):
-                    known = [float(value)] if value is not UNSET else []
-                    if known or number not in PLOTS[RANGES]:  # no number is a gap in a line, but a point at 0
-                        self._log(f"plots/{robot.id}/{number}", rr.Scalars(known))
-        self._draw_contacts(scene)
+                known = [float(value)] if value is not UNSET else []
+                if known or number not in PLOTS[RANGES]:  # no number is a gap in a line, but a point at 0
+                    self._stream.log(f"plots/{robot.id}/{number}", rr.Scalars(known))
         for event in scene.events:
-            self._log("log", rr.TextLog(event.whole, level=RERUN_LEVELS[event.level]))
+            self._stream.log("log", rr.TextLog(event.whole, level=RERUN_LEVELS[event.level]))
 
-    def _draw_robot(self, robot: RobotSetup, player: Player) -> None:
-        pose = player.pose
-        if pose is None:
-            return
-        colour = _colour(player.hue(robot))
-        body = rr.Arrows3D(
-            origins=[(pose.x, pose.y, 0.0)],
-            vectors=[self._ahead(pose)],
-            radii=self._unit / 12,
-            colors=[colour],
-            labels=[robot.id],
+    def _extend_path(self, robot: RobotSetup, player: Player) -> None:
+        """Draw the step of a robot since its last pose. The view shows all steps up to the present time."""
+        pose, before = player.pose, self._last.get(robot.id)
+        if pose is not None:
+            ends = [((before.x, before.y), (pose.x, pose.y))] if before is not None else []
+            if ends and ends[0][0] != ends[0][1]:
+                path = Lines(f"robots/{robot.id}/path", ends, colours.rgb(player.hue(robot)), WIDE)
+                self._stream.log(path.path, _lines(path))
+            self._last[robot.id] = pose
+
+    def _arrows(self, one: Entity) -> rr.Arrows3D:
+        """Return the arrows of an entity, one drawn length long; those of hypotheses are thinner."""
+        body = one.topic.endswith("/body")
+        tips = [
+            compose(Pose(0.0, 0.0, arrow.pose.heading), Pose(self._unit, 0.0, 0.0)) for arrow in one.arrows
+        ]
+        return rr.Arrows3D(
+            origins=[(arrow.pose.x, arrow.pose.y, 0.0) for arrow in one.arrows],
+            vectors=[(tip.x, tip.y, 0.0) for tip in tips],
+            radii=self._unit / (12 if body else 50),
+            colors=[one.rgb],
+            labels=[arrow.label for arrow in one.arrows],
+            show_labels=body or len(one.arrows) > 1,
         )
-        self._log(f"robots/{robot.id}/pose", body)
-        before = self._last.get(robot.id)
-        if before is not None and (before.x, before.y) != (pose.x, pose.y):
-            step = [[(before.x, before.y), (pose.x, pose.y)]]
-            self._log(f"robots/{robot.id}/path", _lines(step, colour, "path"))
-        self._last[robot.id] = pose
-        ranged = None
-        if player.anchor_range is not None:
-            ends = [(pose.x, pose.y), (robot.anchor.x, robot.anchor.y)]
-            ranged = _lines([ends], colour, "thin", f"{player.anchor_range:.2f} m")
-        self._while(f"robots/{robot.id}/range", ranged)
-
-    def _draw_hypotheses(self, robot: RobotSetup, player: Player) -> None:
-        held = player.held
-        if held is None:
-            return
-        poses = held.world
-        if held.local and not poses:
-            frame = robot.frame or Pose(robot.anchor.x, robot.anchor.y, 0.0)
-            poses = tuple([compose(frame, pose) for pose in held.local])
-        arrows = rr.Arrows3D(
-            origins=[(pose.x, pose.y, 0.0) for pose in poses],
-            vectors=[self._ahead(pose) for pose in poses],
-            radii=self._unit / 50,
-            colors=[_colour(player.hue(robot))],
-            labels=[f"{share:.2g}" for share in held.shares],
-            show_labels=len(poses) > 1,
-        )
-        self._while(f"robots/{robot.id}/hypotheses", arrows if poses else None)
-        outline = None
-        if held.outline:
-            outline = _lines([held.outline], _colour(player.hue(robot)), "thin")
-        self._while(f"robots/{robot.id}/ellipse", outline)
-
-    def _draw_contacts(self, scene: Scene) -> None:
-        for link in scene.links(self._setup):
-            length = f"{link.range:.2f} m" if link.range is not None else "no range"
-            line = _lines([link.ends], GREEN, "contact", length) if link.ends else None
-            self._while(f"contact/{link.a}-{link.b}", line)
-
-    def _ahead(self, pose: Pose) -> tuple[float, float, float]:
-        """Return the arrow of a pose, one drawn length long."""
-        tip = compose(Pose(0.0, 0.0, pose.heading), Pose(self._unit, 0.0, 0.0))
-        return tip.x, tip.y, 0.0
 
     def _while(self, path: str, content: rr.AsComponents | None) -> None:
         """Display an entity in this tick and until it is None."""
         if content is not None:
             self._shown.add(path)
-            self._log(path, content)
+            self._stream.log(path, content)
         elif path in self._shown:
             self._shown.remove(path)
-            self._log(path, NONE)
-
-    def _log(self, path: str, content: rr.AsComponents) -> None:
-        self._stream.log(path, content)
-
-    def _fixed(self, path: str, content: rr.AsComponents) -> None:
-        self._stream.log(path, content, static=True)
+            self._stream.log(path, NONE)
 
 
-def _colour(role: Role) -> tuple[int, int, int]:
-    """Return the colour of a role as red, green and blue, each from 0 to 255."""
-    red, green, blue = bytes.fromhex(colours.COLOURS[role][1:])
-    return red, green, blue
-
-
-def _lines(
-    strips: Iterable[Sequence[tuple[float, float]]], colour: Any, width: str, label: str | None = None
-) -> rr.LineStrips3D:
-    """Return lines on the ground plane."""
+def _lines(lines: Lines) -> rr.LineStrips3D:
+    """Return lines on the ground plane. Negative radii are in pixels of the window."""
     return rr.LineStrips3D(
-        [[(x, y, 0.0) for x, y in strip] for strip in strips],
-        colors=[colour],
-        radii=[LINE_RADII[width]],
-        labels=[label] if label is not None else None,
+        [[(x, y, 0.0) for x, y in strip] for strip in lines.strips],
+        colors=[lines.rgb],
+        radii=[-RADIUS_OF_WIDTH * lines.width],
+        labels=[lines.label] if lines.label else None,
     )

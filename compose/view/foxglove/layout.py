@@ -13,12 +13,12 @@ import msgspec
 
 from compose.recording.run_setup import RunSetup
 from compose.view import colours
-from compose.view.foxglove.views import WORLD_FRAME, topics
+from compose.view.foxglove.views import WORLD_FRAME
 from compose.view.numbers import PLOTS, PLOTTED
 from compose.view.outlines import box
 
-VISIBLE = ("/stage", "/contact", "body", "belief")
-"""The topics, or the ends of a robot's topics, that the scene shows; they contain what the others have."""
+ROBOT_TOPICS = {"body": True, "belief": True, "pose": False, "trail": False, "hypotheses": False}
+"""The topics of a robot, and whether the scene shows them; these contain what the others have."""
 HEIGHT_MARGIN = 1.15
 """The shown height, as a multiple of the extent of the sensing ranges and orbits."""
 FAR_M = 5000.0
@@ -57,7 +57,7 @@ def layout(setup: RunSetup) -> bytes:
 def _scene(setup: RunSetup) -> fl.ThreeDeeConfig:
     """Return the scene, which follows nothing and contains all sensing ranges and orbits."""
     scene = box(setup)
-    shown = {topic: topic.endswith(VISIBLE) for topic in topics(setup.ids) if topic not in ("/tf", "/log")}
+    shown = {f"/{robot}/{topic}": visible for robot in setup.ids for topic, visible in ROBOT_TOPICS.items()}
     frames = [WORLD_FRAME, *[frame for robot in setup.ids for frame in (robot, f"{robot}/anchor")]]
     return fl.ThreeDeeConfig(
         camera_state=fl.ThreeDeeCameraState(
@@ -77,8 +77,7 @@ def _scene(setup: RunSetup) -> fl.ThreeDeeConfig:
         transforms={f"frame:{one}": fl.BaseRendererLayerSettingsTransform(visible=False) for one in frames},
         topics={
             topic: fl.BaseRendererSceneUpdateTopicSettings(visible=visible)
-            for topic, visible in shown.items()
-            if not topic.endswith("/numbers")
+            for topic, visible in {"/stage": True, "/contact": True, **shown}.items()
         },
     )
 

@@ -17,7 +17,7 @@ from foxglove.mcap import MCAPWriteOptions
 from compose.recording.frames import Journaled, kind_of
 from compose.recording.run_setup import RunSetup
 from compose.view.foxglove.schemas import object_schema, schema
-from compose.view.foxglove.views import Views, nanoseconds, topics
+from compose.view.foxglove.views import Views, nanoseconds
 from compose.view.numbers import Numbers
 from compose.view.scene import Scene
 from protocol.wire import VERSION
@@ -53,7 +53,7 @@ def mcap(
     context, file, views = Context(), BytesIO(), Views(setup)
     options = MCAPWriteOptions(chunk_size=CHUNK_BYTES, compression_threads=0)
     with foxglove.open_mcap(file, context=context, writer_options=options):
-        shown = {topic: _of_scenes(topic, kind, context) for topic, kind in topics(setup.ids).items()}
+        shown: dict[str, Channel] = {}
         journaled: dict[tuple[str, type[msgspec.Struct]], Channel] = {}
         both: Iterable[Journaled | Scene] = (*frames, *scenes)
         for one in sorted(both, key=lambda one: one.tick):
@@ -65,6 +65,8 @@ def mcap(
                 journaled[of].log(one.body, log_time=at)
                 continue
             for topic, message in (*([] if one.tick else [views.standing()]), *views.of(one)):
+                if topic not in shown:
+                    shown[topic] = _of_scenes(topic, message, context)
                 shown[topic].log(message.encode(), log_time=at)
             check()
     return file.getvalue()
@@ -81,12 +83,8 @@ def _of_frames(journal: str, kind: type[msgspec.Struct], context: Context) -> Ch
     )
 
 
-def _of_scenes(topic: str, kind: Any, context: Context) -> Channel:
-    """Return the channel of a topic of scenes, whose messages have the type `kind`."""
-    numbers = kind is Numbers
-    return Channel(
-        topic,
-        message_encoding="json" if numbers else "protobuf",
-        schema=NUMBERS if numbers else kind.get_schema(),
-        context=context,
-    )
+def _of_scenes(topic: str, message: Any, context: Context) -> Channel:
+    """Return the channel of a topic of scenes, which has messages like `message`."""
+    if isinstance(message, Numbers):
+        return Channel(topic, message_encoding="json", schema=NUMBERS, context=context)
+    return Channel(topic, message_encoding="protobuf", schema=message.get_schema(), context=context)

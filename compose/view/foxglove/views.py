@@ -6,35 +6,27 @@ message is complete in itself, so a viewer can seek in a recording.
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 from foxglove import messages as fox
 
-from compose.recording.run_setup import RobotSetup, RunSetup
-from compose.view import colours
+from compose.recording.run_setup import RunSetup
+from compose.view.drawing import Arrow, Entity, Rgb, anchor_frame, drawing, standing
 from compose.view.events import Event
-from compose.view.foxglove import shapes
 from compose.view.numbers import Numbers
-from compose.view.outlines import circle
-from compose.view.scene import HeldPoses, Player, Scene
-from protocol.mission import Role
-from protocol.motion import Pose
+from compose.view.outlines import Point
+from compose.view.scene import Player, Scene
+from protocol.motion import ORIGIN, Pose
 
 WORLD_FRAME = "world"
-TRAIL_POSES = 200
-"""The number of latest poses in a trail."""
+TRAIL_POSES, TRAIL_WIDTH = 200, 2.0
+"""The number of latest poses in a trail, and its width in pixels."""
 BODY_OF_RANGE = 0.12
 """The drawn length of a robot, as a fraction of the sensing range R."""
-LEAST_OPACITY = 0.06
-"""The minimum opacity of a hypothesis."""
-RGB_COLOURS: dict[Role, tuple[float, float, float]] = {"a": colours.rgb("a"), "b": colours.rgb("b")}
-GREY = (0.5, 0.5, 0.5)
-GREEN = (0.0, 0.5, 0.35)
 FOXGLOVE_LEVELS = {"info": fox.LogLevel.Info, "warning": fox.LogLevel.Warning, "error": fox.LogLevel.Error}
-DELIVERED = {"heard": "received", "damaged": "damaged", "lost": "lost"}
-"""The words for the deliveries of reports, by `Passage.what`."""
 
 
 class Shown(NamedTuple):
@@ -45,40 +37,9 @@ class Shown(NamedTuple):
     """A message of Foxglove's schemas, or Numbers."""
 
 
-def topics(robots: Iterable[str]) -> dict[str, Any]:
-    """Return the message type of each topic, in a run of `robots`."""
-    found = {
-        "/tf": fox.FrameTransforms,
-        "/stage": fox.SceneUpdate,
-        "/contact": fox.SceneUpdate,
-        "/log": fox.Log,
-    }
-    for robot in robots:
-        found[f"/{robot}/pose"] = fox.PoseInFrame
-        found[f"/{robot}/trail"] = fox.PosesInFrame
-        found[f"/{robot}/body"] = fox.SceneUpdate
-        found[f"/{robot}/hypotheses"] = fox.PosesInFrame
-        found[f"/{robot}/belief"] = fox.SceneUpdate
-        found[f"/{robot}/numbers"] = Numbers
-    return found
-
-
 def nanoseconds(setup: RunSetup, tick: int) -> int:
     """Return the simulated time of `tick` in ns."""
     return round(tick * setup.mission.period * 1e9)
-
-
-class Trail:
-    """The latest TRAIL_POSES true poses of a robot, and their positions. Each is converted once."""
-
-    def __init__(self) -> None:
-        self.poses: deque[fox.Pose] = deque(maxlen=TRAIL_POSES)
-        self.points: deque[fox.Point3] = deque(maxlen=TRAIL_POSES)
-
-    def add(self, pose: Pose) -> None:
-        """Append a pose."""
-        self.poses.append(shapes.pose(pose))
-        self.points.append(shapes.point(pose.x, pose.y))
 
 
 class Views:
@@ -87,156 +48,144 @@ class Views:
     def __init__(self, setup: RunSetup) -> None:
         self.setup = setup
         self._unit = BODY_OF_RANGE * setup.mission.sensing_range
-        self._trails = {robot: Trail() for robot in setup.ids}
+        self._trails: dict[str, deque[tuple[fox.Pose, fox.Point3]]] = {
+            robot: deque(maxlen=TRAIL_POSES) for robot in setup.ids
+        }
+        """The latest true poses of each robot, and their positions. Each is converted once."""
 
     def standing(self) -> Shown:
         """Return the static content: anchors, sensing ranges and orbits."""
-        entities = [self._anchor(robot_setup) for robot_setup in self.setup.anchored]
-        if self.setup.visits:
-            entities.append(self._tree())
-        return Shown("/stage", fox.SceneUpdate(entities=entities))
+        at = fox.Timestamp(0, 0)
+        return Shown(
+            "/stage", fox.SceneUpdate(entities=[self._entity(one, at) for one in standing(self.setup)])
+        )
 
     def of(self, scene: Scene) -> Iterator[Shown]:
         """Yield the messages of one tick."""
-        at = shapes.timestamp(nanoseconds(self.setup, scene.tick))
-        for player in scene.players:
-            if player.pose is not None:
-                self._trails[player.robot].add(player.pose)
+        at = fox.Timestamp(*divmod(nanoseconds(self.setup, scene.tick), 1_000_000_000))
         for event in scene.events:
             yield Shown("/log", _line(event, at))
         yield Shown("/tf", fox.FrameTransforms(transforms=list(self._transforms(scene, at))))
         for player in scene.players:
             robot_setup = self.setup.robot_setup(player.robot)
             yield Shown(f"/{player.robot}/numbers", Numbers.in_scene(scene, robot_setup))
-            yield from self._robot(player, at)
-        yield Shown("/contact", fox.SceneUpdate(entities=list(self._contacts(scene, at))))
-
-    # --- robots ---
+            yield from self._poses(player, at)
+        entities: dict[str, list[fox.SceneEntity]] = {"/contact": []}
+        for one in drawing(self.setup, scene):
+            entities.setdefault(one.topic, []).append(self._entity(one, at))
+        for topic, found in entities.items():
+            yield Shown(topic, fox.SceneUpdate(entities=found))
 
     def _transforms(self, scene: Scene, at: fox.Timestamp) -> Iterator[fox.FrameTransform]:
         for player in scene.players:
-            robot_setup = self.setup.robot_setup(player.robot)
-            frames = {}
-            if robot_setup.given_anchor is not None:
-                frames[f"{player.robot}/anchor"] = robot_setup.frame or Pose(
-                    robot_setup.anchor.x, robot_setup.anchor.y, 0.0
-                )
+            robot, frames = self.setup.robot_setup(player.robot), {}
+            if robot.given_anchor is not None:
+                frames[f"{robot.id}/anchor"] = anchor_frame(robot)
             if player.pose is not None:
-                frames[player.robot] = player.pose
+                frames[robot.id] = player.pose
             for child, pose in frames.items():
                 yield fox.FrameTransform(
                     timestamp=at,
                     parent_frame_id=WORLD_FRAME,
                     child_frame_id=child,
                     translation=fox.Vector3(x=pose.x, y=pose.y, z=0.0),
-                    rotation=shapes.turned(pose.heading),
+                    rotation=_turned(pose.heading),
                 )
 
-    def _robot(self, player: Player, at: fox.Timestamp) -> Iterator[Shown]:
-        robot, robot_setup = player.robot, self.setup.robot_setup(player.robot)
+    def _poses(self, player: Player, at: fox.Timestamp) -> Iterator[Shown]:
+        """Yield the true pose of a robot, its trail, and its hypotheses."""
+        robot, trail = player.robot, self._trails[player.robot]
         if player.pose is not None:
-            pose = fox.PoseInFrame(timestamp=at, frame_id=WORLD_FRAME, pose=shapes.pose(player.pose))
-            yield Shown(f"/{robot}/pose", pose)
-            trail = list(self._trails[robot].poses)
-            yield Shown(f"/{robot}/trail", fox.PosesInFrame(timestamp=at, frame_id=WORLD_FRAME, poses=trail))
-            yield Shown(f"/{robot}/body", fox.SceneUpdate(entities=[self._body(robot_setup, player, at)]))
+            trail.append((_pose(player.pose), _point((player.pose.x, player.pose.y))))
+            pose, poses = trail[-1][0], [one for one, _ in trail]
+            yield Shown(f"/{robot}/pose", fox.PoseInFrame(timestamp=at, frame_id=WORLD_FRAME, pose=pose))
+            yield Shown(f"/{robot}/trail", fox.PosesInFrame(timestamp=at, frame_id=WORLD_FRAME, poses=poses))
         if player.held is not None:
-            frame = WORLD_FRAME if player.held.world else f"{robot}/anchor"
-            poses = [shapes.pose(one) for one in player.held.poses]
+            frame, poses = f"{robot}/anchor", [_pose(one) for one in player.held.poses]
+            frame = WORLD_FRAME if player.held.world else frame
             yield Shown(f"/{robot}/hypotheses", fox.PosesInFrame(timestamp=at, frame_id=frame, poses=poses))
-            belief = self._belief(robot, frame, player.held, at, RGB_COLOURS[player.hue(robot_setup)])
-            yield Shown(f"/{robot}/belief", fox.SceneUpdate(entities=[belief]))
 
-    def _body(self, robot_setup: RobotSetup, player: Player, at: fox.Timestamp) -> fox.SceneEntity:
-        """Return the drawing of a robot with its activity, its trail, and its anchor range if it has one."""
-        assert player.pose is not None
-        hue = RGB_COLOURS[player.hue(robot_setup)]
-        colour = shapes.colour(hue)
-        lines = []
-        texts = [shapes.words(f"{robot_setup.id}: {player.activity}", player.pose, self._unit, colour)]
-        trail = self._trails[robot_setup.id].points
-        if len(trail) > 1:
-            lines.append(shapes.line(trail, colour, 2.0))
-        if player.anchor_range is not None:
-            ends = [(player.pose.x, player.pose.y), (robot_setup.anchor.x, robot_setup.anchor.y)]
-            lines.append(shapes.strip(ends, shapes.colour(hue, 0.5), 1.5))
-            middle = shapes.middle(ends)
-            texts.append(shapes.words(f"{player.anchor_range:.3f} m", middle, self._unit, colour))
+    def _entity(self, one: Entity, at: fox.Timestamp) -> fox.SceneEntity:
+        """Return an entity of a drawing; the body of a robot has its trail."""
+        texts = [
+            self._words(arrow.label, arrow.pose, _colour(one.rgb, arrow.opacity))
+            for arrow in one.arrows
+            if arrow.label
+        ]
+        lines, cubes = [], []
+        if one.topic == f"/{one.id}/body":
+            points = [point for _, point in self._trails[one.id]]
+            lines += [_strip(points, _colour(one.rgb), TRAIL_WIDTH)] if len(points) > 1 else []
+        for part in one.lines:
+            colour = _colour(part.rgb, part.opacity)
+            for strip in part.strips:
+                lines.append(_strip([_point(point) for point in strip], colour, part.width))
+                if part.label:
+                    (x, y), (to_x, to_y) = strip[0], strip[-1]
+                    middle = Pose((x + to_x) / 2, (y + to_y) / 2, 0.0)
+                    texts.append(self._words(part.label, middle, _colour(part.rgb)))
+        if one.place is not None:
+            here, side = Pose(*one.place, 0.0), self._unit
+            size = fox.Vector3(x=side, y=side, z=side)
+            cubes = [fox.CubePrimitive(pose=_pose(here), size=size, color=_colour(one.rgb))]
+            texts.append(self._words(f"{one.id.removesuffix('/anchor')}'s anchor", here, _colour(one.rgb)))
         return fox.SceneEntity(
             timestamp=at,
             frame_id=WORLD_FRAME,
-            id=robot_setup.id,
-            arrows=[shapes.arrow(player.pose, self._unit, colour)],
+            id=one.id,
+            arrows=[self._arrow(arrow, one.rgb) for arrow in one.arrows],
+            cubes=cubes,
             lines=lines,
             texts=texts,
         )
 
-    # --- anchors and contacts ---
-
-    def _anchor(self, robot_setup: RobotSetup) -> fox.SceneEntity:
-        colour = GREY if self.setup.visits else RGB_COLOURS[robot_setup.role]
-        centre = (robot_setup.anchor.x, robot_setup.anchor.y)
-        here = Pose(*centre, 0.0)
-        size = fox.Vector3(x=self._unit, y=self._unit, z=self._unit)
-        return fox.SceneEntity(
-            timestamp=shapes.timestamp(0),
-            frame_id=WORLD_FRAME,
-            id=f"{robot_setup.id}/anchor",
-            cubes=[fox.CubePrimitive(pose=shapes.pose(here), size=size, color=shapes.colour(colour))],
-            lines=[
-                shapes.strip(
-                    circle(centre, self.setup.mission.sensing_range), shapes.colour(colour, 0.6), 1.5
-                ),
-                shapes.strip(circle(centre, robot_setup.orbit.radius), shapes.colour(GREY, 0.5), 1.0),
-            ],
-            texts=[shapes.words(f"{robot_setup.id}'s anchor", here, self._unit, shapes.colour(colour))],
+    def _arrow(self, arrow: Arrow, rgb: Rgb) -> fox.ArrowPrimitive:
+        return fox.ArrowPrimitive(
+            pose=_pose(arrow.pose),
+            shaft_length=0.6 * self._unit,
+            shaft_diameter=0.3 * self._unit,
+            head_length=0.4 * self._unit,
+            head_diameter=0.6 * self._unit,
+            color=_colour(rgb, arrow.opacity),
         )
 
-    def _tree(self) -> fox.SceneEntity:
-        """Return a line between the anchors of each planned meeting of a group."""
-        grey = shapes.colour(GREY, 0.6)
-        ends = [((a.anchor.x, a.anchor.y), (b.anchor.x, b.anchor.y)) for a, b in self.setup.links()]
-        return fox.SceneEntity(
-            timestamp=shapes.timestamp(0),
-            frame_id=WORLD_FRAME,
-            id="meetings",
-            lines=[shapes.strip(two, grey, 1.0) for two in ends],
+    def _words(self, text: str, at: Pose, colour: fox.Color) -> fox.TextPrimitive:
+        """Return a text above a position, always facing the viewer."""
+        position = fox.Vector3(x=at.x, y=at.y + self._unit, z=self._unit)
+        place = fox.Pose(position=position, orientation=_turned(0.0))
+        return fox.TextPrimitive(
+            pose=place, billboard=True, font_size=14.0, scale_invariant=True, color=colour, text=text
         )
 
-    def _contacts(self, scene: Scene, at: fox.Timestamp) -> Iterator[fox.SceneEntity]:
-        """Yield one entity per pair. In contact it shows the link, the range and deliveries of reports."""
-        for link in scene.links(self.setup):
-            lines, texts = [], []
-            if link.ends:
-                lines = [shapes.strip(link.ends, shapes.colour(GREEN), 3.0)]
-                words = [f"{link.range:.3f} m"] if link.range is not None else ["no range"]
-                words += [
-                    f"{passage.sender}'s report of tick {passage.tick}: {DELIVERED[passage.what]}"
-                    for passage in scene.passages
-                    if {passage.sender, passage.receiver} == {link.a, link.b} and passage.what != "sent"
-                ]
-                middle = shapes.middle(link.ends)
-                texts = [shapes.words("\n".join(words), middle, self._unit, shapes.colour(GREEN))]
-            yield fox.SceneEntity(
-                timestamp=at, frame_id=WORLD_FRAME, id=f"{link.a}-{link.b}", lines=lines, texts=texts
-            )
 
-    # --- hypotheses ---
+def _turned(heading: float) -> fox.Quaternion:
+    """Return the rotation about the vertical axis by `heading` rad."""
+    return fox.Quaternion(x=0.0, y=0.0, z=math.sin(heading / 2.0), w=math.cos(heading / 2.0))
 
-    def _belief(
-        self, robot: str, frame: str, held: HeldPoses, at: fox.Timestamp, colour: tuple[float, float, float]
-    ) -> fox.SceneEntity:
-        """Return an arrow for each hypothesis, paler if less probable, and where the first one may be."""
-        arrows, texts = [], []
-        for pose, share in zip(held.poses, held.shares, strict=False):
-            shade = shapes.colour(colour, max(LEAST_OPACITY, share))
-            arrows.append(shapes.arrow(pose, self._unit, shade))
-            if len(held.poses) > 1:
-                texts.append(shapes.words(f"{share:.3g}", pose, self._unit, shade))
-        lines = [shapes.strip(held.outline, shapes.colour(colour), 1.5)] if held.outline else []
-        return fox.SceneEntity(
-            timestamp=at, frame_id=frame, id=robot, arrows=arrows, lines=lines, texts=texts
-        )
+
+def _pose(at: Pose) -> fox.Pose:
+    """Return a pose on the ground plane."""
+    return fox.Pose(position=fox.Vector3(x=at.x, y=at.y, z=0.0), orientation=_turned(at.heading))
+
+
+def _colour(rgb: Rgb, alpha: float = 1.0) -> fox.Color:
+    return fox.Color(r=rgb[0], g=rgb[1], b=rgb[2], a=alpha)
+
+
+def _point(place: Point) -> fox.Point3:
+    return fox.Point3(x=place[0], y=place[1], z=0.0)
+
+
+def _strip(points: Sequence[fox.Point3], colour: fox.Color, width: float) -> fox.LinePrimitive:
+    """Return a line through points, `width` pixels wide."""
+    return fox.LinePrimitive(
+        type=fox.LinePrimitiveLineType.LineStrip,
+        pose=_pose(ORIGIN),
+        thickness=width,
+        scale_invariant=True,
+        points=list(points),
+        color=colour,
+    )
 
 
 def _line(event: Event, at: fox.Timestamp) -> fox.Log:

@@ -160,7 +160,6 @@ class Listener:
         self.reached = False
         """True while connected to a router."""
         self._inbox = Inbox("tandem watch")
-        self._answers: SimpleQueue[Arrival] = SimpleQueue()
         self._stop = threading.Event()
         self._looking_since: float | None = None
         self._reported = False
@@ -179,12 +178,6 @@ class Listener:
         """Process the received frames and answers."""
         while (arrival := self._inbox.next(0.0)).topic != "nothing":
             self._take(arrival)
-        while True:
-            try:
-                answer = self._answers.get_nowait()
-            except Empty:
-                break
-            self._take(answer)
         for show in self.shows.values():
             show.poll()
 
@@ -194,15 +187,14 @@ class Listener:
         appears = arrival.topic == "alive" and arrival.source.kind is keys.world_alive
         if appears and run not in self.shows and len(self.shows) < MOST_RUNS:
             self.shows[run] = ReceivedMission(run)
-        if run not in self.shows:
-            return
-        if arrival.topic in ("alive", "gone"):
-            self.shows[run].there(arrival.source, arrival.topic == "alive")
-            return
-        try:
-            self.shows[run].take(arrival.source, arrival.frame)
-        except (MalformedFrame, RefusedFrame) as error:
-            self._inbox.refuse(arrival, error)
+        show = self.shows.get(run)
+        if show is not None and arrival.topic in ("alive", "gone"):
+            show.there(arrival.source, arrival.topic == "alive")
+        elif show is not None:
+            try:
+                show.take(arrival.source, arrival.frame)
+            except (MalformedFrame, RefusedFrame) as error:
+                self._inbox.refuse(arrival, error)
 
     # --- in the thread ---
 
@@ -264,5 +256,5 @@ class Listener:
             return
         key = keys.config(run, robot)
         answer = session.ask(link, key, LIVE_QUERY_S)
-        if isinstance(answer, bytes):
-            self._answers.put(Arrival("command", key, answer, Key(keys.config, run, robot)))
+        if isinstance(answer, bytes):  # queued apart from what is published, which may be too much
+            self._inbox.put("observation", key, answer, Key(keys.config, run, robot))

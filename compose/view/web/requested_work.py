@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import resource
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Any
 
@@ -24,30 +24,10 @@ MOST_MEMORY_BYTES = 4 << 30
 """The largest size in bytes of the data of a process."""
 MOST_FILE_BYTES = 1 << 30
 """The largest size in bytes of a file that it writes."""
-FUNCTIONS = ("compose.view.web.changed_missions", "compose.view.web.trials", "compose.view.web.site")
+FUNCTIONS = ("compose.view.web.reruns", "compose.view.web.site")
 """The modules of the functions that are called."""
 MISSION_MODULES = ("compose.launch.in_process", "compose.scenario.scenario_file")
 """The modules that run a mission. They import numpy, which the server itself does not need."""
-
-
-class _Request(msgspec.Struct, frozen=True):
-    """A call of a function in another process."""
-
-    function: str
-    """The function, as module:function. The server chooses it, never a request from a browser."""
-    arguments: tuple[Any, ...]
-    trusted: frozenset[str]
-    """The classes that the user of the server has named."""
-    models: tuple[str, ...]
-    """The names among them of range and radio models."""
-
-
-class _Answer(msgspec.Struct, frozen=True):
-    """The result of such a call."""
-
-    result: Any = None
-    error: str | None = None
-    """The reason why there is no result; None if there is one."""
 
 
 class RequestedWork:
@@ -65,9 +45,8 @@ class RequestedWork:
         Arguments and result are values of msgpack. Raises UserError if the function raises one, with the text
         `late` after the deadline, or if the server has been stopped.
         """
-        request = _Request(
-            f"{function.__module__}:{function.__name__}", arguments, class_loader.trusted(), tuple(OWN_MODELS)
-        )
+        trusted = [*class_loader.trusted()], [*OWN_MODELS]
+        request = msgspec.msgpack.encode((function.__module__, function.__name__, arguments, *trusted))
         with self._lock:
             self._check()
             child = fork_server(f"{__name__}:warm_up").start(
@@ -75,8 +54,8 @@ class RequestedWork:
             )
             self._children.add(child)
         try:
-            child.send(msgspec.msgpack.encode(request))
-            answer = msgspec.msgpack.decode(child.receive(within), type=_Answer)
+            child.send(request)
+            result, error = msgspec.msgpack.decode(child.receive(within))
         except TimeoutError:
             self._check()
             raise UserError(late) from None
@@ -87,9 +66,9 @@ class RequestedWork:
         finally:
             child.end()
             self._children.discard(child)
-        if answer.error is not None:
-            raise UserError(answer.error)
-        return answer.result
+        if error is not None:
+            raise UserError(error)
+        return result
 
     def stop(self) -> None:
         """Kill all processes; requests that wait for them, and later ones, end with a UserError."""
@@ -115,21 +94,26 @@ def main() -> None:
     """Call the function of the request that the launcher sends, and send its result."""
     resource.setrlimit(resource.RLIMIT_DATA, (MOST_MEMORY_BYTES, MOST_MEMORY_BYTES))
     resource.setrlimit(resource.RLIMIT_FSIZE, (MOST_FILE_BYTES, MOST_FILE_BYTES))
-    request = msgspec.msgpack.decode(launcher().recv_bytes(), type=_Request)
-    launcher().send_bytes(msgspec.msgpack.encode(_answer(request)))
+    launcher().send_bytes(msgspec.msgpack.encode(_answer(*msgspec.msgpack.decode(launcher().recv_bytes()))))
 
 
-def _answer(request: _Request) -> _Answer:
-    for name in request.trusted:
-        class_loader.trust(name)
-    module, _, name = request.function.partition(":")
+def _answer(
+    module: str, name: str, arguments: Sequence[Any], trusted: Sequence[str], models: Sequence[str]
+) -> tuple[Any, str | None]:
+    """Return what a function returns, and the reason why it does not; the latter is None if it does.
+
+    The server chooses the function, never a request from a browser. The user of the server has named the
+    classes that are `trusted`, of which `models` are range and radio models.
+    """
+    for one in trusted:
+        class_loader.trust(one)
     try:
-        for model in request.models:
-            model_loader.trust(model)
-        return _Answer(getattr(import_module(module), name)(*request.arguments))
+        for one in models:
+            model_loader.trust(one)
+        return getattr(import_module(module), name)(*arguments), None
     except UserError as error:
-        return _Answer(error=str(error))
+        return None, str(error)
     except MemoryError:
-        return _Answer(error=f"it takes more than {MOST_MEMORY_BYTES >> 30} GB of memory")
+        return None, f"it takes more than {MOST_MEMORY_BYTES >> 30} GB of memory"
     except Exception as error:  # noqa: BLE001  # of whatever the files of a folder contain
-        return _Answer(error=one_line(f"it cannot be computed: {type(error).__name__}: {error}"))
+        return None, one_line(f"it cannot be computed: {type(error).__name__}: {error}")

@@ -13,7 +13,6 @@ import socket
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import nullcontext, suppress
-from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
@@ -33,7 +32,6 @@ from compose.scenario.scenario_change import ScenarioChange
 from compose.scenario.toml_file import field_first
 from compose.view.recorded import scenes
 from compose.view.series import series
-from compose.view.web import estimate_page, sweep_page
 from compose.view.web.origin import refusal
 from compose.view.web.site import Site
 from compose.view.web.sources import WatchedRun
@@ -100,42 +98,30 @@ class _Answers:
         return FileResponse(PAGE / ("compare.html" if self._site.compared else "index.html"))
 
     async def one(self, _request: Request) -> Response:
-        if not self._site.compared:
-            return _json({"error": "this server does not show two recordings side by side"}, 404)
+        self._site.require_compared()
         policy = HEADERS[b"content-security-policy"].decode().replace("'none'", "'self'")
         return FileResponse(PAGE / "index.html", headers={"content-security-policy": policy})
 
     async def comparison(self, _request: Request) -> Response:
-        try:
-            found = await self._computed(self._site.comparison)
-        except UserError as error:
-            return _json({"error": str(error)}, 404)
-        return _json(found)
+        return _json(await self._computed(self._site.comparison))
 
-    async def sweep(self, _request: Request) -> Response:
-        return _results(self._site.folder, sweep_page.contents, "sweep")
+    async def results(self, request: Request) -> Response:
+        """Return the data of the sweep or of the estimate that the server shows."""
+        return _json(self._site.results(request.path_params["kind"]))
 
     async def figure(self, request: Request) -> Response:
         figure = self._site.figure(request.path_params["name"])
         if figure is None:
-            return _json({"error": "there is no such figure"}, 404)
+            raise _Refused(404, "there is no such figure")
         return Response(figure, media_type="image/svg+xml")
-
-    async def estimate(self, _request: Request) -> Response:
-        return _results(self._site.estimate, estimate_page.contents, "estimate")
 
     async def worst(self, request: Request) -> Response:
         """Run the worst trial of a cell, unless that has been done, and return the name of its recording."""
         trials, cell = self._site.trials, _whole(request.path_params["cell"])
-        if trials is None:
-            return _json({"error": "this server shows no sweep"}, 404)
         _require_local(request)
-        if cell is None:
+        if trials is None or cell is None:
             raise _Refused(404, "there is no such cell")
-        try:
-            worst = await self._computed(trials.worst, cell)
-        except UserError as error:
-            return _json({"error": str(error)}, 409)
+        worst = await self._computed(trials.worst, cell)
         return _json({"show": worst.show.name, "outcome": worst.outcome, "trial": worst.trial})
 
     async def values(self, request: Request) -> Response:
@@ -229,7 +215,7 @@ async def _refusal(_request: Request, error: Exception) -> Response:
 
 async def _change_in(request: Request) -> ScenarioChange:
     """Return the values in the body of a POST of the page. Raises _Refused."""
-    if len(request.headers.getlist("origin")) != 1:  # `_Own` has refused foreign ones
+    if len(request.headers.getlist("origin")) != 1:  # `_Sealed` has refused foreign ones
         raise _Refused(403, "only the page of this server may change a mission (Origin header)")
     if request.headers.get("content-type") != "application/json":
         raise _Refused(415, "the values must be JSON (Content-Type header)")
@@ -245,16 +231,6 @@ async def _change_in(request: Request) -> ScenarioChange:
     return found
 
 
-def _results(folder: Path | None, contents: Callable[[Path], dict[str, Any]], what: str) -> Response:
-    """Return the `contents` of a folder of results; an error if the server shows none."""
-    if folder is None:
-        return _json({"error": f"this server shows no {what}"}, 404)
-    try:
-        return _json(contents(folder))
-    except (UserError, OverflowError) as error:  # the latter for a number that JSON cannot have
-        return _json({"error": str(error)}, 500)
-
-
 def application(site: Site) -> Starlette:
     """Return the web application of `site`, which refuses requests of foreign web pages."""
     answers = _Answers(site)
@@ -263,8 +239,7 @@ def application(site: Site) -> Starlette:
             Route("/", answers.index),
             Route(EMBEDDED, answers.one),
             Route("/api/comparison", answers.comparison),
-            Route("/api/sweep", answers.sweep),
-            Route("/api/estimate", answers.estimate),
+            Route("/api/results/{kind}", answers.results),
             Route("/api/figures/{name}", answers.figure),
             Route("/api/cells/{cell}/worst", answers.worst, methods=["POST"]),
             Route("/api/shows/{name}", answers.show),
@@ -278,30 +253,15 @@ def application(site: Site) -> Starlette:
             Mount("/page", StaticFiles(directory=PAGE)),
         ],
         exception_handlers={_Refused: _refusal, UserError: _refusal},
-        middleware=[
-            Middleware(_Sealed),
-            Middleware(_Own),
-        ],
+        middleware=[Middleware(_Sealed)],
     )
 
 
-class _Own:
-    """Middleware that refuses requests of foreign web pages (see `origin`)."""
-
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        headers = Headers(scope=scope)
-        why = refusal(headers.getlist("host"), headers.getlist("origin"))
-        if why is not None:
-            await PlainTextResponse(f"{why}\n", 403)(scope, receive, send)
-        else:
-            await self._app(scope, receive, send)
-
-
 class _Sealed:
-    """Middleware that adds HEADERS to every answer, except those that the answer has already."""
+    """Middleware that refuses requests of foreign web pages (see `origin`), and adds HEADERS to every answer.
+
+    A header that the answer has already stays.
+    """
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -314,7 +274,10 @@ class _Sealed:
                 message["headers"] = [*message["headers"], *added]
             await send(message)
 
-        await self._app(scope, receive, sealed)
+        headers = Headers(scope=scope)
+        why = refusal(headers.getlist("host"), headers.getlist("origin"))
+        app = self._app if why is None else PlainTextResponse(f"{why}\n", 403)
+        await app(scope, receive, sealed)
 
 
 def _number(request: Request, name: str, default: int) -> int:
@@ -328,7 +291,11 @@ def _whole(text: str) -> int | None:
 
 
 def _json(value: object, status: int = 200) -> Response:
-    return Response(msgspec.json.encode(value), status, media_type="application/json")
+    """Return an answer. Raises UserError if a number in `value` cannot be in JSON."""
+    try:
+        return Response(msgspec.json.encode(value), status, media_type="application/json")
+    except OverflowError as error:
+        raise UserError(str(error)) from None
 
 
 async def _news(site: Site, name: str | None, version: int) -> AsyncIterator[bytes]:
@@ -382,17 +349,12 @@ def bound(port: int, address: str = LOOPBACK) -> socket.socket:
     return taken
 
 
-def host(address: str) -> str:
-    """Return the host part of the URL of a server on `address`, for a browser on this machine."""
-    if ipaddress.ip_address(address).is_unspecified:
-        return LOOPBACK
-    return f"[{address}]" if ":" in address else address
-
-
 def address(taken: socket.socket) -> str:
-    """Return the URL of the server that listens on the socket `taken`."""
-    bound_to, port, *_ = taken.getsockname()
-    return f"http://{host(bound_to)}:{port}/"
+    """Return the URL of the server that listens on the socket `taken`, for a browser on this machine."""
+    host, port, *_ = taken.getsockname()
+    if ipaddress.ip_address(host).is_unspecified:
+        host = LOOPBACK
+    return f"http://{f'[{host}]' if ':' in host else host}:{port}/"
 
 
 Ready = Callable[[Callable[[], None]], None]
@@ -408,14 +370,9 @@ logging.getLogger("uvicorn").addHandler(logging.NullHandler())  # Tandem reports
 
 
 async def _serve(site: Site, taken: socket.socket, ready: Ready) -> None:
+    app = application(site)
     server = _Server(
-        uvicorn.Config(
-            application(site),
-            log_config=None,
-            lifespan="off",
-            timeout_graceful_shutdown=1,
-            ws="none",
-        )
+        uvicorn.Config(app, log_config=None, lifespan="off", timeout_graceful_shutdown=1, ws="none")
     )
     loop = asyncio.get_running_loop()
 
@@ -444,9 +401,6 @@ def _soon(loop: asyncio.AbstractEventLoop, stop: Callable[[], None]) -> None:
 
 class _Server(uvicorn.Server):
     """A uvicorn server that leaves signals to `_serve`."""
-
-    def install_signal_handlers(self) -> None:
-        """Do nothing."""
 
     def capture_signals(self) -> Any:
         """Return a context that does nothing."""

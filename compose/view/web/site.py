@@ -13,15 +13,13 @@ from compose.errors import UserError
 from compose.recording.comparison import comparison
 from compose.recording.recording_files import journals_in
 from compose.recording.run import read
-from compose.view.web import estimate_page, sweep_page
-from compose.view.web.changed_missions import ChangedMissions
+from compose.view.web import results_page
 from compose.view.web.live import Listener
 from compose.view.web.requested_work import RequestedWork
+from compose.view.web.reruns import ChangedMissions, Trials
 from compose.view.web.sources import Recorded, WatchedRun, end_of
-from compose.view.web.trials import Trials
 from protocol import files
 from protocol.journal.journal_file import CorruptJournal
-from protocol.network.endpoints import Endpoints
 
 MOST_FIGURE_BYTES = 64 << 20
 """The largest size of a figure that is shown."""
@@ -79,16 +77,28 @@ class Site:
     def figure(self, name: str) -> bytes | None:
         """Return the figure called `name`; None if there is none, or if it cannot be read."""
         with suppress(OSError):
-            if self.folder is not None and name in sweep_page.figures(self.folder):
-                return files.read_inside(self.folder, sweep_page.FIGURES, name, most=MOST_FIGURE_BYTES)
-            if self.estimate is not None and name in estimate_page.figures(self.estimate):
+            if self.folder is not None and name in results_page.figures_of_sweep(self.folder):
+                return files.read_inside(self.folder, results_page.FIGURES, name, most=MOST_FIGURE_BYTES)
+            if self.estimate is not None and name in results_page.figures_of_estimate(self.estimate):
                 return files.read_inside(self.estimate, name, most=MOST_FIGURE_BYTES)
         return None
 
-    def comparison(self) -> dict[str, Any]:
-        """Return how the two recordings compare, as its value in JSON. Raises UserError."""
+    def results(self, kind: str) -> dict[str, Any]:
+        """Return the data of the folder of kind `sweep` or `estimate`. Raises UserError without one."""
+        if kind == "sweep" and self.folder is not None:
+            return results_page.of_sweep(self.folder)
+        if kind == "estimate" and self.estimate is not None:
+            return results_page.of_estimate(self.estimate)
+        raise UserError(f"this server shows no {kind}")
+
+    def require_compared(self) -> None:
+        """Raise UserError unless two recordings are shown side by side."""
         if not self.compared:
             raise UserError("this server does not show two recordings side by side")
+
+    def comparison(self) -> dict[str, Any]:
+        """Return how the two recordings compare, as its value in JSON. Raises UserError."""
+        self.require_compared()
         folders = [str(show.folder) for show in self.recorded]
         late = f"the recordings are not compared after {COMPARISON_S:g} s: use `tandem.open`"
         return {**self.work.result(compared, *folders, within=COMPARISON_S, late=late), "names": folders}
@@ -154,16 +164,6 @@ def compared(one: str, other: str) -> dict[str, Any]:
         raise UserError(f"the recordings cannot be compared: {error}") from None
 
 
-def of_record(folder: Path) -> Site:
-    """Return the content for one recording, which need not exist yet."""
-    return Site([Recorded(folder.name, folder, expected=True)])
-
-
-def of_network(places: Sequence[Endpoints]) -> Site:
-    """Return the content for the missions found at the given endpoints."""
-    return Site(listeners=[Listener(endpoints) for endpoints in places])
-
-
 def of_two(folders: Sequence[Path]) -> Site:
     """Return the content for two recordings side by side. Raises UserError if one of them is no recording."""
     shows: list[Recorded] = []
@@ -184,13 +184,13 @@ def of_folder(folder: Path) -> Site:
     try:
         if not folder.is_dir():
             raise UserError(f"{folder} is not a folder")
-        if sweep_page.is_sweep(folder):
-            sweep_page.contents(folder)
+        if results_page.is_sweep(folder):
+            results_page.of_sweep(folder)
             return Site(folder=folder)
         folders = [folder]
         if not any(journals_in(folder)):
-            if estimate_page.is_estimate(folder):
-                estimate_page.contents(folder)
+            if results_page.is_estimate(folder):
+                results_page.of_estimate(folder)
                 return Site(estimate=folder)
             folders = sorted(one for one in folder.iterdir() if one.is_dir() and any(journals_in(one)))
         shows = [Recorded(one.resolve().name, one) for one in folders]

@@ -9,13 +9,20 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
+from compose.recording.kills_file import kills_in
 from compose.recording.reasons import reason_for
-from compose.recording.recording_files import WORLD_JOURNAL, agent_journal, journals_in
-from compose.recording.run_setup import RunSetup
-from compose.view.recorded import Journals
+from compose.recording.recording_files import WORLD_JOURNAL, agent_journal, journals_in, robot_of
+from compose.recording.run_setup import RunSetup, of_configs, of_scenario
+from compose.recording.summary_json import SUMMARY_JSON
 from compose.view.run_data import RunData
-from protocol.messages import MissionEnd
+from protocol import documents
+from protocol.journal.journal_file import CorruptJournal, OtherVersion, Tail
+from protocol.messages import MissionEnd, OfRobot
+from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 from world.scenario import Scenario
+from world.world_journal import WorldJournalReading
 
 REVISIONS_KEPT = 1000
 """The number of stored revisions. A page that has missed more reloads all scenes."""
@@ -43,7 +50,8 @@ class WatchedRun(ABC):
         self.notes: list[str] = []
         self.version = 0
         """The number of polls that changed the run."""
-        self._revisions: deque[tuple[int, int]] = deque(maxlen=REVISIONS_KEPT)
+        self._revisions: deque[int] = deque(maxlen=REVISIONS_KEPT)
+        """The first tick that changed in each of the latest versions."""
 
     @abstractmethod
     def poll(self) -> None:
@@ -53,16 +61,15 @@ class WatchedRun(ABC):
         """Record a revision if the data has changed. Subclasses call this at the end of `poll`."""
         if self.known.touched is not None:
             self.version += 1
-            self._revisions.append((self.version, self.known.touched))
+            self._revisions.append(self.known.touched)
             self.known.touched = None
 
     def since(self, version: int) -> int | None:
         """Return the first tick that changed after `version`; None if none did."""
-        if version >= self.version:
-            return None
-        if not self._revisions or self._revisions[0][0] > version + 1:
+        missed = self.version - version
+        if missed > len(self._revisions):
             return 0
-        return min(tick for revision, tick in self._revisions if revision > version)
+        return min(list(self._revisions)[-missed:]) if missed > 0 else None
 
     @property
     def head(self) -> int:
@@ -101,25 +108,25 @@ class WatchedRun(ABC):
 
 
 class Recorded(WatchedRun):
-    """The recording in a folder."""
+    """The recording in a folder, whose journals are read incrementally while they grow."""
 
     def __init__(self, name: str, folder: Path, *, expected: bool = False) -> None:
         """Open the recording in `folder`. `expected` is true if its journals may not exist yet."""
-        self._journals = Journals(folder)
-        super().__init__(name, self._journals.known)
-        self.notes = self._journals.notes
+        super().__init__(name, RunData())
         self.folder = folder
         self.setup = None
         self.live = True
         self._expected = expected
         self._over = False
+        self._tails: dict[str, Tail] = {}
+        self._reading = WorldJournalReading()
         self._writers: dict[str, int] = {}
         """The id of the process that last held the lock of each journal, by the journal's name."""
 
     @property
     def scenario(self) -> Scenario | None:
-        """The scenario in the world's journal; None if there is none."""
-        return self._journals.scenario
+        """The scenario in the world's journal; None until it has been read, or if there is none."""
+        return self._reading.world.scenario if self._reading.world is not None else None
 
     def poll(self) -> None:
         """Read new frames of the journals. Raises OSError."""
@@ -128,20 +135,89 @@ class Recorded(WatchedRun):
         written = self._expected or bool(writers)
         if self._over and not written:
             return
-        self._journals.read()
-        self.setup = self._journals.setup
+        self.read()
+        more = any(tail.more for tail in self._tails.values())
         if written:
             self._attend(writers)
-        self.live = (written or self._journals.more) and self.known.end is None
-        self._over = not written and not self._journals.more  # until a resumed mission writes again
+        self.live = (written or more) and self.known.end is None
+        self._over = not written and not more  # until a resumed mission writes again
         if self._over:
-            self._journals.fill()
+            self._fill()
         self.revised()
+
+    def read(self) -> None:
+        """Read the frames appended since the last call, as many as `Tail` reads at once. Raises OSError."""
+        for path in journals_in(self.folder):
+            tail = self._tails.setdefault(path.name, Tail(path))
+            try:
+                frames = tail.news()
+                if path.name == WORLD_JOURNAL:
+                    self._add_world(frames, path)
+                else:
+                    for frame in frames:
+                        message = decode(frame, OfRobot, MAX_FRAME_BYTES)
+                        self.known.add(message, len(frame), robot_of(path.name))
+            except OtherVersion as error:
+                self._note(f"{self.folder}: {error.versions}; {error.remedy}")  # the same in all journals
+            except CorruptJournal as error:
+                self._note(str(error))
+            except MalformedFrame as error:
+                self._note(f"{path}: {error}")
+        configs, scenario = self.known.configs, self.scenario
+        if scenario is not None:
+            for robot in [robot for robot, one in configs.items() if not scenario.is_of(one)]:
+                path = self.folder / agent_journal(robot)
+                self._note(f"{path}: belongs to another run: its configuration does not match the world's")
+        elif len(configs) > (len(self.setup.robots) if self.setup is not None else 0):
+            self.setup = of_configs(self.folder.name, configs)
+
+    def _add_world(self, frames: list[bytes], path: Path) -> None:
+        reading = self._reading
+        first_new = len(reading.ticks)
+        for frame in frames:
+            if reading.unexpected is not None:
+                break
+            if not reading.take(frame):
+                assert reading.unexpected is not None
+                self._note(f"{path}: {reading.unexpected.what}; all later frames are ignored")
+        if reading.world is None:
+            return
+        if self.setup is None or self.setup.seed is None:
+            self.setup = of_scenario(reading.world.scenario, self._mode())
+        for tick in reading.ticks[first_new:]:
+            self.known.add_tick(tick)
+        if reading.recomputed_end is None:
+            self.known.add_world(reading.world)
+        if reading.end is not None:
+            self.known.conclude(reading.end)
+        self.known.final_reports.update(reading.final_reports)
+
+    def _mode(self) -> str | None:
+        try:
+            summary = documents.json_file(self.folder / SUMMARY_JSON)
+            return str(summary["mode"])
+        except (OSError, msgspec.MsgspecError, TypeError, KeyError):
+            return None
+
+    def _fill(self) -> None:
+        """Add what follows from complete journals: missing observations, and the killed processes."""
+        content = self._reading.content()
+        if content is not None:
+            self.known.add_observations(content.worlds)
+        kills, note = kills_in(self.folder)
+        self.known.add_kills(kills)
+        if note is not None:
+            self._note(note)
+
+    def _note(self, text: str) -> None:
+        """Add a line about a damaged journal, whose frames after the damage are ignored."""
+        if text not in self.notes:
+            self.notes.append(text)
 
     def load(self, stopped: Callable[[], bool] = lambda: False) -> None:
         """Read all that is in the journals, unless `stopped` returns true meanwhile. Raises OSError."""
         self.poll()
-        while self._journals.more and not stopped():
+        while any(tail.more for tail in self._tails.values()) and not stopped():
             self.poll()
 
     def _attend(self, writers: dict[str, int]) -> None:

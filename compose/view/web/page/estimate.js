@@ -3,7 +3,7 @@
 import { make } from "./cards.js";
 
 export async function estimate(root) {
-  const answer = await fetch("/api/estimate"), result = await answer.json();
+  const answer = await fetch("/api/results/estimate"), result = await answer.json();
   root.hidden = false;
   root.setAttribute("aria-label", "Estimate");
   if (!answer.ok) {

@@ -6,7 +6,7 @@ import { style } from "./thumbnail.js";
 
 export async function sweep(root) {
   style();
-  const answer = await fetch("/api/sweep"), result = await answer.json();
+  const answer = await fetch("/api/results/sweep"), result = await answer.json();
   root.hidden = false;
   if (!answer.ok) {
     root.replaceChildren(make("p", { textContent: result.error }));
