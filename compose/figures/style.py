@@ -33,6 +33,8 @@ SMALLEST_FONT = 6.0
 COLUMN, PAGE = 3.5, 7.16
 """The widths of one column and of two columns of a paper (IEEE), in inches."""
 
+_DATES: dict[str, dict[str, None]] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {}}
+
 # Matplotlib has no setting for the size of subscripts, which its 0.7 would make 5.6 points.
 _mathtext.SHRINK_FACTOR = SMALLEST_FONT / TEXT
 # fontTools warns of the dates in the STIX fonts when it embeds them.
@@ -76,29 +78,32 @@ def look(medium: Medium) -> Iterator[None]:
     """Use the matplotlib settings for drawing and saving figures for `medium`, and no others.
 
     Matplotlib reads a file `matplotlibrc` in the working directory. That may be a stranger's folder, and the
-    file can start LaTeX. With the fixed hash salt, and without a date, an SVG that is drawn again differs
+    file can start LaTeX. With the fixed hash salt, and without a date, a figure that is drawn again differs
     little. Fonts are embedded as TrueType (42), because publishers reject Type 3, matplotlib's default.
     """
-    fonts: dict[Any, Any] = {
-        "svg.hashsalt": "tandem",
-        "pdf.fonttype": 42,
-        "ps.fonttype": 42,
-        "text.parse_math": True,
-    }
     with mpl.rc_context():
         mpl.rcdefaults()
-        mpl.rcParams.update({**fonts, **medium.settings})
-        yield
+        with mpl.rc_context(
+            {
+                "svg.hashsalt": "tandem",
+                "pdf.fonttype": 42,
+                "ps.fonttype": 42,
+                "text.parse_math": True,
+                **medium.settings,
+            }
+        ):
+            yield
 
 
 def save(
     figure: Figure, path: Path, formats: Sequence[str] = FIGURE_FORMATS, dpi: int = SWEEP_MEDIUM.dpi
 ) -> tuple[Path, ...]:
-    """Save `figure` as `path` with each of `formats` as its extension; return the paths. Raises OSError."""
-    written = {ending: path.with_name(f"{path.name}.{ending}") for ending in formats}
-    for ending, place in written.items():
+    """Save `figure` as `path` with each of `formats` as its extension, without dates; return the paths.
+
+    Raises OSError.
+    """
+    written = [path.with_name(f"{path.name}.{ending}") for ending in formats]
+    for ending, place in zip(formats, written, strict=True):
         with files.draft(place) as drawn:
-            figure.savefig(
-                drawn, format=ending, dpi=dpi, metadata={"Date": None} if ending == "svg" else None
-            )
-    return tuple(written.values())
+            figure.savefig(drawn, format=ending, dpi=dpi, metadata=_DATES[ending])
+    return tuple(written)

@@ -135,7 +135,12 @@ class Recorded(WatchedRun):
         written = self._expected or bool(writers)
         if self._over and not written:
             return
-        self.read()
+        setup = self.setup
+        try:
+            self.read()
+        except OSError:  # a recording that cannot be read as a whole is not shown in parts
+            self.setup = setup
+            raise
         more = any(tail.more for tail in self._tails.values())
         if written:
             self._attend(writers)
