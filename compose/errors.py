@@ -9,15 +9,11 @@ from protocol.messages import Outcome
 LOCALISED = 0
 """The exit status of a mission in which every robot was localised."""
 ENDED = 0
-"""The exit status of a process launched by `tandem run` after any MissionEnd, and of a completed command."""
+"""The exit status of a completed command, of a check that found nothing wrong, and of a launched process."""
 NOT_LOCALISED = 1
 """The exit status of a mission that ended with another outcome than `localised` or `failed`."""
-CLEAN = 0
-"""The exit status of a check that found nothing wrong."""
 VIOLATED = 1
-"""The exit status of an audit, a replay or a driver check that found a violation."""
-AMISS = 1
-"""The exit status of `tandem doctor` if at least one check failed."""
+"""The exit status of a check that found something wrong: an audit, a replay, a driver, or the doctor."""
 USER_ERROR = 2
 """The exit status of every command that was refused because of a user's mistake."""
 FAILED = 3
@@ -37,10 +33,6 @@ class UserError(Exception):
 
     exit_status = USER_ERROR
     """The exit status of the command that raises it."""
-
-
-class BadOptions(UserError):
-    """The options of a planner are not those that it takes."""
 
 
 class CannotWrite(UserError):
@@ -63,12 +55,21 @@ def writing(place: object) -> Iterator[None]:
 
 
 @contextmanager
-def user_code(what: str, kind: type[UserError] = UserError) -> Iterator[None]:
-    """Raise whatever code of the user raises in this context as a `kind` of error that begins with `what`."""
+def within(where: str, kind: type[UserError]) -> Iterator[None]:
+    """Raise a UserError of this context as a `kind` of error, whose text has `where` in front."""
+    try:
+        yield
+    except UserError as error:
+        raise kind(f"{where}{error}") from None
+
+
+@contextmanager
+def user_code(what: str) -> Iterator[None]:
+    """Raise whatever code of the user raises in this context as a UserError that begins with `what`."""
     try:
         yield
     except (Exception, SystemExit) as error:  # noqa: BLE001  # it may raise anything
-        raise kind(f"{what} {type(error).__name__}: {error}") from None
+        raise UserError(f"{what} {type(error).__name__}: {error}") from None
 
 
 # --- scenarios --------------------------------------------------------------------------------------
@@ -125,13 +126,6 @@ class NoEstimate(UserError):
     """The numbers of a valid recording allow no estimate; the text names the recording and the time."""
 
     exit_status = NOT_LOCALISED
-
-
-# --- keys -------------------------------------------------------------------------------------------
-
-
-class BadKeys(UserError):
-    """A folder of keys is incomplete, or was not made by `tandem keys`; the text names the file."""
 
 
 def status_of(outcome: Outcome) -> int:

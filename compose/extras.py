@@ -10,8 +10,6 @@ from typing import NamedTuple
 from compose.errors import UserError
 from protocol import PACKAGE
 
-"""The name of the distribution."""
-
 
 class Library(NamedTuple):
     """One dependency of Tandem."""

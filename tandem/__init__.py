@@ -17,53 +17,31 @@ TYPE_CHECKING = False  # as in typing, which takes time to import
 if TYPE_CHECKING:
     from typing import Any
 
-    from compose.audit.findings import Findings, Violation
-    from compose.errors import (
-        BadFault,
-        BadKill,
-        BadScenario,
-        BadSpec,
-        NoSuchField,
-        NotToml,
-        Unworkable,
-        UserError,
-    )
-    from compose.launch.supervisor import ChildFailed
-    from tandem.clash import ModuleClash
-    from tandem.columns import Table
-    from tandem.estimates import PoseEstimates, estimate
-    from tandem.missions import run
-    from tandem.results import Run
-    from tandem.results import open_recording as open  # noqa: A004  # used as tandem.open
-    from tandem.scenarios import Scenario
-    from tandem.sweeps import SweepIncomplete, SweepResults, sweep
-    from tandem.worlds import World
+    from compose.audit.findings import Findings as Findings
+    from compose.audit.findings import Violation as Violation
+    from compose.errors import BadFault as BadFault
+    from compose.errors import BadKill as BadKill
+    from compose.errors import BadScenario as BadScenario
+    from compose.errors import BadSpec as BadSpec
+    from compose.errors import NoSuchField as NoSuchField
+    from compose.errors import NotToml as NotToml
+    from compose.errors import Unworkable as Unworkable
+    from compose.errors import UserError as UserError
+    from compose.launch.supervisor import ChildFailed as ChildFailed
+    from tandem.clash import ModuleClash as ModuleClash
+    from tandem.columns import Table as Table
+    from tandem.estimates import PoseEstimates as PoseEstimates
+    from tandem.estimates import estimate as estimate
+    from tandem.missions import run as run
+    from tandem.results import Run as Run
+    from tandem.results import open_recording
+    from tandem.scenarios import Scenario as Scenario
+    from tandem.sweeps import SweepIncomplete as SweepIncomplete
+    from tandem.sweeps import SweepResults as SweepResults
+    from tandem.sweeps import sweep as sweep
+    from tandem.worlds import World as World
 
-__all__ = [
-    "BadFault",
-    "BadKill",
-    "BadScenario",
-    "BadSpec",
-    "ChildFailed",
-    "Findings",
-    "ModuleClash",
-    "NoSuchField",
-    "NotToml",
-    "PoseEstimates",
-    "Run",
-    "Scenario",
-    "SweepIncomplete",
-    "SweepResults",
-    "Table",
-    "Unworkable",
-    "UserError",
-    "Violation",
-    "World",
-    "estimate",
-    "open",
-    "run",
-    "sweep",
-]
+    open = open_recording  # noqa: A001  # used as tandem.open
 
 _PLACES = {
     "run": "tandem.missions:run",
@@ -96,6 +74,7 @@ _PLACES = {
     },
 }
 """The module and the name there of each public name that is imported when it is first used."""
+__all__ = list(_PLACES)
 
 
 def __getattr__(name: str) -> Any:

@@ -13,7 +13,7 @@ import msgspec
 
 from compose.errors import UserError, writing
 from compose.extras import need
-from compose.launch.solver_loader import GuardedSolver
+from compose.launch.class_loader import GuardedSolver
 from compose.recording.estimating.estimate_rows import EstimateSummary, PoseEstimateRow
 from compose.recording.estimating.estimate_run import RecordingEstimate, estimated
 from compose.recording.estimating.estimate_summary import write_estimate

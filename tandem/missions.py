@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import atexit
 import time
 from collections.abc import Mapping, Sequence
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -92,7 +90,6 @@ def _as_processes(chosen: Scenario, kills: Sequence[Kill], rate: float | None, t
     scenario = chosen.template.scenario
     need_module(scenario.planner_name)
     check_rate(scenario, rate)
-    _end_with_this_process()
     inbox = Inbox("tandem.run")
     began = time.perf_counter()
     with folder_for(None) as folder:
@@ -104,11 +101,3 @@ def _as_processes(chosen: Scenario, kills: Sequence[Kill], rate: float | None, t
             inbox.say(f"--kill {kill.text}: not reached")
         model = replace(recorded.read(folder), source=chosen.source)
         return Run(model, "processes", wall_s)
-
-
-@cache
-def _end_with_this_process() -> None:
-    """End the fork servers when this process ends, and not only some time after it."""
-    from compose.launch import forked  # noqa: PLC0415  # as above
-
-    atexit.register(forked.close)

@@ -24,7 +24,8 @@ from pathlib import Path
 import msgpack
 from mcap.reader import make_reader
 
-from compose.audit.replay import Replay, replayed
+from compose.audit.findings import Findings
+from compose.audit.rules import replayed
 from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
 from compose.recording.run import read
 from compose.view.export.folder import export
@@ -66,7 +67,7 @@ def _both_ways(name: str | int, folder: Path) -> tuple[str, bool]:
             tandem("run", name, "-q", "--out", folder / out, *mode)
         found = [journals(folder / out) for out in ("processes", "one-process")]
         what = "a simulation of the paper"
-    once: list[Replay] = [replayed(read(folder / "processes"))]
+    once: list[Findings] = [replayed(read(folder / "processes"))]
     if found[0] != found[1]:
         once.append(replayed(read(folder / "one-process")))
     same = all(not one.differences and not one.tears and one.checks for one in once)

@@ -389,14 +389,6 @@ def start(
     return stack.enter_context(TandemProcess(*arguments, *where))
 
 
-def test_access_rules_without_the_robot_are_a_problem(keys: Path, tmp_path: Path) -> None:
-    everybody = shutil.copytree(keys, tmp_path / "keys")
-    assert tandem("keys", everybody, "--robots", "c").status == 0
-    with router_by(keys, tmp_path) as endpoint:
-        ended = tandem("doctor", "--connect", endpoint, "--keys", everybody / "agent-c")
-    only_fix(ended, "router: it passes no Reports of c; restart it with the zenoh.json5 of `tandem keys`")
-
-
 # --- no mission is disturbed ----------------------------------------------------------------------------
 
 

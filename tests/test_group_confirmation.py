@@ -20,7 +20,7 @@ from agent.planning.group import GroupPlanner
 from agent.planning.own_pose import later_pose
 from agent.planning.state import RobotState
 from agent.planning.tasks import Homing, Listening, Surveying
-from compose.audit.replay import replayed
+from compose.audit.rules import audit_run, replayed
 from compose.errors import Unworkable
 from compose.figures.agent_replay import agent_replay
 from compose.figures.pair import pairs_of
@@ -322,9 +322,10 @@ def test_an_audit_finds_a_visit_that_is_not_planned() -> None:
 
 def audited_scenario(scenario: Scenario) -> list[str]:
     """Return what the audit says about the scenario of a recording."""
-    from compose.audit.scenario_rules import _group  # noqa: PLC0415
-
-    return [one.what for one in _group(scenario) if one is not None]
+    run = of_frames(without_attacker())
+    assert run.world is not None
+    run = replace(run, world=replace(run.world, scenario=scenario))
+    return [one.what for one in audit_run(run).violations if one.rule == "scenario"]
 
 
 @pytest.mark.parametrize(

@@ -21,8 +21,7 @@ from msgspec.structs import replace
 
 import tandem
 from agent.process.agent_journal import Step
-from compose.audit.replay import replayed
-from compose.audit.rules import audit_run
+from compose.audit.rules import audit_run, replayed
 from compose.errors import UserError
 from compose.launch.in_process import run_mission
 from compose.launch.processes import free_endpoint

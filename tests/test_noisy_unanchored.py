@@ -26,8 +26,7 @@ from agent.planning.group import GroupPlanner
 from agent.planning.state import RobotState
 from agent.planning.unanchored import UnanchoredPlanner
 from agent.process.agent_journal import Step
-from compose.audit.replay import replayed
-from compose.audit.rules import audit_run
+from compose.audit.rules import audit_run, replayed
 from compose.errors import UserError
 from compose.launch.in_process import run_mission
 from compose.recording.claim_errors import nees

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from compose.audit.replay import replayed
+from compose.audit.rules import replayed
 from compose.launch import in_process
 from compose.recording.recording_files import KINDS, WORLD_JOURNAL, agent_journal
 from compose.recording.run import of_frames

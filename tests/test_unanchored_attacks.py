@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from agent.planning.state import RobotState
 from agent.planning.tasks import Travelling
 from agent.planning.unanchored import UnanchoredPlanner
-from compose.audit.replay import replayed
+from compose.audit.rules import replayed
 from compose.errors import UserError
 from compose.launch.in_process import run_mission
 from compose.launch.planner_loader import planner_of

@@ -14,8 +14,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 from scipy.stats import expon, kstest, laplace, t, uniform  # type: ignore[import-untyped]
 
-from compose.audit.replay import replayed
-from compose.audit.rules import audit_run
+from compose.audit.rules import audit_run, replayed
 from compose.errors import BadScenario, Unworkable
 from compose.launch import in_process
 from compose.recording.cramer_rao import position_bounds

@@ -10,7 +10,7 @@ from agent.process.agent_journal import Step
 from agent.process.planner_replay import PlannerReplay
 from agent.process.report_bodies import body_of
 from agent.process.robot import Robot
-from compose.audit.findings import Checks, Violation, between, difference
+from compose.audit.findings import Checks, Violation, unlike
 from compose.launch.planner_loader import planner_of
 from compose.recording.run import Run
 from protocol.messages import Command, FinalReport, Message, MissionEnd, Observation, Report
@@ -64,8 +64,7 @@ def _same(tick: int, robot: str, found: Message, frame: bytes | None, expected: 
     if frame == expected or encode(found) == expected:
         return None
     wanted = decode(expected, type(found))
-    what = f"in its {type(found).__name__}, {difference(found, wanted)}"
-    return Violation("decision", tick, robot, what, between(found, wanted))
+    return unlike("decision", tick, robot, found, wanted, f"in its {type(found).__name__}, ")
 
 
 def _final_report(replayed: Robot, robot: str, end: MissionEnd, found: FinalReport) -> Violation | None:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from agent.process.agent_journal import AgentHistory, FramedReport, Step
-from compose.audit.findings import Checks, LinkStatistics, Violation, between, difference, quoted
+from compose.audit.findings import Checks, LinkStatistics, Violation, quoted, unlike
 from compose.recording.run import Run
 from protocol.wire import encode
 
@@ -18,14 +18,9 @@ def observation(run: Run) -> Checks:
     """
     for robot, agent in run.agents.items():
         for step in agent.steps[: len(run.observations)]:
-            expected = run.observations[step.observation.tick][robot]
-            if step.frame == encode(expected):
-                yield None
-            else:
-                what = difference(step.observation, expected)
-                yield Violation(
-                    "observation", step.observation.tick, robot, what, between(step.observation, expected)
-                )
+            found, expected = step.observation, run.observations[step.observation.tick][robot]
+            same = step.frame == encode(expected)
+            yield None if same else unlike("observation", found.tick, robot, found, expected)
 
 
 def contact(run: Run) -> Checks:
@@ -93,8 +88,8 @@ def _as_sent(robot: str, step: Step, framed: FramedReport, peer: AgentHistory) -
         return Violation("report", tick, robot, what)
     if framed.frame == sent.frame:
         return None
-    what = f"in the report of tick {framed.report.tick}, {difference(framed.report, sent.report)}"
-    return Violation("report", tick, robot, what, between(framed.report, sent.report))
+    where = f"in the report of tick {framed.report.tick}, "
+    return unlike("report", tick, robot, framed.report, sent.report, where)
 
 
 def link_statistics(run: Run) -> tuple[LinkStatistics, ...]:

@@ -101,6 +101,21 @@ class Findings(msgspec.Struct, frozen=True):
     versions: str | None = None
     """Description of how those versions differ from the ones of this process; None if they do not."""
 
+    @property
+    def checks(self) -> int:
+        """The number of checks of all rules."""
+        return sum([count.checks for count in self.counts])
+
+    @property
+    def differences(self) -> tuple[Violation, ...]:
+        """The violations that are not only an early end of a journal, by tick."""
+        return tuple([one for one in self.violations if not one.breaks_off])
+
+    @property
+    def tears(self) -> tuple[Violation, ...]:
+        """The violations that are only an early end of a journal."""
+        return tuple([one for one in self.violations if one.breaks_off])
+
 
 def findings_of(
     rules: Sequence[Callable[[Run], Checks]],
@@ -127,18 +142,20 @@ def findings_of(
     return Findings(scenario, ticks, tuple(counts), tuple(violations), links, tuple(rounding), versions)
 
 
-def difference(found: msgspec.Struct, expected: msgspec.Struct) -> str:
-    """Return the names of the fields in which two messages differ to the bit, and the values of the first."""
-    fields = [
-        name
-        for name in found.__struct_fields__
-        if _bits(getattr(found, name)) != _bits(getattr(expected, name))
-    ]
-    if not fields:
-        return "the frame differs, its content is the same"
-    first = fields[0]
-    more = f" (and {', '.join(fields[1:])})" if fields[1:] else ""
-    return f"{first} is {quoted(getattr(found, first))}, expected {quoted(getattr(expected, first))}{more}"
+def unlike(
+    rule: str,
+    tick: int | None,
+    robot: str | None,
+    found: msgspec.Struct,
+    expected: msgspec.Struct,
+    where: str = "",
+) -> Violation:
+    """Return the violation that a message is not the expected one; its text begins with `where`."""
+    first = between(found, expected)
+    what = f"{where}{first.field} is {first.found}, expected {first.expected}"
+    if not first.field:
+        what = f"{where}the frame differs, its content is the same"
+    return Violation(rule, tick, robot, what, first)
 
 
 def between(found: msgspec.Struct, expected: msgspec.Struct) -> Difference:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from agent.process.agent_journal import AgentHistory, Step
-from compose.audit.findings import Checks, Violation, between, difference
+from compose.audit.findings import Checks, Violation, unlike
 from compose.recording.recording_files import agent_journal
 from compose.recording.run import Run
-from protocol.messages import MissionEnd
 from protocol.wire import encode
 from world.world_journal import WorldHistory
 
@@ -29,7 +28,8 @@ def order(run: Run) -> Checks:
             if run.world is not None:
                 yield _same_command(run, robot, agent, step)
         if run.world is not None and agent.end is not None and run.end is not None:
-            yield _same_end(agent.end, robot, run.end)
+            same, where = encode(agent.end) == encode(run.end), "the MissionEnd that it received: "
+            yield None if same else unlike("order", agent.end.tick, robot, agent.end, run.end, where)
             yield _same_final_report(run, robot, agent)
 
 
@@ -93,16 +93,7 @@ def _same_command(run: Run, robot: str, agent: AgentHistory, step: Step) -> Viol
         return Violation("order", tick, robot, "the world has a Command from it, expected none: it sent none")
     if received is sent or encode(received) == step.command_frame or encode(received) == encode(sent):
         return None
-    what = f"the world's Command from it: {difference(received, sent)}"
-    return Violation("order", tick, robot, what, between(received, sent))
-
-
-def _same_end(received: MissionEnd, robot: str, sent: MissionEnd) -> Violation | None:
-    """Return a violation if the robot `received` another MissionEnd than the one in the world's journal."""
-    if encode(received) == encode(sent):
-        return None
-    what = f"the MissionEnd that it received: {difference(received, sent)}"
-    return Violation("order", received.tick, robot, what, between(received, sent))
+    return unlike("order", tick, robot, received, sent, "the world's Command from it: ")
 
 
 def _same_final_report(run: Run, robot: str, agent: AgentHistory) -> Violation | None:
@@ -117,8 +108,7 @@ def _same_final_report(run: Run, robot: str, agent: AgentHistory) -> Violation |
         )
     if encode(received) == encode(sent):
         return None
-    what = f"the world's FinalReport from it: {difference(received, sent)}"
-    return Violation("order", agent.end.tick, robot, what, between(received, sent))
+    return unlike("order", agent.end.tick, robot, received, sent, "the world's FinalReport from it: ")
 
 
 def config(run: Run) -> Checks:
@@ -126,8 +116,5 @@ def config(run: Run) -> Checks:
     tick_s = next((agent.config.tick_s for agent in run.agents.values()), None)
     for robot, agent in run.agents.items():
         expected = run.scenario.config(robot, tick_s)
-        if encode(agent.config) == encode(expected):
-            yield None
-        else:
-            what = difference(agent.config, expected)
-            yield Violation("config", None, robot, what, between(agent.config, expected))
+        same = encode(agent.config) == encode(expected)
+        yield None if same else unlike("config", None, robot, agent.config, expected)

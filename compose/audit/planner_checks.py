@@ -18,7 +18,7 @@ from compose.recording.comparison import comparison
 from compose.recording.reasons import reason_for
 from compose.recording.recording_files import WORLD_JOURNAL
 from compose.recording.run import Run
-from compose.scenario.kills import Kill, parse
+from compose.scenario.kills import KILL_POINTS, Kill, parse
 from compose.scenario.run_settings import run_name
 from protocol.journal.journal_file import MemoryJournal, packed
 from protocol.messages import RobotConfig
@@ -27,8 +27,6 @@ from world.scenario import Scenario
 
 CHECK_TIMEOUT_S = 30.0
 """The time in s without an answer after which a run as processes has failed."""
-CHECKED_POINTS = ("observation", "report", "journal", "command")
-"""The points of a tick at which processes are killed, in turn."""
 
 
 class QuietInbox(Inbox):
@@ -136,7 +134,7 @@ def _kills(scenario: Scenario, run: Run) -> tuple[Kill, ...]:
     found = []
     for i, name in enumerate(names * 2):
         tick = run.length * (i + 1) // (2 * len(names) + 1)
-        point = CHECKED_POINTS[i % len(CHECKED_POINTS)] if tick in _contact(run, name) else "journal"
+        point = KILL_POINTS[i % len(KILL_POINTS)] if tick in _contact(run, name) else "journal"
         if tick > 0:
             found.append(parse(f"{name}@{tick}:{point}"))
     return tuple(found)

@@ -13,7 +13,7 @@ from agent.planning.planner import Planner
 from agent.process.report_bodies import body_of, malformed, report_of
 from compose.errors import PlannerFailed
 from compose.launch.planner_guard import GuardedPlanner
-from protocol.messages import Command, Estimate, Observation, Report, RobotConfig
+from protocol.messages import Observation, Report, RobotConfig
 from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode, encode
 
 MUTANTS = 24
@@ -56,6 +56,17 @@ class Watched(GuardedPlanner):
         return BreaksContract(f"{what} ({self._robot}, tick {self._tick or 0})")
 
 
+def _asked_again(method: str) -> Any:
+    """Return the method of a PurityProbe that calls `method` of its planner, and compares other answers."""
+
+    def called(self: PurityProbe, state: Any) -> Any:
+        answer = self.unchanged(method, getattr(super(PurityProbe, self), method), state)
+        self.compare(method, answer, state)
+        return answer
+
+    return called
+
+
 class PurityProbe(Watched):
     """A planner whose every call is made again, on copies of the arguments.
 
@@ -73,30 +84,14 @@ class PurityProbe(Watched):
         """Return the state with the sensor data."""
         self._tick = observation.tick
         self._copy = self._of_copy("observe", self._copied(self._copy), observation)
-        return self._unchanged("observe", super().observe, state, observation)
-
-    def report(self, state: Any) -> Any:
-        """Return the body of the report."""
-        body = self._unchanged("report", super().report, state)
-        self._compare("report", body, state)
-        return body
+        return self.unchanged("observe", super().observe, state, observation)
 
     def decide(self, state: Any, reports: Sequence[Any] = ()) -> Any:
         """Return the state with the reports."""
         self._copy = self._of_copy("decide", self._copied(self._copy), self._copied(list(reports)))
-        return self._unchanged("decide", super().decide, state, reports)
+        return self.unchanged("decide", super().decide, state, reports)
 
-    def command(self, state: Any) -> Command:
-        """Return the command."""
-        command: Command = self._unchanged("command", super().command, state)
-        self._compare("command", command, state)
-        return command
-
-    def estimate(self, state: Any) -> Estimate:
-        """Return the estimate."""
-        estimate: Estimate = self._unchanged("estimate", super().estimate, state)
-        self._compare("estimate", estimate, state)
-        return estimate
+    report, command, estimate = map(_asked_again, ("report", "command", "estimate"))
 
     def _copied(self, value: Any) -> Any:
         return pickle.loads(self._pickled(value))  # it was pickled here
@@ -107,7 +102,8 @@ class PurityProbe(Watched):
         except (Exception, SystemExit) as error:  # noqa: BLE001  # the user's classes may raise anything
             raise self.broken(f"its state cannot be pickled: {type(error).__name__}: {error}") from None
 
-    def _unchanged(self, method: str, call: Callable[..., Any], *arguments: Any) -> Any:
+    def unchanged(self, method: str, call: Callable[..., Any], *arguments: Any) -> Any:
+        """Return the result of `call`. Raises BreaksContract if it changes an argument."""
         before = self._pickled(arguments)
         result = call(*arguments)
         if self._pickled(arguments) != before:
@@ -123,7 +119,8 @@ class PurityProbe(Watched):
                 f"{method}() of a new object of the class raises {type(error).__name__}: {error}"
             ) from None
 
-    def _compare(self, method: str, answer: Any, state: Any) -> None:
+    def compare(self, method: str, answer: Any, state: Any) -> None:
+        """Raise BreaksContract if `method` has another answer for copies of the state and the planner."""
         if _frame(getattr(GuardedPlanner, method)(self, self._copied(state))) != _frame(answer):
             raise self.broken(f"{method}() gives another answer when it is called again with an equal state")
         if _frame(self._of_copy(method, self._copied(self._copy))) != _frame(answer):

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 from compose.audit import scenario_rules
 from compose.audit.agent_rules import decision, limits, log
-from compose.audit.claim_rules import claim
+from compose.audit.claim_rules import claim, outcome
 from compose.audit.delivery_rules import contact, link_statistics, observation, report
 from compose.audit.findings import Checks, Findings, findings_of
 from compose.audit.journal_rules import config, order
@@ -32,6 +32,21 @@ AUDIT_RULES: Rules = (
 HARDWARE_RULES: Rules = (order, scenario_rules.config, report, decision, limits, log)
 """The rules of the audit in hardware mode, where there is no ground truth: the decisions of each robot follow
 from its inputs, and it received what its peer sent."""
+
+REPLAY_RULES: Rules = (config, observation, contact, report, decision, order, outcome)
+"""The rules that recompute something, in the order of a tick: the first difference causes later ones."""
+HARDWARE_REPLAY_RULES: Rules = (report, decision, order)
+"""Those of them that need no ground truth."""
+
+
+def replayed(run: Run) -> Findings:
+    """Run `run` again from the journaled inputs, and return where it differs, to the bit.
+
+    The world moves by the journaled Commands and computes new Observations. Each robot's planner runs on the
+    Observations and Reports that its process received. In hardware mode, only the agents' journals are
+    replayed. Raises CorruptJournal if a frame cannot be decoded or is in the journal of another robot.
+    """
+    return audit_run(run, REPLAY_RULES, HARDWARE_REPLAY_RULES)
 
 
 def audit_run(run: Run, rules: Rules = AUDIT_RULES, hardware_rules: Rules = HARDWARE_RULES) -> Findings:

@@ -11,7 +11,6 @@ from agent.process.robot import Robot
 from compose.cli.participant import endpoints_of, old_journal, participate, replayed, warn_beyond
 from compose.errors import ENDED, UserError, status_of
 from compose.launch import planner_loader
-from compose.launch.class_loader import trust
 from compose.launch.signals import stop_by_signal
 from compose.recording.reasons import ended
 from compose.recording.recording_files import agent_journal
@@ -51,8 +50,6 @@ def _run(options: argparse.Namespace, inbox: Inbox) -> MissionEnd:
     """Run the agent, resumed from its journal if there is one, and return the MissionEnd."""
     endpoints = endpoints_of(options, f"agent-{options.id}", CONNECT_MISSING)
     old = old_journal(options, agent_journal(options.id))
-    for planner in options.planner:
-        trust(planner)
     memory = remember(old, planner_loader.planner_of) if old is not None else None
     end = memory.end if memory is not None else None
     which = f"world of run '{options.run}'" if options.run else "world"

@@ -3,23 +3,93 @@
 from __future__ import annotations
 
 import ipaddress
-import math
 import re
 from argparse import ArgumentTypeError
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 from compose.errors import BadKill, UserError
+from compose.launch.class_loader import trust
 from compose.scenario.kills import Kill, parse
 from protocol.units import NAME
 
 ENDPOINT_EXAMPLE = "tcp/127.0.0.1:7447"
+Value = TypeVar("Value")
 
 
-def source(text: str) -> str:
-    """Return the name of a scenario or the path of a file. Raises ArgumentTypeError."""
-    if not text:
-        raise ArgumentTypeError("'' is neither a name nor a path")
-    return text
+def checked(
+    what: str, read: Callable[[str], Value], holds: Callable[[Value], object] = lambda _: True
+) -> Callable[[str], Value]:
+    """Return the type of an argument that is `what`: `read` can read it, and `holds` is true of the value."""
+
+    def argument(text: str) -> Value:
+        try:
+            value = read(text)
+            if holds(value):
+                return value
+        except ValueError:
+            pass
+        raise ArgumentTypeError(f"'{text}' is not {what}")
+
+    return argument
+
+
+def _whole(text: str) -> int:
+    return int(_parts("([0-9]{1,19})", text)[0])
+
+
+def _parts(pattern: str, text: str) -> tuple[str, ...]:
+    """Return the groups of `pattern` in `text`, empty where there is none. Raises ValueError."""
+    found = re.fullmatch(pattern, text)
+    if found is None:
+        raise ValueError
+    return found.groups("")
+
+
+def up_to(most: int) -> Callable[[str], int]:
+    """Return the type of an integer from 1 to `most`."""
+    return checked(f"a whole number from 1 to {most}", _whole, lambda value: 0 < value <= most)
+
+
+def _cell_and_trial(text: str) -> tuple[int, int]:
+    cell, trial = _parts("(?:([0-9]{1,18}):)?([0-9]{1,18})", text)
+    return int(cell or 0), int(trial)
+
+
+def _window(text: str) -> tuple[float, float]:
+    first, last = _parts(r"(.*?)\.\.(.*)", text)
+    return float(first), float(last)
+
+
+source = checked("a name or a path", str, bool)
+positive = checked("a positive number", float, lambda value: 0.0 < value < 1e9)
+natural = checked("a whole number from 0 to 2^63 - 1", _whole, lambda value: value < 2**63)
+confidence = checked("a probability from 0.5 to below 1", float, lambda value: 0.5 <= value < 1.0)
+port = checked("a port, which is 0 (any free port) to 65535", _whole, lambda value: value < 1 << 16)
+address = checked("an IP address such as 127.0.0.1 or 0.0.0.0", lambda text: str(ipaddress.ip_address(text)))
+name = checked("a name, which consists of letters, digits, - and _", str, re.compile(NAME).search)
+option = checked(
+    "an option; expected NAME=VALUE",
+    lambda text: _parts("(?s)([^=]*)=(.*)", text),
+    lambda parts: parts[0].isidentifier(),
+)
+cell_and_trial = checked("a trial such as 17, or 3:17 in cell 3", _cell_and_trial)
+window = checked("a window in seconds such as 10..40", _window, lambda ends: 0.0 <= ends[0] < ends[1] < 1e13)
+"""The types of most arguments."""
+
+
+def planner_option(text: str) -> tuple[str, bool | int | float | str]:
+    """Return the name and the value of an option, a number, true, false or text. Raises ArgumentTypeError."""
+    key, value = option(text)
+    if value in ("true", "false"):
+        return key, value == "true"
+    for number in (int, float):
+        try:
+            return key, number(value)
+        except ValueError:
+            continue
+    return key, value
 
 
 def folder(text: str) -> Path:
@@ -33,19 +103,10 @@ def folder(text: str) -> Path:
     return Path(text).expanduser()
 
 
-def planner_option(text: str) -> tuple[str, bool | int | float | str]:
-    """Return the name and the value of an option, a number, true, false or text. Raises ArgumentTypeError."""
-    name, equals, value = text.partition("=")
-    if not equals or not name.isidentifier():
-        raise ArgumentTypeError(f"'{text}' is not an option; expected NAME=VALUE")
-    if value in ("true", "false"):
-        return name, value == "true"
-    for number in (int, float):
-        try:
-            return name, number(value)
-        except ValueError:
-            continue
-    return name, value
+def planner(text: str) -> str:
+    """Return the name of a planner, whose code this process may load from now on."""
+    trust(text)
+    return text
 
 
 def model(text: str) -> str:
@@ -59,70 +120,6 @@ def model(text: str) -> str:
     return text
 
 
-def _number(text: str) -> float:
-    """Return the number that `text` is; NaN if it is none."""
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
-
-
-def positive(text: str) -> float:
-    """Return a number above 0 and below 1e9. Raises ArgumentTypeError."""
-    value = _number(text)
-    if not 0.0 < value < 1e9:
-        raise ArgumentTypeError(f"'{text}' is not a positive number")
-    return value
-
-
-def natural(text: str) -> int:
-    """Return an integer from 0 to 2^63 - 1. Raises ArgumentTypeError."""
-    if not re.fullmatch(r"[0-9]{1,19}", text) or int(text) >= 2**63:
-        raise ArgumentTypeError(f"'{text}' is not a whole number from 0 to 2^63 - 1")
-    return int(text)
-
-
-def cell_and_trial(text: str) -> tuple[int, int]:
-    """Return the cell and the trial of a text such as 3:17; the cell is 0 if the text is only the trial.
-
-    Raises ArgumentTypeError.
-    """
-    found = re.fullmatch("(?:([0-9]{1,18}):)?([0-9]{1,18})", text)
-    if found is None:
-        raise ArgumentTypeError(f"'{text}' is not a trial such as 17, or 3:17 in cell 3")
-    return int(found[1] or 0), int(found[2])
-
-
-def up_to(most: int, text: str) -> int:
-    """Return an integer from 1 to `most`. Raises ArgumentTypeError."""
-    if not re.fullmatch(r"[0-9]{1,19}", text) or not 0 < int(text) <= most:
-        raise ArgumentTypeError(f"'{text}' is not a whole number from 1 to {most}")
-    return int(text)
-
-
-def port(text: str) -> int:
-    """Return a TCP port; 0 stands for any free port. Raises ArgumentTypeError."""
-    value = natural(text)
-    if value >= 1 << 16:
-        raise ArgumentTypeError(f"{value} is not a port, which is 0 (any free port) to 65535")
-    return value
-
-
-def address(text: str) -> str:
-    """Return an IP address in its canonical form. Raises ArgumentTypeError."""
-    try:
-        return str(ipaddress.ip_address(text))
-    except ValueError:
-        raise ArgumentTypeError(f"'{text}' is not an IP address such as 127.0.0.1 or 0.0.0.0") from None
-
-
-def name(text: str) -> str:
-    """Return the name of a robot or a run. Raises ArgumentTypeError."""
-    if not re.search(NAME, text):
-        raise ArgumentTypeError(f"'{text}' is not a name, which consists of letters, digits, - and _")
-    return text
-
-
 def names(text: str) -> tuple[str, ...]:
     """Return the names of robots from a text in which commas separate them. Raises ArgumentTypeError."""
     found = tuple(name(one) for one in text.split(","))
@@ -131,23 +128,6 @@ def names(text: str) -> tuple[str, ...]:
     if any(len(one) > 32 for one in found):
         raise ArgumentTypeError(f"'{text}' has a name of more than 32 characters")
     return found
-
-
-def window(text: str) -> tuple[float, float]:
-    """Return the first and the last second of a text such as 10..40. Raises ArgumentTypeError."""
-    first, dots, last = text.partition("..")
-    begin, end = _number(first), _number(last)
-    if not dots or not 0.0 <= begin < end < 1e13:
-        raise ArgumentTypeError(f"'{text}' is not a window in seconds such as 10..40")
-    return begin, end
-
-
-def confidence(text: str) -> float:
-    """Return a probability from 0.5 to below 1. Raises ArgumentTypeError."""
-    value = _number(text)
-    if not 0.5 <= value < 1.0:
-        raise ArgumentTypeError(f"'{text}' is not a probability from 0.5 to below 1")
-    return value
 
 
 def kill(text: str) -> Kill:

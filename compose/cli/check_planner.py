@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from compose.errors import CLEAN, VIOLATED
+from compose.errors import ENDED, VIOLATED
 from compose.launch import supervisor
 from compose.scenario.scenario_file import setting
 from compose.terminal import text_width
@@ -24,4 +24,4 @@ def main(options: argparse.Namespace) -> int:
         line = f"wrong  {one.what}: {one.wrong}" if one.wrong else f"ok     {one.what}"
         say(*text_width.wrapped(one_line(line), text_width.MARKED))
         failed |= one.wrong is not None
-    return VIOLATED if failed else CLEAN
+    return VIOLATED if failed else ENDED

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any, NamedTuple
 
 from compose.cli import arguments
@@ -28,20 +27,22 @@ VALUES: Mapping[str, Callable[[str], Any] | tuple[str, ...]] = {
     "shell": SHELLS,
     "--address": arguments.address,
     "--confidence": arguments.confidence,
-    "--days": partial(arguments.up_to, 36_500),
+    "--days": arguments.up_to(36_500),
     "--format": FIGURE_FORMATS,
     "--kill": arguments.kill,
     "--model": arguments.model,
     "--only": PICTURES,
+    "--option": arguments.option,
+    "--planner": arguments.planner,
     "--planner-option": arguments.planner_option,
     "--port": arguments.port,
     "--print-trial": arguments.cell_and_trial,
     "--robots": arguments.names,
     "--schema": ("scenario", "sweep"),
     "--seed": arguments.natural,
-    "--trials": partial(arguments.up_to, 10**7),
+    "--trials": arguments.up_to(10**7),
     "--window": arguments.window,
-    "--workers": partial(arguments.up_to, 1000),
+    "--workers": arguments.up_to(1000),
 }
 """The functions that turn the texts of arguments into values, or their choices; all others are texts."""
 

@@ -9,16 +9,16 @@ from compose.doctor.certificate_checks import certificate_findings
 from compose.doctor.finding import FIX
 from compose.doctor.machine_checks import ports, versions
 from compose.doctor.network_checks import network
-from compose.errors import AMISS, CLEAN
+from compose.errors import ENDED, VIOLATED
 from compose.network import reach
 from compose.terminal import text_width
 from protocol.output import one_line, say
 
 
 def main(options: argparse.Namespace) -> int:
-    """Run all checks, and return AMISS if one of them failed."""
+    """Run all checks, and return VIOLATED if one of them failed."""
     endpoints = reach(options, None)
-    status = CLEAN
+    status = ENDED
     checks = (
         versions(),
         ports(endpoints),
@@ -27,5 +27,5 @@ def main(options: argparse.Namespace) -> int:
     )
     for finding in chain.from_iterable(checks):
         say(*text_width.wrapped(one_line(str(finding)), len(finding.mark) + 2))
-        status = AMISS if finding.mark == FIX else status
+        status = VIOLATED if finding.mark == FIX else status
     return status

@@ -12,7 +12,7 @@ from pathlib import Path
 from agent.estimation.solver import Solver
 from compose.errors import BROKEN_PIPE, ENDED, NOT_LOCALISED, STOPPED_STATUS, UserError, writing
 from compose.extras import need
-from compose.launch.solver_loader import solver_named
+from compose.launch.class_loader import solver_named
 from compose.recording.estimating.estimate_rows import PoseEstimateRow, RobotEstimate, estimate_csv
 from compose.recording.estimating.estimate_run import RecordingEstimate, StreamEstimate, estimated
 from compose.recording.estimating.estimate_summary import write_estimate

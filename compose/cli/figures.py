@@ -12,7 +12,6 @@ from compose.cli.recording import read_noted
 from compose.errors import ENDED, FAILED, writing
 from compose.extras import need
 from compose.figures import FIGURE_FORMATS, PICTURES
-from compose.launch.class_loader import trust
 from compose.recording.recording_files import agent_journal, user_errors
 from compose.recording.run import Run
 from compose.terminal.outcome import counting
@@ -32,8 +31,6 @@ def main(options: argparse.Namespace) -> int:
     need("matplotlib")
     from compose.figures.pair import encounters, pair_of  # noqa: PLC0415
 
-    for name in options.planner:
-        trust(name)
     with user_errors(options.recording):
         run = read_noted(options.recording, "figures")
     folder, status = options.recording / "figures", ENDED

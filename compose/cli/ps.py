@@ -9,8 +9,7 @@ from collections.abc import Iterator
 import msgspec
 
 from compose.doctor import running_missions
-from compose.doctor.router_session import Unreached, linked
-from compose.doctor.running_missions import Participant, RunningMission
+from compose.doctor.running_missions import Participant, RunningMission, Unreached, linked
 from compose.errors import ENDED, FAILED
 from compose.network import places
 from compose.terminal import text_width

@@ -14,7 +14,7 @@ from pathlib import Path
 from compose.cli.participant import RELISTEN_S, participate, warn_beyond
 from compose.errors import ENDED, status_of
 from compose.hardware.driver_recording import recorded
-from compose.launch.driver_loader import config_of, driver_class, made, mission, options_of
+from compose.launch.driver_loader import hardware_robot
 from compose.launch.planner_loader import is_shipped
 from compose.launch.processes import free_endpoint
 from compose.launch.signals import stop_by_signal
@@ -22,7 +22,6 @@ from compose.launch.supervisor import STOP_S, ChildFailed, Supervisor
 from compose.network import reach
 from compose.recording.reasons import ended
 from compose.recording.recording_files import folder_for
-from compose.scenario.run_settings import check_rate
 from compose.terminal.text_width import tell
 from protocol.messages import Localised, MissionEnd, RobotConfig
 from protocol.motion import wrap
@@ -38,12 +37,7 @@ LEAST_S = 0.1
 
 def main(options: argparse.Namespace) -> int:
     """Run one robot's hardware and its agent to the end of the mission; resume a recording in --out."""
-    scenario = mission(options.mission, options.id)
-    rate = options.rate or 1.0
-    check_rate(scenario, rate)
-    manoeuvre_s = scenario.mission.period / rate
-    config = config_of(scenario, options.id, manoeuvre_s)
-    maker, given = driver_class(options.driver), options_of(options.option)
+    scenario, config, rate, manoeuvre_s, made = hardware_robot(options, options.id)
     reached = reach(options, "world")
 
     def take_part(inbox: Inbox) -> int:
@@ -51,7 +45,7 @@ def main(options: argparse.Namespace) -> int:
         with (
             folder_for(options.out) as folder,
             recorded(folder, config, inbox, fsync=options.fsync) as recording,
-            closing(made(maker, options.driver, config, manoeuvre_s, given)) as driver,
+            closing(made()) as driver,
         ):
             field = Field(
                 driver,

@@ -6,7 +6,7 @@ import argparse
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 
 from compose.cli import export_files
@@ -83,7 +83,7 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
     inbox = Inbox("tandem run")
     with (
         folder_for(options.out) as folder,
-        _keys(options, scenario) as keys,
+        _keys(scenario) if options.secure else nullcontext() as keys,
         _page(options, folder, inbox) as page,
     ):
         began = time.perf_counter()
@@ -118,11 +118,8 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
 
 
 @contextmanager
-def _keys(options: argparse.Namespace, scenario: Scenario) -> Iterator[Path | None]:
-    """Create keys for this run only, and yield their folder; None without --secure."""
-    if not options.secure:
-        yield None
-        return
+def _keys(scenario: Scenario) -> Iterator[Path]:
+    """Create keys for this run only, and yield their folder."""
     from compose.security import certificates  # noqa: PLC0415  # the library is optional
 
     with tempfile.TemporaryDirectory(prefix="tandem-keys-") as folder:
@@ -130,15 +127,11 @@ def _keys(options: argparse.Namespace, scenario: Scenario) -> Iterator[Path | No
         yield Path(folder)
 
 
-@contextmanager
-def _page(options: argparse.Namespace, folder: Path, inbox: Inbox) -> Iterator[PageProcess | None]:
-    """Serve the page of the mission recorded in `folder`, and print its address; None without --watch."""
-    if not options.watch:
-        yield None
-        return
-    with serving(folder, options.port or 0, inbox) as page:
-        page.announce()
-        yield page
+def _page(
+    options: argparse.Namespace, folder: Path, inbox: Inbox
+) -> AbstractContextManager[PageProcess | None]:
+    """Return the context in which the page of the mission is served, with --watch."""
+    return serving(folder, options.port or 0, inbox) if options.watch else nullcontext()
 
 
 def _finish(

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 from compose.cli.recording import note
 from compose.errors import ENDED, STOPPED_STATUS, UserError
 from compose.extras import need
-from compose.launch.class_loader import trust
 from compose.launch.forked import launcher
 from protocol.output import say
 
@@ -33,8 +32,6 @@ def main(options: argparse.Namespace) -> int:
     from compose.view.web.live import Listener  # noqa: PLC0415
     from compose.view.web.site import Site  # noqa: PLC0415
 
-    for name in options.planner:
-        trust(name)
     if not options.recording:
         from compose.network import places  # noqa: PLC0415  # a recording needs no network
 

@@ -63,24 +63,18 @@ def _findings(files: CertificateSet, endpoints: Endpoints, now: float) -> Iterat
     else:
         yield ok(f"key: only its owner can read {files.key}")
     try:
-        signed = True
-        shown = _shown(files, files.authority)
+        shown = _shown(files)
     except ssl.SSLCertVerificationError as error:
         yield fix(
             f"certificate: {at} is not accepted by {files.authority}: {error.verify_message}; "
             "take both from one folder that `tandem keys` created"
         )
-        signed = False
-        try:
-            shown = _shown(files, at)
-        except ssl.SSLError:
-            return
+        return
     except ssl.SSLError as error:
         yield fix(f"certificate: {at}: {_unusable(files, error)}; copy the folder again")
         return
     name = dict(pair for part in shown["subject"] for pair in part).get("commonName", "no name")
-    if signed:
-        yield ok(f"certificate: {at} is signed by {files.authority.name} and is of {name}")
+    yield ok(f"certificate: {at} is signed by {files.authority.name} and is of {name}")
     yield _dated(f"certificate: {at}", shown, now)
     for authority in _context(ssl.PROTOCOL_TLS_CLIENT, files.authority).get_ca_certs():
         finding = _dated(f"authority: {files.authority}", authority, now)
@@ -160,13 +154,10 @@ def _date(when: float) -> str:
     return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(when))
 
 
-def _shown(files: CertificateSet, trusted: Path) -> Mapping[str, Any]:
-    """Return the certificate as its peer receives it in a handshake, verified against `trusted`.
-
-    Raises ssl.SSLError.
-    """
-    client = _context(ssl.PROTOCOL_TLS_CLIENT, trusted)
-    server = _context(ssl.PROTOCOL_TLS_SERVER, trusted)
+def _shown(files: CertificateSet) -> Mapping[str, Any]:
+    """Return the certificate as its peer receives and verifies it in a handshake. Raises ssl.SSLError."""
+    client = _context(ssl.PROTOCOL_TLS_CLIENT, files.authority)
+    server = _context(ssl.PROTOCOL_TLS_SERVER, files.authority)
     server.load_cert_chain(files.certificate, files.key, UNASKED)
     if files.connects:
         client.verify_mode = ssl.CERT_NONE
@@ -185,5 +176,5 @@ def _context(protocol: int, trusted: Path) -> ssl.SSLContext:
     context = ssl.SSLContext(protocol)
     context.check_hostname = False
     context.load_verify_locations(cafile=trusted)
-    context.verify_flags |= ssl.VerifyFlags(NO_CHECK_TIME) | ssl.VerifyFlags.VERIFY_X509_PARTIAL_CHAIN
+    context.verify_flags |= ssl.VerifyFlags(NO_CHECK_TIME)
     return context

@@ -9,27 +9,46 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict, deque
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import msgspec
 import zenoh
 
 from protocol.messages import Command, FinalReport, MissionEnd, Observation, Outcome, Phase, RobotConfig
-from protocol.network import keys, session
+from protocol.network import diagnosis, keys, session
+from protocol.network.endpoints import Endpoints
 from protocol.network.keys import Key
 from protocol.wire import MalformedFrame, decode, version_of
 
+ROUTER_TIMEOUT_S = 3.0
+"""Time in s after which no new attempt to connect is made."""
 ASK_S = 2.0
 """Time in s to wait for one answer."""
 FIND_S = 0.5
 """Time in s to look for a mission if there is none: routers may just have connected to each other."""
 MISSIONS_POLL_S = 0.02
 """The polling interval in s."""
-COMMAND_AHEAD = 4
-"""The number of ticks by which a Command may be ahead of the latest received Observation."""
 Frames = Mapping[Key, tuple[bytes, ...]]
 """The latest two frames of each key."""
+
+
+class Unreached(OSError):
+    """No router was reached at these endpoints; the text says what to check."""
+
+
+@contextmanager
+def linked(endpoints: Endpoints) -> Iterator[zenoh.Session]:
+    """Yield a client session. Raises Unreached."""
+    give_up = time.monotonic() + ROUTER_TIMEOUT_S
+
+    def unanswered() -> None:
+        if time.monotonic() >= give_up:
+            raise Unreached(f"no router at {endpoints}: {diagnosis.why(endpoints)}")
+
+    with session.open_client(endpoints, unanswered) as link:
+        yield link
 
 
 class Participant(msgspec.Struct, frozen=True):
@@ -159,29 +178,26 @@ def _mission(link: zenoh.Session, frames: Frames, run: str, alive: frozenset[str
     configs = [one for frame in answers.values() if (one := _decoded(frame, RobotConfig)) is not None]
     named = there | observed | _named(frames, run, keys.command)
     named |= {robot for one in configs for robot in one.others}
-    messages = [
+    received = [
         _message(frames, Key(keys.observation, run, robot), Observation | MissionEnd | FinalReport)
         for robot in named
     ]
-    ends = [one for one in messages if isinstance(one, MissionEnd)]
-    tick = max((one.tick for one in messages if isinstance(one, Observation | MissionEnd)), default=None)
     seen = [*[some[-1] for key, some in frames.items() if key.run == run], *answers.values()]
     return RunningMission(
         run,
         "" in alive,
-        tick,
-        ends[0].outcome if ends else None,
+        max([one.tick for one in received if isinstance(one, Observation | MissionEnd)], default=None),
+        next((one.outcome for one in received if isinstance(one, MissionEnd)), None),
         tuple(sorted({version for frame in seen if (version := version_of(frame)) is not None})),
-        tuple(
-            _participant(
-                robot,
-                robot in alive,
-                tick,
-                _message(frames, Key(keys.command, run, robot), Command | FinalReport),
-            )
-            for robot in sorted(named)
-        ),
+        tuple([_participant(frames, run, robot, there=robot in alive) for robot in sorted(named)]),
     )
+
+
+def _participant(frames: Frames, run: str, robot: str, *, there: bool) -> Participant:
+    command = _message(frames, Key(keys.command, run, robot), Command | FinalReport)
+    if not isinstance(command, Command):
+        return Participant(robot, there)
+    return Participant(robot, there, command.tick, command.phase, command.task)
 
 
 def _configs(link: zenoh.Session, run: str, robots: set[str]) -> dict[str, bytes]:
@@ -195,22 +211,10 @@ def _configs(link: zenoh.Session, run: str, robots: set[str]) -> dict[str, bytes
     for robot in sorted(robots):
         if robot not in paired and time.monotonic() < until:
             answer = session.ask(
-                link,
-                keys.config(run, robot),
-                ASK_S,
-                lambda frame: _decoded(frame, RobotConfig) is not None,
+                link, keys.config(run, robot), ASK_S, lambda frame: _decoded(frame, RobotConfig) is not None
             )
             if isinstance(answer, bytes):
                 found[robot] = answer
-                config = _decoded(answer, RobotConfig)
+                config = _decoded(answer, RobotConfig)  # None if it is of another version
                 paired.update(config.others if config is not None else ())
     return found
-
-
-def _participant(
-    robot: str, alive: bool, latest: int | None, command: Command | FinalReport | None
-) -> Participant:
-    """Return the state of a robot; a `command` too far ahead of tick `latest` is ignored."""
-    if not isinstance(command, Command) or (latest is not None and command.tick > latest + COMMAND_AHEAD):
-        return Participant(robot, alive)
-    return Participant(robot, alive, command.tick, command.phase, command.task)

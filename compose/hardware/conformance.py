@@ -84,27 +84,22 @@ def drives(mission: Mission, tries: Sequence[Try]) -> str | None:
 
 def lasts(_: Mission, tries: Sequence[Try]) -> str | None:
     """half of a manoeuvre takes half of its time"""
-    for tick, one in enumerate(tries):
-        if one.what in (FIRST_HALF, SECOND_HALF):
-            part = one.reading.executed.v / one.asked.v
-            if abs(part - one.share) > LIKE:
-                return (
-                    f"tick {tick}, {one.what}: {part:.2f} of the manoeuvre was driven in {one.share:.2f} of "
-                    "its time"
-                )
-    return None
+    return _off_share(
+        tries, (FIRST_HALF, SECOND_HALF), "{:.2f} of the manoeuvre was driven in {:.2f} of its time"
+    )
 
 
 def stops(_: Mission, tries: Sequence[Try]) -> str | None:
     """stop ends a manoeuvre, and odometry measures what was driven, not what was commanded"""
+    says = "it reports {:.2f} of a manoeuvre that was stopped after {:.2f} of its time"
+    return _off_share(tries, (STOPPED_HALF_WAY,), says)
+
+
+def _off_share(tries: Sequence[Try], which: Sequence[str], says: str) -> str | None:
+    """Return the first of the ticks `which` in which the part that was driven is not that of the time."""
     for tick, one in enumerate(tries):
-        if one.what == STOPPED_HALF_WAY:
-            part = one.reading.executed.v / one.asked.v
-            if abs(part - one.share) > LIKE:
-                return (
-                    f"tick {tick}: it reports {part:.2f} of a manoeuvre that was stopped after "
-                    f"{one.share:.2f} of its time"
-                )
+        if one.what in which and abs((part := one.reading.executed.v / one.asked.v) - one.share) > LIKE:
+            return f"tick {tick}, {one.what}: {says.format(part, one.share)}"
     return None
 
 

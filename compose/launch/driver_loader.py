@@ -1,11 +1,14 @@
-"""Loading of drivers by their name on the command line, MODULE:CLASS."""
+"""The robot of hardware mode: its scenario, and its driver, a class of the user (see `class_loader`)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import argparse
+from collections.abc import Callable
+from typing import NamedTuple
 
 from compose.errors import UserError, user_code
 from compose.launch.class_loader import named, trust
+from compose.scenario.run_settings import check_rate
 from compose.scenario.scenario_file import setting
 from protocol.messages import RobotConfig
 from protocol.spelling import did_you_mean
@@ -16,30 +19,44 @@ from world.scenario import Scenario
 DRIVER_METHODS = ("sense", "drive", "stop", "close")
 """The methods that a driver must have."""
 
-Maker = Callable[..., Driver]
-"""The constructor of a driver."""
+
+class HardwareRobot(NamedTuple):
+    """One robot of a mission in hardware mode."""
+
+    scenario: Scenario
+    config: RobotConfig
+    rate: float
+    """The speed relative to real time."""
+    manoeuvre_s: float
+    """The wall time of a manoeuvre in s."""
+    driver: Callable[[], Driver]
+    """Return the driver. Raises UserError for whatever its constructor raises."""
 
 
-def driver_class(name: str) -> Maker:
+def hardware_robot(options: argparse.Namespace, robot: str) -> HardwareRobot:
+    """Return the robot that the flags --mission, --rate, --driver and --option describe. Raises UserError."""
+    scenario = mission(options.mission, robot)
+    rate = options.rate or 1.0
+    check_rate(scenario, rate)
+    manoeuvre_s = scenario.mission.period / rate
+    config = config_of(scenario, robot, manoeuvre_s)
+    maker = driver_class(options.driver)
+
+    def driver() -> Driver:
+        with user_code(f"{options.driver}: cannot be created:"):
+            return maker(config, manoeuvre_s, **dict(options.option))
+
+    return HardwareRobot(scenario, config, rate, manoeuvre_s, driver)
+
+
+def driver_class(name: str) -> Callable[..., Driver]:
     """Return the class that the user has named, also of the working directory. Raises UserError."""
     trust(name)
-    found = named(name, "driver")
+    found: Callable[..., Driver] = named(name, "driver")
     missing = [method for method in DRIVER_METHODS if not callable(getattr(found, method, None))]
     if not callable(found) or missing:
         raise UserError(f"{name}: is not a driver: it has no {', '.join(missing) or 'constructor'}")
-    maker: Maker = found
-    return maker
-
-
-def made(
-    maker: Maker, name: str, config: RobotConfig, manoeuvre_s: float, options: Mapping[str, str]
-) -> Driver:
-    """Return the driver that `maker` creates. Raises UserError for whatever it raises.
-
-    `manoeuvre_s` is the wall time of a manoeuvre in s.
-    """
-    with user_code(f"{name}: cannot be created:"):
-        return maker(config, manoeuvre_s, **options)
+    return found
 
 
 def resume_driver(driver: Driver, name: str, history: DriverHistory) -> None:
@@ -52,17 +69,6 @@ def resume_driver(driver: Driver, name: str, history: DriverHistory) -> None:
     with user_code(f"{name}: cannot resume:"):
         driver.stop()
         resume(history.tick, history.mark)
-
-
-def options_of(words: list[str]) -> dict[str, str]:
-    """Return the driver's options from a list of NAME=VALUE. Raises UserError."""
-    options = {}
-    for word in words:
-        name, equals, value = word.partition("=")
-        if not equals or not name.isidentifier():
-            raise UserError(f"--option: '{word}' is not an option; expected NAME=VALUE")
-        options[name] = value
-    return options
 
 
 def mission(source: str, robot: str) -> Scenario:

@@ -8,6 +8,7 @@ server. Its standard input is a connection to the launcher, for messages in both
 
 from __future__ import annotations
 
+import atexit
 import errno
 import os
 import signal
@@ -349,6 +350,7 @@ def fork_server(warm_up: str) -> ForkServer:
         if warm_up in _servers and _servers[warm_up].gone:
             _servers.pop(warm_up).close()
         if warm_up not in _servers:
+            atexit.register(close)  # else they end some time after this process
             _servers[warm_up] = ForkServer(warm_up)
         return _servers[warm_up]
 

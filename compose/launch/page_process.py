@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import NamedTuple
 
 from compose.errors import UserError
 from compose.launch.forked import ChildProcess
@@ -23,16 +24,11 @@ READY_S = 30.0
 """Time in s that it has to be ready."""
 
 
-class PageProcess:
+class PageProcess(NamedTuple):
     """A running page."""
 
-    def __init__(self, child: ChildProcess, address: str) -> None:
-        self.address = address
-        self._child = child
-
-    def announce(self) -> None:
-        """Print the address."""
-        say(f"{WHAT} at {self.address}")
+    child: ChildProcess
+    address: str
 
     def stay(self, inbox: Inbox) -> bool:
         """Wait, after the mission, for Ctrl-C or for the end of the page, which `inbox` receives.
@@ -40,40 +36,34 @@ class PageProcess:
         Return whether it has not failed; a failure is printed. Processes of the mission that end later are
         ignored.
         """
-        self._child.send(OVER)
+        self.child.send(OVER)
         say(f"{WHAT} remains at {self.address} until Ctrl-C")
         with suppress(Interrupted):
-            while self._child.running:
+            while self.child.running:
                 inbox.next(None)
-        if self._child.running or self._child.status == 0:
+        if self.child.running or self.child.status == 0:
             return True
-        inbox.say(f"{WHAT} {self._child.how_ended.splitlines()[-1]}")
+        inbox.say(f"{WHAT} {self.child.how_ended.splitlines()[-1]}")
         return False
 
 
 @contextmanager
 def serving(folder: Path, port: int, inbox: Inbox) -> Iterator[PageProcess]:
-    """Serve the page of the recording in `folder` in this context; `inbox` receives the end of its process.
+    """Serve the page of the recording in `folder` in this context, and print its address.
 
-    Raises UserError, with the last line of its standard error, if it is not ready within READY_S.
+    `inbox` receives the end of its process. Raises UserError, with the last line of its standard error, if it
+    is not ready within READY_S.
     """
     children = Supervisor(inbox, __name__)  # its modules are few
-    arguments = ("watch", str(folder), "--launched", "--port", str(port))
     try:
-        child = children.start(WHAT, *arguments)
-        address = _address(child)
-        if address is None:
+        child = children.start(WHAT, "watch", str(folder), "--launched", "--port", str(port))
+        try:
+            page = PageProcess(child, child.receive(READY_S).decode())
+        except (TimeoutError, EOFError):
             child.end()
-            errors = child.stderr_text.splitlines()
-            late = f"{WHAT}: not ready within {READY_S:g} s"
-            raise UserError(errors[-1].removeprefix("tandem watch: ") if errors else late)
-        yield PageProcess(child, address)
+            errors = child.stderr_text.splitlines() or [f"{WHAT}: not ready within {READY_S:g} s"]
+            raise UserError(errors[-1].removeprefix("tandem watch: ")) from None
+        say(f"{WHAT} at {page.address}")
+        yield page
     finally:
         children.stop()
-
-
-def _address(child: ChildProcess) -> str | None:
-    """Return the address that the page sends when it is ready; None if it is not ready within READY_S."""
-    with suppress(TimeoutError, EOFError):
-        return child.receive(READY_S).decode()
-    return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +13,20 @@ from agent.planning.planner import Planner, Summary
 from agent.process.report_bodies import body_of, report_of
 from compose.errors import PlannerFailed
 from protocol.messages import Command, Estimate, Observation, Report, RobotConfig
-from protocol.mission import Mission
 from protocol.orbits import Rendezvous
 from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode, encode
+
+ANSWERS = {"command": Command, "estimate": Estimate, "summary": Summary, "rendezvous": Rendezvous}
+"""The types of the answers, by method."""
+
+
+def _guarded(method: str) -> Any:
+    """Return the method of a guard that calls `method` of its planner."""
+
+    def called(self: GuardedPlanner, *arguments: Any) -> Any:
+        return self.answered(method, *arguments)
+
+    return called
 
 
 class GuardedPlanner(Planner[Any, Any]):
@@ -73,20 +84,6 @@ class GuardedPlanner(Planner[Any, Any]):
             raise self._failed(method, f"its own decoder refuses its report: {why}")
         return body
 
-    def decide(self, state: Any, reports: Sequence[Any] = ()) -> Any:
-        """Return the state with the reports."""
-        return self._called(self._planner.decide, state, reports)
-
-    def command(self, state: Any) -> Command:
-        """Return the command."""
-        found: Command = self._answer("command", self._planner.command, state, Command)
-        return found
-
-    def estimate(self, state: Any) -> Estimate:
-        """Return the estimate."""
-        found: Estimate = self._answer("estimate", self._planner.estimate, state, Estimate)
-        return found
-
     def malformed(self, body: Any) -> str | None:
         """Return why the planner's decoder refuses a body, or what it raises."""
         try:
@@ -95,40 +92,22 @@ class GuardedPlanner(Planner[Any, Any]):
             self.decoder_error = f"the decoder of {self._name} raises {type(error).__name__}: {error}"
             return self.decoder_error
 
-    def summary(self, state: Any) -> Summary:
-        """Return the planner's part of the FinalReport."""
-        found = self._called(self._planner.summary, state)
-        if not isinstance(found, Summary):
-            raise self._failed("summary", f"returns {type(found).__name__}, expected Summary")
-        return found
+    decide, misreport, required_mutual_ranges = map(
+        _guarded, ("decide", "misreport", "required_mutual_ranges")
+    )
+    command, estimate, summary, rendezvous = map(_guarded, ANSWERS)
 
-    def rendezvous(self, mission: Mission, distance: float) -> Rendezvous:
-        """Return the orbits."""
-        found = self._called(self._planner.rendezvous, mission, distance)
-        if not isinstance(found, Rendezvous):
-            raise self._failed("rendezvous", f"returns {type(found).__name__}, expected Rendezvous")
-        return found
-
-    def misreport(self, body: Any, observations: Sequence[Observation]) -> str | None:
-        """Return how a report contradicts the observations."""
-        found: str | None = self._called(self._planner.misreport, body, observations)
-        return found
-
-    def required_mutual_ranges(self, mission: Mission) -> int:
-        """Return the minimum number of mutual ranges before a claim."""
-        found: int = self._called(self._planner.required_mutual_ranges, mission)
-        return found
-
-    def _answer(self, method: str, answer: Callable[[Any], Any], state: Any, kind: type[Any]) -> Any:
-        """Return the answer, once it is certain that it is a message of this robot and this tick."""
-        found = self._called(answer, state)
+    def answered(self, method: str, *arguments: Any) -> Any:
+        """Return the answer of a method, once it is certain that it is of its kind, and of this tick."""
+        found, kind = self._called(getattr(self._planner, method), *arguments), ANSWERS.get(method, object)
         if not isinstance(found, kind):
             raise self._failed(method, f"returns {type(found).__name__}, expected {kind.__name__}")
-        try:
-            decode(encode(found), kind)
-        except (MalformedFrame, TypeError, ValueError, OverflowError, msgspec.MsgspecError) as error:
-            raise self._failed(method, f"its {kind.__name__} cannot be sent: {error}") from None
-        self._check_address(method, found)
+        if isinstance(found, Command | Estimate):
+            try:
+                decode(encode(found), kind)
+            except (MalformedFrame, TypeError, ValueError, OverflowError, msgspec.MsgspecError) as error:
+                raise self._failed(method, f"its {kind.__name__} cannot be sent: {error}") from None
+            self._check_address(method, found)
         return found
 
     def _check_address(self, method: str, found: Any) -> None:

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from compose.errors import BadOptions, UserError, user_code
-from compose.launch.class_loader import entry_points, named
-from compose.launch.solver_loader import GuardedSolver
+from compose.errors import UserError, user_code, within
+from compose.launch.class_loader import GuardedSolver, entry_points, named
 from protocol.messages import RobotConfig
 from protocol.mission import Mission
 from protocol.orbits import RENDEZVOUS, Rendezvous, rendezvous
@@ -39,12 +38,17 @@ def installed() -> dict[str, Any]:
 
 
 def check(name: str, options: Mapping[str, Any]) -> None:
-    """Load the planner, and create it. Raises UserError if that is not possible, or not permitted."""
-    if is_shipped(name):
-        if options:
-            raise BadOptions(f"options: the planner '{name}' has none")
-        return
-    _created(name, options)
+    """Load the planner, and create it.
+
+    Raises UserError, whose text begins with the field of the table `[planner]`, if that is not possible, or
+    not permitted.
+    """
+    if not is_shipped(name):
+        with within("name: ", UserError):
+            planner_class(name)
+        _created(name, options)
+    elif options:
+        raise UserError(f"options: the planner '{name}' has none")
 
 
 def planner_of(config: RobotConfig) -> Planner[Any, Any]:
@@ -135,8 +139,8 @@ def planner_class(name: str) -> type[Planner[Any, Any]]:
 
 def _created(name: str, options: Mapping[str, Any]) -> Planner[Any, Any]:
     maker = planner_class(name)
-    with user_code(f"options: {name} cannot be created:", BadOptions):
+    with user_code(f"options: {name} cannot be created:"):
         created = maker(**options)
     if (solver := getattr(created, "SOLVER", None)) is not None:
-        GuardedSolver(solver, f"{name}: SOLVER: ")
+        GuardedSolver(solver, f"name: {name}: SOLVER: ")
     return created

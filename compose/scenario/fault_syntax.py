@@ -11,7 +11,7 @@ from msgspec import Meta
 from msgspec.structs import asdict
 
 from compose.errors import BadFault
-from protocol.spelling import did_you_mean
+from compose.scenario.toml_file import field_first
 from world.faults import MAX_DELAY, MAX_FAULTS, Delay, Fault, LinkSelector
 
 _LINK = re.compile(r"\s*(?P<one>[A-Za-z0-9_-]+)\s*(?P<way><->|->)\s*(?P<other>[A-Za-z0-9_-]+)\s*")
@@ -93,19 +93,8 @@ def table_of(text: str) -> dict[str, Any]:
     try:
         msgspec.convert(table, FaultTable)
     except msgspec.ValidationError as error:
-        raise BadFault(_named(str(error))) from None
+        raise BadFault(field_first(str(error), FaultTable)) from None
     return table
-
-
-def _named(error: str) -> str:
-    """Return msgspec's error with the field in front."""
-    what, _, where = error.partition(" - at `$")
-    unknown = re.fullmatch(r"Object contains unknown field `(.*)`", what, re.DOTALL)
-    if unknown is not None:
-        known = [name for name in Fault.__struct_fields__ if name != "link"]
-        near = did_you_mean(unknown[1], known)
-        return f"there is no '{unknown[1]}'; there are {', '.join(known)}{near}"
-    return f"{where.strip('.`')}: {what[0].lower()}{what[1:]}".replace("`", "'")
 
 
 def _value(name: str, text: str) -> bool | float | list[float]:

@@ -28,9 +28,9 @@ def others_to_meet(tolerates: int) -> int:
     return 2 * tolerates + 1
 
 
-def check_tolerated(file: ScenarioFile, source: str) -> None:
+def check_tolerated(file: ScenarioFile) -> None:
     """Raise Unworkable if the robots, which all have an anchor, cannot tolerate as many attackers."""
-    tolerates, where = file.mission.tolerates, f"{source}: mission.tolerates"
+    tolerates, where = file.mission.tolerates, "mission.tolerates"
     if not tolerates:
         return
     if file.mission.noise.exact:
@@ -45,7 +45,7 @@ def check_tolerated(file: ScenarioFile, source: str) -> None:
     attacks = [i for i, robot in enumerate(file.robot) if robot.attack is not None]
     if len(attacks) > tolerates:
         raise Unworkable(
-            f"{source}: robot[{attacks[tolerates]}].attack: {len(attacks)} robots have one, and "
+            f"robot[{attacks[tolerates]}].attack: {len(attacks)} robots have one, and "
             f"mission.tolerates is {tolerates}"
         )
     if file.mission.safety_distance:

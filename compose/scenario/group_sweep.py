@@ -35,32 +35,28 @@ in 5 of 7 from 0.9 to 1.25, and in 2 of 17 above it. The others took up to 2 000
 """
 
 
-def check_unanchored(file: ScenarioFile, source: str) -> None:
-    """Raise BadScenario or Unworkable if the robots without an anchor in a group cannot be localised.
-
-    The order of the coordinates of the area is checked in any group.
-    """
-    _check_order(file, source)
+def check_unanchored(file: ScenarioFile) -> None:
+    """Raise BadScenario or Unworkable if the robots without an anchor in a group cannot be localised."""
     missing = [i for i, robot in enumerate(file.robot) if robot.anchor is None]
+    _check_area(file, missing)
     if not missing:
         return
-    where = f"{source}: robot[{missing[0]}]: missing field 'anchor'"
+    where = f"robot[{missing[0]}]: missing field 'anchor'"
     if file.group is not None:
-        where = f"{source}: group.without_anchor"
+        where = "group.without_anchor"
     if len(file.robot) - len(missing) < 2:
         raise BadScenario(f"{where}: at least two robots of a group need one")
     if not planner_loader.is_for_groups(file.planner.name, helps=True):
         raise Unworkable(f"{where}: robots with the planner {file.planner.name} do not search for others")
     if file.mission.safety_distance:
         raise Unworkable(
-            f"{source}: mission.safety_distance: there is a robot without an anchor, and until it is "
+            "mission.safety_distance: there is a robot without an anchor, and until it is "
             "found nobody knows on which side to pass it"
         )
-    _check_attacks(file, len(file.robot) - len(missing), source)
-    _check_area(file, missing, source)
+    _check_attacks(file, len(file.robot) - len(missing))
 
 
-def _check_attacks(file: ScenarioFile, anchored: int, source: str) -> None:
+def _check_attacks(file: ScenarioFile, anchored: int) -> None:
     """Raise Unworkable if robots without an anchor cannot tolerate the attackers among the others.
 
     With f of them, f + 1 honest finders must agree, and `anchored` robots have an anchor.
@@ -68,11 +64,11 @@ def _check_attacks(file: ScenarioFile, anchored: int, source: str) -> None:
     tolerates = file.mission.tolerates
     attacks = [i for i, robot in enumerate(file.robot) if robot.attack is not None]
     if tolerates and not file.mission.noise.exact:
-        raise Unworkable(f"{source}: mission.tolerates: with noisy sensors, all robots need an anchor")
+        raise Unworkable("mission.tolerates: with noisy sensors, all robots need an anchor")
     needed = sweepers_of_part(tolerates)
     if tolerates and anchored < needed:
         raise Unworkable(
-            f"{source}: mission.tolerates: to tolerate {tolerates}, {needed} robots need an anchor, of which "
+            f"mission.tolerates: to tolerate {tolerates}, {needed} robots need an anchor, of which "
             f"{tolerates + 1} are then honest; there are {anchored}"
         )
     if len(attacks) > tolerates:
@@ -80,29 +76,24 @@ def _check_attacks(file: ScenarioFile, anchored: int, source: str) -> None:
         if not file.mission.noise.exact:
             remedy = "with noisy sensors, nothing confirms them"
         raise Unworkable(
-            f"{source}: robot[{attacks[0]}].attack: there is a robot without an anchor, which believes the "
+            f"robot[{attacks[0]}].attack: there is a robot without an anchor, which believes the "
             f"poses that others report: {remedy}"
         )
 
 
-def _check_order(file: ScenarioFile, source: str) -> None:
-    """Raise BadScenario if the area has a smallest coordinate that is larger than the largest one."""
+def _check_area(file: ScenarioFile, missing: Sequence[int]) -> None:
+    """Raise BadScenario if the area is invalid, or is not around the starts of all `missing` robots."""
     if file.mission.area is None:
+        if missing:
+            raise BadScenario("mission: missing field 'area': robots without an anchor are in it")
         return
     x_min, y_min, x_max, y_max = file.mission.area
     if x_min > x_max or y_min > y_max:
-        raise BadScenario(f"{source}: mission.area: it must be [x_min, y_min, x_max, y_max]")
-
-
-def _check_area(file: ScenarioFile, missing: Sequence[int], source: str) -> None:
-    """Raise BadScenario if the area is missing, or if one of `missing` is not in it."""
-    if file.mission.area is None:
-        raise BadScenario(f"{source}: mission: missing field 'area': robots without an anchor are in it")
-    x_min, y_min, x_max, y_max = file.mission.area
+        raise BadScenario("mission.area: it must be [x_min, y_min, x_max, y_max]")
     for i in missing:
         start = file.robot[i].start
         if start is not None and not (x_min <= start[0] <= x_max and y_min <= start[1] <= y_max):
-            raise BadScenario(f"{source}: robot[{i}].start: '{file.robot[i].id}' is outside mission.area")
+            raise BadScenario(f"robot[{i}].start: '{file.robot[i].id}' is outside mission.area")
 
 
 def with_sweep(

@@ -9,7 +9,7 @@ from msgspec.structs import fields, replace
 
 from compose.errors import BadScenario, UserError
 from compose.launch import planner_loader
-from compose.scenario.scenario_file import validate
+from compose.scenario.scenario_file import template_of
 from compose.scenario.scenario_tables import LONGEST_NAME
 from protocol.noise import Noise
 from protocol.spelling import did_you_mean
@@ -17,8 +17,6 @@ from protocol.units import Finite, RobotId
 from world.faults import Fault
 from world.scenario import Scenario
 
-CHANGED_SOURCE = "the changed scenario"
-"""The name of the changed scenario in error messages; those of `changed` leave it out."""
 SUFFIX = "-changed"
 """The end of the name of a changed scenario."""
 
@@ -64,7 +62,8 @@ def values_of(scenario: Scenario) -> ScenarioChange:
 
     Raises UserError if it cannot be run again because this process may not load its planner.
     """
-    planner_loader.check(scenario.planner_name, scenario.planner_options)
+    if not planner_loader.is_shipped(scenario.planner_name):
+        planner_loader.planner_class(scenario.planner_name)
     noise = scenario.mission.noise
     place = _place_of_loss(scenario.faults)
     return ScenarioChange(
@@ -98,10 +97,7 @@ def changed(scenario: Scenario, change: ScenarioChange, most_ticks: int) -> Chan
             robot["start"] = [one.x, one.y, one.heading]
     if _has_default_ticks(scenario):
         del table["max_ticks"]
-    try:
-        found = validate(table, CHANGED_SOURCE).scenario
-    except BadScenario as error:
-        raise UserError(str(error).removeprefix(f"{CHANGED_SOURCE}: ")) from None
+    found = template_of(table).scenario
     if found.max_ticks > most_ticks:
         table["max_ticks"] = most_ticks
         found = replace(found, max_ticks=most_ticks)
@@ -139,7 +135,7 @@ def _has_default_ticks(scenario: Scenario) -> bool:
     table = file_table(scenario)
     del table["max_ticks"]
     try:
-        return validate(table, CHANGED_SOURCE).scenario.max_ticks == scenario.max_ticks
+        return template_of(table).scenario.max_ticks == scenario.max_ticks
     except BadScenario:
         return False
 

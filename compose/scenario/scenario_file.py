@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from compose.errors import BadFault, BadKill, BadOptions, BadScenario, Unworkable, UserError
+from compose.errors import BadFault, BadKill, BadScenario, Unworkable, within
 from compose.launch import model_loader, planner_loader
 from compose.launch.class_loader import trust
 from compose.scenario.fault_syntax import FaultTable, added, table_of
-from compose.scenario.first_meetings import in_group, linked, meetings_of, pair_meetings
+from compose.scenario.first_meetings import in_group, linked, meetings_of
+from compose.scenario.group_meetings import FirstMeeting
 from compose.scenario.kills import WORLD, Kill, drawn
-from compose.scenario.scenario_tables import MAX_TICKS, MissionTable, PlannerTable, RobotTable, ScenarioFile
+from compose.scenario.scenario_tables import MAX_TICKS, MissionTable, RobotTable, ScenarioFile
 from compose.scenario.shipped_files import misplaced, shipped, unknown
 from compose.scenario.toml_file import field_first, read_text, table_in
 from protocol.attack import OF_THE_START
@@ -58,8 +60,8 @@ class ScenarioTemplate(msgspec.Struct, frozen=True):
         if seed is None:
             return self.scenario
         if self.file.group is not None:
-            file = _with_robots(msgspec.structs.replace(self.file, seed=seed))
-            return _validated(file, self.source, self.faults)
+            with _naming(self.source):
+                return _scenario(_with_robots(msgspec.structs.replace(self.file, seed=seed)), self.faults)
         mission = self.file.mission
         return msgspec.structs.replace(
             self.scenario,
@@ -173,25 +175,38 @@ def validate(table: Mapping[str, Any], source: str, faults: Sequence[str] = ()) 
     A planner or a model is loaded only if the user has named it (`trust_classes`). Raises BadScenario and
     Unworkable, whose texts begin with `source`.
     """
+    with _naming(source):
+        return msgspec.structs.replace(template_of(table, faults), source=source)
+
+
+@contextmanager
+def _naming(source: str) -> Iterator[None]:
+    """Put `source` in front of a BadScenario of this context; a BadFault is of a flag, which it names."""
+    try:
+        yield
+    except BadScenario as error:
+        raise type(error)(f"{source}: {error}") from None
+    except BadFault as error:
+        raise BadScenario(str(error)) from None
+
+
+def template_of(table: Mapping[str, Any], faults: Sequence[str] = ()) -> ScenarioTemplate:
+    """Return the template like `validate`. The texts of its errors begin with the field."""
     try:
         file = msgspec.convert(_with_profile(table), ScenarioFile)
     except msgspec.ValidationError as error:
-        raise BadScenario(f"{source}: {field_first(str(error), ScenarioFile)}") from None
+        raise BadScenario(field_first(str(error), ScenarioFile)) from None
     if file.group is None and not file.robot:
-        raise BadScenario(f"{source}: missing field 'robot'")
+        raise BadScenario("missing field 'robot'")
     if file.group is not None and file.robot:
-        raise BadScenario(f"{source}: group: its robots are drawn, so there can be no [[robot]]")
+        raise BadScenario("group: its robots are drawn, so there can be no [[robot]]")
     dies = file.group.dies if file.group is not None else None
     if isinstance(dies, list) and dies[0] > dies[1]:
-        raise BadScenario(
-            f"{source}: group.dies: the lower bound {dies[0]} is above the upper bound {dies[1]}"
-        )
+        raise BadScenario(f"group.dies: the lower bound {dies[0]} is above the upper bound {dies[1]}")
     file = _with_robots(file)
-    found = ScenarioTemplate(file, _validated(file, source, faults), source, tuple(faults))
-    try:
+    found = ScenarioTemplate(file, _scenario(file, faults), "", tuple(faults))
+    with within("", BadScenario):
         found.kills(file.seed)
-    except BadKill as error:
-        raise BadScenario(f"{source}: {error}") from None
     return found
 
 
@@ -224,142 +239,126 @@ def _with_profile(table: Mapping[str, Any]) -> Mapping[str, Any]:
     return {**table, "mission": {**mission, "noise": with_profile(mission["noise"])}}
 
 
-def _validated(file: ScenarioFile, source: str, options: Sequence[str]) -> Scenario:
+def _scenario(file: ScenarioFile, options: Sequence[str]) -> Scenario:
     """Return the scenario of `file`, with the faults of the `--fault` options added to its own."""
-    _check_noise(file.mission, source)
-    _check_planner(file.planner, source)
-    faults: tuple[Fault, ...] = ()
-    if in_group(file):
-        faults = _faults(file, options, linked(file.robot, {}, in_group=True), source)
-    meetings = meetings_of(file, faults, source)
-    first = meetings.first if meetings is not None else pair_meetings(file, source)
-    links = linked(file.robot, first, in_group=meetings is not None)
-    _check_world_noise(file, links, source)
-    _check_models(file, source)
-    placed: list[RobotSpec] = []
-    for i, robot in enumerate(file.robot):
-        start = _start(robot, file.mission, file.seed)
-        rho0 = math.dist((start.x, start.y), robot.anchor) if robot.anchor is not None else 0.0
-        if rho0 > file.mission.sensing_range:
-            raise BadScenario(
-                f"{source}: robot[{i}].start: '{robot.id}' is {rho0:.9g} m from its anchor, "
-                f"outside mission.sensing_range = {file.mission.sensing_range:.9g} m"
-            )
-        if robot.attack is not None and robot.attack.kind in OF_THE_START and robot.attack.part != "all":
-            raise BadScenario(
-                f"{source}: robot[{i}].attack.part: an attack of kind {robot.attack.kind} changes "
-                "the start, so part must be 'all'"
-            )
-        if robot.dies is not None and meetings is None:
-            raise BadScenario(f"{source}: robot[{i}].dies: robots die in groups only")
-        peer, role, orbits = first[robot.id]
-        anchor = Anchor(*robot.anchor) if robot.anchor is not None else None
-        placed.append(RobotSpec(robot.id, peer, role, anchor, start, orbits, robot.attack))
-    if meetings is not None:
-        budget = math.ceil(meetings.latest / file.mission.period)
-    else:
-        budget = max(tick_budget(file.mission, one.rendezvous) for one in first.values())
-        faults = _faults(file, options, links, source)
+    mission = file.mission
+    _check_noise(mission)
+    with within("planner.", BadScenario):
+        planner_loader.check(file.planner.name, file.planner.options)
+    links = linked(file)
+    faults = _faults(file, options, links)
+    meetings = meetings_of(file, faults, links)
+    _check_world_noise(file, links)
+    _check_models(file)
+    placed = [_placed(i, file, meetings.first[robot.id]) for i, robot in enumerate(file.robot)]
+    budget = math.ceil(meetings.latest / mission.period)
+    if not in_group(file):
+        budget = max(tick_budget(mission, one.rendezvous) for one in meetings.first.values())
     delay = EXCHANGES * delivery_time_bound(faults) if faults else 0
     if file.max_ticks is None and budget + delay > MAX_TICKS:
         cause = "mission: the rendezvous" if budget > MAX_TICKS else "fault: the delivery of reports"
-        raise Unworkable(f"{source}: {cause} could take {budget + delay} ticks, more than {MAX_TICKS}")
+        raise Unworkable(f"{cause} could take {budget + delay} ticks, more than {MAX_TICKS}")
     noise = file.world.noise
     scenario = Scenario(
         name=file.name,
         seed=file.seed,
         max_ticks=file.max_ticks if file.max_ticks is not None else budget + delay,
-        mission=file.mission.plain,
+        mission=mission.plain,
         planner_name=file.planner.name,
         robots=tuple(placed),
         faults=faults,
-        world_noise=None if noise.changes_nothing(file.mission.noise) else noise,
+        world_noise=None if noise.changes_nothing(mission.noise) else noise,
         planner_options=file.planner.options,
         range_model=file.world.range,
         radio_model=file.world.radio,
-        meetings=meetings.meetings if meetings is not None else (),
-        retries=meetings.retries if meetings is not None else (),
+        meetings=meetings.meetings,
+        retries=meetings.retries,
         deaths=tuple([Death(one.id, one.dies) for one in file.robot if one.dies is not None]),
-        tolerates=file.mission.tolerates,
-        planned_sweep=meetings.planned_sweep if meetings is not None else None,
-        confirmation=meetings.confirmation if meetings is not None else None,
-        least_bound=meetings.least_bound if meetings is not None else 0.0,
+        tolerates=mission.tolerates,
+        planned_sweep=meetings.planned_sweep,
+        confirmation=meetings.confirmation,
+        least_bound=meetings.least_bound,
     )
     try:
         for one in scenario.robots:
             decode(encode(scenario.config(one.id)), RobotConfig)
     except MalformedFrame as error:
-        raise Unworkable(f"{source}: mission: a robot's configuration cannot be encoded: {error}") from None
+        raise Unworkable(f"mission: a robot's configuration cannot be encoded: {error}") from None
     return scenario
 
 
+def _placed(i: int, file: ScenarioFile, first: FirstMeeting) -> RobotSpec:
+    """Return robot `i` of the file, whose first meeting is `first`. Raises BadScenario."""
+    robot, mission = file.robot[i], file.mission
+    start = _start(robot, mission, file.seed)
+    rho0 = math.dist((start.x, start.y), robot.anchor) if robot.anchor is not None else 0.0
+    if rho0 > mission.sensing_range:
+        raise BadScenario(
+            f"robot[{i}].start: '{robot.id}' is {rho0:.9g} m from its anchor, "
+            f"outside mission.sensing_range = {mission.sensing_range:.9g} m"
+        )
+    if robot.attack is not None and robot.attack.kind in OF_THE_START and robot.attack.part != "all":
+        raise BadScenario(
+            f"robot[{i}].attack.part: an attack of kind {robot.attack.kind} changes "
+            "the start, so part must be 'all'"
+        )
+    if robot.dies is not None and not in_group(file):
+        raise BadScenario(f"robot[{i}].dies: robots die in groups only")
+    anchor = Anchor(*robot.anchor) if robot.anchor is not None else None
+    return RobotSpec(robot.id, first.peer, first.role, anchor, start, first.rendezvous, robot.attack)
+
+
 def _faults(
-    file: ScenarioFile, options: Sequence[str], pairs: Sequence[tuple[str, str]], source: str
+    file: ScenarioFile, options: Sequence[str], pairs: Sequence[tuple[str, str]]
 ) -> tuple[Fault, ...]:
     """Return the fault plan: the faults of the file, then those of the `--fault` options.
 
-    `pairs` holds each pair of robots in both orders.
+    `pairs` holds each pair of robots in both orders. Raises BadScenario, and BadFault for an option.
     """
     plan: tuple[Fault, ...] = ()
     for i, table in enumerate(file.fault):
-        try:
+        with within(f"fault[{i}].", BadScenario):
             plan = added(plan, table, pairs)
-        except BadFault as error:
-            raise BadScenario(f"{source}: fault[{i}].{error}") from None
     for text in options:
-        try:
+        with within(f"--fault '{text}': ", BadFault):
             plan = added(plan, msgspec.convert(table_of(text), FaultTable), pairs)
-        except BadFault as error:
-            raise BadScenario(f"--fault '{text}': {error}") from None
     return plan
 
 
-def _check_noise(mission: Mission, source: str) -> None:
+def _check_noise(mission: Mission) -> None:
     """Raise BadScenario if the noise is invalid, Unworkable if robots cannot localise or drive safely."""
     least, most = mission.noise.outlier_bias
     if least > most:
         raise BadScenario(
-            f"{source}: mission.noise.outlier_bias: the lower bound {least:.6g} m is above the upper "
-            f"bound {most:.6g} m"
+            f"mission.noise.outlier_bias: the lower bound {least:.6g} m is above the upper bound {most:.6g} m"
         )
     why = too_small(mission.noise) or noise_infeasibility(mission) or safety_infeasibility(mission)
     if why is not None:
-        raise Unworkable(f"{source}: mission.{why}")
+        raise Unworkable(f"mission.{why}")
 
 
-def _check_planner(table: PlannerTable, source: str) -> None:
-    """Load the planner. Raises BadScenario if it cannot be loaded or created."""
-    try:
-        planner_loader.check(table.name, table.options)
-    except UserError as error:
-        field = "planner." if isinstance(error, BadOptions) else "planner.name: "
-        raise BadScenario(f"{source}: {field}{error}") from None
-
-
-def _check_world_noise(file: ScenarioFile, pairs: Sequence[tuple[str, str]], source: str) -> None:
+def _check_world_noise(file: ScenarioFile, pairs: Sequence[tuple[str, str]]) -> None:
     """Raise BadScenario if the noise of the sensors is invalid, Unworkable if robots cannot localise.
 
     `pairs` holds each pair of robots in both orders.
     """
     mistake = world_noise_mistake(file.world.noise, file.mission, pairs)
     if mistake is not None:
-        raise BadScenario(f"{source}: world.noise.{mistake[0]}: {mistake[1]}")
+        raise BadScenario(f"world.noise.{mistake[0]}: {mistake[1]}")
     why = world_noise_infeasibility(file.world.noise, file.mission.noise)
     if why is not None:
-        raise Unworkable(f"{source}: world.noise: {why}")
+        raise Unworkable(f"world.noise: {why}")
 
 
-def _check_models(file: ScenarioFile, source: str) -> None:
+def _check_models(file: ScenarioFile) -> None:
     """Load the models. Raises BadScenario if one cannot be created, Unworkable if robots cannot localise."""
     for name, spec in (("range", file.world.range), ("radio", file.world.radio)):
         if spec is not None:
-            try:
+            with within(f"world.{name}.", BadScenario):
                 model_loader.check(name, spec)
-            except UserError as error:
-                raise BadScenario(f"{source}: world.{name}.{error}") from None
     if file.world.range is not None and file.mission.noise.exact:
         raise Unworkable(
-            f"{source}: world.range: the robots are told that all sensors are exact, and cannot localise "
+            "world.range: the robots are told that all sensors are exact, and cannot localise "
             "themselves with others: set mission.noise"
         )
 

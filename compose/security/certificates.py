@@ -28,7 +28,7 @@ from cryptography.hazmat.primitives.serialization import (
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from compose.errors import BadKeys
+from compose.errors import UserError
 from compose.network import KEYED
 from protocol import files
 from protocol.network import access_control
@@ -56,7 +56,7 @@ def make(folder: Path, robots: Sequence[str], hosts: Sequence[str], days: int) -
 
     The participants are the router, the world, the viewer, and the agents of `robots` and of robots that have
     a folder. Certificates are valid for `days`; those of the router and the world also name `hosts`. Existing
-    certificates are not changed; all configurations are written again. Raises BadKeys or OSError.
+    certificates are not changed; all configurations are written again. Raises UserError or OSError.
     """
     folder.mkdir(parents=True, exist_ok=True)
     authority = _authority(folder)
@@ -75,9 +75,9 @@ def make(folder: Path, robots: Sequence[str], hosts: Sequence[str], days: int) -
         if own.exists():
             for file in ("cert.pem", "key.pem", "ca.pem"):
                 if not (own / file).is_file():
-                    raise BadKeys(f"{own} has no {file}; remove the folder, and it is created again")
+                    raise UserError(f"{own} has no {file}; remove the folder, and it is created again")
             if files.read_bytes(own / "ca.pem") != files.read_bytes(folder / "ca.pem"):
-                raise BadKeys(f"{own} is of another authority than {folder / 'ca.pem'}")
+                raise UserError(f"{own} is of another authority than {folder / 'ca.pem'}")
             existing.append(name)
         else:
             _participant(own, name, authority, hosts, days)
@@ -110,19 +110,19 @@ def configuration(name: str, robots: Sequence[str]) -> str:
 
 
 def _authority(folder: Path) -> Authority:
-    """Return the authority of `folder`; create it if the folder is empty. Raises BadKeys."""
+    """Return the authority of `folder`; create it if the folder is empty. Raises UserError."""
     certificate, key = folder / "ca.pem", folder / "ca-key.pem"
     if certificate.exists() and key.exists():
         try:
             private = load_pem_private_key(files.read_bytes(key), None)
             found = x509.load_pem_x509_certificate(files.read_bytes(certificate))
         except (TypeError, ValueError) as error:
-            raise BadKeys(f"{folder}: its authority cannot be read: {error}") from None
+            raise UserError(f"{folder}: its authority cannot be read: {error}") from None
         if not isinstance(private, ec.EllipticCurvePrivateKey) or private.public_key() != found.public_key():
-            raise BadKeys(f"{key} is not the key of {certificate}")
+            raise UserError(f"{key} is not the key of {certificate}")
         return Authority(found, private)
     if any(path.name != GITIGNORE and path.suffix != files.DRAFT for path in folder.iterdir()):
-        raise BadKeys(f"{folder} is not empty and has no ca.pem with ca-key.pem; choose another folder")
+        raise UserError(f"{folder} is not empty and has no ca.pem with ca-key.pem; choose another folder")
     private = ec.generate_private_key(ec.SECP256R1())
     name = _name(f"Tandem {x509.random_serial_number() % 16**8:08x}")
     now = datetime.now(UTC)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import chain, count
@@ -81,7 +80,7 @@ def progress(name: str, say: Callable[[str], None], visible: bool) -> Iterator[P
         bars.TextColumn("elapsed,"),
         bars.TimeRemainingColumn(table_column=Column(no_wrap=True)),
         bars.TextColumn("left"),
-        console=tables.display_console(sys.stdout),
+        console=tables.console(),
         disable=not visible,
         transient=True,
         expand=True,

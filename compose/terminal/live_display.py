@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -30,7 +29,7 @@ def live(scenario: Scenario, folder: Path) -> Iterator[None]:
     """Show the progress of the run recorded in `folder`, REFRESHED times a second."""
     with Live(
         get_renderable=ProgressLine(scenario, folder).display,
-        console=tables.display_console(sys.stdout),
+        console=tables.console(),
         auto_refresh=True,
         transient=True,
         refresh_per_second=REFRESHED,

@@ -41,7 +41,7 @@ def counting(what: str, steps: int) -> Iterator[Callable[[], None]]:
 
     from compose.terminal import tables  # noqa: PLC0415
 
-    console = tables.display_console(sys.stderr, soft_wrap=True)  # other output is not wrapped
+    console = tables.console(stderr=True, soft_wrap=True)  # other output is not wrapped
     with Progress(
         *Progress.get_default_columns(),
         TimeElapsedColumn(),

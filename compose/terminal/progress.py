@@ -23,18 +23,10 @@ TABLE_NOTES = (
     (REPORTS, "reports sent / received"),
 )
 """The footnotes, each with its column."""
-COLUMN_SETS = (
-    (TRUTH, ESTIMATE, ERROR, SIGMA, RANGES, REPORTS, LATE),
-    (ESTIMATE, ERROR, SIGMA, RANGES, REPORTS, LATE),
-    (ERROR, SIGMA, RANGES, REPORTS, LATE),
-    (ERROR, SIGMA, LATE),
-)
-"""Sets of columns, of which the first that fits is shown; empty columns SIGMA and LATE are omitted."""
-GROUP_CHOICES = tuple(
-    (TICK_COLUMN, *[TRUTH_AT_CLAIM if column == TRUTH else column for column in columns])
-    for columns in COLUMN_SETS
-)
-"""The sets of columns for a group, whose robots drive on after their claims."""
+RESULT_COLUMNS = (TICK_COLUMN, TRUTH, TRUTH_AT_CLAIM, ESTIMATE, ERROR, SIGMA, RANGES, REPORTS, LATE)
+"""All columns: in a group, robots drive on after their claims; SIGMA and LATE are not shown if empty."""
+NARROWER: tuple[tuple[str, ...], ...] = ((), (TRUTH, TRUTH_AT_CLAIM), (ESTIMATE,), (RANGES, REPORTS))
+"""The columns that are left out one after the other until the table fits."""
 LISTED = 4
 """The largest number of robots that are shown as a list if the table of all columns does not fit."""
 MOST_NAMED_ROBOTS = 10
@@ -51,8 +43,10 @@ def result(summary: Mapping[str, Any], rate: float | None = None) -> None:
     exact = all(robot["covariance"] is None for robot in robots.values())
     late = {name: missed for name, robot in robots.items() if (missed := robot["deadlines_missed"])}
     omitted = {*([SIGMA] if exact else []), *([] if late else [LATE])}
-    for choice in COLUMN_SETS if group is None else GROUP_CHOICES:
-        columns = [column for column in choice if column not in omitted]
+    omitted |= {TICK_COLUMN, TRUTH_AT_CLAIM} if group is None else {TRUTH}
+    for narrower in NARROWER:
+        omitted |= {*narrower}
+        columns = [column for column in RESULT_COLUMNS if column not in omitted]
         cells = {name: _cells(robot, columns) for name, robot in robots.items()}
         rows = [(name, *of_robot.values()) for name, of_robot in cells.items()]
         made = tables.table(["robot"], columns, rows)

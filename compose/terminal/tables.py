@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Sequence
-from typing import Any, TextIO
+from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.cells import cell_len
@@ -14,32 +14,10 @@ from rich.table import Table
 from compose.terminal.text_width import room, wrapped
 from protocol.output import UNLIMITED
 
-BEGIN, END = "\x1b[?2026h", "\x1b[?2026l"
-"""The marks of synchronised output (DEC mode 2026): a terminal shows what is between them at once."""
-
-
-class Frames:
-    """A stream of which a terminal shows each write at once; terminals without that mode ignore the marks."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-
-    def write(self, text: str) -> int:
-        """Write `text` between the marks."""
-        return self._stream.write(f"{BEGIN}{text}{END}")
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
-
 
 def console(**options: Any) -> Console:
     """Return a console that prints text literally: `[red]` and `:smile:` are not markup."""
     return Console(markup=False, emoji=False, highlight=False, **options)
-
-
-def display_console(stream: TextIO, **options: Any) -> Console:
-    """Return a console on `stream` for what is drawn again and again."""
-    return console(file=Frames(stream), **options)
 
 
 def table(left: Sequence[str], right: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
