@@ -110,11 +110,11 @@ def poses(standing: Sequence[RangedPlace], moved: Sequence[RangedPlace], floor: 
     """
     fits: list[Pose] = []
     for position in positions(standing, floor):
-        for heading in _headings(position, moved):
-            pose = Pose(*position, _fitted_heading(position, heading, moved))
-            explained = all(abs(_predicted(pose, one) - one.range) <= floor for one in moved)
+        found = [_fitted_heading(position, one, moved) for one in _headings(position, moved)]
+        around = [Pose(*position, heading) for heading in found]
+        for pose in sorted(around, key=lambda one: _misfit(one, moved)):  # of one pose, the better fit
             turned = [abs(wrap(pose.heading - one.heading)) for one in fits if (one.x, one.y) == position]
-            if explained and all(angle * _reach(moved) > 2.0 * floor for angle in turned):
+            if _misfit(pose, moved) <= floor and all(a * _reach(moved) > 2.0 * floor for a in turned):
                 fits.append(pose)
     return tuple(fits)
 
@@ -201,9 +201,10 @@ def _fitted_heading(position: Point, heading: float, moved: Sequence[RangedPlace
     return wrap(fitted)
 
 
-def _predicted(pose: Pose, one: RangedPlace) -> float:
-    here = compose(pose, one.odometry)
-    return math.hypot(here.x - one.there[0], here.y - one.there[1])
+def _misfit(pose: Pose, moved: Sequence[RangedPlace]) -> float:
+    """Return the largest difference in m between a range and the one that `pose` predicts."""
+    here = [(compose(pose, one.odometry), one) for one in moved]
+    return max([abs(math.dist((at.x, at.y), one.there) - one.range) for at, one in here])
 
 
 def _reach(moved: Sequence[RangedPlace]) -> float:
