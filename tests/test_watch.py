@@ -549,7 +549,7 @@ def test_ctrl_c_ends_a_page_that_is_open_in_a_browser(paper_1: Path) -> None:
         ),
         (
             [".", "--port", "65536"],
-            "argument --port: 65536 is not a port, which is 0 (any free port) to 65535",
+            "argument --port: '65536' is not a port, which is 0 (any free port) to 65535",
         ),
     ],
 )
