@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from copy import copy
 from pathlib import Path
@@ -13,6 +12,7 @@ from compose.recording.reasons import reason_for
 from protocol.messages import Command, MissionEnd, Observation
 from protocol.motion import Controls, Pose
 from protocol.spelling import did_you_mean
+from protocol.wire import decode, encode
 from tandem.scenarios import Scenario, plain, scenario_of
 from world.tick import advance, observations, release
 
@@ -51,12 +51,12 @@ class World:
 
     @property
     def truth(self) -> dict[str, Pose]:
-        """The true pose of each robot in the world frame: m, m and rad."""
+        """The true pose of each robot in the world frame: m, m and rad, not wrapped."""
         return dict(zip(self.scenario.robots, self._state.truth.poses, strict=True))
 
     @property
     def outcome(self) -> str | None:
-        """The outcome, as that of `tandem.run`; None until all robots have results, or at `max_ticks`."""
+        """The outcome, as that of `tandem.run`; None until it is decided, at `max_ticks` at the latest."""
         return None if self._end is None else self._end.outcome
 
     @property
@@ -75,6 +75,8 @@ class World:
         claim. A robot without one rests. Velocities are limited to those of the mission. Raises UserError
         for an unknown robot, for a command that is none of these, and after the end.
         """
+        if not isinstance(commands, Mapping):
+            raise UserError(f"commands: not a dict of commands by robot: {type(commands).__name__}")
         if self._end is not None:
             raise UserError(f"the world has ended: {self._end.outcome}")
         after = copy(self)
@@ -90,20 +92,20 @@ class World:
         if robot not in self.scenario.robots:
             ids = self.scenario.robots
             raise UserError(
-                f"commands: no robot '{robot}'; there are {', '.join(ids)}{did_you_mean(robot, ids)}"
+                f"commands: no robot '{robot}'; there are {', '.join(ids)}{did_you_mean(str(robot), ids)}"
             )
-        match plain(given):
-            case Command(robot=sender, tick=tick) as command:
-                if (sender, tick) != (robot, self.tick):
-                    raise UserError(
-                        f"commands: {robot}: a Command of {sender} in tick {tick}, not {self.tick}"
-                    )
-                return command
-            case Controls(v=v, omega=omega) | [int() | float() as v, int() | float() as omega] if all(
-                map(math.isfinite, (v, omega))
-            ):
-                return Command(self.tick, robot, float(v), float(omega), 1, "")
-        raise UserError(f"commands: {robot}: not (v, omega) in m/s and rad/s: {given!r}")
+        match command := plain(given):
+            case Controls(v=v, omega=omega) | [int() | float() as v, int() | float() as omega]:
+                command = Command(self.tick, robot, v, omega, 1, "")
+            case Command(robot=sender, tick=tick) if (sender, tick) != (robot, self.tick):
+                raise UserError(f"commands: {robot}: a Command of {sender} in tick {tick}, not {self.tick}")
+        try:
+            return decode(encode(command), Command)
+        except (TypeError, ValueError, OverflowError) as error:
+            why = f"not (v, omega) in m/s and rad/s: {given!r}"
+            if isinstance(given, Command):
+                why = f"a Command that cannot be sent: {error}"
+            raise UserError(f"commands: {robot}: {why}") from None
 
     def __repr__(self) -> str:
         return f"<World {self.scenario.name}, seed {self.scenario.seed}: tick {self.tick}>"

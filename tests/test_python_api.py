@@ -122,6 +122,10 @@ def test_steps_from_one_world_are_futures_of_it_and_leave_it_as_it_is() -> None:
         ({"a": (float("nan"), 0.0)}, "commands: a: not (v, omega) in m/s and rad/s: (nan, 0.0)"),
         ({"b": np.zeros(3)}, "commands: b: not (v, omega) in m/s and rad/s: array([0., 0., 0.])"),
         ({"b": Command(3, "b", 0.0, 0.0, 1, "")}, "commands: b: a Command of b in tick 3, not 0"),
+        ({"b": Command(0, "b", float("nan"), 0.0, 1, "")}, "commands: b: a Command that cannot be sent: Exp"),
+        ({"b": (10**400, 0)}, "commands: b: not (v, omega) in m/s and rad/s: (1000"),
+        ({0: (0.0, 0.0)}, "commands: no robot '0'; there are a, b"),
+        ([], "commands: not a dict of commands by robot: list"),
     ],
 )
 def test_a_command_that_is_none_is_refused_in_one_line(commands: dict[str, Any], why: str) -> None:

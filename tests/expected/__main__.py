@@ -105,6 +105,11 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     for name in options.names:
         if name not in spec.shipped():
             parser.error(f"'{name}' is no shipped sweep ({', '.join(spec.shipped())})")
+    for name in ("trials", "jobs"):
+        if (number := getattr(options, name)) is not None and number < 1:
+            parser.error(f"argument --{name}: {number} is less than 1")
+    if options.folder is not None and not (options.folder / TRIALS_PARQUET).is_file():
+        parser.error(f"argument --folder: there is no {options.folder / TRIALS_PARQUET}")
     return options
 
 
