@@ -429,7 +429,7 @@ def test_no_table_is_broken_by_a_terminal_of_80_columns(tmp_path: Path) -> None:
     ):
         status, text = on_a_terminal(*words, cwd=tmp_path)
         assert status == 0, text
-        text = text.rpartition("\x1b[?2026l")[2]  # what is left when a display is gone
+        text = text.rpartition("\x1b[2K")[2]  # what is left when a display is gone
         assert max(map(len, text.splitlines())) <= 80, text
         shown[words[0]] = text
     for robot in LONG_IDS:
