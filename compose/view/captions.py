@@ -86,13 +86,15 @@ def captions(
         paired = {robot.id for pair in pairs for robot in pair}
         pairs += [(robot,) for robot in setup.robots if robot.id not in paired]
         units = [(pair, TOLD_OF_PAIRS) for pair in pairs]
+    over = ended is not None and ended.outcome == "localised"
     for robots, story in units:
         group = PairData(robots, setup, before, now, events)
+        untold = OF_PHASES if group.own_planner else ()
         for tell in story:
-            if not (group.own_planner and tell in OF_PHASES):
-                found = tell(group)
-                over = ended is not None and ended.outcome == "localised"
-                yield from [caption for caption in found if not (over and caption.kind == "claim")]
+            if tell not in untold:
+                for caption in tell(group):
+                    if not (over and caption.kind == "claim"):
+                        yield caption
     if not setup.visits:  # of the world
         yield from happening(PairData((), setup, before, now, [one for one in events if one.robot is None]))
     if ended is not None:
@@ -405,6 +407,8 @@ def concluding(group: PairData) -> Told:
 
 def happening(group: PairData) -> Told:
     """Yield a caption for each kind of events in FAULTS; it is about their robots, or about their pair."""
+    if not group.events:
+        return
     attackers = attacked(group, "does report") or "No robot reports false data."
     mine = None if group.setup.visits else group.ids or None
     for kind, several in FAULTS.items():

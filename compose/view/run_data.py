@@ -96,7 +96,9 @@ class RunData:
         down = self.gone if tick > self.last else ()
         self.last = max(self.last, tick)
         self._touch(tick)
-        return self.ticks.setdefault(tick, TickData(tick, down=set(down)))
+        if tick not in self.ticks:
+            self.ticks[tick] = TickData(tick, down=set(down))
+        return self.ticks[tick]
 
     def between(self, first: int, last: int) -> list[int]:
         """Return the ticks from `first` to `last` with data, in order.

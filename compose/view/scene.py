@@ -218,8 +218,8 @@ def player_of(
         sentence = f"{robot} has missed the deadline and stands still"
     known: dict[str, Any] = {}
     if (observation := now.observations.get(robot)) is not None:
-        known |= {name: getattr(observation, name) for name in ("executed", "anchor_range", "contacts")}
-        known["sensed"] = True
+        known["executed"], known["contacts"] = observation.executed, observation.contacts
+        known["anchor_range"], known["sensed"] = observation.anchor_range, True
     if pose is not None:
         known["pose"] = Pose(pose.x, pose.y, wrap(pose.heading))
         known["reported"] = FalsePose(reported, travelled(pose, reported)) if reported is not None else None
