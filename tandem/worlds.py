@@ -89,11 +89,9 @@ class World:
 
     def _command(self, robot: str, given: object) -> Command:
         """Return the command `given` to `robot`. Raises UserError."""
-        if robot not in self.scenario.robots:
-            ids = self.scenario.robots
-            raise UserError(
-                f"commands: no robot '{robot}'; there are {', '.join(ids)}{did_you_mean(str(robot), ids)}"
-            )
+        if robot not in (ids := self.scenario.robots):
+            near = did_you_mean(str(robot), ids)
+            raise UserError(f"commands: no robot '{robot}'; there are {', '.join(ids)}{near}")
         match command := plain(given):
             case Controls(v=v, omega=omega) | [int() | float() as v, int() | float() as omega]:
                 command = Command(self.tick, robot, v, omega, 1, "")
@@ -102,10 +100,9 @@ class World:
         try:
             return decode(encode(command), Command)
         except (TypeError, ValueError, OverflowError) as error:
-            why = f"not (v, omega) in m/s and rad/s: {given!r}"
             if isinstance(given, Command):
-                why = f"a Command that cannot be sent: {error}"
-            raise UserError(f"commands: {robot}: {why}") from None
+                raise UserError(f"commands: {robot}: a Command that cannot be sent: {error}") from None
+            raise UserError(f"commands: {robot}: not (v, omega) in m/s and rad/s: {given!r}") from None
 
     def __repr__(self) -> str:
         return f"<World {self.scenario.name}, seed {self.scenario.seed}: tick {self.tick}>"

@@ -113,7 +113,7 @@ class GuardedPlanner(Planner[Any, Any]):
     def _check_address(self, method: str, found: Any) -> None:
         if (found.tick, found.robot) != (self._tick, self._robot):
             raise self._failed(
-                method, f"returns a message of {found.robot} at tick {found.tick}, not of {self._robot}"
+                method, f"returns a message of {found.robot} at tick {found.tick}, not of {self._robot} now"
             )
 
     def _called(self, method: Callable[..., Any], *arguments: Any) -> Any:

@@ -282,7 +282,7 @@ def _scenario(file: ScenarioFile, options: Sequence[str]) -> Scenario:
     try:
         for one in scenario.robots:
             decode(encode(scenario.config(one.id)), RobotConfig)
-    except MalformedFrame as error:
+    except (MalformedFrame, UnicodeEncodeError) as error:
         raise Unworkable(f"mission: a robot's configuration cannot be encoded: {error}") from None
     return scenario
 
