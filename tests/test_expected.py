@@ -15,7 +15,7 @@ from compose.sweep import spec
 from compose.sweep.cells import cells, label
 from compose.sweep.spec import Sweep
 from protocol import documents
-from tests.expected.__main__ import report
+from tests.expected.__main__ import main, report
 from tests.expected.comparison import (
     Count,
     Run,
@@ -118,6 +118,23 @@ def test_with_the_same_seeds_trials_are_compared_one_by_one() -> None:
     assert number_changed(run_of(otherwise, old)) == (11, 11 * 20)
     assert report([run_of(otherwise, old)]) == 1
     assert report([run_of(otherwise, old)], statistics=True) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "why"),
+    [
+        (["loss", "--trials", "0"], "argument --trials: 0 is less than 1"),
+        (["loss", "--jobs", "-1"], "argument --jobs: -1 is less than 1"),
+        (["loss", "--folder", "nowhere"], f"argument --folder: there is no {Path('nowhere/trials.parquet')}"),
+        (["los"], "'los' is no shipped sweep"),
+    ],
+)
+def test_a_wrong_argument_is_refused_before_a_mission_runs(
+    arguments: list[str], why: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(arguments)
+    assert why in capsys.readouterr().err
 
 
 def test_a_file_contains_the_results_from_which_it_was_written() -> None:

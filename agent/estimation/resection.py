@@ -110,11 +110,12 @@ def poses(standing: Sequence[RangedPlace], moved: Sequence[RangedPlace], floor: 
     """
     fits: list[Pose] = []
     for position in positions(standing, floor):
-        found = [_fitted_heading(position, one, moved) for one in _headings(position, moved)]
-        around = [Pose(*position, heading) for heading in found]
-        for pose in sorted(around, key=lambda one: _misfit(one, moved)):  # of one pose, the better fit
+        headings = [_fitted_heading(position, one, moved) for one in _headings(position, moved)]
+        around = [Pose(*position, heading) for heading in headings]
+        ranked = sorted([(_misfit(pose, moved), k) for k, pose in enumerate(around)])
+        for misfit, pose in [(misfit, around[k]) for misfit, k in ranked]:  # of one pose, the better fit
             turned = [abs(wrap(pose.heading - one.heading)) for one in fits if (one.x, one.y) == position]
-            if _misfit(pose, moved) <= floor and all(a * _reach(moved) > 2.0 * floor for a in turned):
+            if misfit <= floor and all(angle * _reach(moved) > 2.0 * floor for angle in turned):
                 fits.append(pose)
     return tuple(fits)
 

@@ -36,7 +36,7 @@ from its inputs, and it received what its peer sent."""
 REPLAY_RULES: Rules = (config, observation, contact, report, decision, order, outcome)
 """The rules that recompute something, in the order of a tick: the first difference causes later ones."""
 HARDWARE_REPLAY_RULES: Rules = (report, decision, order)
-"""Those of them that need no ground truth."""
+"""The rules of a replay that need no ground truth."""
 
 
 def replayed(run: Run) -> Findings:

@@ -91,9 +91,9 @@ class _Factors(NamedTuple):
     degrees: bool
     """True if the turns of odometry are in degrees."""
     by_odometry: list[float]
-    """Those of ranges to odometry."""
+    """The logarithms of the factors of ranges to odometry."""
     by_anchors: list[float]
-    """Those of ranges to positions of anchors."""
+    """The logarithms of the factors of ranges to positions of anchors."""
 
 
 def _by_odometry(robots: Sequence[_Factors]) -> float:

@@ -236,25 +236,24 @@ def _own_scale(reference: Numbers, error: Numbers, repeated: float) -> tuple[flo
     return slope / (1.0 + slope), math.sqrt(variance)
 
 
-def _products(t: Numbers, off: Numbers, lag: float) -> Numbers:
-    """Return the products (m^2) of errors that are `lag` s apart."""
-    after = np.searchsorted(t, t + lag)
-    first = np.flatnonzero(after < len(t))
-    second = after[first]
-    near = np.abs(t[second] - t[first] - lag) <= LAG_SHARE * lag
-    centred = off - np.mean(off)
-    found: Numbers = centred[first[near]] * centred[second[near]]
-    return found
+def _common(errors: Sequence[tuple[Numbers, Numbers]], lag: float) -> float:
+    """Return the mean product (m^2) of errors that are `lag` s apart; NaN if there are too few."""
+    products = []
+    for t, off in errors:
+        after = np.searchsorted(t, t + lag)
+        first = np.flatnonzero(after < len(t))
+        second = after[first]
+        near = np.abs(t[second] - t[first] - lag) <= LAG_SHARE * lag
+        centred = off - np.mean(off)
+        products.append(centred[first[near]] * centred[second[near]])
+    found = np.concatenate(products)
+    return float(np.mean(found)) if len(found) >= FEWEST_ERRORS else math.nan
 
 
 def _slow_time(errors: Sequence[tuple[Numbers, Numbers]], lag: float) -> float:
     """Return the time (s) in which the correlation of all `errors` falls to 1 / e after `lag` s."""
-    at_first, longer = 0.0, lag
-    while len(products := np.concatenate([_products(*one, longer) for one in errors])) >= FEWEST_ERRORS:
-        common = float(np.mean(products))
-        at_first = common if longer == lag else at_first
-        if at_first <= 0.0:
-            break
+    at_first, longer = _common(errors, lag), 2.0 * lag
+    while at_first > 0.0 and not math.isnan(common := _common(errors, longer)):
         if common < at_first / math.e:
             falls = math.log(at_first / max(common, FAINT * at_first))
             return max((longer - lag) / falls, SLOW_TIME * lag)
@@ -264,8 +263,7 @@ def _slow_time(errors: Sequence[tuple[Numbers, Numbers]], lag: float) -> float:
 
 def _slow_sigma(t: Numbers, off: Numbers, lag: float, slow_time: float) -> float:
     """Return the sigma (m) of what errors `lag` s apart have in common; 0 if that is not known."""
-    products = _products(t, off, lag)
-    if len(products) < FEWEST_ERRORS:
+    common = _common([(t, off)], lag)
+    if math.isnan(common):
         return 0.0
-    common = float(np.mean(products)) * math.exp(lag / slow_time)
-    return math.sqrt(min(max(common, 0.0), MOST_SLOW * float(np.var(off))))
+    return math.sqrt(min(max(common * math.exp(lag / slow_time), 0.0), MOST_SLOW * float(np.var(off))))
