@@ -6,6 +6,8 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from msgspec.structs import replace
 from numpy.typing import NDArray
 from scipy.optimize import least_squares  # type: ignore[import-untyped]
@@ -20,6 +22,7 @@ from agent.estimation.facts import (
     anchor_range,
     manoeuvre,
     mutual_range,
+    start_pose,
 )
 from agent.estimation.fit import Fit, Start, fits
 from agent.estimation.gauss_newton import Convergence
@@ -29,6 +32,7 @@ from agent.estimation.gaussian.odometry_noise import constant_errors, track, var
 from agent.estimation.gaussian.search import search
 from agent.estimation.judged import of_joint
 from agent.estimation.posterior import Certainty, Posterior, certainties
+from protocol.noise import Noise
 from tests.moving_groups import NOISE, PERIOD_S, MovingGroup, moving_group
 
 Array = NDArray[np.float64]
@@ -311,6 +315,69 @@ def test_an_anchor_that_stands_elsewhere_than_surveyed_is_named(sigma: float) ->
         found = search(measured)
         displaced = displaced_anchor(found.hypotheses[0].fit, measured.some(found.located))
         assert (displaced.anchor if displaced is not None else None) == name
+
+
+# --- without anchors, in the frame of a robot ---------------------------------------------------------------
+
+
+def relative(robots: int, seed: int, sigma: float) -> tuple[MovingGroup, JointMeasurements]:
+    """Return a group without anchors, of which the start of r00 is known; ranges have the `sigma` (m)."""
+    noise = NOISE if sigma == NOISE.mutual_sigma else Noise(sigma, sigma)
+    group = moving_group(robots, seed, noise=noise, unanchored=range(robots))
+    told = Facts(frozenset([start_pose("r00", *group.starts[0].tolist())]))
+    group = group._replace(facts=group.facts | told)
+    return group, measured_of(group)
+
+
+@settings(max_examples=10)
+@given(st.integers(2, 5), st.integers(0, 10**6), st.sampled_from((1e-6, 0.05)))
+def test_robots_without_anchors_have_poses_in_the_frame_of_the_first(
+    robots: int, seed: int, sigma: float
+) -> None:
+    group, measured = relative(robots, seed, sigma)
+    found = search(measured)
+    assert found.located == tuple(range(robots))
+    errors = errors_of(found.hypotheses[0].fit, group, measured)
+    for i, nees in enumerate(nees_of(found.hypotheses[0].fit, errors)):
+        if certainties(found)[i].probability > SURE:
+            assert nees < 5.0**2 + 3.0
+    for i, sure in enumerate(certainties(found)):
+        reason = blocking_reason(i, found, sure, measured)
+        assert not reason or "sigma of the position" in reason or "probability" in reason
+
+
+def test_a_robot_without_ranges_to_the_frame_has_no_pose_and_says_why() -> None:
+    group, _ = relative(2, 7, 0.05)
+    known = [*group.facts.known, mutual_range("r00", "w", 1, 3.0, 0.05)]
+    for tick in range(20):
+        known += [manoeuvre(name, tick, Manoeuvre(0.2, 0.2)) for name in ("u", "v", "w")]
+        known.append(mutual_range("u", "v", tick, 3.0, 0.05))
+    measured = joint_measurements(Facts(frozenset(known)), group.noise, PERIOD_S, REACH)
+    found = search(measured)
+    assert [measured.robots[one] for one in found.located] == ["r00", "r01"]
+    u, w = [undetermined(measured.robots.index(name), found.located, measured) for name in "uw"]
+    assert u == "no range connects it with r00, in whose frame poses are estimated"
+    assert w == "1 of 3 required ranges to located robots"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("robots", "sigma"), [(2, 0.05), (5, 0.05), (3, 1e-6)])
+def test_covariances_in_the_frame_of_a_robot_are_right(robots: int, sigma: float) -> None:
+    claimed: list[float] = []
+    first: list[float] = []
+    for seed in range(2000, 2060):
+        group, measured = relative(robots, seed, sigma)
+        found = search(measured)
+        errors = errors_of(found.hypotheses[0].fit, group, measured)
+        for i, nees in enumerate(nees_of(found.hypotheses[0].fit, errors)):
+            if not blocking_reason(i, found, certainties(found)[i], measured):
+                (claimed if i else first).append(nees)
+    assert len(claimed) >= 0.6 * 60 * (robots - 1)
+    assert len(first) >= 54
+    low, high = chi2.ppf((0.0005, 0.9995), 90) / 30.0  # the poses of a group are correlated
+    assert low < np.mean(claimed) < high
+    assert max(claimed) < chi2.isf(1e-6, 3)
+    assert low < np.mean(first) < high if sigma == NOISE.mutual_sigma else max(first) < 0.1
 
 
 # --- what is not determined ---------------------------------------------------------------------------------

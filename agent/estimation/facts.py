@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 
 import msgspec
 
-Kind = Literal["anchor", "anchor range", "manoeuvre", "mutual range"]
+Kind = Literal["anchor", "anchor range", "manoeuvre", "mutual range", "start"]
 
 
 class FactKey(NamedTuple):
@@ -24,7 +24,7 @@ class FactKey(NamedTuple):
     robot: str
     """The robot, or the anchor of the kind `anchor`. Of a mutual range, the smaller of the two names."""
     tick: int
-    """The tick; 0 for the position of an anchor, which does not change."""
+    """The tick; 0 for a start, and for the position of an anchor, which does not change."""
     kind: Kind
     other: str = ""
     """The other robot of a mutual range, or the anchor of an anchor range."""
@@ -40,6 +40,8 @@ class FactKey(NamedTuple):
                 return f"the manoeuvre of {self.robot} in tick {self.tick}"
             case "mutual range":
                 return f"the range between {self.robot} and {self.other} at tick {self.tick}"
+            case "start":
+                return f"the pose of {self.robot} at tick 0"
 
 
 class Manoeuvre(NamedTuple):
@@ -77,7 +79,18 @@ class AnchorPlace(NamedTuple):
     """The standard deviation of each coordinate in m. 0: surveyed; infinite: unknown."""
 
 
-Value = Manoeuvre | MeasuredRange | AnchorPlace
+class StartPose(NamedTuple):
+    """The pose of a robot at tick 0, which is exact: without anchors, it defines the frame."""
+
+    x: float
+    """The x coordinate in m."""
+    y: float
+    """The y coordinate in m."""
+    heading: float
+    """The heading in rad."""
+
+
+Value = Manoeuvre | MeasuredRange | AnchorPlace | StartPose
 
 
 class Fact(NamedTuple):
@@ -99,7 +112,7 @@ class ContradictoryFacts(ValueError):
 def _text(value: Value) -> str:
     """Return the numbers of a value with their names, without those that are mostly 0 if all of them are."""
     numbers = [f"{name} = {one!r}" for name, one in value._asdict().items()]
-    if not isinstance(value, MeasuredRange) and not any(value[2:]):
+    if isinstance(value, Manoeuvre | AnchorPlace) and not any(value[2:]):
         numbers = numbers[:2]
     return f"({', '.join(numbers)})"
 
@@ -133,7 +146,7 @@ class Facts(msgspec.Struct, frozen=True, dict=True):
 
     @cached_property
     def robots(self) -> tuple[str, ...]:
-        """The names of all robots with a manoeuvre or a range, in their order."""
+        """The names of all robots with a manoeuvre, a range or a start, in their order."""
         names: set[str] = set()
         for key, _ in self.known:
             if key.kind != "anchor":
@@ -184,6 +197,11 @@ def mutual_range(robot: str, other: str, tick: int, rho: float, sigma: float) ->
 def manoeuvre(robot: str, tick: int, measured: Manoeuvre) -> Fact:
     """Return the fact that `robot` has `measured` this motion from `tick` to the next."""
     return _fact(FactKey(robot, tick, "manoeuvre"), Manoeuvre(*[one + 0.0 for one in measured]))
+
+
+def start_pose(robot: str, x: float, y: float, heading: float) -> Fact:
+    """Return the fact that `robot` is at x, y (m) with this heading (rad) at tick 0."""
+    return _fact(FactKey(robot, 0, "start"), StartPose(x + 0.0, y + 0.0, heading + 0.0))
 
 
 def _fact(key: FactKey, value: Value) -> Fact:

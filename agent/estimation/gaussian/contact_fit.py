@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from agent.estimation.claim import blocked
 from agent.estimation.elementary import inverted
-from agent.estimation.fit import TO_THE_END, Start, fits
+from agent.estimation.fit import TO_THE_END
 from agent.estimation.gaussian.beacon_guesses import FEWEST_FOR_POSE
 from agent.estimation.gaussian.consistency import chi2_p_value
 from agent.estimation.gaussian.inference import covariance_of
@@ -25,7 +25,7 @@ from agent.estimation.gaussian.odometry_noise import Track
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
 from agent.estimation.gaussian.search import extended
 from agent.estimation.judged import of_joint
-from agent.estimation.posterior import Posterior, certainties, follow, hypotheses_of
+from agent.estimation.posterior import NO_HYPOTHESES, Posterior, certainties, follow
 from protocol.messages import Ranged
 from protocol.mission import Mission
 from protocol.motion import Covariance, Pose, wrap
@@ -70,8 +70,7 @@ def estimated(contact: ContactRanges, mission: Mission) -> ContactEstimate | Non
     measured = _measured(contact, mission)
     if len(measured.ranges.rho) < FEWEST_FOR_POSE:
         return None
-    finder = _finder_alone(measured)
-    found = extended(finder, measured) if finder.hypotheses else finder
+    found = extended(NO_HYPOTHESES, measured)
     if OWN not in found.located:
         return None
     level = found.hypotheses[0].fit.level
@@ -123,13 +122,6 @@ def _measured(contact: ContactRanges, mission: Mission) -> JointMeasurements:
         PosePrior(mean, information, 3),
     )
     return measured.thinned(mission.sensing_range)
-
-
-def _finder_alone(measured: JointMeasurements) -> Posterior:
-    """Return the finder with the pose that it has sent."""
-    alone = measured.some((FINDER,))
-    assert alone.prior is not None
-    return Posterior((FINDER,), hypotheses_of(fits(alone, [Start(alone.prior.mean)]), alone))
 
 
 def _with_level(measured: JointMeasurements, level: float) -> JointMeasurements:

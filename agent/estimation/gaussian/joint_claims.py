@@ -83,8 +83,11 @@ def undetermined(robot: int, located: tuple[int, ...], measured: JointMeasuremen
     ranges, linked = measured.ranges, _linked(robot, measured)
     anchored = (ranges.second < 0) & np.isin(ranges.first, linked)
     places = {tuple(one) for one in ranges.place[anchored].tolist()}
-    if len(places) < 2:
-        others = [measured.robots[one] for one in linked if one != robot and not measured.is_anchor(one)]
+    others = [measured.robots[one] for one in linked if one != robot and not measured.is_anchor(one)]
+    if measured.started and not set(measured.started) & set(linked) and len(places) < 2:
+        origins = _listed([measured.robots[one] for one in measured.started])
+        return f"no range connects it with {origins}, in whose frame poses are estimated"
+    if not measured.started and len(places) < 2:
         with_others = (
             f"it and the robots with which it has ranges ({_listed(others)}) have" if others else "it has"
         )
@@ -92,7 +95,8 @@ def undetermined(robot: int, located: tuple[int, ...], measured: JointMeasuremen
         return f"{with_others} {ranged}; two at different places are needed"
     rows = beacons(robot, located, measured)
     if len(rows) < FEWEST_DECISIVE:
-        return f"{len(rows)} of {FEWEST_DECISIVE} required ranges to anchors and located robots"
+        beacon = "located robots" if measured.started else "anchors and located robots"
+        return f"{len(rows)} of {FEWEST_DECISIVE} required ranges to {beacon}"
     if len(set(ranges.radio[rows].tolist())) < 2 and bool(np.all(ranges.second[rows] < 0)):
         return "its ranges are to one anchor, and to no robot that is located"
     return "too few of its ranges are from different places, or no pose explains them"

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.elementary import hypot
-from agent.estimation.facts import AnchorPlace, Facts, Manoeuvre, MeasuredRange
+from agent.estimation.facts import AnchorPlace, Facts, Manoeuvre, MeasuredRange, StartPose
 from agent.estimation.gaussian.odometry_noise import Array, Places, Track, track
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
 from agent.estimation.solver import Solver
@@ -30,6 +30,13 @@ MOVED = 0.01
 
 HELD = 1e24
 """The information (1 / rad^2) of a heading that is held: more than any ranges have."""
+
+OF_START = 1e18
+"""The information (1 / m^2, 1 / rad^2) of an exact pose at tick 0: that of a sigma of 1e-9.
+
+It is a thousandth of SIGMA_FLOOR. With less, the covariances of other robots would contain it; with HELD,
+that of a robot with exact odometry would be zero, and no claim.
+"""
 
 MOST_CORRELATED_RANGES = 96
 """The most ranges of a pair of radios that a fit weighs if odometry is noisy.
@@ -224,6 +231,12 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
     def placed(self) -> tuple[int, ...]:
         """The anchors among `robots` with a position and a sigma."""
         return tuple([k for k, one in enumerate(self.surveyed) if one is not None and one.sigma < math.inf])
+
+    @property
+    def started(self) -> tuple[int, ...]:
+        """The robots whose poses at tick 0 have a prior."""
+        known = () if self.prior is None else np.diagonal(self.prior.information)[::3].tolist()
+        return tuple([k for k, told in enumerate(known) if told and not self.is_anchor(k)])
 
     @cached_property
     def as_surveyed(self) -> JointMeasurements:
@@ -475,11 +488,13 @@ def joint_measurements(
     first = sorted(used, key=lambda name: places[name].sigma)[:1]
     origin = places[first[0]] if first else AnchorPlace(0.0, 0.0)
     at = [surveyed.get(row.second, origin) for row in rows]
+    starts = {key.robot: value for key, value in facts.known if isinstance(value, StartPose)}
     standing = [Manoeuvre(0.0, 0.0)] * max(map(len, steps.values()), default=0)
     relative = [
-        places[name]._replace(x=places[name].x - origin.x, y=places[name].y - origin.y) for name in unsure
+        one and one._replace(x=one.x - origin.x, y=one.y - origin.y)
+        for one in (*map(starts.get, facts.robots), *map(places.get, unsure))
     ]
-    anchors = (*[None] * len(facts.robots), *relative) if unsure else ()
+    anchors = tuple([one if isinstance(one, AnchorPlace) else None for one in relative]) if unsure else ()
     return JointMeasurements(
         tuple(index),
         used,
@@ -497,24 +512,28 @@ def joint_measurements(
         period,
         (origin.x, origin.y),
         noise,
-        _prior(anchors),
+        _prior(relative),
         anchors,
         reach,
     )
 
 
-def _prior(surveyed: tuple[AnchorPlace | None, ...]) -> PosePrior | None:
-    """Return what is known of the poses of robots, some of which are anchors; None if none are.
+def _prior(poses: Sequence[AnchorPlace | StartPose | None]) -> PosePrior | None:
+    """Return what is known of the poses of robots and anchors; None if nothing is.
 
     The heading of an anchor means nothing, and is held.
     """
-    if not any(surveyed):
+    if not any(poses):
         return None
-    mean, information = np.zeros((len(surveyed), 3)), np.zeros((3 * len(surveyed), 3 * len(surveyed)))
-    for k, one in enumerate(surveyed):
-        if one is not None:
-            mean[k, :2] = one.x, one.y
-            told = np.array((one.sigma**-2, one.sigma**-2, 1.0))
+    mean, information = np.zeros((len(poses), 3)), np.zeros((3 * len(poses), 3 * len(poses)))
+    for k, one in enumerate(poses):
+        told = None
+        match one:
+            case AnchorPlace(x, y, sigma):
+                mean[k, :2], told = (x, y), (sigma**-2, sigma**-2, 1.0)
+            case StartPose():
+                mean[k], told = one, (OF_START, OF_START, OF_START)
+        if told is not None:
             information[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = np.diag(told)
     known = np.diagonal(information)[np.diagonal(information) > 0.0].tolist()
     return PosePrior(mean, information, len(known), sum(map(math.log, known)))

@@ -95,14 +95,24 @@ def extended(
 ) -> Posterior:
     """Return the hypotheses `known` with all further robots that their ranges locate.
 
-    Those in `failed` are not tried.
+    Those in `failed` are not tried. If none are known, those of robots with a prior come first.
     """
-    tried = set(failed)
+    tried, known = set(failed), known if known.hypotheses else begun(measured)
     while left := [one for one in candidates(known.located, measured, fewest) if one not in tried]:
         tried.add(left[0])
         more = _with(known, left[0], measured, fewest)
         known = more if more.hypotheses else known
     return known
+
+
+def begun(measured: JointMeasurements) -> Posterior:
+    """Return the hypothesis about the robots whose poses at tick 0 have a prior; none without one."""
+    if not measured.started:
+        return NO_HYPOTHESES
+    alone = measured.some(measured.started)
+    assert alone.prior is not None
+    found = hypotheses_of(fits(alone, [Start(alone.prior.mean)]), alone)
+    return Posterior(measured.started, found) if found else NO_HYPOTHESES
 
 
 def candidates(
