@@ -105,6 +105,7 @@ def estimate(
     noise: str | Path | None = None,
     window: tuple[float, float] | None = None,
     anchors: str | Path | None = None,
+    relative: str | None = None,
     accuracy: float = DEFAULTS.accuracy,
     confidence: float = DEFAULTS.confidence,
     solver: Solver | None = None,
@@ -115,8 +116,9 @@ def estimate(
     recording of Tandem), or a Run. `robots` are some of its robots, by default all; three or more are
     estimated in one fit. `noise` is the assumed noise: the name of a profile or the path of a TOML file, by
     default what the recording states. `window` is the part that is used, in s from the first odometry on.
-    `anchors` is a CSV file of further anchors; all anchors are used. A claim needs the standard deviation
-    `accuracy` in m and the probability `confidence`. A `solver` of your own fits the poses, see
+    `anchors` is a CSV file of further anchors; all anchors are used. With `relative`, the name of a robot,
+    poses are in the frame of its first pose, and no anchor has a position. A claim needs the standard
+    deviation `accuracy` in m and the probability `confidence`. A `solver` of your own fits the poses, see
     `tandem.estimation`.
 
     Raises UserError for invalid arguments, and if the recording cannot be read.
@@ -141,5 +143,5 @@ def estimate(
     else:
         ranges = read_ranges(Path(recording), Path(anchors) if anchors is not None else None)
     name = str(noise) if noise is not None else None
-    problem = measurements(ranges, robots, name, window)
+    problem = measurements(ranges, robots, name, window, relative=relative)
     return PoseEstimates(problem, estimated(problem, ClaimRule(accuracy, confidence), solver=guarded))

@@ -34,7 +34,7 @@ SIGMA = 0.05
 def recorded(robots: int, seed: int, *, unanchored: tuple[int, ...] = (), alone: int = 0) -> RangeRecording:
     """Return a recording of a moving group, and of `alone` more robots without any range.
 
-    Of the true poses, the headings are left at 0.
+    Of the true poses, the headings are those of the odometry.
     """
     group = moving_group(robots, seed, unanchored=unanchored)
     names = [*group.facts.robots, *[f"x{i}" for i in range(alone)]]
@@ -50,8 +50,8 @@ def recorded(robots: int, seed: int, *, unanchored: tuple[int, ...] = (), alone:
         t = np.arange(41.0)
         truth = None
         if name in group.facts.robots:
-            place = group.paths[group.facts.robots.index(name)]
-            truth = TruePath(t, np.column_stack((*place, np.zeros(41))))
+            index = group.facts.robots.index(name)
+            truth = TruePath(t, np.column_stack((*group.paths[index], group.starts[index, 2] + turned)))
         odometry = RobotOdometry(t[:-1], t[1:], relative(dead[:-1], dead[1:]), np.full((40, 3, 3), np.nan))
         found.append(RecordedRobot(name, odometry, truth))
     anchors = [FixedAnchor(key.robot, *value) for key, value in group.facts.of_kind("anchor")]
@@ -68,8 +68,45 @@ def recorded(robots: int, seed: int, *, unanchored: tuple[int, ...] = (), alone:
     return RangeRecording("recorded", tuple(found), tuple(anchors), series)
 
 
-def estimate_of(recording: RangeRecording, robots: tuple[str, ...] | None = None) -> RecordingEstimate:
-    return estimated(measurements(recording, robots, None, (0.0, 36.0)), ClaimRule())
+def estimate_of(
+    recording: RangeRecording, robots: tuple[str, ...] | None = None, relative_to: str | None = None
+) -> RecordingEstimate:
+    """Return the estimate. Far from the origin of a frame, a pose is as uncertain as the first heading."""
+    problem = measurements(recording, robots, None, (0.0, 36.0), relative=relative_to)
+    return estimated(problem, ClaimRule(0.3 if relative_to is None else 1.5))
+
+
+@pytest.mark.parametrize("unanchored", [(0, 1, 2), ()])
+def test_robots_and_anchors_are_estimated_in_the_frame_of_a_first_pose(unanchored: tuple[int, ...]) -> None:
+    recording = recorded(3, 3, unanchored=unanchored)
+    found = estimate_of(recording, None, "r01")
+    assert found.summary.relative_to == "r01"
+    for robot in found.summary.robots.values():
+        assert robot.first_claim is not None
+        assert robot.final is not None
+        assert robot.final.position_error_m is not None
+        assert robot.final.position_error_m < 1.0
+        assert robot.final.nees is not None
+        assert robot.final.nees < NEES_99_9
+    assert not found.summary.undetermined
+    origin = recording.robot("r01").truth
+    assert origin is not None
+    assert len(found.summary.anchors) == 3 - len(unanchored)
+    for name, anchor in found.summary.anchors.items():
+        (one,) = (one for one in recording.anchors if one.id == name)
+        place = relative(origin.poses[:1], np.array([[one.x, one.y, 0.0]]))[0, :2]
+        assert anchor.given is None
+        assert math.dist(anchor.position, place) < 5.0 * anchor.sigma
+
+
+def test_the_origin_of_a_frame_is_the_centre_of_a_robot_and_not_its_antenna() -> None:
+    recording = recorded(3, 3)
+    robots = [one._replace(antenna=(0.3, -0.2, 0.0)) for one in recording.robots]
+    found = estimate_of(recording._replace(robots=tuple(robots)), ("r01",), "r01")
+    first = found.rows[0]
+    assert first.position_error_m is not None
+    assert first.position_error_m < 0.03
+    assert first.x == pytest.approx(0.5 * recording.robots[1].odometry.increments[0, 0], abs=0.03)
 
 
 @pytest.mark.long

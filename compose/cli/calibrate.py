@@ -52,7 +52,9 @@ def _calibrated(recording: RangeRecording, options: argparse.Namespace) -> Range
             return calibrated(recording, options.robots, options.window)
         except NoTruth as error:
             why = error
-    measured = measurements(recording, options.robots, ASSUMED, options.window)
+    robots = options.robots or [one.id for one in recording.robots]
+    relative = None if recording.with_places().anchors else robots[0]  # errors are the same in any frame
+    measured = measurements(recording, robots, ASSUMED, options.window, relative=relative)
     if why is not None:
         reference = f"the reference is an estimate of {len(measured.ends)} epochs"
         say(f"tandem calibrate: {why}: {reference}", error=True)

@@ -42,7 +42,9 @@ def main(options: argparse.Namespace) -> int:
         problem, estimate, stopped = _followed(options, rule, solver)
     else:
         recording = read_ranges(options.recording, options.anchors)
-        problem = measurements(recording, options.robots, options.noise, options.window)
+        problem = measurements(
+            *(recording, options.robots, options.noise, options.window), relative=options.relative
+        )
         if options.out is not None:
             make_folder(options.out)
         with counting("tandem estimate", len(problem.ends)) as done:
@@ -68,9 +70,15 @@ def _followed(
 
     if options.window is not None or options.anchors is not None:
         raise UserError("--follow: a stream has its own anchors, and no window")
+    if options.relative is not None and options.robots is None:
+        raise UserError(
+            "--relative: with --follow, --robots has to name the robots: with each, a frame begins"
+        )
     name = "standard input" if str(options.recording) == "-" else str(options.recording)
     noise = told_noise(options.noise) if options.noise is not None else None
-    estimate = StreamEstimate(name, options.robots, noise, rule, partial(_doubted, name), solver)
+    estimate = StreamEstimate(
+        *(name, options.robots, noise, rule, partial(_doubted, name), solver, options.relative)
+    )
     try:
         stream = sys.stdin.buffer if str(options.recording) == "-" else options.recording.open("rb")
     except OSError as error:
@@ -121,6 +129,8 @@ def _lines(problem: Measurements, estimate: RecordingEstimate) -> list[str]:
     found.append(
         f"noise: {summary.noise}; last pose in m and rad; time from the first odometry of {every} on"
     )
+    if summary.relative_to is not None:
+        found.append(f"poses are in the frame of that of {summary.relative_to} at the beginning")
     for name, anchor in summary.anchors.items():
         x, y = anchor.position
         found.append(f"anchor {name}: {x:.2f} {y:.2f}, with a sigma of {anchor.sigma:.2f} m")
@@ -132,7 +142,8 @@ def _lines(problem: Measurements, estimate: RecordingEstimate) -> list[str]:
         found.append(f"{count} {'range' if count == 1 else 'ranges'} not used: {why}")
     for robot in problem.robots:
         found += _about(robot.id, summary.robots[robot.id])
-        found += _without_truth(robot.recorded, [row for row in estimate.rows if row.robot == robot.id])
+        rows_of_robot = [row for row in estimate.rows if row.robot == robot.id]
+        found += _without_truth(robot.recorded, rows_of_robot, summary.relative_to)
     for name, one in summary.robots.items():
         if one.first_claim is not None and one.withdrawn_s is not None:
             after = f"{one.withdrawn_s - summary.begin_s:.1f}"
@@ -152,11 +163,15 @@ def _about(name: str, one: RobotEstimate) -> Iterator[str]:
             yield f"{name}: {count} increment{'s' if count > 1 else ''} of odometry {verb}{what}"
 
 
-def _without_truth(robot: RecordedRobot, rows: list[PoseEstimateRow]) -> Iterator[str]:
+def _without_truth(
+    robot: RecordedRobot, rows: list[PoseEstimateRow], relative_to: str | None
+) -> Iterator[str]:
     """Yield how many estimates of a robot with true poses have no error."""
     without = sum([row.true_x is None for row in rows])
     if robot.truth is not None and without:
         why = f"no true poses around them are within {TRUTH_GAP_S:g} s"
+        if relative_to is not None and not len(robot.truth.t):
+            why = f"the true pose of {relative_to} at the beginning is not known"
         yield f"{robot.id}: {without} of {len(rows)} estimates have no error: {why}"
 
 

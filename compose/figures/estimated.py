@@ -90,7 +90,8 @@ class Drawn(NamedTuple):
         """The robots, the recording and the noise."""
         robots = [one.id for one in self.problem.robots]
         names = " and ".join(robots) if len(robots) < 3 else listed(robots)
-        return [f"{names} in {self.problem.source.rpartition('/')[2]}, noise {self.problem.noise}"]
+        frame = f", frame of {to}" if (to := self.problem.relative_to) is not None else ""
+        return [f"{names} in {self.problem.source.rpartition('/')[2]}, noise {self.problem.noise}{frame}"]
 
     def since_begin(self, times: Any) -> Numbers:
         """Return times in s from the first odometry of both robots on."""

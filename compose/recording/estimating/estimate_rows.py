@@ -167,6 +167,8 @@ class EstimateSummary(msgspec.Struct, frozen=True):
     """The assumed noise: a profile, a file, or what the recording states."""
     begin_s: float
     """The time in s, on the clock of the recording, from which on there is odometry of all robots."""
+    relative_to: str | None
+    """The robot whose pose at `begin_s` is the origin of all poses; null: in the frame of the anchors."""
     accuracy: float
     """The accuracy in m that a claim needs."""
     confidence: float

@@ -80,14 +80,16 @@ class StreamEstimate:
         rule: ClaimRule,
         doubted: Callable[[str], None] = lambda _: None,
         solver: Solver | None = None,
+        relative: str | None = None,
     ) -> None:
         """Begin the estimate of `robots`, with the `noise` that is told.
 
         None: all robots of the stream. With each further one, the estimate begins again.
         `doubted` is called with the suspicion that parts of the stream are in different units; as long as it
-        lasts, nothing is estimated. `solver` fits the poses in place of the smoother.
+        lasts, nothing is estimated. `solver` fits the poses in place of the smoother. `relative` is the robot
+        whose start defines the frame; None: the frame is that of the anchors.
         """
-        self._builder = RecordingBuilder(source)
+        self._builder, self._relative = RecordingBuilder(source), relative
         self._robots, self._noise, self._doubted = robots, noise, doubted
         self._estimator = RecordingEstimator(rule, solver)
         self._measured: Measurements | None = None
@@ -123,7 +125,10 @@ class StreamEstimate:
         doubt = None if examined else self._doubt
         try:
             measured = measurements(
-                self._builder.recording(), names, self._noise, ticks=STREAM_TICKS, doubt=doubt
+                *(self._builder.recording(), names, self._noise),
+                relative=self._relative,
+                ticks=STREAM_TICKS,
+                doubt=doubt,
             )
         except (NoAnchors, NoSteps):
             return  # there will be ranges and odometry
@@ -142,6 +147,7 @@ class StreamEstimate:
     def result(self) -> tuple[Measurements, RecordingEstimate]:
         """Return all estimates so far. Raises UserError if no epoch is complete."""
         if self._measured is None:
-            what = "no second with odometry of all robots and ranges to two anchors"
+            what = "no second with odometry of all robots"
+            what += " and ranges to two anchors" if self._relative is None else ""
             raise UserError(f"{self._builder.source}: there is {what}")
         return self._measured, _result(self._measured, self._estimator)

@@ -48,6 +48,7 @@ def summary_of(measured: Measurements, epochs: Sequence[EstimateEpoch], rule: Cl
         measured.source,
         measured.noise,
         measured.t0,
+        measured.relative_to,
         *rule,
         {
             one.id: _of_robot(one, [row for row in rows if row.robot == one.id], claims[one.id], last.t)

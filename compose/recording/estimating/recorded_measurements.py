@@ -14,7 +14,16 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from agent.estimation.facts import Fact, Facts, Manoeuvre, anchor, anchor_range, manoeuvre, mutual_range
+from agent.estimation.facts import (
+    Fact,
+    Facts,
+    Manoeuvre,
+    anchor,
+    anchor_range,
+    manoeuvre,
+    mutual_range,
+    start_pose,
+)
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, joint_measurements
 from agent.estimation.gaussian.odometry_noise import Track
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
@@ -22,7 +31,7 @@ from compose.errors import BadRecording, NoEstimate, UserError
 from compose.recording.estimating.doubtful_units import doubtful_units
 from compose.recording.estimating.noise_files import AssumedNoise, stated_noise, told_noise
 from compose.recording.estimating.sound_odometry import SoundOdometry, at_antenna, levelled, sound
-from compose.recording.estimating.true_poses import with_bridged_truth
+from compose.recording.estimating.true_poses import in_frame_of, with_bridged_truth
 from compose.recording.ranging.range_recording import (
     SAME_TIME_S,
     FixedAnchor,
@@ -102,6 +111,8 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     """True for an epoch before whose end nothing was measured in RANGE_SILENCE_S: no estimate; shape (E,)."""
     doubt: str = ""
     """The suspicion that parts of the recording are in different units; with one, nothing is estimated."""
+    relative_to: str | None = None
+    """The robot whose pose at tick 0 is the origin; None in the frame of the anchors."""
 
     def time_of(self, tick: Places) -> Numbers:
         """Return the times in s of ticks."""
@@ -161,27 +172,37 @@ def measurements(
     noise: str | AssumedNoise | None,
     window: tuple[float, float] | None = None,
     *,
+    relative: str | None = None,
     ticks: int | None = None,
     doubt: str | None = None,
 ) -> Measurements:
     """Return the measurements of `robots` within `window`, in s from the first odometry on.
 
     `noise` is the name of a profile, the path of a file, or what was read of one; None: what the recording
-    states. `ticks` is the number of them in an epoch; None: by the speed of the robots. `doubt` is the
-    suspicion about the units; None: they are examined. Raises UserError.
+    states. `relative` is the robot whose start defines the frame, in which no anchor has a position; None:
+    the frame is that of the anchors. `ticks` is the number of them in an epoch; None: by the speed of the
+    robots. `doubt` is the suspicion about the units; None: they are examined. Raises UserError.
     """
     told = told_noise(noise) if isinstance(noise, str) else noise
     part = chosen_part(recording, robots, window)
     assumed = told or stated_noise(part)
     if assumed.correction is not None:
         part = assumed.correction.corrected(part)
+    if relative is not None:
+        if relative not in (names := [one.id for one in part.robots]):
+            raise UserError(f"--relative: {relative} is not among the robots {', '.join(names)}")
+        anchors = [one._replace(x=math.nan, y=math.nan, sigma=math.inf) for one in part.anchors]
+        part = part._replace(anchors=tuple(anchors))
     with numerics(recording.source):
-        found = _measurements(part, assumed, ticks)
-        _check_anchors(part)
+        found = _measurements(part, assumed, ticks, relative)
+        if relative is None:
+            _check_anchors(part)
         return msgspec.structs.replace(found, doubt=doubtful_units(part) if doubt is None else doubt)
 
 
-def _measurements(part: RangeRecording, assumed: AssumedNoise, ticks: int | None) -> Measurements:
+def _measurements(
+    part: RangeRecording, assumed: AssumedNoise, ticks: int | None, relative: str | None
+) -> Measurements:
     """Return the measurements in `part`, whose units are not examined."""
     names = [one.id for one in part.robots]
     whole, part = part, part.part(names, *part.span)
@@ -212,13 +233,17 @@ def _measurements(part: RangeRecording, assumed: AssumedNoise, ticks: int | None
     facts = {anchor(one.id, one.x, one.y, one.sigma) for one in placed}
     for name, increments, covariance in zip(names, steps.increments, steps.covariance, strict=True):
         facts.update(_manoeuvres(name, increments, covariance, period))
+    recorded = tuple(map(with_bridged_truth, whole.robots))
+    if relative is not None:
+        facts.add(start_pose(relative, *whole.robot(relative).antenna[:2], 0.0))
+        recorded = tuple(in_frame_of(relative, t0, recorded))
     unused = {
         f"to others than the {MOST_USED_ANCHORS} anchors with the most": len(steps.ranges.t) - len(ranges),
         **steps.unused,
     }
     return Measurements(
         source=part.source,
-        robots=tuple(map(MeasuredRobot, map(with_bridged_truth, whole.robots), anchors, prepared)),
+        robots=tuple(map(MeasuredRobot, recorded, anchors, prepared)),
         joint=joint_measurements(Facts(frozenset(facts.union(ranges))), noise, period),
         t0=t0,
         ticks_per_epoch=ticks,
@@ -227,6 +252,7 @@ def _measurements(part: RangeRecording, assumed: AssumedNoise, ticks: int | None
         skipped_s=steps.skipped_s,
         ends=locked(ends),
         silent=locked(last < ends - RANGE_SILENCE_S),
+        relative_to=relative,
     )
 
 

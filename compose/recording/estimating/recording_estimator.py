@@ -13,7 +13,7 @@ from agent.estimation.claim import BEFORE_SEARCH, blocked
 from agent.estimation.fit import Fit
 from agent.estimation.gaussian.joint_claims import Displacement, displaced_anchor, open_position, undetermined
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
-from agent.estimation.gaussian.search import candidates, extended, search
+from agent.estimation.gaussian.search import begun, candidates, extended, search
 from agent.estimation.judged import of_joint
 from agent.estimation.posterior import NO_HYPOTHESES, Posterior, certainties, settled
 from agent.estimation.solver import Solver, UnusableSolution
@@ -137,7 +137,7 @@ class RecordingEstimator:
         """Return the estimate at the end of the epoch with this `number`, from 0 on, in their order."""
         used = msgspec.structs.replace(measured.until(number), solver=self._solver)
         known = settled(self._known, used)
-        found = self._extended(known if known.hypotheses else NO_HYPOTHESES, used)
+        found = self._extended(known if known.hypotheses else begun(used), used)
         count = len(used.ranges.rho)
         due = found.hypotheses and any(self._searched < at <= count for at in GROUP_SEARCHES)
         reasons = self._reasons(found, used)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -90,6 +91,20 @@ def true_pose(robot: RecordedRobot, t: float) -> Numbers | None:
     way = math.hypot(dx, dy) * (share if half == 0.0 else math.sin(share * half) / math.sin(half))
     course = math.atan2(dy, dx) + (share - 1.0) * half
     return np.array((x + way * math.cos(course), y + way * math.sin(course), heading + share * 2.0 * half))
+
+
+def in_frame_of(name: str, t: float, robots: Sequence[RecordedRobot]) -> Iterator[RecordedRobot]:
+    """Yield `robots` with their true poses in the frame of that of the robot `name` at `t` s.
+
+    If that is unknown, so are all true poses.
+    """
+    origin = next(true_pose(one, t) for one in robots if one.id == name)
+    for one in robots:
+        if (truth := one.truth) is not None:
+            poses = truth.poses[: 0 if origin is None else None]
+            poses = relative(np.full_like(poses, 0.0 if origin is None else origin), poses)
+            truth = TruePath(truth.t[: len(poses)], locked(poses))
+        yield one._replace(truth=truth)
 
 
 def true_antenna(robot: RecordedRobot, t: Numbers) -> Numbers:

@@ -65,6 +65,7 @@ def of_estimate(folder: Path) -> dict[str, Any]:
     }
     with _read(folder, ESTIMATE, "the summary of an estimate") as summary:
         found = {name: kind(summary[name]) for name, kind in kinds.items()}
+        found["frame"] = str(summary.get("relative_to") or "")
         return {"folder": str(folder), **found, "figures": figures_of_estimate(folder)}
 
 

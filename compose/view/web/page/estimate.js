@@ -10,8 +10,8 @@ export async function estimate(root) {
     root.replaceChildren(make("p", { textContent: result.error }));
     return "Estimate";
   }
-  const { source, noise, begin_s, robots, ranges, blocking_reason, figures } = result;
-  const facts = [["noise", noise], ...Object.entries(ranges).map(([pair, count]) => [`ranges ${pair}`, count])];
+  const { source, noise, frame, begin_s, robots, ranges, blocking_reason, figures } = result;
+  const facts = [["noise", noise], ...(frame ? [["frame", `of ${frame}, first pose`]] : []), ...Object.entries(ranges).map(([pair, count]) => [`ranges ${pair}`, count])];
   root.replaceChildren(
     make("dl", { className: "facts" }, ...facts.map(([what, value]) => make("div", {}, make("dt", { textContent: what }), make("dd", { textContent: value })))),
     table(robots, begin_s),
