@@ -213,6 +213,7 @@ def test_a_stream_is_ended_by_ctrl_c_and_by_the_end_of_its_reader_and_the_files_
             ("bad.mcap", "--follow", "--window", "1..2"),
             "--follow: a stream has its own anchors, and no window",
         ),
+        (("bad.mcap", "--follow", "--relative", "A"), "--relative: with --follow, --robots has to name"),
     ],
 )
 def test_a_wrong_stream_is_one_line(words: tuple[str, ...], says: str, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 import tandem as api
 from compose.errors import ENDED, NOT_LOCALISED
+from compose.recording.estimating.calibration import ASSUMED, calibrated_by_fit
 from compose.recording.estimating.estimate_rows import estimate_csv
 from compose.recording.estimating.estimate_run import RecordingEstimate, estimated
 from compose.recording.estimating.recorded_measurements import measurements
@@ -207,6 +208,28 @@ def test_a_recorded_mission_of_a_group_is_estimated_by_default_with_all_robots(m
     assert found.robots == ("a", "b", "c")
     lines = (mission / "estimated" / "estimate.csv").read_text().splitlines()
     assert len(lines) - 1 == len(found.rows["robot"])
+
+
+def test_a_recorded_mission_is_estimated_in_the_frame_of_a_robot(mission: Path) -> None:
+    flags = ("--noise", "group.toml", "--relative")
+    ran = tandem("estimate", "recording", *flags, "b", "--accuracy", "1", "--out", "frame", cwd=mission)
+    assert ran.status == ENDED, ran.out + ran.err
+    assert "poses are in the frame of that of b at the beginning" in ran.out
+    for robot in json.loads((mission / "frame" / "estimate.json").read_text())["robots"].values():
+        assert robot["final"]["nees"] < NEES_99_9
+    assert "frame of b" in (mission / "frame" / "estimate-path.svg").read_text()
+    found = api.estimate(mission / "recording", noise=mission / "group.toml", relative="b")
+    assert found.summary.relative_to == "b"
+    assert abs(found.rows.where(robot="b")["x"][0]) < 1.0
+    ran = tandem("estimate", "recording", *flags, "x", cwd=mission)
+    assert "--relative: x is not among the robots a, b, c" in ran.err
+
+
+def test_radios_of_a_group_without_anchors_are_calibrated_without_truth() -> None:
+    recording = recorded(3, 3, unanchored=(0, 1, 2))
+    names = [one.id for one in recording.robots]
+    found = calibrated_by_fit(measurements(recording, names, ASSUMED, relative=names[0]))
+    assert list(found.pairs) == [("r00", "r01"), ("r00", "r02"), ("r01", "r02")]
 
 
 def test_a_group_of_which_some_robot_has_no_pose_ends_with_status_1(mission: Path) -> None:

@@ -103,10 +103,13 @@ def undetermined(robot: int, located: tuple[int, ...], measured: JointMeasuremen
 
 
 def open_position(robot: int, fit: Fit, measured: JointMeasurements) -> str:
-    """Return why a located robot has no pose: its ranges leave its position open; else an empty text."""
+    """Return why a located robot has no pose: its ranges leave its position open; else an empty text.
+
+    That of a robot whose start is known follows from its odometry, however uncertain.
+    """
     own = np.diagonal(fit.covariance)[3 * robot : 3 * robot + 2]
     sigma = deviation(float(own[0] + own[1]))
-    if sigma <= OPEN * measured.reach:
+    if sigma <= OPEN * measured.reach or robot in measured.started:
         return ""
     how = f"to a sigma of {sigma:.3g} m" if math.isfinite(sigma) else "without a bound"
     return f"its ranges leave its position open {how}"

@@ -193,7 +193,7 @@ def _result(
     t, part, sure = float(measured.ends[number]), used.some(found.located), certainties(found)
     place = {used.robots[robot]: i for i, robot in enumerate(found.located)}
     without = {
-        one.id: open_position(place[one.id], found.hypotheses[0].fit, used)
+        one.id: open_position(place[one.id], found.hypotheses[0].fit, part)
         if one.id in place
         else undetermined(used.robots.index(one.id), found.located, used)
         for one in measured.robots
