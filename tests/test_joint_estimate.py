@@ -346,6 +346,30 @@ def test_robots_without_anchors_have_poses_in_the_frame_of_the_first(
         assert not reason or "sigma of the position" in reason or "probability" in reason
 
 
+def beside_standing(omega: float) -> JointMeasurements:
+    """Return r0, which drives from the origin, r1, which stands, and r2, which drives and ranges r1 alone."""
+    known = [start_pose("r0", 0.0, 0.0, 0.0)]
+    path = track(np.full(20, 0.3), np.full(20, omega), PERIOD_S)
+    for tick in range(20):
+        x, y = float(path.x[tick]), float(path.y[tick])
+        known += [manoeuvre("r0", tick, Manoeuvre(0.3, omega)), manoeuvre("r1", tick, Manoeuvre(0.0, 0.0))]
+        known += [manoeuvre("r2", tick, Manoeuvre(0.3, 0.1)), mutual_range("r1", "r2", tick, 2.0, 0.05)]
+        known.append(mutual_range("r0", "r1", tick, math.hypot(x - 3.0, y - 1.0), 0.05))
+    return joint_measurements(Facts(frozenset(known)), NOISE, PERIOD_S, REACH)
+
+
+def test_the_headings_of_a_robot_that_stands_do_not_hide_its_mirror_image() -> None:
+    found = search(beside_standing(0.0).some((0, 1)))
+    assert sorted([round(float(one.fit.poses[1, 1])) for one in found.hypotheses]) == [-1, 1]
+
+
+def test_no_robot_is_located_by_its_ranges_to_one_that_stands() -> None:
+    measured = beside_standing(0.2)
+    found = search(measured)
+    assert found.located == (0, 1)
+    assert undetermined(2, found.located, measured).startswith("too few of its ranges are from different")
+
+
 def test_a_robot_without_ranges_to_the_frame_has_no_pose_and_says_why() -> None:
     group, _ = relative(2, 7, 0.05)
     known = [*group.facts.known, mutual_range("r00", "w", 1, 3.0, 0.05)]

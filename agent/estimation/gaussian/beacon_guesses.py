@@ -49,9 +49,12 @@ OF_HEADING = 3
 def beacon_guesses(robot: JointMeasurements) -> list[Array]:
     """Return likely guesses for one robot whose beacons are anchors, in the layout of `predicted`."""
     ranges, path = robot.ranges, robot.paths[0]
-    turns = np.linspace(-math.pi, math.pi, ROTATIONS, endpoint=False)
-    c, s = cos(turns)[:, None], sin(turns)[:, None]
     px, py = path.x[ranges.tick], path.y[ranges.tick]
+    turns = np.linspace(-math.pi, math.pi, ROTATIONS, endpoint=False)
+    of_heading: int | None = OF_HEADING
+    if np.max(hypot(px - px[-1], py - py[-1])) <= np.max(ranges.sigma):
+        turns, of_heading = turns[:1], None  # a robot that stands may have any heading
+    c, s = cos(turns)[:, None], sin(turns)[:, None]
     place = ranges.place
     # where the robot would have started if it were at the beacon; shape (turns, N)
     dx, dy = rotated(c, s, px, py)
@@ -75,7 +78,7 @@ def beacon_guesses(robot: JointMeasurements) -> list[Array]:
     away = hypot(sx[..., None] - x[:, None], sy[..., None] - y[:, None])
     longest = max(float(np.max(ranges.rho)), SIGMA_FLOOR)
     likely = log_likelihood(ranges.rho - away, hypot(ranges.sigma, COARSE * longest), robot.noise)
-    best = np.argsort(-likely, 1, kind="stable")[:, :OF_HEADING]
+    best = np.argsort(-likely, 1, kind="stable")[:, :of_heading]
     sx, sy = np.take_along_axis(sx, best, 1), np.take_along_axis(sy, best, 1)
     guesses = np.stack((-(c * sx + s * sy), s * sx - c * sy, np.broadcast_to(turns[:, None], sx.shape)), -1)
     return refined(guesses.reshape(-1, 3), robot)
@@ -108,7 +111,7 @@ def refined(guesses: Array, robot: JointMeasurements) -> list[Array]:
         guesses = guesses + change / np.maximum(np.max(np.abs(change) / most, 1, keepdims=True), 1.0)
     distance, _ = predicted(guesses, at, ranges.place)
     likely = log_likelihood(ranges.rho - distance, hypot(sigma, FINAL * longest), robot.noise)
-    return _distinct(guesses, likely, at[:, -1], longest)
+    return _distinct(guesses, likely, at, longest)
 
 
 def predicted(guesses: Array, at: Array, place: Array) -> tuple[Array, Array]:
@@ -138,8 +141,13 @@ FINAL = 0.02
 """The error of a prediction without a correction of the odometry, as a fraction of the longest range."""
 
 
-def _distinct(guesses: Array, likely: Array, last: Array, longest: float) -> list[Array]:
-    """Return the likeliest of `guesses` at different poses at the place `last` (m) of the path."""
+def _distinct(guesses: Array, likely: Array, at: Array, longest: float) -> list[Array]:
+    """Return the likeliest of `guesses` at different poses at the end of the path `at` (m).
+
+    Headings count only as far as they move the path: those of a robot that stands would leave out the mirror
+    image of its place.
+    """
+    last, extent = at[:, -1], float(np.max(hypot(*(at - at[:, -1:]))))
     c, s = cos(guesses[:, 2]), sin(guesses[:, 2])
     x, y = last[0] - guesses[:, 0], last[1] - guesses[:, 1]
     ends = np.stack(rotated(c, s, x, y), 1)
@@ -150,5 +158,5 @@ def _distinct(guesses: Array, likely: Array, last: Array, longest: float) -> lis
         chosen.append(guesses[best])
         turn = np.remainder(guesses[left, 2] - guesses[best, 2] + math.pi, math.tau) - math.pi
         far = hypot(*(ends[left] - ends[best]).T) > APART * longest
-        left = left[far | (np.abs(turn) > TURNED)]
+        left = left[far | ((np.abs(turn) > TURNED) & (np.abs(turn) * extent > APART * longest))]
     return chosen

@@ -7,13 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.fit import Fit, deviation
+from agent.estimation.fit import Fit
 from agent.estimation.gaussian.consistency import LEAST_INFORMATION
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
-from agent.estimation.gaussian.search import FEWEST_DECISIVE, beacons
-
-OPEN = 0.5
-"""The sigma of a position from which on a robot has no pose, as a fraction of the longest range."""
+from agent.estimation.gaussian.search import FEWEST_DECISIVE, OPEN, beacons, position_sigma
 
 
 class Displacement(NamedTuple):
@@ -107,8 +104,7 @@ def open_position(robot: int, fit: Fit, measured: JointMeasurements) -> str:
 
     That of a robot whose start is known follows from its odometry, however uncertain.
     """
-    own = np.diagonal(fit.covariance)[3 * robot : 3 * robot + 2]
-    sigma = deviation(float(own[0] + own[1]))
+    sigma = position_sigma(fit, robot)
     if sigma <= OPEN * measured.reach or robot in measured.started:
         return ""
     how = f"to a sigma of {sigma:.3g} m" if math.isfinite(sigma) else "without a bound"

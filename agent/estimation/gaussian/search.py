@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
-from agent.estimation.fit import Start, fits
+from agent.estimation.fit import Fit, Start, deviation, fits
 from agent.estimation.gauss_newton import Convergence
 from agent.estimation.gaussian.anchor_guesses import SEED_RANGES, UNLIKELY, anchors
 from agent.estimation.gaussian.beacon_guesses import beacon_guesses, start_of
@@ -49,6 +49,12 @@ As many as for a claim: with fewer, it may stand in many places, and each would 
 
 STARTS_WITHOUT_OUTLIERS = 4
 """The number of the likeliest starts whose outliers are left out of a second fit."""
+
+OPEN = 0.5
+"""The sigma of a position from which on a robot has no pose, as a fraction of the longest range.
+
+One hypothesis would stand for many places, and further ranges would lead it to any of them.
+"""
 
 FOLLOWED_RANGES = 6
 """The number of ranges to an anchor from which on its hypotheses are followed only, without outliers.
@@ -279,8 +285,14 @@ def as_anchors(
 
 
 def _of_robot(robot: JointMeasurements) -> tuple[Hypothesis, ...]:
-    """Return the hypotheses about one robot whose beacons are anchors."""
-    return hypotheses_of(fits(robot, map(start_of, beacon_guesses(robot))), robot)
+    """Return the hypotheses about one robot whose beacons are anchors; none if the first is OPEN."""
+    found = hypotheses_of(fits(robot, map(start_of, beacon_guesses(robot))), robot)
+    return found if found and position_sigma(found[0].fit, 0) <= OPEN * robot.reach else ()
+
+
+def position_sigma(fit: Fit, robot: int) -> float:
+    """Return the sigma (m) of the position of a robot at the end; infinite if ranges leave it open."""
+    return deviation(float(np.trace(fit.covariance[3 * robot : 3 * robot + 2, 3 * robot : 3 * robot + 2])))
 
 
 def _of_pair(pair: JointMeasurements) -> tuple[Hypothesis, ...]:
