@@ -346,28 +346,47 @@ def test_robots_without_anchors_have_poses_in_the_frame_of_the_first(
         assert not reason or "sigma of the position" in reason or "probability" in reason
 
 
-def beside_standing(omega: float) -> JointMeasurements:
-    """Return r0, which drives from the origin, r1, which stands, and r2, which drives and ranges r1 alone."""
-    known = [start_pose("r0", 0.0, 0.0, 0.0)]
-    path = track(np.full(20, 0.3), np.full(20, omega), PERIOD_S)
-    for tick in range(20):
-        x, y = float(path.x[tick]), float(path.y[tick])
-        known += [manoeuvre("r0", tick, Manoeuvre(0.3, omega)), manoeuvre("r1", tick, Manoeuvre(0.0, 0.0))]
-        known += [manoeuvre("r2", tick, Manoeuvre(0.3, 0.1)), mutual_range("r1", "r2", tick, 2.0, 0.05)]
-        known.append(mutual_range("r0", "r1", tick, math.hypot(x - 3.0, y - 1.0), 0.05))
-    return joint_measurements(Facts(frozenset(known)), NOISE, PERIOD_S, REACH)
+Way = tuple[float, float, float, float, float]
+"""The pose of a robot at tick 0, and its constant v and omega."""
+
+
+def driven(
+    ways: list[Way], ticks: int, pairs: tuple[tuple[int, int], ...], noise: Noise = NOISE
+) -> tuple[JointMeasurements, Array]:
+    """Return robots that drive on arcs, on lines or not at all, and their poses at the end; r0 is known."""
+    draw, known, paths = np.random.default_rng(ticks), [start_pose("r0", *ways[0][:3])], []
+    for i, (x, y, heading, v, omega) in enumerate(ways):
+        known += [manoeuvre(f"r{i}", tick, Manoeuvre(v, omega)) for tick in range(ticks)]
+        path = track(np.full(ticks, v), np.full(ticks, omega), PERIOD_S)
+        c, s = math.cos(heading), math.sin(heading)
+        paths.append(np.stack((x + c * path.x - s * path.y, y + s * path.x + c * path.y)))
+    for i, j in pairs:
+        errors = draw.normal(0.0, noise.mutual_sigma, ticks + 1)
+        for tick, rho in enumerate(np.abs(np.hypot(*(paths[i] - paths[j])) + errors).tolist()):
+            known.append(mutual_range(f"r{i}", f"r{j}", tick, rho, noise.mutual_sigma))
+    measured = joint_measurements(Facts(frozenset(known)), noise, PERIOD_S, REACH)
+    return measured, np.array(paths)[:, :, -1]
 
 
 def test_the_headings_of_a_robot_that_stands_do_not_hide_its_mirror_image() -> None:
-    found = search(beside_standing(0.0).some((0, 1)))
+    found = search(driven([(0.0, 0.0, 0.0, 0.3, 0.0), (3.0, 1.0, 0.0, 0.0, 0.0)], 20, ((0, 1),))[0])
     assert sorted([round(float(one.fit.poses[1, 1])) for one in found.hypotheses]) == [-1, 1]
 
 
 def test_no_robot_is_located_by_its_ranges_to_one_that_stands() -> None:
-    measured = beside_standing(0.2)
+    ways = [(0.0, 0.0, 0.0, 0.3, 0.2), (3.0, 1.0, 0.0, 0.0, 0.0), (5.0, 1.0, 0.0, 0.3, 0.1)]
+    measured, _ = driven(ways, 20, ((0, 1), (1, 2)))
     found = search(measured)
     assert found.located == (0, 1)
     assert undetermined(2, found.located, measured).startswith("too few of its ranges are from different")
+
+
+def test_of_two_robots_on_straight_lines_all_four_images_are_found() -> None:
+    ways = [(2.0, 0.3, -1.9, 0.3, 0.0), (2.8, 0.6, 0.0, 0.5, 0.0)]
+    measured, ends = driven(ways, 14, ((0, 1),), Noise(1e-6, 1e-6))
+    found = search(measured).hypotheses
+    assert len(found) == 4
+    assert min([math.dist(one.fit.poses[1, :2], ends[1]) for one in found]) < 1e-4
 
 
 def test_a_robot_without_ranges_to_the_frame_has_no_pose_and_says_why() -> None:

@@ -91,6 +91,22 @@ def start_of(guess: Array) -> Start:
     return Start(np.array([[-x, -y, turn]]))
 
 
+def straight(measured: JointMeasurements) -> float:
+    """Return the width (m) of a path up to which ranges hardly tell it from a straight line."""
+    return 3.0 * float(np.max(measured.ranges.sigma)) + FINAL * float(np.max(measured.ranges.rho))
+
+
+def line_of(points: Array) -> tuple[tuple[float, float], float, float]:
+    """Return the line nearest to `points` (m), (N, 2): its foot from 0, its course (rad), and their width."""
+    x, y = (points - (middle := np.mean(points, 0))).T
+    xx, xy, yy = float(np.mean(x * x)), float(np.mean(x * y)), float(np.mean(y * y))
+    course = 0.5 * math.atan2(2.0 * xy, xx - yy)
+    c, s = math.cos(course), math.sin(course)
+    off = c * float(middle[1]) - s * float(middle[0])
+    width = math.sqrt(max(0.5 * (xx + yy) - math.hypot(0.5 * (xx - yy), xy), 0.0))
+    return (-s * off, c * off), course, width
+
+
 def refined(guesses: Array, robot: JointMeasurements) -> list[Array]:
     """Return the likeliest of `guesses` after Gauss-Newton steps on all ranges, with measured odometry."""
     ranges, path = robot.ranges, robot.paths[0]

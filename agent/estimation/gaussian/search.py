@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from agent.estimation.fit import Fit, Start, deviation, fits
 from agent.estimation.gauss_newton import Convergence
 from agent.estimation.gaussian.anchor_guesses import SEED_RANGES, UNLIKELY, anchors
-from agent.estimation.gaussian.beacon_guesses import beacon_guesses, start_of
+from agent.estimation.gaussian.beacon_guesses import beacon_guesses, line_of, start_of, straight
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges
 from agent.estimation.gaussian.odometry_noise import Array, Places
 from agent.estimation.gaussian.placement_guesses import STARTS, placements
@@ -33,6 +33,7 @@ from agent.estimation.posterior import (
     Posterior,
     hypotheses_of,
     merged,
+    same,
 )
 
 FEWEST_DECISIVE = 3
@@ -221,7 +222,31 @@ def _with(known: Posterior, candidate: Candidate, measured: JointMeasurements, f
             errors = [*begun.errors[:count], *start.errors]
             with_anchors = np.concatenate((poses, begun.poses[count:]))
             starts.append(Start(with_anchors, tuple([errors[k] for k in order])))
-    return Posterior(located, hypotheses_of(fits(part, starts), part))
+    return Posterior(located, _with_images(hypotheses_of(fits(part, starts), part), part))
+
+
+def _with_images(found: tuple[Hypothesis, ...], part: JointMeasurements) -> tuple[Hypothesis, ...]:
+    """Return the hypotheses with their images in the line on which the robots with a prior have driven."""
+    starts = []
+    for one in found if part.started and bool(np.all(part.ranges.mutual)) else ():
+        foot, course, width = line_of(np.concatenate([one.fit.paths[k, :, :2] for k in part.started]))
+        if width <= straight(part):
+            poses, (c, s) = one.fit.start.poses.copy(), (math.cos(2.0 * course), math.sin(2.0 * course))
+            others = [k for k in range(len(poses)) if k not in part.started]
+            x, y, heading = poses[others].T
+            poses[others] = np.stack(
+                (c * x + s * y + 2.0 * foot[0], s * x - c * y + 2.0 * foot[1], 2.0 * course - heading), 1
+            )
+            starts.append(Start(poses))
+    return _with_more(found, starts, part)
+
+
+def _with_more(
+    found: tuple[Hypothesis, ...], starts: list[Start], measured: JointMeasurements
+) -> tuple[Hypothesis, ...]:
+    """Return the hypotheses with the fits from `starts` that none of them is already."""
+    more = [fit for fit in fits(measured, starts) if not any(all(same(fit, known.fit)) for known in found)]
+    return hypotheses_of([*[known.fit for known in found], *more], measured) if more else found
 
 
 def _alone(
@@ -287,6 +312,12 @@ def as_anchors(
 def _of_robot(robot: JointMeasurements) -> tuple[Hypothesis, ...]:
     """Return the hypotheses about one robot whose beacons are anchors; none if the first is OPEN."""
     found = hypotheses_of(fits(robot, map(start_of, beacon_guesses(robot))), robot)
+    starts = []
+    for one in found:
+        foot, _, width = line_of(one.fit.places(0, robot.ranges.tick).T - robot.ranges.place)
+        if width <= straight(robot):  # it may be on the other side, with the same heading
+            starts.append(Start(one.fit.start.poses - 2.0 * np.array([[*foot, 0.0]])))
+    found = _with_more(found, starts, robot)
     return found if found and position_sigma(found[0].fit, 0) <= OPEN * robot.reach else ()
 
 
