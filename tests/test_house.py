@@ -32,7 +32,7 @@ BELOW = {
 }
 """The packages of the project that each package may import."""
 
-BUDGETS = {"protocol": 4_362, "agent": 17_255, "world": 4_275, "compose": 26_795, "tandem": 1_510}
+BUDGETS = {"protocol": 4_362, "agent": 17_260, "world": 4_275, "compose": 26_795, "tandem": 1_510}
 """The largest number of lines of Python and C of each package. Raising one needs a reason in the commit."""
 
 SHELL = {

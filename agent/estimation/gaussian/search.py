@@ -201,6 +201,8 @@ def _with(known: Posterior, candidate: Candidate, measured: JointMeasurements, f
         if whole := alone == part:
             alone = part  # which has its problem
         new = _of_pair(alone) if len(candidate.robots) == 2 else _of_robot(alone)
+        if part.started and len(candidate.robots) == 1:
+            new = _determined(new, alone)
         if whole:
             return Posterior(located, new)
         log_weight = math.log(one.probability) if one is not None else 0.0
@@ -310,8 +312,12 @@ def as_anchors(
 
 
 def _of_robot(robot: JointMeasurements) -> tuple[Hypothesis, ...]:
-    """Return the hypotheses about one robot whose beacons are anchors; none if the first is OPEN."""
-    found = hypotheses_of(fits(robot, map(start_of, beacon_guesses(robot))), robot)
+    """Return the hypotheses about one robot whose beacons are anchors."""
+    return hypotheses_of(fits(robot, map(start_of, beacon_guesses(robot))), robot)
+
+
+def _determined(found: tuple[Hypothesis, ...], robot: JointMeasurements) -> tuple[Hypothesis, ...]:
+    """Return the hypotheses about one robot with their images; none if the first leaves its place OPEN."""
     starts = []
     for one in found:
         foot, _, width = line_of(one.fit.places(0, robot.ranges.tick).T - robot.ranges.place)
