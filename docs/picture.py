@@ -95,10 +95,11 @@ def mission(name: str, figures: Mapping[str, str], *, exact: bool = True) -> Sou
 
     def draw(folder: Path, wanted: Mapping[str, str]) -> None:
         run = ran(name, folder)
-        pair = next(pairs_of(run, {robot: agent_replay(run, robot) for robot in run.robots}))
+        pair = next(pairs_of(run, {robot: agent_replay(run, robot) for robot in run.robots}), None)
         for kind in PICTURES:
             with look(SCREEN):
-                for title, figure in catalogue.pictures(pair, kind):
+                drawn = catalogue.pictures(pair, kind) if pair is not None else catalogue.of_team(run, kind)
+                for title, figure in drawn:
                     for file in [one for one in wanted if wanted[one] == title]:
                         if not isinstance(figure, Absent):
                             save(figure, folder / Path(file).stem, ["svg"])
@@ -221,6 +222,8 @@ SOURCES = (
     ),
     mission("noisy", {"noisy-plan": "plan-a-b", "noisy-a": "robot-a"}, exact=False),
     mission("group-8", {"group-8": "meetings"}),
+    mission("room", {"room": "trajectory"}, exact=False),
+    mission("relative", {"relative": "trajectory"}, exact=False),
     Source(
         {"page.gif": "guided play", "page.png": STILL[0]}, ("compose/scenario/shipped/paper-1.toml", *PAGE),
         page, lambda folder: decisions(ran("paper-1", folder)), exact=True, quick=True,

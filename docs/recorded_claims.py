@@ -23,11 +23,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from agent.estimation.following import ClaimRule
 from compose.recording.estimating.calibration import calibrated, profile_toml
 from compose.recording.estimating.estimate_rows import PoseEstimate
 from compose.recording.estimating.estimate_summary import summary_of
 from compose.recording.estimating.recorded_measurements import measurements
-from compose.recording.estimating.recording_estimator import ClaimRule, RecordingEstimator
+from compose.recording.estimating.recording_estimator import RecordingEstimator
 from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.range_recording import (
     FixedAnchor,

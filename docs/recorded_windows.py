@@ -16,9 +16,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from agent.estimation.following import ClaimRule
 from compose.recording.estimating.estimate_run import estimated
 from compose.recording.estimating.recorded_measurements import measurements
-from compose.recording.estimating.recording_estimator import ClaimRule
 from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.range_recording import RangeRecording
 

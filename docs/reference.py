@@ -38,11 +38,13 @@ from compose.scenario.fault_syntax import FaultTable
 from compose.scenario.json_schema import described
 from compose.scenario.kills import KillTable
 from compose.scenario.scenario_tables import (
+    AnchorTable,
     GroupTable,
     MissionTable,
     PlannerTable,
     RobotTable,
     ScenarioFile,
+    TeamTable,
     WorldTable,
 )
 from compose.sweep import spec
@@ -68,6 +70,10 @@ NO_VALUE = "none"
 PARTS = (
     messages.Contact,
     messages.Ranged,
+    messages.NamedRange,
+    messages.Pairing,
+    messages.Team,
+    messages.TeamAnchor,
     messages.LostReport,
     messages.Cause,
     messages.Localised,
@@ -82,6 +88,8 @@ NAMES = {
     "MissionTable": "table `[mission]`",
     "RobotTable": "`[[robot]]`",
     "GroupTable": "`[group]`",
+    "AnchorTable": "`[[anchor]]`",
+    "TeamTable": "`[team]`",
     "PlannerTable": "table `[planner]`",
     "FaultTable": "`[[fault]]`",
     "KillTable": "`[[kill]]`",
@@ -309,6 +317,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "planner": partial(fields_of, PlannerTable),
     "robot": partial(fields_of, RobotTable),
     "group": partial(fields_of, GroupTable),
+    "anchor": partial(fields_of, AnchorTable),
+    "team": partial(fields_of, TeamTable),
     "attack": partial(fields_of, Attack),
     "noise": partial(fields_of, Noise),
     "velocity-noise": partial(fields_of, VelocityNoise),

@@ -8,7 +8,7 @@
 
 There is no simulator process: each robot moves by its own kinematics. Only the beacon, which takes the place
 of ultra-wideband exchanges between them, receives their positions. The agents receive none. The robots may be
-those of a group.
+those of a group or a team.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from typing import Any
 import msgspec
 
 from protocol.messages import RobotConfig
+from protocol.mission import Anchor
 from protocol.motion import REST, Controls, Pose, step, wrap
 from world.hardware.driver import Reading
 
@@ -91,9 +92,17 @@ class Rover:
         executed, self._driven = self._driven, REST
         self._tick, self._executed, self._is_under_way = tick, executed, True
         self._save()
-        anchor, reach = self._config.given_anchor, self._config.mission.sensing_range
-        rho = math.hypot(self.pose.x - anchor.x, self.pose.y - anchor.y) if anchor else math.inf
-        return Reading(executed, rho if rho <= reach else None, mutual_ranges=self._mutual_ranges(tick))
+        config = self._config
+        return Reading(
+            executed,
+            self._range_to(config.given_anchor),
+            mutual_ranges=self._mutual_ranges(tick),
+            anchors={
+                one.id: self._range_to(one.position)
+                for one in (config.team.anchors if config.team is not None else ())
+                if one.id in config.ranges
+            },
+        )
 
     def drive(self, v: float, omega: float) -> None:
         """Hold `v` and `omega` for a manoeuvre. The rest of the previous manoeuvre is not driven."""
@@ -151,6 +160,13 @@ class Rover:
     def _load(self, state: Path) -> None:
         body = msgspec.json.decode(state.read_bytes(), type=BODY)
         self.pose, self._controls, self._began, self._done, self._driven, self._executed, self._tick = body
+
+    def _range_to(self, anchor: Anchor | None) -> float | None:
+        """Return the range (m) to an anchor; None if it is beyond R, or its position is unknown."""
+        if anchor is None:
+            return None
+        rho = math.hypot(self.pose.x - anchor.x, self.pose.y - anchor.y)
+        return rho if rho <= self._config.mission.sensing_range else None
 
     def _mutual_ranges(self, tick: int) -> dict[str, float | None]:
         """Return the range (m) to each robot within R in the same tick. Raises TimeoutError."""

@@ -50,7 +50,18 @@ from protocol.mission import HEADING_ACCURACY, Anchor, Mission, Options, Planner
 from protocol.motion import Controls, Covariance, Pose, Segment
 from protocol.orbits import Orbit, Rendezvous, visiting
 from protocol.sweep_strips import SweptArea, widest_distance
-from protocol.units import Angle, AngularVelocity, Count, Finite, Range, RobotId, Tick, Time, Velocity
+from protocol.units import (
+    Angle,
+    AngularVelocity,
+    Clearance,
+    Count,
+    Finite,
+    Range,
+    RobotId,
+    Tick,
+    Time,
+    Velocity,
+)
 
 Outcome = Literal["localised", "undecided", "inconsistent", "wrong", "failed"]
 """The outcome of a run. Only `localised` is a success.
@@ -119,6 +130,15 @@ class Ranged(msgspec.Struct, frozen=True, array_like=True, gc=False, forbid_unkn
 
     tick: Tick
     """The tick of the measurement."""
+    range: Range
+    """The measured distance, in m."""
+
+
+class NamedRange(msgspec.Struct, frozen=True, array_like=True, gc=False, forbid_unknown_fields=True):
+    """A measured range to one of the anchors of a team."""
+
+    anchor: RobotId
+    """The anchor."""
     range: Range
     """The measured distance, in m."""
 
@@ -310,29 +330,65 @@ Five sigmas are within reach of its search.
 """
 
 
-class RobotConfig(Message, frozen=True, dict=True):
-    """The configuration of a robot: everything that its agent needs to start.
+class Pairing(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """The robot that another one has to meet, and how: in a group, its first meeting.
 
-    In a group, `peer`, `role`, `peer_anchor` and `rendezvous` are those of its first meeting. A robot without
-    an anchor is in no meeting: `peer` is the first of the robots that search for it.
+    A robot of a group without an anchor is in no meeting: `peer` is the first of those that search for it.
     """
 
-    robot: RobotId
-    """The robot that is configured."""
     peer: RobotId
     """The robot that it has to meet."""
     role: Role
     """The role of this robot in the pair; its peer has the other one."""
-    given_anchor: Anchor | None = msgspec.field(name="anchor")
-    """The position of the robot's own anchor in <W>, in m; None if it has none."""
     peer_anchor: Anchor
     """The position of the peer's anchor in <W>, in m."""
+    rendezvous: Rendezvous
+    """The orbits of both robots in phase 2."""
+
+
+class TeamAnchor(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """An anchor of a team, as its robots know it."""
+
+    id: RobotId
+    """The anchor."""
+    position: Anchor | None = None
+    """Its position in <W>, in m; None if it is unknown."""
+    sigma: Clearance = 0.0
+    """The standard deviation of each coordinate of `position` in m; 0 if it is surveyed."""
+
+
+class Team(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """The robots that share all measurements, and the anchors that they may range: all know the same."""
+
+    robots: Annotated[tuple[RobotId, ...], Meta(max_length=MAX_MEMBERS)]
+    """All robots, in the order of the scenario."""
+    anchors: Annotated[tuple[TeamAnchor, ...], Meta(max_length=MAX_MEMBERS)] = ()
+    """All anchors, in the order of the scenario."""
+    origin: RobotId | None = None
+    """The robot whose pose at tick 0 is the origin of <W>; None if anchors determine <W>."""
+    bound: Time = 0.0
+    """The bound in s of the time at which all robots are localised, with exact sensors."""
+    survey: Clearance = 0.0
+    """The sigma (m) of an anchor's position up to which robots measure before they claim their poses, of
+    anchors that are not surveyed and that they have ranged; 0: they do not wait for it."""
+
+
+class RobotConfig(Message, frozen=True, dict=True):
+    """The configuration of a robot: everything that its agent needs to start.
+
+    It has either an `encounter`, in a pair or a group, or a `team`.
+    """
+
+    robot: RobotId
+    """The robot that is configured."""
+    encounter: Pairing | None
+    """The robot that it has to meet; None in a team."""
+    given_anchor: Anchor | None = msgspec.field(name="anchor")
+    """The position of the robot's own anchor in <W>, in m; None if it has none."""
     mission: Mission
     """The parameters of the mission, the same for all robots."""
     planner_name: PlannerName
     """The name of the planner."""
-    rendezvous: Rendezvous
-    """The orbits of both robots in phase 2."""
     attack: Attack | None = None
     """The false data that the robot injects into its Reports; None for an honest robot."""
     tick_s: Annotated[float, Meta(gt=0.0, le=1e6)] | None = None
@@ -357,9 +413,22 @@ class RobotConfig(Message, frozen=True, dict=True):
     """The area in which they are, and the number of its parts; None if there are none."""
     part: Count = 0
     """The part that this robot sweeps first, after its visits."""
+    team: Team | None = None
+    """The robots with which it shares all measurements; None in a pair or a group."""
+    ranges: Annotated[tuple[RobotId, ...], Meta(max_length=MAX_MEMBERS)] = ()
+    """The anchors of the team that this robot may range."""
 
     def __post_init__(self) -> None:
         """Raise ValueError if the fields contradict each other; a frame with such fields is refused."""
+        if (self.team is None) == (self.encounter is None):
+            raise ValueError("team: a robot has an encounter, or it is one of a team")
+        if self.team is not None:
+            known = {one.id for one in self.team.anchors}
+            if self.robot not in self.team.robots or not known.issuperset(self.ranges):
+                raise ValueError("team: without the robot, or without an anchor that it may range")
+            if self.given_anchor is not None or self.members or self.unanchored:
+                raise ValueError("team: its robots have no anchor of their own, and form no group")
+            return
         if (self.given_anchor is None) != (self.robot in self.unanchored):
             raise ValueError("anchor: only the robots in unanchored have none")
         if bool(self.unanchored) != (self.sweep is not None) or (self.unanchored and not self.members):
@@ -371,6 +440,33 @@ class RobotConfig(Message, frozen=True, dict=True):
         if self.given_anchor is None:
             raise LookupError(f"{self.robot} has no anchor")
         return self.given_anchor
+
+    @property
+    def meeting(self) -> Pairing:
+        """The robot that it has to meet. Raises LookupError if there is none."""
+        if self.encounter is None:
+            raise LookupError(f"{self.robot} has no peer")
+        return self.encounter
+
+    @property
+    def peer(self) -> RobotId:
+        """The robot that it has to meet."""
+        return self.meeting.peer
+
+    @property
+    def role(self) -> Role:
+        """The role of this robot in the pair."""
+        return self.meeting.role
+
+    @property
+    def peer_anchor(self) -> Anchor:
+        """The position of the peer's anchor in <W>, in m."""
+        return self.meeting.peer_anchor
+
+    @property
+    def rendezvous(self) -> Rendezvous:
+        """The orbits of both robots in phase 2."""
+        return self.meeting.rendezvous
 
     @property
     def m1(self) -> Anchor:
@@ -400,6 +496,8 @@ class RobotConfig(Message, frozen=True, dict=True):
 
         Robots without an anchor are last.
         """
+        if self.team is not None:
+            return self.team.robots
         if self.members:
             return (*[member.robot for member in self.members], *self.unanchored)
         return (self.robot, self.peer) if self.role == "a" else (self.peer, self.robot)
@@ -454,7 +552,7 @@ class RobotConfig(Message, frozen=True, dict=True):
         if orbits is None:
             distance = math.hypot(self.anchor.x - anchor.x, self.anchor.y - anchor.y)
             orbits = visiting(self.mission, distance)
-        return msgspec.structs.replace(self, peer=peer, role=role, peer_anchor=anchor, rendezvous=orbits)
+        return msgspec.structs.replace(self, encounter=Pairing(peer, role, anchor, orbits))
 
 
 class Observation(Message, frozen=True):
@@ -472,6 +570,14 @@ class Observation(Message, frozen=True):
     """The contacts at tick k; empty if no robot is within range R."""
     lost: tuple[LostReport, ...] = ()
     """The Reports to this robot that are lost at tick k; empty in hardware mode, where nobody knows."""
+    anchors: tuple[NamedRange, ...] = ()
+    """The measured distances to anchors of the team, in their order, of those in range."""
+
+    @property
+    def nearest_anchor_range(self) -> float | None:
+        """The measured distance to the nearest anchor, in m; None if there is none."""
+        ranges = [one.range for one in self.anchors]
+        return min(ranges, default=None) if self.anchor_range is None else self.anchor_range
 
 
 class MissionEnd(Message, frozen=True):
@@ -583,6 +689,17 @@ class Command(Message, frozen=True):
     """True if the sender has its result, and no robot or area to drive to: it stays where it is."""
 
 
+class SurveyedAnchor(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """The estimate of an anchor of a team that is not surveyed."""
+
+    id: RobotId
+    """The anchor."""
+    position: Anchor
+    """Its position in <W> by the most probable hypothesis, in m."""
+    sigma: Clearance
+    """The root of the trace of the covariance of `position` in m."""
+
+
 class Estimate(Message, frozen=True):
     """The poses that a robot considers possible at tick k."""
 
@@ -604,6 +721,8 @@ class Estimate(Message, frozen=True):
     """
     covariance: Covariance | None = None
     """The covariance of the error of the first pose in `world`; None with exact sensors."""
+    anchors: Annotated[tuple[SurveyedAnchor, ...], Meta(max_length=MAX_MEMBERS)] = ()
+    """The anchors of a team that are not surveyed, as far as they are located."""
 
 
 class FinalReport(Message, frozen=True):

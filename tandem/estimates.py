@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from agent.estimation.following import ClaimRule
 from compose.errors import UserError, writing
 from compose.extras import need
 from compose.launch.class_loader import GuardedSolver
@@ -18,7 +19,6 @@ from compose.recording.estimating.estimate_rows import EstimateSummary, PoseEsti
 from compose.recording.estimating.estimate_run import RecordingEstimate, estimated
 from compose.recording.estimating.estimate_summary import write_estimate
 from compose.recording.estimating.recorded_measurements import Measurements, measurements
-from compose.recording.estimating.recording_estimator import ClaimRule
 from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.run_ranges import ranges_of_run
 from compose.recording.recording_files import make_folder, user_errors

@@ -7,6 +7,9 @@ import math
 from compose.launch.in_process import run_mission
 from compose.recording.run import Run
 from compose.scenario.scenario_file import parse
+from world.scenario import Scenario
+from world.sensors import anchor_ranges
+from world.truth import Truth
 
 
 def mission_of(
@@ -36,3 +39,8 @@ def mission_of(
         start = [10.4, 0.3, 3.6]
         """
     return run_mission(parse(text, "mission"))
+
+
+def own_ranges(truth: Truth, scenario: Scenario) -> list[float | None]:
+    """Return the measured range of each robot to its own anchor in m; None if it has none."""
+    return [ranges[0].range if ranges else None for ranges in anchor_ranges(truth, scenario)]

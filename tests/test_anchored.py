@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from agent.estimation.following import ClaimRule
 from agent.estimation.gaussian.beacon_guesses import predicted
 from agent.estimation.gaussian.consistency import chi2_p_value
 from compose.errors import UserError
@@ -14,7 +15,6 @@ from compose.recording.estimating.calibration import ASSUMED, calibrated_by_fit
 from compose.recording.estimating.estimate_rows import estimate_csv
 from compose.recording.estimating.estimate_run import RecordingEstimate, estimated
 from compose.recording.estimating.recorded_measurements import measurements
-from compose.recording.estimating.recording_estimator import ClaimRule
 from compose.recording.ranging.range_recording import (
     FixedAnchor,
     Numbers,

@@ -461,21 +461,34 @@ def with_robots(**fields: Any) -> Callable[[Scenario], Scenario]:
     return lambda told: replace(told, robots=tuple([replace(robot, **fields) for robot in told.robots]))
 
 
+def with_meetings(**fields: Any) -> Callable[[Scenario], Scenario]:
+    """Return a function that sets these fields of the meeting of every robot."""
+    return lambda told: replace(
+        told,
+        robots=tuple([replace(one, encounter=replace(one.meeting, **fields)) for one in told.robots]),
+    )
+
+
 def test_an_orbit_that_does_not_follow_from_the_mission_is_found(folder: Path) -> None:
     plan = load("paper-1").robots[0].rendezvous
     other = replace(plan, a=replace(plan.a, radius=plan.a.radius * (1.0 + 2.0**-50)))
-    plant_scenario(folder, with_robots(rendezvous=other))
+    plant_scenario(folder, with_meetings(rendezvous=other))
     findings = audit(folder)
     assert {(robot, rule) for _, robot, rule in found(findings)} >= {("a", "scenario"), ("b", "scenario")}
-    assert what(findings, "scenario")[0].startswith("rendezvous.a.radius is 6.5")
+    assert what(findings, "scenario")[0].startswith("encounter.rendezvous.a.radius is 6.5")
     assert "config" not in {rule for _, _, rule in found(findings)}
 
 
 def test_an_orbit_that_does_not_follow_from_the_mission_is_found_without_a_world(folder: Path) -> None:
     plan = load("paper-1").robots[0].rendezvous
     (folder / WORLD_JOURNAL).unlink()
+
+    def later(config: RobotConfig) -> RobotConfig:
+        meeting = replace(config.meeting, rendezvous=replace(plan, bound=plan.bound + 1.0))
+        return replace(config, encounter=meeting)
+
     for name in (A, B):
-        plant(folder / name, (of(RobotConfig), to(rendezvous=replace(plan, bound=plan.bound + 1.0))))
+        plant(folder / name, (of(RobotConfig), later))
     assert found(audit(folder)) == [(None, "a", "config"), (None, "b", "config")]
 
 
@@ -871,7 +884,12 @@ def test_journals_that_are_none_are_refused(honest: Path, folder: Path) -> None:
     assert f"{WORLD_JOURNAL}: " in spoilt(folder, WORLD_JOURNAL, world[1:])
     scenario = load("paper-1")
     first, second = scenario.robots
-    for robots in ((first,), (first, first), (first, replace(second, role="a")), ()):
+    for robots in (
+        (first,),
+        (first, first),
+        (first, replace(second, encounter=replace(second.meeting, role="a"))),
+        (),
+    ):
         lone = encode(replace(scenario, robots=robots))
         assert f"{WORLD_JOURNAL}: " in spoilt(folder, WORLD_JOURNAL, [lone, *world[1:]])
 

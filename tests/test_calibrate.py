@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from agent.estimation.following import ClaimRule
 from compose.errors import USER_ERROR, UserError
 from compose.recording.estimating.calibration import (
     ASSUMED,
@@ -25,7 +26,6 @@ from compose.recording.estimating.estimate_run import estimated
 from compose.recording.estimating.noise_files import told_noise
 from compose.recording.estimating.radio_errors import PairErrors, range_calibration, true_errors
 from compose.recording.estimating.recorded_measurements import measurements
-from compose.recording.estimating.recording_estimator import ClaimRule
 from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.range_recording import Numbers, RangeRecording, TruePath
 from protocol.noise import Noise

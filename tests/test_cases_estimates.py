@@ -15,15 +15,15 @@ import pytest
 from numpy.typing import NDArray
 
 import tandem as api
+from agent.estimation import following
+from agent.estimation.following import ClaimRule
 from agent.estimation.gaussian.search import search
 from agent.estimation.posterior import Posterior
 from compose.errors import ENDED, NOT_LOCALISED, USER_ERROR, UserError
-from compose.recording.estimating import recording_estimator
 from compose.recording.estimating.calibration import calibrated
 from compose.recording.estimating.doubtful_units import doubtful_units
 from compose.recording.estimating.estimate_run import estimated
 from compose.recording.estimating.recorded_measurements import measurements
-from compose.recording.estimating.recording_estimator import ClaimRule
 from compose.recording.estimating.sound_odometry import sound
 from compose.recording.estimating.true_poses import true_pose, with_bridged_truth
 from compose.recording.ranging.range_files import read_ranges
@@ -205,11 +205,11 @@ def test_a_recording_that_contradicts_itself_is_searched_a_bounded_number_of_tim
         searched.append(given)
         return search(*given)
 
-    monkeypatch.setattr(recording_estimator, "search", counted)
-    monkeypatch.setattr(recording_estimator, "MOST_SEARCHES", 5)
+    monkeypatch.setattr(following, "search", counted)
+    monkeypatch.setattr(following, "MOST_SEARCHES", 5)
     found = estimated(measurements(with_ranges(recording, shuffled), None, "uwb", (0.0, 16.0)), ClaimRule())
     assert not any(row.claim for row in found.rows)
-    assert len(searched) <= 5 + len(recording_estimator.GROUP_SEARCHES)
+    assert len(searched) <= 5 + len(following.GROUP_SEARCHES)
 
 
 # --- all anchors ------------------------------------------------------------------------------------------

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from agent.estimation.following import ClaimRule
 from compose.launch.in_process import run_mission
 from compose.recording.estimating.estimate_rows import PoseEstimateRow
 from compose.recording.estimating.estimate_run import RecordingEstimate, estimated
 from compose.recording.estimating.recorded_measurements import measurements
-from compose.recording.estimating.recording_estimator import ClaimRule
 from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.range_recording import (
     FixedAnchor,
@@ -25,8 +25,9 @@ from compose.recording.ranging.range_recording import (
 from compose.recording.ranging.range_steps import relative
 from compose.scenario.scenario_file import parse
 from protocol.motion import Controls, Pose, step
+from tests.missions import own_ranges
 from tests.test_world_noise import near
-from world.sensors import anchor_ranges, mutual_ranges
+from world.sensors import mutual_ranges
 from world.tick import release
 
 LATE = Path(__file__).parent / "data" / "cases" / "late-ranges"
@@ -42,12 +43,12 @@ def test_late_ranges_are_those_of_the_poses_before() -> None:
     told = "anchor_sigma = 0.0\nmutual_sigma = 0.0\ngyro_bias = 0.1"
     late, prompt = near(f"range_delay = {DELAY_S}", told=told), near("", told=told)
     still = release(late).truth
-    assert anchor_ranges(still, late) == anchor_ranges(still, prompt), "the robots were at rest before"
+    assert own_ranges(still, late) == own_ranges(still, prompt), "the robots were at rest before"
     driven = Controls(0.3, 0.8), Controls(-0.2, 0.4)
     moved = still.moved(driven, 1.0)
     places = zip(still.local, driven, strict=True)
     early = [step(pose, one.v, one.omega, 1.0 - DELAY_S) for pose, one in places]
-    for i, rho in enumerate(anchor_ranges(moved, late)):
+    for i, rho in enumerate(own_ranges(moved, late)):
         anchor, origin = late.robots[i].anchor, still.origins[i]
         assert rho == pytest.approx(apart(early[i], Pose(anchor.x - origin.x, anchor.y - origin.y, 0.0)))
     (contact,) = mutual_ranges(moved, late, [(0, 1)])

@@ -19,6 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from agent.estimation.following import ClaimRule
 from agent.estimation.gaussian.joint_ranges import near_anchors
 from agent.estimation.gaussian.odometry_noise import track
 from agent.estimation.problem import Problem
@@ -31,7 +32,6 @@ from compose.recording.estimating.estimate_rows import PoseEstimate, PoseEstimat
 from compose.recording.estimating.estimate_run import RecordingEstimate, estimated
 from compose.recording.estimating.noise_files import AssumedNoise, RangeCorrection, told_noise
 from compose.recording.estimating.recorded_measurements import EPOCH_S, MOST_USED_ANCHORS, measurements
-from compose.recording.estimating.recording_estimator import ClaimRule
 from compose.recording.estimating.sound_odometry import GAP_MOTION_S, sound
 from compose.recording.estimating.true_poses import true_pose
 from compose.recording.ranging.range_files import read_ranges

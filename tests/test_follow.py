@@ -13,13 +13,13 @@ from pathlib import Path
 import pytest
 from mcap.writer import Writer
 
+from agent.estimation.following import ClaimRule
 from compose.errors import BROKEN_PIPE, STOPPED_STATUS, USER_ERROR
 from compose.recording.estimating import estimate_run
 from compose.recording.estimating.estimate_rows import PoseEstimateRow, estimate_csv
 from compose.recording.estimating.estimate_run import StreamEstimate, estimated
 from compose.recording.estimating.noise_files import told_noise
 from compose.recording.estimating.recorded_measurements import measurements
-from compose.recording.estimating.recording_estimator import ClaimRule
 from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.range_mcap import rows_as_they_arrive
 from compose.recording.ranging.range_recording import RangeRecording

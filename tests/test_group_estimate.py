@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import tandem as api
+from agent.estimation.following import ClaimRule
 from compose.errors import ENDED, NOT_LOCALISED
 from compose.recording.estimating.calibration import ASSUMED, calibrated_by_fit
 from compose.recording.estimating.estimate_rows import estimate_csv
 from compose.recording.estimating.estimate_run import RecordingEstimate, estimated
 from compose.recording.estimating.recorded_measurements import measurements
-from compose.recording.estimating.recording_estimator import ClaimRule
 from compose.recording.ranging.range_recording import (
     FixedAnchor,
     RangeRecording,

@@ -181,7 +181,10 @@ def test_another_visitor_than_the_planned_one_is_found(group: Journals) -> None:
         scenario,
         meetings=(*scenario.meetings[:-1], replace(last, visitor=other)),
         robots=tuple(
-            [replace(one, peer=other) if one.id == last.visited else one for one in scenario.robots]
+            [
+                replace(one, encounter=replace(one.meeting, peer=other)) if one.id == last.visited else one
+                for one in scenario.robots
+            ]
         ),
     )
     found = audited(with_scenario(group, changed))
@@ -203,7 +206,10 @@ def test_orbits_that_are_not_the_planned_ones_are_found(group: Journals) -> None
     scenario = scenario_of(group)
     last = scenario.meetings[-1].visited
     other = replace(scenario.robot(last).rendezvous, bound=1.0)
-    robots = [replace(one, rendezvous=other) if one.id == last else one for one in scenario.robots]
+    robots = [
+        replace(one, encounter=replace(one.meeting, rendezvous=other)) if one.id == last else one
+        for one in scenario.robots
+    ]
     found = audited(with_scenario(group, replace(scenario, robots=tuple(robots))))
     assert {(None, last, "scenario"), (None, last, "config")} <= set(found)
 

@@ -347,14 +347,14 @@ def test_the_report_of_a_robot_is_the_one_to_the_robot_that_it_meets(crowd: Run)
 
 
 def test_the_mutual_range_is_that_to_the_robot_of_the_present_meeting(crowd: Run) -> None:
+    setup, known = crowd.setup, run_data(crowd)
+    assert setup is not None
     for scene in scenes_of(crowd):
         for player in scene.players:
             assert player.peer is not None
-            one = Numbers.of(player, crowd.scenario.robot(player.robot).anchor, scene.held_by(player.peer))
+            one = Numbers.in_scene(scene, setup.robot_setup(player.robot), setup)
             ranges = [contact.range for contact in player.contacts if contact.peer == player.peer]
             assert [one.mutual_range_m] == ranges or not ranges
-    setup, known = crowd.setup, run_data(crowd)
-    assert setup is not None
     (curves,) = series(setup, known, 0, known.last, ["a"]).robots
     numbers = [scene.player("a").contacts for scene in scenes_of(crowd)]
     assert len(curves.curves["mutual_range_m"].low) == len(numbers)

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from agent.estimation.fit import Fit
+from agent.estimation.following import ClaimRule
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from compose.recording.estimating.estimate_run import estimated
 from compose.recording.estimating.recorded_measurements import measurements
-from compose.recording.estimating.recording_estimator import ClaimRule
 from compose.recording.ranging.range_files import read_ranges
 from protocol.motion import Pose, step
 

@@ -32,7 +32,7 @@ BELOW = {
 }
 """The packages of the project that each package may import."""
 
-BUDGETS = {"protocol": 4_362, "agent": 17_260, "world": 4_275, "compose": 26_795, "tandem": 1_510}
+BUDGETS = {"protocol": 4_567, "agent": 18_230, "world": 4_415, "compose": 27_426, "tandem": 1_510}
 """The largest number of lines of Python and C of each package. Raising one needs a reason in the commit."""
 
 SHELL = {
@@ -296,9 +296,9 @@ def test_robot_states_and_worlds_are_immutable() -> None:
 
 ASKED_IN = {
     "planner_name": set(),
-    "exact": {"agent.planning.state"},
+    "exact": {"agent.planning.state", "agent.estimation.gaussian.joint_ranges"},
 }
-"""The modules of the agent that read these fields: they select a planner and an estimator."""
+"""The modules of the agent that read these fields: they select a planner, an estimator, or a claim."""
 
 
 @pytest.mark.parametrize("field", ASKED_IN)

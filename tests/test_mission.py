@@ -22,9 +22,9 @@ from protocol.messages import Localised
 from protocol.mission import OPTIMAL_TURN, Mission, PlannerName, third_point_turn_rate
 from protocol.motion import Pose, compose, step
 from protocol.orbits import rendezvous, tick_budget
-from tests.missions import mission_of
+from tests.missions import mission_of, own_ranges
 from tests.steps import planner_of, steps
-from world.sensors import anchor_ranges, mutual_ranges
+from world.sensors import mutual_ranges
 from world.truth import Truth
 from world.world_journal import Tick
 
@@ -168,7 +168,7 @@ def test_a_range_is_taken_up_to_r_and_at_r() -> None:
     def at(a: Pose, b: Pose) -> Truth:
         return Truth(0, (a, b), (scenario.robots[0].anchor,) * 2)
 
-    assert anchor_ranges(at(Pose(3.0, 0.0, 0.0), Pose(10.0, -beyond, 0.0)), scenario) == [3.0, None]
+    assert own_ranges(at(Pose(3.0, 0.0, 0.0), Pose(10.0, -beyond, 0.0)), scenario) == [3.0, None]
     assert mutual_ranges(at(Pose(0.0, 0.0, 0.0), Pose(0.0, 3.0, 0.0)), scenario, [(0, 1)]) == [(3.0,)]
     assert mutual_ranges(at(Pose(0.0, 0.0, 0.0), Pose(0.0, beyond, 0.0)), scenario, [(0, 1)]) == [None]
 

@@ -28,11 +28,12 @@ from protocol.motion import REST, Controls, Covariance, Pose, step
 from protocol.noise import Noise, VelocityNoise
 from protocol.wire import decode, encode
 from tests.commands import SECTION_IV, journals, tandem
+from tests.missions import own_ranges
 from tests.series import series
 from world import random_streams
 from world.random_streams import gaussian, uniform
 from world.scenario import Scenario
-from world.sensors import Mutual, anchor_ranges, executed, in_contact, mutual_ranges, odometry
+from world.sensors import Mutual, executed, in_contact, mutual_ranges, odometry
 from world.simulation import Simulation
 from world.tick import World, advance, observations, release
 from world.truth import Truth
@@ -83,7 +84,7 @@ def at_tick(scenario: Scenario, tick: int) -> Truth:
 
 def to_anchors(scenario: Scenario, ticks: int = N) -> list[list[float | None]]:
     """Return the anchor ranges of every robot, tick by tick."""
-    told = [anchor_ranges(at_tick(scenario, tick), scenario) for tick in range(ticks)]
+    told = [own_ranges(at_tick(scenario, tick), scenario) for tick in range(ticks)]
     return [list(ranges) for ranges in zip(*told, strict=True)]
 
 
@@ -211,7 +212,7 @@ def test_other_robots_shift_no_draw() -> None:
         replace(
             one,
             id=name,
-            peer=peer,
+            encounter=replace(one.meeting, peer=peer),
             given_anchor=replace(one.anchor, y=90.0),
             start=replace(one.start, y=90.0),
         )
@@ -219,8 +220,8 @@ def test_other_robots_shift_no_draw() -> None:
     ]
     four = replace(two, robots=(*far, *two.robots))
     for tick in range(20):
-        assert anchor_ranges(at_tick(four, tick), four)[2:] == anchor_ranges(at_tick(two, tick), two)
-        assert anchor_ranges(at_tick(four, tick), four)[:2] != anchor_ranges(at_tick(two, tick), two)
+        assert own_ranges(at_tick(four, tick), four)[2:] == own_ranges(at_tick(two, tick), two)
+        assert own_ranges(at_tick(four, tick), four)[:2] != own_ranges(at_tick(two, tick), two)
         _, ours = mutual_ranges(at_tick(four, tick), four, four.pairs())
         assert [ours] == mutual_ranges(at_tick(two, tick), two, two.pairs())
 
@@ -352,11 +353,11 @@ def test_who_is_in_range_follows_from_the_distance_and_not_from_what_is_measured
     for tick in range(100):
         on_it = Truth(tick, (rim, Pose(0.0, 0.0, 0.0)), origins)
         off_it = Truth(tick, (beyond, Pose(0.0, 0.0, 0.0)), origins)
-        assert anchor_ranges(on_it, scenario)[0] is not None
+        assert own_ranges(on_it, scenario)[0] is not None
         assert isinstance(mutual_ranges(on_it, scenario, [(0, 1)])[0], Mutual)
-        assert anchor_ranges(off_it, scenario)[0] is None
+        assert own_ranges(off_it, scenario)[0] is None
         assert mutual_ranges(off_it, scenario, [(0, 1)]) == [None]
-    measured = [anchor_ranges(Truth(tick, (rim, rim), origins), scenario)[0] or 0.0 for tick in range(100)]
+    measured = [own_ranges(Truth(tick, (rim, rim), origins), scenario)[0] or 0.0 for tick in range(100)]
     assert min(measured) < reach < max(measured)
 
 
@@ -364,7 +365,7 @@ def test_a_range_is_never_negative() -> None:
     scenario = near("anchor_sigma = 0.5")
     origins = release(scenario).truth.origins
     here = Pose(0.01, 0.0, 0.0)
-    told = known([anchor_ranges(Truth(tick, (here, here), origins), scenario)[0] for tick in range(100)])
+    told = known([own_ranges(Truth(tick, (here, here), origins), scenario)[0] for tick in range(100)])
     assert told.min() == 0.0
     assert 30 < (told > 0.0).sum() < 70
 
@@ -455,7 +456,7 @@ def test_the_largest_noisy_motion_fits_an_observation() -> None:
     fastest = 0.0
     for tick in range(2000):
         done = odometry(executed(Controls(1e6, 1e6), scenario, "a", tick), scenario, "a", tick + 1)
-        observation = Observation(tick, "a", done, anchor_ranges(at_tick(scenario, tick), scenario)[0])
+        observation = Observation(tick, "a", done, own_ranges(at_tick(scenario, tick), scenario)[0])
         assert decode(encode(observation), Observation) == observation
         fastest = max(fastest, abs(done.v))
     assert fastest > 3e6

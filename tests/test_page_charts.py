@@ -120,6 +120,7 @@ def test_residuals_are_the_ranges_less_those_of_the_first_poses(noisy: Path) -> 
     known_mutual = 0
     for of_robot in series_of(run).robots:
         setup = run.setup.robot_setup(of_robot.robot)
+        assert setup.peer is not None
         for tick in range(run.length):
             one, peer = held[of_robot.robot][tick], held[setup.peer][tick]
             measured = run.observations[tick][of_robot.robot].anchor_range

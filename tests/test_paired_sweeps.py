@@ -38,6 +38,7 @@ OTHER: dict[str, Any] = {
     "mission.confidence": 0.99,
     "mission.safety_distance": 0.3,
     "mission.tolerates": 1,
+    "mission.survey": 0.07,
     "mission.noise.range_bias": 0.1,
     "mission.noise.pair_bias": 0.1,
     "mission.noise.range_scale": 0.01,
@@ -124,19 +125,21 @@ def seen(scenario: Scenario) -> list[list[Observation]]:
     return found
 
 
-@pytest.mark.parametrize("of_group", [False, True])
-def test_what_robots_observe_does_not_depend_on_fields_that_the_world_does_not_use(
-    of_group: bool,
-) -> None:
-    base = scenario_table("random-group" if of_group else "random")
+BASES = {"group.attack": "random-group", "mission.tolerates": "random-group", "mission.survey": "survey"}
+"""The scenarios of the fields that pairs do not have."""
+
+
+@pytest.mark.parametrize("name", ["random", "random-group", "survey"])
+def test_what_robots_observe_does_not_depend_on_fields_that_the_world_does_not_use(name: str) -> None:
+    base = scenario_table(name)
     base["world"] = {"noise": ALL_NOISE, "radio": {"model": "fading"}}
     base["mission"]["noise"] = {"anchor_sigma": 0.05, "mutual_sigma": 0.05, "gyro_bias": 0.0002}
     base["fault"] = [{"loss": 0.3, "delay": [0, 2]}]
-    if not of_group:
+    if name == "random":
         base["robot"][1]["anchor"] = [4.0, 0.0]  # in range of each other soon
     as_it_is = seen(validate(base, "base").seeded(7))
     for field, value in OTHER.items():
-        if of_group != (field in ("group.attack", "mission.tolerates")):
+        if BASES.get(field, "random") != name:
             continue
         path = field.replace("robot.", "robot[0].")
         table = with_value(base, steps(path, base), value)
@@ -145,7 +148,7 @@ def test_what_robots_observe_does_not_depend_on_fields_that_the_world_does_not_u
         (found,) = spec.validated(sweep, "x", Path(), base=base).axes
         assert found.paired, field
         assert seen(validate(table, field).seeded(7)) == as_it_is, field
-    assert any(one.contacts for sensed in as_it_is for one in sensed) or of_group
+    assert any(one.contacts for sensed in as_it_is for one in sensed) or name == "random-group"
 
 
 def test_an_axis_is_paired_unless_what_is_drawn_depends_on_it() -> None:

@@ -34,11 +34,12 @@ from protocol.messages import Ranged, Undecided
 from protocol.motion import Pose, compose, inverse
 from protocol.noise import Noise
 from protocol.wire import encode
+from tests.missions import own_ranges
 from tests.pair_starts import alone
 from tests.series import series
 from tests.surveys import ODOMETRY, SIGMA, WHEELS, assert_localised, scenario_of, states, survey
 from world.scenario import Scenario
-from world.sensors import anchor_ranges, mutual_ranges
+from world.sensors import mutual_ranges
 from world.tick import World, advance, observations, release
 
 NOISES = {
@@ -59,7 +60,7 @@ PLANNER = Assured()
 def first_ranges(scenario: Scenario, robot: int, ticks: int) -> list[float | None]:
     """Return the anchor ranges of a robot that stays at its start, in the first ticks."""
     truth = release(scenario).truth
-    return [anchor_ranges(replace(truth, tick=tick), scenario)[robot] for tick in range(ticks)]
+    return [own_ranges(replace(truth, tick=tick), scenario)[robot] for tick in range(ticks)]
 
 
 def without(noise: Noise, scenario: Scenario) -> Scenario:
@@ -239,7 +240,7 @@ def test_a_robot_without_detection_where_its_anchor_should_be_drives_back() -> N
         back = len(done) - 1 - done[::-1].index("homing")
         assert done[back + 1] in ("straight", "surveying", "aligning"), "and is ranged again"
         place = ("a", "b").index(robot)
-        assert anchor_ranges(recording.ticks[back + 1].truth, recording.scenario)[place] is not None
+        assert own_ranges(recording.ticks[back + 1].truth, recording.scenario)[place] is not None
     assert_localised(recording)
 
 

@@ -353,7 +353,7 @@ def test_check_driver_refuses_a_robot_without_an_anchor(tmp_path: Path) -> None:
     scenario.write_text(FILE, encoding="utf-8")
     refused = tandem_command("check-driver", "docs.rover:Rover", "--mission", scenario, "--robot", "u")
     assert refused.status == 2
-    assert "--robot: u has no anchor, and the checks need ranges to one" in refused.err
+    assert "--robot: u has no anchor of its own, and the checks need ranges to one" in refused.err
 
 
 def test_a_driver_may_report_the_range_to_an_anchor_that_its_robot_does_not_have() -> None:

@@ -26,6 +26,7 @@ from protocol.motion import REST, Controls, Pose
 from protocol.noise import Noise, VelocityNoise
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from tests.commands import journals, tandem
+from tests.missions import own_ranges
 from tests.series import series
 from tests.test_noise import (
     APART,
@@ -45,7 +46,7 @@ from tests.test_noise import (
 from world import random_streams
 from world.random_streams import correlated, random_walk
 from world.scenario import Scenario
-from world.sensors import anchor_ranges, executed, mutual_ranges, odometry
+from world.sensors import executed, mutual_ranges, odometry
 from world.tick import World, advance, observations, release
 from world.truth import Truth
 from world.world_noise import WorldNoise
@@ -246,9 +247,7 @@ def reaches(scenario: Scenario, rho: float, direction: float, heading: float = 0
     """Return whether there is a range to the anchor of a and to b, if a is `rho` m from both."""
     x, y = rho * math.cos(direction), rho * math.sin(direction)
     truth = Truth(0, (Pose(x, y, heading), Pose(2.0 * x, 2.0 * y, 0.0)), release(scenario).truth.origins)
-    return anchor_ranges(truth, scenario)[0] is not None, mutual_ranges(truth, scenario, [(0, 1)])[
-        0
-    ] is not None
+    return own_ranges(truth, scenario)[0] is not None, mutual_ranges(truth, scenario, [(0, 1)])[0] is not None
 
 
 def test_the_true_sensing_range_is_a_multiple_of_the_assumed_one() -> None:
@@ -279,10 +278,10 @@ def test_an_anchor_stands_elsewhere_than_the_robots_are_told() -> None:
     offsets = []
     for seed in range(300):
         scenario = near("anchor_sigma = 0\nsurvey_error = {a = 0.3}", seed=seed)
-        (x, y), b = scenario.sensors.survey
+        (x, y), b = scenario.sensors.survey.values()
         assert math.hypot(x, y) == pytest.approx(0.3)
         assert b == (0.0, 0.0)
-        told = known([anchor_ranges(at_tick(scenario, 0), scenario)[0]])[0]
+        told = known([own_ranges(at_tick(scenario, 0), scenario)[0]])[0]
         assert told == pytest.approx(math.hypot(RHO_A - x, y))
         assert scenario.config("a").anchor == scenario.robots[0].anchor
         offsets.append(math.atan2(y, x))
@@ -377,7 +376,7 @@ def streams(monkeypatch: pytest.MonkeyPatch, scenario: Scenario) -> set[str]:
     random_streams._remembered.cache_clear()
     monkeypatch.setattr(random_streams, "_uniforms", noted)
     for tick in range(3):
-        anchor_ranges(at_tick(scenario, tick), scenario)
+        own_ranges(at_tick(scenario, tick), scenario)
         mutual_ranges(at_tick(scenario, tick), scenario, scenario.pairs())
         done = executed(Controls(0.5, 0.5), scenario, "a", tick)
         odometry(done, scenario, "a", tick + 1)

@@ -82,7 +82,8 @@ class WorldProcess:
         self._timeout = timeout
         self._inbox = inbox
         self._robots = [robot.id for robot in scenario.robots]
-        self._peers = {robot.id: robot.peer for robot in scenario.robots}
+        self._peers = {one.id: one.encounter.peer if one.encounter else one.id for one in scenario.robots}
+        """The peer of each robot, which repeats its Reports; in a team, it is the robot itself."""
         self._repeat = self._repeat_to_all = math.inf
         """The times of the next repetition to robots that have not answered, and to all robots."""
         self._alive: set[str] = set()

@@ -103,7 +103,7 @@ def decide_outcome(
         for robot in scenario.robots
         if robot.id not in verdicts
         and not scenario.is_dead(robot.id, truth.tick)
-        and (scenario.meetings or not isinstance(verdicts.get(robot.peer), Undecided | Inconsistent))
+        and (not scenario.in_pairs or not isinstance(verdicts.get(robot.peer), Undecided | Inconsistent))
     ]
     if open_cases and truth.tick < scenario.max_ticks:
         return None
@@ -120,7 +120,7 @@ def decide_outcome(
     if main is None:
         main = next((_dead(one) for one in scenario.deaths if one.robot not in verdicts), None)
     causes = [main] if main is not None else []
-    if main is not None and scenario.meetings:
+    if main is not None and not scenario.in_pairs:
         named = open_cases if main.code == "max-ticks" else main.robots[:1]
         causes += _others_not_localised(scenario, verdicts, truth.tick, named)
     return mission_end(truth.tick, causes)
@@ -128,7 +128,8 @@ def decide_outcome(
 
 def _shortfalls(scenario: Scenario, verdicts: Mapping[str, Verdict]) -> dict[str, Cause]:
     """Return why robots are not localised by their verdicts, in the order of `scenario`."""
-    causes = [shortfall(one.id, verdicts.get(one.id), scenario.mission, one.peer) for one in scenario.robots]
+    met = [(one.id, one.encounter.peer if one.encounter else None) for one in scenario.robots]
+    causes = [shortfall(one, verdicts.get(one), scenario.mission, peer) for one, peer in met]
     return {one.robots[0]: one for one in causes if one is not None}
 
 

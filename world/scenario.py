@@ -12,12 +12,12 @@ import msgspec
 from msgspec import Meta
 
 from protocol.attack import Attack
-from protocol.messages import MAX_MEMBERS, Appointment, Member, RobotConfig
+from protocol.messages import MAX_MEMBERS, Appointment, Member, Pairing, RobotConfig, Team, TeamAnchor
 from protocol.mission import Anchor, Mission, Options, PlannerName, Role
 from protocol.motion import Pose
 from protocol.orbits import Rendezvous
 from protocol.sweep_strips import SweptArea
-from protocol.units import RobotId, Tick, Time
+from protocol.units import Clearance, RobotId, Tick, Time
 from world.faults import Fault
 from world.radio_models import RADIO_MODELS
 from world.range_models import RANGE_MODELS
@@ -39,18 +39,38 @@ class RobotSpec(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fie
 
     id: RobotId
     """The name of the robot."""
-    peer: RobotId
-    """The robot that it has to meet."""
-    role: Role
-    """The role of the robot in the pair."""
+    encounter: Pairing | None
+    """The robot that it has to meet; None in a team."""
     given_anchor: Anchor | None
     """The position of its anchor in <W>, in m; None if it has none, as some robots of a group."""
     start: Pose
     """The true pose at tick 0 in <W>, which is unknown to the robot: m, m and rad."""
-    rendezvous: Rendezvous
-    """The orbits of the pair."""
     attack: Attack | None = None
     """The false data that the robot injects into its Reports; None for an honest robot."""
+    ranges: tuple[RobotId, ...] = ()
+    """The anchors of a team that it may range."""
+
+    @property
+    def meeting(self) -> Pairing:
+        """The robot that it has to meet. Raises LookupError if there is none."""
+        if self.encounter is None:
+            raise LookupError(f"{self.id} has no peer")
+        return self.encounter
+
+    @property
+    def peer(self) -> RobotId:
+        """The robot that it has to meet."""
+        return self.meeting.peer
+
+    @property
+    def role(self) -> Role:
+        """The role of the robot in the pair."""
+        return self.meeting.role
+
+    @property
+    def rendezvous(self) -> Rendezvous:
+        """The orbits of the pair."""
+        return self.meeting.rendezvous
 
     @property
     def anchor(self) -> Anchor:
@@ -58,11 +78,6 @@ class RobotSpec(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fie
         if self.given_anchor is None:
             raise LookupError(f"{self.id} has no anchor")
         return self.given_anchor
-
-    @property
-    def home(self) -> Anchor:
-        """The position of its anchor, or of the start of a robot that has none, in <W>, in m."""
-        return self.given_anchor or Anchor(self.start.x, self.start.y)
 
 
 GIVES_UP = 0.97
@@ -107,6 +122,28 @@ class Death(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=
     """The robot."""
     tick: Tick
     """The tick from which on it is dead."""
+
+
+class PlacedAnchor(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """An anchor of a team."""
+
+    told: TeamAnchor
+    """The anchor, as the robots know it."""
+    place: Anchor
+    """Its true position in <W>, in m."""
+
+
+class PlannedTeam(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """The anchors of a team, and what its robots are told."""
+
+    anchors: tuple[PlacedAnchor, ...]
+    """The anchors, in the order of the scenario."""
+    origin: RobotId | None
+    """The robot whose pose at tick 0 is the origin of <W>; None if anchors determine <W>."""
+    bound: Time
+    """The bound in s of the time at which all robots are localised, with exact sensors."""
+    survey: Clearance = 0.0
+    """The sigma (m) up to which anchors that are not surveyed are measured; 0: robots do not wait for it."""
 
 
 class Scenario(
@@ -154,6 +191,8 @@ class Scenario(
     """The meetings that confirm poses; None if robots claim the pose that they know."""
     least_bound: Time = 0.0
     """A lower bound in s of the time that any plan of the meetings allows; 0 if the robots form pairs."""
+    team: PlannedTeam | None = None
+    """The anchors of robots that share all measurements; None if they form pairs or a group."""
 
     @cached_property
     def ranging(self) -> RangeModel | None:
@@ -171,14 +210,50 @@ class Scenario(
     def sensors(self) -> SensorModel:
         """The sensors of all robots, with everything that is drawn once for the mission."""
         ids = [robot.id for robot in self.robots]
+        ranged = [(one, name) for one, known in zip(ids, self.ranged, strict=True) for name, _ in known]
         return sensor_model(
-            self.mission, self.world_noise or WorldNoise(), ids, self.radio_pairs(), self.seed
+            self.mission, self.world_noise or WorldNoise(), ids, ranged, self.radio_pairs(), self.seed
         )
+
+    @cached_property
+    def ranged(self) -> tuple[tuple[tuple[str, Anchor], ...], ...]:
+        """The anchors that each robot may range, with their true positions in <W>, in m.
+
+        The name of a robot's own anchor is that of the robot.
+        """
+        anchors = self.team.anchors if self.team is not None else ()
+        return tuple(
+            [
+                ((one.id, one.given_anchor),)
+                if one.given_anchor is not None
+                else tuple([(each.told.id, each.place) for each in anchors if each.told.id in one.ranges])
+                for one in self.robots
+            ]
+        )
+
+    def home(self, place: int) -> Anchor:
+        """Return the position of a robot's anchor, or of its start if it has none, in <W>, in m."""
+        robot = self.robots[place]
+        return robot.given_anchor or Anchor(robot.start.x, robot.start.y)
+
+    @property
+    def t_max(self) -> float:
+        """T_max in s: the largest bound of the meetings of all pairs; in a team, that of its duration."""
+        if self.team is not None:
+            return self.team.bound
+        return max([robot.rendezvous.bound for robot in self.robots])
+
+    @property
+    def in_pairs(self) -> bool:
+        """True if the robots form pairs: others range all that are in contact, and withdraw claims."""
+        return not self.meetings and self.team is None
 
     @property
     def unanchored(self) -> tuple[str, ...]:
         """The robots without an anchor, in the order of the scenario."""
-        return tuple([robot.id for robot in self.robots if robot.given_anchor is None])
+        return tuple(
+            [one.id for one in self.robots if one.given_anchor is None and one.encounter is not None]
+        )
 
     @cached_property
     def _dead_from(self) -> dict[str, int]:
@@ -196,11 +271,12 @@ class Scenario(
         index = {robot.id: i for i, robot in enumerate(self.robots)}
         if self.meetings:
             return tuple((index[one.visitor], index[one.visited]) for one in self.meetings)
-        return tuple((index[one.id], index[one.peer]) for one in self.robots if one.role == "a")
+        met = [one for one in self.robots if one.encounter is not None]
+        return tuple((index[one.id], index[one.peer]) for one in met if one.role == "a")
 
     def radio_pairs(self) -> tuple[tuple[int, int], ...]:
         """Return the pairs that measure their range if it is at most R: the peers, or any two of a group."""
-        return tuple(combinations(range(len(self.robots)), 2)) if self.meetings else self.pairs()
+        return self.pairs() if self.in_pairs else tuple(combinations(range(len(self.robots)), 2))
 
     def robot(self, robot: str) -> RobotSpec:
         """Return the specification of `robot`. Raises KeyError if there is no such robot."""
@@ -221,31 +297,39 @@ class Scenario(
         """
         own = self.robot(robot)
         visits = [one.visited for one in self.meetings if one.visitor == robot and one.visited != own.peer]
+        team = self.team
         retries = [one for one in self.retries if robot in (one.visitor, one.visited)]
         confirming = self.confirmation.visits if self.confirmation is not None else ()
         sweep = self.planned_sweep.sweep if self.planned_sweep is not None else None
         sweepers = self.planned_sweep.sweepers if self.planned_sweep is not None else ()
         return RobotConfig(
             robot=own.id,
-            peer=own.peer,
-            role=own.role,
+            encounter=own.encounter,
             given_anchor=own.given_anchor,
-            peer_anchor=self.robot(own.peer).anchor,
             mission=self.mission,
             planner_name=self.planner_name,
-            rendezvous=own.rendezvous,
             attack=own.attack,
             tick_s=tick_s,
             planner_options=self.planner_options,
             members=self.members,
             visits=tuple(visits),
             retries=tuple(retries),
-            gives_up=self.max_ticks * self.mission.period * GIVES_UP if self.meetings else 0.0,
+            gives_up=0.0 if self.in_pairs else self.max_ticks * self.mission.period * GIVES_UP,
             tolerates=self.tolerates,
             confirmations=tuple([one for one in confirming if one.visitor == robot]),
             unanchored=self.unanchored,
             sweep=sweep,
             part=sweepers.index(robot) if robot in sweepers else 0,
+            team=None
+            if team is None
+            else Team(
+                tuple([one.id for one in self.robots]),
+                tuple([one.told for one in team.anchors]),
+                team.origin,
+                team.bound,
+                team.survey,
+            ),
+            ranges=own.ranges,
         )
 
     @cached_property

@@ -79,14 +79,14 @@ class SensorModel(msgspec.Struct, frozen=True):
     """The true sensing range in m."""
     period: float
     """The duration of a tick in s."""
-    survey: tuple[tuple[float, float], ...]
-    """The true position of each robot's anchor less the one that the robots are told, in m."""
-    anchors: tuple[RangeSensor, ...]
-    """The ranges of each robot to its anchor."""
+    survey: dict[str, tuple[float, float]]
+    """The true position of each anchor less that of the scenario, in m, by its name."""
+    anchors: dict[tuple[str, str], RangeSensor]
+    """The ranges of each robot to each anchor that it may range, by their names."""
     mutual: dict[tuple[int, int], RangeSensor]
     """The ranges of each pair of robots that may measure each other, by their places in the scenario."""
-    anchor_lobes: tuple[Lobes, ...]
-    """The pattern of each robot's anchor."""
+    anchor_lobes: dict[str, Lobes]
+    """The pattern of each anchor, by its name."""
     robot_lobes: tuple[Lobes, ...]
     """The pattern of each robot."""
     odometers: dict[str, Odometer]
@@ -189,13 +189,16 @@ def sensor_model(
     mission: Mission,
     world: WorldNoise,
     ids: Sequence[str],
+    ranged: Sequence[tuple[str, str]],
     pairs: Sequence[tuple[int, int]],
     seed: int,
 ) -> SensorModel:
     """Return the sensors of a mission.
 
-    `ids` are those of the robots; `pairs` are pairs of places in it, those that may measure each other.
+    `ids` are those of the robots; `ranged` are each robot with each anchor that it may range, where a robot's
+    own anchor has its name. `pairs` are pairs of places in `ids`, those that may measure each other.
     """
+    anchors = list(dict.fromkeys([anchor for _, anchor in ranged]))
     noise = world.shared(mission.noise)
     # A robot with one partner keys the errors of their ranges; in a group, both robots do.
     alone = len(dict(pairs)) == len(pairs)
@@ -237,21 +240,19 @@ def sensor_model(
         exact=noise.exact and world.is_shared,
         reach=world.sensing_range_factor * mission.sensing_range,
         period=mission.period,
-        survey=tuple([surveyed(robot) for robot in ids]),
-        anchors=tuple(
-            [
-                ranging(
-                    "anchor",
-                    noise.anchor_sigma,
-                    robot,
-                    of_robot(world.anchor_bias, robot),
-                    of_robot(world.anchor_scale, robot),
-                    ("robot", robot),
-                    ("anchor", robot),
-                )
-                for robot in ids
-            ]
-        ),
+        survey={anchor: surveyed(anchor) for anchor in anchors},
+        anchors={
+            (robot, anchor): ranging(
+                "anchor",
+                noise.anchor_sigma,
+                robot if robot == anchor else f"{robot}-{anchor}",
+                of_robot(world.anchor_bias, robot),
+                of_robot(world.anchor_scale, robot),
+                ("robot", robot),
+                ("anchor", anchor),
+            )
+            for robot, anchor in ranged
+        },
         mutual={
             (i, j): ranging(
                 "mutual",
@@ -264,7 +265,7 @@ def sensor_model(
             )
             for (i, j), key in zip(pairs, keys, strict=True)
         },
-        anchor_lobes=tuple([lobes("anchor", robot) for robot in ids]),
+        anchor_lobes={anchor: lobes("anchor", anchor) for anchor in anchors},
         robot_lobes=tuple([lobes("robot", robot) for robot in ids]),
         odometers={
             robot: Odometer(

@@ -9,6 +9,8 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from protocol.messages import NamedRange
+from protocol.mission import Anchor
 from protocol.motion import REST, Controls
 from protocol.noise import VelocityNoise
 from world.near_pairs import near_pairs
@@ -19,39 +21,39 @@ from world.truth import Truth
 from world.world_models import Radios, RangeModel
 
 
-def anchor_ranges(truth: Truth, scenario: Scenario) -> list[float | None]:
-    """Return the measured range of each robot to its own anchor (eq. (1b)), in m; None if there is none."""
-    sensors, model, radios = scenario.sensors, scenario.ranging, None
-    if sensors.exact and model is None:
-        return [
-            None
-            if (anchor := robot.given_anchor) is None
-            else _exact_range(pose.x - (anchor.x - at.x), pose.y - (anchor.y - at.y), sensors.reach)
-            for pose, at, robot in zip(truth.local, truth.origins, scenario.robots, strict=True)
+def anchor_ranges(truth: Truth, scenario: Scenario) -> list[list[NamedRange]]:
+    """Return the measured ranges of each robot to its anchors (eq. (1b)), of those in range."""
+    return [
+        [
+            NamedRange(name, rho)
+            for name, anchor in ranged
+            if (rho := _anchor_range(truth, scenario, i, name, anchor)) is not None
         ]
-    lobed, late = sensors.world.lobe_depth, truth.before(sensors.world.range_delay)
-    ranges: list[float | None] = []
-    for i, (pose, origin, robot) in enumerate(zip(truth.local, truth.origins, scenario.robots, strict=True)):
-        if robot.given_anchor is None:
-            ranges.append(None)
-            continue
-        anchor, (off_x, off_y) = robot.given_anchor, sensors.survey[i]
-        x, y = pose.x - (anchor.x - origin.x) - off_x, pose.y - (anchor.y - origin.y) - off_y
-        rho = math.hypot(x, y)
-        pattern = sensors.anchor_lobes[i].reach(math.atan2(y, x)) if lobed else 1.0
-        if model is not None:
-            surveyed = (anchor.x + off_x, anchor.y + off_y)
-            radios = Radios(
-                f"anchor/{robot.id}", (x + surveyed[0], y + surveyed[1]), surveyed, truth.tick, scenario.seed
-            )
-        if not sensors.detects("anchor", robot.id, truth.tick, rho, pattern, model, radios):
-            ranges.append(None)
-        elif sensors.exact:
-            ranges.append(rho)
-        else:
-            rho = math.hypot(x + (late[i].x - pose.x), y + (late[i].y - pose.y))
-            ranges.append(_modelled(sensors.measured(sensors.anchors[i], rho, truth.tick), model, radios))
-    return ranges
+        for i, ranged in enumerate(scenario.ranged)
+    ]
+
+
+def _anchor_range(truth: Truth, scenario: Scenario, i: int, name: str, anchor: Anchor) -> float | None:
+    """Return the measured range of robot `i` to the anchor called `name`, in m; None if there is none."""
+    sensors, model, radios = scenario.sensors, scenario.ranging, None
+    robot, pose, origin = scenario.robots[i].id, truth.local[i], truth.origins[i]
+    if sensors.exact and model is None:
+        return _exact_range(pose.x - (anchor.x - origin.x), pose.y - (anchor.y - origin.y), sensors.reach)
+    sensor, (off_x, off_y) = sensors.anchors[robot, name], sensors.survey[name]
+    x, y = pose.x - (anchor.x - origin.x) - off_x, pose.y - (anchor.y - origin.y) - off_y
+    rho = math.hypot(x, y)
+    pattern = sensors.anchor_lobes[name].reach(math.atan2(y, x)) if sensors.world.lobe_depth else 1.0
+    if model is not None:
+        surveyed = (anchor.x + off_x, anchor.y + off_y)
+        at = (x + surveyed[0], y + surveyed[1])
+        radios = Radios(f"anchor/{sensor.robot}", at, surveyed, truth.tick, scenario.seed)
+    if not sensors.detects("anchor", sensor.robot, truth.tick, rho, pattern, model, radios):
+        return None
+    if sensors.exact:
+        return rho
+    late = truth.before(sensors.world.range_delay)[i]
+    rho = math.hypot(x + (late.x - pose.x), y + (late.y - pose.y))
+    return _modelled(sensors.measured(sensor, rho, truth.tick), model, radios)
 
 
 class Mutual(NamedTuple):
@@ -69,7 +71,7 @@ def in_contact(
     `pairs` are all that may measure each other. In a group, those that are too far apart are not tried, and
     none with a dead robot.
     """
-    if scenario.meetings and scenario.range_model is None:
+    if not scenario.in_pairs and scenario.range_model is None:
         pairs = near_pairs([(pose.x, pose.y) for pose in truth.local], scenario.sensors.reach)
     if scenario.deaths:
         dead = [scenario.is_dead(robot.id, truth.tick) for robot in scenario.robots]

@@ -46,7 +46,8 @@ class World(msgspec.Struct, frozen=True):
 def release(scenario: Scenario) -> World:
     """Return the world at tick 0."""
     pairs = scenario.radio_pairs()
-    origins = {place: scenario.robots[i].home for i, j in reversed(pairs) for place in (i, j)}
+    origins = {0: scenario.home(0)}  # of one that is alone
+    origins |= {place: scenario.home(i) for i, j in reversed(pairs) for place in (i, j)}
     local = tuple(
         Pose(robot.start.x - origins[i].x, robot.start.y - origins[i].y, robot.start.heading)
         for i, robot in enumerate(scenario.robots)
@@ -81,15 +82,22 @@ def observations(world: World) -> list[Observation]:
     ranges = anchor_ranges(truth, scenario)
     if scenario.deaths:
         ranges = [
-            None if scenario.is_dead(robot.id, tick) else rho
-            for robot, rho in zip(robots, ranges, strict=True)
+            [] if scenario.is_dead(robot.id, tick) else measured
+            for robot, measured in zip(robots, ranges, strict=True)
         ]
     lost: list[tuple[LostReport, ...]] = [()] * len(robots)
     for (sender, receiver), link in (world.links or {}).items():
         if link.lost:
             lost[receiver] += tuple([LostReport(robots[sender].id, sent) for sent in link.lost])
+    if scenario.team is not None:
+        return [
+            Observation(tick, robot.id, measured[i], None, contacts[i], lost[i], tuple(ranges[i]))
+            for i, robot in enumerate(robots)
+        ]
     return [
-        Observation(tick, robot.id, measured[i], ranges[i], contacts[i], lost[i])
+        Observation(
+            tick, robot.id, measured[i], ranges[i][0].range if ranges[i] else None, contacts[i], lost[i]
+        )
         for i, robot in enumerate(robots)
     ]
 
@@ -128,15 +136,15 @@ def advance(world: World, commands: Mapping[str, Command]) -> World | MissionEnd
 def verdicts_after(world: World, commands: Mapping[str, Command]) -> dict[str, Verdict]:
     """Return the verdicts of the robots after the `commands` of this tick, by robot.
 
-    The first verdict of a robot of a pair is final. In a group, another meeting may contradict a claim, which
-    is then withdrawn.
+    The first verdict of a robot of a pair is final. In a group or a team, later measurements may contradict a
+    claim, which is then withdrawn.
     """
     scenario, verdicts = world.scenario, world.verdicts
     for robot in scenario.robots:
         command, given = commands.get(robot.id), verdicts.get(robot.id)
         if command is None or command.verdict == given or scenario.is_dead(robot.id, world.truth.tick):
             continue
-        if given is None or scenario.meetings:
+        if given is None or not scenario.in_pairs:
             verdicts = {name: one for name, one in verdicts.items() if name != robot.id}
             if command.verdict is not None:
                 verdicts[robot.id] = command.verdict

@@ -11,7 +11,7 @@ from protocol.journal.journal_file import CorruptJournal, UnexpectedFrame, take_
 from protocol.messages import Command, DeadlineMissed, Environment, FinalReport, MissionEnd
 from protocol.mission import Role
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
-from world.scenario import Scenario
+from world.scenario import PlannedTeam, Scenario
 from world.tick import World, advance, release
 from world.truth import Truth
 
@@ -194,6 +194,8 @@ def _unpaired(scenario: Scenario) -> str | None:
     robots = {robot.id: robot for robot in scenario.robots}
     if not robots or len(robots) != len(scenario.robots):
         return "its scenario has no robots, or several of the same name"
+    if scenario.team is not None:
+        return _unequal(scenario, scenario.team)
     if scenario.meetings:
         return _unplanned(scenario)
     if scenario.retries or scenario.deaths or scenario.planned_sweep or scenario.confirmation:
@@ -201,9 +203,26 @@ def _unpaired(scenario: Scenario) -> str | None:
     if scenario.unanchored:
         return f"in its scenario {scenario.unanchored[0]} has no anchor"
     for robot in scenario.robots:
-        peer = robots.get(robot.peer)
-        if peer is None or peer.peer != robot.id or peer.role == robot.role:
+        peer = robots.get(robot.encounter.peer) if robot.encounter is not None else None
+        if peer is None or peer.encounter is None or peer.peer != robot.id or peer.role == robot.role:
             return f"in its scenario {robot.id} has no peer"
+    return None
+
+
+def _unequal(scenario: Scenario, team: PlannedTeam) -> str | None:
+    """Return which robot of a team has what only a robot of a pair or a group has, for a user."""
+    anchors = [one.told.id for one in team.anchors]
+    if scenario.meetings or scenario.retries or scenario.planned_sweep or scenario.confirmation:
+        return "its scenario has the plan of a group, and a team"
+    if len(set(anchors)) != len(anchors):
+        return "in its scenario two anchors have the same name"
+    for robot in scenario.robots:
+        if robot.encounter is not None or robot.given_anchor is not None:
+            return f"in its scenario {robot.id} of a team has a peer or an anchor of its own"
+        if not {*anchors}.issuperset(robot.ranges):
+            return f"in its scenario {robot.id} may range an anchor that is not there"
+    if team.origin is not None and team.origin not in {robot.id for robot in scenario.robots}:
+        return f"in its scenario there is no robot {team.origin}, in whose frame the poses are"
     return None
 
 

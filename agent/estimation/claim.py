@@ -117,7 +117,7 @@ def consistency(judged: Judged) -> str:
     return "" if found.p_value >= CLAIM_P_VALUE else f"the fit fails the consistency test: {found.what}"
 
 
-@condition("unanchored", "recording")
+@condition("unanchored", "recording", "team")
 def strays(judged: Judged) -> str:
     """The ranges that fit no other are at most {LARGEST_STRAY_SHARE:.0%}, and the outliers told."""
     own = judged.fit.weights[judged.measured.ranges.of(judged.robot)]
@@ -134,7 +134,7 @@ def definite_covariance(judged: Judged) -> str:
     return "" if definite else "rounding has made its covariance indefinite"
 
 
-@condition("recording")
+@condition("recording", "team")
 def determined_position(judged: Judged) -> str:
     """The sigma of the position is less than half of the longest range: else, the robot has no pose."""
     return open_position(judged.robot, judged.fit, judged.measured)
@@ -153,8 +153,13 @@ def position(judged: Judged) -> str:
 
 @condition(*FIRST_CLAIMS)
 def heading(judged: Judged) -> str:
-    """The sigma of the heading is at most {HEADING_ACCURACY:g} rad, and less before a far visit."""
+    """The sigma of the heading is at most {HEADING_ACCURACY:g} rad, and less before a far visit.
+
+    Ranges from one place contain no information about it, whatever rounding makes of that.
+    """
     for i, whose, required in judged.headings:
+        if not judged.measured.has_moved(i):
+            return f"{whose} heading is undetermined: all ranges are from one place"
         sigma = deviation(float(judged.stated.covariance[3 * i + 2, 3 * i + 2]))
         if not sigma <= required:
             return f"the sigma of {whose} heading is {sigma:.3g} rad, required {required:.3g}"
@@ -185,7 +190,7 @@ def early_consistency(judged: Judged) -> str:
     return f"the fit is too improbable for so few ranges: {found.what}"
 
 
-@condition("recording")
+@condition("recording", "team")
 def anchors(judged: Judged) -> str:
     """No anchor seems to stand {DISPLACED_SIGMAS:g} sigmas or more from where it was surveyed."""
     found = judged.displaced
@@ -196,14 +201,19 @@ def anchors(judged: Judged) -> str:
 
 @condition(*FIRST_CLAIMS)
 def profiles(judged: Judged) -> str:
-    """No profile of common sensors explains the measurements much better than the assumed noise."""
+    """No profile of common sensors explains the measurements much better than the assumed noise.
+
+    Of exact sensors, which fit to rounding, a profile that learns a smaller noise would.
+    """
+    if judged.measured.only_rounding:
+        return ""
     found = contradiction(judged.fit, judged.measured)
     if found is None:
         return ""
     return found.reason("--noise {}" if judged.user == "recording" else 'noise = "{}"')
 
 
-@condition("assured", "finder", "unanchored")
+@condition("assured", "finder", "unanchored", "team")
 def rivals(judged: Judged) -> str:
     """Poses {WRONG_SIGMAS:g} sigmas away are at most 1 - `confidence` times as likely.
 

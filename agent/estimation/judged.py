@@ -22,12 +22,12 @@ from protocol.messages import Localised, RobotConfig
 from protocol.mission import HEADING_ACCURACY
 from protocol.noise import Noise
 
-User = Literal["paper", "assured", "meeting", "finder", "unanchored", "recording"]
+User = Literal["paper", "assured", "meeting", "finder", "unanchored", "recording", "team"]
 """The kinds of robots that state a pose.
 
 They are a robot of a pair with the planner `paper`, or `assured`, also in a group; one that confirms the pose
 of an earlier meeting; a finder that passes its pose on; a robot without an anchor by its finder; a robot of a
-recording.
+recording; a robot of a team.
 """
 
 EVERYBODY = frozenset(get_args(User))
@@ -111,8 +111,9 @@ class Judged(NamedTuple):
 
     @property
     def localised(self) -> Localised:
-        """The pose and its covariance in <W>."""
-        return localised(self.stated, self.robot, self.origin)
+        """The pose and its covariance in <W>; with exact sensors, without one."""
+        found = localised(self.stated, self.robot, self.origin)
+        return Localised(found.pose) if self.measured.only_rounding else found
 
 
 def of_pair(

@@ -21,7 +21,7 @@ from agent.estimation.gaussian.odometry_noise import Array, Places
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
 from agent.planning import separation
 from agent.planning.strides import STRIDES_AHEAD, Choice, choice, stride
-from protocol.mission import Mission, Role
+from protocol.mission import HEADING_ACCURACY, Mission, Role
 from protocol.motion import Controls
 
 NEGLIGIBLE_GAIN = 0.03
@@ -295,3 +295,56 @@ SIGMA_FACTOR = 1.5
 
 LARGEST_GAP = 400.0
 """The largest squared difference of predictions in sigmas^2. Larger ones do not distinguish better."""
+
+
+# --- among several beacons ------------------------------------------------------------------------------
+
+
+class AmongBeacons(NamedTuple):
+    """A hypothesis about a robot among several beacons: anchors, and robots that are located."""
+
+    planned: PlanningHypothesis
+    """The pose of the robot, (3,)."""
+    beacons: Array
+    """The places (m) of the anchors and robots that it may range; (m, 2)."""
+    near: Array
+    """The places (m) of those of which it has to stay in range of one; (k, 2)."""
+
+
+def plan_among(
+    hypotheses: Sequence[AmongBeacons], sigma: float, mission: Mission, turned: float = 0.0
+) -> Controls:
+    """Return the manoeuvre of a robot whose ranges to several beacons are expected to be most informative.
+
+    The most probable of the `hypotheses` is the first one; `sigma` (m) is that of a range. Without anchors,
+    `turned` (rad) is the sigma of the rotation of all poses about the origin.
+    """
+    ways, reach = choice(mission), mission.sensing_range
+    sigma = max(sigma, NEGLIGIBLE_GAIN * mission.accuracy)
+    cost, distances = np.zeros(len(ways.v)), []
+    for one, places, near in hypotheses:
+        x, y = ways.ends(one.poses)
+        dx, dy = x[:, :, None] - places[:, 0], y[:, :, None] - places[:, 1]
+        distance = np.maximum(hypot(dx, dy), SIGMA_FLOOR)
+        distances.append(distance.reshape(len(cost), -1))
+        nearest = np.min(distance[:, 0], 1)
+        away = np.min(hypot(x[:, :1] - near[:, 0], y[:, :1] - near[:, 1]), 1)
+        cost += one.probability * OUTSIDE_COST * np.maximum(0.0, away - FARTHEST_PLANNED * reach)
+        cost += one.probability * OUTSIDE_COST * np.maximum(0.0, NEAREST_TO_ANCHOR * reach - nearest)
+        if one is not hypotheses[0].planned:
+            continue
+        nx, ny, weight = dx / distance, dy / distance, (distance <= reach) / sigma
+        lx, ly = x[:, :, None] - one.poses[0], y[:, :, None] - one.poses[1]
+        rows = np.stack((nx * weight, ny * weight, (ny * lx - nx * ly) * weight), -1).reshape(
+            len(cost), -1, 3
+        )
+        after = inverted(_information(one.covariance, mission) + product(np.swapaxes(rows, 1, 2), rows))
+        lx, ly = lx[:, -1, 0], ly[:, -1, 0]
+        variance = after[:, 0, 0] + after[:, 1, 1] + (lx * lx + ly * ly) * after[:, 2, 2]
+        variance += 2.0 * (lx * after[:, 1, 2] - ly * after[:, 0, 2])
+        variance += turned**2 * (x[:, -1] ** 2 + y[:, -1] ** 2)
+        cost += variance / mission.accuracy**2 + after[:, 2, 2] / HEADING_ACCURACY**2
+    cost += _confusion([one.planned for one in hypotheses], distances, sigma, reach)
+    cost[-1] += STALLED_COST
+    best = int(np.argmin(cost))
+    return Controls(float(ways.v[best]), float(ways.omega[best]))

@@ -29,9 +29,8 @@ class AgentLink:
 
     def __init__(self, config: RobotConfig, run: str, inbox: Inbox) -> None:
         self._id = config.robot
-        self._peer = config.peer
-        self._senders = "*" if config.members else config.peer
-        """The robots whose Reports are received: the peer, or in a group all robots."""
+        self._senders = "*" if config.members or config.team is not None else config.peer
+        """The robots whose Reports are received: the peer, or in a group or a team all robots."""
         self._run = run
         self._inbox = inbox
         self._link_timeout = WORLD_SILENCE_S + (config.tick_s or 0.0)
@@ -43,7 +42,7 @@ class AgentLink:
         me, run = self._id, self._run
         self._session = link
         self._command = session.publisher(link, keys.command(run, me))
-        self._reports = {self._peer: session.publisher(link, keys.report(run, me, self._peer))}
+        self._reports: dict[str, zenoh.Publisher] = {}
         self._estimate = session.publisher(link, keys.estimate(run, me))
         session.on_matching(self._estimate, self._want_estimate)
         session.subscribe_directly(link, keys.observation(run, me), self._inbox, "observation")

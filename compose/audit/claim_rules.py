@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from agent.estimation.judged import sufficient_mutual_ranges
 from agent.estimation.mutual_ranges import ELSEWHERE
 from agent.planning.planner import Planner
 from agent.process.agent_journal import AgentHistory
@@ -42,9 +43,12 @@ def _redundant(run: Run, placed: RobotSpec, agent: AgentHistory, tick: int) -> V
 
     How many it needs depends on the planner. Ranges count up to the latest tick for which the robot had
     received the peer's log, if there are logs. In a group, the peer may be any robot whose log it had, but
-    ranges to several robots do not add up.
+    ranges to several robots do not add up. In a team, all ranges of the robot do.
     """
     planner, mission = planner_of(agent.config), run.scenario.mission
+    if agent.config.team is not None:
+        least = sufficient_mutual_ranges(mission.noise)
+        return _too_few(tick, placed, "ranges that determine a pose", _determining(agent, tick), least)
     peers = [agent.config.peer]
     if run.scenario.meetings:
         senders = [framed.report.robot for step in agent.steps[: tick + 1] for framed in step.received]
@@ -56,6 +60,17 @@ def _redundant(run: Run, placed: RobotSpec, agent: AgentHistory, tick: int) -> V
         return _too_few(tick, placed, "relative placements with a mutual range", places, least)
     least = planner.required_mutual_ranges(mission)
     return _too_few(tick, placed, "mutual ranges", max(map(len, ranged.values())), least)
+
+
+def _determining(agent: AgentHistory, tick: int) -> int:
+    """Return the number of ranges of a robot of a team up to `tick`, without those to an only anchor.
+
+    The latter leave a circle.
+    """
+    observations = [step.observation for step in agent.steps[: tick + 1]]
+    mutual = [one for observation in observations for one in observation.contacts if one.range is not None]
+    anchors = [one.anchor for observation in observations for one in observation.anchors]
+    return len(mutual) + (len(anchors) if len(set(anchors)) > 1 else 0)
 
 
 def _known_until(agent: AgentHistory, peer: str, tick: int, planner: Planner[Any, Any]) -> int:

@@ -102,7 +102,8 @@ def link_statistics(run: Run) -> tuple[LinkStatistics, ...]:
 def _peers(agent: AgentHistory) -> list[str]:
     """Return the robots that the robot whose journal is `agent` met, and the one that it should have met."""
     contacts = [contact for step in agent.steps for contact in step.observation.contacts]
-    return list(dict.fromkeys([agent.config.peer, *[contact.peer for contact in contacts]]))
+    due = [agent.config.peer] if agent.config.team is None else []
+    return list(dict.fromkeys([*due, *[contact.peer for contact in contacts]]))
 
 
 def _statistics(agent: AgentHistory, peer: str) -> LinkStatistics:

@@ -39,10 +39,10 @@ def config(run: Run) -> Checks:
 
     This is for hardware mode. Otherwise, `journal_rules.config` compares the RobotConfig with the scenario.
     In a group, a robot that waits is told the orbits of a pair, or of a visitor that is localised. A robot
-    without an anchor has none: it waits.
+    without an anchor has none: it waits. A team has no orbits.
     """
     for robot, agent in run.agents.items():
-        yield _off_orbits(robot, agent.config)
+        yield _off_orbits(robot, agent.config) if agent.config.team is None else None
 
 
 def _off_orbits(robot: str, found: RobotConfig) -> Violation | None:

@@ -83,7 +83,9 @@ def _run(options: argparse.Namespace, inbox: Inbox) -> MissionEnd:
             inbox.say(replayed(observation.tick + 1 if observation is not None else 0))
         elif not (options.quiet or options.launched):
             where = f", resumed at tick {observation.tick}" if observation is not None else ""
-            say(f"{options.id}: in run {run}, with {config.peer}{where}")
+            others = (config.peer,) if config.team is None else config.others
+            company = f"with {', '.join(others)}" if others else "alone"
+            say(f"{options.id}: in run {run}, {company}{where}")
 
     def leave_at_once() -> None:
         # The world has received everything. A launched process ends here, because closing the links of

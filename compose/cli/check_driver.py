@@ -18,7 +18,9 @@ def main(options: argparse.Namespace) -> int:
     """Run the exercise, print the result of each check, and return VIOLATED if one failed."""
     robot = hardware_robot(options, options.robot)
     if robot.config.given_anchor is None:
-        raise UserError(f"--robot: {options.robot} has no anchor, and the checks need ranges to one")
+        raise UserError(
+            f"--robot: {options.robot} has no anchor of its own, and the checks need ranges to one"
+        )
     with closing(robot.driver()) as driver:
         trial = ExerciseRun(driver, robot.config, robot.manoeuvre_s)
         try:

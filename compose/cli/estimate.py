@@ -9,6 +9,7 @@ from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
+from agent.estimation.following import ClaimRule
 from agent.estimation.solver import Solver
 from compose.errors import BROKEN_PIPE, ENDED, NOT_LOCALISED, STOPPED_STATUS, UserError, writing
 from compose.extras import need
@@ -18,7 +19,6 @@ from compose.recording.estimating.estimate_run import RecordingEstimate, StreamE
 from compose.recording.estimating.estimate_summary import write_estimate
 from compose.recording.estimating.noise_files import told_noise
 from compose.recording.estimating.recorded_measurements import Measurements, listed, measurements
-from compose.recording.estimating.recording_estimator import ClaimRule
 from compose.recording.estimating.true_poses import TRUTH_GAP_S
 from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.range_recording import RecordedRobot

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,11 +21,13 @@ from protocol.output import say
 
 if TYPE_CHECKING:
     from compose.figures.agent_replay import AgentReplay
+    from compose.figures.catalogue import Picture
     from compose.figures.pair import PairRecord
+    from compose.figures.style import Medium
 
 
 def main(options: argparse.Namespace) -> int:
-    """Draw each pair of the recording into DIR/figures.
+    """Draw each pair of the recording, or its team, into DIR/figures.
 
     Return FAILED if the journal of a robot is missing or cannot be replayed to its end.
     """
@@ -38,7 +41,8 @@ def main(options: argparse.Namespace) -> int:
     formats = [one for one in FIGURE_FORMATS if one in (options.format or FIGURE_FORMATS)]
     pairs = encounters(run)
     replays: dict[str, AgentReplay] = {}
-    paired = dict.fromkeys([robot for one in pairs for robot in (one.a, one.b)])
+    team = run.setup is not None and run.setup.team
+    paired = dict.fromkeys(run.robots if team else [robot for one in pairs for robot in (one.a, one.b)])
     drawn: list[Path] = []
     with ExitStack() as stack:
         stack.callback(
@@ -52,6 +56,8 @@ def main(options: argparse.Namespace) -> int:
             if replay is None or replay.broken is not None:
                 status = FAILED
             done()
+        if team:
+            drawn += _draw_team(run, kinds, formats, folder, paper=options.paper)
         for meeting in pairs:
             robots = dict.fromkeys((meeting.a, meeting.b))
             histories = {robot: replays[robot].history for robot in robots if robot in replays}
@@ -79,14 +85,43 @@ def draw(
     `torn` states that the recording is incomplete, so that an event that it lacks may have happened; `paper`
     is the flag. Raises OSError.
     """
-    from compose.figures import catalogue, style  # noqa: PLC0415
+    from compose.figures import catalogue  # noqa: PLC0415
+
+    return _save(partial(catalogue.pictures, pair, kind), formats, folder, torn=torn, paper=paper)
+
+
+def _draw_team(
+    run: Run, kinds: Sequence[str], formats: Sequence[str], folder: Path, *, paper: bool
+) -> list[Path]:
+    """Draw the figures of a team, print which are not of teams, and return the paths. Raises UserError."""
+    from compose.figures import catalogue, team_figures  # noqa: PLC0415
+
+    if others := [kind for kind in kinds if kind not in team_figures.DRAWN]:
+        _say(f"no {', '.join(others)}: the robots of a team share all measurements, and form no pairs")
+    torn, paths = run.world is None or run.world.end is None, list[Path]()
+    with writing(folder):
+        for kind in kinds:
+            paths += _save(partial(catalogue.of_team, run, kind), formats, folder, torn=torn, paper=paper)
+    return paths
+
+
+def _save(
+    pictures: Callable[[Medium], Iterable[Picture]],
+    formats: Sequence[str],
+    folder: Path,
+    *,
+    torn: bool,
+    paper: bool,
+) -> list[Path]:
+    """Save `pictures`, as `draw` does."""
+    from compose.figures import style  # noqa: PLC0415
     from compose.figures.sheet import Absent  # noqa: PLC0415
 
     medium = style.PAPER if paper else style.SCREEN
     folder.mkdir(exist_ok=True)
     paths: list[Path] = []
     with style.look(medium):
-        for name, figure in catalogue.pictures(pair, kind, medium):
+        for name, figure in pictures(medium):
             if isinstance(figure, Absent):
                 _say(f"no {name}: {figure.why}{' (in the incomplete recording)' if torn else ''}")
             else:

@@ -1,4 +1,4 @@
-"""The catalogue of the figures of a pair, by kind."""
+"""The catalogue of the figures of a pair, and of those of a team, by kind."""
 
 from __future__ import annotations
 
@@ -6,11 +6,21 @@ from collections.abc import Iterator
 
 from matplotlib.figure import Figure
 
-from compose.figures import encounter, manoeuvre, one_robot, over_time, phase_one, spread, trajectory
+from compose.figures import (
+    encounter,
+    manoeuvre,
+    one_robot,
+    over_time,
+    phase_one,
+    spread,
+    team_figures,
+    trajectory,
+)
 from compose.figures.pair import PairRecord
 from compose.figures.sheet import Absent
 from compose.figures.style import SCREEN, Medium
 from compose.recording.group_localisation import past_meetings
+from compose.recording.run import Run
 
 Picture = tuple[str, Figure | Absent]
 
@@ -43,3 +53,9 @@ def pictures(pair: PairRecord, kind: str, medium: Medium = SCREEN) -> Iterator[P
             yield f"{kind}-{pair.name}", one(pair, medium)
         case "errors" if pair.readable:
             yield f"{kind}-{pair.name}", over_time.errors(pair, medium)
+
+
+def of_team(run: Run, kind: str, medium: Medium = SCREEN) -> Iterator[Picture]:
+    """Yield the figure of one kind of the team in `run`. Must be called within the `look` of the medium."""
+    if kind in team_figures.DRAWN:
+        yield kind, team_figures.DRAWN[kind](run, medium)

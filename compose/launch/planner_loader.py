@@ -63,6 +63,10 @@ def planner_of(config: RobotConfig) -> Planner[Any, Any]:
 def unguarded_planner_of(config: RobotConfig) -> Planner[Any, Any]:
     """Return a new planner of the robot with this configuration, without a guard. Raises UserError."""
     name = config.planner_name
+    if config.team is not None:
+        from agent.planning.team import TeamPlanner  # noqa: PLC0415  # it imports numpy
+
+        return TeamPlanner()
     found = _created(name, config.planner_options)
     if not config.members:
         return found

@@ -42,7 +42,7 @@ def position_bounds(run: Run, pair: tuple[int, int], tick: int) -> tuple[float, 
         truth = at.truth
         ranges = anchor_ranges(truth, scenario)
         for k, (place, anchor) in enumerate(zip(pair, anchors, strict=True)):
-            if ranges[place] is not None:
+            if ranges[place]:
                 own[k].append((truth.tick, _apart(truth.poses[place], Pose(anchor.x, anchor.y, 0.0))))
         contact = at.world.contacts.get((min(pair), max(pair)))
         if contact is not None and contact.range is not None:

@@ -41,9 +41,9 @@ class TickRow(msgspec.Struct, frozen=True):
     omega: float | None
     """Turn rate in rad/s, like `v`."""
     anchor_range: float | None
-    """Measured range to the anchor in m."""
+    """Measured range to the anchor in m; in a team, to the nearest anchor."""
     mutual_range: float | None
-    """Measured range to the peer in m; in a group, to the nearest robot."""
+    """Measured range to the peer in m; in a group or a team, to the nearest robot."""
     phase: int | None
     """Phase of the Command; None if the Command was late."""
     state: str | None
@@ -80,7 +80,7 @@ class ObservationRow(RobotTick, frozen=True):
     omega: float | None
     """The odometry over the tick before: turn rate in rad/s; missing in tick 0."""
     anchor_range: float | None
-    """The range to the robot's anchor in m; missing without one."""
+    """The range to the robot's anchor in m, in a team to the nearest anchor; missing without one."""
     contact: bool
     """True if the peer is within sensing range."""
     mutual_range: float | None
@@ -174,9 +174,9 @@ class ClaimRow(msgspec.Struct, frozen=True):
     nees: float | None
     """The normalised estimation error squared; missing with exact sensors."""
     anchor_ranges: int | None
-    """The number of ranges to the anchor; this and all below are missing if the robot sent no FinalReport."""
+    """The number of ranges to anchors; this and all below are missing if the robot sent no FinalReport."""
     mutual_ranges: int | None
-    """The number of ranges to the peer."""
+    """The number of ranges to the peer, or to all robots."""
     reports_sent: int | None
     """The number of reports sent."""
     reports_heard: int | None
@@ -198,7 +198,7 @@ def tick_rows(run: recorded.Run) -> Iterator[TickRow]:
                 *parts(pose, "x", "y"),
                 wrap(pose.heading) if pose is not None else None,
             ]
-            values += [*parts(run.driven(robot, tick), "v", "omega"), observation.anchor_range]
+            values += [*parts(run.driven(robot, tick), "v", "omega"), observation.nearest_anchor_range]
             values += [*parts(contact, "range"), *parts(command, "phase", "task")]
             yield TickRow(*values)
 
@@ -227,7 +227,7 @@ def observation_rows(run: recorded.Run, period: float) -> Iterator[ObservationRo
                 tick * period,
                 robot,
                 *parts(one.executed, "v", "omega"),
-                one.anchor_range,
+                one.nearest_anchor_range,
             ]
             values += [contact is not None, *parts(contact, "range")]
             yield ObservationRow(*values)

@@ -93,11 +93,11 @@ class Run(msgspec.Struct, frozen=True, dict=True):
 
     @property
     def pairs(self) -> tuple[tuple[str, ...], ...]:
-        """The pairs, role a first. In hardware mode, a robot without a RobotConfig is alone."""
+        """The pairs, role a first; none in a team. In hardware mode, a robot without a pair is alone."""
         if self.world is not None:
             ids = self.robots
             return tuple([(ids[a], ids[b]) for a, b in self.world.scenario.pairs()])
-        configs = [agent.config for agent in self.agents.values()]
+        configs = [agent.config for agent in self.agents.values() if agent.config.team is None]
         pairs = [(one.robot, one.peer) if one.role == "a" else (one.peer, one.robot) for one in configs]
         paired = {robot for pair in pairs for robot in pair}
         return (*dict.fromkeys(pairs), *[(robot,) for robot in self.robots if robot not in paired])
@@ -235,7 +235,7 @@ class Run(msgspec.Struct, frozen=True, dict=True):
     def standing_claim(self, robot: str) -> tuple[int, Localised] | None:
         """Return the claim that `robot` has made and not withdrawn, and its tick; None if there is none.
 
-        Only robots of a group withdraw claims. The first claim of a robot of a pair is final.
+        The first claim of a robot of a pair is final; others withdraw claims.
         """
         made = None
         for tick in self.ticks:
@@ -246,7 +246,7 @@ class Run(msgspec.Struct, frozen=True, dict=True):
                 made = None
             elif made is None:
                 made = tick.truth.tick, command.verdict
-                if not self.scenario.meetings:
+                if self.scenario.in_pairs:
                     break
         return made
 
@@ -400,20 +400,20 @@ def _agent(
 
 
 def _agree(configs: Mapping[str, RobotConfig], source: object) -> None:
-    """Raise CorruptJournal if two peers' configurations are not of the same pair, or group, and mission."""
+    """Raise CorruptJournal if configurations are not of the same pair, group or team, and mission."""
     for robot, one in configs.items():
-        other = configs.get(one.peer)
+        other = next((configs[peer] for peer in one.others if peer in configs), None)
         if other is not None and _shared(one) != _shared(other):
-            path = f"{source}/{agent_journal(one.peer)}"
+            path = f"{source}/{agent_journal(other.robot)}"
             raise CorruptJournal(
                 f"{path}: belongs to another run: its configuration does not match {robot}'s"
             )
 
 
 def _shared(config: RobotConfig) -> tuple[object, ...]:
-    """Return the part of a configuration that both robots of a pair share, or all robots of a group."""
-    shared = config.group, config.members, config.mission, config.planner_name, config.tick_s
-    if config.members:  # in its first meeting, a peer may have another one
+    """Return the part of a configuration that both robots of a pair share, or all of a group or a team."""
+    shared = config.group, config.members, config.team, config.mission, config.planner_name, config.tick_s
+    if config.members or config.team is not None:  # in its first meeting, a peer may have another one
         return shared
     anchors = [config.anchor, config.peer_anchor]
     return (*shared, anchors if config.role == "a" else anchors[::-1], config.rendezvous)

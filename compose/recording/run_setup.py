@@ -1,17 +1,18 @@
-"""The static data of a run: its robots, their anchors and orbits, and the mission parameters."""
+"""The static data of a run: its robots, anchors and orbits, and the mission parameters."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from itertools import combinations
 from typing import NamedTuple
 
 import msgspec
 from msgspec.structs import replace
 
 from protocol.attack import Attack
-from protocol.messages import Command, RobotConfig
+from protocol.messages import Command, RobotConfig, TeamAnchor
 from protocol.mission import Anchor, Mission, PlannerName, Role
 from protocol.motion import Pose
 from protocol.orbits import RENDEZVOUS, Orbit
@@ -22,14 +23,17 @@ from world.scenario import Scenario
 
 
 class RobotSetup(msgspec.Struct, frozen=True):
-    """One robot: its role, peer, anchor and orbit. In a group, they are those of its first meeting."""
+    """One robot: its role, peer, anchor and orbit. In a group, they are those of its first meeting.
+
+    A robot of a team has none of them.
+    """
 
     id: RobotId
-    peer: RobotId
-    role: Role
-    given_anchor: Anchor | None = msgspec.field(name="anchor")
+    peer: RobotId | None = None
+    role: Role | None = None
+    given_anchor: Anchor | None = msgspec.field(name="anchor", default=None)
     """The anchor of the robot; None if it has none, as some robots of a group."""
-    orbit: Orbit
+    given_orbit: Orbit | None = msgspec.field(name="orbit", default=None)
     attack: Attack | None = None
     """The false data injection that the scenario configures for this robot."""
     frame: Pose | None = None
@@ -50,6 +54,25 @@ class RobotSetup(msgspec.Struct, frozen=True):
         if self.given_anchor is None:
             raise LookupError(f"{self.id} has no anchor")
         return self.given_anchor
+
+    @property
+    def orbit(self) -> Orbit:
+        """Its orbit. Raises LookupError if it has none."""
+        if self.given_orbit is None:
+            raise LookupError(f"{self.id} has no orbit")
+        return self.given_orbit
+
+
+class AnchorSetup(msgspec.Struct, frozen=True):
+    """One anchor of a team."""
+
+    id: RobotId
+    position: Anchor | None
+    """The position that the robots are told, in m; None if they know none."""
+    sigma: float
+    """The standard deviation of each coordinate of `position` in m; 0 if it is surveyed."""
+    place: Anchor | None = None
+    """The true position in m; None without the world's journal."""
 
 
 class Visit(msgspec.Struct, frozen=True):
@@ -105,6 +128,17 @@ class RunSetup(msgspec.Struct, frozen=True, dict=True):
     """The meetings of a group, in the order in which they are planned to end; empty for pairs."""
     sweep: SweptArea | None = None
     """The area in which robots without an anchor are; None if all robots have one."""
+    team: bool = False
+    """True if the robots share all measurements: they form neither pairs nor a group."""
+    anchors: tuple[AnchorSetup, ...] = ()
+    """The anchors of a team."""
+    origin: RobotId | None = None
+    """The robot of a team whose pose at tick 0 is the origin of <W>; None if anchors determine <W>."""
+
+    @property
+    def in_pairs(self) -> bool:
+        """True if the robots form pairs, and neither a group nor a team."""
+        return not self.visits and not self.team
 
     @property
     def anchored(self) -> tuple[RobotSetup, ...]:
@@ -115,6 +149,10 @@ class RunSetup(msgspec.Struct, frozen=True, dict=True):
     def ids(self) -> tuple[str, ...]:
         """The ids of the robots, in scenario order."""
         return tuple([robot.id for robot in self.robots])
+
+    def position_of(self, anchor: str) -> Anchor | None:
+        """Return the position of an anchor of a team as robots know it; None if it is not known."""
+        return next((one.position for one in self.anchors if one.id == anchor), None)
 
     def robot_setup(self, robot: str) -> RobotSetup:
         """Return the setup of `robot`. Raises KeyError if there is no such robot."""
@@ -140,7 +178,9 @@ class RunSetup(msgspec.Struct, frozen=True, dict=True):
         )
 
     def links(self) -> tuple[tuple[RobotSetup, RobotSetup], ...]:
-        """Return all pairs that meet during the run: in a group, the robots of each meeting."""
+        """Return all pairs that meet during the run: in a group those of each meeting, in a team any two."""
+        if self.team:
+            return tuple(combinations(self.robots, 2))
         known = {one.id: one for one in self.robots}
         met = [
             (known[one.visitor], known[one.visited])
@@ -179,11 +219,14 @@ def of_scenario(scenario: Scenario, mode: str | None = None, tick_s: float | Non
 
     `mode` and `tick_s` are not part of the scenario; see the fields of RunSetup.
     """
+    team = scenario.team
     return RunSetup(
         name=scenario.name,
         robots=tuple(
             [
-                RobotSetup(
+                RobotSetup(robot.id)
+                if robot.encounter is None
+                else RobotSetup(
                     robot.id,
                     robot.peer,
                     robot.role,
@@ -206,11 +249,20 @@ def of_scenario(scenario: Scenario, mode: str | None = None, tick_s: float | Non
         faults=scenario.faults,
         visits=tuple([Visit(one.visitor, one.visited, one.ends) for one in scenario.meetings]),
         sweep=scenario.planned_sweep.sweep if scenario.planned_sweep is not None else None,
+        team=team is not None,
+        anchors=tuple([_anchor(one.told, one.place) for one in team.anchors]) if team is not None else (),
+        origin=team.origin if team is not None else None,
     )
 
 
+def _anchor(told: TeamAnchor, place: Anchor | None = None) -> AnchorSetup:
+    return AnchorSetup(told.id, told.position, told.sigma, place)
+
+
 def _bound(scenario: Scenario) -> float:
-    """Return the bound T_max in s: that of the group, or the largest of all pairs."""
+    """Return the bound T_max in s: that of the group or the team, or the largest of all pairs."""
+    if scenario.team is not None:
+        return scenario.team.bound
     if (planned := scenario.confirmation or scenario.planned_sweep) is not None:
         return planned.ends
     return max(
@@ -224,6 +276,18 @@ def of_configs(name: str, configs_by_robot: Mapping[str, RobotConfig]) -> RunSet
     `configs_by_robot` maps robot ids to configurations and must not be empty.
     """
     configs = list(configs_by_robot.values())
+    if (team := configs[0].team) is not None:
+        return RunSetup(
+            name=name,
+            robots=tuple([RobotSetup(one.robot) for one in configs]),
+            mission=configs[0].mission,
+            planner_name=configs[0].planner_name,
+            t_max_s=team.bound,
+            tick_s=configs[0].tick_s,
+            team=True,
+            anchors=tuple(map(_anchor, team.anchors)),
+            origin=team.origin,
+        )
     visits = _visits(configs)
     unanchored = [one for one in configs if one.given_anchor is None]
     return RunSetup(

@@ -42,7 +42,7 @@ def summary(run: Run, mode: Mode | None, wall_s: float | None) -> dict[str, Any]
         "ticks": ticks[-1].truth.tick if ticks else 0,
         "wall_s": wall_s,
         "first_contact_tick": first_contact(run),
-        "t_max_s": max(robot.rendezvous.bound for robot in scenario.robots),
+        "t_max_s": scenario.t_max,
         "min_separation_m": min(
             (
                 math.hypot(one.x - other.x, one.y - other.y)
@@ -106,7 +106,7 @@ def _robot_summary(run: Run, robot: str) -> dict[str, Any]:
         "estimate": _listed(pose) if pose is not None else None,
         "covariance": covariance.matrix if covariance is not None else None,
         "truth": _listed(truth[-1]) if truth else None,
-        **(at_claim if run.scenario.meetings else {}),
+        **({} if run.scenario.in_pairs else at_claim),
         **dict(zip(names, errors, strict=True)),
         **dict(zip(_FINAL_REPORT_COUNTS, parts(final_report, *_FINAL_REPORT_COUNTS), strict=True)),
         "no_farewell": None if final_report is not None else _missing_final_report(run, robot),

@@ -13,6 +13,7 @@ from compose.scenario.group_confirmation import check_tolerated, with_confirmati
 from compose.scenario.group_meetings import FirstMeeting, GroupMeetings, group_meetings
 from compose.scenario.group_sweep import check_unanchored, with_sweep
 from compose.scenario.scenario_tables import RobotTable, ScenarioFile
+from compose.scenario.team_plan import is_team
 from protocol.mission import infeasibility
 from protocol.rounding import TOLERANCE
 from protocol.spelling import did_you_mean
@@ -32,7 +33,7 @@ def linked(file: ScenarioFile) -> list[tuple[str, str]]:
     for name, count in Counter(robot.id for robot in file.robot).items():
         if count > 1:
             raise BadScenario(f"robot.id: {count} robots have the id '{name}'")
-    if in_group(file):
+    if in_group(file) or is_team(file):
         return list(permutations([robot.id for robot in file.robot], 2))
     for i, robot in enumerate(file.robot):
         if robot.anchor is None:
@@ -48,6 +49,15 @@ def meetings_of(
     `links` holds each pair of robots in both orders. Raises BadScenario and Unworkable.
     """
     robots, mission = file.robot, file.mission
+    if is_team(file):
+        return GroupMeetings((), {}, 0.0, (), 0.0, 0.0)
+    if mission.survey:
+        raise BadScenario("mission.survey: there is no [[anchor]] in the file")
+    for i, robot in enumerate(robots):
+        if robot.anchors is not None:
+            raise BadScenario(f"robot[{i}].anchors: there is no [[anchor]] in the file")
+    if len(robots) < 2:
+        raise BadScenario("robot: one robot alone needs at least two [[anchor]]")
     if not in_group(file):
         if mission.tolerates:
             raise Unworkable("mission.tolerates: it is for groups, and the robots form pairs")

@@ -15,7 +15,7 @@ from protocol.noise import Noise
 from protocol.spelling import did_you_mean
 from protocol.units import Finite, RobotId
 from world.faults import Fault
-from world.scenario import Scenario
+from world.scenario import PlacedAnchor, Scenario
 
 SUFFIX = "-changed"
 """The end of the name of a changed scenario."""
@@ -30,9 +30,9 @@ class RobotChange(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The y coordinate of the start in <W>, in m."""
     heading: Finite
     """The heading at the start, in rad."""
-    anchor_x: Finite
-    """The x coordinate of the anchor in <W>, in m."""
-    anchor_y: Finite
+    anchor_x: Finite | None = None
+    """The x coordinate of the anchor in <W>, in m; None in a team, like the y coordinate."""
+    anchor_y: Finite | None = None
     """The y coordinate of the anchor in <W>, in m."""
 
 
@@ -68,9 +68,11 @@ def values_of(scenario: Scenario) -> ScenarioChange:
     place = _place_of_loss(scenario.faults)
     return ScenarioChange(
         robots={
-            one.id: RobotChange(one.start.x, one.start.y, one.start.heading, one.anchor.x, one.anchor.y)
+            one.id: RobotChange(
+                one.start.x, one.start.y, one.start.heading, at.x if at else None, at.y if at else None
+            )
             for one in scenario.robots
-            if one.given_anchor is not None
+            if (at := one.given_anchor) is not None or one.encounter is None
         },
         sensing_range=scenario.mission.sensing_range,
         sigma=max(noise.anchor_sigma, noise.mutual_sigma),
@@ -93,7 +95,8 @@ def changed(scenario: Scenario, change: ScenarioChange, most_ticks: int) -> Chan
     table = file_table(_with_values(scenario, before, change))
     for robot in table["robot"]:
         if (one := change.robots.get(robot["id"])) is not None:
-            robot["anchor"] = [one.anchor_x, one.anchor_y]
+            if "anchor" in robot:
+                robot["anchor"] = [one.anchor_x, one.anchor_y]
             robot["start"] = [one.x, one.y, one.heading]
     if _has_default_ticks(scenario):
         del table["max_ticks"]
@@ -148,6 +151,10 @@ def file_table(scenario: Scenario) -> dict[str, Any]:
     mission = _given(scenario.mission)
     if scenario.planned_sweep is not None:
         mission["area"] = list(scenario.planned_sweep.sweep.bounds)
+    if scenario.team is not None and scenario.team.origin is not None:
+        mission["frame"] = "relative"
+    if scenario.team is not None and scenario.team.survey:
+        mission["survey"] = scenario.team.survey
     if scenario.tolerates:
         mission["tolerates"] = scenario.tolerates
     if scenario.mission.noise.profile is not None:  # a default would have the value of the profile
@@ -170,7 +177,8 @@ def file_table(scenario: Scenario) -> dict[str, Any]:
         "robot": [
             {
                 "id": one.id,
-                **({"peer": one.peer} if not scenario.meetings else {}),
+                **({"peer": one.peer} if scenario.in_pairs else {}),
+                **({"anchors": list(one.ranges)} if scenario.team and scenario.team.anchors else {}),
                 **({"anchor": [at.x, at.y]} if (at := one.given_anchor) is not None else {}),
                 "start": [one.start.x, one.start.y, one.start.heading],
                 **({"attack": _given(one.attack)} if one.attack is not None else {}),
@@ -178,9 +186,21 @@ def file_table(scenario: Scenario) -> dict[str, Any]:
             }
             for one in scenario.robots
         ],
+        "anchor": [_anchor_table(one) for one in scenario.team.anchors] if scenario.team else [],
         "fault": [_fault_table(one) for one in scenario.faults],
     }
     return {name: value for name, value in table.items() if value or name == "seed"}
+
+
+def _anchor_table(anchor: PlacedAnchor) -> dict[str, Any]:
+    """Return the `[[anchor]]` table of `anchor`."""
+    told, place = anchor.told, anchor.place
+    return {
+        "id": told.id,
+        **({"position": [told.position.x, told.position.y]} if told.position is not None else {}),
+        **({"sigma": told.sigma} if told.sigma else {}),
+        "stands": [place.x, place.y],
+    }
 
 
 def _fault_table(fault: Fault) -> dict[str, Any]:

@@ -20,11 +20,12 @@ from compose.scenario.group_meetings import FirstMeeting
 from compose.scenario.kills import WORLD, Kill, drawn
 from compose.scenario.scenario_tables import MAX_TICKS, MissionTable, RobotTable, ScenarioFile
 from compose.scenario.shipped_files import misplaced, shipped, unknown
+from compose.scenario.team_plan import given_start, is_team, planned_team, with_team
 from compose.scenario.toml_file import field_first, read_text, table_in
 from protocol.attack import OF_THE_START
-from protocol.messages import RobotConfig
+from protocol.messages import Pairing, RobotConfig
 from protocol.mission import Anchor, Mission, noise_infeasibility, safety_infeasibility, too_small
-from protocol.motion import TAU, Pose, wrap
+from protocol.motion import TAU, Pose
 from protocol.noise import with_profile
 from protocol.orbits import tick_budget
 from protocol.spelling import did_you_mean
@@ -35,6 +36,8 @@ from world.world_noise import world_noise_infeasibility, world_noise_mistake
 
 EXCHANGES = 20
 """The number of reports for each of which `max_ticks` allows the full `delivery_time_bound`."""
+TEAM_SLOWER = 4
+"""The ticks of a team in `max_ticks`, in units of its bound with exact sensors: noise takes more ranges."""
 STARTS_WITHIN = 1.0 - 1e-9
 """The part of R within which starts are drawn, so that rounding cannot move one outside."""
 
@@ -59,7 +62,7 @@ class ScenarioTemplate(msgspec.Struct, frozen=True):
         """
         if seed is None:
             return self.scenario
-        if self.file.group is not None:
+        if self.file.group is not None or is_team(self.file):
             with _naming(self.source):
                 return _scenario(_with_robots(msgspec.structs.replace(self.file, seed=seed)), self.faults)
         mission = self.file.mission
@@ -196,7 +199,7 @@ def template_of(table: Mapping[str, Any], faults: Sequence[str] = ()) -> Scenari
         file = msgspec.convert(_with_profile(table), ScenarioFile)
     except msgspec.ValidationError as error:
         raise BadScenario(field_first(str(error), ScenarioFile)) from None
-    if file.group is None and not file.robot:
+    if file.group is None and file.team is None and not file.robot:
         raise BadScenario("missing field 'robot'")
     if file.group is not None and file.robot:
         raise BadScenario("group: its robots are drawn, so there can be no [[robot]]")
@@ -211,9 +214,9 @@ def template_of(table: Mapping[str, Any], faults: Sequence[str] = ()) -> Scenari
 
 
 def _with_robots(file: ScenarioFile) -> ScenarioFile:
-    """Return `file` with the robots of its `[group]`, whose anchors are drawn from its seed."""
+    """Return `file` with the robots of its `[group]` or `[team]`, whose places are drawn from its seed."""
     if file.group is None:
-        return file
+        return with_team(file)
     side = file.group.spacing * math.sqrt(file.group.robots)
     robots = []
     anchored = file.group.robots - file.group.without_anchor
@@ -250,9 +253,15 @@ def _scenario(file: ScenarioFile, options: Sequence[str]) -> Scenario:
     meetings = meetings_of(file, faults, links)
     _check_world_noise(file, links)
     _check_models(file)
-    placed = [_placed(i, file, meetings.first[robot.id]) for i, robot in enumerate(file.robot)]
-    budget = math.ceil(meetings.latest / mission.period)
-    if not in_group(file):
+    team = None
+    if is_team(file):
+        team, placed = planned_team(file)
+        budget = TEAM_SLOWER * round(team.bound / mission.period)
+    elif in_group(file):
+        placed = _all_placed(file, meetings.first)
+        budget = math.ceil(meetings.latest / mission.period)
+    else:
+        placed = _all_placed(file, meetings.first)
         budget = max(tick_budget(mission, one.rendezvous) for one in meetings.first.values())
     delay = EXCHANGES * delivery_time_bound(faults) if faults else 0
     if file.max_ticks is None and budget + delay > MAX_TICKS:
@@ -265,7 +274,7 @@ def _scenario(file: ScenarioFile, options: Sequence[str]) -> Scenario:
         max_ticks=file.max_ticks if file.max_ticks is not None else budget + delay,
         mission=mission.plain,
         planner_name=file.planner.name,
-        robots=tuple(placed),
+        robots=placed,
         faults=faults,
         world_noise=None if noise.changes_nothing(mission.noise) else noise,
         planner_options=file.planner.options,
@@ -278,6 +287,7 @@ def _scenario(file: ScenarioFile, options: Sequence[str]) -> Scenario:
         planned_sweep=meetings.planned_sweep,
         confirmation=meetings.confirmation,
         least_bound=meetings.least_bound,
+        team=team,
     )
     try:
         for one in scenario.robots:
@@ -287,7 +297,13 @@ def _scenario(file: ScenarioFile, options: Sequence[str]) -> Scenario:
     return scenario
 
 
-def _placed(i: int, file: ScenarioFile, first: FirstMeeting) -> RobotSpec:
+def _all_placed(file: ScenarioFile, first: Mapping[str, FirstMeeting]) -> tuple[RobotSpec, ...]:
+    """Return the robots of the file, which have these first meetings. Raises BadScenario."""
+    anchors = {one.id: Anchor(*one.anchor) for one in file.robot if one.anchor is not None}
+    return tuple([_placed(i, file, first[one.id], anchors) for i, one in enumerate(file.robot)])
+
+
+def _placed(i: int, file: ScenarioFile, first: FirstMeeting, anchors: Mapping[str, Anchor]) -> RobotSpec:
     """Return robot `i` of the file, whose first meeting is `first`. Raises BadScenario."""
     robot, mission = file.robot[i], file.mission
     start = _start(robot, mission, file.seed)
@@ -304,8 +320,8 @@ def _placed(i: int, file: ScenarioFile, first: FirstMeeting) -> RobotSpec:
         )
     if robot.dies is not None and not in_group(file):
         raise BadScenario(f"robot[{i}].dies: robots die in groups only")
-    anchor = Anchor(*robot.anchor) if robot.anchor is not None else None
-    return RobotSpec(robot.id, first.peer, first.role, anchor, start, first.rendezvous, robot.attack)
+    encounter = Pairing(first.peer, first.role, anchors[first.peer], first.rendezvous)
+    return RobotSpec(robot.id, encounter, anchors.get(robot.id), start, robot.attack)
 
 
 def _faults(
@@ -369,9 +385,7 @@ def _start(robot: RobotTable, mission: MissionTable, seed: int) -> Pose:
     Without an anchor, it is drawn from the area of the mission. A drawn heading is uniform in [0, 2 pi).
     """
     if robot.start is not None:
-        x, y, heading = robot.start
-        # many turns are removed here, because trigonometric functions of large angles lose digits
-        return Pose(x, y, heading if abs(heading) <= TAU else wrap(heading))
+        return given_start(robot.start)
     draw = random.Random(f"{seed}/start/{robot.id}").random
     if robot.anchor is None:
         assert mission.area is not None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
@@ -11,7 +11,7 @@ from compose.scenario.fault_syntax import FaultTable
 from compose.scenario.kills import KillTable
 from protocol.attack import Attack
 from protocol.mission import Mission, Options, PlannerName
-from protocol.units import NAME, RobotId, Tick
+from protocol.units import NAME, Clearance, RobotId, Tick
 from world.world_models import ModelSpec
 from world.world_noise import WorldNoise
 
@@ -19,6 +19,8 @@ MAX_TICKS = 10**9
 """The largest number of ticks of a run."""
 MAX_ROBOTS = 200
 """The largest number of robots, so that a GroundTruth message of all of them fits a frame."""
+MAX_TEAM = 16
+"""The largest number of robots of a team: each of them estimates the poses of all."""
 Place = Annotated[float, Meta(ge=-1e6, le=1e6)]
 """A coordinate in m. No robot can drive so far from it that it leaves the range of `units.Coordinate`."""
 
@@ -56,6 +58,13 @@ class MissionTable(Mission, frozen=True, forbid_unknown_fields=True):
 
     area: Area | None = None
     """x_min, y_min, x_max, y_max in m: the area in which robots without an anchor are."""
+    frame: Literal["relative"] | None = None
+    """`relative`: without anchors, in the frame of the first robot's start. None: anchors determine <W>."""
+    survey: Clearance = 0.0
+    """The sigma in m up to which robots measure anchors that are not surveyed before they claim their poses.
+
+    0: they do not wait for it.
+    """
     tolerates: Annotated[int, Meta(ge=0, le=MAX_ROBOTS)] = 0
     """The number of robots of a group that may report false data: one more must agree before a claim.
 
@@ -76,6 +85,8 @@ class RobotTable(_Table, frozen=True):
     """The robot's name."""
     anchor: tuple[Place, Place] | None = None
     """x, y of the robot's anchor, in m. Robots of a group may have none."""
+    anchors: list[RobotId] | None = None
+    """The `[[anchor]]` that it may range; None: all."""
     start: tuple[Place, Place, Annotated[float, Meta(ge=-1e6, le=1e6)]] | None = None
     """Start pose x, y in m and heading in rad; None: drawn from the seed, within range of the anchor.
 
@@ -88,6 +99,33 @@ class RobotTable(_Table, frozen=True):
     dies: Tick | None = None
     """The tick from which on it is dead, in a group: it stands still, and measures, sends and receives
     nothing."""
+
+
+class AnchorTable(_Table, frozen=True):
+    """An `[[anchor]]` table: an anchor that every robot may range, unless it has `anchors` of its own."""
+
+    id: RobotId
+    """The anchor's name."""
+    position: tuple[Place, Place] | None = None
+    """x, y in m, as the robots are told; None: they do not know it, and estimate it."""
+    sigma: Clearance = 0.0
+    """The standard deviation of each coordinate of `position` in m, as the robots are told. The true position
+    is drawn with it."""
+    stands: tuple[Place, Place] | None = None
+    """The true x, y in m; None: at `position`, or drawn from the seed in `mission.area` without one."""
+
+
+class TeamTable(_Table, frozen=True):
+    """The `[team]` table: a room whose anchors and robots are drawn from the seed."""
+
+    robots: Annotated[int, Meta(ge=1, le=MAX_TEAM)]
+    """The number n of robots, which are r1 to rn."""
+    side: Annotated[float, Meta(gt=0.0, le=1e5)]
+    """The anchors and the starts are uniform in a square with this side in m."""
+    anchors: Annotated[int, Meta(ge=0, le=MAX_ROBOTS)] = 0
+    """The number m of anchors, which are A1 to Am; none with `mission.frame`."""
+    unknown: Annotated[int, Meta(ge=0, le=MAX_ROBOTS)] = 0
+    """The number of anchors whose position the robots do not know, the last ones."""
 
 
 class GroupTable(_Table, frozen=True):
@@ -116,10 +154,14 @@ class ScenarioFile(_Table, frozen=True):
     """The name of the scenario, and the beginning of the names of its runs."""
     mission: MissionTable
     """The `[mission]` table."""
-    robot: Annotated[list[RobotTable], Meta(min_length=2, max_length=MAX_ROBOTS)] = []
-    """One `[[robot]]` for each robot; required without `[group]`."""
+    robot: Annotated[list[RobotTable], Meta(min_length=1, max_length=MAX_ROBOTS)] = []
+    """One `[[robot]]` for each robot; required without `[group]` and `[team]`."""
     group: GroupTable | None = None
     """The `[group]` table."""
+    anchor: Annotated[list[AnchorTable], Meta(max_length=MAX_ROBOTS)] = []
+    """One `[[anchor]]` for each anchor of a team."""
+    team: TeamTable | None = None
+    """The `[team]` table."""
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
     """The seed of all random draws, starts included."""
     max_ticks: Annotated[int, Meta(ge=1, le=MAX_TICKS)] | None = None

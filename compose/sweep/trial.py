@@ -117,7 +117,8 @@ class TrialRow(msgspec.Struct, frozen=True, array_like=True):
     period_s: float | None = None
     """T_s, the duration of a tick in s"""
     t_max_s: float | None = None
-    """T_max in s, the bound on the time in orbit until two robots meet; the largest of all robots"""
+    """T_max in s, the bound on the time in orbit until two robots meet; the largest of all robots; in a team,
+    the bound of the time at which all robots are localised with exact sensors"""
     t_max_ticks: int | None = None
     """T_max in ticks, rounded up"""
     group: GroupColumns | None = None
@@ -212,7 +213,7 @@ def row(trial: Trial, run: Run, wall_s: float, findings: Findings | None = None)
         # a robot of a group claims after its first meeting, so its bound is that of this one
         bounded = _bounded(robots, run, pair)
         robots |= {name: one for name, one in bounded.items() if robots[name].bound_m is None}
-    t_max_s = max(robot.rendezvous.bound for robot in scenario.robots)
+    t_max_s = scenario.t_max
     encounters = [_meeting(run, a, b, in_group=bool(scenario.meetings)) for a, b in run.pairs]
     final_reports = run.final_reports.values()
     known: dict[str, list[Any]] = {
@@ -296,6 +297,6 @@ def _meeting(run: Run, a: str, b: str, *, in_group: bool) -> tuple[int | None, i
 
 
 def _last(ticks: list[int | None]) -> int | None:
-    """Return the largest of `ticks`; None if any is None."""
+    """Return the largest of `ticks`; None if any is None, or there are none."""
     known = [tick for tick in ticks if tick is not None]
-    return max(known) if len(known) == len(ticks) else None
+    return max(known, default=None) if len(known) == len(ticks) else None

@@ -19,7 +19,7 @@ TABLE_NOTES = (
     (SIGMA, "sigma: claimed, of the position"),
     (LATE, "late: ticks in which the robot stopped because its command was late"),
     (ERROR, "poses in m and rad"),
-    (RANGES, "ranges to the anchor + to the peer"),
+    (RANGES, "ranges to anchors + to other robots"),
     (REPORTS, "reports sent / received"),
 )
 """The footnotes, each with its column."""

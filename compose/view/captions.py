@@ -1,7 +1,7 @@
 """Captions of a mission: a sentence or two for each important event, for readers who do not know the method.
 
 Captions follow from the data of a tick and of the one before, as events do. There are far fewer of them; each
-is about a pair, or about robots of a group, whose meetings have fewer captions. They state what was measured,
+is about a pair, or about robots of a group or a team. They state what was measured,
 held, claimed and decided, and no more: a claim counts as true only once the mission has ended `localised`.
 """
 
@@ -82,6 +82,8 @@ def captions(
             *[(pair, TOLD_OF_MEETINGS) for pair in pairs if before is not None],
             (setup.robots, TOLD_OF_GROUPS),
         ]
+    elif setup.team:
+        units = [(setup.robots, TOLD_OF_TEAMS)]
     else:
         paired = {robot.id for pair in pairs for robot in pair}
         pairs += [(robot,) for robot in setup.robots if robot.id not in paired]
@@ -263,11 +265,68 @@ def departing(group: PairData) -> Told:
         text = f"{listed(sweeps)} {verb} the area for robots without an anchor."
         yield Caption("search", text, tuple(sweeps))
     leaving = [robot for robot, (was, task) in tasks.items() if task == TRAVELLING != was]
-    found = [(robot, group.setup.robot_setup(robot).peer) for robot in leaving]
+    found = [(robot, peer) for robot in leaving if (peer := group.setup.robot_setup(robot).peer)]
     if found:
         waits = "waits beside its anchor" if len(found) == 1 else "wait beside their anchors"
         ways = listed([f"{robot} drives to {peer}" for robot, peer in found], "robots drive to others")
         yield Caption("search", f"{ways}, which {waits}.", tuple(robot for pair in found for robot in pair))
+
+
+# --- teams ------------------------------------------------------------------------------------------
+
+
+def team_beginning(team: PairData) -> Told:
+    """Yield what the robots of a team know before the first tick, and what they share."""
+    setup, number = team.setup, len(team.ids)
+    if team.before is not None or team.now.tick != 0:
+        return
+    known = sum([one.position is not None for one in setup.anchors])
+    places = "There is no anchor"
+    if setup.anchors:
+        verb = "anchor is" if known == 1 else "anchors are"
+        places = f"The positions of {count_word(known)} {verb} known"
+        if unknown := len(setup.anchors) - known:
+            places += f", {'that' if unknown == 1 else 'those'} of {count_word(unknown)} more not"
+    who = f"{setup.ids[0]} does not know" if number == 1 else "No robot knows"
+    text = f"{places}. {who} where it is or which way it heads."
+    if setup.origin is not None:
+        text = f"{places}. All poses are those in the frame in which {setup.origin} starts at the origin."
+    yield Caption("rules", text)
+    shared = "" if number == 1 else f"{count_word(number).capitalize()} robots share all that they measure. "
+    what = ["an anchor"] * bool(setup.anchors) + ["another robot"] * (number > 1)
+    reach = f"up to {setup.mission.sensing_range:g} m, but not in which direction."
+    text = f"{shared}A robot measures how far away {' or '.join(what)} is, {reach}"
+    yield Caption("ranging", text, truth="The simulated sensors are exact." if team.exact else None)
+
+
+def locating(team: PairData) -> Told:
+    """Yield how many poses are first possible by all measurements, and which robots have one left."""
+    new, left = [], []
+    for robot, was, held in team.estimates():
+        if not was.world and held.world and not held.localised:
+            new.append((robot, len(held.world)))
+        elif len(was.world) > len(held.world) == 1:
+            left.append(robot)
+    if new:
+        what = f" possible pose{'' if new[0][1] == 1 else 's'}"
+        poses = [
+            f"{count_word(count)}{what if i == 0 else ''} of {one}" for i, (one, count) in enumerate(new)
+        ]
+        text = f"The distances leave {listed(poses, 'robots a few possible poses')}."
+        yield Caption("configurations", text, tuple([robot for robot, _ in new]))
+    if left:
+        yield Caption("ruled-out", f"One possible pose of {listed(left)} is left.", tuple(left))
+
+
+def leaving(team: PairData) -> Told:
+    """Yield which robots begin to drive past another anchor, since one does not tell them their headings."""
+    commands = [(robot, *team.commands(robot)) for robot in team.ids]
+    robots = [robot for robot, was, now in commands if was and now and now.task == "orbiting" != was.task]
+    if robots:
+        verb = "drives" if len(robots) == 1 else "drive"
+        why = "to where another one is in range: from one alone, the bearing is not known"
+        text = f"{listed(robots)} {verb} on a circle around an anchor, {why}."
+        yield Caption("search", text, tuple(robots))
 
 
 # --- phase 3 ----------------------------------------------------------------------------------------
@@ -402,7 +461,7 @@ def concluding(group: PairData) -> Told:
         text = "Both" if many and robots == 2 else listed(claiming)
         text += " claim to know their poses" if many else " claims to know its pose"
         text += f": {known} of {robots} robots now do." if robots > 2 else "."
-        yield Caption("claim", text, tuple(claiming) if group.setup.visits else group.ids)
+        yield Caption("claim", text, group.ids if group.setup.in_pairs else tuple(claiming))
 
 
 def happening(group: PairData) -> Told:
@@ -429,7 +488,8 @@ TOLD_OF_PAIRS: tuple[Teller, ...] = (
 )  # fmt: skip
 TOLD_OF_MEETINGS: tuple[Teller, ...] = (meeting,)
 TOLD_OF_GROUPS: tuple[Teller, ...] = (group_beginning, concluding, departing, happening)
-"""The captions of a pair, of the present meetings of a group, and of the whole group, in order."""
+TOLD_OF_TEAMS: tuple[Teller, ...] = (team_beginning, leaving, locating, concluding, happening)
+"""The captions of a pair, of the present meetings of a group, of the whole group, and of a team, in order."""
 
 
 def _ending(setup: RunSetup, now: TickData, end: MissionEnd) -> Caption:
@@ -464,7 +524,7 @@ def _silent_links(setup: RunSetup) -> str | None:
         for fault in setup.faults
         if (fault.partition or not fault.let_through) and fault.ticks is None and fault.contact_ticks is None
     ]
-    pairs = [(robot.id, robot.peer) for robot in setup.robots]
+    pairs = [(robot.id, robot.peer) for robot in setup.robots if robot.peer is not None]
     links = [f"from {one} to {peer}" for one, peer in pairs if any(fault.on(one, peer) for fault in dead)]
     if len(links) > MOST_LISTED_LINKS:
         return f"No report arrives on {len(links)} of the {len(setup.robots)} links between robots."

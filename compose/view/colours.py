@@ -9,8 +9,8 @@ from typing import Any
 
 from protocol.mission import Role
 
-COLOURS: dict[Role, str] = {"a": "#0b62a4", "b": "#c4451c"}
-"""The colours of a pair's robots by role, blue and red as in the paper."""
+COLOURS: dict[Role | None, str] = {"a": "#0b62a4", "b": "#c4451c", None: "#7f7f7f"}
+"""The colours of a pair's robots by role, blue and red as in the paper; grey without one."""
 DASHES: dict[int, tuple[float, ...]] = {1: (1.0, 1.6), 2: (4.0, 1.6), 3: ()}
 """The dashes of a path by phase, in multiples of the line width: dotted, dashed, solid."""
 
@@ -20,7 +20,7 @@ def line_style(phase: int) -> Any:
     return (0, DASHES[phase]) if DASHES[phase] else "-"
 
 
-def rgb(role: Role) -> tuple[float, float, float]:
+def rgb(role: Role | None) -> tuple[float, float, float]:
     """Return the colour of a robot as red, green and blue, each from 0 to 1."""
     red, green, blue = bytes.fromhex(COLOURS[role][1:])
     return red / 255.0, green / 255.0, blue / 255.0

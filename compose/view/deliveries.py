@@ -55,7 +55,7 @@ def _links(setup: RunSetup, now: TickData) -> list[Link]:
     )
 
 
-def contact_of(now: TickData, robot: str, peer: str) -> Contact | None:
+def contact_of(now: TickData, robot: str, peer: str | None) -> Contact | None:
     """Return the contact with `peer` in `robot`'s observation; None if there is none or it is unknown."""
     observation = now.observations.get(robot)
     return (

@@ -14,6 +14,7 @@ from protocol.motion import Pose, compose
 Rgb = tuple[float, float, float]
 """Red, green and blue, each from 0 to 1."""
 GREY: Rgb = (0.5, 0.5, 0.5)
+DARK: Rgb = (0.1, 0.1, 0.13)
 GREEN: Rgb = (0.0, 0.5, 0.35)
 THIN, WIDE = 1.5, 3.0
 """The widths of lines, in pixels."""
@@ -59,7 +60,10 @@ class Entity(NamedTuple):
 
 
 def standing(setup: RunSetup) -> Iterator[Entity]:
-    """Yield what does not change: anchors, sensing ranges and orbits, and the planned meetings of a group."""
+    """Yield what does not change: anchors, sensing ranges and orbits, and the planned meetings of a group.
+
+    Anchors of a team are where they are in truth, if that is known.
+    """
     for robot in setup.anchored:
         rgb, at = GREY if setup.visits else colours.rgb(robot.role), (robot.anchor.x, robot.anchor.y)
         reach, orbit = circle(at, setup.mission.sensing_range), circle(at, robot.orbit.radius)
@@ -68,6 +72,12 @@ def standing(setup: RunSetup) -> Iterator[Entity]:
             Lines(f"stage/orbit/{robot.id}", [orbit], GREY, 1.0, opacity=0.5),
         ]
         yield Entity("/stage", f"{robot.id}/anchor", f"stage/anchor/{robot.id}", rgb, lines=lines, place=at)
+    for anchor in setup.anchors:
+        if (spot := anchor.place or anchor.position) is not None:
+            at = (spot.x, spot.y)
+            lines = [Lines(f"stage/range/{anchor.id}", [circle(at, setup.mission.sensing_range)], GREY, 1.0)]
+            known = GREY if anchor.position is None else DARK
+            yield Entity("/stage", anchor.id, f"stage/anchor/{anchor.id}", known, lines=lines, place=at)
     if setup.visits:
         ends = [((a.anchor.x, a.anchor.y), (b.anchor.x, b.anchor.y)) for a, b in setup.links()]
         tree = Lines("stage/meetings", ends, GREY, 1.0, opacity=0.6)
@@ -77,7 +87,7 @@ def standing(setup: RunSetup) -> Iterator[Entity]:
 def drawing(setup: RunSetup, scene: Scene) -> Iterator[Entity]:
     """Yield what is drawn of one tick: robots, their hypotheses, and contacts."""
     for player in scene.players:
-        yield from _robot(setup.robot_setup(player.robot), player)
+        yield from _robot(setup.robot_setup(player.robot), setup, player)
     for link in scene.links(setup):
         words = [f"{link.range:.3f} m"] if link.range is not None else ["no range"]
         words += [
@@ -95,14 +105,20 @@ def anchor_frame(robot: RobotSetup) -> Pose:
     return robot.frame or Pose(robot.anchor.x, robot.anchor.y, 0.0)
 
 
-def _robot(robot: RobotSetup, player: Player) -> Iterator[Entity]:
-    """Yield a robot with its activity and its anchor range, and its hypotheses, paler if less probable."""
+def _robot(robot: RobotSetup, setup: RunSetup, player: Player) -> Iterator[Entity]:
+    """Yield a robot with its activity, ranges to anchors, and hypotheses, paler if less probable."""
     rgb, path, held, pose = colours.rgb(player.hue(robot)), f"robots/{robot.id}", player.held, player.pose
     if pose is not None:
+        at = (pose.x, pose.y)
         ends = []
         if player.anchor_range is not None:
-            ends = [((pose.x, pose.y), (robot.anchor.x, robot.anchor.y))]
+            ends = [(at, (robot.anchor.x, robot.anchor.y))]
         lines = [Lines(f"{path}/range", ends, rgb, THIN, f"{player.anchor_range or 0.0:.3f} m", 0.5)]
+        ranges = {one.anchor: one.range for one in player.anchors}
+        for anchor in setup.anchors:
+            rho, spot = ranges.get(anchor.id), anchor.place or anchor.position
+            strips = [(at, (spot.x, spot.y))] if rho is not None and spot is not None else []
+            lines.append(Lines(f"{path}/range/{anchor.id}", strips, rgb, THIN, f"{rho or 0.0:.3f} m", 0.5))
         body = [Arrow(pose, f"{robot.id}: {player.activity}")]
         yield Entity(f"/{robot.id}/body", robot.id, f"{path}/pose", rgb, body, lines)
     if held is not None:

@@ -13,7 +13,7 @@ from compose.recording.run_setup import RobotSetup, RunSetup
 from compose.view.deliveries import Passage, contact_of
 from compose.view.run_data import TickData
 from compose.view.words import doing
-from protocol.messages import Command, Inconsistent, Localised, MissionEnd
+from protocol.messages import Command, Inconsistent, Localised, MissionEnd, Observation
 from protocol.motion import travelled, wrap
 
 Kind = Literal[
@@ -62,8 +62,8 @@ def events(
     for robot in (None, *setup.ids):
         yield from _presence(robot, before, now)
     for robot_setup in setup.robots:
-        yield from _sensing(robot_setup, before, now)
-        yield from _deciding(robot_setup, before, now, grouped=bool(setup.visits))
+        yield from _sensing(robot_setup, setup, before, now)
+        yield from _deciding(robot_setup, setup, before, now)
         yield from _believing(robot_setup, before, now)
     yield from _radio(now.tick, passages)
     if end is not None and end.tick == now.tick:
@@ -84,7 +84,7 @@ def _presence(robot: str | None, before: TickData | None, now: TickData) -> Iter
 
 
 def _radio(tick: int, passages: Sequence[Passage]) -> Iterator[Event]:
-    received = Counter((one.receiver, one.tick) for one in passages if one.what == "heard")
+    received = Counter((one.sender, one.receiver, one.tick) for one in passages if one.what == "heard")
     for one in passages:
         report = f"{one.sender}'s report of tick {one.tick}"
         match one.what:
@@ -96,57 +96,79 @@ def _radio(tick: int, passages: Sequence[Passage]) -> Iterator[Event]:
             case "heard" if one.tick < tick:
                 late = f"{tick - one.tick} tick{'s' if tick - one.tick > 1 else ''} late"
                 yield Event(tick, "report-late", one.receiver, f"{one.receiver} receives {report}, {late}")
-    for (receiver, sent), times in received.items():
+    for (_, receiver, sent), times in received.items():
         if times > 1:
             text = f"{receiver} receives the report of tick {sent} {times} times"
             yield Event(tick, "report-doubled", receiver, text)
 
 
-def _sensing(robot_setup: RobotSetup, before: TickData | None, now: TickData) -> Iterator[Event]:
-    robot, peer, tick = robot_setup.id, robot_setup.peer, now.tick
+def _sensing(
+    robot_setup: RobotSetup, setup: RunSetup, before: TickData | None, now: TickData
+) -> Iterator[Event]:
+    robot, tick = robot_setup.id, now.tick
     observation = now.observations.get(robot)
     earlier = before.observations.get(robot) if before is not None else None
     if observation is None or (before is not None and earlier is None):
         return
-    was = earlier.anchor_range if earlier is not None else None
-    if was is None and observation.anchor_range is not None:
-        text = f"{robot} is in its anchor's range: {metres(observation.anchor_range)}"
+    was, ranges = _anchor_ranges(earlier), _anchor_ranges(observation)
+    for anchor in [one for one in ranges if one not in was]:
+        text = f"{robot} is in {anchor}'s range: {metres(ranges[anchor])}"
         yield Event(tick, "anchor", robot, text)
-    if was is not None and observation.anchor_range is None:
-        yield Event(tick, "anchor-lost", robot, f"{robot} is out of its anchor's range")
-    if robot_setup.role == "b" and peer in now.observations:  # yielded once in a pair, for role a
-        return
-    contact = contact_of(now, robot, peer)
-    near = before is not None and contact_of(before, robot, peer) is not None
-    if contact is not None and not near:
-        far = f": {metres(contact.range)}" if contact.range is not None else ""
-        yield Event(tick, "contact", robot, f"{robot} and {peer} are in range of each other{far}")
-    if contact is None and near:
-        yield Event(tick, "contact-lost", robot, f"{robot} and {peer} have lost contact")
+    for anchor in [one for one in was if one not in ranges]:
+        yield Event(tick, "anchor-lost", robot, f"{robot} is out of {anchor}'s range")
+    for peer in _contacts_told(robot_setup, setup, now):
+        contact = contact_of(now, robot, peer)
+        near = before is not None and contact_of(before, robot, peer) is not None
+        if contact is not None and not near:
+            far = f": {metres(contact.range)}" if contact.range is not None else ""
+            yield Event(tick, "contact", robot, f"{robot} and {peer} are in range of each other{far}")
+        if contact is None and near:
+            yield Event(tick, "contact-lost", robot, f"{robot} and {peer} have lost contact")
+
+
+def _anchor_ranges(observation: Observation | None) -> dict[str, float]:
+    """Return the ranges to anchors, in m, by how a sentence names the anchor."""
+    if observation is None:
+        return {}
+    own = {"its anchor": observation.anchor_range} if observation.anchor_range is not None else {}
+    return own | {one.anchor: one.range for one in observation.anchors}
+
+
+def _contacts_told(robot_setup: RobotSetup, setup: RunSetup, now: TickData) -> Sequence[str]:
+    """Return the robots whose contacts with this one are its events; the first robot tells each once."""
+    if setup.team:
+        ids = setup.ids
+        after = ids[ids.index(robot_setup.id) + 1 :]
+        return [one for one in ids if one != robot_setup.id and (one in after or one not in now.observations)]
+    if robot_setup.peer is None or (robot_setup.role == "b" and robot_setup.peer in now.observations):
+        return ()
+    return (robot_setup.peer,)
 
 
 def _deciding(
-    robot_setup: RobotSetup, before: TickData | None, now: TickData, *, grouped: bool
+    robot_setup: RobotSetup, setup: RunSetup, before: TickData | None, now: TickData
 ) -> Iterator[Event]:
-    """Yield the changes of phase, state and verdict. Robots that are `grouped` have states after a claim."""
+    """Yield the changes of phase, state and verdict. Robots of groups and teams have states after a claim."""
     robot, tick = robot_setup.id, now.tick
     if robot in now.late:
         yield Event(tick, "late", robot, f"{robot} misses the deadline and stops for this tick")
     if robot in now.without:
-        text = f"{robot} decides without {robot_setup.peer}'s report, which missed the deadline"
+        whose = "a" if setup.team else f"{robot_setup.peer}'s"
+        text = f"{robot} decides without {whose} report, which missed the deadline"
         yield Event(tick, "late", robot, text)
     command = now.commands.get(robot)
     earlier = before.commands.get(robot) if before is not None else None
     if command is None or (before is not None and earlier is None):
         return
-    if earlier is None or command.phase != earlier.phase:
+    if not setup.team and (earlier is None or command.phase != earlier.phase):
         name = "" if robot_setup.own_planner else f": {PHASE_NAMES[command.phase]}"
         yield Event(tick, "phase", robot, f"{robot} begins phase {command.phase}{name}")
-    active = command.verdict is None or (grouped and command.task != "localised")
+    active = command.verdict is None or (not setup.in_pairs and command.task != "localised")
     if active and (earlier is None or command.task != earlier.task):
         yield Event(tick, "state", robot, doing(robot_setup, command.phase, command.task, None))
     if command.verdict is None and earlier is not None and earlier.verdict is not None:
-        yield Event(tick, "undecided", robot, f"{robot} withdraws its claim: another meeting contradicts it")
+        what = "later measurements contradict" if setup.team else "another meeting contradicts"
+        yield Event(tick, "undecided", robot, f"{robot} withdraws its claim: {what} it")
     if command.verdict is not None and (earlier is None or earlier.verdict is None):
         yield _verdict(robot_setup, command, now)
 

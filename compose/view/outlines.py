@@ -101,8 +101,15 @@ class Box(NamedTuple):
 
 
 def box(setup: RunSetup) -> Box:
-    """Return the box about all sensing ranges and orbits, and the area of robots without an anchor."""
-    reach = [(one.anchor, max(setup.mission.sensing_range, one.orbit.radius)) for one in setup.anchored]
+    """Return the box about all sensing ranges and orbits, and the area of robots without an anchor.
+
+    Without an anchor, it is the box about where robots that range each other in a row may be.
+    """
+    far = setup.mission.sensing_range
+    reach = [(one.anchor, max(far, one.orbit.radius)) for one in setup.anchored]
+    reach += [(at, far) for one in setup.anchors if (at := one.place or one.position) is not None]
+    if not reach:
+        reach = [(Anchor(0.0, 0.0), far * math.sqrt(len(setup.robots)))]
     if (area := setup.sweep) is not None:
         reach += [(Anchor(area.x_min, area.y_min), 0.0), (Anchor(area.x_max, area.y_max), 0.0)]
     left, right = min(at.x - r for at, r in reach), max(at.x + r for at, r in reach)

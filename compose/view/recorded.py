@@ -66,5 +66,5 @@ def checked(run: Run) -> tuple[Sequence[str], RunSetup]:
         raise UserError(
             f"{run.source}: there is no {WORLD_JOURNAL}, and no robot's journal has a configuration"
         )
-    peers = [] if run.world is not None else [robot_setup.peer for robot_setup in setup.robots]
+    peers = [one.peer for one in setup.robots if one.peer is not None and run.world is None]
     return list(dict.fromkeys([*run.robots, *sorted(peers)])), setup

@@ -245,7 +245,7 @@ class RunData:
         if count < len(contacts):
             return contacts[count].peer
         config = self.configs.get(sender)
-        return config.peer if config is not None else ""
+        return config.others[0] if config is not None and config.others else ""
 
     def _add_reported(self, report: Report) -> None:
         """Extend the reported log of an attacker; a report may change earlier ticks than its own."""

@@ -15,16 +15,16 @@ from compose.view.events import Event, events
 from compose.view.outlines import Point, arc, ellipse
 from compose.view.run_data import TickData
 from compose.view.words import doing
-from protocol.messages import Contact, Localised, MissionEnd, Phase, Probability, Verdict, Word
+from protocol.messages import Contact, Localised, MissionEnd, NamedRange, Phase, Probability, Verdict, Word
 from protocol.mission import Role
 from protocol.motion import Controls, Covariance, Pose, travelled, wrap
 
 
 class Sent(msgspec.Struct, frozen=True):
-    """A report that a robot sends to its peer."""
+    """A report that a robot sends to its peer, or in a team the reports to all that are in range."""
 
     bytes: int
-    """The size of the frame in bytes."""
+    """The size of the frame in bytes, or of all frames."""
     phase: Phase | None = None
     """The phase; None, like the following fields, for a planner with reports of its own."""
     state: Word | None = None
@@ -104,6 +104,8 @@ class Player(msgspec.Struct, frozen=True, omit_defaults=True):
     executed: Controls | None = None
     """The controls over the previous tick, as measured by odometry."""
     anchor_range: float | None = None
+    anchors: tuple[NamedRange, ...] = ()
+    """The ranges to anchors of a team."""
     contacts: tuple[Contact, ...] = ()
     sent: Sent | None = None
     command: Decision | None = None
@@ -114,8 +116,8 @@ class Player(msgspec.Struct, frozen=True, omit_defaults=True):
     """The robot that it meets at present, or next, in a group; None for pairs."""
 
     def hue(self, robot_setup: RobotSetup) -> Role:
-        """Return the role whose colour the robot has: in a group, a once it is localised, and b before."""
-        if self.peer is None:
+        """Return the role whose colour the robot has: in groups and teams, a once localised, b before."""
+        if self.peer is None and robot_setup.role is not None:
             return robot_setup.role
         return "a" if self.command is not None and isinstance(self.command.verdict, Localised) else "b"
 
@@ -150,7 +152,7 @@ class Scene(msgspec.Struct, frozen=True):
                 return player
         raise KeyError(robot)
 
-    def held_by(self, robot: str) -> HeldPoses | None:
+    def held_by(self, robot: str | None) -> HeldPoses | None:
         """Return the poses that `robot` holds; None if they, or the robot, are unknown."""
         return next((player.held for player in self.players if player.robot == robot), None)
 
@@ -190,9 +192,9 @@ def scene(
     )
 
 
-def held_poses(robot: str, now: TickData) -> HeldPoses | None:
+def held_poses(robot: str | None, now: TickData) -> HeldPoses | None:
     """Return the poses that `robot` holds in the tick of `now`; None if its Estimate is unknown."""
-    estimate = now.estimates.get(robot)
+    estimate = now.estimates.get(robot) if robot is not None else None
     if estimate is None:
         return None
     bent: tuple[Point, ...] = ()
@@ -220,12 +222,16 @@ def player_of(
     if (observation := now.observations.get(robot)) is not None:
         known["executed"], known["contacts"] = observation.executed, observation.contacts
         known["anchor_range"], known["sensed"] = observation.anchor_range, True
+        known["anchors"] = observation.anchors
     if pose is not None:
         known["pose"] = Pose(pose.x, pose.y, wrap(pose.heading))
         known["reported"] = FalsePose(reported, travelled(pose, reported)) if reported is not None else None
     if command is not None:
         known["command"] = Decision(command.v, command.omega, command.phase, command.task, command.verdict)
-    if (sized := now.reports.get((robot, peer))) is not None:
+    if setup.team:
+        sent = [one.bytes for (sender, _), one in now.reports.items() if sender == robot]
+        known["sent"] = Sent(sum(sent)) if sent else None
+    elif peer is not None and (sized := now.reports.get((robot, peer))) is not None:
         report = sized.report
         shared = (report.phase, report.state, report.through, report.heard) if report.body is None else ()
         known["sent"] = Sent(sized.bytes, *shared)

@@ -80,7 +80,7 @@ def series(
 
 def _numbers(setup: RunSetup, place: int, now: TickData) -> Numbers:
     robot = setup.robots[place]
-    return Numbers.of(player_of(robot, setup, now), robot.given_anchor, held_poses(robot.peer, now))
+    return Numbers.of(player_of(robot, setup, now), robot, setup, lambda one: held_poses(one, now))
 
 
 def _curve(name: str, bins: Iterable[Sequence[Numbers]]) -> Curve:

@@ -40,6 +40,14 @@ DOING = {
 """Sentences by state name, of all other states."""
 TRAVELLING = "travelling"
 """The state of a robot that drives to another one of its group."""
+OF_TEAMS = {
+    "asleep": DOING["asleep"],
+    "circling": "{robot} drives a loop and ranges what is near",
+    "orbiting": "{robot} drives to where another anchor is in range",
+    "surveying": "{robot} drives to where its next ranges are most informative",
+    "localised": "{robot} is localised",
+}
+"""Sentences by state name, of robots of a team."""
 WAITING = "{robot} waits beside its anchor until {peer} comes into range"
 """The sentence of the state "orbiting" of a robot whose plan has no speed."""
 
@@ -54,9 +62,12 @@ def doing(robot_setup: RobotSetup, phase: int, state: str, verdict: Verdict | No
         case Undecided(reason):
             return f"{robot_setup.id} is undecided: {reason}"
         case Inconsistent(claim):
-            return f"{robot_setup.id} found an inconsistency in the reports of {robot_setup.peer}: {claim}"
+            where = f"reports of {robot_setup.peer}" if robot_setup.peer is not None else "measurements"
+            return f"{robot_setup.id} found an inconsistency in the {where}: {claim}"
     if robot_setup.own_planner:
         return f"{robot_setup.id}: {state}"
+    if robot_setup.peer is None:
+        return (OF_TEAMS.get(state) or "{robot}: " + state).format(robot=robot_setup.id)
     if robot_setup.given_anchor is None and state == "standing":
         return f"{robot_setup.id} has no anchor, and stands still until a localised robot is in range"
     sentence = SEEKING.get(state) or DOING.get(state) or "{robot}: " + state

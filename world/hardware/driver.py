@@ -43,6 +43,8 @@ class Reading(msgspec.Struct, frozen=True):
     A driver for groups returns these; one for pairs may, in place of `mutual_range` and `contact`, which are
     about the peer in the RobotConfig.
     """
+    anchors: Mapping[str, float | None] = {}
+    """The range to each anchor of a team, in m, by its name; absent or None where none was measured."""
 
 
 class Driver(Protocol):

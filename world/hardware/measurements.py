@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from protocol.messages import Contact, Message, Observation, RobotConfig
+from protocol.messages import Contact, Message, NamedRange, Observation, RobotConfig
 from protocol.wire import MalformedFrame, decode, encode
 from world.hardware.driver import Reading
 from world.hardware.driver_journal import Mark
@@ -26,7 +26,8 @@ def observation_frame(reading: Any, tick: int, config: RobotConfig) -> bytes:
         raise InvalidReading(f"returns {type(reading).__name__}, expected a Reading")
     executed = reading.executed if tick > 0 else None
     anchor_range = None if config.given_anchor is None else reading.anchor_range
-    return _checked(Observation(tick, config.robot, executed, anchor_range, _contacts(reading, config)))
+    contacts, anchors = _contacts(reading, config), _anchors(reading, config)
+    return _checked(Observation(tick, config.robot, executed, anchor_range, contacts, anchors=anchors))
 
 
 def mark_frames(reading: Reading, tick: int, robot: str) -> list[bytes]:
@@ -43,8 +44,11 @@ def _contacts(reading: Reading, config: RobotConfig) -> tuple[Contact, ...]:
     """Return the contacts in `reading`. Raises InvalidReading."""
     if not isinstance(reading.mutual_ranges, Mapping):
         raise InvalidReading(f"mutual_ranges is a {type(reading.mutual_ranges).__name__}, expected a mapping")
-    ranges, peer = dict(reading.mutual_ranges), config.peer
+    ranges = dict(reading.mutual_ranges)
     if reading.mutual_range is not None or reading.contact:
+        if config.encounter is None:
+            raise InvalidReading("robots of a team have no peer: mutual_ranges has their contacts")
+        peer = config.encounter.peer
         if peer in ranges:
             raise InvalidReading(f"both mutual_ranges and the other fields have a contact with {peer}")
         ranges[peer] = reading.mutual_range
@@ -53,6 +57,17 @@ def _contacts(reading: Reading, config: RobotConfig) -> tuple[Contact, ...]:
         stranger = next(iter(ranges))
         raise InvalidReading(f"mutual_ranges: {stranger!r} is none of {', '.join(config.others)}")
     return contacts
+
+
+def _anchors(reading: Reading, config: RobotConfig) -> tuple[NamedRange, ...]:
+    """Return the ranges to anchors of a team in `reading`. Raises InvalidReading."""
+    if not isinstance(reading.anchors, Mapping):
+        raise InvalidReading(f"anchors is a {type(reading.anchors).__name__}, expected a mapping")
+    for name in reading.anchors:
+        if name not in config.ranges:
+            raise InvalidReading(f"anchors: {name!r} is none that {config.robot} may range")
+    ranges = [(name, reading.anchors.get(name)) for name in config.ranges]
+    return tuple([NamedRange(name, rho) for name, rho in ranges if rho is not None])
 
 
 def _checked(message: Message) -> bytes:

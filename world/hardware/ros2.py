@@ -139,7 +139,8 @@ class Ros2:
     ) -> None:
         """Connect to the bridge at the Zenoh endpoint `connect`. The other options are names of topics.
 
-        In a group, the range to robot ID is on the topic `peer_range`/ID. If `stamped` is "true", messages on
+        In a group or a team, the range to robot ID is on the topic `peer_range`/ID, in a team that to the
+        anchor ID on `anchor_range`/ID. If `stamped` is "true", messages on
         `cmd_vel` are TwistStamped, otherwise Twist.
 
         Raises TimeoutError if there is no bridge within BRIDGE_S, and ValueError.
@@ -167,10 +168,12 @@ class Ros2:
         self._command = threading.Event()
         """The event that ends the current manoeuvre."""
         self._command.set()  # there is no manoeuvre yet
-        in_group = bool(config.members)
-        self._anchors = () if config.given_anchor is None else (anchor_range,)
+        several = bool(config.members) or config.team is not None
+        self._anchor = None if config.given_anchor is None else anchor_range
         """The topic of the range to the robot's own anchor, if it has one."""
-        self._peers = {one: f"{peer_range}/{one}" if in_group else peer_range for one in config.others}
+        self._anchors = {one: f"{anchor_range}/{one}" for one in config.ranges}
+        """The topic of the range to each anchor of the team."""
+        self._peers = {one: f"{peer_range}/{one}" if several else peer_range for one in config.others}
         """The topic of the range to each other robot."""
         self._open = ExitStack()
         give_up = time.monotonic() + BRIDGE_S
@@ -184,7 +187,9 @@ class Ros2:
         self._cmd_vel = session.publisher(link, cmd_vel)
         self._odom = odom
         link.declare_subscriber(odom, lambda sample: self._on_odometry(sample.payload.to_bytes()))
-        for topic in (*self._anchors, *self._peers.values()):
+        own = () if self._anchor is None else (self._anchor,)
+        self._topics = (*own, *self._anchors.values(), *self._peers.values())
+        for topic in self._topics:
             link.declare_subscriber(topic, self._on_range(topic))
 
     def sense(self, tick: int) -> Reading:
@@ -205,13 +210,15 @@ class Ros2:
             pose, _ = self._pose
             driven = executed(self._last or pose, pose, self._mission.period)
             self._last = pose
-            anchor_range = next((self._fresh(topic, since) for topic in self._anchors), None)
+            anchor_range = self._fresh(self._anchor, since) if self._anchor is not None else None
+            anchors = {one: self._fresh(topic, since) for one, topic in self._anchors.items()}
             mutual = [(robot, self._fresh(topic, since)) for robot, topic in self._peers.items()]
             return Reading(
                 driven,
                 _measured(anchor_range),
                 mark=(pose.x, pose.y, pose.heading),
                 mutual_ranges={robot: _measured(rho) for robot, rho in mutual if rho is not None},
+                anchors={one: _measured(rho) for one, rho in anchors.items()},
             )
 
     def drive(self, v: float, omega: float) -> None:
@@ -307,9 +314,8 @@ class Ros2:
 
     def _is_all_here(self, since: float) -> bool:
         came = [self._pose[1] if self._pose else 0.0]
-        topics = (*self._anchors, *self._peers.values())
-        came += [self._ranges[topic][1] for topic in topics if topic in self._ranges]
-        return len(came) == 1 + len(topics) and min(came) >= since
+        came += [self._ranges[topic][1] for topic in self._topics if topic in self._ranges]
+        return len(came) == 1 + len(self._topics) and min(came) >= since
 
     def _fresh(self, topic: str, since: float) -> float | None:
         """Return the range in m that arrived on `topic` since then; None if it is out of range, or missing.

@@ -40,7 +40,8 @@ class Ending:
         self._group, self._others = config.group, {*config.others}
         self._ends = {one.robot: one.ends for one in config.members}
         """The tick until which each robot of a group is localised, by the plan."""
-        self._peers = {} if config.members else {config.robot: config.peer, config.peer: config.robot}
+        self._in_pair = not config.members and config.team is None
+        self._peers = {config.robot: config.peer, config.peer: config.robot} if self._in_pair else {}
         """The peer of each robot of a pair."""
         planned = max(self._ends.values(), default=0) + _sweep_ticks(config)
         self._plan = max(planned, _confirmed_tick(config))
@@ -95,7 +96,7 @@ class Ending:
         A robot that catches up after a restart sends no TickStarts: it ends when it has sent enough of them.
         """
         if command is not None:
-            if self.verdict is None or self._ends:  # a robot of a pair does not withdraw its result
+            if self.verdict is None or not self._in_pair:  # a robot of a pair does not withdraw its result
                 self.verdict = command.verdict
             self._rests = command.rests
         lost = [robot for robot in self._others if self._is_lost(robot, tick)]
@@ -130,9 +131,9 @@ class Ending:
             main = Cause("waiting", (self._me,))
         causes = [main] if main is not None else []
         left = tuple([one.robots[0] for one in found if one is not main])
-        if left and self._ends:  # in a pair, one cause suffices
+        if left and not self._in_pair:  # in a pair, one cause suffices
             causes.append(Cause("others", left))
-        if missing and (self._ends or (main is not None and main.code == "waiting")):
+        if missing and (not self._in_pair or (main is not None and main.code == "waiting")):
             causes.append(Cause("no-result", missing))
         return mission_end(tick, causes)
 

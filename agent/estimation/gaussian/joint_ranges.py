@@ -31,11 +31,11 @@ MOVED = 0.01
 HELD = 1e24
 """The information (1 / rad^2) of a heading that is held: more than any ranges have."""
 
-OF_START = 1e18
-"""The information (1 / m^2, 1 / rad^2) of an exact pose at tick 0: that of a sigma of 1e-9.
+OF_START = 1e-3
+"""The sigma (m, rad) of an exact pose at tick 0, as a fraction of that of a range in m.
 
-It is a thousandth of SIGMA_FLOOR. With less, the covariances of other robots would contain it; with HELD,
-that of a robot with exact odometry would be zero, and no claim.
+Without it, the covariance of a robot that only its odometry moves would be singular, and no claim. With more,
+the covariances of other robots would contain it.
 """
 
 MOST_CORRELATED_RANGES = 96
@@ -334,6 +334,18 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
                 moved[1:] |= hypot(np.diff(x), np.diff(y)) > MOVED * self.reach
         return np.flatnonzero(moved)
 
+    @property
+    def only_rounding(self) -> bool:
+        """True if the sensors are exact: what a fit leaves is rounding."""
+        return self.noise.exact
+
+    def has_moved(self, robot: int) -> bool:
+        """Return whether the ranges of a robot are from different places in the frame of its odometry."""
+        own, path = self.ranges.of(robot), self.paths[robot]
+        x, y = path.x[self.ranges.tick[own]], path.y[self.ranges.tick[own]]
+        away = hypot(x - x[:1], y - y[:1]).max(initial=0.0)
+        return bool(away > MOVED * self.ranges.rho[own].max(initial=0.0))
+
     @cached_property
     def mutual_places(self) -> Places:
         """The indices of the mutual ranges of a pair that are the first, or follow a motion of a robot."""
@@ -512,16 +524,16 @@ def joint_measurements(
         period,
         (origin.x, origin.y),
         noise,
-        _prior(relative),
+        _prior(relative, OF_START * max(noise.anchor_sigma, noise.mutual_sigma, SIGMA_FLOOR)),
         anchors,
         reach,
     )
 
 
-def _prior(poses: Sequence[AnchorPlace | StartPose | None]) -> PosePrior | None:
+def _prior(poses: Sequence[AnchorPlace | StartPose | None], of_start: float) -> PosePrior | None:
     """Return what is known of the poses of robots and anchors; None if nothing is.
 
-    The heading of an anchor means nothing, and is held.
+    The heading of an anchor means nothing, and is held. `of_start` is the sigma (m, rad) of a start.
     """
     if not any(poses):
         return None
@@ -532,7 +544,7 @@ def _prior(poses: Sequence[AnchorPlace | StartPose | None]) -> PosePrior | None:
             case AnchorPlace(x, y, sigma):
                 mean[k, :2], told = (x, y), (sigma**-2, sigma**-2, 1.0)
             case StartPose():
-                mean[k], told = one, (OF_START, OF_START, OF_START)
+                mean[k], told = one, (of_start**-2, of_start**-2, of_start**-2)
         if told is not None:
             information[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = np.diag(told)
     known = np.diagonal(information)[np.diagonal(information) > 0.0].tolist()

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from agent.estimation.following import ClaimRule
 from compose.errors import UserError
 from compose.recording.estimating.estimate_run import estimated
 from compose.recording.estimating.noise_files import RangeCorrection
@@ -21,7 +22,6 @@ from compose.recording.estimating.radio_errors import (
     true_errors,
 )
 from compose.recording.estimating.recorded_measurements import Measurements, chosen_part, numerics
-from compose.recording.estimating.recording_estimator import ClaimRule
 from compose.recording.estimating.true_poses import TRUTH_GAP_S
 from compose.recording.ranging.range_recording import RangeRecording
 from protocol.noise import PROFILES, ProfileName

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
+from agent.estimation.following import ClaimRule
 from agent.estimation.solver import Solver
 from compose.errors import UserError
 from compose.recording.estimating.estimate_rows import EstimateSummary, PoseEstimateRow
@@ -23,7 +24,7 @@ from compose.recording.estimating.recorded_measurements import (
     measurements,
     numerics,
 )
-from compose.recording.estimating.recording_estimator import ClaimRule, EstimateEpoch, RecordingEstimator
+from compose.recording.estimating.recording_estimator import EstimateEpoch, RecordingEstimator
 from compose.recording.ranging.range_recording import SAME_TIME_S
 from compose.recording.ranging.range_steps import NoSteps
 from compose.recording.ranging.recording_rows import AnyRow, OdometryRow, RecordingBuilder, SourcePlace

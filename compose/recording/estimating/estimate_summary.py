@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from agent.estimation.fit import Fit
+from agent.estimation.following import ClaimRule
 from agent.estimation.gaussian.joint_claims import displaced_anchor
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.noise_level import INLIER
@@ -24,7 +25,7 @@ from compose.recording.estimating.estimate_rows import (
     estimate_csv,
 )
 from compose.recording.estimating.recorded_measurements import MeasuredRobot, Measurements, listed
-from compose.recording.estimating.recording_estimator import ClaimRule, EpochFit, EstimateEpoch
+from compose.recording.estimating.recording_estimator import EpochFit, EstimateEpoch
 from protocol import files
 
 MOST_STRAYS, FEWEST_OF_ANCHOR = 0.5, 8

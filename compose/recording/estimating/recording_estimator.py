@@ -3,58 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
-from agent.estimation.claim import BEFORE_SEARCH, blocked
 from agent.estimation.fit import Fit
-from agent.estimation.gaussian.joint_claims import Displacement, displaced_anchor, open_position, undetermined
+from agent.estimation.following import ClaimRule, Following
+from agent.estimation.gaussian.joint_claims import open_position, undetermined
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
-from agent.estimation.gaussian.search import begun, candidates, extended, search
-from agent.estimation.judged import of_joint
-from agent.estimation.posterior import NO_HYPOTHESES, Posterior, certainties, settled
+from agent.estimation.posterior import Posterior, certainties
 from agent.estimation.solver import Solver, UnusableSolution
 from compose.errors import UserError
 from compose.recording.estimating.estimate_rows import FinalHypothesis, PoseEstimateRow, pose_row
 from compose.recording.estimating.recorded_measurements import Measurements, numerics
 from compose.recording.ranging.range_recording import Numbers, RecordedRobot
 from protocol.motion import wrap
-
-GROUP_SEARCHES = tuple(8 * 2**n for n in range(16))
-"""The numbers of ranges at which the whole plane is searched again."""
-
-MOST_SEARCHES = 100
-"""The number of searches of the whole plane after which it is only searched with twice as many ranges.
-
-Where no hypothesis fits, each epoch has a search. With fewer, recordings of a minute that settle late would
-have other estimates; with more, recordings that contradict themselves take longer.
-"""
-
-GIVEN_UP = (
-    f"not settled after {MOST_SEARCHES} searches of the plane; the next is due with twice as many ranges"
-)
-"""The reason against a claim that such a search has not confirmed."""
-
-RETESTED = 1.1
-"""The factor by which ranges must have grown before the places of the anchors are tested again.
-
-With less, claims of robots with many anchors take twice as long; with more, a false place is found later.
-"""
-
-MORE_RANGES = 1.5
-"""The factor by which the decisive ranges of a robot must have grown before it is tried again."""
-
-
-class ClaimRule(NamedTuple):
-    """The accuracy and the confidence that a claim needs."""
-
-    accuracy: float = 0.3
-    """The largest sigma of the position in m: the root of the trace of its covariance."""
-    confidence: float = 0.9999
-    """The least probability of the hypothesis."""
 
 
 class EpochFit(NamedTuple):
@@ -87,11 +52,7 @@ class EstimateEpoch(NamedTuple):
 
 
 class RecordingEstimator:
-    """The estimate of any number of robots, which goes on from epoch to epoch.
-
-    Robots that are located are followed. The whole plane is searched at the numbers of ranges GROUP_SEARCHES,
-    and before the first claim of each robot.
-    """
+    """The estimate of any number of robots, which goes on from epoch to epoch (see `following`)."""
 
     def __init__(self, rule: ClaimRule, solver: Solver | None = None) -> None:
         self.rule, self._solver = rule, solver
@@ -102,12 +63,7 @@ class RecordingEstimator:
     def begin(self) -> None:
         """Begin the search of all further epochs again."""
         self._next = 0
-        self._known: Posterior = NO_HYPOTHESES
-        self._searched = self._searches = 0
-        self._failed: dict[tuple[int, ...], int] = {}
-        self._claimed: set[str] = set()
-        self._displaced: Displacement | None = None
-        self._tested = 0
+        self._following = Following()
 
     def epochs(
         self, measured: Measurements, done: Callable[[], None] = lambda: None
@@ -136,50 +92,8 @@ class RecordingEstimator:
     def _epoch(self, measured: Measurements, number: int) -> EstimateEpoch:
         """Return the estimate at the end of the epoch with this `number`, from 0 on, in their order."""
         used = msgspec.structs.replace(measured.until(number), solver=self._solver)
-        known = settled(self._known, used)
-        found = self._extended(known if known.hypotheses else begun(used), used)
-        count = len(used.ranges.rho)
-        due = found.hypotheses and any(self._searched < at <= count for at in GROUP_SEARCHES)
-        reasons = self._reasons(found, used)
-        claiming = {name for name, reason in reasons.items() if not reason} - self._claimed
-        if claiming and not due and self._searches >= MOST_SEARCHES:
-            reasons |= dict.fromkeys(sorted(claiming), GIVEN_UP)
-        elif due or claiming:
-            found, self._searched = search(used, found), count
-            self._searches += 1
-            reasons = self._reasons(found, used)
-        self._known = found
-        self._claimed |= {name for name, reason in reasons.items() if not reason}
-        return _result(measured, number, used, found, reasons)
-
-    def _extended(self, found: Posterior, used: JointMeasurements) -> Posterior:
-        """Return `found` with further robots; those that failed are tried again with more ranges."""
-        possible = candidates(found.located, used)
-        failed = [one for one in possible if one.decisive < MORE_RANGES * self._failed.get(one.robots, 0)]
-        if len(failed) == len(possible):
-            return found
-        more = extended(found, used, failed)
-        for one in candidates(more.located, used):
-            if one not in failed:
-                self._failed[one.robots] = one.decisive
-        return more
-
-    def _reasons(self, found: Posterior, used: JointMeasurements) -> dict[str, str]:
-        """Return what blocks the claim of each located robot; an empty text if nothing does."""
-        part = used.some(found.located)
-        judged = {
-            part.robots[i]: of_joint("recording", i, found, certainty, part, *self.rule)
-            for i, certainty in enumerate(certainties(found))
-            if not part.is_anchor(i)
-        }
-        claiming = {name for name, one in judged.items() if blocked(one, BEFORE_SEARCH) is None}
-        if claiming:
-            count = len(part.ranges.rho)
-            if count >= RETESTED * self._tested or not claiming <= self._claimed:
-                self._tested, self._displaced = count, displaced_anchor(found.hypotheses[0].fit, part)
-            judged = {name: one._replace(displaced=self._displaced) for name, one in judged.items()}
-        reasons = {name: blocked(one) for name, one in judged.items()}
-        return {name: one.reason if one is not None else "" for name, one in reasons.items()}
+        found = self._following = self._following.after(used, self.rule, "recording")
+        return _result(measured, number, used, found.known, found.reasons)
 
 
 def _result(
@@ -187,7 +101,7 @@ def _result(
     number: int,
     used: JointMeasurements,
     found: Posterior,
-    reasons: dict[str, str],
+    reasons: Mapping[str, str],
 ) -> EstimateEpoch:
     """Return the estimate at the end of an epoch, by what was `found` with what is `used`."""
     t, part, sure = float(measured.ends[number]), used.some(found.located), certainties(found)

@@ -51,6 +51,9 @@ def ranges_of_run(run: Run, given: Sequence[AnchorRow] = ()) -> RangeRecording:
             anchors[one.anchor] = name = f"anchor-{one.id}"
             builder.add(AnchorRow(name, one.anchor.x, one.anchor.y), run.source)
     anchor_of = {one.id: anchors[one.anchor] for one in setup.anchored}
+    for each in setup.anchors:
+        x, y = (at.x, at.y) if (at := each.position) is not None else (None, None)
+        builder.add(AnchorRow(each.id, x, y, sigma=each.sigma), run.source)
     period = setup.mission.period
     for tick in range(run.length):
         observations = [one for robot, one in run.observations[tick].items() if robot in setup.ids]
@@ -79,6 +82,8 @@ def _add_tick(
             builder.add_odometry(row, increment_covariance(executed, period, noise.odometry), builder.source)
         if (rho := observed.anchor_range) is not None:
             builder.add(RangeRow(t, robot, anchor_of[robot], rho, anchor_sigma), builder.source)
+        for measured in observed.anchors:
+            builder.add(RangeRow(t, robot, measured.anchor, measured.range, anchor_sigma), builder.source)
         for one in observed.contacts:
             pair = frozenset((robot, one.peer))
             if one.range is not None and one.peer in setup.ids and pair not in ranged:

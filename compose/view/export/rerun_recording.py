@@ -146,7 +146,7 @@ class _Drawing:
         for player in scene.players:
             self._extend_path(self._setup.robot_setup(player.robot), player)
         for robot in self._setup.robots[:PLOTTED]:
-            numbers = Numbers.in_scene(scene, robot)
+            numbers = Numbers.in_scene(scene, robot, self._setup)
             for number in [number for plotted in PLOTS.values() for number in plotted]:
                 value = getattr(numbers, number)
                 known = [float(value)] if value is not UNSET else []

@@ -68,7 +68,7 @@ class Views:
         yield Shown("/tf", fox.FrameTransforms(transforms=list(self._transforms(scene, at))))
         for player in scene.players:
             robot_setup = self.setup.robot_setup(player.robot)
-            yield Shown(f"/{player.robot}/numbers", Numbers.in_scene(scene, robot_setup))
+            yield Shown(f"/{player.robot}/numbers", Numbers.in_scene(scene, robot_setup, self.setup))
             yield from self._poses(player, at)
         entities: dict[str, list[fox.SceneEntity]] = {"/contact": []}
         for one in drawing(self.setup, scene):

@@ -21,7 +21,7 @@ MOST_ROBOTS = 40
 
 
 def thumbnail(setup: RunSetup, known: RunData) -> str:
-    """Return the picture of a run as SVG. In a group, those localised at last have the colour of a."""
+    """Return the picture of a run as SVG. Where robots form no pairs, localised ones have the colour of a."""
     shown, ticks = box(setup), [known.ticks[tick] for tick in sorted(known.ticks)]
     scale = min(WIDTH / shown.width, HEIGHT / shown.height) * 0.96
     commands = [one for tick in ticks for one in tick.commands.items()]
@@ -32,7 +32,7 @@ def thumbnail(setup: RunSetup, known: RunData) -> str:
 
     parts: tuple[list[str], list[str]] = [], []
     for robot in setup.robots[:MOST_ROBOTS]:
-        role = robot.role if not setup.visits else "a" if robot.id in localised else "b"
+        role = robot.role if setup.in_pairs else "a" if robot.id in localised else "b"
         colour = colours.COLOURS[role]
         if robot.given_anchor is not None:
             x, y = at(robot.given_anchor)

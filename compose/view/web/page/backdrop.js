@@ -29,7 +29,8 @@ export class Backdrop {
       this.pen.font = look.font;
       this.#grid(look);
       if (store.grouped && truth) draw_tree(this.pen, plane, view);
-      for (const robot of robots) this.#anchor(view, robot);
+      for (const robot of robots) if (robot.anchor) this.#anchor(view, robot);
+      for (const one of this.#shared(view)) this.#anchor(view, one);
       if (truth) for (const robot of robots) for (const kind of kinds_of(robot)) this.trails.trail(this.pen, view, robot, kind);
       this.paths = [...plane.marks]; // the trails have named them
     }
@@ -38,8 +39,18 @@ export class Backdrop {
     plane.context.drawImage(canvas, 0, 0);
     plane.context.restore();
     plane.labels.placed.push(this.bar);
-    for (const robot of robots) this.#name(view, robot);
-    for (const mark of ["anchor", "orbit", ...this.paths]) plane.marks.add(mark);
+    for (const robot of robots) if (robot.anchor) this.#name(view, robot, `anchor of ${robot.id}`);
+    for (const one of this.#shared(view)) this.#name(view, one, one.told ? one.id : `${one.id}, unknown`);
+    const { anchors } = store.stage, marks = anchors.some(({ position }) => !position) && truth ? ["unsurveyed"] : [];
+    if (!store.stage.team) marks.push("anchor", "orbit");
+    else if (anchors.some(({ position }) => position)) marks.push("anchor");
+    for (const mark of [...marks, ...this.paths]) plane.marks.add(mark);
+  }
+
+  /** Returns the anchors of a team that are drawn: those that no robot knows with the ground truth only. */
+  #shared({ store, truth }) {
+    return store.stage.anchors.map((one) => ({ id: one.id, anchor: store.anchor_at(one, truth), told: one.position, sigma: one.sigma }))
+      .filter(({ anchor }) => anchor);
   }
 
   /** Draws the grid, and a bar with its unit. */
@@ -72,9 +83,8 @@ export class Backdrop {
     this.bar = [x - Math.max(bar, 60), y - 18, x, y + 4];
   }
 
-  /** Draws the range of an anchor and its robot's orbit. */
+  /** Draws the range of an anchor, and its robot's orbit or, in a team, three sigmas of its position. */
   #anchor(view, robot) {
-    if (!robot.anchor) return;
     const { pen, plane } = this, { look } = view, { at: [x, y], reach, alpha } = this.#place(view, robot);
     pen.globalAlpha = alpha;
     pen.beginPath();
@@ -86,7 +96,7 @@ export class Backdrop {
     pen.strokeStyle = localised ? look.robot.a : look.ring;
     pen.stroke();
     pen.beginPath();
-    pen.arc(x, y, robot.orbit[0] * plane.scale, 0, TAU);
+    pen.arc(...(robot.told ? plane.at(robot.told) : [x, y]), (robot.orbit?.[0] ?? 3 * robot.sigma) * plane.scale, 0, TAU);
     pen.setLineDash([7, 4, 1.5, 4]);
     pen.lineWidth = 1;
     pen.strokeStyle = look.orbit;
@@ -95,9 +105,13 @@ export class Backdrop {
     pen.globalAlpha = 1;
   }
 
-  /** Draws an anchor, above paths and poses that are ruled out. */
-  beacon(view, robot) {
-    if (!robot.anchor) return;
+  /** Draws all anchors, above paths and poses that are ruled out. */
+  beacons(view, robots) {
+    for (const robot of robots) if (robot.anchor) this.#beacon(view, robot);
+    for (const one of this.#shared(view)) this.#beacon(view, one);
+  }
+
+  #beacon(view, robot) {
     const pen = this.plane.context, { at: [x, y], radius: r, alpha } = this.#place(view, robot);
     pen.globalAlpha = alpha;
     pen.beginPath();
@@ -105,25 +119,30 @@ export class Backdrop {
     pen.lineWidth = 2.5;
     pen.strokeStyle = view.look.paper;
     pen.stroke();
-    pen.fillStyle = view.look.ink;
+    const hollow = robot.told === null;
+    pen.fillStyle = hollow ? view.look.paper : view.look.ink;
     pen.fill();
+    if (hollow) {
+      pen.lineWidth = 1.4;
+      pen.strokeStyle = view.look.ink;
+      pen.stroke();
+    }
     pen.globalAlpha = 1;
   }
 
   /** Asks for the label of an anchor, and adds its target. */
-  #name(view, robot) {
-    if (!robot.anchor) return;
+  #name(view, robot, label) {
     const { plane } = this, { at, reach, radius, alpha } = this.#place(view, robot);
     plane.targets.push({ kind: "anchor", robot: robot.id, at, radius });
     plane.context.globalAlpha = alpha;
-    const [x, y] = at, below = [[x, y + radius + 12]];
-    if (reach > LEGIBLE) plane.labels.put(`anchor of ${robot.id}`, x, y - reach - 5, view.look.faint, "center", { others: below });
+    const [x, y] = at, below = [x, y + radius + 12], above = [x, y - reach - 5], [spot, other] = view.store.stage.team ? [below, above] : [above, below];
+    if (reach > LEGIBLE) plane.labels.put(label, ...spot, view.look.faint, "center", { others: [other] });
     plane.context.globalAlpha = 1;
   }
 
   #place({ store, focus }, robot) {
     const reach = store.stage.mission.sensing_range * this.plane.scale;
-    const mine = !focus || robot.id === focus || robot.peer === focus;
+    const mine = !focus || robot.id === focus || robot.peer === focus || robot.sigma !== undefined;
     return { at: this.plane.at(robot.anchor), reach, radius: reach > 40 ? 6 : 4, alpha: mine ? 1 : 0.45 };
   }
 }

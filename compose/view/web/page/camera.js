@@ -10,9 +10,17 @@ export const true_and_reported = (player) => [player?.pose, player?.reported?.po
 /**
  * Returns the discs [position, radius] of the scenario: the anchors of `robots` with their ranges and orbits.
  *
- * With a robot that has no anchor, these are also the corners of the area in which it is.
+ * With a robot that has no anchor, these are also the corners of the area in which it is. In a team, they are those of
+ * all anchors; without any, those around the starts of the robots, or around the origin if these are unknown.
  */
-export function scenario_discs(robots, { mission: { sensing_range }, sweep }) {
+export function scenario_discs(robots, store) {
+  const { mission: { sensing_range }, sweep, anchors, team } = store.stage;
+  if (team) {
+    const known = anchors.map((one) => store.anchor_at(one, true)).filter(Boolean);
+    const starts = known.length ? [] : store.stage.robots.map(({ id }) => store.player(store.first, id)?.pose).filter(Boolean);
+    const discs = [...known, ...starts].map((at) => [at, (known.length ? 1 : 0.6) * sensing_range]);
+    return discs.length ? discs : [[[0, 0], sensing_range * Math.sqrt(store.stage.robots.length)]];
+  }
   const anchored = robots.filter(({ anchor }) => anchor), discs = anchored.map(({ anchor, orbit }) => [anchor, Math.max(sensing_range, orbit[0])]);
   if (anchored.length < robots.length) discs.push([[sweep[0], sweep[1]], 0], [[sweep[2], sweep[3]], 0]);
   return discs;
@@ -26,11 +34,11 @@ export function scenario_discs(robots, { mission: { sensing_range }, sweep }) {
  */
 export function story_discs({ store, tick, focus, truth, eliminated }, pair) {
   const { robots, mission: { sensing_range } } = store.stage;
-  if (store.grouped && !focus) return scenario_discs(robots, store.stage);
+  if (store.grouped && !focus) return scenario_discs(robots, store);
   const finished = pair.every((robot) => store.player(tick - 1, robot.id)?.command?.verdict);
-  if (finished && truth && robots.length > pair.length) return scenario_discs(robots, store.stage);
+  if (finished && truth && robots.length > pair.length) return scenario_discs(robots, store);
   const shown = truth || !focus ? pair : pair.filter((robot) => robot.id === focus);
-  const discs = scenario_discs(shown, store.stage);
+  const discs = scenario_discs(shown, store);
   if (!pair.some((robot) => store.phase(tick, robot.id) === 3)) return discs;
   const poses = [];
   for (const robot of shown) {

@@ -4,7 +4,7 @@ import { distance, wrap } from "./geometry.js";
 import { counted, task } from "./group.js";
 import { leads } from "./held.js";
 import { LEAST_GAP_M } from "./trails.js";
-import { metres, probability, PHASES, place, plural, rad, speed, turning } from "./words.js";
+import { metres, probability, PHASES, place, plural, rad, speed, STEPS, turning } from "./words.js";
 
 const MOST_PROBABILITIES = 5;
 const MANY = 4;
@@ -74,7 +74,7 @@ export class Cards {
     const groups = new Map(OUTCOMES.map((outcome) => [outcome, []]));
     for (const id of this.entries.keys()) groups.get(this.store.player(tick, id)?.command?.verdict?.[0] ?? "running").push(id);
     const players = [...this.entries.keys()].map((id) => this.store.player(tick, id));
-    const counts = this.store.grouped ? [counted(players)] : OUTCOMES.filter((outcome) => groups.get(outcome).length).map((outcome) => `${groups.get(outcome).length} ${outcome}`);
+    const counts = this.store.grouped ? [counted(players, this.store.stage.team)] : OUTCOMES.filter((outcome) => groups.get(outcome).length).map((outcome) => `${groups.get(outcome).length} ${outcome}`);
     if (this.counts.textContent !== counts.join(", ")) this.counts.textContent = counts.join(", ");
     const sorted = [...groups.values()].flat(), order = sorted.join();
     if (order === this.order) return;
@@ -126,7 +126,8 @@ class Card {
     const phase = store.phase(tick, this.robot.id);
     this.root.dataset.phase = phase;
     this.root.classList.toggle("down", Boolean(player.down));
-    this.phase.textContent = `phase ${phase}${this.robot.own_planner ? "" : `: ${PHASES[phase]}`}${player.down ? "; down" : ""}`;
+    const words = store.stage.team ? STEPS[phase] : `phase ${phase}${this.robot.own_planner ? "" : `: ${PHASES[phase]}`}`;
+    this.phase.textContent = `${words}${player.down ? "; down" : ""}`;
     if (this.doing.textContent !== player.activity) this.doing.textContent = player.activity;
     const attack = truth && player.reported ? attacked(store, tick, this.robot, player.reported) : "";
     if (this.attack.textContent !== attack) this.attack.textContent = attack;
@@ -134,11 +135,11 @@ class Card {
     const [off, range] = truth && player.pose && held?.world.length ? error(held, player.pose) : ["", ""];
     this.error.textContent = off;
     this.error.title = range;
-    this.#row("measured", measured(player, this.robot));
+    this.#row("measured", measured(player, this.robot, store.stage));
     this.#row("received", received(player));
     this.#row("command", command ? commanded(command) : "–");
-    this.#row("sent", player.sent ? `report of ${player.sent.bytes} bytes, log through tick ${player.sent.through}` : "nothing");
-    this.#row("belief", held ? believed(held) : "–");
+    this.#row("sent", player.sent ? sent(player.sent) : "nothing");
+    this.#row("belief", held ? believed(held, store.stage.team ? "pose" : "configuration") : "–");
     if (truth) this.#row("true pose", player.pose ? `${place(player.pose)}, ${rad(player.pose[2])}` : "unknown");
     else if (this.fields.has("true pose")) this.#row("true pose", "hidden");
     const counted = store.counted(this.robot.id, tick);
@@ -181,15 +182,18 @@ function attacked(store, tick, { id, peer }, { gap }) {
   return `${id} ${off}. ${peer} ${kind === "undecided" ? "ends undecided" : `rejects ${id}`} ${at}: ${reason}.`;
 }
 
-function measured(player, robot) {
+function measured(player, robot, { team, anchors }) {
   if (!player.sensed) return "unknown";
   const odometry = player.executed ? `odometry ${speed(player.executed[0])}, ${turning(player.executed[1])}; ` : "";
-  const none = robot.anchor ? "no range to its anchor" : "no anchor";
-  const anchor = player.anchor_range === undefined ? none : `anchor ${metres(player.anchor_range)}`;
-  if (!player.contacts?.length) return `${odometry}${anchor}; ${robot.peer} is not in range`;
+  const none = robot.anchor ? "no range to its anchor" : anchors.length ? "no range to an anchor" : "no anchor";
+  const anchor = player.anchors?.length ? player.anchors.map(([id, range]) => `${id} ${metres(range)}`).join(", ") : player.anchor_range === undefined ? none : `anchor ${metres(player.anchor_range)}`;
+  if (!player.contacts?.length) return `${odometry}${anchor}; ${team ? "no robot is in range" : `${robot.peer} is not in range`}`;
   const contacts = player.contacts.map(([peer, range]) => `${peer} ${range === null ? "in range, not measured" : metres(range)}`);
   return `${odometry}${anchor}; ${contacts.join(", ")}`;
 }
+
+/** Returns the size of the reports sent; a log has the last tick that it contains. */
+const sent = ({ bytes, through }) => (through === undefined || through === null ? `${bytes} bytes` : `report of ${bytes} bytes, log through tick ${through}`);
 
 function received(player) {
   return player.contacts?.map(received_from).join("; ") || "nothing";
@@ -204,13 +208,13 @@ function received_from([peer, , heard, damaged]) {
 
 const commanded = ({ v, omega, state }) => `${state}: ${v === 0 && omega === 0 ? "stop" : `${speed(v)}, ${turning(omega)}`}`;
 
-function believed({ local, world, probability: chances, covariance, localised }) {
+function believed({ local, world, probability: chances, covariance, localised }, what) {
   const sigma = covariance && world.length ? `, sigma ${metres(Math.sqrt(Math.max(0, covariance[0] + covariance[3])))}` : "";
   if (world.length === 1) {
     const at = `${place(world[0])}, ${rad(wrap(world[0][2]))}${sigma}`;
-    return localised ? `localised at ${at}` : `1 possible configuration: ${at}`;
+    return localised ? `localised at ${at}` : `1 possible ${what}: ${at}`;
   }
-  if (world.length) return `${world.length} possible configurations${chances.length ? "" : ", equally probable"}${sigma}`;
+  if (world.length) return `${world.length} possible ${what}s${chances.length ? "" : ", equally probable"}${sigma}`;
   if (local.length > 1) return `${local.length} possible branches in the anchor's frame`;
   if (local.length) return `${metres(Math.hypot(local[0][0], local[0][1]))} from its anchor, bearing unknown`;
   return "pose unknown";

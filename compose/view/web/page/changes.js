@@ -92,7 +92,7 @@ export class Changes {
     for (const one of this.section.querySelectorAll("input, select, button:not([name=close])")) one.disabled = off;
     if (this.values) {
       for (const [i, [name]] of COMMON.entries()) this.common[i].show(this.values[name]);
-      for (const [i, [name]] of OWN.entries()) this.own[i].show(this.values.robots[this.robot.value][name]);
+      for (const [i, [name]] of OWN.entries()) this.own[i].show(this.values.robots[this.robot.value][name] ?? null);
     }
     this.redraw();
   }
@@ -140,7 +140,7 @@ export class Changes {
     if (!this.open || !this.values) return [];
     return Object.entries(this.values.robots).flatMap(([robot, own]) => [["x", "y"], ["anchor_x", "anchor_y"]].map(([x, y]) => (
       { robot, x, y, at: [own[x], own[y]] }
-    )));
+    ))).filter(({ at: [x] }) => x !== null); // in a team, no robot has an anchor of its own
   }
 
   /** Returns a function that moves the handle at a pixel to a position in m; null if there is none. */
@@ -198,7 +198,11 @@ function number(list, label, changed) {
   input.id = `change-${label.replaceAll(" ", "-")}`;
   list.append(make("dt", {}, make("label", { htmlFor: input.id }, label)), make("dd", {}, input));
   input.addEventListener("input", () => { if (input.checkValidity()) changed(input.valueAsNumber); });
-  const show = (value) => { if (input.valueAsNumber !== value && document.activeElement !== input) input.value = value; };
+  const show = (value) => {
+    for (const part of [input.parentElement, input.parentElement.previousElementSibling]) part.hidden = value === null;
+    if (value === null) input.disabled = true; // else an empty field would be invalid
+    else if (input.valueAsNumber !== value && document.activeElement !== input) input.value = value;
+  };
   return { input, show };
 }
 

@@ -388,7 +388,7 @@ function valued({ text }, { low, high }, bin) {
   return least === most ? most : `${least} to ${most}`;
 }
 
-const who = (robot, name) => (MUTUAL.has(name) ? `${robot.id} to ${robot.peer}` : name === "position_bound_m" ? `${robot.id} 3 sigma` : robot.id);
+const who = (robot, name) => (MUTUAL.has(name) ? `${robot.id} to ${robot.peer ?? "the nearest"}` : name === "position_bound_m" ? `${robot.id} 3 sigma` : robot.id);
 
 /** Returns the texts above a strip, with the error and 3 sigma of a robot in one. */
 function joined(values) {

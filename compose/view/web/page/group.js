@@ -11,7 +11,7 @@ const TRAVELLING = "travelling";
 const HUES = { "robot-a": "localised", "robot-b": "unlocalised" };
 
 /** Returns the names of the marks for the legend of a group. */
-export const group_marks = (marks) => new Set([...[...marks].map((mark) => HUES[mark] ?? mark), "meeting"]);
+export const group_marks = (marks, team) => new Set([...[...marks].map((mark) => HUES[mark] ?? mark), ...(team ? [] : ["meeting"])]);
 
 /** Draws a thin arrow for each meeting, between the anchors: dotted until the visited robot is localised. */
 export function draw_tree(pen, plane, { store, tick, look }) {
@@ -67,12 +67,12 @@ const waits = ({ command }) => (
 );
 
 /** Returns how many robots are localised, travel to others, wait for them, and do something else. */
-export function counted(players) {
+export function counted(players, team) {
   const is = (kind) => players.filter((player) => player?.command?.verdict?.[0] === kind).length;
   const travelling = players.filter((player) => player?.command?.state === TRAVELLING).length;
   const waiting = players.filter((player) => player && waits(player)).length;
   const sweeping = players.filter((player) => ["sweeping", "looping"].includes(player?.command?.state) && player.command.verdict).length;
   const others = ["inconsistent", "undecided"].filter(is).map((kind) => `${is(kind)} ${kind}`);
   const ways = [`${travelling} travelling`, ...(sweeping ? [`${sweeping} sweeping`] : []), `${waiting} waiting`];
-  return [...others, `${is("localised")} of ${plural(players.length, "robot")} localised`, ...ways].join(", ");
+  return [...others, `${is("localised")} of ${plural(players.length, "robot")} localised`, ...(team ? [] : ways)].join(", ");
 }

@@ -18,21 +18,22 @@ const cross = 'M11 4l8 8M19 4l-8 8';
 const LASTING = {
   "robot-a": [drawn(`<path ${POINTED} fill="var(--robot-a)"/>`), ({ a }) => `robot ${a}`],
   "robot-b": [drawn(`<path ${ROUND} fill="var(--robot-b)"/>`), ({ b }) => `robot ${b}`],
-  localised: [drawn(`<path ${POINTED} fill="var(--robot-a)"/>`), "localised robot, its path and its anchor"],
+  localised: [drawn(`<path ${POINTED} fill="var(--robot-a)"/>`), ({ team }) => `localised robot, its path${team ? "" : " and its anchor"}`],
   unlocalised: [drawn(`<path ${ROUND} fill="var(--robot-b)"/>`), "robot that is not yet localised, its path"],
   meeting: [drawn('<path d="M1 8h20" stroke="var(--robot-a)" stroke-width="1.3"/><path d="M28 8l-7 3v-6z" fill="var(--robot-a)"/>'), "who localises whom; dotted: planned"],
   anchor: [drawn('<circle cx="15" cy="8" r="7.5" fill="var(--disc)" stroke="var(--ring)"/><path d="M15 4.5l3.5 6h-7z" fill="var(--ink)"/>'), ({ range }) => `anchor (beacon); range ${range}`],
+  unsurveyed: [drawn('<path d="M15 4.5l3.5 6h-7z" fill="var(--paper)" stroke="var(--ink)"/>'), "anchor at a position that robots do not know"],
   orbit: [drawn('<path d="M2 15q13-22 26 0" fill="none" stroke="var(--orbit)" stroke-width="1.6" stroke-dasharray="5 2.5 1 2.5"/>'), ({ own }) => (own ? "orbit" : "search circle (phase 2)")],
-  "path-1": [line("faint", 'stroke-dasharray="1.5 4"'), ({ own }) => `path, phase 1${own ? "" : ": near anchor"}`],
-  "path-2": [line("faint", 'stroke-dasharray="6 4"'), ({ own }) => `path, phase 2${own ? "" : ": search"}`],
-  "path-3": [line("faint"), ({ own }) => `path, phase 3${own ? "" : ": encounter"}`],
+  "path-1": [line("faint", 'stroke-dasharray="1.5 4"'), ({ own, team }) => (team ? "path, not located" : `path, phase 1${own ? "" : ": near anchor"}`)],
+  "path-2": [line("faint", 'stroke-dasharray="6 4"'), ({ own, team }) => (team ? "path to another anchor" : `path, phase 2${own ? "" : ": search"}`)],
+  "path-3": [line("faint"), ({ own, team }) => (team ? "path, located" : `path, phase 3${own ? "" : ": encounter"}`)],
   reported: [line("fault", 'stroke-dasharray="3 3"'), "path that an attacker reports"],
 };
 /** The other marks. */
 const MOMENTARY = {
   down: [drawn(`<path ${POINTED} fill="none" stroke="var(--faint)" stroke-width="2"/><path d="${cross}" stroke="var(--fault)" stroke-width="2"/>`), "robot whose process is gone"],
   places: [drawn('<circle cx="15" cy="8" r="6.5" fill="none" stroke="var(--ghost)" stroke-width="2.4" stroke-dasharray="1.6 2.5"/><path d="M15 5.5l2.5 4.3h-5z" fill="var(--ink)"/>'), "all places at the measured distance"],
-  distance: [line("range"), "distance to the anchor"],
+  distance: [line("range"), ({ team }) => `distance to ${team ? "an" : "the"} anchor`],
   turned: [drawn(`<path ${POINTED} fill="none" stroke="var(--faint)" stroke-opacity="0.7"/>`), "turned around the anchor: just as possible"],
   pose: [drawn(`<path ${POINTED} fill="none" stroke="var(--ghost)" stroke-width="1.6" stroke-dasharray="2.5 2"/>`), "possible pose (place and heading) of a robot"],
   "ruled-out": [drawn(`<path ${POINTED} fill="none" stroke="var(--ghost)" stroke-dasharray="2 2"/><path d="${cross}" stroke="var(--fault)" stroke-width="1.8"/>`), "pose that is ruled out"],
@@ -40,7 +41,7 @@ const MOMENTARY = {
   arc: [drawn('<path d="M2 13q13-15 26 0l-4 2q-9-9-18 0z" fill="var(--cloud)" stroke="var(--ghost)"/>'), "uncertainty (3 sigma): along an arc"],
   contact: [drawn('<path d="M1 6h28M1 10h28" stroke="var(--link)" stroke-width="1.4"/>'), "in range of each other"],
   reach: [ring("link", 'stroke-dasharray="3 2.4"'), ({ range }) => `range between robots: ${range}`],
-  report: [dot('fill="var(--link)"'), "report to the other robot"],
+  report: [dot('fill="var(--link)"'), ({ team }) => `report to ${team ? "another" : "the other"} robot`],
   late: [drawn('<path d="M4 8h11" stroke="var(--link)" stroke-width="4"/><circle cx="17" cy="8" r="4.5" fill="var(--link)"/>'), "report that arrives late"],
   waiting: [dot('fill="none" stroke="var(--link)"'), "report under way"],
   lost: [dot('fill="none" stroke="var(--fault)" stroke-dasharray="2 2"'), "report that is lost"],
@@ -73,7 +74,7 @@ export class Legend {
    * Lists `marks` of the plane and `kinds` of events above the time line. What stays comes first, so that lines keep their places.
    *
    * `names` are the words of the story: the ids of robots `a` and `b`, the `mover` of the last manoeuvre and its `value`, the
-   * sensing `range`, and whether the planner is the user's `own`.
+   * sensing `range`, whether the planner is the user's `own`, and whether the robots are a `team`.
    */
   draw(marks, kinds, names) {
     const key = [...marks, "", ...kinds, "", ...Object.values(names)].join();
@@ -84,7 +85,7 @@ export class Legend {
     const times = Object.entries(TIMES).filter(([kind]) => kinds.has(kind)).map(([kind, words]) => (
       make("li", {}, make("b", { textContent: SIGNS[kind] }), make("span", { textContent: words }))
     ));
-    times.push(entry(BANDS, "thickness: phase 1, 2, 3"));
+    times.push(entry(BANDS, names.team ? "thickness: not located, to another anchor, located" : "thickness: phase 1, 2, 3"));
     const passing = items(MOMENTARY);
     if (passing.length) passing.unshift(title("now"));
     this.list.replaceChildren(...items(LASTING), title("on the time line"), ...times, ...passing);

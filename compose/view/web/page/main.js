@@ -310,7 +310,7 @@ function draw() {
     cards.draw(view);
     log.draw(view);
     timeline.draw(view, activities(store, view));
-    legend.draw(store.grouped ? group_marks(plane.marks) : plane.marks, timeline.kinds, legend_names());
+    legend.draw(store.grouped ? group_marks(plane.marks, store.stage.team) : plane.marks, timeline.kinds, legend_names());
     sequence.draw(store, view);
     charts.draw(store, view, store.grouped ? [store.chosen(view.focus)] : guide.pair(view.focus));
     const news = view.playing && view.guided ? null : announcer.text(store, view, now);
@@ -327,7 +327,7 @@ function legend_names() {
   const at = view.eliminated < 1 ? view.tick - 1 : view.tick, manoeuvre = joined(store.scene(at), story[0].id)?.manoeuvre;
   const value = manoeuvre ? `: J\u00a0=\u00a0${manoeuvre.separation_m2.toPrecision(3)}\u00a0m²` : "";
   const range = `${Number(store.stage.mission.sensing_range.toFixed(3))}\u00a0m`, own = store.stage.robots.some(({ own_planner }) => own_planner);
-  return { a: of("a"), b: of("b"), mover: manoeuvre?.robot ?? "a robot", value, range, own };
+  return { a: of("a"), b: of("b"), mover: manoeuvre?.robot ?? "a robot", value, range, own, team: store.stage.team };
 }
 
 function controls() {
@@ -355,7 +355,7 @@ function controls() {
   text($("notes"), notes);
   $("notes").hidden = !notes;
   const subject = view.focus ?? "each robot";
-  const bearing = knows_bearing() ? "" : "; the bearing from the anchor is arbitrary until the robot is placed in the world";
+  const bearing = store.stage.team || knows_bearing() ? "" : "; the bearing from the anchor is arbitrary until the robot is placed in the world";
   const only = store.has_truth ? `only the belief of ${subject}` : `no ground truth: only the belief of ${subject}`;
   const unknown = store.scene(view.tick)?.players.every((player) => !player.pose) ? "the ground truth of this tick is unknown" : "";
   text($("seen"), !view.truth ? `${only}${bearing}` : unknown || (view.focus ? `ground truth and the belief of ${subject}` : ""));

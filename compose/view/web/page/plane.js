@@ -150,7 +150,7 @@ export class Plane {
       return this.#frame([[anchor, Math.max(reach, orbit[0]) + reach]], LIST_PX - CLEAR_PX);
     }
     const chosen = focus && robots.length > 2 ? robots.filter((r) => r.id === focus || r.peer === focus) : robots;
-    return this.#frame(scenario_discs(chosen, store.stage), LIST_PX - CLEAR_PX);
+    return this.#frame(scenario_discs(chosen, store), LIST_PX - CLEAR_PX);
   }
 
   /** Zooms to the robots and to all poses that they consider possible, or to those of the selected robot's pair. */
@@ -160,7 +160,7 @@ export class Plane {
       if (focus && robot.id !== focus && (robot.peer !== focus || !truth)) continue;
       const player = store.player(tick, robot.id);
       const poses = [...(truth ? true_and_reported(player) : []), ...(player?.held?.world ?? [])];
-      discs.push(...(poses.length ? poses.map((pose) => [pose, 0.3 * reach]) : scenario_discs([robot], store.stage)));
+      discs.push(...(poses.length ? poses.map((pose) => [pose, 0.3 * reach]) : scenario_discs([robot], store)));
     }
     this.#frame(discs, this.#list_height());
     this.#free();
@@ -248,7 +248,7 @@ export class Plane {
       if (truth) this.#trails.turned(pen, view, robot);
     }
     if (view.scene) this.#scene(view, robots);
-    else for (const robot of robots) this.#backdrop.beacon(view, robot);
+    else this.#backdrop.beacons(view, robots);
     this.#ring(this.targets.find((one) => same(one, selected)), look);
     this.canvas.style.cursor = this.hovered ? "pointer" : "";
     this.labels.draw();
@@ -282,7 +282,7 @@ export class Plane {
     if (truth) for (const [robot, peer] of pairs) this.#signals.contact(view, robot, peer);
     if (!truth) for (const robot of robots) this.#signals.mutual_ring(view, robot);
     if (truth) for (const robot of robots) this.#reported(view, robot);
-    for (const robot of robots) this.#backdrop.beacon(view, robot);
+    this.#backdrop.beacons(view, robots);
     for (const robot of robots) if (robot.role === "a") this.#configurations.manoeuvre(view, robot);
     if (truth) for (const robot of robots) this.#robot(view, robot, view.places.get(robot.id));
   }

@@ -31,11 +31,13 @@ export function read(text) {
 /** Returns the lines of a target's label. */
 export function numbers({ store, tick, truth }, { kind, robot, place: index }) {
   const player = store.player(tick, robot), setup = store.stage.robots.find(({ id }) => id === robot);
+  if (kind === "anchor" && !setup?.anchor) return of_shared(store, tick, truth, robot);
   const range = player?.anchor_range === undefined ? "no range to it in this tick" : `range ${metres(player.anchor_range)}`;
   if (kind === "anchor") return [`anchor of ${robot}: ${place(setup.anchor)}`, range];
   if (kind === "robot") {
     const mutual = (player.contacts ?? []).map(([peer, far]) => `${peer}: ${far === null ? "in range" : `range ${metres(far)}`}`);
-    return [`${robot}: ${posed(player.pose)}`, `anchor: ${range.replace("to it ", "")}`, ...mutual];
+    const own = store.stage.team ? (player.anchors ?? []).map(([id, far]) => `${id}: range ${metres(far)}`) : [`anchor: ${range.replace("to it ", "")}`];
+    return [`${robot}: ${posed(player.pose)}`, ...own, ...mutual];
   }
   const { held } = player, in_world = held.world.length > 0, poses = in_world ? held.world : held.local, pose = poses[index];
   const chance = held.probability[index] ?? 1 / poses.length;
@@ -43,6 +45,17 @@ export function numbers({ store, tick, truth }, { kind, robot, place: index }) {
   lines.push(`probability ${probability(chance)}`);
   if (!in_world) lines.push("in its anchor's frame");
   else if (truth && player.pose) lines.push(`error ${metres(distance(pose, player.pose))}`);
+  return lines;
+}
+
+/** Returns the lines of an anchor of a team: what the robots know of its position, where it is, and the ranges to it. */
+function of_shared(store, tick, truth, id) {
+  const { position, sigma, place: at } = store.stage.anchors.find((one) => one.id === id);
+  const known = position ? `${id}: ${place(position)}${sigma ? `, sigma ${metres(sigma)}` : ", surveyed"}` : `${id}: position unknown to the robots`;
+  const lines = [known, ...(truth && at && (sigma || !position) ? [`in truth at ${place(at)}`] : [])];
+  for (const { robot, anchors } of store.scene(tick)?.players ?? []) {
+    for (const [anchor, far] of anchors ?? []) if (anchor === id) lines.push(`${robot}: range ${metres(far)}`);
+  }
   return lines;
 }
 

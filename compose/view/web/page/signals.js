@@ -23,15 +23,15 @@ export class Signals {
 
   anchor_range(view, robot) {
     const { scene, store, share, moving } = view;
-    const range = scene.players[store.places.get(robot.id)]?.anchor_range;
-    const true_pose = scene.players[store.places.get(robot.id)]?.pose;
+    const { anchor_range, anchors, pose: true_pose } = scene.players[store.places.get(robot.id)] ?? {};
     const poses = view.truth ? [true_pose].filter(Boolean) : this.#origins(view, robot);
-    if (range === undefined || !poses.length) return;
-    for (const pose of poses) this.#anchor_line(pose, robot, range, view, fading(share, moving));
+    const ranges = new Map(anchors ?? []), found = anchor_range === undefined ? [] : [[robot.anchor, anchor_range]];
+    for (const one of store.stage.anchors) if (ranges.has(one.id)) found.push([store.anchor_at(one, view.truth), ranges.get(one.id)]);
+    for (const [at, range] of found) if (at) for (const pose of poses) this.#anchor_line(pose, at, range, view, fading(share, moving));
   }
 
-  #anchor_line(pose, robot, range, { look, size }, alpha) {
-    const pen = this.plane.context, from = this.plane.at(pose), to = this.plane.at(robot.anchor);
+  #anchor_line(pose, anchor, range, { look, size }, alpha) {
+    const pen = this.plane.context, from = this.plane.at(pose), to = this.plane.at(anchor);
     this.plane.marks.add("distance");
     pen.globalAlpha = alpha;
     pen.beginPath();

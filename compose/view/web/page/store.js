@@ -43,8 +43,11 @@ export class Store {
     this.#wake?.();
   }
 
-  /** True if the robots form a group, which meets in turn. */
-  get grouped() { return this.stage.visits?.length > 0; }
+  /** True if the robots form no pairs: they are a group, which meets in turn, or a team. */
+  get grouped() { return this.stage.visits?.length > 0 || this.stage.team; }
+
+  /** Returns where an anchor of a team is drawn: with the `truth` where it is, else where robots know it; null if nowhere. */
+  anchor_at({ position, place }, truth) { return (truth ? place : null) ?? position; }
 
   scene(tick) { return this.scenes[tick]; }
 
@@ -166,8 +169,9 @@ export class Store {
       const before = counts[k - 1] ?? Object.fromEntries(COUNTERS.map((name) => [name, 0]));
       const scene = this.scenes[k], player = scene?.players[place], now = { ...before };
       if (player) {
-        now.anchor += player.anchor_range !== undefined ? 1 : 0;
-        now.mutual += player.contacts?.some((contact) => contact[1] !== null) ? 1 : 0;
+        now.anchor += (player.anchor_range !== undefined ? 1 : 0) + (player.anchors?.length ?? 0);
+        const ranged = player.contacts?.filter((contact) => contact[1] !== null).length ?? 0;
+        now.mutual += this.stage.team ? ranged : Math.min(ranged, 1);
         now.sent += player.sent ? 1 : 0;
         now.bytes += player.sent?.bytes ?? 0;
         for (const passage of scene.passages) {

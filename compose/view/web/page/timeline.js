@@ -125,7 +125,7 @@ export class Timeline {
         if (width > 54 && band > 10) {
           pen.fillStyle = value === 3 ? of("paper") : of("faint");
           if (value < 0) pen.fillText("down", left + 5, y + band - 3.5);
-          if (value === 3) pen.fillText(`phase ${value}`, left + 5, y + band - 3.5);
+          if (value === 3) pen.fillText(store.stage.team ? "located" : `phase ${value}`, left + 5, y + band - 3.5);
         }
       }
       pen.fillStyle = of("shade");

@@ -2,6 +2,9 @@
 
 export const PHASES = { 1: "own anchor", 2: "search", 3: "encounter" };
 
+/** What robots of a team do, by phase. */
+export const STEPS = { 1: "not located", 2: "to another anchor", 3: "located" };
+
 const number = (value, digits) => value.toFixed(digits).replace("-", "−");
 
 export function metres(value) {
@@ -88,5 +91,7 @@ export const MEANINGS = [
   ["trail", "in the colour of the robot, as in the figures; dotted in phase 1, dashed in phase 2, solid in phase 3"],
   ["dashed robot and thin dashed trail in the hue of faults", "the path that an attacker reports; a line joins it to the true one"],
   ["in a group", "the hue of a robot, of its trail and of its anchor's range tells whether it is localised; thin arrows join the anchors of robots that meet, and are dotted until the second one is localised"],
+  ["in a team", "the hue of a robot and of its trail tells whether it is localised; lines join a robot to all anchors that it ranges"],
+  ["hollow triangle", "anchor whose position the robots do not know, where it is in truth; a dashed circle: 3 sigma of a known position"],
   ["circle around an anchor", "solid: its sensing range; dashed: the orbit"],
 ];

@@ -1,0 +1,157 @@
+"""The estimate of any number of robots that goes on from tick to tick: of a team, or of a recording.
+
+Robots that are located are followed. The whole plane is searched at the numbers of ranges GROUP_SEARCHES, and
+before the first claim of each robot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from agent.estimation.claim import BEFORE_SEARCH, blocked
+from agent.estimation.gaussian.consistency import CLAIM_P_VALUE
+from agent.estimation.gaussian.joint_claims import Displacement, displaced_anchor
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.gaussian.search import begun, candidates, extended, search
+from agent.estimation.judged import Judged, User, of_joint
+from agent.estimation.posterior import NO_HYPOTHESES, Posterior, certainties, settled
+
+GROUP_SEARCHES = tuple(8 * 2**n for n in range(16))
+"""The numbers of ranges at which the whole plane is searched again."""
+
+MOST_SEARCHES = 100
+"""The number of searches of the whole plane after which it is only searched with twice as many ranges.
+
+Where no hypothesis fits, each epoch has a search. With fewer, recordings of a minute that settle late would
+have other estimates; with more, recordings that contradict themselves take longer.
+"""
+
+GIVEN_UP = (
+    f"not settled after {MOST_SEARCHES} searches of the plane; the next is due with twice as many ranges"
+)
+"""The reason against a claim that such a search has not confirmed."""
+
+RETESTED = 1.1
+"""The factor by which ranges must have grown before the places of the anchors are tested again.
+
+With less, claims of robots with many anchors take twice as long; with more, a false place is found later.
+"""
+
+MORE_RANGES = 1.5
+"""The factor by which the decisive ranges of a robot must have grown before it is tried again."""
+
+
+class ClaimRule(NamedTuple):
+    """The accuracy and the confidence that a claim needs."""
+
+    accuracy: float = 0.3
+    """The largest sigma of the position in m: the root of the trace of its covariance."""
+    confidence: float = 0.9999
+    """The least probability of the hypothesis."""
+
+
+EXACT_ACCURACY = 1e-5
+"""The largest sigma (m) of a position that is claimed with exact sensors, where a range has one of 1e-6 m.
+
+Rounding is smaller than that by several powers of ten. With more, a fit that has converged to a hundredth of
+a sigma might be off by more than a claim may be.
+"""
+
+
+class Following(NamedTuple):
+    """The hypotheses about robots that are located, and what the searches for others have led to."""
+
+    known: Posterior = NO_HYPOTHESES
+    """The hypotheses."""
+    part: JointMeasurements | None = None
+    """The measurements to which they are fitted; None before the first."""
+    judged: Mapping[str, Judged] = {}
+    """The estimate of each located robot, as the conditions for a claim see it."""
+    reasons: Mapping[str, str] = {}
+    """The reason against the claim of each located robot; an empty text if there is none."""
+    searched: int = 0
+    """The number of ranges at the latest search of the whole plane."""
+    searches: int = 0
+    """The number of searches."""
+    failed: Mapping[tuple[int, ...], int] = {}
+    """The decisive ranges with which robots were not located."""
+    claimed: frozenset[str] = frozenset()
+    """The robots that might have claimed their poses."""
+    displaced: Displacement | None = None
+    """The anchor that seems to stand elsewhere, at the latest test."""
+    tested: int = 0
+    """The number of ranges at that test."""
+    begun_again: int = 0
+    """The number of ranges at which a team has dropped hypotheses that its measurements contradict."""
+
+    def after(self, used: JointMeasurements, rule: ClaimRule, user: User) -> Following:
+        """Return the estimate by what is `used`, which has grown since the last one.
+
+        A team whose measurements contradict all hypotheses begins again, with ever more ranges. A recording
+        has other robots, and errors that nobody has told.
+        """
+        count = len(used.ranges.rho)
+        if used.only_rounding:
+            rule = rule._replace(accuracy=EXACT_ACCURACY)
+        if user == "team" and self._contradicted and count >= MORE_RANGES * self.begun_again:
+            self = Following(claimed=self.claimed, begun_again=count)  # noqa: PLW0642  # as if it were new
+        known = settled(self.known, used)
+        now = self._extended(known if known.hypotheses else begun(used), used)
+        due = now.known.hypotheses and any(self.searched < at <= count for at in GROUP_SEARCHES)
+        now = now._tested(used, rule, user)
+        claiming = now._claiming - self.claimed
+        if claiming and not due and self.searches >= MOST_SEARCHES:
+            now = now._replace(reasons={**now.reasons, **dict.fromkeys(sorted(claiming), GIVEN_UP)})
+        elif due or claiming:
+            now = now._replace(known=search(used, now.known), searched=count, searches=self.searches + 1)
+            now = now._tested(used, rule, user)
+        return now._replace(claimed=self.claimed | now._claiming)
+
+    @property
+    def _claiming(self) -> frozenset[str]:
+        """The robots that nothing prevents from claiming their poses."""
+        return frozenset([name for name, reason in self.reasons.items() if not reason])
+
+    @property
+    def _contradicted(self) -> bool:
+        """True if the measurements contradict the likeliest hypothesis."""
+        tests = [one.inconsistency for one in self.judged.values() if one.inconsistency is not None]
+        return any(one.p_value < CLAIM_P_VALUE for one in tests)
+
+    def _extended(self, found: Posterior, used: JointMeasurements) -> Following:
+        """Return `found` with further robots; those that failed are tried again with more ranges."""
+        possible = candidates(found.located, used)
+        left = [one for one in possible if one.decisive < MORE_RANGES * self.failed.get(one.robots, 0)]
+        if len(left) == len(possible):
+            return self._replace(known=found)
+        more, failed = extended(found, used, left), dict(self.failed)
+        for one in candidates(more.located, used):
+            if one not in left:
+                failed[one.robots] = one.decisive
+        return self._replace(known=more, failed=failed)
+
+    def _tested(self, used: JointMeasurements, rule: ClaimRule, user: User) -> Following:
+        """Return this with what blocks the claim of each located robot."""
+        found = self.known
+        part = used.some(found.located)
+        judged = {
+            part.robots[i]: of_joint(user, i, found, certainty, part, *rule)
+            for i, certainty in enumerate(certainties(found))
+            if not part.is_anchor(i)
+        }
+        claiming = {name for name, one in judged.items() if blocked(one, BEFORE_SEARCH) is None}
+        displaced, tested = self.displaced, self.tested
+        if claiming:
+            count = len(part.ranges.rho)
+            if count >= RETESTED * tested or not claiming <= self.claimed:
+                tested, displaced = count, displaced_anchor(found.hypotheses[0].fit, part)
+            judged = {name: one._replace(displaced=displaced) for name, one in judged.items()}
+        reasons = {name: blocked(one) for name, one in judged.items()}
+        return self._replace(
+            part=part,
+            judged=judged,
+            reasons={name: one.reason if one is not None else "" for name, one in reasons.items()},
+            displaced=displaced,
+            tested=tested,
+        )

@@ -1,0 +1,220 @@
+"""The team of a scenario file: its anchors, the starts of its robots, and whether they can be localised."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Sequence
+
+from msgspec.structs import replace
+
+from compose.errors import BadScenario, Unworkable
+from compose.launch import planner_loader
+from compose.scenario.scenario_tables import MAX_TEAM, AnchorTable, Area, RobotTable, ScenarioFile
+from protocol.messages import TeamAnchor
+from protocol.mission import Anchor, Mission
+from protocol.motion import ORIGIN, TAU, Pose, relative, wrap
+from protocol.spelling import did_you_mean
+from protocol.team_motion import nearest_other, team_ticks
+from world.random_streams import gaussian
+from world.scenario import PlacedAnchor, PlannedTeam, RobotSpec
+
+MOST_DRAWS = 10_000
+"""The number of starts that are drawn for one robot until one is admitted."""
+
+
+def is_team(file: ScenarioFile) -> bool:
+    """Return whether the robots share all measurements, and form neither pairs nor a group."""
+    return bool(file.anchor) or file.team is not None or file.mission.frame is not None
+
+
+def with_team(file: ScenarioFile) -> ScenarioFile:
+    """Return `file` with the anchors and robots of its `[team]`, whose places are drawn from its seed."""
+    team = file.team
+    if team is None:
+        return file
+    if file.robot or file.anchor or file.group is not None:
+        raise BadScenario("team: its robots and anchors are drawn, so there can be no others")
+    if team.unknown > team.anchors:
+        raise BadScenario(f"team.unknown: more than team.anchors = {team.anchors}")
+    anchors = []
+    for i in range(1, team.anchors + 1):
+        draw = random.Random(f"{file.seed}/anchor/A{i}").random
+        place = team.side * draw(), team.side * draw()
+        known = place if i <= team.anchors - team.unknown else None
+        anchors.append(AnchorTable(f"A{i}", known, stands=place))
+    area = file.mission.area or (0.0, 0.0, team.side, team.side)
+    robots = [RobotTable(f"r{i}") for i in range(1, team.robots + 1)]
+    return replace(file, robot=robots, anchor=anchors, mission=replace(file.mission, area=area))
+
+
+def planned_team(file: ScenarioFile) -> tuple[PlannedTeam, tuple[RobotSpec, ...]]:
+    """Return the team and the robots of `file`. Raises BadScenario, and Unworkable if it is not admitted."""
+    _check(file)
+    mission, ids = file.mission, [one.id for one in file.anchor]
+    for name in ids:
+        if ids.count(name) > 1:
+            raise BadScenario(f"anchor.id: {ids.count(name)} anchors have the id '{name}'")
+    anchors = tuple([_placed_anchor(i, file) for i in range(len(file.anchor))])
+    robots = []
+    for i, robot in enumerate(file.robot):
+        if robot.id in ids:
+            raise BadScenario(f"robot[{i}].id: an anchor has the id '{robot.id}', too")
+        for name in robot.anchors or ():
+            if name not in ids:
+                raise BadScenario(f"robot[{i}].anchors: there is no anchor '{name}'{did_you_mean(name, ids)}")
+        ranges = tuple([name for name in ids if robot.anchors is None or name in robot.anchors])
+        robots.append(RobotSpec(robot.id, None, None, ORIGIN, ranges=ranges))
+    told = [one.told for one in anchors]
+    if mission.frame is None:
+        robots = [_in_range(i, file, one, anchors) for i, one in enumerate(robots)]
+        away = [nearest_other(one, told) for one in told]
+        farthest = max([one for one in away if one is not None], default=0.0)
+    else:
+        robots, farthest = _connected(file, robots), 0.0
+    ticks = team_ticks(mission, len(robots), farthest) * (1 if mission.frame is None else len(robots))
+    origin = robots[0].id if mission.frame is not None else None
+    return PlannedTeam(anchors, origin, ticks * mission.period, mission.survey), tuple(robots)
+
+
+def _check(file: ScenarioFile) -> None:
+    """Raise BadScenario or Unworkable if `file` has what is not for teams."""
+    if file.group is not None:
+        raise BadScenario("group: its robots have an anchor each, so there can be no [[anchor]] and no frame")
+    if len(file.robot) > MAX_TEAM:
+        raise BadScenario(f"robot: {len(file.robot)} robots, and a team has at most {MAX_TEAM}")
+    for i, robot in enumerate(file.robot):
+        for name in ("anchor", "peer", "attack", "dies"):
+            if getattr(robot, name) is not None:
+                raise BadScenario(f"robot[{i}].{name}: it is not for robots that share [[anchor]] or a frame")
+    _check_mission(file)
+
+
+def _check_mission(file: ScenarioFile) -> None:
+    """Raise BadScenario or Unworkable if the mission or its planner is not one of teams."""
+    if file.mission.tolerates:
+        raise Unworkable("mission.tolerates: robots that share all measurements tolerate no false data")
+    if file.mission.safety_distance:
+        raise Unworkable("mission.safety_distance: robots that share [[anchor]] or a frame keep none")
+    if file.planner.name != planner_loader.GROUP_PLANNER:
+        raise Unworkable(
+            f"planner.name: robots with the planner {file.planner.name} form pairs and groups; those that "
+            f"share [[anchor]] or a frame have '{planner_loader.GROUP_PLANNER}'"
+        )
+    if file.mission.survey and all(one.position and not one.sigma for one in file.anchor):
+        raise BadScenario("mission.survey: all [[anchor]] are surveyed")
+    if file.mission.frame is not None:
+        if file.anchor:
+            raise BadScenario("mission.frame: anchors determine the frame, so there can be no [[anchor]]")
+        if len(file.robot) < 2:
+            raise Unworkable("mission.frame: the poses of at least two robots are relative to each other")
+
+
+def _placed_anchor(i: int, file: ScenarioFile) -> PlacedAnchor:
+    """Return anchor `i` of the file. Raises BadScenario."""
+    anchor, seed = file.anchor[i], file.seed
+    known = Anchor(*anchor.position) if anchor.position is not None else None
+    told = TeamAnchor(anchor.id, known, anchor.sigma)
+    if known is None and anchor.sigma:
+        raise BadScenario(f"anchor[{i}].sigma: it is that of a position, and '{anchor.id}' has none")
+    if anchor.stands is not None:
+        return PlacedAnchor(told, Anchor(*anchor.stands))
+    if known is None:
+        area = _area(file)
+        draw = random.Random(f"{seed}/anchor/{anchor.id}").random
+        return PlacedAnchor(told, Anchor(*_within(area, draw(), draw())))
+    dx, dy = [
+        anchor.sigma * gaussian(seed, f"survey-{axis}", anchor.id, 0) if anchor.sigma else 0.0
+        for axis in "xy"
+    ]
+    return PlacedAnchor(told, Anchor(known.x + dx, known.y + dy))
+
+
+def _area(file: ScenarioFile) -> Area:
+    """Return the area in which places are drawn: by default the one that the anchors span."""
+    if file.mission.area is not None:
+        return file.mission.area
+    places = [one.stands or one.position for one in file.anchor]
+    known = [one for one in places if one is not None]
+    if not known:
+        raise BadScenario("mission.area: the area in which starts are drawn is missing")
+    x, y = zip(*known, strict=True)
+    return min(x), min(y), max(x), max(y)
+
+
+def _within(area: Area, right: float, up: float) -> tuple[float, float]:
+    x_min, y_min, x_max, y_max = area
+    return x_min + (x_max - x_min) * right, y_min + (y_max - y_min) * up
+
+
+def _in_range(i: int, file: ScenarioFile, robot: RobotSpec, anchors: Sequence[PlacedAnchor]) -> RobotSpec:
+    """Return the robot at its start, in range of an anchor from which it can reach another one."""
+    mission, given = file.mission, file.robot[i].start
+    known = [one.told for one in anchors if one.told.id in robot.ranges]
+    first = {one.id for one in known if nearest_other(one, known) is not None}
+    if not first:
+        raise Unworkable(
+            f"robot[{i}]: '{robot.id}' may range fewer than two anchors at different known positions; "
+            "with one, its heading is not determined"
+        )
+    places = [one.place for one in anchors if one.told.id in first]
+    if given is not None:
+        start = given_start(given)
+        if not _reached(start, places, mission):
+            raise BadScenario(
+                f"robot[{i}].start: no anchor that '{robot.id}' knows and may range is within "
+                f"mission.sensing_range = {mission.sensing_range:.9g} m"
+            )
+        return replace(robot, start=start)
+    draw, area = random.Random(f"{file.seed}/start/{robot.id}").random, _area(file)
+    for _ in range(MOST_DRAWS):
+        start = Pose(*_within(area, draw(), draw()), TAU * draw())
+        if _reached(start, places, mission):
+            return replace(robot, start=start)
+    raise Unworkable(
+        f"robot[{i}].start: none of {MOST_DRAWS} places in the area is in range of an anchor of '{robot.id}'"
+    )
+
+
+def given_start(given: tuple[float, float, float]) -> Pose:
+    """Return the start of a file. Many turns are removed: functions of large angles lose digits."""
+    x, y, heading = given
+    return Pose(x, y, heading if abs(heading) <= TAU else wrap(heading))
+
+
+def _reached(start: Pose, places: Sequence[Anchor], mission: Mission) -> bool:
+    return any(math.hypot(start.x - at.x, start.y - at.y) <= mission.sensing_range for at in places)
+
+
+def _connected(file: ScenarioFile, robots: Sequence[RobotSpec]) -> list[RobotSpec]:
+    """Return the robots at their starts in the frame of the first one; ranges connect all of them."""
+    starts: list[Pose] = []
+    reach = file.mission.sensing_range
+    for i, robot in enumerate(file.robot):
+        if robot.start is not None:
+            starts.append(given_start(robot.start))
+            continue
+        draw = random.Random(f"{file.seed}/start/{robot.id}").random
+        for _ in range(MOST_DRAWS):
+            start = Pose(*_within(_area(file), draw(), draw()), TAU * draw())
+            if not starts or any(math.hypot(start.x - at.x, start.y - at.y) <= reach for at in starts):
+                break
+        else:
+            raise Unworkable(f"robot[{i}].start: no place in the area is in range of another robot")
+        starts.append(start)
+    left = list(range(1, len(starts)))
+    seen = [0]
+    for one in seen:
+        near = [
+            k for k in left if math.hypot(starts[one].x - starts[k].x, starts[one].y - starts[k].y) <= reach
+        ]
+        seen += near
+        left = [k for k in left if k not in near]
+    if left:
+        raise Unworkable(
+            f"robot[{left[0]}].start: '{robots[left[0]].id}' is in range of no robot that is connected with "
+            f"'{robots[0].id}', in mission.sensing_range = {reach:.9g} m"
+        )
+    first = starts[0]
+    moved = starts if first == ORIGIN else [relative(first, one) for one in starts]
+    return [replace(one, start=start) for one, start in zip(robots, moved, strict=True)]

@@ -1,0 +1,405 @@
+"""Teams: robots that share all measurements, with several anchors, anchors that they survey, or none."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+import tandem
+from agent.peer.team_log import Entry, LogPart, Ranging, TeamLog, TeamReport
+from agent.planning.team import TeamPlanner, TeamState
+from compose.audit.rules import audit_run, replayed
+from compose.errors import BadScenario
+from compose.launch.in_process import run_mission
+from compose.recording.ranging.run_ranges import ranges_of_run
+from compose.recording.run import of_frames, read
+from compose.recording.summary_json import summary
+from compose.scenario.scenario_change import file_table
+from compose.scenario.scenario_file import load, parse, template_of
+from compose.sweep.trial import Trial, row
+from protocol.journal.journal_file import CorruptJournal
+from protocol.messages import Contact, Localised, NamedRange, Observation
+from protocol.mission import Anchor
+from protocol.motion import Controls
+from protocol.wire import decode, encode
+from tests.commands import journals
+from tests.commands import tandem as tandem_command
+from tests.series import series
+from tests.test_audit import kept
+from world.hardware.driver import Reading
+from world.hardware.measurements import InvalidReading, observation_frame
+from world.scenario import Scenario
+from world.tick import World, advance, observations, release
+
+SHIPPED = ("room", "relative")
+MISSION = """
+[mission]
+sensing_range = 5.0
+period = 1.0
+max_speed = 0.5
+max_turn_rate = 1.0
+accuracy = 0.1
+noise = {anchor_sigma = 0.05, mutual_sigma = 0.05}
+"""
+ANCHORS = """
+[[anchor]]
+id = "A1"
+position = [0.0, 0.0]
+[[anchor]]
+id = "A2"
+position = [3.0, 0.0]
+[[anchor]]
+id = "A3"
+position = [0.0, 3.0]
+"""
+
+
+def team(robots: str, anchors: str = ANCHORS, mission: str = MISSION, more: str = "") -> Scenario:
+    """Return the scenario of a team with these tables."""
+    return parse(f'name = "team"\nseed = 1\n{more}\n{mission}\n{anchors}\n{robots}', "team")
+
+
+ALONE = '[[robot]]\nid = "a"\nstart = [1.0, 1.0, 0.5]'
+
+
+# --- missions -------------------------------------------------------------------------------------------
+
+
+def test_a_robot_alone_in_a_room_is_localised() -> None:
+    run = run_mission(team(ALONE))
+    assert run.end is not None
+    assert run.end.outcome == "localised"
+    claim = run.claim("a")
+    assert claim is not None
+    assert claim.position_error < 0.3
+    assert summary(run, None, None)["t_max_s"] == run.scenario.t_max > 0.0
+
+
+def test_an_anchor_that_is_not_in_the_list_of_a_robot_is_not_ranged() -> None:
+    run = run_mission(team(ALONE + '\nanchors = ["A1", "A3"]'))
+    ranged = {one.anchor for seen in run.observations for one in seen["a"].anchors}
+    assert ranged == {"A1", "A3"}
+    assert run.end is not None
+    assert run.end.outcome == "localised"
+    everything = {one.anchor for one in observations(release(team(ALONE)))[0].anchors}
+    assert everything == {"A1", "A2", "A3"}
+
+
+def test_poses_without_anchors_are_those_in_the_frame_of_the_first_robot() -> None:
+    run = run_mission(load("relative"))
+    assert run.end is not None
+    assert run.end.outcome == "localised"
+    first = run.truth("a")[0]
+    assert (first.x, first.y, first.heading) == (0.0, 0.0, 0.0)
+    assert not any(seen[robot].anchors for seen in run.observations for robot in seen)
+
+
+KILLS = ("a@2 world@4", "", "b@1:command b@3:report world@0")
+EACH_KILLED = [(SHIPPED[i % 2], kills) for i, kills in enumerate(KILLS[:2])]
+EACH_KILLED += [(name, kills) for name in SHIPPED for kills in KILLS if (name, kills) not in EACH_KILLED]
+
+
+@pytest.mark.parametrize("killed", series(EACH_KILLED, 2), ids=" ".join)
+def test_a_team_as_processes_has_the_recording_of_one_process(
+    killed: tuple[str, str], tmp_path: Path
+) -> None:
+    name, kills = killed
+    tandem_command("run", name, "--in-process", "-q", "--no-export", "--out", tmp_path / "one")
+    words = [word for kill in kills.split() for word in ("--kill", kill)]
+    ended = tandem_command("run", name, "-q", "--no-export", "--out", tmp_path / "processes", *words)
+    assert ended.status == 0, ended
+    assert journals(tmp_path / "one") == journals(tmp_path / "processes")
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_team_is_replayed_to_the_bit_and_has_no_violation(name: str) -> None:
+    run = of_frames(kept(load(name)))
+    assert (replayed(run).differences, replayed(run).tears) == ((), ())
+    findings = audit_run(run)
+    assert findings.violations == ()
+
+
+@pytest.mark.parametrize("seed", series(range(3), 1))
+def test_loss_delay_and_duplication_of_reports_change_ticks_only(seed: int) -> None:
+    mission = MISSION.replace("accuracy", 'frame = "relative"\narea = [0.0, 0.0, 4.0, 4.0]\naccuracy')
+    robots = "".join([f'[[robot]]\nid = "{robot}"\n' for robot in "abc"])
+    fault = "[[fault]]\nloss = 0.4\ndelay = [0, 3]\nduplicate = 0.3"
+    text = f"{mission}\n{robots}\n{fault}"
+    scenario = parse(f'name = "faulty"\nseed = {seed}\n{text}', "faulty")
+    run = of_frames(kept(scenario))
+    assert run.end is not None
+    assert run.end.outcome == "localised"
+    assert audit_run(run).violations == ()
+
+
+# --- reports -------------------------------------------------------------------------------------------
+
+DELIVERIES = st.lists(
+    st.tuples(st.integers(0, 2), st.integers(0, 2), st.integers(0, 5), st.booleans()), max_size=60
+)
+
+
+@given(DELIVERIES)
+def test_in_any_order_of_lost_late_and_repeated_reports_a_log_is_the_beginning_of_the_true_one(
+    deliveries: list[tuple[int, int, int, bool]],
+) -> None:
+    """A delivery is of a report of one robot to another one, of as many reports ago; or a tick passes."""
+    config = load("relative").config("a")
+    assert config.team is not None
+    logs = [TeamLog.of(config.team)] * 3
+    truth: list[list[Entry]] = [[], [], []]
+    sent: dict[tuple[int, int], list[TeamReport]] = {}
+    for sender, receiver, ago, passes in deliveries:
+        if passes:
+            for place, name in enumerate(config.team.robots):
+                tick = len(truth[place])
+                contact = Contact(config.team.robots[(place + 1) % 3], 1.0 + place + tick / 8.0, ())
+                seen = Observation(tick, name, Controls(0.1 * tick, 0.0) if tick else None, None, (contact,))
+                logs[place] = logs[place].measured(place, seen, config.team)
+                truth[place].append(logs[place].logs[place][-1])
+        elif sender != receiver:
+            reports = sent.setdefault((sender, receiver), [])
+            reports.append(logs[sender].report(sender, receiver))
+            logs[receiver] = logs[receiver].received([reports[max(0, len(reports) - 1 - ago)]], receiver)
+        for log in logs:
+            assert all(list(one) == truth[k][: len(one)] for k, one in enumerate(log.logs))
+
+
+def state_after(ticks: int) -> tuple[TeamState, Observation]:
+    """Return the state of a robot of the team `relative` after these ticks, and its next Observation."""
+    scenario, planner = load("relative"), TeamPlanner()
+    ids = [one.id for one in scenario.robots]
+    world, states = release(scenario), {one: planner.start(scenario.config(one)) for one in ids}
+    for _ in range(ticks):
+        seen = {one.robot: one for one in observations(world)}
+        states = {one: planner.observe(states[one], seen[one]) for one in ids}
+        sent = {(one, other): planner.report_to(states[one], other) for one in ids for other in ids}
+        states = {
+            one: planner.decide(states[one], [sent[other, one] for other in ids if other != one])
+            for one in ids
+        }
+        onward = advance(world, {one: planner.command(states[one]) for one in ids})
+        assert isinstance(onward, World)
+        world = onward
+    return states["a"], observations(world)[0]
+
+
+REACHED = state_after(3)
+COUNTS = st.integers(0, 6) | st.sampled_from([2**31, 2**53])
+ANY_RANGING = st.builds(Ranging, COUNTS, st.floats(0.0, 1e7) | st.floats(0.0, 10.0))
+ANY_ENTRY = st.builds(
+    Entry,
+    st.none() | st.builds(Controls, st.floats(-1e6, 1e6), st.floats(-1e6, 1e6)),
+    st.lists(ANY_RANGING, max_size=3).map(tuple),
+    st.lists(ANY_RANGING, max_size=3).map(tuple),
+)
+ANY_PART = st.builds(
+    LogPart, COUNTS, COUNTS, st.lists(ANY_ENTRY, max_size=4).map(tuple) | st.just((Entry(None),) * 140)
+)
+ANY_REPORT = st.builds(
+    TeamReport,
+    COUNTS,
+    st.lists(ANY_PART, max_size=4).map(tuple),
+    st.lists(COUNTS, max_size=5).map(tuple),
+    st.lists(COUNTS, max_size=3).map(tuple),
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(ANY_REPORT, max_size=3))
+def test_whatever_a_report_contains_it_ends_no_robot(reports: list[TeamReport]) -> None:
+    state, seen = REACHED
+    planner = TeamPlanner()
+    after = planner.decide(planner.observe(state, seen), reports)
+    assert decode(encode(planner.command(after)), type(planner.command(after))).tick == seen.tick
+    encode(planner.estimate(after))
+    own = after.log.logs[after.own]
+    assert own[:-1] == state.log.logs[state.own], "nobody changes what the robot itself has measured"
+
+
+def test_a_report_changes_no_entry_leaves_no_gap_and_names_no_place_beyond_the_team() -> None:
+    state, seen = REACHED
+    planner = TeamPlanner()
+    observed = planner.observe(state, seen)
+    has = len(observed.log.logs[1])
+
+    def after(*parts: LogPart) -> TeamState:
+        return planner.decide(observed, [TeamReport(1, parts, (0, 0, 0))])
+
+    stray = Entry(Controls(0.2, 0.1), (Ranging(99, 1.0),), (Ranging(99, 1.0), Ranging(1, 1.0)))
+    plain = after().log.logs
+    assert after(LogPart(0, len(plain[0]), (stray,))).log.logs == plain, "its own log"
+    assert after(LogPart(1, 0, (stray,) * has)).log.logs == plain, "what it has contradicts"
+    assert after(LogPart(1, has + 1, (stray,))).log.logs == plain, "a tick is missing"
+    assert after(LogPart(99, 0, (stray,))).log.logs == plain, "there is no such robot"
+    found = after(LogPart(1, has, (stray,)))
+    assert found.log.logs[1] == (*plain[1], stray)
+    bare = after(LogPart(1, has, (Entry(Controls(0.2, 0.1)),)))
+    assert planner.estimate(found) == planner.estimate(bare), "stray ranges are of nobody"
+
+
+# --- scenarios -----------------------------------------------------------------------------------------
+
+TWO = ALONE + '\n[[robot]]\nid = "b"\nstart = [2.0, 1.0, 0.0]'
+SAME = ANCHORS.replace("[3.0, 0.0]", "[0.0, 0.0]").split('[[anchor]]\nid = "A3"')[0]
+RELATIVE = MISSION.replace("accuracy", 'frame = "relative"\naccuracy')
+DRAWN = "[team]\nrobots = 2\nside = 4.0\nanchors = 3\n"
+
+
+@pytest.mark.parametrize(
+    ("fields", "why"),
+    [
+        ({"robots": ALONE, "anchors": SAME}, "robot[0]: 'a' may range fewer than two anchors at different"),
+        ({"robots": ALONE.replace("1.0, 1.0", "9.0, 9.0")}, "robot[0].start: no anchor that 'a' knows"),
+        ({"robots": ALONE, "anchors": ANCHORS.replace("A3", "A1")}, "anchor.id: 2 anchors have the id 'A1'"),
+        ({"robots": ALONE + '\nanchors = ["A1", "B2"]'}, "robot[0].anchors: there is no anchor 'B2'"),
+        ({"robots": ALONE + '\nanchors = ["A1"]'}, "robot[0]: 'a' may range fewer than two anchors"),
+        ({"robots": TWO, "mission": RELATIVE}, "mission.frame: anchors determine the frame"),
+        ({"robots": ALONE, "anchors": "", "mission": RELATIVE}, "mission.frame: the poses of at least two"),
+        (
+            {"robots": TWO, "anchors": "", "mission": RELATIVE.replace("5.0", "0.5")},
+            "is in range of no robot",
+        ),
+        ({"robots": TWO, "more": "[team]\nrobots = 2\nside = 4.0"}, "team: its robots and anchors are drawn"),
+        ({"robots": "", "anchors": DRAWN + "unknown = 4"}, "team.unknown: more than team.anchors = 3"),
+        ({"robots": ALONE + "\nanchor = [0.0, 0.0]"}, "robot[0].anchor: it is not for robots that share"),
+        ({"robots": ALONE + '\nattack = {kind = "shift", size = 1.0}'}, "robot[0].attack: it is not for"),
+        ({"robots": TWO + '\npeer = "a"'}, "robot[1].peer: it is not for robots that share"),
+        ({"robots": ALONE + "\ndies = 4"}, "robot[0].dies: it is not for robots that share"),
+        ({"robots": ALONE, "anchors": ""}, "robot: one robot alone needs at least two [[anchor]]"),
+        ({"robots": TWO.replace('"b"', '"a"')}, "robot.id: 2 robots have the id 'a'"),
+        (
+            {"robots": TWO, "more": 'planner = {name = "paper"}'},
+            "planner.name: robots with the planner paper",
+        ),
+    ],
+)
+def test_a_team_that_cannot_run_is_refused_with_one_line(fields: dict[str, Any], why: str) -> None:
+    with pytest.raises(BadScenario) as refused:
+        team(**fields)
+    assert why in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        load("room"),
+        load("relative"),
+        team("", DRAWN + "unknown = 1"),
+        team(ALONE + '\nanchors = ["A3", "A1"]', ANCHORS.replace("[3.0, 0.0]", "[3.0, 0.0]\nsigma = 0.2")),
+    ],
+    ids=["room", "relative", "drawn", "listed"],
+)
+def test_a_file_with_the_content_of_a_team_has_the_same_scenario(scenario: Scenario) -> None:
+    assert template_of(file_table(scenario)).scenario == scenario
+
+
+def test_a_room_that_is_drawn_follows_from_its_seed() -> None:
+    one, again = team("", DRAWN), team("", DRAWN)
+    assert one == again
+    other = parse(f'name = "team"\nseed = 2\n{MISSION}\n{DRAWN}', "team")
+    assert other.team != one.team
+    assert [robot.start for robot in other.robots] != [robot.start for robot in one.robots]
+
+
+def spoilt(scenario: Scenario, changed: Scenario) -> None:
+    frames = kept(scenario)
+    frames["world.journal"] = [
+        encode(changed) if x == encode(scenario) else x for x in frames["world.journal"]
+    ]
+    of_frames(frames)
+
+
+def test_a_journal_of_a_team_that_is_none_is_refused() -> None:
+    scenario = load("room")
+    assert scenario.team is not None
+    a, b = scenario.robots
+    met = load("paper-1").robots[0].encounter
+    for changed, why in (
+        (replace(scenario, robots=(a, replace(b, encounter=met))), "b of a team has a peer"),
+        (replace(scenario, robots=(a, replace(b, given_anchor=Anchor(0.0, 0.0)))), "an anchor of its own"),
+        (
+            replace(scenario, robots=(a, replace(b, ranges=("A9",)))),
+            "b may range an anchor that is not there",
+        ),
+        (replace(scenario, team=replace(scenario.team, origin="z")), "there is no robot z"),
+        (replace(scenario, team=replace(scenario.team, anchors=scenario.team.anchors * 2)), "the same name"),
+        (replace(scenario, team=None), "a has no peer"),
+    ):
+        with pytest.raises(CorruptJournal, match=why):
+            spoilt(scenario, changed)
+
+
+# --- what is made of a run -----------------------------------------------------------------------------
+
+
+def test_a_claim_with_fewer_ranges_than_determine_a_pose_is_a_violation() -> None:
+    run = run_mission(team(ALONE))
+    recorded = of_frames(kept(run.scenario))
+    agent = recorded.agents["a"]
+    bare = [replace(one, observation=replace(one.observation, anchors=())) for one in agent.steps]
+    spoilt_run = replace(recorded, agents={"a": replace(agent, steps=tuple(bare))})
+    found = [one.what for one in audit_run(spoilt_run).violations if one.rule == "claim"]
+    assert any("ranges that determine a pose" in one for one in found)
+
+
+def test_a_run_of_a_team_is_a_range_recording_with_its_anchors_by_name() -> None:
+    run = run_mission(team("", DRAWN + "unknown = 1"))
+    recording = ranges_of_run(run)
+    assert [one.id for one in recording.anchors] == ["A1", "A2", "A3"]
+    assert [one.sigma for one in recording.anchors] == [0.0, 0.0, float("inf")]
+    assert len(recording.ranges.t) == sum(
+        len(seen[robot].anchors) for seen in run.observations[: run.length] for robot in seen
+    ) + sum(bool(seen["r1"].contacts) for seen in run.observations[: run.length])
+
+
+def test_a_trial_of_a_team_has_no_columns_of_pairs() -> None:
+    scenario = load("room")
+    found = row(Trial(0, 0, scenario, processes=False), run_mission(scenario), 1.0)
+    assert (found.outcome, found.claims, found.claims_within) == ("localised", 2, 2)
+    assert (found.meeting_tick, found.orbiting_tick, found.group, found.robots["a"].bound_m) == (None,) * 4
+    assert found.t_max_s == scenario.t_max
+
+
+def test_the_python_api_has_the_ranges_to_all_anchors() -> None:
+    world = tandem.World(file_table(team(ALONE)))
+    seen = world.observe()["a"]
+    assert [one.anchor for one in seen.anchors] == ["A1", "A2", "A3"]
+    assert seen.anchor_range is None
+    assert seen.nearest_anchor_range == min(one.range for one in seen.anchors)
+    result = tandem.run("room")
+    assert result.outcome == "localised"
+
+
+def test_a_driver_reports_the_ranges_to_the_anchors_of_a_team() -> None:
+    config = team(ALONE + '\nanchors = ["A1", "A3"]').config("a")
+    reading = Reading(Controls(0.0, 0.0), anchors={"A3": 2.0, "A1": None})
+    assert decode(observation_frame(reading, 1, config), Observation).anchors == (NamedRange("A3", 2.0),)
+    for wrong, why in (
+        (replace(reading, anchors={"A2": 1.0}), "'A2' is none that a may range"),
+        (replace(reading, anchors=3), "anchors is a int"),
+        (replace(reading, mutual_range=1.0), "robots of a team have no peer"),
+        (replace(reading, anchors={"A1": -1.0}), "Expected `float` >= 0.0"),
+    ):
+        with pytest.raises(InvalidReading, match=why):
+            observation_frame(wrong, 1, config)
+
+
+def test_a_recorded_team_is_audited_and_exported(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shown = tandem_command("run", "relative", "--in-process", "--out", out)
+    assert shown.status == 0, shown
+    assert "ranges to anchors + to other robots" in " ".join(shown.out.split())
+    assert tandem_command("audit", out).status == 0
+    summed = json.loads((out / "summary.json").read_text())
+    assert summed["t_max_s"] > 0.0
+    assert {robot["localised"] for robot in summed["robots"].values()} == {True}
+    run = read(out)
+    assert all(isinstance(one, Localised) for one in run.verdicts().values())
