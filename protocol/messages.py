@@ -352,7 +352,7 @@ class TeamAnchor(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fi
     id: RobotId
     """The anchor."""
     position: Anchor | None = None
-    """Its position in <W>, in m; None if it is unknown."""
+    """The position in <W>, in m; None if it is unknown."""
     sigma: Clearance = 0.0
     """The standard deviation of each coordinate of `position` in m; 0 if it is surveyed."""
 
@@ -695,7 +695,7 @@ class SurveyedAnchor(msgspec.Struct, frozen=True, array_like=True, forbid_unknow
     id: RobotId
     """The anchor."""
     position: Anchor
-    """Its position in <W> by the most probable hypothesis, in m."""
+    """The position in <W> by the most probable hypothesis, in m."""
     sigma: Clearance
     """The root of the trace of the covariance of `position` in m."""
 

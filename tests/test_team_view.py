@@ -1,4 +1,4 @@
-"""What viewers, exports and figures show of teams: anchors by name, ranges to several, poses and claims."""
+"""Teams in viewers, exports and figures: anchors by name, ranges to several, poses and claims."""
 
 from __future__ import annotations
 

@@ -130,7 +130,7 @@ class PlacedAnchor(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_
     told: TeamAnchor
     """The anchor, as the robots know it."""
     place: Anchor
-    """Its true position in <W>, in m."""
+    """The true position in <W>, in m."""
 
 
 class PlannedTeam(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):

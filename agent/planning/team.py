@@ -15,13 +15,12 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from agent.estimation.fit import Fit, deviation
 from agent.estimation.following import ClaimRule, Following
 from agent.estimation.gaussian.inference import PlanningHypothesis
 from agent.estimation.gaussian.joint_claims import undetermined
 from agent.estimation.gaussian.joint_ranges import near_anchors
-from agent.estimation.gaussian.odometry_noise import Array
-from agent.estimation.gaussian.search import of_anchor
+from agent.estimation.gaussian.odometry_noise import Array, track
+from agent.estimation.gaussian.search import of_anchor, position_sigma
 from agent.estimation.posterior import Hypothesis, certainties, same
 from agent.estimation.team_measurements import team_measurements
 from agent.peer.team_log import TeamLog, TeamReport
@@ -256,17 +255,12 @@ def _wanted(following: Following, team: Team, confidence: float) -> tuple[str, .
             continue
         if anchor.id in part.robots:
             k = part.robots.index(anchor.id)
-            sigma = _sigma(following.known.hypotheses[0].fit, k)
+            sigma = position_sigma(following.known.hypotheses[0].fit, k)
             if sigma > team.survey or sure[k].probability < confidence:
                 left.append((-sigma, anchor.id))
         elif anchor.id in part.anchors:
             left.append((-math.inf, anchor.id))
     return tuple([name for _, name in sorted(left)])
-
-
-def _sigma(fit: Fit, k: int) -> float:
-    """Return the root of the trace of the covariance of a position, in m."""
-    return deviation(float(np.trace(fit.covariance[3 * k : 3 * k + 2, 3 * k : 3 * k + 2])))
 
 
 def _claimed(state: TeamState) -> TeamState:
@@ -331,7 +325,7 @@ def _anchors(state: TeamState) -> tuple[SurveyedAnchor, ...]:
             SurveyedAnchor(
                 name,
                 Anchor(float(x + fit.poses[k, 0]), float(y + fit.poses[k, 1])),
-                min(_sigma(fit, k), MOST_SIGMA),
+                min(position_sigma(fit, k), MOST_SIGMA),
             )
             for k, name in enumerate(part.robots)
             if part.is_anchor(k)
@@ -510,8 +504,9 @@ def _on_way(state: TeamState) -> TeamState:
     distance = nearest_other(anchors[first], known)
     if distance is None or (state.way is not None and rooms[first][-1][0] < state.tick):
         return state
-    measured = team_measurements(state.log, state.team, mission)
-    path = measured.paths[measured.robots.index(state.config.robot)]
+    driven = [one.executed for one in entries if one.executed is not None]
+    v, omega = (np.array([getattr(one, name) for one in driven]) + 0.0 for name in ("v", "omega"))
+    path = track(v, omega, mission.period)
     alone = near_anchors((path,), (rooms[first],), ((0.0, 0.0),), mission.noise, mission.sensing_range)
     found = of_anchor((), alone.alone(0))
     if not found:

@@ -57,7 +57,7 @@ class RobotSetup(msgspec.Struct, frozen=True):
 
     @property
     def orbit(self) -> Orbit:
-        """Its orbit. Raises LookupError if it has none."""
+        """The orbit of the robot. Raises LookupError if it has none."""
         if self.given_orbit is None:
             raise LookupError(f"{self.id} has no orbit")
         return self.given_orbit
