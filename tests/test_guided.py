@@ -137,6 +137,43 @@ def test_guided_play_stops_at_each_kill_and_at_the_first_fault_of_each_kind(
     assert ticks.count(10) > 1.5 * ticks.count(40)
 
 
+PX_PER_M = """() => {
+  const { targets } = document.getElementById('canvas');
+  const of_b = (kind) => targets.find((one) => one.kind === kind && one.robot === 'b').at;
+  const [robot, anchor] = [of_b('robot'), of_b('anchor')];
+  return Math.hypot(robot[0] - anchor[0], robot[1] - anchor[1]);
+}"""
+"""A function of the page that returns how far b is from its anchor on the plane, in pixels."""
+
+
+@pytest.mark.long
+def test_the_camera_is_where_two_mirror_images_are_and_goes_back(opened: Open, address: str) -> None:
+    page = opened(f"{address}#tick=1")
+    until_shown(page, 1)
+    expect(page.locator("#camera")).to_have_attribute("aria-pressed", "true")
+    picture(page)
+    near = page.evaluate(PX_PER_M) / 0.934
+    page.evaluate("location.hash = 'tick=4'")
+    until_shown(page, 4)
+    picture(page)
+    far = page.evaluate(PX_PER_M) / 2.69
+    assert near > 3 * far
+
+
+@pytest.mark.long
+def test_a_path_that_is_turned_comes_to_one_hypothesis_after_the_other(opened: Open, address: str) -> None:
+    page = started(opened, address, 46)
+    drawn = []
+    for tick, caption in played(page):
+        if tick == 47 and caption.startswith("The distance was"):
+            targets = page.evaluate("document.getElementById('canvas').targets")
+            drawn.append(sum(one["kind"] == "hypothesis" and one["robot"] == "a" for one in targets))
+        if "predict distances" in caption:
+            break
+    assert drawn == sorted(drawn)
+    assert min(drawn) < 4 == max(drawn)
+
+
 @pytest.mark.long
 def test_the_camera_follows_the_story_until_it_is_moved(opened: Open, address: str) -> None:
     page = started(opened, address, 44)
@@ -251,10 +288,10 @@ def test_guided_play_can_be_left_and_entered_by_keys_and_buttons(opened: Open, a
     before = picture(page)
     page.keyboard.press("Space")
     until_shown(page, 48)
-    expect(page.locator("#camera")).to_have_attribute("aria-pressed", "false")
+    expect(page.locator("#camera")).to_have_attribute("aria-pressed", "true")
     page.keyboard.press("Home")
     until_shown(page, 0)
-    assert picture(page) == before  # a plain speed leaves the camera where it is
+    assert picture(page) == before  # the camera is back, too
 
 
 @pytest.mark.long

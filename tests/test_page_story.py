@@ -72,7 +72,10 @@ def test_the_legend_lists_only_the_marks_that_are_drawn(opened: Open, address: s
         picture(page)
         at[tick] = " ".join(page.locator("#legend li").all_text_contents())
     for words, drawn in (
-        ("all places at the measured distance", {0}),
+        ("all places at the measured distance", {0, 1, 2}),
+        ("mirror axis", {1, 2}),
+        ("turned about its anchor, the driven path fits", {47}),
+        ("number of hypotheses", set(ticks)),
         ("distance to the anchor", {0, 1, 2, 5}),
         ("pose that is ruled out", {2, 48}),
         ("turned around the anchor", {5, 20}),
@@ -82,7 +85,7 @@ def test_the_legend_lists_only_the_marks_that_are_drawn(opened: Open, address: s
         ("possible pose", {1}),
         ("range between robots: 3\u00a0m", {46}),
         ("anchor (beacon); range 3\u00a0m", set(ticks)),
-        ("manoeuvre chosen by b: J\u00a0=\u00a01.80\u00a0m²", {47}),
+        ("manoeuvre chosen by b", {47}),
         ("robot a", set(ticks)),
     ):
         assert {tick for tick, listed in at.items() if words in listed} == drawn, words

@@ -100,6 +100,8 @@ def test_the_slider_reaches_the_last_tick_as_soon_as_it_is_visible(opened: Open,
 @pytest.mark.long
 def test_the_plane_is_drawn_in_the_colours_of_what_happens(opened: Open, address: str) -> None:
     page = opened(address)
+    until_shown(page, 0)
+    page.keyboard.press("f")  # the camera stays where it is
     seen = {}
     for tick in (0, 20, 45, 46, 47, 48):
         scrub_to(page, tick)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import signal
 import socket
@@ -35,7 +36,8 @@ LISTENING_PORTS = range(20_000, 32_000)
 RESERVED = 64
 """The number of latest ports that this process reserves, so that no other process is given one of them."""
 
-_reservations: deque[socket.socket] = deque()
+_reservations: deque[int] = deque()
+"""Their file descriptors. A socket that is still open would be warned of when this process ends."""
 
 
 def free_endpoint(protocol: str = "tcp") -> str:
@@ -54,9 +56,9 @@ def free_endpoint(protocol: str = "tcp") -> str:
             reservation.close()
             continue
         reservation.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        _reservations.append(reservation)
+        _reservations.append(reservation.detach())
         if len(_reservations) > RESERVED:
-            _reservations.popleft().close()
+            os.close(_reservations.popleft())
         return f"{protocol}/127.0.0.1:{port}"
 
 

@@ -25,8 +25,12 @@ SHOWN_EVERY = 12
 
 
 class Reachable(msgspec.Struct, frozen=True):
-    """An end point of the last manoeuvre, relative to the pose before it: x ahead and y to the left, in m."""
+    """A turn rate of the last manoeuvre in rad/s, and its end point relative to the pose before it.
 
+    x is ahead and y to the left, in m.
+    """
+
+    omega: float
     x: float
     y: float
     separation_m2: float
@@ -127,5 +131,6 @@ def _compared(
     ways = compared(Question("a" if moves_a else "b", ORIGIN, ORIGIN, places), setup.mission, manoeuvres)
     row = int(abs(ways.reach.v[:, 0] - command.v).argmin())
     column = int(abs(ways.reach.omega - command.omega).argmin())
+    turns = ways.reach.omega[::SHOWN_EVERY].tolist()
     shown = [values[row, ::SHOWN_EVERY].tolist() for values in (ways.reach.x, ways.reach.y, ways.gap)]
-    return ComparedManoeuvre(robot, float(ways.gap[row, column]), tuple(map(Reachable, *shown)))
+    return ComparedManoeuvre(robot, float(ways.gap[row, column]), tuple(map(Reachable, turns, *shown)))

@@ -28,6 +28,7 @@ export class Beliefs {
     const bearing_unknown = truth && lacks_bearing(held);
     if (!bearing_unknown) this.plane.marks.add(tints.length ? "configuration" : "pose");
     poses.slice(0, 60).forEach((pose, place) => {
+      if (view.passed.get(robot.id)?.(place) === false) return;
       const chance = held.probability[place] ?? 1 / poses.length;
       const [x, y] = this.plane.at(pose);
       pen.globalAlpha = tints.length ? 0.55 + 0.45 * Math.sqrt(chance) : 0.3 + 0.7 * Math.sqrt(chance);

@@ -1,6 +1,7 @@
 // The camera of guided play: the whole pair during the search, and all that counts from the encounter on.
 
-import { compose, frame_of } from "./geometry.js";
+import { crossing, mirrored } from "./construction.js";
+import { compose, distance, frame_of } from "./geometry.js";
 
 const AROUND = 0.25; // of the sensing range, around each pose
 
@@ -29,16 +30,20 @@ export function scenario_discs(robots, store) {
 /**
  * Returns the discs that the story needs in view in this tick.
  *
- * From the encounter on, these are the robots and all poses that they consider possible, now and in the next tick, and
+ * While a robot has two mirror images relative to its anchor, these are what they follow from. From the encounter on, these are the robots and all poses that they consider possible, now and in the next tick, and
  * those that are being ruled out. Once the pair has finished, these are all pairs.
  */
-export function story_discs({ store, tick, focus, truth, eliminated }, pair) {
+export function story_discs({ store, tick, focus, truth, eliminated, turned }, pair) {
   const { robots, mission: { sensing_range } } = store.stage;
   if (store.grouped && !focus) return scenario_discs(robots, store);
   const finished = pair.every((robot) => store.player(tick - 1, robot.id)?.command?.verdict);
   if (finished && truth && robots.length > pair.length) return scenario_discs(robots, store);
   const shown = truth || !focus ? pair : pair.filter((robot) => robot.id === focus);
   const discs = scenario_discs(shown, store);
+  for (const robot of shown) {
+    const found = mirrored(store, tick, robot, truth);
+    if (found) return found.ranges.map(([, range]) => [robot.anchor, 1.2 * range]);
+  }
   if (!pair.some((robot) => store.phase(tick, robot.id) === 3)) return discs;
   const poses = [];
   for (const robot of shown) {
@@ -49,5 +54,7 @@ export function story_discs({ store, tick, focus, truth, eliminated }, pair) {
     const held = store.player(tick, robot.id)?.held;
     if (!truth && held && !held.world.length) poses.push(...held.local.map((local) => compose(frame_of(robot, truth), local)));
   }
+  const found = truth && turned !== null && turned < 1 ? crossing(store, tick, pair.find(({ role }) => role === "a") ?? pair[0]) : null;
+  if (found) return [found.circle, ...found.places.map((place) => [found.anchor, distance(place, found.anchor)])];
   return poses.length ? poses.map((pose) => [pose, AROUND * sensing_range]) : discs;
 }

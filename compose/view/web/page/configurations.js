@@ -65,7 +65,7 @@ export class Configurations {
     if (live.length < 2) return;
     this.plane.marks.add("configuration");
     pen.lineWidth = 1.3;
-    for (const { tint, a, b, out } of live) {
+    for (const { tint, a, b, out } of live.filter((_, i) => view.passed.get(robot.id)?.(i) !== false)) {
       pen.globalAlpha = out ? 0.25 : 0.9;
       pen.strokeStyle = look.tint(tint);
       pen.beginPath();

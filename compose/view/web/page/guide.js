@@ -6,7 +6,8 @@ const ENCOUNTER_S = 24; // the ticks of phase 3 together
 const GROUP_S = 24; // the ticks of a group's mission together
 const LONGEST_TICK_S = { search: 0.25, encounter: 1.5 };
 const MANOEUVRE_S = 2.5;
-const ELIMINATION_S = 3.5;
+/** For how long time stops at least at captions whose contents are shown bit by bit, in s. */
+const SHOWN_S = { measured: 3.5, configurations: 6 };
 /** How much of an elimination has been shown when all configurations that are ruled out are crossed out. */
 const ALMOST = 0.999;
 const HOLDS_S = 45; // all captions together
@@ -91,6 +92,13 @@ export class Guide {
     return view.beat === null || view.beat >= place;
   }
 
+  /** Returns the part of a whole turn that the path of a driven robot has been turned about its anchor; null once that is told. */
+  turned(view) {
+    const here = this.captions(view), place = here.findIndex(({ kind }) => kind === "configurations");
+    if (view.beat === null || place < 0) return 1;
+    return view.beat === place ? Math.min(ALMOST, view.held / this.#hold(here[place], view.focus)) : null;
+  }
+
   /** Passes `s` seconds. Returns false once the story has ended. */
   advance(view, s) {
     const { store } = this;
@@ -120,7 +128,7 @@ export class Guide {
   #hold(caption, focus) {
     const seconds = (one) => {
       const reading = Math.min(1 + 0.03 * (one.text.length + (one.truth?.length ?? 0)), 4.5);
-      return one.kind === "measured" ? Math.max(reading, ELIMINATION_S) : reading;
+      return Math.max(reading, SHOWN_S[one.kind] ?? 0);
     };
     const first = new Map(), told = this.beats.flatMap(({ captions }) => this.#about(captions, focus));
     for (const one of told) if (!first.has(one.kind)) first.set(one.kind, one);

@@ -33,6 +33,8 @@ const LASTING = {
 const MOMENTARY = {
   down: [drawn(`<path ${POINTED} fill="none" stroke="var(--faint)" stroke-width="2"/><path d="${cross}" stroke="var(--fault)" stroke-width="2"/>`), "robot whose process is gone"],
   places: [drawn('<circle cx="15" cy="8" r="6.5" fill="none" stroke="var(--ghost)" stroke-width="2.4" stroke-dasharray="1.6 2.5"/><path d="M15 5.5l2.5 4.3h-5z" fill="var(--ink)"/>'), "all places at the measured distance"],
+  axis: [line("faint", 'stroke-width="1" stroke-dasharray="7 2 2 2"'), "mirror axis: distances to the anchor do not tell its sides apart"],
+  crossing: [drawn('<circle cx="10" cy="8" r="7" fill="none" stroke="var(--ghost)" stroke-dasharray="3 2.4"/><circle cx="20" cy="8" r="7" fill="none" stroke="var(--ghost)" stroke-width="2" stroke-dasharray="1.6 2.5"/>'), "turned about its anchor, the driven path fits where the circles cross"],
   distance: [line("range"), ({ team }) => `distance to ${team ? "an" : "the"} anchor`],
   turned: [drawn(`<path ${POINTED} fill="none" stroke="var(--faint)" stroke-opacity="0.7"/>`), "turned around the anchor: just as possible"],
   pose: [drawn(`<path ${POINTED} fill="none" stroke="var(--ghost)" stroke-width="1.6" stroke-dasharray="2.5 2"/>`), "possible pose (place and heading) of a robot"],
@@ -48,7 +50,7 @@ const MOMENTARY = {
   damaged: [drawn(`<circle cx="15" cy="8" r="5" fill="none" stroke="var(--fault)" stroke-width="1.6"/><path d="${cross}" stroke="var(--fault)"/>`), "report that arrives damaged"],
   configuration: [drawn('<path d="M5 8h20" stroke="var(--tint-1)"/><circle cx="5" cy="8" r="3.6" fill="var(--card)" stroke="var(--tint-1)" stroke-width="2"/><circle cx="25" cy="8" r="3.6" fill="var(--card)" stroke="var(--tint-1)" stroke-width="2"/>'), "configuration: a pose of each robot, in one colour"],
   reachable: [drawn('<path d="M3 13q12-14 24-4" fill="none" stroke="var(--faint)" stroke-width="4"/>'), ({ mover }) => `where ${mover} could drive; thick: predictions differ more`],
-  choice: [drawn('<path d="M3 11q10-9 19-4" fill="none" stroke="var(--ink)" stroke-width="2"/><path d="M28 9.5l-8 1.5 3.5-6z" fill="var(--ink)"/>'), ({ mover, value }) => `manoeuvre chosen by ${mover}${value}`],
+  choice: [drawn('<path d="M3 11q10-9 19-4" fill="none" stroke="var(--ink)" stroke-width="2"/><path d="M28 9.5l-8 1.5 3.5-6z" fill="var(--ink)"/>'), ({ mover }) => `manoeuvre chosen by ${mover}`],
   predicted: [drawn('<circle cx="15" cy="8" r="6" fill="none" stroke="var(--tint-1)" stroke-width="1.8" stroke-dasharray="4 2.5"/><path d="M15 8h6" stroke="var(--tint-1)"/>'), "distance that a configuration predicts"],
   measured: [ring("ink", 'style="stroke-width: 4; opacity: 0.2"'), "measured distance"],
 };
@@ -57,7 +59,7 @@ const BANDS = drawn('<path d="M1 8h9" stroke="var(--faint)" stroke-width="3"/><p
 /** The signs above the time line. */
 const TIMES = {
   contact: "in range of each other", claim: "a robot claims its pose", inconsistent: "a contradiction is found",
-  undecided: "a robot stops without a claim", down: "a process is gone", back: "a process is back",
+  several: "number of hypotheses of a robot", undecided: "a robot stops without a claim", down: "a process is gone", back: "a process is back",
 };
 
 export class Legend {
@@ -73,7 +75,7 @@ export class Legend {
   /**
    * Lists `marks` of the plane and `kinds` of events above the time line. What stays comes first, so that lines keep their places.
    *
-   * `names` are the words of the story: the ids of robots `a` and `b`, the `mover` of the last manoeuvre and its `value`, the
+   * `names` are the words of the story: the ids of robots `a` and `b`, the `mover` of the last manoeuvre, the
    * sensing `range`, whether the planner is the user's `own`, and whether the robots are a `team`.
    */
   draw(marks, kinds, names) {
@@ -83,7 +85,7 @@ export class Legend {
     const said = (words) => (typeof words === "string" ? words : words(names));
     const items = (all) => Object.entries(all).filter(([name]) => marks.has(name)).map(([, [picture, words]]) => entry(picture, said(words)));
     const times = Object.entries(TIMES).filter(([kind]) => kinds.has(kind)).map(([kind, words]) => (
-      make("li", {}, make("b", { textContent: SIGNS[kind] }), make("span", { textContent: words }))
+      make("li", {}, make("b", { textContent: SIGNS[kind] ?? "4" }), make("span", { textContent: words }))
     ));
     times.push(entry(BANDS, names.team ? "thickness: not located, to another anchor, located" : "thickness: phase 1, 2, 3"));
     const passing = items(MOMENTARY);

@@ -151,7 +151,8 @@ async function open(name) {
     view.wanted = truth;
     view.playing = false;
     view.beat = null;
-    plane.following = plane.freed = false;
+    plane.freed = false;
+    plane.following = !embedded; // two recordings side by side are compared at one scale
     view.focus = store.places.has(robot) ? robot : null;
     view.selected = selected;
     staged();
@@ -200,6 +201,7 @@ function go(tick, { keep_playing = false } = {}) {
   if (!store) return;
   if (embedded) return void tell({ tick });
   view.tick = Math.min(Math.max(tick, store.first), Math.max(store.last, 0));
+  plane.easing = false; // a jump in time is no motion
   view.share = 0;
   view.beat = null;
   if (!keep_playing) view.playing = false;
@@ -295,12 +297,13 @@ function draw() {
     view.moving = (view.playing || view.driven) && !still.matches && (view.guided || view.speed <= 60);
     view.eliminated = guide.eliminated(view);
     view.planned = guide.planned(view);
+    view.turned = guide.turned(view) === null ? null : still.matches ? 1 : guide.turned(view);
     // First the texts: they decide the size of the plane, and its camera and its labels keep clear of them.
     controls();
     $("caption").classList.toggle("several", guide.several(view));
     caption(guide.text(view));
     predictions.draw(view, store, guide.pair(view.focus));
-    if (plane.following) plane.follow(view, store, guide.pair(view.focus), still.matches ? null : now);
+    if (plane.following) plane.follow(view, store, guide.pair(view.focus), (view.playing || plane.easing) && !still.matches ? now : null);
     document.body.dataset.tick = view.tick;
     document.body.dataset.shown = store.scene(view.tick) ? view.tick : "";
     tell_state({ shown: store.scene(view.tick) ? view.tick : null, first: store.first, last: store.last });
@@ -316,7 +319,7 @@ function draw() {
     const news = view.playing && view.guided ? null : announcer.text(store, view, now);
     if (news !== null) text($("live"), news);
     if (view.playing || plane.easing) draw();
-    if (!view.playing) keep_address();
+    if (!view.playing && !plane.easing) keep_address();
   });
 }
 
@@ -325,9 +328,8 @@ function legend_names() {
   const story = guide.pair(view.focus), several = store.stage.robots.length > story.length;
   const of = (role) => (several ? null : story.find((robot) => robot.role === role)?.id) ?? `of role ${role}`;
   const at = view.eliminated < 1 ? view.tick - 1 : view.tick, manoeuvre = joined(store.scene(at), story[0].id)?.manoeuvre;
-  const value = manoeuvre ? `: J\u00a0=\u00a0${manoeuvre.separation_m2.toPrecision(3)}\u00a0m²` : "";
   const range = `${Number(store.stage.mission.sensing_range.toFixed(3))}\u00a0m`, own = store.stage.robots.some(({ own_planner }) => own_planner);
-  return { a: of("a"), b: of("b"), mover: manoeuvre?.robot ?? "a robot", value, range, own, team: store.stage.team };
+  return { a: of("a"), b: of("b"), mover: manoeuvre?.robot ?? "a robot", range, own, team: store.stage.team };
 }
 
 function controls() {

@@ -3,6 +3,7 @@
 import { Backdrop } from "./backdrop.js";
 import { Beliefs } from "./beliefs.js";
 import { Configurations } from "./configurations.js";
+import { Construction } from "./construction.js";
 import { scenario_discs, story_discs, true_and_reported } from "./camera.js";
 import { distance, TAU } from "./geometry.js";
 import { heads, links } from "./group.js";
@@ -50,6 +51,7 @@ export class Plane {
     this.#beliefs = new Beliefs(this);
     this.#signals = new Signals(this);
     this.#configurations = new Configurations(this);
+    this.#construction = new Construction(this);
     this.tints = new Tints();
     /** The names of the marks that are drawn, for the legend. */
     this.marks = new Set();
@@ -91,6 +93,7 @@ export class Plane {
   #beliefs;
   #signals;
   #configurations;
+  #construction;
   #revision = -1;
   #pointer = null;
 
@@ -215,7 +218,7 @@ export class Plane {
     return [this.centre[0] + (x - this.width / 2) / this.scale, this.centre[1] - (y - this.height / 2) / this.scale];
   }
 
-  draw(store, { tick, share, focus, truth, moving, eliminated, planned, selected }) {
+  draw(store, { tick, share, focus, truth, moving, eliminated, planned, turned, selected }) {
     this.#measure();
     const ratio = (window.devicePixelRatio || 1) * unit();
     const width = Math.round(this.width * ratio), height = Math.round(this.height * ratio);
@@ -237,7 +240,7 @@ export class Plane {
     pen.clearRect(0, 0, this.width, this.height);
     pen.lineCap = pen.lineJoin = "round";
     pen.font = look.font;
-    const view = { store, tick, share, focus, truth, moving, eliminated, planned, look, scene: store.scene(tick) };
+    const view = { store, tick, share, focus, truth, moving, eliminated, planned, turned, look, scene: store.scene(tick) };
     this.labels = new Labels(pen, look, this.width, this.height, this.#overlays());
     const shown = (robot) => truth || !focus || robot.id === focus;
     const robots = store.stage.robots.filter(shown);
@@ -275,6 +278,12 @@ export class Plane {
     const { store, truth, focus } = view;
     view.size = this.robot_size(store);
     view.places = new Map(store.stage.robots.map((robot) => [robot.id, pose_now(view, robot, TRUE)]));
+    for (const robot of robots) if (!focus || robot.id === focus) this.#construction.mirror(view, robot);
+    view.passed = new Map();
+    for (const robot of robots.filter(({ role }) => role === "a")) {
+      const passed = this.#construction.crossings(view, robot);
+      for (const id of [robot.id, robot.peer]) view.passed.set(id, passed);
+    }
     for (const robot of robots) if (store.grouped ? heads(view, robot) : robot.role === "a") this.#configurations.draw(view, robot);
     for (const robot of robots) if (!focus || robot.id === focus) this.#beliefs.belief(view, robot);
     for (const robot of robots) this.#signals.anchor_range(view, robot);

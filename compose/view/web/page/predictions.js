@@ -7,6 +7,17 @@ import { joined } from "./tints.js";
 import { metres } from "./words.js";
 
 const MOST = 8;
+/** The width and height of the strip in pixels. */
+const WIDE = 110, TALL = 30;
+
+/** Returns J of the last manoeuvre, and J over its turn rates as a picture with a mark at the chosen one. */
+function strip({ reachable, separation_m2 }, omega) {
+  const [low, high] = [reachable[0].omega, reachable.at(-1).omega], most = Math.max(separation_m2, ...reachable.map((one) => one.separation_m2));
+  const at = (turn, value) => `${(2 + ((WIDE - 4) * (turn - low)) / (high - low || 1)).toFixed(1)} ${(TALL - 3 - ((TALL - 7) * value) / (most || 1)).toFixed(1)}`;
+  const [x, y] = at(omega, separation_m2).split(" "), said = `J over the turn rate from ${low.toFixed(1)} to ${high.toFixed(1)} rad/s; chosen: ${omega.toFixed(2)} rad/s, ${separation_m2.toPrecision(3)} m²`;
+  return `J\u00a0=\u00a0${separation_m2.toPrecision(3)}\u00a0m² <svg viewBox="0 0 ${WIDE} ${TALL}" width="${WIDE}" height="${TALL}" role="img" aria-label="${said}"><title>${said}</title><path d="M${reachable.map((one) => at(one.omega, one.separation_m2)).join("L")}" fill="none" stroke="var(--faint)" stroke-width="1.5"/>`
+    + `<path d="M${x} ${TALL - 2}V${y}" stroke="var(--ink)"/><circle cx="${x}" cy="${y}" r="3" fill="var(--ink)"/></svg>`;
+}
 
 export class Predictions {
   constructor(root, plane) {
@@ -29,8 +40,10 @@ export class Predictions {
       return item;
     });
     const measured = found.measured ? [make("li", { className: "measured", textContent: `measured ${found.measured}` })] : [];
+    const picture = make("li", { className: "strip" });
+    if (found.strip) picture.innerHTML = found.strip;
     const value = found.least ? [make("li", { className: "value", textContent: `nearest two differ by ${found.least}` })] : [];
-    this.root.replaceChildren(make("li", { className: "title", textContent: found.title }), ...items, ...measured, ...value);
+    this.root.replaceChildren(make("li", { className: "title", textContent: found.title }), ...items, ...measured, ...value, ...(found.strip ? [picture] : []));
   }
 
   #found(view, robot) {
@@ -45,6 +58,7 @@ export class Predictions {
     const all = predicted(store, tick, robot, tints);
     const lengths = all.map((one) => one.predicted).sort((a, b) => a - b);
     const least = now.manoeuvre && metres(Math.min(...lengths.slice(1).map((length, i) => length - lengths[i])));
-    return all.length ? { title: "predicted", all: listed(all), least } : null;
+    const drawn = now.manoeuvre?.reachable.length > 1 && strip(now.manoeuvre, store.player(tick, now.manoeuvre.robot).command.omega);
+    return all.length ? { title: "predicted", all: listed(all), least, strip: drawn } : null;
   }
 }

@@ -1,4 +1,4 @@
-// The timeline: one band of phases per robot, contact shaded, and marks above for contacts, verdicts, and processes that end and return.
+// The timeline: one band of phases per robot with the numbers of its hypotheses, contact shaded, and marks above for contacts, verdicts, and processes that end and return.
 
 import { unit } from "./pen.js";
 import { SIGNS } from "./words.js";
@@ -33,8 +33,8 @@ export class Timeline {
     scrub.addEventListener("input", () => go(Number(scrub.value)));
   }
 
-  /** The kinds of events that have a sign. */
-  get kinds() { return new Set(this.marks.map(([, kind]) => kind)); }
+  /** The kinds of events that have a sign; `several` if a robot has several hypotheses. */
+  get kinds() { return new Set([...this.marks.map(([, kind]) => kind), ...([...this.counts.values()].some((one) => one.length) ? ["several"] : [])]); }
 
   inset = 30;
   last = 0;
@@ -46,6 +46,7 @@ export class Timeline {
     this.read = 0;
     this.spans = new Map(store.stage.robots.map((robot) => [robot.id, []]));
     this.contacts = new Map(store.stage.robots.map((robot) => [robot.id, []]));
+    this.counts = new Map(store.stage.robots.map((robot) => [robot.id, []]));
     this.marks = [];
   }
 
@@ -60,6 +61,8 @@ export class Timeline {
         if (!spans) continue; // a robot that has just joined: `stage` is called again when the mission has been read again
         const phase = player.command?.phase ?? Math.abs(spans.at(-1)?.value ?? 1);
         lengthen(spans, this.read, player.down ? -phase : phase, store.grouped ? store.role(this.read, player.robot) : null);
+        const count = player.held?.world.length || player.held?.local.length;
+        if (count > 1) lengthen(this.counts.get(player.robot), this.read, count);
         if (player.contacts?.length) lengthen(this.contacts.get(player.robot), this.read, 1);
       }
       for (const event of scene.events) {
@@ -71,7 +74,7 @@ export class Timeline {
   /** Discards the data of `tick` and later, because it has changed. */
   forget(tick) {
     if (tick >= this.read) return;
-    for (const spans of [...this.spans.values(), ...this.contacts.values()]) {
+    for (const spans of [...this.spans.values(), ...this.contacts.values(), ...this.counts.values()]) {
       while (spans.length && spans.at(-1).from >= tick) spans.pop();
       if (spans.length) spans.at(-1).to = Math.min(spans.at(-1).to, tick - 1);
     }
@@ -125,9 +128,20 @@ export class Timeline {
         if (width > 54 && band > 10) {
           pen.fillStyle = value === 3 ? of("paper") : of("faint");
           if (value < 0) pen.fillText("down", left + 5, y + band - 3.5);
-          if (value === 3) pen.fillText(store.stage.team ? "located" : `phase ${value}`, left + 5, y + band - 3.5);
+          if (value === 3 && store.stage.team) pen.fillText("located", left + 5, y + band - 3.5);
         }
       }
+      pen.textAlign = "center";
+      pen.lineWidth = 3;
+      for (const { from, to, value } of band > 10 ? this.counts.get(robot.id) : []) {
+        const text = String(value), left = x(from), room = x(Math.min(to + 1, this.last)) - left;
+        if (room < pen.measureText(text).width + 2) continue;
+        pen.strokeStyle = of("paper");
+        pen.fillStyle = of("ink");
+        pen.strokeText(text, left + room / 2, y + band - 3);
+        pen.fillText(text, left + room / 2, y + band - 3);
+      }
+      pen.textAlign = "left";
       pen.fillStyle = of("shade");
       for (const { from, to } of this.contacts.get(robot.id)) {
         pen.fillRect(x(from), y - 2, Math.max(x(Math.min(to + 1, this.last)) - x(from), 2), band + 4);
