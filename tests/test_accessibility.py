@@ -25,6 +25,7 @@ def violations(page: Page) -> dict[str, list[str]]:
     return {one["id"]: [str(node["target"]) for node in one["nodes"]] for one in found}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("look", series([(False, 1280), (True, 1280), (False, NARROW)], 1), ids=str)
 def test_no_beat_of_a_recording_breaks_a_rule(opened: Open, address: str, look: tuple[bool, int]) -> None:
     dark, width = look

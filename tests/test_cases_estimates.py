@@ -256,6 +256,7 @@ def test_of_two_robots_the_one_that_stands_is_named(metres: Path, tmp_path: Path
     assert both.blocking_reason.startswith("r, s do not move, by their odometry")
 
 
+@pytest.mark.long
 def test_whole_turns_are_removed_from_increments_and_counted(tmp_path: Path) -> None:
     ended = tandem("estimate", WRAPPED, "--out", "found", cwd=tmp_path)
     assert ended.status == ENDED
@@ -286,6 +287,7 @@ def test_a_robot_that_turns_far_within_an_increment_keeps_its_turn(
 # --- what is said of claims and of the truth --------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_claim_that_does_not_hold_at_the_end_is_the_last_line_and_status_1(tmp_path: Path) -> None:
     few = changed(WRAPPED, tmp_path / "few", {}, last_s=8.0)
     ended = tandem("estimate", few, "--out", "found", cwd=tmp_path)

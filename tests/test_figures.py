@@ -418,6 +418,7 @@ def test_a_journal_of_another_run_is_not_used(noisy: Path, tmp_path: Path) -> No
     assert "another run" in ended.err
 
 
+@pytest.mark.long
 def test_a_figure_of_thirty_rows_has_room_for_each() -> None:
     names = [f"row {i}" for i in range(30)]
     sheet = Sheet(SCREEN, False, ["many"], [[name] for name in names])

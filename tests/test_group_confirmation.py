@@ -95,12 +95,14 @@ def test_all_claim_right_poses_within_the_bound_if_nobody_reports_false_data() -
     assert corrected_bounds(run) == ()
 
 
+@pytest.mark.long
 def test_the_recording_passes_the_audit_and_the_replay() -> None:
     journals = without_attacker()
     assert audited(journals) == []
     assert replayed(of_frames(journals)).differences == ()
 
 
+@pytest.mark.long
 def test_a_robot_claims_a_pose_later_than_it_knows_one_and_by_two_peers_that_agree() -> None:
     run = of_frames(without_attacker())
     for robot in run.robots:
@@ -175,6 +177,7 @@ def test_lost_and_late_reports_only_cost_time(fault: dict[str, Any]) -> None:
     assert honest(run) == (4, 0, 0)
 
 
+@pytest.mark.long
 def test_a_robot_leaves_for_its_anchor_though_the_one_that_it_has_met_is_in_range() -> None:
     run = of_frames(without_attacker())
     left = 0
@@ -265,6 +268,7 @@ def test_a_second_meeting_of_two_robots_has_file_names_of_its_own() -> None:
 # --- the plan -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @given(robots=st.integers(4, 9), seed=st.integers(0, 1000), tolerates=st.integers(1, 3))
 def test_each_robot_meets_enough_others_and_is_in_one_meeting_at_a_time(
     robots: int, seed: int, tolerates: int
@@ -312,6 +316,7 @@ def test_a_changed_scenario_keeps_the_number_of_false_reporters() -> None:
     assert validate(file_table(scenario), "group.toml").seeded(None) == scenario
 
 
+@pytest.mark.long
 def test_an_audit_finds_a_visit_that_is_not_planned() -> None:
     journals = without_attacker()
     scenario = of_frames(journals).scenario

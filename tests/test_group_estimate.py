@@ -210,6 +210,7 @@ def test_a_recorded_mission_of_a_group_is_estimated_by_default_with_all_robots(m
     assert len(lines) - 1 == len(found.rows["robot"])
 
 
+@pytest.mark.long
 def test_a_recorded_mission_is_estimated_in_the_frame_of_a_robot(mission: Path) -> None:
     flags = ("--noise", "group.toml", "--relative")
     ran = tandem("estimate", "recording", *flags, "b", "--accuracy", "1", "--out", "frame", cwd=mission)

@@ -600,6 +600,7 @@ def test_a_contact_is_longer_where_ranges_are_less_accurate() -> None:
 # --- a robot that dies --------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_finder_that_has_died_is_named_with_the_robots_that_it_has_not_found(tmp_path: Path) -> None:
     table = four(name="four")
     table["robot"][0]["dies"] = 60

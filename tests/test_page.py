@@ -190,6 +190,7 @@ def test_a_hypothesis_that_goes_on_moves_to_where_it_is_next_and_others_as_drive
     assert page.evaluate(HELD, [now, far, 0.5])["poses"][0] == [0.5, 0, 0]  # it jumps at the tick
 
 
+@pytest.mark.long
 def test_a_view_is_the_same_picture_however_it_was_reached(opened: Open, address: str) -> None:
     """A part that does not change between two ticks is drawn once, and again when it changes."""
     pages = {tick: opened(f"{address}#tick={tick}") for tick in (30, 40)}

@@ -51,6 +51,7 @@ def until_both_show(page: Page, left: int, right: int) -> None:
         expect(frame.locator("body")).to_have_attribute("data-shown", str(tick))
 
 
+@pytest.mark.long
 def test_both_recordings_show_the_tick_of_one_clock(
     opened: Open, beside: str, paper_1: Path, assured: Path
 ) -> None:

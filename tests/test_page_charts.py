@@ -235,6 +235,7 @@ def test_a_click_in_the_charts_goes_to_the_tick_whose_values_it_shows(
     shot(page, "charts")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("look", cases([(False, 1280, 720), (True, 800, 600), (False, 390, 844)]), ids=str)
 def test_open_charts_break_no_rule_of_accessibility(
     opened: Open, served: str, look: tuple[bool, int, int]
@@ -307,6 +308,7 @@ def test_the_charts_follow_a_mission_while_it_runs(opened: Open, noisy: Path, tm
             expect(page.locator("#status")).to_contain_text("running")
 
 
+@pytest.mark.long
 def test_a_position_whose_sigma_is_large_is_drawn_along_its_arc(opened: Open, tmp_path: Path) -> None:
     run_mission(load("noisy", seed=BENT), tmp_path)
     shown = scenes_of(read(tmp_path))

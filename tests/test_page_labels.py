@@ -149,6 +149,7 @@ def address_of(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Address]:
 # --- what is shown ------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("shown", series(SHOWN), ids=str)
 def test_no_text_overlaps_another(
     shown: tuple[str, tuple[int, int]], opened: Open, browser: Browser, address_of: Address

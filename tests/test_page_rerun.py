@@ -228,6 +228,7 @@ def drag(page: Page, before: tuple[float, float], after: tuple[float, float]) ->
     page.mouse.up()
 
 
+@pytest.mark.long
 def test_a_start_that_is_dragged_is_where_the_mission_begins_again(opened: Open, address: str) -> None:
     page = opened_form(opened, address)
     start = PAPER_1.robots[0].start

@@ -29,6 +29,7 @@ def test_the_sequence_diagram_says_what_became_of_the_reports_of_the_tick(opened
     expect(diagram).to_be_hidden()
 
 
+@pytest.mark.long
 def test_the_diagram_shows_a_killed_process_and_zooms_by_key_and_by_button(
     opened: Open, tmp_path: Path
 ) -> None:

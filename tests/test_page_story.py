@@ -150,6 +150,7 @@ def test_the_label_of_a_mutual_distance_goes_as_soon_as_the_robots_drive_on(
     assert labelled == sorted(labelled, reverse=True)
 
 
+@pytest.mark.long
 def test_the_phase_of_a_planner_of_the_user_is_a_number(opened: Open, tmp_path: Path) -> None:
     run_mission(setting("paper-1", planner="tests.own_planners:Wrapping").scenario, tmp_path)
     with watching(tmp_path) as (_, found):

@@ -187,6 +187,7 @@ def test_a_finder_and_the_robot_that_it_has_found_sweep_each_strip_once(
     assert len(taken) == 2 * (more // 2)
 
 
+@pytest.mark.long
 def test_robots_that_search_once_they_are_found_save_a_quarter_of_the_ticks(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -96,6 +96,7 @@ def test_a_recording_with_an_attacker_passes_the_audit_and_the_replay() -> None:
     assert replayed(of_frames(journals())).differences == ()
 
 
+@pytest.mark.long
 def test_a_robot_with_no_second_finder_stays_undecided_and_names_the_one() -> None:
     table = five()
     for robot in table["robot"][1:3]:
@@ -283,6 +284,7 @@ def test_a_pose_is_claimed_when_one_more_finder_than_may_lie_agrees_on_it() -> N
     assert abs(wrap(state.verdict.pose.heading - pose.heading)) < 1e-9
 
 
+@pytest.mark.long
 def test_a_finder_that_has_heard_that_it_is_not_needed_sends_no_pose_and_does_not_stop_again() -> None:
     agent = of_frames(journals()).agents["u"]
     received = [framed.report for one in agent.steps for framed in one.received]
