@@ -73,6 +73,9 @@ export class Guide {
     return "";
   }
 
+  /** Returns the caption at which time has stopped; undefined if there is none. */
+  told(view) { return view.beat === null ? undefined : this.captions(view)[view.beat]; }
+
   /** Returns whether the text to show is that of several captions. */
   several(view) { return view.beat === null && this.captions(view).length > 1; }
 

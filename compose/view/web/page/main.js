@@ -297,6 +297,7 @@ function draw() {
     view.moving = (view.playing || view.driven) && !still.matches && (view.guided || view.speed <= 60);
     view.eliminated = guide.eliminated(view);
     view.planned = guide.planned(view);
+    view.told = guide.told(view);
     view.turned = guide.turned(view) === null ? null : still.matches ? 1 : guide.turned(view);
     // First the texts: they decide the size of the plane, and its camera and its labels keep clear of them.
     controls();

@@ -33,8 +33,8 @@ export class Timeline {
     scrub.addEventListener("input", () => go(Number(scrub.value)));
   }
 
-  /** The kinds of events that have a sign; `several` if a robot has several hypotheses. */
-  get kinds() { return new Set([...this.marks.map(([, kind]) => kind), ...([...this.counts.values()].some((one) => one.length) ? ["several"] : [])]); }
+  /** The kinds of events that have a sign; `several` if numbers of hypotheses are drawn. */
+  get kinds() { return new Set([...this.marks.map(([, kind]) => kind), ...(this.counted ? ["several"] : [])]); }
 
   inset = 30;
   last = 0;
@@ -48,6 +48,7 @@ export class Timeline {
     this.contacts = new Map(store.stage.robots.map((robot) => [robot.id, []]));
     this.counts = new Map(store.stage.robots.map((robot) => [robot.id, []]));
     this.marks = [];
+    this.counted = false;
   }
 
   /** Adds the scenes that have been loaded since the last call. */
@@ -107,6 +108,7 @@ export class Timeline {
     pen.font = `11px ${of("font")}`;
     this.inset = 12 + Math.max(...shown.map((robot) => pen.measureText(robot.id).width));
     const x = (k) => this.inset + (k / Math.max(this.last, 1)) * (wide - this.inset - 6);
+    this.counted = false;
     const ids = new Set(shown.map((robot) => robot.id));
     shown.forEach((robot, row) => {
       const y = MARKS + row * (band + 3);
@@ -138,6 +140,7 @@ export class Timeline {
         if (room < pen.measureText(text).width + 2) continue;
         pen.strokeStyle = of("paper");
         pen.fillStyle = of("ink");
+        this.counted = true;
         pen.strokeText(text, left + room / 2, y + band - 3);
         pen.fillText(text, left + room / 2, y + band - 3);
       }
