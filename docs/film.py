@@ -55,7 +55,6 @@ def gif(html: str) -> bytes:
     """Return the guided play of the standalone page as an animated GIF."""
     with _opened(html, (WIDTH, HEIGHT)) as page:
         page.add_style_tag(content=STYLE)
-        page.keyboard.press("f")  # a camera at rest: most of the picture stays the same
         return _gif(list(_played(page)))
 
 
