@@ -30,6 +30,8 @@ FRAME_MS = 250
 """The time between two frames in ms; the page lets no more pass between two of its drawings."""
 STILL_AFTER = 6
 """The number of frames with a mark before the one that is a picture of it."""
+MOVED = 0.025
+"""The share of changed pixels from which on the camera moves. Of its movement, the last frame is shown."""
 LAST_MS = 3000
 """The time in ms for which the last frame is shown."""
 MOST_MS = 300_000
@@ -118,6 +120,7 @@ def _gif(frames: list[bytes]) -> bytes:
         images.append(Image.open(BytesIO(frame)).convert("RGB"))
         durations.append(FRAME_MS)
     durations[-1] = LAST_MS
+    images, durations = _cut(images, durations)
     palette = Image.new("P", (1, 1))
     palette.putpalette(_colours())
     shown = [np.asarray(image.quantize(palette=palette, dither=Image.Dither.NONE)) for image in images]
@@ -131,6 +134,25 @@ def _gif(frames: list[bytes]) -> bytes:
         transparency=SAME_PIXEL, disposal=1, optimize=False,
     )  # fmt: skip
     return file.getvalue()
+
+
+def _cut(images: list[Image.Image], durations: list[int]) -> tuple[list[Image.Image], list[int]]:
+    """Return the frames and their durations without those in which the camera is on its way.
+
+    Each of these would be as large as ten others.
+    """
+    pixels = [np.asarray(image) for image in images]
+    moved = [bool((now != was).any(axis=2).mean() > MOVED) for was, now in pairwise(pixels)]
+    kept, lasting = [images[0]], [durations[0]]
+    for image, duration, moves, goes_on in zip(
+        images[1:], durations[1:], moved, [*moved[1:], False], strict=True
+    ):
+        if moves and goes_on:
+            lasting[-1] += duration
+        else:
+            kept.append(image)
+            lasting.append(duration)
+    return kept, lasting
 
 
 def _colours() -> list[int]:
