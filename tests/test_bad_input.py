@@ -533,7 +533,7 @@ def test_an_agents_journal_is_never_overwritten(tmp_path: Path) -> None:
         ("estimate x --all-anchors", ": all anchors are used without it"),
         ("bench --rounds 3", ": `uv run python -m tests.benchmark` in a clone measures the same"),
         ("run paper-1 --sede 3", "tandem run: unrecognized arguments: --sede 3; did you mean '--seed'?"),
-        ("figures x --out y", "tandem figures: unrecognized arguments: --out y"),
+        ("figures x --size y", "tandem figures: unrecognized arguments: --size y"),
         ("figures x --only encunter", "; did you mean 'encounter'?"),
         ("run paper-1 --kill wolrd@3", "; did you mean 'world'?"),
         ("robot robot2 --mission FILE --driver docs.rover:Rover", "; did you mean 'robot-2'?"),

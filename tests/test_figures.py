@@ -66,6 +66,22 @@ def draw(folder: Path) -> Ended:
     return tandem("figures", folder, "--only", "robot", "--format", "svg")
 
 
+def test_without_legends_their_content_and_the_title_are_a_text_file(noisy: Path, tmp_path: Path) -> None:
+    out = tmp_path / "for" / "paper"
+    ended = tandem(
+        "figures", noisy, *("--only", "trajectory", "--format", "svg"), "--no-legend", "--out", out
+    )
+    assert ended.status == 0
+    assert ended.out.split() == [str(out / "trajectory-a-b.svg"), str(out / "trajectory-a-b.txt")]
+    title, *entries = (out / "trajectory-a-b.txt").read_text().splitlines()
+    assert title.startswith("noisy")
+    assert {"grey dotted line: path in phase 1", "grey dashed line: path in phase 2"} <= {*entries}
+    assert any(re.fullmatch(r"white squares: start", entry) for entry in entries)
+    with_legend = copied(noisy, tmp_path / "copy")
+    assert tandem("figures", with_legend, "--only", "trajectory", "--format", "svg").status == 0
+    assert not (with_legend / "figures" / "trajectory-a-b.txt").exists()
+
+
 def picture(folder: Path, name: str) -> Path:
     """Return the figure of one robot, drawn in this process."""
     (folder / "figures").mkdir(exist_ok=True)

@@ -296,6 +296,8 @@ COMMANDS = (
         --only NAME+: draw only this figure; may be repeated [default: all of {", ".join(PICTURES)}]
         --format+: write only this format; may be repeated [default: all of {", ".join(FIGURE_FORMATS)}]
         --paper: draw for a paper: 3.5 or 7.16 inches wide, 8 point text, no title
+        --no-legend: draw no legends; write their content, with the title, to a text file beside each figure
+        --out DIR: folder for the figures [default: the folder figures of the recording]
         """,
     ),
     CommandEntry(

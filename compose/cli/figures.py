@@ -16,6 +16,7 @@ from compose.figures import FIGURE_FORMATS, PICTURES
 from compose.recording.recording_files import agent_journal, user_errors
 from compose.recording.run import Run
 from compose.terminal.outcome import counting
+from protocol import files
 from protocol.journal.journal_file import CorruptJournal
 from protocol.output import say
 
@@ -36,7 +37,8 @@ def main(options: argparse.Namespace) -> int:
 
     with user_errors(options.recording):
         run = read_noted(options.recording, "figures")
-    folder, status = options.recording / "figures", ENDED
+    folder, status = options.out or options.recording / "figures", ENDED
+    medium = _medium(options)
     kinds = [kind for kind in PICTURES if kind in (options.only or PICTURES)]
     formats = [one for one in FIGURE_FORMATS if one in (options.format or FIGURE_FORMATS)]
     pairs = encounters(run)
@@ -57,7 +59,7 @@ def main(options: argparse.Namespace) -> int:
                 status = FAILED
             done()
         if team:
-            drawn += _draw_team(run, kinds, formats, folder, paper=options.paper)
+            drawn += _draw_team(run, kinds, formats, folder, medium=medium)
         for meeting in pairs:
             robots = dict.fromkeys((meeting.a, meeting.b))
             histories = {robot: replays[robot].history for robot in robots if robot in replays}
@@ -72,26 +74,26 @@ def main(options: argparse.Namespace) -> int:
                 continue
             with writing(folder):
                 for kind in kinds:
-                    drawn += draw(pair, kind, formats, folder, torn=bool(torn), paper=options.paper)
+                    drawn += draw(pair, kind, formats, folder, torn=bool(torn), medium=medium)
                     done()
     return status
 
 
 def draw(
-    pair: PairRecord, kind: str, formats: Sequence[str], folder: Path, *, torn: bool, paper: bool
+    pair: PairRecord, kind: str, formats: Sequence[str], folder: Path, *, torn: bool, medium: Medium
 ) -> list[Path]:
     """Draw the figures of `kind`, print why one does not apply, and return the paths of the files.
 
-    `torn` states that the recording is incomplete, so that an event that it lacks may have happened; `paper`
-    is the flag. Raises OSError.
+    `torn` states that the recording is incomplete, so that an event that it lacks may have happened.
+    Raises OSError.
     """
     from compose.figures import catalogue  # noqa: PLC0415
 
-    return _save(partial(catalogue.pictures, pair, kind), formats, folder, torn=torn, paper=paper)
+    return _save(partial(catalogue.pictures, pair, kind), formats, folder, torn=torn, medium=medium)
 
 
 def _draw_team(
-    run: Run, kinds: Sequence[str], formats: Sequence[str], folder: Path, *, paper: bool
+    run: Run, kinds: Sequence[str], formats: Sequence[str], folder: Path, *, medium: Medium
 ) -> list[Path]:
     """Draw the figures of a team, print which are not of teams, and return the paths. Raises UserError."""
     from compose.figures import catalogue, team_figures  # noqa: PLC0415
@@ -101,7 +103,7 @@ def _draw_team(
     torn, paths = run.world is None or run.world.end is None, list[Path]()
     with writing(folder):
         for kind in kinds:
-            paths += _save(partial(catalogue.of_team, run, kind), formats, folder, torn=torn, paper=paper)
+            paths += _save(partial(catalogue.of_team, run, kind), formats, folder, torn=torn, medium=medium)
     return paths
 
 
@@ -111,14 +113,13 @@ def _save(
     folder: Path,
     *,
     torn: bool,
-    paper: bool,
+    medium: Medium,
 ) -> list[Path]:
     """Save `pictures`, as `draw` does."""
     from compose.figures import style  # noqa: PLC0415
     from compose.figures.sheet import Absent  # noqa: PLC0415
 
-    medium = style.PAPER if paper else style.SCREEN
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     paths: list[Path] = []
     with style.look(medium):
         for name, figure in pictures(medium):
@@ -126,7 +127,18 @@ def _save(
                 _say(f"no {name}: {figure.why}{' (in the incomplete recording)' if torn else ''}")
             else:
                 paths += style.save(figure, folder / name, formats, medium.dpi)
+                if not medium.keyed:
+                    paths.append(folder / f"{name}.txt")
+                    files.write(paths[-1], f"{figure.get_label()}\n")
     return paths
+
+
+def _medium(options: argparse.Namespace) -> Medium:
+    """Return the medium for which the flags ask."""
+    from compose.figures import style  # noqa: PLC0415
+
+    medium = style.PAPER if options.paper else style.SCREEN
+    return medium._replace(keyed=not options.no_legend)
 
 
 def _replay(run: Run, robot: str) -> AgentReplay | None:

@@ -7,12 +7,16 @@ from collections.abc import Callable, Iterable, Sequence
 from textwrap import wrap
 from typing import Any, NamedTuple, TypeVar
 
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.colors import rgb_to_hsv, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Bbox, blended_transform_factory
+from matplotlib.typing import ColorType
 
 from compose.figures.style import INK, PAGE, TEXT, Medium
 from protocol.mission import Role
@@ -37,6 +41,31 @@ ANCHORS: dict[Role, str] = {"a": "M_1", "b": "M_2"}
 """The anchors' names in the paper, for use between two `$`."""
 LABEL = {"facecolor": "white", "alpha": 0.75, "pad": 0.6, "lw": 0}
 """The background of a text within a panel."""
+LINES = {"-": "solid", "--": "dashed", "-.": "dash-dotted", ":": "dotted"}
+MARKERS = {
+    "o": "circles",
+    "^": "triangles",
+    "s": "squares",
+    "*": "stars",
+    "x": "crosses",
+    "+": "crosses",
+    ".": "dots",
+}
+"""The words for the lines and the markers of figures."""
+HUE_NAMES = {
+    "red": 0.0,
+    "orange": 0.09,
+    "yellow": 0.15,
+    "green": 0.36,
+    "blue": 0.58,
+    "purple": 0.76,
+    "magenta": 0.88,
+}
+"""The hues of colours with a name, as parts of a turn."""
+LEAST_SATURATION, DARK = 0.15, 0.2
+"""The saturation from which on a colour has a hue, and the value up to which one without is black."""
+DOT = 1.0
+"""The longest dash that is a dot, in line widths."""
 Window = tuple[float, float, float, float]
 """A window of the plane: left, right, low and high, in m."""
 Moment = TypeVar("Moment")
@@ -64,6 +93,7 @@ class Sheet:
         widths: Sequence[float] | None = None,
     ) -> None:
         self.width = medium.narrow if narrow else PAGE
+        self._keyed, self._caption = medium.keyed, list(title)
         self._engine = ConstrainedLayoutEngine(w_pad=PAD, h_pad=PAD, wspace=0.0, hspace=0.0)
         height = max(6.0, 0.5 * len(mosaic))  # labels alone must fit: without room, there is no layout
         self.figure = Figure(figsize=(self.width, height), layout=self._engine)
@@ -106,6 +136,12 @@ class Sheet:
         cell, edge = self.panels[name], self.width < PAGE
         cell.set_axis_off()
         handles, labels = panel.get_legend_handles_labels()
+        if not self._keyed:
+            self._caption += [
+                f"{said(handle)}: {label}" for handle, label in zip(handles, labels, strict=True)
+            ]
+            self._heights[name] = lambda: 0.0
+            return
         row = next(row for row in self._mosaic if name in row)
         share = [width for width, one in zip(self._widths, row, strict=True) if one == name]
         room = self.width - 2 * PAD if edge else KEY_WIDTH * self.width * sum(share) / sum(self._widths)
@@ -139,6 +175,7 @@ class Sheet:
             axes.set_aspect("equal", adjustable="box", anchor="NW")
         self._engine.execute(self.figure)
         self.figure.set_layout_engine("none")
+        self.figure.set_label("\n".join(self._caption))
         return self.figure
 
 
@@ -156,6 +193,31 @@ def series(
         sheet.plane(str(i), window, LONE if count == 1 else math.inf, low=i % columns == 0)
         sheet.panels[str(i)].set_title(caption, loc="left", pad=3)
     return sheet, [sheet.panels[str(i)] for i in range(count)]
+
+
+def said(handle: Artist) -> str:
+    """Return how a line or its markers look, in words, as for the caption of a figure without a legend."""
+    if not isinstance(handle, Line2D):
+        return "shaded"
+    style, marker = handle.get_linestyle(), str(handle.get_marker())
+    _, dashes = vars(handle).get("_unscaled_dash_pattern") or (0, None)  # the style of any dashes is "--"
+    dotted = style == "--" and dashes is not None and len(dashes) == 2 and dashes[0] <= DOT
+    words = [] if style == "None" else [f"{'dotted' if dotted else LINES.get(str(style), 'dashed')} line"]
+    colour = handle.get_color()
+    if marker != "None":
+        colour = colour if words else handle.get_markerfacecolor()
+        words.append(MARKERS.get(marker, "markers"))
+    return f"{hue(colour)} {' with '.join(words)}".strip()
+
+
+def hue(colour: ColorType) -> str:
+    """Return the name of the hue of `colour`: grey, or one of HUE_NAMES."""
+    if isinstance(colour, str) and colour == "none":
+        return "open"
+    at, saturation, value = rgb_to_hsv(to_rgb(colour))
+    if saturation < LEAST_SATURATION:
+        return "black" if value < DARK else "white" if value > 1.0 - DARK else "grey"
+    return min(HUE_NAMES, key=lambda name: abs((HUE_NAMES[name] - at + 0.5) % 1.0 - 0.5))
 
 
 def _place(axes: Axes) -> Bbox:

@@ -52,6 +52,8 @@ class Medium(NamedTuple):
     """The resolution of PNG files, in dots per inch."""
     settings: dict[Any, Any]
     """The fonts, as settings of Matplotlib."""
+    keyed: bool = True
+    """True if figures have legends; without them, the label of a figure has their content."""
 
 
 _SIZES = dict.fromkeys(
