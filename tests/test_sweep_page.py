@@ -49,7 +49,7 @@ def test_the_map_has_each_cell_in_its_place_with_its_outcomes_in_words(opened: O
     with watching(folder) as (_, where):
         page = opened(where)
         cells = page.locator(".heat td")
-        expect(cells).to_have_text(["100 %", "75 %?1", "25 %✕2 ?1", "refused"])
+        expect(cells).to_have_text(["100 %", "75 %1 undecided", "25 %2 wrong, 1 undecided", "refused"])
         expect(page.locator(".heat tbody th")).to_have_text(["lossless", "90 % loss"])
         expect(page.locator(".heat thead th")).to_have_text(["way ↓ by max_speed →", "0.5", "1"])
         expect(page.get_by_role("button", name="25 % of 4 localised, 2 wrong, 1 undecided")).to_have_count(1)

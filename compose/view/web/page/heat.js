@@ -1,7 +1,6 @@
 // The map of a sweep's cells: the first axis goes down, the second across; of more axes, one map for each combination.
 
 import { make } from "./cards.js";
-import { SIGNS } from "./thumbnail.js";
 
 const OUTCOMES = ["wrong", "inconsistent", "failed", "undecided"];
 
@@ -10,10 +9,9 @@ export function heat_map(axes, rows, on_cell) {
   const by_cell = new Map(rows.map((row) => [Number(row.cell), row]));
   const [down, across, ...rest] = axes;
   const maps = combinations(rest).map((chosen) => map(down, across, rest, chosen, axes, by_cell, on_cell));
-  const signs = OUTCOMES.filter((outcome) => rows.some((row) => Number(row[outcome]))).map((outcome) => `${SIGNS[outcome]} ${outcome}`);
   return make("section", { className: "heat" },
     make("h2", { textContent: "Share of trials that localised" }),
-    make("p", { className: "note", textContent: `Select a cell to play its worst trial.${signs.length ? ` Signs with numbers of trials: ${signs.join(", ")}.` : ""}` }),
+    make("p", { className: "note", textContent: "Select a cell to play its worst trial." }),
     ...maps);
 }
 
@@ -37,7 +35,7 @@ function cell(row, axes, caption, on_cell) {
   const percent = `${Math.round(100 * Number(row.rate))} %`;
   const bad = OUTCOMES.filter((outcome) => Number(row[outcome]));
   const button = make("button", { type: "button", className: "cell" }, make("b", { textContent: percent }),
-    make("span", { textContent: bad.map((outcome) => `${SIGNS[outcome]}${row[outcome]}`).join(" ") }));
+    make("span", { textContent: bad.map((outcome) => `${row[outcome]} ${outcome}`).join(", ") }));
   button.style.setProperty("--share", row.rate);
   if (Number(row.wrong) || Number(row.violations)) button.classList.add("bad");
   const where = [caption, ...axes.filter(([axis]) => axis).map(([axis, label]) => `${title(axis)} ${label}`)].filter(Boolean).join(", ");
