@@ -1,10 +1,14 @@
 """The exit statuses of all commands, and the exceptions that stand for a user's mistake."""
 
+from __future__ import annotations
+
 import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
-from protocol.messages import Outcome
+if TYPE_CHECKING:
+    from protocol.messages import Outcome
 
 LOCALISED = 0
 """The exit status of a mission in which every robot was localised."""
