@@ -8,11 +8,14 @@ from __future__ import annotations
 import math
 
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
 
 from agent.planning.state import RobotState
 from agent.planning.strides import stride
 from agent.planning.tasks import Surveying
+from compose.figures.one_robot import outline_of
 from compose.figures.pair import PairRecord
 from compose.figures.sheet import (
     NO_ENCOUNTER,
@@ -163,6 +166,7 @@ def draw_decisions(pair: PairRecord, medium: Medium = SCREEN) -> Figure | Absent
     for role in ROLES:
         marker = ROLE_MARKERS[role]["marker"]
         entry(axes, f"{pair.robot(role).id}, most probable", marker, ms=7, color=COLOURS[role])
+    entry(axes, "its 3 sigma", "-", lw=0.8, color=PALE)
     entry(axes, "less probable", "o", ms=4, mfc="white", mec=PALE)
     entry(axes, "chosen manoeuvre", "x-", ms=6, mew=1.5, lw=1.6, color=PALE)
     entry(axes, "true" if pair.true else "from the claim", "+", ms=9, mew=1.2, color=INK)
@@ -197,6 +201,14 @@ def _decision(axes: Axes, pair: PairRecord, tick: int, made: Decision) -> None:
             trace(axes, two, "-", lw=0.7, color=PALER, zorder=3)
     for role, state in made.items():
         colour = COLOURS[role]
+        for estimate, _ in pair.robot(role).likeliest:
+            if estimate.tick == tick and (points := outline_of(estimate)):
+                axes.add_patch(
+                    Polygon(
+                        list(points), facecolor=to_rgba(colour, 0.12), edgecolor=colour, lw=0.8, zorder=2.5,
+                        gid=f"sigma-{tick}-{role}",
+                    )
+                )  # fmt: skip
         for i, (pose, one) in enumerate(zip(state.belief.poses, state.belief.pair, strict=True)):
             trace(
                 axes, [pose], ROLE_MARKERS[role]["marker"], ms=2.5 + 4.5 * math.sqrt(one.probability),
