@@ -1,7 +1,8 @@
 """Tables of the pages, generated from code and expected results: `uv run docs/reference.py [--check]`.
 
-The script writes each of TABLES into the page that has its two marker lines, between them. With `--check` it
-writes nothing, and its exit status is 1 if a page would change.
+The script writes each of TABLES into the page that has its two marker lines, between them: README.md, or one
+of docs. `uv run docs/peers.py` measures the results of peers. With `--check` it writes
+nothing, and its exit status is 1 if a page would change.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import argparse
 import inspect
 import re
+import subprocess
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache, partial
@@ -54,10 +56,12 @@ from compose.sweep.paired_differences import PairedDifference
 from compose.sweep.spec import AxisTable, RowTable, SpecFile
 from compose.sweep.statistics import CellSummary
 from compose.sweep.trial import RobotRow, TrialRow
+from docs import peer_tables
 from protocol import messages, wire
 from protocol.attack import Attack
 from protocol.network import keys
 from protocol.noise import Noise, VelocityNoise
+from tests.expected import tables as expected_tables
 from tests.expected.tables import table as results_of
 from world.world_noise import WorldActuationNoise, WorldNoise, WorldOdometryNoise
 
@@ -311,7 +315,22 @@ def _help(action: argparse.Action) -> str:
         return text
 
 
+def printed(scenario: str) -> str:
+    """Return the output of `tandem run SCENARIO`."""
+    command = [sys.executable, "-m", "tandem", "run", scenario, "--in-process"]
+    return (
+        f"```text\n{subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()}\n```"
+    )
+
+
 TABLES: dict[str, Callable[[], str]] = {
+    "results-summary": expected_tables.summary,
+    "results-run-noisy": partial(printed, "noisy"),
+    "results-peers": peer_tables.short_table,
+    "results-peers-tiers": partial(peer_tables.full_table, "TIERS"),
+    "results-peers-lias": partial(peer_tables.full_table, "LIAS"),
+    "results-peers-plaza": partial(peer_tables.full_table, "Plaza 1"),
+    "results-peers-mrclam": partial(peer_tables.full_table, "MRCLAM 6"),
     "scenario": partial(fields_of, ScenarioFile),
     "mission": partial(fields_of, MissionTable),
     "planner": partial(fields_of, PlannerTable),
@@ -393,7 +412,8 @@ def main(arguments: Sequence[str] | None = None, docs: Path = DOCS) -> None:
     parser.add_argument("--check", action="store_true", help="only compare; exit status 1 if they differ")
     options = parser.parse_args(arguments)
     stale = []
-    for path in sorted(docs.glob("*.md")):
+    readme = [DOCS.parent / "README.md"] if docs == DOCS else []
+    for path in [*readme, *sorted(docs.glob("*.md"))]:
         before = path.read_text()
         try:
             after = written(before)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from PIL import Image, ImageSequence
 
-from docs import film, picture, rendezvous
+from docs import film, peer_tables, peers, picture, rendezvous
 
 ROOT = Path(__file__).parents[1]
 IMAGE = re.compile(r"!\[[^]]*\]\((?:docs/)?([^)]+)\)")
@@ -66,6 +66,30 @@ def test_a_figure_is_stale_if_what_it_was_made_of_has_changed(
     lines = [line for line in picture.stale(quick=True) if line.startswith("noisy-a.svg: ")]
     assert len(lines) == (reason is not None)
     assert not lines or (reason or "") in lines[0]
+
+
+def test_the_comparison_with_other_estimators_is_that_of_its_code() -> None:
+    assert peer_tables.results().code == peer_tables.code_hash(), "uv run docs/peers.py measures it again"
+
+
+@pytest.mark.long
+def test_a_window_of_the_comparison_measures_what_the_pages_have(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        monkeypatch.setenv(name, "1")
+    source, raw = peers.unpacked(tmp_path)
+    few = ("gtsam LM, true start", "gtsam LM Huber, one random start", "EKF, the likeliest of 4 096")
+    shown = {(one.ranges, one.window, one.estimator): one for one in peer_tables.results().trials}
+    for window in (one for one in peers.tiers_windows(source) if one.name == "A B 0"):
+        for now in peers.tried(window, raw, few):
+            then = shown[now.ranges, now.window, now.estimator]
+            stale = f"{now} is not {then}: uv run docs/peers.py"
+            if now.estimator in (peer_tables.TANDEM, few[0]):
+                assert now.errors_m == pytest.approx(then.errors_m, abs=0.01), stale
+                assert now.claims == then.claims, stale
+            if now.estimator == few[1]:  # one start, which does not lead to the truth
+                assert max(one or 9.0 for one in now.errors_m) > 1.0, stale
 
 
 @pytest.mark.long

@@ -3,11 +3,15 @@
 The recording has one anchor, and a pair of robots needs two. The second is made from the truth and from the
 residuals of a robot's ranges to the first, which it replaces: its errors are those of a radio.
 
-`uv run python -m tests.uwb_sample tiers.pyfg tests/data/uwb/tiers-a-b-30-s.pyfg` writes it.
+`uv run python -m tests.uwb_sample tiers.pyfg tests/data/uwb/tiers-a-b-30-s.pyfg` writes it. To a file whose
+name ends in .xz, it writes all robots and the one anchor, compressed: of the first 60 s of the recording, the
+file of docs/peers.py. With a CSV file of raw ranges, it writes the two measurements of each, compressed.
 """
 
 from __future__ import annotations
 
+import csv
+import lzma
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -26,10 +30,10 @@ NAMES = {"VERTEX_SE2": (2,), "VERTEX_XY": (), "EDGE_SE2": (2, 3), "EDGE_RANGE": 
 """The places of the poses and landmarks in each kind of line."""
 
 
-def sample_lines(lines: Sequence[str]) -> Iterator[str]:
-    """Yield the lines of the sample, with fewer decimals and with stamps from 0 s on."""
+def sample_lines(lines: Sequence[str], *, whole: bool = False) -> Iterator[str]:
+    """Yield the lines of the sample, or all, with fewer decimals and with stamps from 0 s on."""
     for words in map(str.split, lines):
-        if not all(_kept(words[place]) for place in NAMES[words[0]]):
+        if not whole and not all(_kept(words[place]) for place in NAMES[words[0]]):
             continue
         if words[0] != "VERTEX_XY":
             words[1] = f"{float(words[1]) - BEGIN_S:.{STAMP_DIGITS}f}"
@@ -65,7 +69,22 @@ def with_second_anchor(path: Path, robot: str = ROBOTS[-1]) -> Iterator[str]:
     yield from moved
 
 
+def raw_lines(source: Path) -> Iterator[str]:
+    """Yield the columns of a CSV file of raw ranges that docs/recorded_claims.py reads, in mm."""
+    yield "node1,node2,uwb_range,mocap_range"
+    with source.open(newline="") as file:
+        for row in csv.DictReader(file):
+            nodes = ",".join(f"{float(row[name]):.0f}" for name in ("node1", "node2"))
+            yield f"{nodes},{float(row['uwb_range']):.3f},{float(row['mocap_range']):.3f}"
+
+
 if __name__ == "__main__":
     source, target = map(Path, sys.argv[1:])
-    target.write_text("\n".join([*sample_lines(source.read_text().splitlines()), ""]))
-    target.write_text("\n".join([*with_second_anchor(target), ""]))
+    packed, raw = target.suffix == ".xz", source.suffix == ".csv"
+    lines = raw_lines(source) if raw else sample_lines(source.read_text().splitlines(), whole=packed)
+    content = "\n".join([*lines, ""])
+    if packed:
+        target.write_bytes(lzma.compress(content.encode(), preset=9))
+    else:
+        target.write_text(content)
+        target.write_text("\n".join([*with_second_anchor(target), ""]))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 
+from compose.sweep.statistics import wilson
 from tests.expected.results import CellResults, Expected, Quantiles, read
 
 OUTCOMES = ("localised", "undecided", "inconsistent", "wrong", "failed", "refused")
@@ -40,6 +41,47 @@ def table(name: str) -> str:
             *[_line([row, *[of(cells) for _, of in columns]]) for row, cells in rows.items()],
         ]
     return "\n".join(lines)
+
+
+HEADLINE = {
+    "any-start": "exact sensors, any start",
+    "anywhere": "exact sensors, any settings and start",
+    "loss": "0 to 95 % of the reports lost",
+    "delay": "reports late by up to 20 ticks, and other faults",
+    "partition": "partitions of up to 50 ticks",
+    "noise": "ranges of sigma 0 to 0.1 m, odometry of 0 to 5 %, outliers",
+    "mismatch": "noise that nobody has told the robots",
+    "mismatch-uwb": "uncalibrated radios and odometry",
+    "group": "groups of 3 to 16 robots",
+    "group-unanchored": "groups with robots without an anchor",
+}
+"""The sweeps of the summary, and what varies in each."""
+
+
+def summary() -> str:
+    """Return the table of the summary in Markdown: all cells of `assured` of a sweep together."""
+    lines = [["sweep", "missions", "localised, %", "wrong claims, %", "ticks, median"], ["---"] * 5]
+    for name, what in HEADLINE.items():
+        file = read(name)
+        assert file is not None
+        cells = [one for one in file.cell if "planner.name = paper" not in one.label]
+        trials = sum(one.trials for one in cells)
+        localised = sum(one.outcomes.get("localised", 0) for one in cells)
+        medians = [one.ticks.p50 for one in cells if one.ticks is not None]
+        wrong = sum(one.wrong for one in cells)
+        lines += [
+            [
+                *(f"`{name}`: {what}", _number(trials), _share(localised, trials), _share(wrong, trials)),
+                f"{min(medians):.0f} to {max(medians):.0f}" if len(medians) > 1 else f"{medians[0]:.0f}",
+            ]
+        ]
+    return "\n".join(map(_line, lines))
+
+
+def _share(count: int, trials: int) -> str:
+    """Return a share in percent with its 95 % interval."""
+    interval = wilson(count, trials)
+    return f"{100 * count / trials:.3g} ({100 * interval.low:.3g} to {100 * interval.high:.3g})"
 
 
 def _rows(file: Expected) -> dict[str, list[CellResults]]:
