@@ -65,7 +65,7 @@ COMMENTS = {
     ".css": r"/\*(?s:.*?)\*/",
 }
 """The parts that are no code, by the ending of a file, beside the spaces."""
-STILL = ("distance that a configuration predicts", (1360, 840))
+STILL = ("distance that a hypothesis predicts", (1360, 840))
 """The mark of the legend that page.png shows, and its size in pixels."""
 RECORDED = "tests/data/uwb/tiers-a-b-30-s.pyfg"
 

@@ -61,12 +61,12 @@ def test_the_story_of_paper_1_has_a_caption_for_each_of_its_beats(paper_1: Run) 
         ),
         (
             1,
-            "After a straight drive and a second distance, b has two possible poses relative to its anchor, "
-            "mirror images of each other.",
+            "After a straight drive and a second distance, b has two hypotheses of the pose relative to its "
+            "anchor, mirror images of each other.",
         ),
         (
             2,
-            "b had two possible poses relative to its anchor. "
+            "b had two hypotheses of its pose relative to its anchor. "
             "The distance now measured, 1.69 m, rules out one of them.",
         ),
         (
@@ -87,7 +87,7 @@ def test_the_story_of_paper_1_has_a_caption_for_each_of_its_beats(paper_1: Run) 
         (
             47,
             "The distance was 2.95 m and is 2.11 m now. "
-            "Four configurations fit, each with one angle, and so one pose, of a and one of b.",
+            "Four hypotheses fit, each with one angle, and so one pose, of a and one of b.",
         ),
         (
             47,
@@ -97,9 +97,9 @@ def test_the_story_of_paper_1_has_a_caption_for_each_of_its_beats(paper_1: Run) 
         (
             48,
             "The distance is 2.39 m now. "
-            "Configurations that predicted another distance are ruled out, one by one.",
+            "Hypotheses that predicted another distance are ruled out, one by one.",
         ),
-        (48, "Only one of the four configurations is left."),
+        (48, "Only one of the four hypotheses is left."),
         (48, "Both are localised: each knows its position and its heading."),
     ]
     truths = [one.truth for scene in scenes_of(paper_1) for one in scene.captions if one.truth]
@@ -117,9 +117,9 @@ def test_under_noise_captions_speak_of_estimates_and_probabilities(recorded: Rec
     assert "a drives on a circle around its anchor to find b, which waits near its own." in text
     assert re.search(r"the most probable with \d\d %\.", text)
     assert "Both drive to where the next distances are expected to distinguish them" in text
-    assert "Only one of the two configurations is left. It is not claimed yet." in text
+    assert "Only one of the two hypotheses is left. It is not claimed yet." in text
     assert "roughly how it moves" in text
-    assert "The configuration that does not fit it is ruled out." in text
+    assert "The hypothesis that does not fit it is ruled out." in text
     assert "exact" not in " ".join(sentences(scenes_of(run)))
     assert text.endswith("Both are localised: each knows its position and its heading.")
 
@@ -128,7 +128,7 @@ def test_robots_that_lose_contact_are_told_to_meet_again(recorded: Record) -> No
     text = [text for _, text in told(recorded(load("noisy", seed=779)))]
     left = text.index("They have left each other's range.")
     assert text[left + 1].startswith("a and b are in range of each other again.")
-    assert text[left + 2].startswith("Two configurations fit, each with one pose of a and one of b")
+    assert text[left + 2].startswith("Two hypotheses fit, each with one pose of a and one of b")
 
 
 def test_a_detected_attack_is_told_as_a_contradiction_and_named_with_the_truth_only(recorded: Record) -> None:
@@ -181,9 +181,9 @@ def test_what_each_robot_of_a_pair_finds_at_another_time_is_told_of_it_alone(rec
     text = " ".join(text for _, text in told(run))
     for one in (
         "a's report of tick 57 to b is lost.",
-        "For a, two configurations fit, each with one angle, and so one pose, of a and one of b.",
-        "For b, two configurations fit, each with one angle, and so one pose, of a and one of b.",
-        "For b, only one of the two configurations is left.",
+        "For a, two hypotheses fit, each with one angle, and so one pose, of a and one of b.",
+        "For b, two hypotheses fit, each with one angle, and so one pose, of a and one of b.",
+        "For b, only one of the two hypotheses is left.",
         "b claims to know its pose.",
     ):
         assert one in text
@@ -323,11 +323,11 @@ def test_no_configuration_and_more_configurations_are_told(paper_1: Run) -> None
     held = before.estimates
     none = {robot: replace(one, world=()) for robot, one in held.items()}
     assert texts(setup, before, replace(now, estimates=none))[1] == (
-        "No configuration fits what was measured and reported any more."
+        "No hypothesis fits what was measured and reported any more."
     )
     two = {robot: replace(one, world=one.world[:2]) for robot, one in held.items()}
     assert texts(setup, replace(before, estimates=two), replace(now, estimates=held))[0] == (
-        "Four configurations of the robots fit now, instead of two."
+        "Four hypotheses fit now, instead of two."
     )
 
 

@@ -272,7 +272,7 @@ def test_a_position_turned_about_a_point_keeps_its_distance_and_a_small_turn_is_
 def test_an_exact_recording_has_counts_for_probabilities_and_no_ellipse(tmp_path: Path) -> None:
     svg = picture(recorded(load("paper-1"), tmp_path), "a")
     words, found = texts(svg), ids(svg)
-    assert {"possible poses", "one pose", "tolerance: 1e-06; smaller", "than 1e-07 is drawn there"} <= words
+    assert {"hypotheses", "one pose", "tolerance: 1e-06; smaller", "than 1e-07 is drawn there"} <= words
     assert {"count", "tolerance", "position-a", "ghosts", "near-truth"} <= found
     assert not {"envelope", "sigma", "confidence", "accuracy"} & found
     assert not [name for name in found if name.startswith(("outline-", "probability-"))]

@@ -122,7 +122,7 @@ def test_the_scene_says_with_which_robot_each_one_is_or_to_which_it_drives(shown
     assert shown[30].player("r0").activity == "r0 drives to r3 to localise it"
     assert shown[30].player("r3").activity == "r3 waits beside its anchor until r0 comes into range"
     assert shown[63].player("r3").activity == (
-        "r3 drives to where the remaining configurations predict different ranges"
+        "r3 drives to where the remaining hypotheses predict different ranges"
     )
 
 

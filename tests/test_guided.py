@@ -68,7 +68,7 @@ def test_guided_play_tells_paper_1_in_less_than_a_minute_and_at_no_moment_does_t
         "Each robot knows where the anchors are and how it moves",
         "A robot measures how far away its anchor or the other robot is",
         "After a straight drive and a second distance",
-        "b had two possible poses relative to its anchor",
+        "b had two hypotheses of its pose relative to its anchor",
         "After a short drive",
         "They drive on circles around their anchors to find each other",
         "a and b meet",
@@ -76,7 +76,7 @@ def test_guided_play_tells_paper_1_in_less_than_a_minute_and_at_no_moment_does_t
         "Now a stands still and b drives to where the four predict distances that differ most: then the "
         "next measured distance can tell which one is true",
         "The distance is 2",
-        "Only one of the four configurations is left",
+        "Only one of the four hypotheses is left",
         "Both are localised: each knows its position and its heading",
     ]
     assert 40.0 < 0.001 * STEP_MS * len(seen) < 60.0

@@ -66,7 +66,7 @@ def test_late_data_of_a_tick_appears_on_the_time_line_and_in_the_log(
         expect(page.locator("#log")).to_contain_text("a and b are in range of each other: 2.95 m")
         assert marks(page) > 20  # the mark of the contact
         grow(48, 48)
-        expect(page.locator("#log")).to_contain_text("b has 4 possible configurations of the pair")
+        expect(page.locator("#log")).to_contain_text("b has 4 hypotheses")
         expect(page.locator("#log")).to_contain_text("a and b are in range of each other: 2.95 m")
 
 

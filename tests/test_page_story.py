@@ -82,7 +82,7 @@ def test_the_legend_lists_only_the_marks_that_are_drawn(opened: Open, address: s
         ("path, phase 3: encounter", {47, 48}),
         ("report to the other robot", {46, 47, 48}),
         ("where b could drive", {47}),
-        ("possible pose", {1}),
+        ("a pose (place and heading) that a robot may have", {1}),
         ("range between robots: 3\u00a0m", {46}),
         ("anchor (beacon); range 3\u00a0m", set(ticks)),
         ("manoeuvre chosen by b", {47}),

@@ -90,7 +90,7 @@ def test_the_first_contact_of_paper_1_is_shown_at_tick_46(paper_1: Path) -> None
     assert said(shown, "contact") == [(46, "a and b are in range of each other: 2.95 m")]
     assert said(shown, "anchor")[0] == (0, "a is in its anchor's range: 2.68 m")
     assert shown.scenes[46].player("b").activity == "b stands still and waits for a's second range"
-    assert said(shown, "candidates")[-1] == (48, "b's possible configurations fall from 4 to 1")
+    assert said(shown, "candidates")[-1] == (48, "b's hypotheses fall from 4 to 1")
     assert said(shown, "end") == [(48, "The mission ends: localised")]
 
 

@@ -106,7 +106,7 @@ def _title(pair: PairRecord, one: Planned) -> str:
     frame = f"{robot}'s own frame" if own else rf"$\langle\,{mover}({ANCHORS[mover]})\rangle$"
     chosen = rf"$v_2$ = {plan.command.v:g} m/s, $\omega_2$ = {plan.command.omega:+.4f} rad/s"
     count = len(plan.question.candidates)
-    candidates = f"{count} candidates" if count > 1 else "1 candidate, to be checked"
+    candidates = f"{count} hypotheses" if count > 1 else "1 hypothesis, to be checked"
     value = f", $J$ = {plan.separation_m2:.5g} m$^2$" if plan.separation_m2 is not None else ""
     return f"Plan of {robot} at $k$ = {one.tick}, in {frame}: {candidates}; {chosen}{value}"
 
@@ -124,7 +124,7 @@ def _candidates(axes: Axes, pair: PairRecord, one: Planned, seen: ManoeuvreView,
                 zorder=1, gid=f"bisector-{i}-{j}",
             )  # fmt: skip
     if len(seen.others) > 1:
-        entry(axes, "bisectors of two candidates", "-", color=PALE, lw=0.7)
+        entry(axes, "bisectors of two hypotheses", "-", color=PALE, lw=0.7)
     rho = pair.mutual[one.tick][1]
     if rho is not None:
         label = f"last range, {rho:.4f} m"

@@ -101,7 +101,7 @@ def draw_estimates(axes: Axes, pair: PairRecord, role: Role) -> None:
     within = [pose for pose in ghosts if left <= pose.x <= right and low <= pose.y <= high]
     if within:
         weighed = any(estimate.probabilities for estimate, _ in one.placed)
-        label = "other hypotheses" if weighed else "possible poses"
+        label = "other hypotheses" if weighed else "hypotheses"
         trace(axes, within, "x", ms=3.6, mew=0.8, color=COLOURS[role], alpha=0.5, gid="ghosts", label=label)
     if not one.likeliest:
         return

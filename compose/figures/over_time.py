@@ -151,7 +151,7 @@ def errors(pair: PairRecord, medium: Medium = SCREEN) -> Figure | Absent:
 
 
 def draw_errors(axes: Axes, pair: PairRecord, name: str, *roles: Role) -> None:
-    """Draw the errors of the most probable pose and of the other possible poses, and the claimed sigmas.
+    """Draw the errors of the most probable pose and of the other hypotheses, and the claimed sigmas.
 
     Before the encounter, draw those of the pose relative to the anchor. Of one robot, the claimed sigma is
     drawn too, and the errors within 3 sigma are shaded. `name` is one of QUANTITIES.
@@ -186,7 +186,7 @@ def _errors(axes: Axes, pair: PairRecord, role: Role, name: str) -> Points:
     label = f"{robot.id}, relative to its anchor"
     _line(axes, alone, ls=LONE_LINES[role], lw=1.0, gid=f"{name}-alone-{robot.id}", label=label, **look)
     ghosts = [(one.tick, quantity.error(pose, true)) for one, true in robot.placed for pose in others(one)]
-    label, marker = f"{robot.id}, other possible poses", "x" if role == "a" else "+"
+    label, marker = f"{robot.id}, other hypotheses", "x" if role == "a" else "+"
     gid = f"{name}-others-{robot.id}"
     _line(axes, ghosts, ls="", marker=marker, ms=4, mew=0.8, alpha=0.75, gid=gid, label=label, **look)
     likeliest = [(one.tick, quantity.error(one.world[0], truth)) for one, truth in robot.likeliest]
@@ -219,7 +219,7 @@ def _line(axes: Axes, points: Points, **looks: Any) -> None:
 
 
 def draw_hypotheses(axes: Axes, pair: PairRecord, role: Role) -> None:
-    """Draw the probability of each hypothesis, or, with exact sensors, the number of possible poses."""
+    """Draw the probability of each hypothesis, or, with exact sensors, the number of hypotheses."""
     robot = pair.robot(role)
     weighed = any(one.probabilities for one, _ in robot.estimates)
     (_probabilities if weighed else _count)(axes, pair, role)
@@ -272,11 +272,11 @@ def percent(probability: float) -> str:
 
 
 def _count(axes: Axes, pair: PairRecord, role: Role) -> None:
-    """Draw the number of possible poses. It is undefined while the robot may be anywhere on a circle."""
+    """Draw the number of hypotheses. It is undefined while the robot may be anywhere on a circle."""
     counts = [(one.tick, len(one.world or one.local) or math.nan) for one, _ in pair.robot(role).estimates]
     look = {"drawstyle": "steps-post", "markevery": _every(counts), **ROLE_MARKERS[role]}
-    _line(axes, counts, ms=3.6, lw=1.2, color=COLOURS[role], gid="count", label="possible poses", **look)
+    _line(axes, counts, ms=3.6, lw=1.2, color=COLOURS[role], gid="count", label="hypotheses", **look)
     axes.axhline(1.0, color=PALE, lw=0.9, ls="-.", label="one pose")
     axes.set_ylim(0.0, 1.0 + max([count for _, count in counts if not math.isnan(count)], default=1))
     axes.yaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))
-    axes.set_ylabel("possible poses")
+    axes.set_ylabel("hypotheses")

@@ -172,21 +172,21 @@ def group_beginning(group: PairData) -> Told:
 
 
 def mirrored(pair: PairData) -> Told:
-    """Yield which robots now have two possible poses relative to their anchors, if sensors are exact."""
+    """Yield which robots now have two hypotheses relative to their anchors, if sensors are exact."""
     robots = [robot for robot, was, held in pair.estimates() if not was.local and len(held.local) == 2]
     if robots and pair.exact:
         who = f"{listed(robots)} each have" if len(robots) > 1 else f"{robots[0]} has"
         relative = f"relative to {'their anchors' if len(robots) > 1 else 'its anchor'}"
-        text = f"{who} two possible poses {relative}, mirror images of each other."
+        text = f"{who} two hypotheses of the pose {relative}, mirror images of each other."
         yield Caption("mirrored", f"After a straight drive and a second distance, {text}", pair.ids)
 
 
 def choosing_branch(pair: PairData) -> Told:
-    """Yield how each robot that had several possible poses relative to its anchor is left with one."""
+    """Yield how each robot that had several hypotheses relative to its anchor is left with one."""
     for robot, was, held in pair.estimates():
         if was.world or held.world or len(was.local) < 2 or len(held.local) != 1:
             continue
-        had = f"{robot} had {count_word(len(was.local))} possible poses relative to its anchor"
+        had = f"{robot} had {count_word(len(was.local))} hypotheses of its pose relative to its anchor"
         all_but_one = "one of them" if len(was.local) == 2 else "all but one of them"
         what, observation = "What it has measured since", pair.now.observations.get(robot)
         if observation is not None:
@@ -308,14 +308,14 @@ def locating(team: PairData) -> Told:
         elif len(was.world) > len(held.world) == 1:
             left.append(robot)
     if new:
-        what = f" possible pose{'' if new[0][1] == 1 else 's'}"
+        what = " hypothesis" if new[0][1] == 1 else " hypotheses"
         poses = [
             f"{count_word(count)}{what if i == 0 else ''} of {one}" for i, (one, count) in enumerate(new)
         ]
-        text = f"The distances leave {listed(poses, 'robots a few possible poses')}."
+        text = f"The distances leave {listed(poses, 'robots a few hypotheses')}."
         yield Caption("configurations", text, tuple([robot for robot, _ in new]))
     if left:
-        yield Caption("ruled-out", f"One possible pose of {listed(left)} is left.", tuple(left))
+        yield Caption("ruled-out", f"One hypothesis of {listed(left)} is left.", tuple(left))
 
 
 def leaving(team: PairData) -> Told:
@@ -365,7 +365,7 @@ def meeting(pair: PairData) -> Told:
 
 
 def fitting(pair: PairData) -> Told:
-    """Yield how many configurations appear, are left, or are added; once if both robots have as many."""
+    """Yield how many hypotheses appear, are left, or are added; once if both robots have as many."""
     changes: dict[tuple[int, int], list[str]] = {}
     for robot, was, held in pair.estimates():
         if len(was.world) != len(held.world) and (was.world or not held.localised):
@@ -388,15 +388,15 @@ def _sentence(text: str) -> str:
 
 
 def _fit(pair: PairData, had: int, has: int) -> str:
-    """Return that `has` configurations fit, instead of `had`, as a clause."""
+    """Return that `has` hypotheses fit, instead of `had`, as a clause."""
     if had:
-        fit = "configuration of the robots fits" if has == 1 else "configurations of the robots fit"
+        fit = "hypothesis fits" if has == 1 else "hypotheses fit"
         return f"{count_word(has)} {fit} now, instead of {count_word(had)}"
     if has == 1:
-        return "one configuration of the robots fits what was measured and reported"
+        return "one hypothesis fits what was measured and reported"
     pose = "one angle, and so one pose," if pair.exact else "one pose"
     poses = f"each with {pose} of {pair.ids[0]} and one of {pair.robots[0].peer}"
-    return f"{count_word(has)} configurations fit, {poses}"
+    return f"{count_word(has)} hypotheses fit, {poses}"
 
 
 def _two_distances(pair: PairData) -> str:
@@ -407,29 +407,29 @@ def _two_distances(pair: PairData) -> str:
 
 
 def _ruling_out(pair: PairData, count: int) -> str:
-    """Return what rules `count` configurations out, before it says how many are left."""
+    """Return what rules `count` hypotheses out, before it says how many are left."""
     contact = pair.contact(pair.now)
     if contact is None or contact.range is None:
-        return "What was measured and reported since rules configurations out."
+        return "What was measured and reported since rules hypotheses out."
     why = "predicted another distance" if pair.exact else "does not fit it" if count == 1 else "do not fit it"
-    others = f"The configuration that {why} is ruled out."
+    others = f"The hypothesis that {why} is ruled out."
     if count > 1:
-        others = f"Configurations that {why} are ruled out, one by one."
+        others = f"Hypotheses that {why} are ruled out, one by one."
     return f"The distance is {metres(contact.range)} now. {others}"
 
 
 def _left(pair: PairData, had: int, has: int) -> str:
     if has == 0:
-        return "no configuration fits what was measured and reported any more"
+        return "no hypothesis fits what was measured and reported any more"
     verb, only = ("is left", "only ") if has == 1 else ("are left", "")
-    text = f"{only}{count_word(has)} of the {count_word(had)} configurations {verb}"
+    text = f"{only}{count_word(has)} of the {count_word(had)} hypotheses {verb}"
     commands = [pair.now.commands.get(robot) for robot in pair.ids]
     ended = any(command is not None and command.verdict is not None for command in commands)
     return text if has > 1 or ended else f"{text}. It is not claimed yet"
 
 
 def planning(pair: PairData) -> Told:
-    """Yield the beginning of each last manoeuvre, or of active sensing with several configurations."""
+    """Yield the beginning of each last manoeuvre, or of active sensing with several hypotheses."""
     for robot, held in [(robot, pair.held(robot)[1]) for robot in pair.ids]:
         if held is None or not held.world or not pair.begins(robot, "last-manoeuvre"):
             continue

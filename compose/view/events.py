@@ -197,15 +197,14 @@ def _believing(robot_setup: RobotSetup, before: TickData | None, now: TickData) 
     if held is None or earlier is None:
         return
     if len(held.local) == 1 != len(earlier.local) and not held.world:
-        text = f"{robot} has chosen its branch: its pose in its anchor's frame is unique"
+        text = f"{robot} has one hypothesis left in its anchor's frame"
         yield Event(tick, "branch", robot, text)
     previous, current = len(earlier.world), len(held.world)
-    what, of = ("pose", "") if robot_setup.given_anchor is None else ("configuration", " of the pair")
     if previous != current > 0:
         change = "fall" if current < previous else "rise"
-        text = f"{robot}'s possible {what}s {change} from {previous} to {current}"
+        text = f"{robot}'s hypotheses {change} from {previous} to {current}"
         if previous == 0:
-            text = f"{robot} has {current} possible {what}{'s' if current > 1 else ''}{of}"
+            text = f"{robot} has {current} hypothes{'e' if current > 1 else 'i'}s"
         yield Event(tick, "candidates", robot, text)
 
 

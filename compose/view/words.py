@@ -19,7 +19,7 @@ The beacon is the robot's own anchor in phase 1 and the peer in phase 3.
 
 DOING = {
     "asleep": "{robot} has not received an observation yet",
-    "third-point": "{robot} drives to where a third range distinguishes its two branches",
+    "third-point": "{robot} drives to where a third range distinguishes its two hypotheses",
     "homing": "{robot} drives back to its anchor to measure its pose again",
     "aligning": "{robot} turns until it points straight away from its anchor",
     "radial": "{robot} drives along the radius to its orbit",
@@ -30,7 +30,7 @@ DOING = {
     "looping": "{robot} drives loops, so that a robot without an anchor is localised by ranges",
     "standing": "{robot} stands still and waits for {peer}'s second range",
     "waiting": "{robot} stands still and waits for {peer}'s last manoeuvre",
-    "last-manoeuvre": "{robot} drives to where the remaining configurations predict different ranges",
+    "last-manoeuvre": "{robot} drives to where the remaining hypotheses predict different ranges",
     "returning": "{robot} has left {peer}'s range and drives the same arc back to report to it",
     "retreating": "{robot} has left {peer}'s range and drives back along its path, and as far again",
     "listening": "{robot} stands still within {peer}'s range and waits for missing reports",

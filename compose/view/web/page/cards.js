@@ -139,7 +139,7 @@ class Card {
     this.#row("received", received(player));
     this.#row("command", command ? commanded(command) : "–");
     this.#row("sent", player.sent ? sent(player.sent) : "nothing");
-    this.#row("belief", held ? believed(held, store.stage.team ? "pose" : "configuration") : "–");
+    this.#row("belief", held ? believed(held) : "–");
     if (truth) this.#row("true pose", player.pose ? `${place(player.pose)}, ${rad(player.pose[2])}` : "unknown");
     else if (this.fields.has("true pose")) this.#row("true pose", "hidden");
     const counted = store.counted(this.robot.id, tick);
@@ -208,14 +208,14 @@ function received_from([peer, , heard, damaged]) {
 
 const commanded = ({ v, omega, state }) => `${state}: ${v === 0 && omega === 0 ? "stop" : `${speed(v)}, ${turning(omega)}`}`;
 
-function believed({ local, world, probability: chances, covariance, localised }, what) {
+function believed({ local, world, probability: chances, covariance, localised }) {
   const sigma = covariance && world.length ? `, sigma ${metres(Math.sqrt(Math.max(0, covariance[0] + covariance[3])))}` : "";
   if (world.length === 1) {
     const at = `${place(world[0])}, ${rad(wrap(world[0][2]))}${sigma}`;
-    return localised ? `localised at ${at}` : `1 possible ${what}: ${at}`;
+    return localised ? `localised at ${at}` : `1 hypothesis: ${at}`;
   }
-  if (world.length) return `${world.length} possible ${what}s${chances.length ? "" : ", equally probable"}${sigma}`;
-  if (local.length > 1) return `${local.length} possible branches in the anchor's frame`;
+  if (world.length) return `${world.length} hypotheses${chances.length ? "" : ", equally probable"}${sigma}`;
+  if (local.length > 1) return `${local.length} hypotheses in the anchor's frame`;
   if (local.length) return `${metres(Math.hypot(local[0][0], local[0][1]))} from its anchor, bearing unknown`;
   return "pose unknown";
 }

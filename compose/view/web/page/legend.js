@@ -37,7 +37,7 @@ const MOMENTARY = {
   crossing: [drawn('<circle cx="10" cy="8" r="7" fill="none" stroke="var(--ghost)" stroke-dasharray="3 2.4"/><circle cx="20" cy="8" r="7" fill="none" stroke="var(--ghost)" stroke-width="2" stroke-dasharray="1.6 2.5"/>'), "turned about its anchor, the driven path fits where the circles cross"],
   distance: [line("range"), ({ team }) => `distance to ${team ? "an" : "the"} anchor`],
   turned: [drawn(`<path ${POINTED} fill="none" stroke="var(--faint)" stroke-opacity="0.7"/>`), "turned around the anchor: just as possible"],
-  pose: [drawn(`<path ${POINTED} fill="none" stroke="var(--ghost)" stroke-width="1.6" stroke-dasharray="2.5 2"/>`), "possible pose (place and heading) of a robot"],
+  pose: [drawn(`<path ${POINTED} fill="none" stroke="var(--ghost)" stroke-width="1.6" stroke-dasharray="2.5 2"/>`), "hypothesis: a pose (place and heading) that a robot may have"],
   "ruled-out": [drawn(`<path ${POINTED} fill="none" stroke="var(--ghost)" stroke-dasharray="2 2"/><path d="${cross}" stroke="var(--fault)" stroke-width="1.8"/>`), "pose that is ruled out"],
   ellipse: [drawn('<ellipse cx="15" cy="8" rx="12" ry="5.5" fill="var(--cloud)" stroke="var(--ghost)"/>'), "uncertainty (3 sigma)"],
   arc: [drawn('<path d="M2 13q13-15 26 0l-4 2q-9-9-18 0z" fill="var(--cloud)" stroke="var(--ghost)"/>'), "uncertainty (3 sigma): along an arc"],
@@ -48,10 +48,10 @@ const MOMENTARY = {
   waiting: [dot('fill="none" stroke="var(--link)"'), "report under way"],
   lost: [dot('fill="none" stroke="var(--fault)" stroke-dasharray="2 2"'), "report that is lost"],
   damaged: [drawn(`<circle cx="15" cy="8" r="5" fill="none" stroke="var(--fault)" stroke-width="1.6"/><path d="${cross}" stroke="var(--fault)"/>`), "report that arrives damaged"],
-  configuration: [drawn('<path d="M5 8h20" stroke="var(--tint-1)"/><circle cx="5" cy="8" r="3.6" fill="var(--card)" stroke="var(--tint-1)" stroke-width="2"/><circle cx="25" cy="8" r="3.6" fill="var(--card)" stroke="var(--tint-1)" stroke-width="2"/>'), "configuration: a pose of each robot, in one colour"],
+  configuration: [drawn('<path d="M5 8h20" stroke="var(--tint-1)"/><circle cx="5" cy="8" r="3.6" fill="var(--card)" stroke="var(--tint-1)" stroke-width="2"/><circle cx="25" cy="8" r="3.6" fill="var(--card)" stroke="var(--tint-1)" stroke-width="2"/>'), "hypothesis: a pose of each robot, in one colour"],
   reachable: [drawn('<path d="M3 13q12-14 24-4" fill="none" stroke="var(--faint)" stroke-width="4"/>'), ({ mover }) => `where ${mover} could drive; thick: predictions differ more`],
   choice: [drawn('<path d="M3 11q10-9 19-4" fill="none" stroke="var(--ink)" stroke-width="2"/><path d="M28 9.5l-8 1.5 3.5-6z" fill="var(--ink)"/>'), ({ mover }) => `manoeuvre chosen by ${mover}`],
-  predicted: [drawn('<circle cx="15" cy="8" r="6" fill="none" stroke="var(--tint-1)" stroke-width="1.8" stroke-dasharray="4 2.5"/><path d="M15 8h6" stroke="var(--tint-1)"/>'), "distance that a configuration predicts"],
+  predicted: [drawn('<circle cx="15" cy="8" r="6" fill="none" stroke="var(--tint-1)" stroke-width="1.8" stroke-dasharray="4 2.5"/><path d="M15 8h6" stroke="var(--tint-1)"/>'), "distance that a hypothesis predicts"],
   measured: [ring("ink", 'style="stroke-width: 4; opacity: 0.2"'), "measured distance"],
 };
 /** The drawing of the bands of the time line. */

@@ -41,7 +41,7 @@ export function numbers({ store, tick, truth }, { kind, robot, place: index }) {
   }
   const { held } = player, in_world = held.world.length > 0, poses = in_world ? held.world : held.local, pose = poses[index];
   const chance = held.probability[index] ?? 1 / poses.length;
-  const lines = [`${robot}, ${in_world ? "hypothesis" : "branch"} ${index + 1} of ${poses.length}: ${posed(pose)}`];
+  const lines = [`${robot}, hypothesis ${index + 1} of ${poses.length}: ${posed(pose)}`];
   lines.push(`probability ${probability(chance)}`);
   if (!in_world) lines.push("in its anchor's frame");
   else if (truth && player.pose) lines.push(`error ${metres(distance(pose, player.pose))}`);

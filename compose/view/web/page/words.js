@@ -44,7 +44,7 @@ export const SIGNS = {
 
 export const KIND_NAMES = {
   anchor: "anchor in range", "anchor-lost": "anchor out of range", contact: "contact", "contact-lost": "contact lost",
-  phase: "phase", state: "state", branch: "branch chosen", candidates: "possible configurations", claim: "claim",
+  phase: "phase", state: "state", branch: "one pose about the anchor", candidates: "hypotheses", claim: "claim",
   undecided: "undecided", inconsistent: "inconsistent", late: "deadline missed", end: "end", down: "process gone",
   back: "process back", "report-lost": "report lost", "report-damaged": "report damaged",
   "report-late": "report late", "report-doubled": "report duplicated",
@@ -77,10 +77,10 @@ export const KEYS = [
 export const MEANINGS = [
   ["filled robot", "true pose; pointed for role a, round for role b"],
   ["outlined robot", "pose that the robot considers possible; paler means less probable; crossed out: just ruled out"],
-  ["colour of outlined robots", "poses of a and b in one colour, joined by a line, belong to one configuration of the pair"],
-  ["dashed circles around a driving robot", "the distances that the configurations predict; wide and pale: the measured one"],
+  ["colour of outlined robots", "poses of a and b in one colour, joined by a line, belong to one hypothesis"],
+  ["dashed circles around a driving robot", "the distances that the hypotheses predict; wide and pale: the measured one"],
   ["arc with an arrow", "where the last manoeuvre can end: the thicker, the larger J of eq. (8); the arrow is the choice"],
-  ["J", "the least difference between the squares of two distances that the configurations predict"],
+  ["J", "the least difference between the squares of two distances that the hypotheses predict"],
   ["dotted circle around an anchor", "where the robot may be by its only range"],
   ["ellipse or arc", "3 sigma of the most probable position; an arc if the heading is so uncertain that an ellipse shows nothing"],
   ["hollow robot, crossed out", "its process is gone"],
