@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from playwright.sync_api import Browser
 
 from compose import errors
 from compose.audit import rules
@@ -301,22 +302,52 @@ def test_the_tables_on_the_pages_are_those_of_the_code_and_one_command_writes_th
     assert str(write_tables(tmp_path)).startswith("recordings.md: a table has no line `<!-- end of NAME -->`")
 
 
-@pytest.mark.long
-def test_the_site_is_built_without_a_warning_and_loads_nothing_from_other_hosts(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of the built site."""
     pytest.importorskip("material")
+    folder = tmp_path_factory.mktemp("site")
     built = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", tmp_path],
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", folder],
         cwd=ROOT,
         capture_output=True,
         text=True,
         check=False,
     )
     assert built.returncode == 0, built.stdout + built.stderr
-    for page in tmp_path.rglob("*.html"):
+    return folder
+
+
+@pytest.mark.long
+def test_the_site_is_built_without_a_warning_and_loads_nothing_from_other_hosts(site: Path) -> None:
+    for page in site.rglob("*.html"):
         loaded = re.findall(
             r'<(?:script|img|iframe)[^>]* src="([^"]*)"|<link[^>]* href="([^"]*)"', page.read_text()
         )
         assert not [one for pair in loaded for one in pair if "//" in one], page.name
+    equations = re.findall(r"<math .*?</math>", (site / "method.html").read_text())
+    assert len(equations) == (ROOT / "docs" / "method.md").read_text().count("$$") / 2
+
+
+@pytest.mark.long
+def test_the_figures_of_the_method_follow_their_sliders_and_no_page_is_wider_than_a_telephone(
+    site: Path, browser: Browser
+) -> None:
+    page = browser.new_page(viewport={"width": 390, "height": 844})
+    errors: list[str] = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.goto((site / "method.html").as_uri())
+    figures = page.locator("figure[data-figure]")
+    assert figures.count() == 5
+    for figure in figures.all():
+        said, drawn = figure.locator("output").inner_text(), figure.locator("svg").inner_html()
+        figure.locator("input").press("End")
+        assert figure.locator("output").inner_text() != said
+        assert figure.locator("svg").inner_html() != drawn
+    for name in ("index", "method", "peers", "results", "glossary"):
+        page.goto((site / f"{name}.html").as_uri())
+        assert page.evaluate("document.documentElement.scrollWidth") <= 390, name
+    assert errors == []
 
 
 def test_the_project_has_one_version_and_lists_tested_versions_of_its_dependencies() -> None:
