@@ -366,6 +366,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "claim-table": partial(columns_of, rows.ClaimRow),
     "meeting-table": partial(columns_of, MeetingResult),
     "odometry-columns": partial(fields_of, recording_rows.OdometryRow),
+    "pose-columns": partial(fields_of, recording_rows.PoseRow),
     "range-columns": partial(fields_of, recording_rows.RangeRow),
     "anchor-columns": partial(fields_of, recording_rows.AnchorRow),
     "antenna-columns": partial(fields_of, recording_rows.AntennaRow),

@@ -180,6 +180,30 @@ def travelled(origin: Pose, pose: Pose) -> float:
     return math.hypot(pose.x - origin.x, pose.y - origin.y)
 
 
+def heading_of(x: float, y: float, z: float, w: float) -> float:
+    """Return the heading in rad, in (-pi, pi], of a robot with this orientation as a quaternion.
+
+    The norm may differ from 1 by NORM. Raises ValueError if it does by more, or if the robot is not upright.
+    """
+    norm = math.hypot(x, y, z, w)
+    if not abs(norm - 1.0) <= NORM:
+        raise ValueError(f"an orientation with a norm of {norm:.6g}, expected 1")
+    x, y, z, w = x / norm, y / norm, z / norm, w / norm
+    if (up := 1.0 - 2.0 * (x * x + y * y)) < UPRIGHT:
+        tilt = math.degrees(math.acos(max(up, -1.0)))
+        raise ValueError(f"an orientation tilted by {tilt:.0f} degrees, expected a robot in the plane, z up")
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+NORM = 0.1
+"""The largest difference from 1 of the norm of an orientation.
+
+Linear interpolation between two orientations shortens the quaternion by less, up to 100 degrees between them.
+"""
+UPRIGHT = 0.5
+"""The least cosine of the angle between the robot's vertical axis and that of the frame; REP 103 has z up."""
+
+
 def wrap(angle: float) -> float:
     """Return `angle`, in rad, wrapped to (-pi, pi]."""
     wrapped = math.remainder(angle, TAU)

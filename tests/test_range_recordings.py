@@ -11,17 +11,19 @@ import numpy as np
 import pytest
 import scipy.io  # type: ignore[import-untyped]
 from mcap.writer import Writer
+from msgspec.structs import astuple
 
 from compose.errors import USER_ERROR, BadRecording, UserError
 from compose.launch import in_process
+from compose.recording.estimating.sound_odometry import sound
 from compose.recording.ranging.pyfg import written_pyfg
-from compose.recording.ranging.range_files import read_csv, read_ranges
+from compose.recording.ranging.range_files import TUM_FIELDS, read_ranges
 from compose.recording.ranging.range_recording import FixedAnchor, RangeRecording
 from compose.recording.ranging.run_ranges import ADDED_SIGMA, increment_covariance, ranges_of_run
 from compose.recording.run import Run
 from compose.scenario.scenario_file import load
 from docs import plaza_csv
-from protocol.motion import ORIGIN, Controls, step
+from protocol.motion import ORIGIN, Controls, Pose, compose, step, wrap
 from protocol.noise import VelocityNoise
 from tests.commands import tandem
 from tests.uwb_sample import NAMES
@@ -125,7 +127,7 @@ def test_a_csv_folder_is_read_with_everything_that_it_states(tmp_path: Path) -> 
 
 def test_an_mcap_file_gives_the_same_as_csv_files_and_counts_what_it_does_not_use(tmp_path: Path) -> None:
     recording = read_ranges(written_mcap(tmp_path / "one.mcap", TABLES))
-    same(recording, read_csv(written_csv(tmp_path / "csv", TABLES)))
+    same(recording, read_ranges(written_csv(tmp_path / "csv", TABLES)))
     assert recording.radios == ("a", "b", "M1")
     assert recording.unused == {"messages on /battery": 1}
 
@@ -490,7 +492,7 @@ def test_a_wrong_head_of_a_table_is_refused(head: str, says: str, tmp_path: Path
 def test_what_is_no_recording_is_refused_with_the_formats(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("hello")
     formats = (
-        "it is not a .pyfg file, an .mcap file, a folder with odometry.csv and ranges.csv, or a recording"
+        "it is not a .pyfg file, an .mcap file, a folder with ranges.csv and odometry.csv or poses.csv, or a "
     )
     assert refused(tmp_path / "notes.txt").startswith(f"{tmp_path}/notes.txt: {formats}")
     assert refused(tmp_path).startswith(f"{tmp_path}: {formats}")
@@ -533,6 +535,114 @@ def test_names_of_robots_and_anchors_do_not_overlap(tmp_path: Path) -> None:
     tables["ranges"] = [{"t": 0, "from": "M1", "to": "M2", "range": 1}]
     said = refused(written_csv(tmp_path, tables))
     assert said == f"{tmp_path}/ranges.csv, line 2: M1 and M2 are both anchors"
+
+
+# --- odometry as poses -----------------------------------------------------------------------------------
+
+
+def track(*, headings: str, begin: Pose) -> list[dict[str, object]]:
+    """Return poses over two turns of a robot, at uneven times, with a gap, and one of them twice."""
+    rows: list[dict[str, object]] = []
+    times = [0.1 * k + 0.03 * (k % 3) for k in range(120) if not 40 <= k < 70]
+    for t in [times[0], *times]:
+        pose = compose(begin, step(ORIGIN, 0.5, 1.1, t))
+        half = 0.5 * pose.heading
+        turned: dict[str, dict[str, object]] = {
+            "unwrapped": {"heading": pose.heading},
+            "wrapped": {"heading": wrap(pose.heading)},
+            "quaternion": {"qx": 0.0, "qy": 0.0, "qz": math.sin(half), "qw": math.cos(half)},
+        }
+        rows.append({"robot": "a", "t": t, "x": pose.x, "y": pose.y, **turned[headings]})
+    return rows
+
+
+@pytest.mark.parametrize("headings", ["unwrapped", "wrapped", "quaternion"])
+def test_odometry_as_poses_that_begin_anywhere_gives_the_increments(headings: str, tmp_path: Path) -> None:
+    rows = track(headings=headings, begin=Pose(400.0, -70.0, 3.0))
+    tables = {"poses": rows, "ranges": [{"t": 0.3, "from": "a", "to": "M1", "range": 2.5}]}
+    tables["anchors"] = TABLES["anchors"]
+    (a,) = read_ranges(written_csv(tmp_path / "csv", tables)).robots
+    times = np.array([row["t"] for row in rows[1:]])
+    np.testing.assert_array_equal((a.odometry.t0, a.odometry.t1), (times[:-1], times[1:]))
+    moved = [astuple(step(ORIGIN, 0.5, 1.1, dt)) for dt in np.diff(times)]
+    gap = int(np.argmax(np.diff(times)))
+    moved[gap] = (*moved[gap][:2], wrap(moved[gap][2]))
+    np.testing.assert_allclose(a.odometry.increments, moved, atol=1e-12)
+    assert np.isnan(a.odometry.covariance).all()
+    same(
+        read_ranges(written_mcap(tmp_path / "one.mcap", tables)),
+        read_ranges(written_csv(tmp_path / "again", tables)),
+    )
+
+
+def test_a_tum_file_gives_the_poses_of_a_csv_file(tmp_path: Path) -> None:
+    rows, ranges = track(headings="quaternion", begin=Pose(4.0, 2.0, -1.0)), TABLES["ranges"][1:]
+    tables = {"poses": rows, "truth": rows, "ranges": ranges, "anchors": TABLES["anchors"]}
+    both = written_csv(tmp_path / "csv", tables)
+    tum = written_csv(tmp_path / "tum", {"ranges": ranges, "anchors": TABLES["anchors"]})
+    lines = [" ".join(str(row.get(name, 0.5)) for name in TUM_FIELDS) for row in rows]
+    for name in ("poses-a.tum", "truth-a.tum", "estimate-a.tum"):
+        (tum / name).write_text("\n".join(["# timestamp tx ty tz qx qy qz qw", "", *lines, ""]))
+    same(read_ranges(tum), read_ranges(both))
+    (tum / "poses-a.tum").write_text(f"{lines[0]}\n{lines[1]} 7\n")
+    needed = "timestamp tx ty tz qx qy qz qw"
+    assert refused(tum) == f"{tum}/poses-a.tum, line 2: it has 9 fields, and needs {needed}"
+    (tum / "poses-a.tum").write_text("0 0 east 0 0 0 0 1")
+    assert refused(tum) == f"{tum}/poses-a.tum, line 1: y: expected a number, got 'east'"
+
+
+def test_odometry_that_was_reset_is_one_gross_increment(tmp_path: Path) -> None:
+    rows = track(headings="wrapped", begin=ORIGIN)
+    rows[60:] = track(headings="wrapped", begin=Pose(-8.0, 20.0, 2.0))[60:]
+    tables = {"poses": rows, "ranges": TABLES["ranges"][1:], "anchors": TABLES["anchors"]}
+    (a,) = read_ranges(written_csv(tmp_path, tables)).robots
+    (row,) = sound(a.odometry).gross
+    assert a.odometry.t1[row] == rows[60]["t"]
+
+
+POSE: dict[str, object] = {"robot": "a", "t": 0, "x": 1, "y": 2, "heading": 3}
+
+
+@pytest.mark.parametrize(
+    ("row", "says"),
+    [
+        ({"t": -1}, "t: it is of -1 s, and the pose of a before it is of 0 s"),
+        ({"heading": None}, "it needs heading, or all of qx, qy, qz, qw"),
+        ({"qw": 1}, "it needs heading, or all of qx, qy, qz, qw"),
+        ({"heading": None, "qx": 0, "qy": 0, "qz": 0}, "it needs heading, or all of qx, qy, qz, qw"),
+        (
+            {"heading": None, "qx": 0, "qy": 0, "qz": 0, "qw": 0},
+            "qx, qy, qz, qw: an orientation with a norm of 0, expected 1",
+        ),
+        (
+            {"heading": None, "qx": 1, "qy": 0, "qz": 0, "qw": 0},
+            "qx, qy, qz, qw: an orientation tilted by 180 degrees, expected a robot in the plane, z up",
+        ),
+        ({"robot": "b"}, "robot: b has increments of odometry, too"),
+    ],
+)
+def test_an_invalid_pose_is_one_line_with_its_place(
+    row: dict[str, object], says: str, tmp_path: Path
+) -> None:
+    poses = [POSE, {name: value for name, value in {**POSE, **row}.items() if value is not None}]
+    tables = {"odometry": TABLES["odometry"][1:2], "poses": poses, "ranges": TABLES["ranges"]}
+    assert refused(written_csv(tmp_path, tables)) == f"{tmp_path}/poses.csv, line 3: {says}"
+    assert (
+        refused(written_mcap(tmp_path / "a.mcap", tables)) == f"{tmp_path}/a.mcap, /poses, message 2: {says}"
+    )
+
+
+def test_poses_hours_apart_are_a_jump_and_poses_among_increments_are_named(tmp_path: Path) -> None:
+    late = {**POSE, "t": 4000}
+    tables = {"poses": [POSE, late, {**late, "t": 4001}], "ranges": TABLES["ranges"][1:]}
+    tables["anchors"] = TABLES["anchors"]
+    (a,) = read_ranges(written_csv(tmp_path, tables)).robots
+    assert [one.why for one in a.jumps] == [
+        f"{tmp_path}/poses.csv, line 3: t: it lasts 4000 s, and an estimate bridges at most 3600 s; "
+        "was a clock set? --window chooses a part"
+    ]
+    (tmp_path / "poses.csv").rename(tmp_path / "odometry.csv")
+    assert refused(tmp_path).endswith("sigma_dheading; poses are in poses.csv")
 
 
 # --- converters -------------------------------------------------------------------------------------------

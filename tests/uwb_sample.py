@@ -16,7 +16,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from compose.recording.ranging.pyfg import read_pyfg
+from compose.recording.ranging.range_files import read_ranges
 from docs.recorded_claims import SECOND_ANCHOR, second_place, second_ranges
 
 ROBOTS = "AB"
@@ -53,7 +53,7 @@ def with_second_anchor(path: Path, robot: str = ROBOTS[-1]) -> Iterator[str]:
 
     They replace those to the first, whose errors are the same: an estimate would count these twice.
     """
-    recording = read_pyfg(path)
+    recording = read_ranges(path)
     place = second_place(recording)
     _, measured = second_ranges(recording, robot, place)
     lengths = iter(measured.tolist())

@@ -19,7 +19,7 @@ import zenoh
 from rosbags.typesys import Stores, get_typestore
 
 from protocol.messages import RobotConfig
-from protocol.motion import ORIGIN, Controls, Pose, relative, wrap
+from protocol.motion import ORIGIN, Controls, Pose, heading_of, relative, wrap
 from protocol.network import session
 from protocol.network.endpoints import at
 from world.hardware.driver import SENSING, Reading
@@ -30,13 +30,6 @@ BRIDGE_S = 10.0
 """The time in s to wait for the bridge."""
 REPEATS = 10
 """The number of Twists in a manoeuvre. A mobile base stops if it receives none for a while, as it should."""
-NORM = 0.1
-"""The largest difference from 1 of the norm of an orientation.
-
-Linear interpolation between two orientations shortens the quaternion by less, up to 100 degrees between them.
-"""
-UPRIGHT = 0.5
-"""The least cosine of the angle between the robot's vertical axis and that of the frame; REP 103 has z up."""
 TOO_CLOSE = -math.inf
 """The range to a sensor that is too close to measure it, as in REP 117."""
 SINGLE = 1e-6
@@ -74,20 +67,12 @@ def decoded(payload: bytes, kind: str) -> Any:
 def odometry(message: Any) -> Pose:
     """Return the pose in a nav_msgs/Odometry: m, m, and rad in (-pi, pi].
 
-    Raises ValueError if a value is not finite, or the orientation is none of an upright robot. The norm of
-    the quaternion may differ from 1 by NORM.
+    Raises ValueError if a value is not finite, or the orientation is none of an upright robot.
     """
     at, q = message.pose.pose.position, message.pose.pose.orientation
     if not all(map(math.isfinite, (at.x, at.y, q.x, q.y, q.z, q.w))):
         raise ValueError("a pose that is not finite")
-    norm = math.hypot(q.x, q.y, q.z, q.w)
-    if abs(norm - 1.0) > NORM:
-        raise ValueError(f"an orientation with a norm of {norm:.6g}, expected 1")
-    x, y, z, w = q.x / norm, q.y / norm, q.z / norm, q.w / norm
-    if (up := 1.0 - 2.0 * (x * x + y * y)) < UPRIGHT:
-        tilt = math.degrees(math.acos(max(up, -1.0)))
-        raise ValueError(f"an orientation tilted by {tilt:.0f} degrees, expected a robot in the plane, z up")
-    return Pose(float(at.x), float(at.y), math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+    return Pose(float(at.x), float(at.y), heading_of(q.x, q.y, q.z, q.w))
 
 
 def ranged(message: Any, reach: float) -> float | None:

@@ -27,7 +27,13 @@ from compose.recording.estimating.recorded_measurements import (
 from compose.recording.estimating.recording_estimator import EstimateEpoch, RecordingEstimator
 from compose.recording.ranging.range_recording import SAME_TIME_S
 from compose.recording.ranging.range_steps import NoSteps
-from compose.recording.ranging.recording_rows import AnyRow, OdometryRow, RecordingBuilder, SourcePlace
+from compose.recording.ranging.recording_rows import (
+    AnyRow,
+    OdometryRow,
+    PoseRow,
+    RecordingBuilder,
+    SourcePlace,
+)
 
 STREAM_TICKS = 20
 """The number of ticks in an epoch of a stream. A robot of 0.5 m/s then moves by a quarter of 0.05 m in half a
@@ -105,7 +111,7 @@ class StreamEstimate:
         """Yield the estimates that follow from `arriving` rows, as soon as they do. Raises UserError."""
         for row, place in arriving:
             self._builder.add(row, place)
-            if isinstance(row, OdometryRow):
+            if type(row) in (OdometryRow, PoseRow):
                 yield from self._due()
 
     def _due(self) -> Iterator[PoseEstimateRow]:

@@ -29,7 +29,6 @@ from compose.recording.ranging.recording_rows import (
     number_of,
     row_of,
 )
-from protocol import files
 
 POSE = re.compile(r"(?P<robot>[A-KM-Za-km-z][A-Za-z]*)(?P<index>[0-9]{1,15})\Z")
 """The name of a pose: the robot and a number. Names with L are those of landmarks."""
@@ -61,16 +60,8 @@ Poses = dict[int, tuple[TruePoseRow, SourcePlace]]
 """The true poses of a robot and their places, by their numbers."""
 
 
-def read_pyfg(path: Path, anchors: Sequence[AnchorRow] = ()) -> RangeRecording:
-    """Return the recording in the file `path`, with `anchors` in place of those of the same names there.
-
-    Raises OSError, and BadRecording, which names the line.
-    """
-    try:
-        text = files.read_text(path)
-    except UnicodeDecodeError:
-        raise BadRecording(f"{path}: it is not UTF-8 text") from None
-    builder = RecordingBuilder(path, anchors)
+def add_pyfg(builder: RecordingBuilder, path: Path, text: str) -> None:
+    """Add the content `text` of the file `path`. Raises BadRecording, which names the line."""
     poses: dict[str, Poses] = {}
     edges: dict[str, list[Edge]] = {}
     for number, line in enumerate(text.split("\n"), 1):
@@ -85,7 +76,6 @@ def read_pyfg(path: Path, anchors: Sequence[AnchorRow] = ()) -> RangeRecording:
     for numbered in poses.values():
         for _, (truth, place) in sorted(numbered.items()):
             builder.add(truth, place)
-    return builder.recording()
 
 
 def _take(

@@ -1,22 +1,27 @@
-"""Range recordings of all formats: the reader that a file or folder needs, and that of CSV files.
+"""Range recordings of all formats: the reader that a file or folder needs, and that of CSV and TUM files.
 
-A folder of them has odometry.csv and ranges.csv; anchors.csv, antennas.csv and truth.csv, if any.
+A folder of them has ranges.csv, and odometry.csv, poses.csv or TUM files; anchors.csv, antennas.csv and
+truth.csv, if any.
 """
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterator
 from pathlib import Path
 
 from compose.errors import BadRecording
 from compose.extras import need
-from compose.recording.ranging.pyfg import read_pyfg
+from compose.recording.ranging.pyfg import add_pyfg
 from compose.recording.ranging.range_recording import RangeRecording
 from compose.recording.ranging.recording_rows import (
     TABLES,
     AnchorRow,
+    AnyRow,
+    OdometryRow,
+    PoseRow,
     RecordingBuilder,
     Row,
     RowKind,
@@ -30,11 +35,16 @@ from compose.recording.run import read
 from protocol import files
 from protocol.spelling import did_you_mean
 
-REQUIRED = ("odometry", "ranges")
-"""The tables that a folder of CSV files must have."""
+ODOMETRY = ("odometry", "poses")
+"""The tables of which a folder of CSV files must have one, beside `ranges`."""
+TUM = re.compile(r"(?P<table>poses|truth)-(?P<robot>.+)\.tum")
+"""The name of a TUM file in such a folder: the table whose rows it has, and the robot."""
+TUM_FIELDS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
+"""The fields of a line of a TUM file."""
 
 READABLE_FORMATS = (
-    "a .pyfg file, an .mcap file, a folder with odometry.csv and ranges.csv, or a recording of Tandem"
+    "a .pyfg file, an .mcap file, a folder with ranges.csv and odometry.csv or poses.csv, or a recording of "
+    "Tandem"
 )
 """The formats that can be read."""
 
@@ -48,19 +58,28 @@ def read_ranges(path: Path, anchors_csv: Path | None = None) -> RangeRecording:
     """
     try:
         anchors = _anchors(anchors_csv) if anchors_csv is not None else []
+        if path.is_dir() and not any((path / f"{name}.csv").exists() for name in (*ODOMETRY, "ranges")):
+            if not journals_in(path):
+                raise BadRecording(f"{path}: it is not {READABLE_FORMATS}")
+            with user_errors(path):
+                return ranges_of_run(read(path), anchors)
+        builder = RecordingBuilder(path, anchors)
         if path.is_dir():
-            return _folder(path, anchors)
-        if path.suffix == ".pyfg":
-            return read_pyfg(path, anchors)
-        if path.suffix == ".mcap":
+            for row, place in _tables(path):
+                builder.add(row, place)
+        elif path.suffix == ".pyfg":
+            add_pyfg(builder, path, _text(path))
+        elif path.suffix == ".mcap":
             need("mcap")
-            from compose.recording.ranging.range_mcap import read_mcap  # noqa: PLC0415  # optional
+            from compose.recording.ranging.range_mcap import add_mcap  # noqa: PLC0415  # optional
 
-            return read_mcap(path, anchors)
-        path.stat()
+            add_mcap(builder, path)
+        else:
+            path.stat()
+            raise BadRecording(f"{path}: it is not {READABLE_FORMATS}")
     except OSError as error:
         raise BadRecording(f"{error.filename or path} cannot be read: {error.strerror or error}") from None
-    raise BadRecording(f"{path}: it is not {READABLE_FORMATS}")
+    return builder.recording()
 
 
 def _anchors(path: Path) -> list[AnchorRow]:
@@ -73,36 +92,49 @@ def _anchors(path: Path) -> list[AnchorRow]:
     return [*found.values()]
 
 
-def _folder(folder: Path, anchors: Sequence[AnchorRow]) -> RangeRecording:
-    if any((folder / f"{name}.csv").exists() for name in REQUIRED):
-        return read_csv(folder, anchors)
-    if journals_in(folder):
-        with user_errors(folder):
-            return ranges_of_run(read(folder), anchors)
-    raise BadRecording(f"{folder}: it is not {READABLE_FORMATS}")
+# --- CSV and TUM files --------------------------------------------------------------------------------------
 
 
-# --- CSV files ---------------------------------------------------------------------------------------------
-
-
-def read_csv(folder: Path, anchors: Sequence[AnchorRow] = ()) -> RangeRecording:
-    """Return the recording in `folder`, with `anchors` in place of those of the same names there.
-
-    Raises OSError, and BadRecording, which names the file and the line.
-    """
-    builder = RecordingBuilder(folder, anchors)
+def _tables(folder: Path) -> Iterator[tuple[AnyRow, SourcePlace]]:
+    """Yield all rows in `folder` and their places. Raises OSError, and BadRecording, which names the line."""
+    tracks = {path: found for path in sorted(folder.iterdir()) if (found := TUM.fullmatch(path.name))}
+    odometry = [name for name in ODOMETRY if (folder / f"{name}.csv").exists()]
+    if not odometry and not any(found["table"] == "poses" for found in tracks.values()):
+        odometry = [ODOMETRY[0]]
     for name, kind in TABLES.items():
         path = folder / f"{name}.csv"
-        if name in REQUIRED or path.exists():
-            for row, place in rows_in(path, kind):
-                builder.add(row, place)
-    return builder.recording()
+        if name in (*odometry, "ranges") or path.exists():
+            yield from rows_in(path, kind)
+        for track, found in tracks.items():
+            if found["table"] == name:
+                yield from _rows_in_tum(track, found["robot"], kind)
+
+
+def _rows_in_tum(path: Path, robot: str, kind: type[AnyRow]) -> Iterator[tuple[AnyRow, SourcePlace]]:
+    """Yield the poses of a TUM file, of which the height is not used. Raises like `_tables`."""
+    for number, line in enumerate(_text(path).splitlines(), 1):
+        place, words = SourcePlace(path, number), line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        if len(words) != len(TUM_FIELDS):
+            needed = "timestamp tx ty tz qx qy qz qw"
+            raise BadRecording(f"{place}: it has {len(words)} fields, and needs {needed}")
+        values = dict(zip(TUM_FIELDS, words, strict=True))
+        del values["z"]
+        yield row_of({"robot": robot, **values}, kind, place), place
+
+
+def _text(path: Path) -> str:
+    try:
+        return files.read_text(path)
+    except UnicodeDecodeError:
+        raise BadRecording(f"{path}: it is not UTF-8 text") from None
 
 
 def rows_in(path: Path, kind: type[RowKind]) -> Iterator[tuple[RowKind, SourcePlace]]:
-    """Yield the rows of the CSV file `path` and their places. Raises like `read_csv`."""
+    """Yield the rows of the CSV file `path` and their places. Raises like `_tables`."""
+    lines = csv.reader(io.StringIO(_text(path), newline=""), strict=True)
     try:
-        lines = csv.reader(io.StringIO(files.read_text(path), newline=""), strict=True)
         head = next(lines, [])
         _check_head(head, kind, SourcePlace(path, 1))
         for values in lines:
@@ -113,8 +145,6 @@ def rows_in(path: Path, kind: type[RowKind]) -> Iterator[tuple[RowKind, SourcePl
                 raise BadRecording(f"{place}: it has {len(values)} fields, and the first line {len(head)}")
             given = {name: value.strip() for name, value in zip(head, values, strict=True)}
             yield row_of({name: value for name, value in given.items() if value}, kind, place), place
-    except UnicodeDecodeError:
-        raise BadRecording(f"{path}: it is not UTF-8 text") from None
     except csv.Error as error:
         raise BadRecording(f"{SourcePlace(path, lines.line_num)}: {error}") from None
 
@@ -126,6 +156,8 @@ def _check_head(head: list[str], kind: type[Row], place: SourcePlace) -> None:
     for name in head:
         if name not in known:
             guess = did_you_mean(name, known)
+            if kind is OdometryRow and name in PoseRow.__struct_fields__:
+                guess = "; poses are in poses.csv"
             raise BadRecording(f"{place}: unknown column {name[:40]!a}; it has {', '.join(known)}{guess}")
         if head.count(name) > 1:
             raise BadRecording(f"{place}: there are two columns {name}")

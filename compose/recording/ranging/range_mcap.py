@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import struct
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO
@@ -21,10 +21,8 @@ from mcap.records import Channel, Chunk, McapRecord, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from compose.errors import BadRecording
-from compose.recording.ranging.range_recording import RangeRecording
 from compose.recording.ranging.recording_rows import (
     TABLES,
-    AnchorRow,
     AnyRow,
     RecordingBuilder,
     SourcePlace,
@@ -48,12 +46,11 @@ class EndOfStream(BadRecording):
     """The file or stream ends before its end record."""
 
 
-def read_mcap(path: Path, anchors: Sequence[AnchorRow] = ()) -> RangeRecording:
-    """Return the recording in the file `path`, with `anchors` in place of those of the same names there.
+def add_mcap(builder: RecordingBuilder, path: Path) -> None:
+    """Add the rows in the file `path`.
 
     Raises OSError, and BadRecording, which names the message, or the byte.
     """
-    builder = RecordingBuilder(path, anchors)
     with files.open_file(path) as file:
         size = os.fstat(file.fileno()).st_size
         try:
@@ -63,7 +60,6 @@ def read_mcap(path: Path, anchors: Sequence[AnchorRow] = ()) -> RangeRecording:
             raise BadRecording(
                 f"{error}; --follow estimates what is before" if size else str(error)
             ) from None
-    return builder.recording()
 
 
 def rows_as_they_arrive(stream: BinaryIO, name: str) -> Iterator[tuple[AnyRow, SourcePlace]]:

@@ -10,6 +10,7 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 import msgspec
 import numpy as np
 from msgspec import Meta
+from msgspec.structs import astuple
 
 from compose.errors import BadRecording
 from compose.recording.ranging.range_recording import (
@@ -24,12 +25,15 @@ from compose.recording.ranging.range_recording import (
     TruePath,
     locked,
 )
+from protocol.motion import Pose, heading_of, relative, wrap
 from protocol.units import Angle, Coordinate, Range, RobotId, Sigma
 
 Stamp = Annotated[float, Meta(ge=-1e12, le=1e12)]
 """A time in s, on a clock that all robots and radios of a recording share."""
 StatedSigma = Annotated[float, Meta(gt=0.0, le=1e4)]
 """A standard deviation that a file states, in m or rad."""
+Part = Annotated[float, Meta(ge=-2.0, le=2.0)]
+"""An element of a quaternion."""
 
 
 class SourcePlace(NamedTuple):
@@ -120,8 +124,8 @@ class AntennaRow(Row, frozen=True):
     """The height in m."""
 
 
-class TruePoseRow(Row, frozen=True):
-    """The true pose of a robot's centre."""
+class PoseRow(Row, frozen=True):
+    """The pose of a robot by its odometry, in a frame that begins anywhere."""
 
     robot: RobotId
     """The robot."""
@@ -131,14 +135,27 @@ class TruePoseRow(Row, frozen=True):
     """The x coordinate in m."""
     y: Coordinate
     """The y coordinate in m."""
-    heading: Angle
-    """The heading in rad, counter-clockwise from the x-axis."""
+    heading: Angle | None = None
+    """The heading in rad, counter-clockwise from the x-axis, wrapped or not; or the next four."""
+    qx: Part | None = None
+    """The orientation as a quaternion in place of `heading`, z up: its x."""
+    qy: Part | None = None
+    """Its y."""
+    qz: Part | None = None
+    """Its z."""
+    qw: Part | None = None
+    """Its w."""
 
 
-AnyRow = OdometryRow | RangeRow | AnchorRow | AntennaRow | TruePoseRow
+class TruePoseRow(PoseRow, frozen=True):
+    """The true pose of a robot's centre."""
+
+
+AnyRow = OdometryRow | PoseRow | RangeRow | AnchorRow | AntennaRow
 RowKind = TypeVar("RowKind", bound=Row)
 TABLES: dict[str, type[AnyRow]] = {
     "odometry": OdometryRow,
+    "poses": PoseRow,
     "ranges": RangeRow,
     "anchors": AnchorRow,
     "antennas": AntennaRow,
@@ -195,7 +212,8 @@ class RecordingBuilder:
         """The number of entries that are not used, by kind."""
         self._odometry: dict[str, list[tuple[OdometryRow, Covariance6 | None]]] = {}
         self._jumps: dict[str, list[Jump]] = {}
-        self._truth: dict[str, list[TruePoseRow]] = {}
+        self._truth: dict[str, list[TimedPose]] = {}
+        self._poses: dict[str, TimedPose] = {}
         self._given = {row.anchor: row for row in anchors}
         self._anchors: dict[str, AnchorRow] = {}
         self._antennas: dict[str, AntennaRow] = {}
@@ -232,11 +250,10 @@ class RecordingBuilder:
                 self._claims.append((row.robot, place))
             case TruePoseRow():
                 path = self._truth.setdefault(row.robot, [])
-                if path and row.t < path[-1].t:
-                    before = f"the true pose before it is of {path[-1].t:.15g} s"
-                    raise BadRecording(f"{place}: t: it is of {row.t:.15g} s, and {before}")
-                path.append(row)
+                path.append(_after(path[-1] if path else None, row, "true pose", place))
                 self._claims.append((row.robot, place))
+            case PoseRow():
+                self._add_pose(row, place)
 
     def add_prior(self, row: AnchorRow) -> None:
         """Add an anchor in place of one of the same name, unless that was given from outside."""
@@ -257,12 +274,23 @@ class RecordingBuilder:
         self._add_jump(row, path[-1][0].t1 if path else row.t0, place)
         path.append((row, covariance))
 
+    def _add_pose(self, row: PoseRow, place: object) -> None:
+        """Add the increment from the pose before to this one. The same pose again is none."""
+        before = self._poses.get(row.robot)
+        if before is None and row.robot in self._odometry:
+            raise BadRecording(f"{place}: robot: {row.robot} has increments of odometry, too")
+        pose = self._poses[row.robot] = _after(before, row, f"pose of {row.robot}", place)
+        self.add_robot(row.robot)
+        if before is not None and pose != before:
+            dx, dy, turn = astuple(relative(before.pose, pose.pose))
+            self.add_odometry(OdometryRow(row.robot, before.t, row.t, dx, dy, wrap(turn)), None, place)
+
     def _add_jump(self, row: OdometryRow, before: float, place: object) -> None:
         """Note an increment that lasts, or begins after the time `before` by, more than LONGEST_GAP_S."""
         late, lasts = row.t0 - before, row.t1 - row.t0
         if max(late, lasts) <= LONGEST_GAP_S:
             return
-        what = f"t1: it lasts {lasts:.6g} s"
+        what = f"{'t' if row.robot in self._poses else 't1'}: it lasts {lasts:.6g} s"
         begin, end = row.t0, row.t1
         if late > LONGEST_GAP_S:
             what = f"t0: it starts {late:.6g} s after the end of the increment of {row.robot} before it"
@@ -319,7 +347,7 @@ class RecordingBuilder:
         rows, truth, antenna = self._odometry[name], self._truth.get(name), self._antennas.get(name)
         stated = _table([one or UNSTATED_COVARIANCE for _, one in rows], 6)
         moved = _table([(row.t0, row.t1, row.dx, row.dy, row.dheading) for row, _ in rows], 5)
-        true = _table([(row.t, row.x, row.y, row.heading) for row in truth or ()], 4)
+        true = _table([(t, *astuple(pose)) for t, pose in truth or ()], 4)
         t0, t1, increments = [locked(moved[:, part].copy()) for part in (0, 1, slice(2, 5))]
         path: Any = [locked(true[:, part].copy()) for part in (0, slice(1, 4))]
         return RecordedRobot(
@@ -347,6 +375,28 @@ class RecordingBuilder:
         t, measured, sigma = _table(lengths, 3).T
         unsorted = RangeSeries(t, ends[:, 0], ends[:, 1], measured, sigma)
         return unsorted.rows(np.argsort(t, kind="stable"))
+
+
+class TimedPose(NamedTuple):
+    """A pose at the time `t` in s."""
+
+    t: float
+    pose: Pose
+
+
+def _after(before: TimedPose | None, row: PoseRow, what: str, place: object) -> TimedPose:
+    """Return the pose at `place`, which must not be earlier than that `before`. Raises BadRecording."""
+    if before is not None and row.t < before.t:
+        earlier = f"the {what} before it is of {before.t:.15g} s"
+        raise BadRecording(f"{place}: t: it is of {row.t:.15g} s, and {earlier}")
+    quaternion = [one for one in (row.qx, row.qy, row.qz, row.qw) if one is not None]
+    if (row.heading is None, len(quaternion)) not in ((True, 4), (False, 0)):
+        raise BadRecording(f"{place}: it needs heading, or all of qx, qy, qz, qw")
+    try:
+        heading = heading_of(*quaternion) if row.heading is None else row.heading
+    except ValueError as error:
+        raise BadRecording(f"{place}: qx, qy, qz, qw: {error}") from None
+    return TimedPose(row.t, Pose(row.x, row.y, heading))
 
 
 def check_anchor(row: AnchorRow, place: object) -> None:
