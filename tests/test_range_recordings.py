@@ -11,17 +11,20 @@ import numpy as np
 import pytest
 import scipy.io  # type: ignore[import-untyped]
 from mcap.writer import Writer
-from msgspec.structs import astuple
+from msgspec.structs import astuple, replace
 
 from compose.errors import USER_ERROR, BadRecording, UserError
 from compose.launch import in_process
+from compose.recording.estimating.estimate_rows import PoseEstimateRow, estimate_csv
 from compose.recording.estimating.sound_odometry import sound
 from compose.recording.ranging.pyfg import written_pyfg
 from compose.recording.ranging.range_files import TUM_FIELDS, read_ranges
 from compose.recording.ranging.range_recording import FixedAnchor, RangeRecording
 from compose.recording.ranging.run_ranges import ADDED_SIGMA, increment_covariance, ranges_of_run
-from compose.recording.run import Run
+from compose.recording.rows import estimate_rows
+from compose.recording.run import Run, read
 from compose.scenario.scenario_file import load
+from compose.view.export.tum import tum_of_estimate, tum_of_run
 from docs import plaza_csv
 from protocol.motion import ORIGIN, Controls, Pose, compose, step, wrap
 from protocol.noise import VelocityNoise
@@ -319,6 +322,63 @@ def test_the_covariance_of_an_increment_is_that_of_its_derivatives(omega: float)
 
 
 # --- export -----------------------------------------------------------------------------------------------
+
+
+def errors_in(folder: Path, kind: str, robot: str) -> np.ndarray:
+    """Return the distances of the poses in a TUM file from the truth, as evo_ape computes them."""
+    truth, found = [np.loadtxt(folder / f"{name}-{robot}.tum", ndmin=2) for name in ("truth", kind)]
+    nearest = np.argmin(np.abs(truth[:, 0] - found[:, :1]), axis=1)
+    near = np.abs(truth[nearest, 0] - found[:, 0]) <= 0.01  # the bound of evo
+    distance: np.ndarray = np.linalg.norm((found - truth[nearest])[near, 1:4], axis=1)
+    return distance
+
+
+def test_tum_files_of_a_run_have_its_errors_and_are_read_back(tmp_path: Path) -> None:
+    in_process.run_mission(load("noisy"), tmp_path)
+    run = read(tmp_path)
+    for name, text in tum_of_run(run).items():
+        (tmp_path / name).write_text(text)
+    rows = [row for row in estimate_rows(run, 1.0) if row.frame == "world" and not row.hypothesis]
+    for robot in ("a", "b"):
+        own = [row for row in rows if row.robot == robot]
+        errors = [row.position_error_m or math.nan for row in own]
+        assert len(errors) > 5
+        np.testing.assert_allclose(errors_in(tmp_path, "estimate", robot), errors, rtol=0, atol=1e-6)
+        claims = [row.position_error_m or math.nan for row in own if row.localised]
+        assert claims
+        np.testing.assert_allclose(errors_in(tmp_path, "claim", robot), claims, rtol=0, atol=1e-6)
+    there = ranges_of_run(run)
+    radios, series = there.radios, there.ranges
+    ranges = [
+        {"t": t, "from": radios[first], "to": radios[second], "range": rho, "sigma": sigma}
+        for t, first, second, rho, sigma in zip(*map(np.ndarray.tolist, series), strict=True)
+    ]
+    anchors = [{"anchor": one.id, "x": one.x, "y": one.y} for one in there.anchors]
+    here = read_ranges(written_csv(tmp_path, {"ranges": ranges, "anchors": anchors}))
+    for one, other in zip(here.robots, there.robots, strict=True):
+        np.testing.assert_array_equal(one.odometry.t1, other.odometry.t1)
+        np.testing.assert_allclose(one.odometry.increments, other.odometry.increments, atol=1e-9)
+        assert one.truth is not None
+        assert other.truth is not None
+        np.testing.assert_allclose(np.cos(one.truth.poses), np.cos(other.truth.poses), atol=1e-12)
+        np.testing.assert_allclose(np.sin(one.truth.poses), np.sin(other.truth.poses), atol=1e-12)
+    for column, its in zip(here.ranges, series, strict=True):
+        np.testing.assert_array_equal(column, its)
+
+
+def test_tum_files_of_an_estimate_have_its_errors(tmp_path: Path) -> None:
+    first = PoseEstimateRow(0.5, "a", 2, 0.9, 1.0, -0.5, 0.1, 0.1, 0.0, 0.0, 0.1, 0.0, 0.1, claim=False)
+    second = replace(first, t_s=1.0, claim=True, true_x=1.3, true_y=-0.1, true_heading=3.1)
+    (tmp_path / "estimate.csv").write_text(estimate_csv([first, second]))
+    ended = tandem("export", tmp_path, "--tum", "--out", tmp_path / "tum")
+    names = [f"{kind}-a.tum" for kind in ("claim", "estimate", "truth")]
+    assert ended == (0, "".join(f"{tmp_path}/tum/{name}\n" for name in names), "")
+    assert len((tmp_path / "tum" / names[1]).read_text().splitlines()) == 3
+    for kind in ("claim", "estimate"):
+        np.testing.assert_allclose(errors_in(tmp_path / "tum", kind, "a"), [0.5], rtol=0, atol=1e-12)
+    (tmp_path / "estimate.csv").write_text("t_s,robot\n1,a\n")
+    with pytest.raises(UserError, match=r"estimate.csv, line 2: .*missing required field `hypotheses`"):
+        tum_of_estimate(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["paper-1", "noisy"])

@@ -308,6 +308,8 @@ COMMANDS = (
         --pyfg: write only run.pyfg: odometry, ranges and true poses as a factor graph for other estimators
         | --html: write only run.html: the page of the run in one file, which a browser opens without a server
         | --rerun: write only run.rrd: a recording for Rerun, with its views in place (extra rerun)
+        | --tum: write only TUM files, for evo: true, estimated and dead-reckoned poses of each robot; also \
+            from the folder of `tandem estimate --out`
         """,
     ),
     CommandEntry(

@@ -9,7 +9,7 @@ from compose.cli.export_files import EXPORT_MODULES, exported
 from compose.cli.recording import note, read_noted
 from compose.errors import ENDED, FAILED, writing
 from compose.extras import need
-from compose.recording.recording_files import make_folder, user_errors
+from compose.recording.recording_files import journals_in, make_folder, user_errors
 from compose.terminal.text_width import tell
 from protocol import files
 from protocol.output import say
@@ -21,8 +21,9 @@ def main(options: argparse.Namespace) -> int:
     The export then contains only what the other journals hold about that robot.
     """
     out: Path = options.out or options.recording
-    for flag, write in ((options.pyfg, _pyfg), (options.html, _html), (options.rerun, _rerun)):
-        if flag:
+    alone = {"pyfg": _pyfg, "html": _html, "rerun": _rerun, "tum": _tum}
+    for flag, write in alone.items():
+        if getattr(options, flag):
             write(options.recording, out)
             return ENDED
     need(*EXPORT_MODULES)
@@ -64,6 +65,19 @@ def _rerun(recording: Path, out: Path) -> None:
         _, setup = checked(run)
         content = rerun_recording(setup, scenes_of(run))
     _write(out, "run.rrd", content)
+
+
+def _tum(recording: Path, out: Path) -> None:
+    """Write the TUM files of a run, or of an estimate, to `out`, and print their paths."""
+    from compose.view.export.tum import ESTIMATE_CSV, tum_of_estimate, tum_of_run  # noqa: PLC0415  # numpy
+
+    with user_errors(recording):
+        if (recording / ESTIMATE_CSV).exists() and not journals_in(recording):
+            texts = tum_of_estimate(recording)
+        else:
+            texts = tum_of_run(read_noted(recording, "export"))
+    for name, text in texts.items():
+        _write(out, name, text)
 
 
 def _write(out: Path, name: str, text: str | bytes) -> None:
