@@ -36,6 +36,7 @@ from compose.recording.estimating.estimate_rows import (
 )
 from compose.recording.group_localisation import MeetingResult
 from compose.recording.ranging import recording_rows
+from compose.recording.ranging.ros_bag import BagFile, TopicTable
 from compose.scenario.fault_syntax import FaultTable
 from compose.scenario.json_schema import described
 from compose.scenario.kills import KillTable
@@ -89,6 +90,9 @@ PARTS = (
 )
 """structs that messages contain, and that have no tables on other pages"""
 NAMES = {
+    "TopicTable": "`[[topic]]`",
+    "AnchorRow": "`[[anchor]]`",
+    "AntennaRow": "`[[antenna]]`",
     "MissionTable": "table `[mission]`",
     "RobotTable": "`[[robot]]`",
     "GroupTable": "`[group]`",
@@ -366,6 +370,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "claim-table": partial(columns_of, rows.ClaimRow),
     "meeting-table": partial(columns_of, MeetingResult),
     "odometry-columns": partial(fields_of, recording_rows.OdometryRow),
+    "bag-fields": partial(fields_of, BagFile),
+    "bag-topic-fields": partial(fields_of, TopicTable),
     "pose-columns": partial(fields_of, recording_rows.PoseRow),
     "range-columns": partial(fields_of, recording_rows.RangeRow),
     "anchor-columns": partial(fields_of, recording_rows.AnchorRow),

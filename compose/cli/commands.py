@@ -167,7 +167,8 @@ LISTENING_TIME = """
 PAGE_PORT = """
     --port N: TCP port of the web page, 0 to 65535 [default: any free port]
 """
-RANGES = "range recording: a .pyfg or .mcap file, a folder of CSV files, or a recording of Tandem"
+RANGES = "range recording: a .pyfg or .mcap file, a folder of CSV files, a recording of Tandem, or a .toml \
+            file that maps the topics of a rosbag2"
 PART_OF_RECORDING = """
     --anchors FILE: CSV file of anchors to add to the recording, or to move [default: none]
     --window S..S: use only these seconds, such as 10..40, from the first odometry on [default: all]

@@ -35,13 +35,14 @@ def main(options: argparse.Namespace) -> int:
     Return NOT_LOCALISED if a robot may not claim its pose at the end; if a stream was ended by a signal
     STOPPED_STATUS, and BROKEN_PIPE if the reader of the output has gone.
     """
-    stopped = None
+    stopped, unread = None, ""
     rule = ClaimRule(options.accuracy, options.confidence)
     solver = solver_named(options.solver) if options.solver is not None else None
     if options.follow:
         problem, estimate, stopped = _followed(options, rule, solver)
     else:
         recording = read_ranges(options.recording, options.anchors)
+        unread = ", ".join([f"{what}: {count}" for what, count in recording.unused.items()])
         problem = measurements(
             *(recording, options.robots, options.noise, options.window), relative=options.relative
         )
@@ -53,7 +54,7 @@ def main(options: argparse.Namespace) -> int:
         written = _written(options.out, problem, estimate)
         say(*map(str, written), error=options.follow)
     if not options.follow:
-        tell(*_lines(problem, estimate))
+        tell(*_lines(problem, estimate), *[f"not used: {unread}"] * bool(unread))
     if stopped is not None:
         return stopped
     robots = estimate.summary.robots.values()

@@ -43,8 +43,8 @@ TUM_FIELDS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 """The fields of a line of a TUM file."""
 
 READABLE_FORMATS = (
-    "a .pyfg file, an .mcap file, a folder with ranges.csv and odometry.csv or poses.csv, or a recording of "
-    "Tandem"
+    "a .pyfg file, an .mcap file, a folder with ranges.csv and odometry.csv or poses.csv, a .toml file that "
+    "maps a rosbag2, or a recording of Tandem"
 )
 """The formats that can be read."""
 
@@ -69,6 +69,11 @@ def read_ranges(path: Path, anchors_csv: Path | None = None) -> RangeRecording:
                 builder.add(row, place)
         elif path.suffix == ".pyfg":
             add_pyfg(builder, path, _text(path))
+        elif path.suffix in (".toml", ".db3"):
+            need("rosbags", extra="ros")
+            from compose.recording.ranging.ros_bag import add_bag  # noqa: PLC0415  # optional
+
+            add_bag(builder, path, _text(path) if path.suffix == ".toml" else f"bag = '{path.name}'")
         elif path.suffix == ".mcap":
             need("mcap")
             from compose.recording.ranging.range_mcap import add_mcap  # noqa: PLC0415  # optional

@@ -314,7 +314,9 @@ class RecordingBuilder:
     def recording(self) -> RangeRecording:
         """Return the recording. Raises BadRecording if a name is unknown, or if there is no odometry."""
         if not self._odometry:
-            raise BadRecording(f"{self.source}: there is no odometry")
+            there = ", ".join([f"{what}: {count}" for what, count in self.unused.items()])
+            hint = f", but {there}; a .toml file maps topics of ROS" if there else ""
+            raise BadRecording(f"{self.source}: there is no odometry{hint}")
         for robot, place in self._claims:
             if robot not in self._odometry:
                 raise BadRecording(f"{place}: robot: {robot} has no odometry")
