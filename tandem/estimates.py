@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import cached_property
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import msgspec
 
@@ -68,6 +68,13 @@ class PoseEstimates(msgspec.Struct, frozen=True, dict=True, eq=False):
 
         with look(SCREEN):
             return dict(estimate_figures(self.problem, self.result))
+
+    def plot(self, kind: Literal["path", "over-time"] = "path") -> Figure:
+        """Return one figure: the estimated and true paths from above, or errors and sigmas over time.
+
+        Raises UserError like `figures`.
+        """
+        return self.figures()[f"estimate-{kind}"]
 
     def save(self, folder: str | Path) -> Path:
         """Write `estimate.csv` and `estimate.json` to `folder`, and return its path. Raises UserError."""

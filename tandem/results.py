@@ -6,7 +6,7 @@ import base64
 import html
 import io
 from collections.abc import Iterable, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -178,12 +178,23 @@ class Run(msgspec.Struct, frozen=True, dict=True, eq=False):
 
         medium = style.PAPER if paper else style.SCREEN
         found: dict[str, Figure] = {}
-        for pair in self._pairs:
+        team = self.model.setup is not None and self.model.setup.team
+        of_pairs = [partial(catalogue.pictures, pair) for pair in ([] if team else self._pairs)]
+        for draw in [partial(catalogue.of_team, self.model)] if team else of_pairs:
             for kind in kinds or PICTURES:
                 with style.look(medium):
-                    drawn = catalogue.pictures(pair, kind, medium)
+                    drawn = draw(kind, medium)
                     found |= {name: figure for name, figure in drawn if not isinstance(figure, Absent)}
         return found
+
+    def plot(self, kind: str = "trajectory") -> Figure:
+        """Return the first figure of a kind, by default the paths from above.
+
+        Raises UserError like `figures`, and if the run has none of this kind.
+        """
+        for figure in self.figures(kind).values():
+            return figure
+        raise UserError(f"{self._title}: there is no figure '{kind}' of it")
 
     def save(self, folder: str | Path) -> Path:
         """Write the recording to `folder`, as `tandem run --out` does, and return its path.

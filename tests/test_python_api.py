@@ -14,6 +14,7 @@ from typing import Any, NoReturn
 import msgspec
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import tandem
 from agent.process import agent_journal
@@ -199,6 +200,20 @@ def test_figures_of_a_run_are_those_of_the_command(run: tandem.Run) -> None:
     assert list(found) == ["trajectory-a-b", "ranges-a-b"]
     with pytest.raises(tandem.UserError, match=r"there is no figure 'range'; .*; did you mean 'ranges'"):
         run.figures("range")
+
+
+def test_a_plot_is_the_first_figure_of_its_kind(run: tandem.Run) -> None:
+    assert {"path-a", "path-b", "range-a"} <= names_in(run.plot())
+    assert names_in(run.plot("ranges")) == names_in(run.figures("ranges")["ranges-a-b"])
+    with pytest.raises(tandem.UserError, match=r"^random, .*: there is no figure 'meetings' of it$"):
+        run.plot("meetings")
+    with pytest.raises(tandem.UserError, match="there is no figure 'range'"):
+        run.plot("range")
+
+
+def names_in(figure: Figure) -> set[str | None]:
+    """Return the names of what a figure shows."""
+    return {artist.get_gid() for artist in figure.findobj()}
 
 
 def test_a_notebook_shows_the_outcome_and_the_picture(run: tandem.Run) -> None:
@@ -468,6 +483,8 @@ def test_estimates_are_those_of_the_command(tmp_path: Path) -> None:
     for name in ("estimate.csv", "estimate.json"):
         assert (saved / name).read_bytes() == (tmp_path / "found" / name).read_bytes()
     assert found.rows.columns == PoseEstimateRow.__struct_fields__
+    for name, figure in found.figures().items():
+        assert names_in(found.plot(name.removeprefix("estimate-"))) == names_in(figure)  # type: ignore[arg-type]
     assert {*found.figures()} == {path.stem for path in (tmp_path / "found").glob("*.svg")}
     assert "<td>A</td>" in found._repr_html_()
 
