@@ -14,7 +14,7 @@ from typing import Any
 
 import zenoh
 from pycdr2 import IdlStruct
-from pycdr2.types import array, float32, float64, int32, uint8, uint32
+from pycdr2.types import array, float32, float64, int32, sequence, uint8, uint32
 
 from protocol.motion import Pose, step
 from protocol.network import session
@@ -103,6 +103,51 @@ class Range(IdlStruct, typename="sensor_msgs/msg/Range"):
     min_range: float32
     max_range: float32
     range: float32
+
+
+@dataclass
+class PoseWithCovarianceStamped(IdlStruct, typename="geometry_msgs/msg/PoseWithCovarianceStamped"):
+    header: Header
+    pose: PoseWithCovariance
+
+
+@dataclass
+class Transform(IdlStruct, typename="geometry_msgs/msg/Transform"):
+    translation: Vector3
+    rotation: Quaternion
+
+
+@dataclass
+class TransformStamped(IdlStruct, typename="geometry_msgs/msg/TransformStamped"):
+    header: Header
+    child_frame_id: str
+    transform: Transform
+
+
+@dataclass
+class TFMessage(IdlStruct, typename="tf2_msgs/msg/TFMessage"):
+    transforms: sequence[TransformStamped]  # type: ignore[type-arg]
+
+
+@dataclass
+class KeyValue(IdlStruct, typename="diagnostic_msgs/msg/KeyValue"):
+    key: str
+    value: str
+
+
+@dataclass
+class DiagnosticStatus(IdlStruct, typename="diagnostic_msgs/msg/DiagnosticStatus"):
+    level: uint8
+    name: str
+    message: str
+    hardware_id: str
+    values: sequence[KeyValue]  # type: ignore[type-arg]
+
+
+@dataclass
+class DiagnosticArray(IdlStruct, typename="diagnostic_msgs/msg/DiagnosticArray"):
+    header: Header
+    status: sequence[DiagnosticStatus]  # type: ignore[type-arg]
 
 
 def odometry(pose: Pose, norm: float = 1.0, frame: str = "odom") -> bytes:

@@ -21,6 +21,7 @@ from protocol.journal.journal_file import MemoryJournal
 from protocol.messages import (
     Cause,
     Command,
+    Estimate,
     FinalReport,
     Inconsistent,
     Localised,
@@ -167,6 +168,36 @@ def test_no_robot_drives_faster_than_the_mission_allows(played: Play) -> None:
     driver = Recorded()
     played(driver, lambda tick: [encode(Command(tick, "a", -7.0, 1e6, 1, "straight"))], ticks=1)
     assert driver.commands == [(-1.0, 3.141592653589793)] * 2
+
+
+class Told(Recorded):
+    """A driver that takes estimates, and fails at some tick."""
+
+    def __init__(self, fails_at: int | None = None) -> None:
+        super().__init__()
+        self.estimates: list[Estimate] = []
+        self._last = fails_at
+
+    def estimated(self, estimate: Estimate) -> None:
+        self.estimates.append(estimate)
+        if estimate.tick == self._last:
+            raise OSError("no such map")
+
+
+def test_a_driver_that_takes_estimates_gets_those_of_its_agent(stage: Stage, played: Play) -> None:
+    def answer(tick: int) -> list[bytes]:
+        for robot in ("b", "a"):
+            estimate = Estimate(tick, robot, (), (ORIGIN,), localised=True)
+            stage.comes("estimate", keys.estimate("r", "a"), encode(estimate))
+        return [encode(command(tick))]
+
+    driver = Told()
+    _, end, _ = played(driver, answer)
+    assert [(one.tick, one.robot) for one in driver.estimates] == [
+        (tick, "a") for tick in range(end.tick + 1)
+    ]
+    _, end, _ = played(Told(fails_at=2), answer)
+    assert reason_for(end) == "a's driver: estimated(): OSError: no such map"
 
 
 def test_a_late_command_is_not_executed(played: Play) -> None:

@@ -7,17 +7,21 @@ import struct
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import closing
+from functools import partial
 from itertools import cycle
 from pathlib import Path
 from queue import SimpleQueue
+from typing import Any
 
 import pytest
+import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
 from compose.launch.processes import free_endpoint
 from compose.scenario.scenario_file import parse
-from protocol.motion import Controls, Pose, step, wrap
+from protocol.messages import Estimate
+from protocol.motion import ORIGIN, Controls, Covariance, Pose, compose, step, wrap
 from protocol.network import session
 from protocol.network.endpoints import listening
 from tests import ros_base
@@ -347,6 +351,64 @@ def test_a_driver_sends_stamped_twists_if_it_is_told_to(stamped: str, sent: byte
             driver.stop()
     with pytest.raises(ValueError, match="stamped: 'yes', expected true or false"):
         ros2.Ros2(config, 60.0, connect=endpoint, stamped="yes")
+
+
+def put(queue: SimpleQueue[bytes], sample: zenoh.Sample) -> None:
+    queue.put(sample.payload.to_bytes())
+
+
+def test_pose_and_transform_are_published_while_the_robot_claims_its_pose_and_diagnostics_always() -> None:
+    """Another library decodes them. The odometry is at `base`, and the claim says where its frame is."""
+    config, endpoint, base = parse(SCENARIO, "ros").config("a"), free_endpoint(), Pose(2.0, -1.0, 3.0)
+    claim, covariance = Pose(-4.0, 7.0, 0.5), Covariance(1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
+    several = Estimate(1, "a", (ORIGIN, claim), (), localised=False, probabilities=(0.75, 0.25))
+    claimed = Estimate(2, "a", (), (claim,), localised=True, probabilities=(1.0,), covariance=covariance)
+    received: dict[str, SimpleQueue[bytes]] = {name: SimpleQueue() for name in ("pose", "tf", "diagnostics")}
+    with session.open_router(listening(endpoint)) as link:
+        for name, queue in received.items():
+            link.declare_subscriber(name, partial(put, queue))
+        odom = session.publisher(link, "odom")
+        with closing(ros2.Ros2(config, 60.0, connect=endpoint)) as driver, ThreadPoolExecutor(1) as pool:
+            driver.estimated(several)  # of a tick without a reading
+            for estimate in (several, claimed):
+                driver.stop()
+                for topic in ("anchor_range", "peer_range"):
+                    session.publisher(link, topic).put(ros_base.ranged(2.5))
+                reading = pool.submit(driver.sense, estimate.tick)
+                while not reading.done():
+                    odom.put(ros_base.odometry(base, frame="a/odom"))
+                    for topic in ("anchor_range", "peer_range"):
+                        session.publisher(link, topic).put(ros_base.ranged(2.5))
+                    wait([reading], 0.01)
+                driver.estimated(estimate)
+            odom.put(ros_base.odometry(base, frame="a/odom"))
+            found = {name: queue.get(timeout=BOUND_S) for name, queue in received.items()}
+            second: Any = ros_base.DiagnosticArray.deserialize(received["diagnostics"].get(timeout=BOUND_S))
+            driver.stop()
+    pose: Any = ros_base.PoseWithCovarianceStamped.deserialize(found["pose"])
+    assert (pose.header.frame_id, pose.header.stamp.sec, pose.header.stamp.nanosec) == ("map", 7, 8)
+    assert (pose.pose.pose.position.x, pose.pose.pose.position.y) == (-4.0, 7.0)
+    assert pose.pose.pose.orientation.z == pytest.approx(math.sin(0.25))
+    rows = [list(pose.pose.covariance[6 * row : 6 * row + 6]) for row in (0, 1, 5)]
+    assert [[row[0], row[1], row[5]] for row in rows] == covariance.matrix
+    assert sum(pose.pose.covariance) == sum(map(sum, covariance.matrix))
+    tf: Any = ros_base.TFMessage.deserialize(found["tf"])
+    (one,) = tf.transforms
+    assert (one.header.frame_id, one.child_frame_id, one.header.stamp.sec) == ("map", "a/odom", 7)
+    at, turned = one.transform.translation, one.transform.rotation
+    placed = compose(Pose(at.x, at.y, 2.0 * math.atan2(turned.z, turned.w)), base)
+    assert (placed.x, placed.y, wrap(placed.heading)) == pytest.approx((claim.x, claim.y, claim.heading))
+    first: Any = ros_base.DiagnosticArray.deserialize(found["diagnostics"])
+    told = [(one.status[0].level, one.status[0].message) for one in (first, second)]
+    assert told == [(1, "2 hypotheses"), (0, "localised")]
+    assert {one.key: one.value for one in first.status[0].values} == {
+        "tick": "1",
+        "hypotheses": "2",
+        "frame": "local",
+        "probability": "0.75",
+        "position_sigma_m": "",
+    }
+    assert received["pose"].empty()
 
 
 @pytest.mark.long

@@ -14,7 +14,9 @@ from protocol.network.timer import Timer
 from protocol.output import say
 from protocol.wire import MAX_SENT_BYTES, MalformedFrame, decode
 
-Topic = Literal["observation", "command", "report", "tick-start", "alive", "gone", "ended", "stop", "nothing"]
+Topic = Literal[
+    "observation", "command", "estimate", "report", "tick-start", "alive", "gone", "ended", "stop", "nothing"
+]
 """The kind of an event: a received frame ("observation" to "tick-start"), a liveliness token that appeared or
 disappeared, the end of the agent's process, a signal to stop, or a timeout."""
 

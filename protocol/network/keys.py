@@ -89,7 +89,7 @@ KEY_RULES: Mapping[Callable[..., str], Rule] = MappingProxyType(
         command: Rule("put", "robot", ("world", "viewer")),
         report: Rule("put", "robot", ("peer", "viewer")),
         tick_start: Rule("put", "world", ("world",)),
-        estimate: Rule("put", "robot", ("viewer",)),
+        estimate: Rule("put", "robot", ("world", "viewer")),
         world_alive: Rule("show", "world", ("robots", "viewer")),
         robot_alive: Rule("show", "robot", ("robot", "world", "viewer")),
     }

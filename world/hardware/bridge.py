@@ -20,7 +20,16 @@ from collections.abc import Callable
 import zenoh
 
 from protocol.journal.journal_file import Sink
-from protocol.messages import Cause, Command, FinalReport, MissionEnd, RobotConfig, TickStart, Verdict
+from protocol.messages import (
+    Cause,
+    Command,
+    Estimate,
+    FinalReport,
+    MissionEnd,
+    RobotConfig,
+    TickStart,
+    Verdict,
+)
 from protocol.network import keys, session
 from protocol.network.inbox import NO_ARRIVAL, Arrival, Inbox
 from protocol.wire import MAX_REPORT_BYTES, encode
@@ -88,6 +97,7 @@ class Field:
         answer. Observations and Commands are written to `journal`, which already contains the RobotConfig.
         """
         self._driver = driver
+        self._estimated: Callable[[Estimate], None] | None = getattr(driver, "estimated", None)
         self._config = config
         self._id, self._others = config.robot, config.others
         self.run = run
@@ -155,6 +165,8 @@ class Field:
         self._observation = session.publisher(link, keys.observation(run, me))
         self._tick_start = session.publisher(link, keys.tick_start(run, me))
         session.subscribe(link, keys.command(run, me), inbox, "command")
+        if self._estimated is not None:
+            session.subscribe(link, keys.estimate(run, me), inbox, "estimate")
         for robot in self._others:
             session.subscribe(link, keys.tick_start(run, robot), inbox, "tick-start")
         session.watch_liveliness(link, keys.robot_alive(run, "*"), inbox)
@@ -315,6 +327,8 @@ class Field:
         match arrival.topic:
             case "command":
                 return self._on_command(arrival)
+            case "estimate":
+                self._on_estimate(arrival)
             case "tick-start":
                 self._on_tick_start(arrival)
             case "alive":
@@ -340,6 +354,16 @@ class Field:
             self._unanswered.popleft()
             self._answered = time.monotonic()
         return command
+
+    def _on_estimate(self, arrival: Arrival) -> None:
+        """Give an Estimate to a driver that takes them. Raises DriverFailed."""
+        estimate: Estimate | None = self._inbox.accepted(arrival, Estimate)
+        if estimate is None or self._estimated is None:
+            return
+        try:
+            self._estimated(estimate)
+        except (Exception, SystemExit) as error:  # as above
+            raise DriverFailed(f"estimated(): {type(error).__name__}: {error}") from error
 
     def _on_tick_start(self, arrival: Arrival) -> None:
         """Set the time of the next tick from a TickStart of the robot that this one follows.

@@ -12,6 +12,7 @@ from typing import Protocol
 
 import msgspec
 
+from protocol.messages import Estimate
 from protocol.motion import Controls
 
 THINKING = 0.25
@@ -84,4 +85,14 @@ class Resumable(Driver, Protocol):
 
         This is called once after a restart, after `stop` and before the first `sense`. A later reading is not
         in the recording and has to be repeated: the next `executed` is the motion since the recorded one.
+        """
+
+
+class Reporting(Driver, Protocol):
+    """A driver that publishes what its robot knows, such as to the robot's navigation."""
+
+    def estimated(self, estimate: Estimate) -> None:
+        """Take the Estimate of the agent for a tick, mostly between `sense` and `drive` of that tick.
+
+        It may be late or missing, as a Command may. An exception ends the mission of this robot.
         """

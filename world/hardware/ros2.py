@@ -1,7 +1,9 @@
 """A driver for robots with ROS 2, through zenoh-bridge-ros2dds.
 
 The bridge maps each topic to the Zenoh key of the same name, with messages in CDR. The driver publishes
-geometry_msgs/Twist or TwistStamped, and subscribes to nav_msgs/Odometry and sensor_msgs/Range. It decides by
+geometry_msgs/Twist or TwistStamped, and what the robot knows: its pose, the transform from the frame of the
+anchors to that of its odometry, and diagnostics. It subscribes to nav_msgs/Odometry and sensor_msgs/Range,
+and decides by
 the time of arrival whether a message is fresh, and ignores the stamps, so the clocks need not be
 synchronised. It needs the extra `ros`.
 """
@@ -15,17 +17,22 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
 
+import numpy as np
 import zenoh
 from rosbags.typesys import Stores, get_typestore
 
-from protocol.messages import RobotConfig
-from protocol.motion import ORIGIN, Controls, Pose, heading_of, relative, wrap
+from protocol.messages import Estimate, RobotConfig
+from protocol.motion import ORIGIN, Controls, Covariance, Pose, compose, heading_of, inverse, relative, wrap
 from protocol.network import session
 from protocol.network.endpoints import at
 from world.hardware.driver import SENSING, Reading
 
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 ODOMETRY, RANGE = "nav_msgs/msg/Odometry", "sensor_msgs/msg/Range"
+POSE, TRANSFORM = "geometry_msgs/msg/PoseWithCovarianceStamped", "tf2_msgs/msg/TFMessage"
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+OK, WARNING = 0, 1
+"""The levels of a diagnostic_msgs/DiagnosticStatus: with a pose, and without."""
 BRIDGE_S = 10.0
 """The time in s to wait for the bridge."""
 REPEATS = 10
@@ -43,17 +50,72 @@ class TooClose(ValueError):
 
 
 def twist(v: float, omega: float, *, stamped: bool = False) -> bytes:
-    """Return the geometry_msgs/Twist with `v` m/s and `omega` rad/s, in CDR; a TwistStamped if `stamped`.
-
-    Its stamp is 0, which controllers replace by the time of arrival, in their own clock.
-    """
+    """Return the geometry_msgs/Twist with `v` m/s and `omega` rad/s, in CDR; a TwistStamped if `stamped`."""
     types = _types.types
     vector = types["geometry_msgs/msg/Vector3"]
     message = types[TWIST](linear=vector(v, 0.0, 0.0), angular=vector(0.0, 0.0, omega))
     if not stamped:
         return bytes(_types.serialize_cdr(message, TWIST))
-    header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, 0), "")
-    return bytes(_types.serialize_cdr(types[STAMPED](header=header, twist=message), STAMPED))
+    return bytes(_types.serialize_cdr(types[STAMPED](_header("", NO_STAMP), message), STAMPED))
+
+
+def claimed(pose: Pose, covariance: Covariance | None, frame: str, stamp: Any) -> bytes:
+    """Return the geometry_msgs/PoseWithCovarianceStamped of `pose`, in CDR.
+
+    The covariance is 0 where it is unknown, as for exact sensors, and for z, roll and pitch.
+    """
+    types, matrix = _types.types, np.zeros((6, 6))
+    if covariance is not None:
+        matrix[np.ix_((0, 1, 5), (0, 1, 5))] = covariance.matrix
+    at = types["geometry_msgs/msg/Point"](pose.x, pose.y, 0.0)
+    with_covariance = types["geometry_msgs/msg/PoseWithCovariance"](
+        types["geometry_msgs/msg/Pose"](at, _turned(pose.heading)), matrix.ravel()
+    )
+    return bytes(_types.serialize_cdr(types[POSE](_header(frame, stamp), with_covariance), POSE))
+
+
+def transform(pose: Pose, frame: str, child: str, stamp: Any) -> bytes:
+    """Return the tf2_msgs/TFMessage that has the frame `child` at `pose` in `frame`, in CDR."""
+    types = _types.types
+    moved = types["geometry_msgs/msg/Transform"](
+        types["geometry_msgs/msg/Vector3"](pose.x, pose.y, 0.0), _turned(pose.heading)
+    )
+    one = types["geometry_msgs/msg/TransformStamped"](_header(frame, stamp), child, moved)
+    return bytes(_types.serialize_cdr(types[TRANSFORM]([one]), TRANSFORM))
+
+
+def diagnostics(estimate: Estimate, stamp: Any) -> bytes:
+    """Return the diagnostic_msgs/DiagnosticArray about an Estimate, in CDR: OK with a claimed pose."""
+    types, possible = _types.types, estimate.world or estimate.local
+    sigma = estimate.covariance.position_sigma if estimate.covariance is not None else ""
+    values = {
+        "tick": estimate.tick,
+        "hypotheses": len(possible),
+        "frame": "world" if estimate.world else "local",
+        "probability": estimate.probabilities[0] if estimate.probabilities else "",
+        "position_sigma_m": sigma,
+    }
+    status = types["diagnostic_msgs/msg/DiagnosticStatus"](
+        level=OK if estimate.localised else WARNING,
+        name="tandem: localisation",
+        message="localised" if estimate.localised else f"{len(possible)} hypotheses",
+        hardware_id=estimate.robot,
+        values=[types["diagnostic_msgs/msg/KeyValue"](name, str(one)) for name, one in values.items()],
+    )
+    return bytes(_types.serialize_cdr(types[DIAGNOSTICS](_header("", stamp), [status]), DIAGNOSTICS))
+
+
+def _header(frame: str, stamp: Any) -> Any:
+    return _types.types["std_msgs/msg/Header"](stamp, frame)
+
+
+def _turned(heading: float) -> Any:
+    half = 0.5 * heading
+    return _types.types["geometry_msgs/msg/Quaternion"](0.0, 0.0, math.sin(half), math.cos(half))
+
+
+NO_STAMP = _types.types["builtin_interfaces/msg/Time"](0, 0)
+"""The stamp of a TwistStamped, which controllers replace by the time of arrival, in their own clock."""
 
 
 def decoded(payload: bytes, kind: str) -> Any:
@@ -121,12 +183,16 @@ class Ros2:
         anchor_range: str = "anchor_range",
         peer_range: str = "peer_range",
         stamped: str = "false",
+        pose: str = "pose",
+        tf: str = "tf",
+        diagnostics: str = "diagnostics",
+        map_frame: str = "map",
     ) -> None:
         """Connect to the bridge at the Zenoh endpoint `connect`. The other options are names of topics.
 
         In a group or a team, the range to robot ID is on the topic `peer_range`/ID, in a team that to the
         anchor ID on `anchor_range`/ID. If `stamped` is "true", messages on
-        `cmd_vel` are TwistStamped, otherwise Twist.
+        `cmd_vel` are TwistStamped, otherwise Twist. `map_frame` is the name of the frame of the anchors.
 
         Raises TimeoutError if there is no bridge within BRIDGE_S, and ValueError.
         """
@@ -144,6 +210,10 @@ class Ros2:
         """The reason by topic why the latest invalid message was refused, and the time of its arrival."""
         self._frames: tuple[str, str] | None = None
         """The frames of the odometry: that of the pose, and that of the robot."""
+        self._map_frame, self._tick, self._stamp = map_frame, -1, NO_STAMP
+        """The frame of the anchors, the tick of the latest reading, and the stamp of the latest odometry."""
+        self._odometry_in_map: Pose | None = None
+        """The frame of the odometry in that of the anchors; None while the robot does not claim its pose."""
         self._unsuitable: str | None = None
         """The reason why a sensor cannot serve this mission; None if it can."""
         self._last: Pose | None = None
@@ -169,7 +239,8 @@ class Ros2:
             time.sleep(0.05)
 
         link = self._open.enter_context(session.open_client(at(connect), unanswered))
-        self._cmd_vel = session.publisher(link, cmd_vel)
+        out = [session.publisher(link, topic) for topic in (cmd_vel, pose, tf, diagnostics)]
+        self._cmd_vel, self._claimed, self._tf, self._diagnostics = out
         self._odom = odom
         link.declare_subscriber(odom, lambda sample: self._on_odometry(sample.payload.to_bytes()))
         own = () if self._anchor is None else (self._anchor,)
@@ -194,7 +265,7 @@ class Ros2:
                 raise TimeoutError(f"no odometry since the robot stopped{self._why(self._odom, since)}")
             pose, _ = self._pose
             driven = executed(self._last or pose, pose, self._mission.period)
-            self._last = pose
+            self._last, self._tick = pose, tick
             anchor_range = self._fresh(self._anchor, since) if self._anchor is not None else None
             anchors = {one: self._fresh(topic, since) for one, topic in self._anchors.items()}
             mutual = [(robot, self._fresh(topic, since)) for robot, topic in self._peers.items()]
@@ -222,6 +293,18 @@ class Ros2:
 
         self._publisher = threading.Thread(target=publish, daemon=True)
         self._publisher.start()
+
+    def estimated(self, estimate: Estimate) -> None:
+        """Publish diagnostics, and a claimed pose; its transform follows with each odometry."""
+        with self._changed:
+            if estimate.tick != self._tick or self._last is None:
+                return  # the robot has moved since
+            pose = estimate.world[0] if estimate.localised and estimate.world else None
+            self._odometry_in_map = compose(pose, inverse(self._last)) if pose is not None else None
+            stamp = self._stamp
+        if pose is not None:
+            self._claimed.put(claimed(pose, estimate.covariance, self._map_frame, stamp))
+        self._diagnostics.put(diagnostics(estimate, stamp))
 
     def resume(self, tick: int, mark: tuple[float, ...]) -> None:  # noqa: ARG002  # the mark is a pose
         """Continue from the pose of the latest recorded reading. The odometry must not have been reset."""
@@ -262,11 +345,14 @@ class Ros2:
             self._refuse(self._odom, error)
             return
         with self._changed:
-            self._frames = frames
+            self._frames, self._stamp = frames, message.header.stamp
+            in_map = self._odometry_in_map
             before = self._pose[0] if self._pose is not None else ORIGIN
             heading = before.heading + wrap(pose.heading - before.heading)
             self._pose = Pose(pose.x, pose.y, heading), time.monotonic()
             self._changed.notify_all()
+        if in_map is not None:
+            self._tf.put(transform(in_map, self._map_frame, frames[0], message.header.stamp))
 
     def _on_range(self, topic: str) -> Callable[[zenoh.Sample], None]:
         reach, drop_outs = self._mission.sensing_range, self._mission.noise.drop_outs
