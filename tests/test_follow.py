@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from mcap.writer import Writer
+from msgspec.structs import asdict
 
 from agent.estimation.following import ClaimRule
 from compose.errors import BROKEN_PIPE, STOPPED_STATUS, USER_ERROR
@@ -23,6 +24,7 @@ from compose.recording.estimating.recorded_measurements import measurements
 from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.range_mcap import rows_as_they_arrive
 from compose.recording.ranging.range_recording import RangeRecording
+from protocol.motion import Pose, compose
 from tests.commands import tandem
 from tests.test_estimate import SAMPLE
 from tests.test_house import HOUSE
@@ -123,6 +125,28 @@ def test_a_robot_that_joins_a_stream_begins_the_estimate_again(messages: Message
         assert times == sorted(set(times))
         assert len(result.epochs[-1].claims) == 2
         assert times[-1] > end - 0.6
+
+
+def test_poses_in_a_stream_are_its_odometry(messages: Messages) -> None:
+    at: dict[object, Pose] = {}
+    early = [one for one in messages if one[0] <= 6.0]
+    poses: Messages = []
+    for t, topic, row in early:
+        match topic, row:
+            case "/odometry", {"robot": str(robot), "t0": float(t0), "dx": dx, "dy": dy, "dheading": turn}:
+                begin = at.get(robot) or Pose(7.0, -3.0, 2.0)
+                at[robot] = end = compose(begin, Pose(dx, dy, turn))  # type: ignore[arg-type]
+                for stamp, pose in ((t0, begin), (t, end)):
+                    poses.append((t, "/poses", {"robot": robot, "t": stamp, **asdict(pose)}))
+            case _:
+                poses.append((t, topic, row))
+
+    def times(some: Messages) -> list[tuple[float, str]]:
+        estimate = StreamEstimate("it", None, told_noise(PROFILE), ClaimRule())
+        rows = estimate.rows(rows_as_they_arrive(io.BytesIO(written(some)), "it"))
+        return [(row.t_s, row.robot) for row in rows]
+
+    assert times(poses) == times(early) != []
 
 
 @pytest.mark.long

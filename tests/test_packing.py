@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import tarfile
 import zipfile
+from functools import partial
 from pathlib import Path, PurePath
 
 import pytest
@@ -94,3 +96,27 @@ def test_a_wheel_has_the_packages_with_their_data_and_types_and_nothing_else(
     assert names == tracked(tree, "tandem", "agent", "world", "protocol", "compose") | compiled
     assert not compiled & tracked(tree, "agent")
     assert {f"{package}/py.typed" for package in ("tandem", "agent", "world", "protocol", "compose")} <= names
+
+
+@pytest.mark.long("slow")
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("version", ["3.11", "3.12", "3.13"])
+def test_a_wheel_works_without_a_clone(version: str, tree: Path, tmp_path: Path) -> None:
+    """The environment is empty, and has the Python of this version that is on this machine."""
+    wheel, environment = built(tree, "wheel", tmp_path / "wheel"), tmp_path / "environment"
+    apart = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    run = partial(subprocess.run, cwd=tmp_path, env=apart, capture_output=True, text=True, check=False)
+    uv = ("uv", "--no-config", "--no-python-downloads")
+    if run([*uv, "venv", "-q", "--python", version, environment]).returncode:
+        pytest.skip(f"there is no Python {version}")
+    made = run([*uv, "pip", "install", "-q", "--python", environment, wheel])
+    if made.returncode:
+        pytest.skip(f"there is no package index: {made.stderr}")
+    for words in (
+        "run paper-1 --out recording",
+        "export recording --html",
+        "estimate recording",
+        "run noisy",
+    ):
+        ended = run([environment / "bin" / "tandem", *words.split()])
+        assert (ended.returncode, ended.stderr) == (0, ""), words
