@@ -552,7 +552,7 @@ def test_a_wrong_head_of_a_table_is_refused(head: str, says: str, tmp_path: Path
 def test_what_is_no_recording_is_refused_with_the_formats(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("hello")
     formats = (
-        "it is not a .pyfg file, an .mcap file, a folder with ranges.csv and odometry.csv or poses.csv, or a "
+        "it is not a .pyfg file, an .mcap file, a folder with ranges.csv and odometry.csv or poses.csv, a "
     )
     assert refused(tmp_path / "notes.txt").startswith(f"{tmp_path}/notes.txt: {formats}")
     assert refused(tmp_path).startswith(f"{tmp_path}: {formats}")

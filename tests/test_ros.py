@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import closing
@@ -17,6 +18,7 @@ import pytest
 import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
+from zenoh import ext
 
 from compose.launch.processes import free_endpoint
 from compose.scenario.scenario_file import parse
@@ -28,6 +30,7 @@ from tests import ros_base
 from tests.commands import BOUND_S, TandemProcess, tandem
 from world.hardware import ros2
 from world.hardware.driver import Reading
+from world.hardware.ros2_topics import GID_BYTES, JAZZY, QOS, decoded, rmw_type
 
 LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 """The encapsulation header of CDR (OMG DDSI-RTPS 10.5): CDR_LE without options."""
@@ -62,11 +65,11 @@ ODOMETRY = (
 
 
 def odometry(payload: bytes) -> Pose:
-    return ros2.odometry(ros2.decoded(payload, ros2.ODOMETRY))
+    return ros2.odometry(decoded(payload, ros2.ODOMETRY))
 
 
 def ranged(payload: bytes, reach: float) -> float | None:
-    return ros2.ranged(ros2.decoded(payload, ros2.RANGE), reach)
+    return ros2.ranged(decoded(payload, ros2.RANGE), reach)
 
 
 def test_a_twist_is_the_bytes_of_the_specification_and_of_another_library() -> None:
@@ -353,32 +356,45 @@ def test_a_driver_sends_stamped_twists_if_it_is_told_to(stamped: str, sent: byte
         ros2.Ros2(config, 60.0, connect=endpoint, stamped="yes")
 
 
+def test_a_range_of_jazzy_which_has_a_variance_is_read() -> None:
+    types = JAZZY.types
+    header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](7, 8), "uwb")
+    message = types["sensor_msgs/msg/Range"](header, 0, 0.1, 0.1, 50.0, 2.5, 0.01)
+    assert ranged(bytes(JAZZY.serialize_cdr(message, "sensor_msgs/msg/Range")), 3.0) == 2.5
+
+
 def put(queue: SimpleQueue[bytes], sample: zenoh.Sample) -> None:
     queue.put(sample.payload.to_bytes())
 
 
-def test_pose_and_transform_are_published_while_the_robot_claims_its_pose_and_diagnostics_always() -> None:
+@pytest.mark.parametrize("domain", ["", "3"])
+def test_a_claimed_pose_and_its_transform_are_published_and_diagnostics_always(domain: str) -> None:
     """Another library decodes them. The odometry is at `base`, and the claim says where its frame is."""
     config, endpoint, base = parse(SCENARIO, "ros").config("a"), free_endpoint(), Pose(2.0, -1.0, 3.0)
     claim, covariance = Pose(-4.0, 7.0, 0.5), Covariance(1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
     several = Estimate(1, "a", (ORIGIN, claim), (), localised=False, probabilities=(0.75, 0.25))
     claimed = Estimate(2, "a", (), (claim,), localised=True, probabilities=(1.0,), covariance=covariance)
     received: dict[str, SimpleQueue[bytes]] = {name: SimpleQueue() for name in ("pose", "tf", "diagnostics")}
+
+    def key(topic: str) -> str:
+        return f"3/{topic}/{rmw_type(TOPIC_TYPES[topic])}" if domain else topic
+
     with session.open_router(listening(endpoint)) as link:
         for name, queue in received.items():
-            link.declare_subscriber(name, partial(put, queue))
-        odom = session.publisher(link, "odom")
-        with closing(ros2.Ros2(config, 60.0, connect=endpoint)) as driver, ThreadPoolExecutor(1) as pool:
+            link.declare_subscriber(key(name), partial(put, queue))
+        odom = session.publisher(link, key("odom"))
+        with (
+            closing(ros2.Ros2(config, 60.0, connect=endpoint, domain=domain)) as driver,
+            ThreadPoolExecutor(1) as pool,
+        ):
             driver.estimated(several)  # of a tick without a reading
             for estimate in (several, claimed):
                 driver.stop()
-                for topic in ("anchor_range", "peer_range"):
-                    session.publisher(link, topic).put(ros_base.ranged(2.5))
                 reading = pool.submit(driver.sense, estimate.tick)
                 while not reading.done():
                     odom.put(ros_base.odometry(base, frame="a/odom"))
                     for topic in ("anchor_range", "peer_range"):
-                        session.publisher(link, topic).put(ros_base.ranged(2.5))
+                        session.publisher(link, key(topic)).put(ros_base.ranged(2.5))
                     wait([reading], 0.01)
                 driver.estimated(estimate)
             odom.put(ros_base.odometry(base, frame="a/odom"))
@@ -409,6 +425,54 @@ def test_pose_and_transform_are_published_while_the_robot_claims_its_pose_and_di
         "position_sigma_m": "",
     }
     assert received["pose"].empty()
+
+
+TOPIC_TYPES = {
+    "odom": "nav_msgs/msg/Odometry",
+    "anchor_range": "sensor_msgs/msg/Range",
+    "peer_range": "sensor_msgs/msg/Range",
+    "pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "tf": "tf2_msgs/msg/TFMessage",
+    "diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+}
+HASHES = {
+    "std_msgs/msg/String": "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
+    "geometry_msgs/msg/TwistStamped": "5f0fcd4f81d5d06ad9b4c4c63e3ea51b82d6ae4d0558f1d475229b1121db6f64",
+}
+"""The hashes of types: that in the design document of rmw_zenoh, and one that a node of ROS 2 used."""
+
+
+def test_a_node_of_rmw_zenoh_has_the_keys_tokens_and_attachments_of_its_design() -> None:
+    """Attachments are a sequence number from 1, a time in ns and 16 bytes, as Zenoh serializes them."""
+    for kind, digest in HASHES.items():
+        package, _, name = kind.split("/")
+        assert rmw_type(kind) == f"{package}::msg::dds_::{name}_/RIHS01_{digest}"
+    config, endpoint = parse(SCENARIO, "ros").config("a"), free_endpoint()
+    received: SimpleQueue[zenoh.Sample] = SimpleQueue()
+    shown: SimpleQueue[zenoh.Sample] = SimpleQueue()
+    twist = rmw_type("geometry_msgs/msg/TwistStamped")
+    with session.open_router(listening(endpoint)) as link:
+        link.declare_subscriber(f"3/bot/cmd_vel/{twist}", received.put)
+        link.liveliness().declare_subscriber("@ros2_lv/3/**", shown.put)
+        options = {"connect": endpoint, "stamped": "true", "cmd_vel": "/bot/cmd_vel", "domain": "3"}
+        with closing(ros2.Ros2(config, 60.0, **options)) as driver:
+            driver.stop()
+            driver.stop()
+            samples = [received.get(timeout=BOUND_S) for _ in range(2)]
+            tokens = [str(shown.get(timeout=BOUND_S).key_expr) for _ in range(8)]
+    numbers = []
+    for sample in samples:
+        assert sample.attachment is not None
+        number, sent_ns, gid = ext.z_deserialize(tuple[ext.Int64, ext.Int64, bytes], sample.attachment)
+        assert abs(sent_ns / 1e9 - time.time()) < BOUND_S
+        assert len(gid) == GID_BYTES
+        numbers.append(int(number))
+    assert numbers == [1, 2]
+    (zid,) = {token.split("/")[2] for token in tokens}
+    assert f"@ros2_lv/3/{zid}/0/0/NN/%/%/tandem_a" in tokens
+    assert f"@ros2_lv/3/{zid}/0/1/MP/%/%/tandem_a/%bot%cmd_vel/{twist}/{QOS}" in tokens
+    assert sum("/MS/" in token for token in tokens) == 3
+    assert len({token.split("/")[4] for token in tokens}) == len(tokens)
 
 
 @pytest.mark.long

@@ -1,6 +1,6 @@
-"""A driver for robots with ROS 2, through zenoh-bridge-ros2dds.
+"""A driver for robots with ROS 2, through zenoh-bridge-ros2dds or rmw_zenoh.
 
-The bridge maps each topic to the Zenoh key of the same name, with messages in CDR. The driver publishes
+Messages are in CDR (see `ros2_topics`). The driver publishes
 geometry_msgs/Twist or TwistStamped, and what the robot knows: its pose, the transform from the frame of the
 anchors to that of its odometry, and diagnostics. It subscribes to nav_msgs/Odometry and sensor_msgs/Range,
 and decides by
@@ -18,14 +18,13 @@ from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
-import zenoh
-from rosbags.typesys import Stores, get_typestore
 
 from protocol.messages import Estimate, RobotConfig
 from protocol.motion import ORIGIN, Controls, Covariance, Pose, compose, heading_of, inverse, relative, wrap
 from protocol.network import session
 from protocol.network.endpoints import at
 from world.hardware.driver import SENSING, Reading
+from world.hardware.ros2_topics import HUMBLE, RosTopics, decoded
 
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 ODOMETRY, RANGE = "nav_msgs/msg/Odometry", "sensor_msgs/msg/Range"
@@ -42,8 +41,6 @@ TOO_CLOSE = -math.inf
 SINGLE = 1e-6
 """The relative rounding error of the single-precision numbers of a sensor_msgs/Range, and some margin."""
 
-_types = get_typestore(Stores.ROS2_HUMBLE)
-
 
 class TooClose(ValueError):
     """A sensor_msgs/Range of a sensor that is too close to measure a range. It is in range, however."""
@@ -51,12 +48,12 @@ class TooClose(ValueError):
 
 def twist(v: float, omega: float, *, stamped: bool = False) -> bytes:
     """Return the geometry_msgs/Twist with `v` m/s and `omega` rad/s, in CDR; a TwistStamped if `stamped`."""
-    types = _types.types
+    types = HUMBLE.types
     vector = types["geometry_msgs/msg/Vector3"]
     message = types[TWIST](linear=vector(v, 0.0, 0.0), angular=vector(0.0, 0.0, omega))
     if not stamped:
-        return bytes(_types.serialize_cdr(message, TWIST))
-    return bytes(_types.serialize_cdr(types[STAMPED](_header("", NO_STAMP), message), STAMPED))
+        return bytes(HUMBLE.serialize_cdr(message, TWIST))
+    return bytes(HUMBLE.serialize_cdr(types[STAMPED](_header("", NO_STAMP), message), STAMPED))
 
 
 def claimed(pose: Pose, covariance: Covariance | None, frame: str, stamp: Any) -> bytes:
@@ -64,29 +61,29 @@ def claimed(pose: Pose, covariance: Covariance | None, frame: str, stamp: Any) -
 
     The covariance is 0 where it is unknown, as for exact sensors, and for z, roll and pitch.
     """
-    types, matrix = _types.types, np.zeros((6, 6))
+    types, matrix = HUMBLE.types, np.zeros((6, 6))
     if covariance is not None:
         matrix[np.ix_((0, 1, 5), (0, 1, 5))] = covariance.matrix
     at = types["geometry_msgs/msg/Point"](pose.x, pose.y, 0.0)
     with_covariance = types["geometry_msgs/msg/PoseWithCovariance"](
         types["geometry_msgs/msg/Pose"](at, _turned(pose.heading)), matrix.ravel()
     )
-    return bytes(_types.serialize_cdr(types[POSE](_header(frame, stamp), with_covariance), POSE))
+    return bytes(HUMBLE.serialize_cdr(types[POSE](_header(frame, stamp), with_covariance), POSE))
 
 
 def transform(pose: Pose, frame: str, child: str, stamp: Any) -> bytes:
     """Return the tf2_msgs/TFMessage that has the frame `child` at `pose` in `frame`, in CDR."""
-    types = _types.types
+    types = HUMBLE.types
     moved = types["geometry_msgs/msg/Transform"](
         types["geometry_msgs/msg/Vector3"](pose.x, pose.y, 0.0), _turned(pose.heading)
     )
     one = types["geometry_msgs/msg/TransformStamped"](_header(frame, stamp), child, moved)
-    return bytes(_types.serialize_cdr(types[TRANSFORM]([one]), TRANSFORM))
+    return bytes(HUMBLE.serialize_cdr(types[TRANSFORM]([one]), TRANSFORM))
 
 
 def diagnostics(estimate: Estimate, stamp: Any) -> bytes:
     """Return the diagnostic_msgs/DiagnosticArray about an Estimate, in CDR: OK with a claimed pose."""
-    types, possible = _types.types, estimate.world or estimate.local
+    types, possible = HUMBLE.types, estimate.world or estimate.local
     sigma = estimate.covariance.position_sigma if estimate.covariance is not None else ""
     values = {
         "tick": estimate.tick,
@@ -102,28 +99,20 @@ def diagnostics(estimate: Estimate, stamp: Any) -> bytes:
         hardware_id=estimate.robot,
         values=[types["diagnostic_msgs/msg/KeyValue"](name, str(one)) for name, one in values.items()],
     )
-    return bytes(_types.serialize_cdr(types[DIAGNOSTICS](_header("", stamp), [status]), DIAGNOSTICS))
+    return bytes(HUMBLE.serialize_cdr(types[DIAGNOSTICS](_header("", stamp), [status]), DIAGNOSTICS))
 
 
 def _header(frame: str, stamp: Any) -> Any:
-    return _types.types["std_msgs/msg/Header"](stamp, frame)
+    return HUMBLE.types["std_msgs/msg/Header"](stamp, frame)
 
 
 def _turned(heading: float) -> Any:
     half = 0.5 * heading
-    return _types.types["geometry_msgs/msg/Quaternion"](0.0, 0.0, math.sin(half), math.cos(half))
+    return HUMBLE.types["geometry_msgs/msg/Quaternion"](0.0, 0.0, math.sin(half), math.cos(half))
 
 
-NO_STAMP = _types.types["builtin_interfaces/msg/Time"](0, 0)
+NO_STAMP = HUMBLE.types["builtin_interfaces/msg/Time"](0, 0)
 """The stamp of a TwistStamped, which controllers replace by the time of arrival, in their own clock."""
-
-
-def decoded(payload: bytes, kind: str) -> Any:
-    """Return the message of this type in CDR. Raises ValueError."""
-    try:
-        return _types.deserialize_cdr(payload, kind)
-    except Exception as error:  # noqa: BLE001  # the library raises all kinds of errors for malformed bytes
-        raise ValueError(f"not a {kind}: {error}") from None
 
 
 def odometry(message: Any) -> Pose:
@@ -187,20 +176,21 @@ class Ros2:
         tf: str = "tf",
         diagnostics: str = "diagnostics",
         map_frame: str = "map",
+        domain: str = "",
     ) -> None:
         """Connect to the bridge at the Zenoh endpoint `connect`. The other options are names of topics.
 
         In a group or a team, the range to robot ID is on the topic `peer_range`/ID, in a team that to the
         anchor ID on `anchor_range`/ID. If `stamped` is "true", messages on
         `cmd_vel` are TwistStamped, otherwise Twist. `map_frame` is the name of the frame of the anchors.
+        With a ROS domain, `domain`, it talks to rmw_zenoh by the router at `connect`, in place of a bridge.
 
         Raises TimeoutError if there is no bridge within BRIDGE_S, and ValueError.
         """
         if stamped not in ("true", "false"):
             raise ValueError(f"stamped: '{stamped}', expected true or false")
         self._stamped = stamped == "true"
-        self._mission = config.mission
-        self._manoeuvre_s = manoeuvre_s
+        self._mission, self._manoeuvre_s = config.mission, manoeuvre_s
         self._changed = threading.Condition()
         self._pose: tuple[Pose, float] | None = None
         """The latest pose, with its heading not wrapped, and the time of its arrival."""
@@ -239,14 +229,17 @@ class Ros2:
             time.sleep(0.05)
 
         link = self._open.enter_context(session.open_client(at(connect), unanswered))
-        out = [session.publisher(link, topic) for topic in (cmd_vel, pose, tf, diagnostics)]
-        self._cmd_vel, self._claimed, self._tf, self._diagnostics = out
+        topics = RosTopics(link, f"tandem_{config.robot}".replace("-", "_"), domain)
+        out = ((cmd_vel, STAMPED if self._stamped else TWIST), (pose, POSE), (tf, TRANSFORM))
+        self._cmd_vel, self._claimed, self._tf, self._diagnostics = [
+            topics.publisher(topic, kind) for topic, kind in (*out, (diagnostics, DIAGNOSTICS))
+        ]
         self._odom = odom
-        link.declare_subscriber(odom, lambda sample: self._on_odometry(sample.payload.to_bytes()))
+        topics.subscribe(odom, ODOMETRY, self._on_odometry)
         own = () if self._anchor is None else (self._anchor,)
         self._topics = (*own, *self._anchors.values(), *self._peers.values())
         for topic in self._topics:
-            link.declare_subscriber(topic, self._on_range(topic))
+            topics.subscribe(topic, RANGE, self._on_range(topic))
 
     def sense(self, tick: int) -> Reading:
         """Return the messages that have arrived since the robot stopped.
@@ -287,9 +280,9 @@ class Ros2:
 
         def publish() -> None:
             while not ended.is_set() and (left := until - time.monotonic()) > 0.0:
-                self._cmd_vel.put(payload)
+                self._cmd_vel(payload)
                 ended.wait(min(left, self._manoeuvre_s / REPEATS))
-            self._cmd_vel.put(self._twist(0.0, 0.0))
+            self._cmd_vel(self._twist(0.0, 0.0))
 
         self._publisher = threading.Thread(target=publish, daemon=True)
         self._publisher.start()
@@ -303,8 +296,8 @@ class Ros2:
             self._odometry_in_map = compose(pose, inverse(self._last)) if pose is not None else None
             stamp = self._stamp
         if pose is not None:
-            self._claimed.put(claimed(pose, estimate.covariance, self._map_frame, stamp))
-        self._diagnostics.put(diagnostics(estimate, stamp))
+            self._claimed(claimed(pose, estimate.covariance, self._map_frame, stamp))
+        self._diagnostics(diagnostics(estimate, stamp))
 
     def resume(self, tick: int, mark: tuple[float, ...]) -> None:  # noqa: ARG002  # the mark is a pose
         """Continue from the pose of the latest recorded reading. The odometry must not have been reset."""
@@ -318,7 +311,7 @@ class Ros2:
         """End the manoeuvre, and publish a Twist of zero."""
         self._end_drive()
         self._rest_since = min(self._rest_since, time.monotonic())
-        self._cmd_vel.put(self._twist(0.0, 0.0))
+        self._cmd_vel(self._twist(0.0, 0.0))
 
     def close(self) -> None:
         """Stop the robot and disconnect from the bridge."""
@@ -352,15 +345,15 @@ class Ros2:
             self._pose = Pose(pose.x, pose.y, heading), time.monotonic()
             self._changed.notify_all()
         if in_map is not None:
-            self._tf.put(transform(in_map, self._map_frame, frames[0], message.header.stamp))
+            self._tf(transform(in_map, self._map_frame, frames[0], message.header.stamp))
 
-    def _on_range(self, topic: str) -> Callable[[zenoh.Sample], None]:
+    def _on_range(self, topic: str) -> Callable[[bytes], None]:
         reach, drop_outs = self._mission.sensing_range, self._mission.noise.drop_outs
 
-        def take(sample: zenoh.Sample) -> None:
+        def take(payload: bytes) -> None:
             unsuitable = None
             try:
-                message = decoded(sample.payload.to_bytes(), RANGE)
+                message = decoded(payload, RANGE)
                 rho = ranged(message, reach)
                 if 0.0 < message.max_range < reach * (1.0 - SINGLE):
                     unsuitable = f"{topic}: max_range is {message.max_range:.6g} m, less than the mission's "
