@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import sqlite3
 from collections.abc import Callable
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -212,6 +214,8 @@ TILTED.pose.pose.orientation.x = 1.0
     ("mapping", "messages", "says"),
     [
         (f"{A}speed = 1", FEW, "/map.toml: topic[0]: unknown field 'speed'"),
+        (f"{A}{A[12:]}", FEW, "/map.toml: topic: there are two of one name"),
+        (f"{A}scale = 0", FEW, "/map.toml: topic[0].scale: expected 'float' > 0"),
         ("bag = 1", FEW, "/map.toml: bag: expected 'str', got 'int'"),
         ('bag = "other"', FEW, "/other cannot be read: No such file or directory"),
         (
@@ -267,6 +271,21 @@ def test_what_does_not_fit_is_one_line_with_its_place(
 ) -> None:
     said = refused(written(tmp_path, messages, StoragePlugin.MCAP, mapping))
     assert said.startswith(f"{tmp_path}{says.format(tmp_path)}"), said
+
+
+def test_a_bag_of_ros_1_is_read_like_one_of_ros_2(tmp_path: Path) -> None:
+    one, two = get_typestore(Stores.ROS1_NOETIC), tmp_path / "two"
+    with Ros1Writer(tmp_path / "one.bag") as writer:
+        on = writer.add_connection("/a/odom", ODOMETRY, typestore=one)
+        for _, _, t, message in FEW[:2]:
+            of_one = one.types["std_msgs/msg/Header"](7, message.header.stamp, message.header.frame_id)
+            data = one.serialize_ros1(dataclasses.replace(message, header=of_one), ODOMETRY)
+            writer.write(on, round((BEGIN_S + t) * 1e9), data)
+    (tmp_path / "one.toml").write_text(A.replace('"bag"', '"one.bag"'))
+    two.mkdir()
+    expected = read_ranges(written(two, FEW, StoragePlugin.MCAP, A)).robots[0].odometry
+    for column, its in zip(read_ranges(tmp_path / "one.toml").robots[0].odometry, expected, strict=True):
+        np.testing.assert_array_equal(column, its)
 
 
 @pytest.mark.parametrize("stamps", ["header", "received"])

@@ -69,7 +69,7 @@ def read_ranges(path: Path, anchors_csv: Path | None = None) -> RangeRecording:
                 builder.add(row, place)
         elif path.suffix == ".pyfg":
             add_pyfg(builder, path, _text(path))
-        elif path.suffix in (".toml", ".db3"):
+        elif path.suffix in (".toml", ".db3", ".bag"):
             need("rosbags", extra="ros")
             from compose.recording.ranging.ros_bag import add_bag  # noqa: PLC0415  # optional
 

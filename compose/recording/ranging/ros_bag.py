@@ -9,9 +9,10 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
+from msgspec import Meta
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
@@ -41,6 +42,10 @@ DISTANCES = {"sensor_msgs/msg/Range": "range"}
 """The field with the distance in each type of message that is known to have one."""
 
 
+Scale = Annotated[float, Meta(gt=0.0, le=1e6)]
+"""A unit of length in m."""
+
+
 class TopicTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One `[[topic]]`: poses of a robot, or ranges; its type decides, or `distance`.
 
@@ -59,7 +64,7 @@ class TopicTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """In place of `to`: the field with its name or number."""
     distance: str = ""
     """The field with the distance, of messages that are no sensor_msgs/Range."""
-    scale: float = 1.0
+    scale: Scale = 1.0
     """The unit of the distance in m, such as 0.001."""
     sigma: StatedSigma | None = None
     """The standard deviation of the ranges in m; left out: the recording states none."""
@@ -128,6 +133,8 @@ def _messages(path: Path, table: BagFile, unused: Counter[str]) -> Iterator[_Mes
     bag.stat()  # the error of the library does not name the file
     try:
         with AnyReader([bag], default_typestore=_types(path, table.types)) as reader:
+            if len(topics) < len(table.topic):
+                raise BadRecording(f"{path}: topic: there are two of one name")
             there = {f"messages on {one.topic} ({one.msgtype})": one for one in reader.connections}
             if missing := sorted(topics.keys() - reader.topics.keys()):
                 names = ", ".join([f"{name}: {one.msgcount}" for name, one in there.items()])
