@@ -229,17 +229,17 @@ class Ros2:
             time.sleep(0.05)
 
         link = self._open.enter_context(session.open_client(at(connect), unanswered))
-        topics = RosTopics(link, f"tandem_{config.robot}".replace("-", "_"), domain)
+        self._node = RosTopics(link, f"tandem_{config.robot}".replace("-", "_"), domain)
         out = ((cmd_vel, STAMPED if self._stamped else TWIST), (pose, POSE), (tf, TRANSFORM))
         self._cmd_vel, self._claimed, self._tf, self._diagnostics = [
-            topics.publisher(topic, kind) for topic, kind in (*out, (diagnostics, DIAGNOSTICS))
+            self._node.publisher(topic, kind) for topic, kind in (*out, (diagnostics, DIAGNOSTICS))
         ]
         self._odom = odom
-        topics.subscribe(odom, ODOMETRY, self._on_odometry)
+        self._node.subscribe(odom, ODOMETRY, self._on_odometry)
         own = () if self._anchor is None else (self._anchor,)
         self._topics = (*own, *self._anchors.values(), *self._peers.values())
         for topic in self._topics:
-            topics.subscribe(topic, RANGE, self._on_range(topic))
+            self._node.subscribe(topic, RANGE, self._on_range(topic))
 
     def sense(self, tick: int) -> Reading:
         """Return the messages that have arrived since the robot stopped.
