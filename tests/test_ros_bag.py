@@ -273,6 +273,15 @@ def test_what_does_not_fit_is_one_line_with_its_place(
     assert said.startswith(f"{tmp_path}{says.format(tmp_path)}"), said
 
 
+def test_a_bag_without_a_mapping_is_refused_with_its_topics(tmp_path: Path) -> None:
+    written(tmp_path, FEW, StoragePlugin.SQLITE3)
+    (data,) = (tmp_path / "bag").glob("*.db3")
+    moved = data.rename(tmp_path / "a 'robot'.db3")
+    there = f"messages on /a/odom ({ODOMETRY}): 2, messages on /uwb ({UWB}): 1"
+    hint = "a .toml file maps topics of ROS"
+    assert refused(moved) == f"{moved}: there is no odometry, but {there}; {hint}"
+
+
 def test_a_bag_of_ros_1_is_read_like_one_of_ros_2(tmp_path: Path) -> None:
     one, two = get_typestore(Stores.ROS1_NOETIC), tmp_path / "two"
     with Ros1Writer(tmp_path / "one.bag") as writer:
@@ -327,5 +336,3 @@ def test_the_command_line_says_what_it_does_not_use(run: RangeRecording, tmp_pat
     path = written(tmp_path, messages_of(run), StoragePlugin.SQLITE3, mapped(run))
     ended = tandem("estimate", path)
     assert f"not used: messages on /chat ({TEXT}): 1, ranges on /uwb that are none: " in ended.out
-    (data,) = (tmp_path / "bag").glob("*.db3")
-    assert refused(data).startswith(f"{data}: there is no odometry, but ")

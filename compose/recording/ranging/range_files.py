@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -73,7 +74,9 @@ def read_ranges(path: Path, anchors_csv: Path | None = None) -> RangeRecording:
             need("rosbags", extra="ros")
             from compose.recording.ranging.ros_bag import add_bag  # noqa: PLC0415  # optional
 
-            add_bag(builder, path, _text(path) if path.suffix == ".toml" else f"bag = '{path.name}'")
+            add_bag(
+                builder, path, _text(path) if path.suffix == ".toml" else f"bag = {json.dumps(path.name)}"
+            )
         elif path.suffix == ".mcap":
             need("mcap")
             from compose.recording.ranging.range_mcap import add_mcap  # noqa: PLC0415  # optional
