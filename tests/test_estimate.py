@@ -517,7 +517,7 @@ def test_the_rows_of_the_table_of_claims_get_no_worse_and_no_claim_is_wrong(
     starts_s: Sequence[float],
     least: LeastRow,
 ) -> None:
-    """The part of the table in docs/howto-estimate.md that the sample allows: two robots, and 30 s.
+    """The part of the table of docs/recorded_claims.py that the sample allows: two robots, and 30 s.
 
     The bounds are those of the commit that wrote them. With fits that begin again after every two steps, the
     pairs with outliers claim after 26 s in place of 16 s, and fewer do.
