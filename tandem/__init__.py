@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from tandem.sweeps import SweepResults as SweepResults
     from tandem.sweeps import sweep as sweep
     from tandem.worlds import World as World
+    from tandem.worlds import parallel_env as parallel_env
 
     open = open_recording  # noqa: A001  # used as tandem.open
 
@@ -55,6 +56,7 @@ _PLACES = {
     "SweepResults": "tandem.sweeps:SweepResults",
     "Table": "tandem.columns:Table",
     "World": "tandem.worlds:World",
+    "parallel_env": "tandem.worlds:parallel_env",
     "Findings": "compose.audit.findings:Findings",
     "Violation": "compose.audit.findings:Violation",
     "ModuleClash": "tandem.clash:ModuleClash",

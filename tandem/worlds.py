@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from compose.errors import UserError
+from compose.extras import need
 from compose.recording.reasons import reason_for
-from protocol.messages import Command, MissionEnd, Observation
+from protocol.messages import Command, MissionEnd, Observation, RobotConfig
 from protocol.motion import Controls, Pose
 from protocol.spelling import did_you_mean
 from protocol.wire import decode, encode
@@ -18,6 +19,8 @@ from world.tick import advance, observations, release
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from tandem.environments import Environment
 
 
 class World:
@@ -64,6 +67,12 @@ class World:
         """The reason for an outcome other than `localised`."""
         return None if self._end is None else reason_for(self._end)
 
+    def config(self, robot: str) -> RobotConfig:
+        """Return what `robot` is told before it starts, with which its `Planner` starts. Raises UserError."""
+        if robot not in (ids := self.scenario.robots):
+            raise UserError(f"no robot '{robot}'; there are {', '.join(ids)}{did_you_mean(str(robot), ids)}")
+        return self.scenario.template.scenario.config(robot)
+
     def observe(self) -> dict[str, Observation]:
         """Return what each robot measures and receives in this tick; the same whenever it is called."""
         return {one.robot: one for one in observations(self._state)}
@@ -79,8 +88,12 @@ class World:
             raise UserError(f"commands: not a dict of commands by robot: {type(commands).__name__}")
         if self._end is not None:
             raise UserError(f"the world has ended: {self._end.outcome}")
+        return self._advanced({robot: self._command(robot, one) for robot, one in commands.items()})
+
+    def _advanced(self, commands: Mapping[str, Command]) -> World:
+        """Return the world after valid `commands`, as `step`."""
         after = copy(self)
-        onward = advance(self._state, {robot: self._command(robot, one) for robot, one in commands.items()})
+        onward = advance(self._state, commands)
         if isinstance(onward, MissionEnd):
             after._end = onward
         else:
@@ -106,3 +119,24 @@ class World:
 
     def __repr__(self) -> str:
         return f"<World {self.scenario.name}, seed {self.scenario.seed}: tick {self.tick}>"
+
+
+def parallel_env(
+    scenario: Scenario | str | Path | Mapping[str, Any], *, seed: int | None = None
+) -> Environment:
+    """Return a PettingZoo `ParallelEnv` in which a policy drives the robots of `scenario`.
+
+    `seed` is that of the first mission, by default that of the scenario. Raises UserError for invalid
+    arguments, and without the extra `rl`.
+
+    >>> import tandem
+    >>> env = tandem.parallel_env("random")
+    >>> seen, infos = env.reset(seed=7)
+    >>> env.step({robot: env.action_space(robot).sample() for robot in env.agents})[1]
+    {'a': -1.0, 'b': -1.0}
+    """
+    need("gymnasium", "pettingzoo", extra="rl")
+    from tandem.environments import Environment  # noqa: PLC0415  # optional
+
+    chosen = scenario_of(scenario)
+    return Environment(chosen if seed is None else chosen.with_(seed=seed))

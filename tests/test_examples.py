@@ -23,7 +23,15 @@ SMALL: dict[str, dict[str, Any]] = {
     "estimate_ranges": {},
 }
 """The arguments with which `main` of each example takes seconds."""
-WITHOUT_FIGURE = ("group_planner", "gtsam_solver", "last_manoeuvre", "own_driver", "own_radio", "seek")
+WITHOUT_FIGURE = (
+    "environment",
+    "group_planner",
+    "gtsam_solver",
+    "last_manoeuvre",
+    "own_driver",
+    "own_radio",
+    "seek",
+)
 """The examples that only print."""
 MAX_LINES = 120
 """The bound on the lines of an example: a factor graph takes the most."""
