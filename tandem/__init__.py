@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from tandem.scenarios import Scenario as Scenario
     from tandem.sweeps import SweepIncomplete as SweepIncomplete
     from tandem.sweeps import SweepResults as SweepResults
+    from tandem.sweeps import arena as arena
     from tandem.sweeps import sweep as sweep
     from tandem.worlds import World as World
     from tandem.worlds import parallel_env as parallel_env
@@ -48,6 +49,7 @@ _PLACES = {
     "run": "tandem.missions:run",
     "open": "tandem.results:open_recording",
     "sweep": "tandem.sweeps:sweep",
+    "arena": "tandem.sweeps:arena",
     "estimate": "tandem.estimates:estimate",
     "PoseEstimates": "tandem.estimates:PoseEstimates",
     "Run": "tandem.results:Run",

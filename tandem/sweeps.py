@@ -24,6 +24,7 @@ from tandem.scenarios import Scenario, plain, scenario_of
 
 if TYPE_CHECKING:
     from compose.sweep.execution import ExecutionOptions, Results
+    from tandem.planning import Planner
 
 DEFAULT_TRIALS = 20
 """The default number of trials per cell of a sweep that is given by a scenario and axes."""
@@ -128,6 +129,47 @@ def sweep(
         return _results(_run(found, folder, options, visible=progress), kept=out is not None)
 
 
+def arena(
+    planners: str | type[Planner[Any, Any]] | Sequence[str | type[Planner[Any, Any]]] = (),
+    scenarios: Scenario | str | Path | Sequence[Scenario | str | Path] = "noisy",
+    *,
+    trials: int | None = None,
+    seed: int | None = None,
+    out: str | Path | None = None,
+    workers: int | None = None,
+    progress: bool = False,
+) -> Table:
+    """Run the same missions with each planner, and return a table: the columns of `arena.csv`.
+
+    `planners` are names or classes, by default those of `tandem arena`; the first is the reference. `trials`
+    is the number of missions of each planner in each scenario, whose seeds follow from `seed`. `out` is the
+    folder for the table, its figure and the sweeps; the same call resumes an arena in it. Raises like
+    `sweep`.
+
+    >>> import tandem
+    >>> table = tandem.arena(["assured", "fisher"], trials=2, workers=1)  # doctest: +SKIP
+    >>> table["more_ticks"]  # doctest: +SKIP
+    array([nan, -2.5])
+    """
+    need("distributed", "matplotlib", "pyarrow", "tomli_w")
+    from compose.sweep import arena as found  # noqa: PLC0415  # slow to import, and optional
+    from compose.sweep.execution import ExecutionOptions  # noqa: PLC0415  # likewise
+
+    options = ExecutionOptions(audit=False)
+    if workers is not None:
+        options = msgspec.structs.replace(options, workers=workers)
+    given: Any = scenarios if isinstance(scenarios, list | tuple) else [scenarios]
+    names = plain([planners] if isinstance(planners, str | type) else planners or [])
+    for name in names:
+        need_module(name)
+    sweeps = found.sweeps(names, [(one.source, one.table) for one in map(scenario_of, given)], trials, seed)
+    with ExitStack() as stack:
+        folder = Path(out) if out is not None else Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        rows, results = found.run(sweeps, folder, lambda one, to: _run(one, to, options, visible=progress))
+        _check_complete(results[-1], kept=out is not None)
+    return Table({name: _array([row[name] for row in rows]) for name in rows[0]})
+
+
 def _sweep_of(
     base: Scenario | str | Path | Mapping[str, Any],
     axes: Mapping[str, Sequence[Any]] | None,
@@ -186,7 +228,8 @@ def _run(found: Sweep, folder: Path, options: ExecutionOptions, *, visible: bool
         return execution.sweep(found, folder, options, inbox, progress)
 
 
-def _results(results: Results, *, kept: bool) -> SweepResults:
+def _check_complete(results: Results, *, kept: bool) -> None:
+    """Raise SweepIncomplete if the sweep was stopped; `kept` says whether its folder is."""
     if results.stopped is not None:
         how = (
             "the same call resumes the sweep" if kept else "with `out`, the same call would resume the sweep"
@@ -194,6 +237,10 @@ def _results(results: Results, *, kept: bool) -> SweepResults:
         raise SweepIncomplete(
             f"{results.stopped}: {len(results.table)} of {results.trials} trials are done; {how}"
         )
+
+
+def _results(results: Results, *, kept: bool) -> SweepResults:
+    _check_complete(results, kept=kept)
     trials = {name: results.table[name].to_numpy() for name in results.table.schema.names}
     return SweepResults(
         results.sweep, Table(trials), Table(_cells(results)), Table(_differences(results)), results

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import subprocess
 import sys
 from importlib import import_module
@@ -18,7 +17,6 @@ EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
 SMALL: dict[str, dict[str, Any]] = {
     "run_and_plot": {},
     "loss_sweep": {"trials": 1, "workers": 1},
-    "greedy_planner": {"trials": 1, "workers": 1},
     "planners_and_radios": {"trials": 1, "workers": 1},
     "estimate_ranges": {},
 }
@@ -51,28 +49,20 @@ def test_an_example_runs_and_writes_its_figure(name: str, tmp_path: Path) -> Non
     assert (tmp_path / "figure.png").stat().st_size > 1000
 
 
-INTERVAL = re.compile(
-    r"(?P<what>[^:\n]+): .*?[+-][\d.]+ ticks \((?P<low>[+-][\d.]+) to (?P<high>[+-][\d.]+)\)"
-)
-"""The line of a difference with its interval, as examples print it and pages show it."""
-
-
 @pytest.mark.long
 @pytest.mark.timeout(600)
-def test_figures_that_a_page_shows_agree_with_what_fewer_trials_print(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The 200 trials of the page take minutes; the first 10 of the same trials must not contradict them."""
+def test_the_planner_of_the_page_runs_in_the_arena_as_the_page_shows(tmp_path: Path) -> None:
     page = (EXAMPLES.parent / "own-planner.md").read_text()
-    shown = page.partition("<!-- printed by: greedy_planner -->")[2]
-    import_module("docs.examples.greedy_planner").main(str(tmp_path / "figure.png"), trials=10)
-    printed = capsys.readouterr().out
-    few, many = ({one["what"]: one for one in INTERVAL.finditer(text)} for text in (printed, shown))
-    assert {*few} == {*many} == {"greedy - assured"}
-    one, other = few["greedy - assured"], many["greedy - assured"]
-    assert float(one["low"]) <= float(other["high"])
-    assert float(other["low"]) <= float(one["high"])
-    assert printed.splitlines()[-1] == shown.partition("\n```\n")[0].splitlines()[-1]
+    code = page.partition("```python\n")[2].partition("```")[0]
+    (tmp_path / "mine.py").write_text(code)
+    assert len(code.splitlines()) <= 40
+    words = ("-m", "tandem", "arena", "assured", "mine:Circling", "--trials", "10")
+    ended = subprocess.run(
+        [sys.executable, *words], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    shown = [line for line in page.splitlines() if line.startswith((" scenario", " noisy"))]
+    assert len(shown) == 3
+    assert [line for line in ended.stdout.splitlines() if line in shown] == shown
 
 
 @pytest.mark.parametrize("name", WITHOUT_FIGURE)

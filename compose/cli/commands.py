@@ -23,6 +23,7 @@ VALUES: Mapping[str, Callable[[str], Any] | tuple[str, ...]] = {
     **dict.fromkeys(("--accuracy", "--connect-timeout", "--rate", "--timeout"), arguments.positive),
     **dict.fromkeys(("id", "--robot", "--run"), arguments.name),
     "others": another_scenario,
+    "planners": arguments.planner,
     "scenario": arguments.source,
     "shell": SHELLS,
     "--address": arguments.address,
@@ -38,6 +39,7 @@ VALUES: Mapping[str, Callable[[str], Any] | tuple[str, ...]] = {
     "--port": arguments.port,
     "--print-trial": arguments.cell_and_trial,
     "--robots": arguments.names,
+    "--scenario": arguments.source,
     "--schema": ("scenario", "sweep"),
     "--seed": arguments.natural,
     "--trials": arguments.up_to(10**7),
@@ -240,6 +242,20 @@ COMMANDS = (
         --retry: run failed trials of an earlier call again
         --print-trial [CELL:]N: print the scenario file of a trial and exit [default cell: 0]
         -q --quiet: print only the counts
+        """,
+    ),
+    CommandEntry(
+        *("arena", "Run", "Compare planners on the same missions."),
+        *("tandem arena assured greedy mine:Own --trials 20", "docs/own-planner.md"),
+        """
+        planners PLANNER*: planners to compare, the first of which is the reference: names, or MODULE:CLASS \
+            [default: assured paper greedy fisher random]
+        --scenario SCENARIO+: scenario of missions: a name or a TOML file; may be repeated [default: noisy]
+        --out DIR = arena: folder for the results; an unfinished arena in it is resumed [default: %(default)s]
+        --trials N: missions of each planner in each scenario, 1 to 10^7 [default: 50]
+        --seed S: seed of all missions, 0 to 2^63 - 1 [default: 0]
+        --workers N: worker processes, 1 to 1000 [default: one per core]
+        -q --quiet: print only the table
         """,
     ),
     CommandEntry(

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 import tandem
 
-PLANNERS = {"assured": "assured", "greedy": "docs.examples.greedy_planner:Greedy", "paper": "paper"}
+PLANNERS = {"assured": "assured", "greedy": "greedy", "paper": "paper"}
 RADIOS = {
     "disc": {"model": "disc"},
     "fading": {"model": "fading", "options": {"far": 1.0, "exponent": 1.0}},
