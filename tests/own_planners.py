@@ -203,6 +203,13 @@ class Fast(Assured):
         return replace(one, v=1.5 * one.v)
 
 
+class Stranger(Assured):
+    """It meets a robot that does not exist."""
+
+    def command(self, state: RobotState) -> Command:
+        return replace(super().command(state), peer="nobody")
+
+
 class NotANumber(Assured):
     """It commands NaN at tick 5."""
 

@@ -654,6 +654,12 @@ def test_a_command_beyond_the_limits_is_found(beyond: dict[str, float], folder: 
     assert what(findings, "limits") == [f"it commanded {quantity} = {value:g}, expected at most {most}"]
 
 
+def test_a_command_with_a_peer_that_the_robot_cannot_meet_is_found(folder: Path) -> None:
+    for name in (A, WORLD_JOURNAL):
+        plant(folder / name, (of(Command, LAST, "a"), to(peer="nobody")))
+    assert what(audit(folder), "limits") == ["its peer is nobody, which it cannot meet"]
+
+
 def test_a_manoeuvre_beyond_the_limits_is_found(folder: Path) -> None:
     (before,) = [one for one in messages(folder / B) if of(Observation, LAST)(one)]
     plant(folder / B, (of(Observation, LAST), to(executed=replace(before.executed, v=1.0 + 1e-9))))

@@ -399,6 +399,7 @@ def test_an_unknown_scenario_is_refused(
         (["sweep", "noise", "--workers", "0"], "--workers: '0' is not a whole number from 1 to 1000"),
         (["sweep", "noise", "--print-trial", ":"], "--print-trial: ':' is not a trial such as 17, or 3:17"),
         (["sweep", "noise", "--print-trial", "x:1"], "--print-trial: 'x:1' is not a trial such as 17, or"),
+        (["sweep", "noise", "--trials", "3", "--print-trial", "7"], "with --trials 3, trials are 0 to 2"),
         (["estimate", "run", "--confidence", "nan"], "'nan' is not a probability from 0.5 to below 1"),
         (["estimate", "run", "--confidence", "x"], "'x' is not a probability from 0.5 to below 1"),
         *((["agent", v, *CONNECT], "ID: ") for v in ("", "a/b", "*", "a\n", "x" * 65)),

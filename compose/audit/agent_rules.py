@@ -82,7 +82,7 @@ def _final_report(replayed: Robot, robot: str, end: MissionEnd, found: FinalRepo
 
 
 def limits(run: Run) -> Checks:
-    """Check that no robot commanded or drove more than v_max and omega_max.
+    """Check that no robot commanded or drove more than v_max and omega_max, or named a peer that is none.
 
     With noise, only the commanded speeds are checked: the executed ones include wheel noise, and the
     Observation contains measurements of them.
@@ -93,6 +93,10 @@ def limits(run: Run) -> Checks:
             tick, command, driven = step.observation.tick, step.command, step.observation.executed
             if command is not None:
                 yield _within(tick, robot, "commanded", command, mission)
+                if command.peer not in (None, *agent.config.others):
+                    yield Violation(
+                        "limits", tick, robot, f"its peer is {command.peer}, which it cannot meet"
+                    )
             if driven is not None and exact:
                 yield _within(tick, robot, "drove", driven, mission)
 

@@ -26,6 +26,10 @@ def main(options: argparse.Namespace) -> int:
     sweep = spec.load(options.spec, trials=options.trials, seed=options.seed)
     need("distributed", "matplotlib", "pyarrow", "tomli_w")
     if options.print_trial is not None:
+        if options.trials is not None and options.print_trial[1] >= options.trials:
+            raise UserError(
+                f"--print-trial: with --trials {options.trials}, trials are 0 to {options.trials - 1}"
+            )
         return print_trial(sweep, *options.print_trial)
     from compose.sweep import axis_figures, execution, report  # noqa: PLC0415  # slow to import, and optional
 

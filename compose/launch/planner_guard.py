@@ -40,6 +40,7 @@ class GuardedPlanner(Planner[Any, Any]):
         self._name = name
         self._planner = planner
         self._robot = ""
+        self._others: tuple[str, ...] = ()
         self._tick: int | None = None
         """The tick of the latest Observation."""
         self.decoder_error: str | None = None
@@ -51,7 +52,7 @@ class GuardedPlanner(Planner[Any, Any]):
 
     def start(self, config: RobotConfig) -> Any:
         """Return the first state."""
-        self._robot = config.robot
+        self._robot, self._others = config.robot, config.others
         return self._called(self._planner.start, config)
 
     def observe(self, state: Any, observation: Observation) -> Any:
@@ -108,6 +109,8 @@ class GuardedPlanner(Planner[Any, Any]):
             except (MalformedFrame, TypeError, ValueError, OverflowError, msgspec.MsgspecError) as error:
                 raise self._failed(method, f"its {kind.__name__} cannot be sent: {error}") from None
             self._check_address(method, found)
+        if isinstance(found, Command) and found.peer not in (None, *self._others):
+            raise self._failed(method, f"returns the peer {found.peer}, expected {' or '.join(self._others)}")
         return found
 
     def _check_address(self, method: str, found: Any) -> None:
