@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 import tandem
+from agent.estimation.team_measurements import TeamMeasurements
 from agent.peer.team_log import Entry, LogPart, Ranging, TeamLog, TeamReport
 from agent.planning.team import TeamPlanner, TeamState
 from compose.audit.rules import audit_run, replayed
@@ -154,6 +155,7 @@ def test_in_any_order_of_lost_late_and_repeated_reports_a_log_is_the_beginning_o
     assert config.team is not None
     logs = [TeamLog.of(config.team)] * 3
     truth: list[list[Entry]] = [[], [], []]
+    read, mission = [TeamMeasurements()] * 3, config.mission
     sent: dict[tuple[int, int], list[TeamReport]] = {}
     for sender, receiver, ago, passes in deliveries:
         if passes:
@@ -167,8 +169,11 @@ def test_in_any_order_of_lost_late_and_repeated_reports_a_log_is_the_beginning_o
             reports = sent.setdefault((sender, receiver), [])
             reports.append(logs[sender].report(sender, receiver))
             logs[receiver] = logs[receiver].received([reports[max(0, len(reports) - 1 - ago)]], receiver)
-        for log in logs:
+        read = [one.grown(log, config.team, mission) for one, log in zip(read, logs, strict=True)]
+        for log, grown in zip(logs, read, strict=True):
             assert all(list(one) == truth[k][: len(one)] for k, one in enumerate(log.logs))
+            at_once = TeamMeasurements().grown(log, config.team, mission)
+            assert grown.joint(config.team, mission) == at_once.joint(config.team, mission)
 
 
 def state_after(ticks: int) -> tuple[TeamState, Observation]:

@@ -6,7 +6,7 @@ before the first claim of each robot.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import NamedTuple
 
 from agent.estimation.claim import BEFORE_SEARCH, blocked
@@ -69,7 +69,7 @@ class Following(NamedTuple):
     judged: Mapping[str, Judged] = {}
     """The estimate of each located robot, as the conditions for a claim see it."""
     reasons: Mapping[str, str] = {}
-    """The reason against the claim of each located robot; an empty text if there is none."""
+    """The reason against the claim of each located robot that is asked; an empty text if there is none."""
     searched: int = 0
     """The number of ranges at the latest search of the whole plane."""
     searches: int = 0
@@ -85,8 +85,10 @@ class Following(NamedTuple):
     begun_again: int = 0
     """The number of ranges at which a team has dropped hypotheses that its measurements contradict."""
 
-    def after(self, used: JointMeasurements, rule: ClaimRule, user: User) -> Following:
+    def after(self, used: JointMeasurements, rule: ClaimRule, user: User, asked: Container[str]) -> Following:
         """Return the estimate by what is `used`, which has grown since the last one.
+
+        The robots `asked` may claim their poses; the plane is searched before that.
 
         A team whose measurements contradict all hypotheses begins again, with ever more ranges. A recording
         has other robots, and errors that nobody has told.
@@ -99,13 +101,13 @@ class Following(NamedTuple):
         known = settled(self.known, used)
         now = self._extended(known if known.hypotheses else begun(used), used)
         due = now.known.hypotheses and any(self.searched < at <= count for at in GROUP_SEARCHES)
-        now = now._tested(used, rule, user)
+        now = now._tested(used, rule, user, asked)
         claiming = now._claiming - self.claimed
         if claiming and not due and self.searches >= MOST_SEARCHES:
             now = now._replace(reasons={**now.reasons, **dict.fromkeys(sorted(claiming), GIVEN_UP)})
         elif due or claiming:
             now = now._replace(known=search(used, now.known), searched=count, searches=self.searches + 1)
-            now = now._tested(used, rule, user)
+            now = now._tested(used, rule, user, asked)
         return now._replace(claimed=self.claimed | now._claiming)
 
     @property
@@ -131,8 +133,10 @@ class Following(NamedTuple):
                 failed[one.robots] = one.decisive
         return self._replace(known=more, failed=failed)
 
-    def _tested(self, used: JointMeasurements, rule: ClaimRule, user: User) -> Following:
-        """Return this with what blocks the claim of each located robot."""
+    def _tested(
+        self, used: JointMeasurements, rule: ClaimRule, user: User, asked: Container[str]
+    ) -> Following:
+        """Return this with what blocks the claim of each located robot that is `asked`."""
         found = self.known
         part = used.some(found.located)
         judged = {
@@ -140,14 +144,15 @@ class Following(NamedTuple):
             for i, certainty in enumerate(certainties(found))
             if not part.is_anchor(i)
         }
-        claiming = {name for name, one in judged.items() if blocked(one, BEFORE_SEARCH) is None}
+        due = [name for name in judged if name in asked]
+        claiming = {name for name in due if blocked(judged[name], BEFORE_SEARCH) is None}
         displaced, tested = self.displaced, self.tested
         if claiming:
             count = len(part.ranges.rho)
             if count >= RETESTED * tested or not claiming <= self.claimed:
                 tested, displaced = count, displaced_anchor(found.hypotheses[0].fit, part)
             judged = {name: one._replace(displaced=displaced) for name, one in judged.items()}
-        reasons = {name: blocked(one) for name, one in judged.items()}
+        reasons = {name: blocked(judged[name]) for name in due}
         return self._replace(
             part=part,
             judged=judged,

@@ -1,52 +1,77 @@
-"""The measurements of a team as those of a joint fit."""
+"""The measurements of a team as those of a joint fit. They grow with its log, whose entries are read once."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
 
-import msgspec
+from msgspec.structs import astuple, replace
 
-from agent.estimation import facts
-from agent.estimation.facts import Fact, Facts, Manoeuvre
-from agent.estimation.gaussian.joint_ranges import JointMeasurements, joint_measurements
-from agent.peer.team_log import TeamLog
+from agent.estimation.facts import AnchorPlace, Manoeuvre, MeasuredRange, StartPose
+from agent.estimation.gaussian.joint_ranges import JointMeasurements, Row, of_rows
+from agent.peer.team_log import Entry, TeamLog
 from protocol.messages import Team
 from protocol.mission import Mission
 
 
-def team_measurements(log: TeamLog, team: Team, mission: Mission) -> JointMeasurements:
-    """Return the measurements in `log`: those of all robots of which there are some.
+class TeamMeasurements(NamedTuple):
+    """What has been read of a team's log."""
 
-    Exact sensors have no sigmas that could be larger than told.
-    """
-    known: list[Fact] = []
-    for anchor in team.anchors:
-        place, sigma = anchor.position, anchor.sigma
-        known.append(
-            facts.anchor(anchor.id, place.x, place.y, sigma)
-            if place is not None
-            else facts.anchor(anchor.id, 0.0, 0.0, math.inf)
-        )
-    noise = mission.noise
-    for robot, entries in zip(team.robots, log.logs, strict=True):
-        if robot == team.origin:
-            known.append(facts.start_pose(robot, 0.0, 0.0, 0.0))
-        for tick, entry in enumerate(entries):
-            if entry.executed is not None:
-                moved = Manoeuvre(entry.executed.v, entry.executed.omega)
-                known.append(facts.manoeuvre(robot, tick - 1, moved))
-            known += [
-                facts.anchor_range(robot, team.anchors[one.to].id, tick, one.range, noise.anchor_sigma)
-                for one in entry.anchors
-                if one.to < len(team.anchors)
-            ]
-    count = len(team.robots)
-    known += [
-        facts.mutual_range(team.robots[one], team.robots[other], tick, rho, noise.mutual_sigma)
-        for one, other, tick, rho in log.mutual()
-        if one != other and other < count
-    ]
-    measured = joint_measurements(Facts(frozenset(known)), noise, mission.period, mission.sensing_range)
-    if measured.only_rounding:
-        measured = msgspec.structs.replace(measured, noise=noise.as_told)
-    return measured.thinned(mission.sensing_range)
+    read: tuple[int, ...] = ()
+    """The number of entries of each robot."""
+    steps: Mapping[str, tuple[Manoeuvre, ...]] = {}
+    """The manoeuvres of each robot of which there is a measurement."""
+    rows: Mapping[tuple[bool, str, str, int], Row] = {}
+    """The ranges. Both robots measure the same one between them: that of the first in the team counts."""
+
+    def grown(self, log: TeamLog, team: Team, mission: Mission) -> TeamMeasurements:
+        """Return this with the entries in `log` that are new."""
+        steps, rows = dict(self.steps), dict(self.rows)
+        if team.origin is not None:
+            steps.setdefault(team.origin, ())
+        for i, since in enumerate(self.read or (0,) * len(log.logs)):
+            robot = team.robots[i]
+            driven: list[Manoeuvre] = []
+            for tick, entry in enumerate(log.logs[i][since:], since):
+                if entry.executed is not None and tick == len(steps.get(robot, ())) + len(driven) + 1:
+                    driven.append(Manoeuvre(entry.executed.v + 0.0, entry.executed.omega + 0.0))
+                for row, first in _ranges(i, tick, entry, team, mission):
+                    if first or row[:4] not in rows:
+                        rows[row[:4]] = row
+                    for name in (row.first, row.second)[: 1 + row.mutual]:
+                        steps.setdefault(name, ())
+            if driven:
+                steps[robot] = (*steps.get(robot, ()), *driven)
+        return TeamMeasurements(tuple(map(len, log.logs)), steps, rows)
+
+    def joint(self, team: Team, mission: Mission) -> JointMeasurements:
+        """Return the measurements of all robots of which there are some.
+
+        Exact sensors have no sigmas that could be larger than told.
+        """
+        places = {
+            one.id: AnchorPlace(one.position.x + 0.0, one.position.y + 0.0, one.sigma + 0.0)
+            if one.position is not None
+            else AnchorPlace(0.0, 0.0, math.inf)
+            for one in team.anchors
+        }
+        starts = {team.origin: StartPose(0.0, 0.0, 0.0)} if team.origin is not None else {}
+        noise, reach = mission.noise, mission.sensing_range
+        measured = of_rows(places, starts, self.steps, self.rows.values(), noise, mission.period, reach)
+        if measured.only_rounding:
+            measured = replace(measured, noise=noise.as_told)
+        return measured.thinned(reach)
+
+
+def _ranges(i: int, tick: int, entry: Entry, team: Team, mission: Mission) -> Iterator[tuple[Row, bool]]:
+    """Yield each range in the entry of robot `i`, and whether it counts before that of the other robot."""
+    noise, robot = mission.noise, team.robots[i]
+    for to, rho in map(astuple, entry.anchors):
+        if to < len(team.anchors):
+            measured = MeasuredRange(rho + 0.0, noise.anchor_sigma)
+            yield Row(False, robot, team.anchors[to].id, tick, measured), True
+    for to, rho in map(astuple, entry.robots):
+        if to < len(team.robots) and to != i:
+            first, second = sorted((robot, team.robots[to]))
+            yield Row(True, first, second, tick, MeasuredRange(rho + 0.0, noise.mutual_sigma)), i < to

@@ -7,7 +7,7 @@ one of a tick counts. So a report may be lost, late or repeated, and changes not
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Annotated
 
 import msgspec
@@ -134,19 +134,6 @@ class TeamLog(msgspec.Struct, frozen=True):
             if chosen:
                 parts.append(LogPart(robot, since, tuple(chosen)))
         return TeamReport(own, tuple(parts), tuple(map(len, self.logs)), tuple(sorted(self.done)))
-
-    def mutual(self) -> Iterator[tuple[int, int, int, float]]:
-        """Yield each range between robots once, as (first, second, tick, m), in this order.
-
-        Both robots measure the same.
-        """
-        found: dict[tuple[int, int, int], float] = {}
-        for one, log in enumerate(self.logs):
-            for tick, entry in enumerate(log):
-                for other, rho in map(msgspec.structs.astuple, entry.robots):
-                    found.setdefault((min(one, other), max(one, other), tick), rho)
-        for (first, second, tick), rho in sorted(found.items()):
-            yield first, second, tick, rho
 
 
 def _replaced(values: tuple[tuple, ...], place: int, value: tuple) -> tuple[tuple, ...]:  # type: ignore[type-arg]

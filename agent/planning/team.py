@@ -22,7 +22,7 @@ from agent.estimation.gaussian.joint_ranges import near_anchors
 from agent.estimation.gaussian.odometry_noise import Array, track
 from agent.estimation.gaussian.search import of_anchor, position_sigma
 from agent.estimation.posterior import Hypothesis, certainties, same
-from agent.estimation.team_measurements import team_measurements
+from agent.estimation.team_measurements import TeamMeasurements
 from agent.peer.team_log import TeamLog, TeamReport
 from agent.planning.active_sensing import AmongBeacons, plan_among
 from agent.planning.drive import pursuit, towards
@@ -96,6 +96,8 @@ class TeamState(msgspec.Struct, frozen=True):
     """The place where the robot was nearest to each robot of the team."""
     anchored: Near = Near()
     """The place where the robot was nearest to an anchor."""
+    measured: TeamMeasurements = TeamMeasurements()
+    """What the estimate has read of the log."""
     following: Following = Following()
     """The estimate of all poses."""
     wanted: tuple[str, ...] = ()
@@ -230,15 +232,21 @@ class TeamPlanner(Planner[TeamState, TeamReport]):
 def _followed(state: TeamState) -> TeamState:
     """Return `state` with the estimate by all measurements so far."""
     mission, config = state.config.mission, state.config
-    used = team_measurements(state.log, state.team, mission)
-    following = state.following.after(used, ClaimRule(mission.accuracy, mission.confidence), "team")
+    measured = state.measured.grown(state.log, state.team, mission)
+    used = measured.joint(state.team, mission)
+    following = state.following.after(
+        used,
+        ClaimRule(mission.accuracy, mission.confidence),
+        "team",
+        (config.robot,) if state.verdict is None else (),
+    )
     why_not = following.reasons.get(config.robot)
     if why_not is None:
         why_not = undetermined(used.robots.index(config.robot), following.known.located, used)
     wanted = _wanted(following, state.team, mission.confidence)
     if wanted and not why_not:
         why_not = f"anchor {wanted[0]} is not known to {state.team.survey:g} m yet"
-    return replace(state, following=following, why_not=why_not, wanted=wanted)
+    return replace(state, measured=measured, following=following, why_not=why_not, wanted=wanted)
 
 
 def _wanted(following: Following, team: Team, confidence: float) -> tuple[str, ...]:

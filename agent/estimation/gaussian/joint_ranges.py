@@ -7,7 +7,7 @@ An anchor that is not surveyed is a robot that stands: its position is estimated
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -459,7 +459,7 @@ def near_anchors(
     )
 
 
-class _Row(NamedTuple):
+class Row(NamedTuple):
     """A range with the names of its radios, in the order of the ranges of a fit."""
 
     mutual: bool
@@ -478,33 +478,53 @@ def joint_measurements(
     anchors of which no position is known.
     """
     places = {key.robot: value for key, value in facts.known if isinstance(value, AnchorPlace)}
-    surveyed = {name: one for name, one in places.items() if not one.sigma}
+    starts = {key.robot: value for key, value in facts.known if isinstance(value, StartPose)}
     steps: dict[str, list[Manoeuvre]] = {name: [] for name in facts.robots}
     for key, value in facts.of_kind("manoeuvre"):
         if isinstance(value, Manoeuvre) and key.tick == len(steps[key.robot]):
             steps[key.robot].append(value)
-    rows = []
-    for key, value in facts.ordered:
-        if not isinstance(value, MeasuredRange) or key.tick > len(steps[key.robot]):
-            continue
-        mutual = key.kind == "mutual range"
-        if key.tick <= len(steps[key.other]) if mutual else key.other in places:
-            rows.append(_Row(mutual, key.robot, key.other, key.tick, value))
+    rows = [
+        Row(key.kind == "mutual range", key.robot, key.other, key.tick, value)
+        for key, value in facts.ordered
+        if isinstance(value, MeasuredRange)
+    ]
+    return of_rows(places, starts, steps, rows, noise, period, reach)
+
+
+def of_rows(
+    places: Mapping[str, AnchorPlace],
+    starts: Mapping[str, StartPose],
+    steps: Mapping[str, Sequence[Manoeuvre]],
+    measured: Iterable[Row],
+    noise: Noise,
+    period: float,
+    reach: float,
+) -> JointMeasurements:
+    """Return what was `measured` by robots whose manoeuvres from tick 0 on are in `steps`.
+
+    `places` are those of the anchors, and `starts` those of the robots that have one.
+    """
+    surveyed, robots = {name: one for name, one in places.items() if not one.sigma}, sorted(steps)
+    rows = [
+        row
+        for row in measured
+        if row.tick <= len(steps[row.first])
+        and (row.tick <= len(steps[row.second]) if row.mutual else row.second in places)
+    ]
     rows.sort(key=lambda row: row[:4])
     used = tuple(sorted({row.second for row in rows if not row.mutual}))
     unsure = [one for one in used if one not in surveyed]
     unsure.sort(key=lambda name: places[name].sigma < math.inf)
-    index = {name: number for number, name in enumerate((*facts.robots, *unsure))}
+    index = {name: number for number, name in enumerate((*robots, *unsure))}
     radios = tuple(dict.fromkeys([(row.first, row.second) for row in rows]))
     radio = {names: number for number, names in enumerate(radios)}
     first = sorted(used, key=lambda name: places[name].sigma)[:1]
     origin = places[first[0]] if first else AnchorPlace(0.0, 0.0)
     at = [surveyed.get(row.second, origin) for row in rows]
-    starts = {key.robot: value for key, value in facts.known if isinstance(value, StartPose)}
     standing = [Manoeuvre(0.0, 0.0)] * max(map(len, steps.values()), default=0)
     relative = [
         one and one._replace(x=one.x - origin.x, y=one.y - origin.y)
-        for one in (*map(starts.get, facts.robots), *map(places.get, unsure))
+        for one in (*map(starts.get, robots), *map(places.get, unsure))
     ]
     anchors = tuple([one if isinstance(one, AnchorPlace) else None for one in relative]) if unsure else ()
     return JointMeasurements(

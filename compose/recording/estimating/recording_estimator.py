@@ -92,7 +92,7 @@ class RecordingEstimator:
     def _epoch(self, measured: Measurements, number: int) -> EstimateEpoch:
         """Return the estimate at the end of the epoch with this `number`, from 0 on, in their order."""
         used = msgspec.structs.replace(measured.until(number), solver=self._solver)
-        found = self._following = self._following.after(used, self.rule, "recording")
+        found = self._following = self._following.after(used, self.rule, "recording", used.robots)
         return _result(measured, number, used, found.known, found.reasons)
 
 
