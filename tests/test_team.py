@@ -101,6 +101,15 @@ def test_poses_without_anchors_are_those_in_the_frame_of_the_first_robot() -> No
     assert not any(seen[robot].anchors for seen in run.observations for robot in seen)
 
 
+def test_a_robot_with_three_ranges_keeps_no_other_one_from_its_claim() -> None:
+    """Fits of the third one end where no step descends: its ranges are explained by their linear model."""
+    exact = MISSION.replace("0.05", "0.0").replace("accuracy", 'frame = "relative"\naccuracy')
+    run = run_mission(parse(f'name = "met"\nseed = 3199\n{exact}[team]\nrobots = 3\nside = 10.0', "met"))
+    assert run.end is not None
+    assert run.end.outcome == "localised"
+    assert run.end.tick < 30
+
+
 KILLS = ("a@2 world@4", "", "b@1:command b@3:report world@0")
 EACH_KILLED = [(SHIPPED[i % 2], kills) for i, kills in enumerate(KILLS[:2])]
 EACH_KILLED += [(name, kills) for name in SHIPPED for kills in KILLS if (name, kills) not in EACH_KILLED]

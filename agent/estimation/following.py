@@ -15,7 +15,7 @@ from agent.estimation.gaussian.joint_claims import Displacement, displaced_ancho
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.search import begun, candidates, extended, search
 from agent.estimation.judged import Judged, User, of_joint
-from agent.estimation.posterior import NO_HYPOTHESES, Posterior, certainties, settled
+from agent.estimation.posterior import NO_HYPOTHESES, Posterior, certainties, ended, settled
 
 GROUP_SEARCHES = tuple(8 * 2**n for n in range(16))
 """The numbers of ranges at which the whole plane is searched again."""
@@ -98,7 +98,7 @@ class Following(NamedTuple):
             rule = rule._replace(accuracy=EXACT_ACCURACY)
         if user == "team" and self._contradicted and count >= MORE_RANGES * self.begun_again:
             self = Following(claimed=self.claimed, begun_again=count)  # noqa: PLW0642  # as if it were new
-        known = settled(self.known, used)
+        known = ended(settled(self.known, used), used)
         now = self._extended(known if known.hypotheses else begun(used), used)
         due = now.known.hypotheses and any(self.searched < at <= count for at in GROUP_SEARCHES)
         now = now._tested(used, rule, user, asked)
@@ -106,7 +106,8 @@ class Following(NamedTuple):
         if claiming and not due and self.searches >= MOST_SEARCHES:
             now = now._replace(reasons={**now.reasons, **dict.fromkeys(sorted(claiming), GIVEN_UP)})
         elif due or claiming:
-            now = now._replace(known=search(used, now.known), searched=count, searches=self.searches + 1)
+            found = ended(search(used, now.known), used)
+            now = now._replace(known=found, searched=count, searches=self.searches + 1)
             now = now._tested(used, rule, user, asked)
         return now._replace(claimed=self.claimed | now._claiming)
 

@@ -19,6 +19,7 @@ from agent.estimation.gauss_newton import Convergence
 from agent.estimation.gaussian.consistency import FINISHED
 from agent.estimation.gaussian.detections import detection_log_likelihoods
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.gaussian.noise_level import misfit_log_likelihood
 
 NEGLIGIBLE_PROBABILITY = 1e-7
 """The probability, relative to the likeliest hypothesis, below which a hypothesis is dropped."""
@@ -47,6 +48,12 @@ WARM_STEPS = 2
 
 Where the best fit has not converged by then, all fits go on to their end (see `settled`). With one step, that
 is every third tick; with more, each tick takes longer."""
+
+FAR_OFF = 10.0
+"""The length in sigmas of the next step from which on a fit is far from its minimum."""
+
+PATIENT = Convergence(64)
+"""The convergence of fits that are far from their minimum after TO_THE_END: mostly, they are in none."""
 
 FOLLOWED = Convergence(WARM_STEPS)
 """The convergence of fits that begin at those of the previous tick."""
@@ -157,6 +164,26 @@ def settled(known: Posterior, measured: JointMeasurements) -> Posterior:
     """
     found = follow(known, measured)
     return found if found.has_converged else follow(found, measured, TO_THE_END)
+
+
+def ended(found: Posterior, measured: JointMeasurements) -> Posterior:
+    """Return the hypotheses with fits that have ended, if the likeliest is FAR_OFF its linear model.
+
+    What is off then counts as misfit. The model would explain three ranges of a robot wherever it is: no
+    other robot that has ranges to it could ever claim its pose.
+    """
+    if not found.hypotheses or found.hypotheses[0].fit.last_step <= FAR_OFF:
+        return found
+    part, nu, fitted = measured.some(found.located), measured.noise.sigma_degrees, []
+    for one in found.hypotheses:
+        if one.fit.last_step <= FAR_OFF:
+            fitted.append(one.fit)
+            continue
+        for fit in fits(part, [one.fit.start], PATIENT):
+            chi2 = fit.chi2 + (fit.last_step**2 * fit.level if fit.last_step > FAR_OFF else 0.0)
+            before, after = [misfit_log_likelihood(each, fit.freedom, nu) for each in (fit.chi2, chi2)]
+            fitted.append(fit._replace(chi2=chi2, weight=fit.weight + after - before))
+    return Posterior(found.located, hypotheses_of(fitted, part))
 
 
 def merged(known: Posterior, found: Posterior, measured: JointMeasurements) -> Posterior:
