@@ -26,7 +26,7 @@ from agent.estimation.facts import (
 )
 from agent.estimation.fit import Fit, Start, fits
 from agent.estimation.gauss_newton import Convergence
-from agent.estimation.gaussian.joint_claims import displaced_anchor, undetermined
+from agent.estimation.gaussian.joint_claims import decisive_ranges, displaced_anchor, undetermined
 from agent.estimation.gaussian.joint_ranges import MOST_MUTUAL_RANGES, JointMeasurements, joint_measurements
 from agent.estimation.gaussian.odometry_noise import constant_errors, track, variances
 from agent.estimation.gaussian.search import search
@@ -451,6 +451,23 @@ def test_only_the_robot_with_a_mirror_image_is_uncertain() -> None:
     reasons = [blocking_reason(i, found, sure[i], measured) for i in range(3)]
     assert reasons[:2] == ["", ""]
     assert reasons[2].startswith("the most probable of 2 hypotheses has probability 0.")
+
+
+def test_ranges_among_robots_do_not_add_to_those_that_connect_them_with_the_frame() -> None:
+    """Three ranges admit several places of a and all that know where a is: in one of 300 teams, a claimed."""
+    known = [start_pose("o", 0.0, 0.0, 0.0)]
+    for tick in range(6):
+        known += [manoeuvre(name, tick, Manoeuvre(0.5, 0.2)) for name in "oabc"]
+        known += [
+            mutual_range(one, other, tick, 3.0, 0.05) for one, other in (("a", "b"), ("b", "c"), ("a", "c"))
+        ]
+        known += [mutual_range("o", "a", tick, 2.0, 0.05)] if tick < 3 else []
+    measured = joint_measurements(Facts(frozenset(known)), NOISE, PERIOD_S, REACH)
+    assert measured.robots == ("a", "b", "c", "o")
+    assert [decisive_ranges(robot, measured) for robot in range(4)] == [3, 3, 3, 3]
+    more = Facts(frozenset([*known, *[mutual_range("o", "c", tick, 2.0, 0.05) for tick in range(5)]]))
+    measured = joint_measurements(more, NOISE, PERIOD_S, REACH)
+    assert [decisive_ranges(robot, measured) for robot in range(4)] == [8, 8, 8, 8]
 
 
 def test_a_component_without_two_anchors_has_no_pose_and_says_why() -> None:

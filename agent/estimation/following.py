@@ -14,7 +14,7 @@ from agent.estimation.gaussian.consistency import CLAIM_P_VALUE
 from agent.estimation.gaussian.joint_claims import Displacement, displaced_anchor
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.search import begun, candidates, extended, search
-from agent.estimation.judged import Judged, User, of_joint
+from agent.estimation.judged import Judged, User, misfit, of_joint
 from agent.estimation.posterior import NO_HYPOTHESES, Posterior, certainties, ended, settled
 
 GROUP_SEARCHES = tuple(8 * 2**n for n in range(16))
@@ -67,9 +67,9 @@ class Following(NamedTuple):
     part: JointMeasurements | None = None
     """The measurements to which they are fitted; None before the first."""
     judged: Mapping[str, Judged] = {}
-    """The estimate of each located robot, as the conditions for a claim see it."""
+    """The estimate of each located robot that is asked, as the conditions for a claim see it."""
     reasons: Mapping[str, str] = {}
-    """The reason against the claim of each located robot that is asked; an empty text if there is none."""
+    """The reason against the claim of each of them; an empty text if there is none."""
     searched: int = 0
     """The number of ranges at the latest search of the whole plane."""
     searches: int = 0
@@ -119,8 +119,8 @@ class Following(NamedTuple):
     @property
     def _contradicted(self) -> bool:
         """True if the measurements contradict the likeliest hypothesis."""
-        tests = [one.inconsistency for one in self.judged.values() if one.inconsistency is not None]
-        return any(one.p_value < CLAIM_P_VALUE for one in tests)
+        known = self.known.hypotheses
+        return bool(known) and misfit(known[0].fit).p_value < CLAIM_P_VALUE
 
     def _extended(self, found: Posterior, used: JointMeasurements) -> Following:
         """Return `found` with further robots; those that failed are tried again with more ranges."""
@@ -143,17 +143,16 @@ class Following(NamedTuple):
         judged = {
             part.robots[i]: of_joint(user, i, found, certainty, part, *rule)
             for i, certainty in enumerate(certainties(found))
-            if not part.is_anchor(i)
+            if part.robots[i] in asked and not part.is_anchor(i)
         }
-        due = [name for name in judged if name in asked]
-        claiming = {name for name in due if blocked(judged[name], BEFORE_SEARCH) is None}
+        claiming = {name for name, one in judged.items() if blocked(one, BEFORE_SEARCH) is None}
         displaced, tested = self.displaced, self.tested
         if claiming:
             count = len(part.ranges.rho)
             if count >= RETESTED * tested or not claiming <= self.claimed:
                 tested, displaced = count, displaced_anchor(found.hypotheses[0].fit, part)
             judged = {name: one._replace(displaced=displaced) for name, one in judged.items()}
-        reasons = {name: blocked(judged[name]) for name in due}
+        reasons = {name: blocked(one) for name, one in judged.items()}
         return self._replace(
             part=part,
             judged=judged,

@@ -150,6 +150,15 @@ def of_pair(
     )
 
 
+def misfit(fit: Fit) -> Inconsistency:
+    """Return the test of the residuals of a fit, which is that of all its robots."""
+    return Inconsistency(
+        f"chi-square {fit.chi2:.3g} for {fit.freedom} degrees of freedom",
+        0.0,
+        chi2_p_value(fit.chi2 / min(max(fit.level, 1.0), HIGHEST_LEVEL), fit.freedom),
+    )
+
+
 def of_joint(
     user: User,
     robot: int,
@@ -163,7 +172,7 @@ def of_joint(
 
     `certainty` is that of its pose; `measured` are the measurements of all these robots.
     """
-    fit, free = found.hypotheses[0].fit, found.hypotheses[0].fit.freedom
+    fit = found.hypotheses[0].fit
     return Judged(
         user=user,
         robot=robot,
@@ -174,11 +183,7 @@ def of_joint(
         ranges=decisive_ranges(robot, measured),
         required=sufficient_mutual_ranges(measured.noise),
         stated=PlanningHypothesis(certainty.probability, fit.poses.ravel(), fit.covariance),
-        inconsistency=Inconsistency(
-            f"chi-square {fit.chi2:.3g} for {free} degrees of freedom",
-            0.0,
-            chi2_p_value(fit.chi2 / min(max(fit.level, 1.0), HIGHEST_LEVEL), free),
-        ),
+        inconsistency=misfit(fit),
         accuracy=accuracy,
         headings=((robot, "the", HEADING_ACCURACY),),
         confidence=confidence,

@@ -238,7 +238,7 @@ def _followed(state: TeamState) -> TeamState:
         used,
         ClaimRule(mission.accuracy, mission.confidence),
         "team",
-        (config.robot,) if state.verdict is None else (),
+        (config.robot,),
     )
     why_not = following.reasons.get(config.robot)
     if why_not is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -61,17 +62,45 @@ def displaced_anchor(fit: Fit, used: JointMeasurements) -> Displacement | None:
 def decisive_ranges(robot: int, used: JointMeasurements) -> int:
     """Return the number of ranges of a robot from different places, if it has one anchor without those to it.
 
-    Ranges to one anchor leave a circle. A range counts if one of the two ends has moved since the last.
+    Ranges to one anchor leave a circle. A range counts if one of the two ends has moved since the last. They
+    are at most as many as connect it, by any way, with what determines the frame: robots that know all about
+    each other, and have three ranges to all others, are where these three admit.
     """
     ranges, total, of_anchors = used.ranges, 0, []
+    fixed = {-1, *used.placed, *used.started}
+    left: dict[int, dict[int, int]] = {k: {} for k in (-1, *range(len(used.robots)))}
     for pair in ranges.pairs:
         rows = np.flatnonzero(pair)
         ends = int(ranges.first[rows[0]]), int(ranges.second[rows[0]])
+        count = len(used.from_places(ends, ranges.tick[rows]))
         if robot in ends:
-            count = len(used.from_places(ends, ranges.tick[rows]))
             total += count
             of_anchors += [count] if ends[1] < 0 or used.is_anchor(ends[1]) else []
-    return total - (sum(of_anchors) if len(of_anchors) == 1 else 0)
+        a, b = [-1 if end in fixed else end for end in ends]
+        left[a][b] = left[b][a] = left[a].get(b, 0) + count
+    total -= sum(of_anchors) if len(of_anchors) == 1 else 0
+    return total if robot in fixed else min(total, _most_flow(left, robot))
+
+
+def _most_flow(left: dict[int, dict[int, int]], source: int) -> int:
+    """Return the largest flow from `source` to -1 by what is `left` of each edge (Edmonds and Karp 1972)."""
+    total = 0
+    while True:
+        before = {source: source}
+        for node in (queue := [source]):
+            new = [other for other, count in left[node].items() if count and other not in before]
+            before.update(dict.fromkeys(new, node))
+            queue += new
+        if -1 not in before:
+            return total
+        path = [-1]
+        while path[-1] != source:
+            path.append(before[path[-1]])
+        flow = min(left[a][b] for b, a in pairwise(path))
+        for b, a in pairwise(path):
+            left[a][b] -= flow
+            left[b][a] += flow
+        total += flow
 
 
 def undetermined(robot: int, located: tuple[int, ...], measured: JointMeasurements) -> str:
