@@ -420,10 +420,12 @@ def _lost(state: TeamState) -> Pose | None:
     """Return the place to which the robot returns if it is not where it seemed to be; None if that is open.
 
     It has had no range for a few loops to what determines the frame: an anchor, or the robot whose start is
-    the origin. If it has never had one, others bring it.
+    the origin. If it has never had one, others bring it: it returns to where it had the latest range to one.
     """
     team = state.team
     beacon = state.anchored if team.origin is None else state.nearest[team.robots.index(team.origin)]
+    if team.origin is not None and beacon.range == math.inf:
+        beacon = max(state.nearest, key=lambda one: (one.range < math.inf, one.latest))
     if beacon.range == math.inf or state.config.robot == team.origin:
         return None
     waits = LOOPS_UNTIL_RETURN * loop_ticks(state.config.mission, state.own) if state.doing != "homing" else 0
