@@ -371,6 +371,9 @@ class Team(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=T
     survey: Clearance = 0.0
     """The sigma (m) of an anchor's position up to which robots measure before they claim their poses, of
     anchors that are not surveyed and that they have ranged; 0: they do not wait for it."""
+    diameter: Clearance = 0.0
+    """The largest distance (m) of a robot from the first one at the start. The others stand until that one
+    has found them; 0: ranges connect all robots."""
 
 
 class RobotConfig(Message, frozen=True, dict=True):

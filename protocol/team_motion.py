@@ -1,4 +1,4 @@
-"""The motion of a team's robots that know too little to plan: a loop where they are, and a way to an anchor.
+"""The motion of a team's robots that know too little to plan: a loop, a way to an anchor, and a search.
 
 Both are functions of the mission, so that the bound of its duration is computed with the scenario.
 """
@@ -7,11 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from functools import lru_cache
 
 from protocol.messages import TeamAnchor
 from protocol.mission import Anchor, Mission
 from protocol.motion import TAU, Controls
 from protocol.orbits import Orbit
+from protocol.sweep_strips import Place
+from protocol.sweep_ticks import way_ticks
 
 LOOP_RADII = (0.2, 0.14, 0.17)
 """The radii of the loops of consecutive robots in units of R. Their turns alternate, too.
@@ -76,6 +79,35 @@ def team_ticks(mission: Mission, robots: int, farthest: float) -> int:
     orbit = way_past(mission, farthest)
     radial = math.ceil((orbit.radius + mission.sensing_range) / (orbit.v * mission.period))
     return (MEASURING_LOOPS + 1) * loops + radial + math.ceil(TAU / (orbit.omega * mission.period))
+
+
+def next_on_spiral(place: tuple[float, float], side: int, mission: Mission) -> tuple[float, float]:
+    """Return the end of the side after `side` of a square spiral, in m, if the latter ends at `place`.
+
+    Each second side is longer, by R.
+    """
+    length = (side // 2 + 1) * mission.sensing_range
+    along, sign = side % 2, 1.0 if side % 4 < 2 else -1.0
+    x, y = place
+    return (x, y + sign * length) if along else (x + sign * length, y)
+
+
+@lru_cache(maxsize=8)
+def spiral(mission: Mission, diameter: float) -> tuple[Place, ...]:
+    """Return the corners (m) of a square spiral from 0 that passes all places within `diameter` (m) of 0.
+
+    Each place is within 0.6 R of a side, so the robot is in range of it for a part of the side.
+    """
+    places = [(0.0, 0.0)]
+    for side in range(4 * math.ceil(diameter / mission.sensing_range - 0.5) + 1):
+        places.append(next_on_spiral(places[-1], side, mission))
+    return tuple(places)
+
+
+def search_ticks(mission: Mission, robots: int, diameter: float) -> int:
+    """Return the bound on the ticks of a search on that spiral, with a return to it after each robot."""
+    aside = way_ticks(((0.0, 0.0), (2.0 * mission.sensing_range, 0.0)), mission)
+    return way_ticks(spiral(mission, diameter), mission) + (robots - 1) * aside
 
 
 MEASURING_LOOPS = 3

@@ -21,7 +21,6 @@ from agent.estimation.knowledge import Belief, Knowledge
 from agent.peer.motion_log import MotionLog
 from agent.peer.peer_state import PeerState
 from agent.planning.assured import Assured
-from agent.planning.range_seeking import next_on_spiral
 from agent.planning.state import RobotState
 from compose.launch.in_process import played, run_mission
 from compose.recording.run import read
@@ -30,6 +29,7 @@ from protocol.messages import Member, Ranged, Report, RobotConfig
 from protocol.mission import Mission
 from protocol.noise import Noise
 from protocol.orbits import pair_ticks, rendezvous, tick_budget
+from protocol.team_motion import next_on_spiral
 from tests.commands import tandem
 from tests.series import series
 from tests.surveys import assert_localised, scenario_of, states

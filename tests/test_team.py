@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,7 @@ from protocol.journal.journal_file import CorruptJournal
 from protocol.messages import Contact, Localised, NamedRange, Observation
 from protocol.mission import Anchor
 from protocol.motion import Controls
+from protocol.team_motion import spiral
 from protocol.wire import decode, encode
 from tests.commands import journals
 from tests.commands import tandem as tandem_command
@@ -108,6 +111,34 @@ def test_a_robot_with_three_ranges_keeps_no_other_one_from_its_claim() -> None:
     assert run.end is not None
     assert run.end.outcome == "localised"
     assert run.end.tick < 30
+
+
+APART = '[[robot]]\nid = "a"\nstart = [1.0, 1.0, 0.5]\n[[robot]]\nid = "b"\nstart = [9.0, 7.0, 2.0]'
+SCATTERED = team(APART, "", MISSION.replace("0.05", "0.0") + '\nframe = "relative"\ndiameter = 10.0')
+
+
+def test_the_first_robot_searches_for_one_that_starts_out_of_range_and_stands() -> None:
+    run = run_mission(SCATTERED)
+    assert run.end is not None
+    assert run.end.outcome == "localised"
+    assert run.end.tick * run.scenario.mission.period <= run.scenario.t_max
+    met = next(seen["b"].tick for seen in run.observations if seen["b"].contacts)
+    assert met > 10
+    assert {run.truth("b")[k] for k in range(met)} == {run.truth("b")[0]}
+
+
+@given(st.floats(0.0, 30.0), st.floats(0.0, math.tau))
+def test_the_spiral_passes_each_place_well_in_range(distance: float, angle: float) -> None:
+    mission = SCATTERED.mission
+    place = complex(distance * math.cos(angle), distance * math.sin(angle))
+    sides = pairwise([complex(*one) for one in spiral(mission, distance)])
+    nearest = min(_distance(place, *side) for side in sides)
+    assert nearest <= 0.6 * mission.sensing_range
+
+
+def _distance(place: complex, begin: complex, end: complex) -> float:
+    along = ((place - begin) * (end - begin).conjugate()).real / abs(end - begin) ** 2
+    return abs(place - begin - min(max(along, 0.0), 1.0) * (end - begin))
 
 
 KILLS = ("a@2 world@4", "", "b@1:command b@3:report world@0")
@@ -276,6 +307,11 @@ DRAWN = "[team]\nrobots = 2\nside = 4.0\nanchors = 3\n"
         ({"robots": ALONE + '\nanchors = ["A1"]'}, "robot[0]: 'a' may range fewer than two anchors"),
         ({"robots": TWO, "mission": RELATIVE}, "mission.frame: anchors determine the frame"),
         ({"robots": ALONE, "anchors": "", "mission": RELATIVE}, "mission.frame: the poses of at least two"),
+        ({"robots": ALONE, "mission": MISSION + "diameter = 9.0"}, "mission.diameter: it is for robots with"),
+        (
+            {"robots": APART, "anchors": "", "mission": RELATIVE + "\ndiameter = 9.0"},
+            "robot[1].start: it is not within mission.diameter = 9 m of that of 'a'",
+        ),
         (
             {"robots": TWO, "anchors": "", "mission": RELATIVE.replace("5.0", "0.5")},
             "is in range of no robot",
@@ -306,10 +342,11 @@ def test_a_team_that_cannot_run_is_refused_with_one_line(fields: dict[str, Any],
     [
         load("room"),
         load("relative"),
+        SCATTERED,
         team("", DRAWN + "unknown = 1"),
         team(ALONE + '\nanchors = ["A3", "A1"]', ANCHORS.replace("[3.0, 0.0]", "[3.0, 0.0]\nsigma = 0.2")),
     ],
-    ids=["room", "relative", "drawn", "listed"],
+    ids=["room", "relative", "scattered", "drawn", "listed"],
 )
 def test_a_file_with_the_content_of_a_team_has_the_same_scenario(scenario: Scenario) -> None:
     assert template_of(file_table(scenario)).scenario == scenario

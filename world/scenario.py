@@ -144,6 +144,8 @@ class PlannedTeam(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_f
     """The bound in s of the time at which all robots are localised, with exact sensors."""
     survey: Clearance = 0.0
     """The sigma (m) up to which anchors that are not surveyed are measured; 0: robots do not wait for it."""
+    diameter: Clearance = 0.0
+    """The distance (m) within which the first robot searches for the others; 0: ranges connect all robots."""
 
 
 class Scenario(
@@ -328,6 +330,7 @@ class Scenario(
                 team.origin,
                 team.bound,
                 team.survey,
+                team.diameter,
             ),
             ranges=own.ranges,
         )

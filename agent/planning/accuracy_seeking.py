@@ -31,6 +31,7 @@ from agent.planning.tasks import Homing, Listening, Orbital, Orbiting, Radial, R
 from protocol.messages import BranchKind, Localised
 from protocol.mission import Mission, Role
 from protocol.motion import ORIGIN, REST, Controls, Pose, compose, inverse
+from protocol.team_motion import next_on_spiral
 
 MANOEUVRES = Manoeuvres(
     directions=(1.0, -1.0), sides=(1.0, -1.0), last_speeds=LAST_SPEEDS, fewest_out_of_range=True
@@ -93,7 +94,7 @@ def sensed(state: RobotState, ranged: bool) -> RobotState:
                 return state
             if side is None:
                 return state.doing(Straight("anchor", state.odometry, 0.0))
-            x, y = range_seeking.next_on_spiral((place.x, place.y), side, mission)
+            x, y = next_on_spiral((place.x, place.y), side, mission)
             return state.doing(Homing(Pose(x, y, 0.0), side + 1))
         case Surveying("peer") | Listening() | Retreating():
             return _continue_phase3(state)

@@ -50,17 +50,6 @@ def onward(state: RobotState, task: Searching, measured: bool, manoeuvres: Manoe
             return None if measured else task
 
 
-def next_on_spiral(place: tuple[float, float], side: int, mission: Mission) -> tuple[float, float]:
-    """Return the end of the side after `side` of a square spiral, in m, if the latter ends at `place`.
-
-    Each second side is longer, by R.
-    """
-    length = (side // 2 + 1) * mission.sensing_range
-    along, sign = side % 2, 1.0 if side % 4 < 2 else -1.0
-    x, y = place
-    return (x, y + sign * length) if along else (x + sign * length, y)
-
-
 def inside_arc(rho0: float, radius: float, reach: float) -> float:
     """Return 2 pi - 2 eta in rad (Section III.A.2): the part of a circle that is in range of the beacon.
 

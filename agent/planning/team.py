@@ -42,7 +42,9 @@ from protocol.messages import (
 from protocol.mission import Anchor
 from protocol.motion import ORIGIN, REST, TAU, Controls, Pose, compose, relative, step, wrap
 from protocol.orbits import Orbit
-from protocol.team_motion import loop, loop_ticks, nearest_other, way_past
+from protocol.sweep_strips import Place
+from protocol.sweep_ticks import sweep_speed
+from protocol.team_motion import loop, loop_ticks, nearest_other, spiral, way_past
 
 ARRIVED = 0.01
 """The distance from a place, as a fraction of A_0, and the error (rad) of the way, at which it is there."""
@@ -63,6 +65,15 @@ class Way(msgspec.Struct, frozen=True):
     """The circle about it."""
     since: int
     """The tick in which the robot set out."""
+
+
+class Spiral(NamedTuple):
+    """The place of the first robot in its search for robots that nobody has met."""
+
+    corner: int = 0
+    """The corner of the spiral to which it drives."""
+    place: Place = (0.0, 0.0)
+    """The place (m) up to which it has searched, in the frame of the odometry."""
 
 
 class Near(NamedTuple):
@@ -107,6 +118,8 @@ class TeamState(msgspec.Struct, frozen=True):
     verdict: Verdict | None = None
     way: Way | None = None
     """The way past an anchor; None until it has none."""
+    spiral: Spiral = Spiral()
+    """The search for robots that start elsewhere."""
     doing: str = "asleep"
     """The name of the present task."""
     phase: int = 1
@@ -131,6 +144,10 @@ class TeamState(msgspec.Struct, frozen=True):
     def waiting(self) -> list[int]:
         """The other robots that have no result, as far as this one knows."""
         return [one for one in range(len(self.team.robots)) if one not in {*self.log.done, self.own}]
+
+    def has_met(self, robot: int) -> bool:
+        """Return whether measurements connect this robot with another one."""
+        return bool(self.log.logs[robot]) or self.nearest[robot].range < math.inf
 
 
 class TeamPlanner(Planner[TeamState, TeamReport]):
@@ -364,6 +381,8 @@ def _moved_on(state: TeamState) -> TeamState:
     if isinstance(state.verdict, Undecided) or (state.verdict is not None and not state.waiting):
         name = "undecided" if isinstance(state.verdict, Undecided) else "localised"
         return replace(state, doing=name, phase=3, controls=REST)
+    if state.team.diameter and state.waiting and not any(map(state.has_met, _to_meet(state))):
+        return _searching(state)
     lost = [state.nearest[one].place for one in state.waiting if state.nearest[one].range < math.inf]
     if state.team.origin is not None and lost and not waiting and (state.verdict or not state.peers):
         back = towards((lost[0].x, lost[0].y), state.odometry, mission, ARRIVED)
@@ -382,6 +401,33 @@ def _moved_on(state: TeamState) -> TeamState:
     if state.way is None:
         return replace(state, doing="circling", phase=1, controls=loop(mission, own, state.tick))
     return replace(state, doing="orbiting", phase=2, controls=_along(state, state.way))
+
+
+def _to_meet(state: TeamState) -> list[int]:
+    """Return the robots of which one is met before this robot moves as in other teams."""
+    origin = state.team.robots.index(state.team.origin or "")
+    return state.waiting if origin == state.own else [origin]
+
+
+def _searching(state: TeamState) -> TeamState:
+    """Return `state` on the spiral, on which the first robot searches; the others stand.
+
+    After a meeting, it goes on where it has left the spiral.
+    """
+    if state.config.robot != state.team.origin:
+        return replace(state, doing="waiting", phase=1, controls=REST)
+    mission, here, (corner, place) = state.config.mission, state.odometry, state.spiral
+    corners, v = spiral(mission, state.team.diameter), sweep_speed(mission)
+    if math.hypot(here.x - place[0], here.y - place[1]) <= (1.0 + ARRIVED) * v * mission.period:
+        place = here.x, here.y
+    for k in (corner, corner + 1):
+        at = corners[k % len(corners)] if place == (here.x, here.y) else place
+        way = towards(at, here, mission, ARRIVED)
+        if way is not None:
+            break
+    way = way or REST
+    controls = Controls(min(way.v, v), way.omega)
+    return replace(state, doing="searching", phase=2, controls=controls, spiral=Spiral(k, place))
 
 
 def _seen(state: TeamState) -> list[AmongBeacons]:

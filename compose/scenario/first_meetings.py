@@ -51,8 +51,9 @@ def meetings_of(
     robots, mission = file.robot, file.mission
     if is_team(file):
         return GroupMeetings((), {}, 0.0, (), 0.0, 0.0)
-    if mission.survey:
-        raise BadScenario("mission.survey: there is no [[anchor]] in the file")
+    if mission.survey or mission.diameter:
+        name, what = ("survey", "[[anchor]]") if mission.survey else ("diameter", "mission.frame")
+        raise BadScenario(f"mission.{name}: there is no {what} in the file")
     for i, robot in enumerate(robots):
         if robot.anchors is not None:
             raise BadScenario(f"robot[{i}].anchors: there is no [[anchor]] in the file")

@@ -153,8 +153,9 @@ def file_table(scenario: Scenario) -> dict[str, Any]:
         mission["area"] = list(scenario.planned_sweep.sweep.bounds)
     if scenario.team is not None and scenario.team.origin is not None:
         mission["frame"] = "relative"
-    if scenario.team is not None and scenario.team.survey:
-        mission["survey"] = scenario.team.survey
+    for name in ("survey", "diameter") if scenario.team is not None else ():
+        if value := getattr(scenario.team, name):
+            mission[name] = value
     if scenario.tolerates:
         mission["tolerates"] = scenario.tolerates
     if scenario.mission.noise.profile is not None:  # a default would have the value of the profile

@@ -65,6 +65,12 @@ class MissionTable(Mission, frozen=True, forbid_unknown_fields=True):
 
     0: they do not wait for it.
     """
+    diameter: Clearance = 0.0
+    """With `frame`, the largest distance in m of a start from that of the first robot, which searches for the
+    others.
+
+    0: ranges connect all starts.
+    """
     tolerates: Annotated[int, Meta(ge=0, le=MAX_ROBOTS)] = 0
     """The number of robots of a group that may report false data: one more must agree before a claim.
 

@@ -15,7 +15,7 @@ from protocol.messages import TeamAnchor
 from protocol.mission import Anchor, Mission
 from protocol.motion import ORIGIN, TAU, Pose, relative, wrap
 from protocol.spelling import did_you_mean
-from protocol.team_motion import nearest_other, team_ticks
+from protocol.team_motion import nearest_other, search_ticks, team_ticks
 from world.random_streams import gaussian
 from world.scenario import PlacedAnchor, PlannedTeam, RobotSpec
 
@@ -65,16 +65,19 @@ def planned_team(file: ScenarioFile) -> tuple[PlannedTeam, tuple[RobotSpec, ...]
                 raise BadScenario(f"robot[{i}].anchors: there is no anchor '{name}'{did_you_mean(name, ids)}")
         ranges = tuple([name for name in ids if robot.anchors is None or name in robot.anchors])
         robots.append(RobotSpec(robot.id, None, None, ORIGIN, ranges=ranges))
-    told = [one.told for one in anchors]
+    known = [one.told for one in anchors]
     if mission.frame is None:
         robots = [_in_range(i, file, one, anchors) for i, one in enumerate(robots)]
-        away = [nearest_other(one, told) for one in told]
+        away = [nearest_other(one, known) for one in known]
         farthest = max([one for one in away if one is not None], default=0.0)
     else:
         robots, farthest = _connected(file, robots), 0.0
     ticks = team_ticks(mission, len(robots), farthest) * (1 if mission.frame is None else len(robots))
+    if mission.diameter:
+        ticks += search_ticks(mission, len(robots), mission.diameter)
     origin = robots[0].id if mission.frame is not None else None
-    return PlannedTeam(anchors, origin, ticks * mission.period, mission.survey), tuple(robots)
+    told = anchors, origin, ticks * mission.period, mission.survey, mission.diameter
+    return PlannedTeam(*told), tuple(robots)
 
 
 def _check(file: ScenarioFile) -> None:
@@ -103,6 +106,8 @@ def _check_mission(file: ScenarioFile) -> None:
         )
     if file.mission.survey and all(one.position and not one.sigma for one in file.anchor):
         raise BadScenario("mission.survey: all [[anchor]] are surveyed")
+    if file.mission.frame is None and file.mission.diameter:
+        raise BadScenario("mission.diameter: it is for robots with mission.frame")
     if file.mission.frame is not None:
         if file.anchor:
             raise BadScenario("mission.frame: anchors determine the frame, so there can be no [[anchor]]")
@@ -187,9 +192,13 @@ def _reached(start: Pose, places: Sequence[Anchor], mission: Mission) -> bool:
 
 
 def _connected(file: ScenarioFile, robots: Sequence[RobotSpec]) -> list[RobotSpec]:
-    """Return the robots at their starts in the frame of the first one; ranges connect all of them."""
+    """Return the robots at their starts in the frame of the first one.
+
+    Ranges connect all of them, or they are within `mission.diameter` of the first one.
+    """
     starts: list[Pose] = []
-    reach = file.mission.sensing_range
+    diameter = file.mission.diameter
+    reach = diameter or file.mission.sensing_range
     for i, robot in enumerate(file.robot):
         if robot.start is not None:
             starts.append(given_start(robot.start))
@@ -197,19 +206,25 @@ def _connected(file: ScenarioFile, robots: Sequence[RobotSpec]) -> list[RobotSpe
         draw = random.Random(f"{file.seed}/start/{robot.id}").random
         for _ in range(MOST_DRAWS):
             start = Pose(*_within(_area(file), draw(), draw()), TAU * draw())
-            if not starts or any(math.hypot(start.x - at.x, start.y - at.y) <= reach for at in starts):
+            others = starts[:1] if diameter else starts
+            if not starts or any(math.hypot(start.x - at.x, start.y - at.y) <= reach for at in others):
                 break
         else:
             raise Unworkable(f"robot[{i}].start: no place in the area is in range of another robot")
         starts.append(start)
     left = list(range(1, len(starts)))
     seen = [0]
-    for one in seen:
+    for one in seen[:1] if diameter else seen:
         near = [
             k for k in left if math.hypot(starts[one].x - starts[k].x, starts[one].y - starts[k].y) <= reach
         ]
         seen += near
         left = [k for k in left if k not in near]
+    if left and diameter:
+        raise Unworkable(
+            f"robot[{left[0]}].start: it is not within mission.diameter = {diameter:.9g} m of that of "
+            f"'{robots[0].id}'"
+        )
     if left:
         raise Unworkable(
             f"robot[{left[0]}].start: '{robots[left[0]].id}' is in range of no robot that is connected with "

@@ -24,7 +24,7 @@ FIELDS_OF_USERS: Mapping[User, Mapping[str, str]] = {
         "": "seed world fault anchor team",
         "robot.": "id anchor anchors start peer dies",
         "group.": "robots spacing without_anchor dies",
-        "mission.": "sensing_range period max_speed max_turn_rate area frame",
+        "mission.": "sensing_range period max_speed max_turn_rate area frame diameter",
     },
     "robots": {
         "": "name max_ticks planner kill robot.attack group.attack",

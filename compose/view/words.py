@@ -46,6 +46,9 @@ OF_TEAMS = {
     "orbiting": "{robot} drives to where another anchor is in range",
     "surveying": "{robot} drives to where its next ranges are most informative",
     "localised": "{robot} is localised",
+    "homing": "{robot} drives back to where it had a range",
+    "searching": "{robot} searches for robots that have no range yet",
+    "waiting": "{robot} waits until another robot finds it",
 }
 """Sentences by state name, of robots of a team."""
 WAITING = "{robot} waits beside its anchor until {peer} comes into range"
