@@ -118,6 +118,10 @@ class TeamState(msgspec.Struct, frozen=True):
     verdict: Verdict | None = None
     way: Way | None = None
     """The way past an anchor; None until it has none."""
+    returned: int = -1
+    """The tick of the latest return to a contact; -1 before the first."""
+    loops_until: int = -1
+    """The tick until which it drives loops there, since it was there before."""
     spiral: Spiral = Spiral()
     """The search for robots that start elsewhere."""
     doing: str = "asleep"
@@ -383,6 +387,11 @@ def _moved_on(state: TeamState) -> TeamState:
         return replace(state, doing=name, phase=3, controls=REST)
     if state.team.diameter and state.waiting and not any(map(state.has_met, _to_meet(state))):
         return _searching(state)
+    if state.doing == "homing" and state.peers:  # what it did after the first return has led away again
+        until = state.tick + 2 * loop_ticks(mission, own) if state.returned >= 0 else -1
+        state = replace(state, returned=state.tick, loops_until=until)
+    if state.tick < state.loops_until:
+        return replace(state, doing="circling", phase=1, controls=loop(mission, own, state.tick))
     lost = [state.nearest[one].place for one in state.waiting if state.nearest[one].range < math.inf]
     if state.team.origin is not None and lost and not waiting and (state.verdict or not state.peers):
         back = towards((lost[0].x, lost[0].y), state.odometry, mission, ARRIVED)
